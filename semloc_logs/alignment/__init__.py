@@ -1,0 +1,1 @@
+"""Hypotheses, verification, ICP, pose and covariance (paper 3.5)."""

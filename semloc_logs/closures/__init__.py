@@ -1,0 +1,1 @@
+"""Queries over sessions and the acceptance of loop closures."""

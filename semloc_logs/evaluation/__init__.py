@@ -1,0 +1,1 @@
+"""Closures against the truth."""

@@ -1,0 +1,123 @@
+"""What a log is made of once decoded: small frozen types, stamps in integer nanoseconds, lengths in metres.
+
+``stamp_ns`` is the sensor time of the message header, ``log_time_ns`` the receive time of the log. Arrays are never written to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Header:
+    """Where and when a message comes from."""
+
+    topic: str
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarFrame:
+    """One sweep. ``points`` (n, 3) in the sensor frame; rows with NaN, infinity or exactly zero are already gone."""
+
+    header: Header
+    points: F32
+    label: NDArray[np.uint32] | None = None  # ids exactly as recorded
+    offset_ns: NDArray[np.int64] | None = None  # time of each point minus header.stamp_ns
+    ring: NDArray[np.uint16] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageFrame:
+    """A decoded picture: (h, w) or (h, w, 3) RGB, uint8 or uint16."""
+
+    header: Header
+    image: NDArray[np.uint8] | NDArray[np.uint16]
+    encoding: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthFrame:
+    """Depth along the optical axis in metres (h, w) float32; 0 where there is none."""
+
+    header: Header
+    depth: F32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A CameraInfo or CameraCalibration: ``K`` (3, 3), ``P`` (3, 4), ``R`` (3, 3), distortion ``D`` of ``model``."""
+
+    header: Header
+    width: int
+    height: int
+    K: F64
+    D: F64
+    R: F64
+    P: F64
+    model: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseSample:
+    """``frame_T_child`` (4, 4): pose of ``child_frame_id`` in ``header.frame_id``; child is "" for PoseStamped."""
+
+    header: Header
+    child_frame_id: str
+    frame_T_child: F64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TransformSample:
+    """An edge of the TF tree: ``frame_T_child`` (4, 4)."""
+
+    header: Header
+    child_frame_id: str
+    frame_T_child: F64
+    static: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSample:
+    """Specific force in m/s^2 and angular rate in rad/s, in the IMU frame."""
+
+    header: Header
+    acceleration: F64
+    angular_velocity: F64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NavSatSample:
+    """WGS 84 latitude and longitude in degrees, ellipsoid height in metres."""
+
+    header: Header
+    latitude_deg: float
+    longitude_deg: float
+    altitude: float
+
+
+Frame = LidarFrame | ImageFrame | DepthFrame | Camera | PoseSample | TransformSample | ImuSample | NavSatSample
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedCloud:
+    """Labelled or unlabelled points of one sensor at one time in the base frame: what fusion eats.
+
+    ``points`` (n, 3) float32 and ``origin`` (3,), the sensor's centre, in the base frame; ``label`` (n,) ids as recorded or None;
+    ``session_T_base`` (4, 4) or None in a log without poses.
+    """
+
+    header: Header
+    points: F32
+    origin: F32
+    session_T_base: F64 | None
+    label: NDArray[np.uint32] | None = None
+    extra: dict[str, str] = field(default_factory=dict)

@@ -1,0 +1,1 @@
+"""Label spaces, and labels from the log or from geometry."""

@@ -1,0 +1,1 @@
+"""Log -> typed frames, and results -> channels of a log: the only code that knows containers and messages."""

@@ -1,0 +1,1 @@
+"""A procedural street and simulated drive logs with ground truth."""

@@ -1,0 +1,1 @@
+"""Semantic occupancy fusion; blocks and voxels as Parquet."""
