@@ -1,0 +1,123 @@
+"""The ground of a street world: smooth slopes, carriageways, kerbs, pavements and lawns on a raster of half a metre."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from semloc_logs.simulation.network import RoadNetwork
+from semloc_logs.simulation.world import F64, ROAD, SIDEWALK, TERRAIN, Mesh
+
+CELL = 0.5  # m; kerbs are exact to half of it
+MARGIN = 48.0  # m of ground beside a road
+KERB = 0.12  # m
+
+
+@dataclass(slots=True, eq=False)
+class Ground:
+    """Heights and kinds of ground around a network; ``free`` is what still may be built upon."""
+
+    network: RoadNetwork
+    rng: np.random.Generator
+    corner: F64 = field(init=False)
+    kind: NDArray[np.uint8] = field(init=False)  # ROAD, SIDEWALK, TERRAIN; 255 = no ground
+    beside: NDArray[np.float32] = field(init=False)  # metres from the edge of the carriageway, negative on it
+    free: NDArray[np.bool_] = field(init=False)
+    _waves: F64 = field(init=False)
+    _bank: tuple[float, float] = field(init=False)
+
+    def __post_init__(self) -> None:
+        everything = np.concatenate([r.path for r in self.network.roads])
+        self.corner = everything.min(0) - MARGIN
+        shape = np.ceil((everything.max(0) + MARGIN - self.corner) / CELL).astype(int)
+        x, y = np.meshgrid(*(self.corner[k] + CELL * (np.arange(shape[k]) + 0.5) for k in (0, 1)), indexing="ij")
+        centres = np.column_stack([x.ravel(), y.ravel()])
+        beside = np.full(len(centres), np.inf, np.float32)
+        walk = np.full(len(centres), np.inf, np.float32)
+        for road in self.network.roads:
+            low, high = road.path.min(0) - MARGIN - 8, road.path.max(0) + MARGIN + 8
+            near = np.flatnonzero(((centres > low) & (centres < high)).all(1))
+            distance = cKDTree(road.path).query(centres[near], distance_upper_bound=MARGIN + 8)[0].astype(np.float32)
+            beside[near] = np.minimum(beside[near], distance - road.half_width)
+            walk[near] = np.minimum(walk[near], distance - road.half_width - road.sidewalk)
+        field_ = _rounded_corners(beside.reshape(shape))
+        self.beside = field_
+        kind = np.where(field_ < 0, ROAD, np.where(walk.reshape(shape) < 0, SIDEWALK, TERRAIN))
+        self.kind = np.where(field_ > MARGIN, 255, kind).astype(np.uint8)
+        self.free = self.kind == TERRAIN
+        wavelength = self.rng.uniform([25, 60, 90, 150], [60, 120, 200, 400])
+        slope = self.rng.uniform(0, [0.006, 0.012, 0.02, 0.03])
+        angle, phase = self.rng.uniform(0, 2 * np.pi, (2, 4))
+        k = 2 * np.pi / wavelength
+        self._waves = np.stack([k * np.cos(angle), k * np.sin(angle), phase, slope / k])
+        self._bank = (float(self.rng.uniform(4, 14)), float(self.rng.choice([0.0, 0.0, 0.06, 0.15, -0.06])))
+
+    def slope_height(self, x: F64, y: F64) -> F64:
+        """Height of the carriageway's surface in metres at plan positions (n,)."""
+        kx, ky, phase, size = self._waves
+        return (np.sin(np.multiply.outer(x, kx) + np.multiply.outer(y, ky) + phase) * size).sum(-1)
+
+    def cell(self, x: F64, y: F64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Raster cells of plan positions (n,), kept inside."""
+        i = np.clip(((x - self.corner[0]) / CELL).astype(np.int64), 0, self.kind.shape[0] - 1)
+        j = np.clip(((y - self.corner[1]) / CELL).astype(np.int64), 0, self.kind.shape[1] - 1)
+        return i, j
+
+    def height(self, x: F64, y: F64) -> F64:
+        """Height of the ground in metres at plan positions (n,), kerbs and banks included."""
+        cell = self.cell(x, y)
+        return self.slope_height(x, y) + self._step(x, y, self.kind[cell], self.beside[cell])
+
+    def _step(self, x: F64, y: F64, kind: NDArray[np.uint8], beside: NDArray[np.float32]) -> F64:
+        start, bank = self._bank
+        rough = 0.05 * (np.sin(1.1 * x + 0.4 * y) + np.sin(0.7 * y - 0.5 * x + 1.0)) * np.clip((beside - 3) / 6, 0, 1)
+        rise = bank * np.clip(beside - start, 0, 12.0) * (1 + 0.5 * np.sin(0.03 * x + 0.05 * y))
+        return np.where(kind == ROAD, 0.0, KERB + np.where(kind == TERRAIN, rough + rise, 0.0))
+
+    def allowed(self, points: F64) -> bool:
+        """Whether all plan points (n, 2) are free ground."""
+        return bool(self.free[self.cell(points[:, 0], points[:, 1])].all())
+
+    def take(self, points: F64) -> None:
+        """Mark plan points (n, 2) as built upon."""
+        self.free[self.cell(points[:, 0], points[:, 1])] = False
+
+    def mesh(self) -> tuple[Mesh, NDArray[np.uint8]]:
+        """The ground with its kerbs, heights absolute, and the label of each triangle."""
+        i, j = np.nonzero(self.kind != 255)
+        kind = self.kind[i, j]
+        corners = np.zeros((len(i), 4, 3))
+        for k, (di, dj) in enumerate(((0, 0), (1, 0), (1, 1), (0, 1))):
+            x, y = self.corner[0] + CELL * (i + di), self.corner[1] + CELL * (j + dj)
+            at = self._corner_distance(i + di, j + dj)
+            corners[:, k] = np.column_stack([x, y, self.slope_height(x, y) + self._step(x, y, kind, at)])
+        start = 4 * np.arange(len(i), dtype=np.int64)[:, None]
+        triangles = [start + [0, 1, 2], start + [0, 2, 3]]
+        labels = [kind, kind]
+        number = np.full(self.kind.shape, -1, np.int64)
+        number[i, j] = np.arange(len(i))
+        for (a, b), (c, d), here, there in (((1, 2), (0, 3), np.s_[:-1, :], np.s_[1:, :]), ((3, 2), (0, 1), np.s_[:, :-1], np.s_[:, 1:])):
+            step = ((self.kind[here] == ROAD) != (self.kind[there] == ROAD)) & (number[here] >= 0) & (number[there] >= 0)
+            p, q = 4 * number[here][step], 4 * number[there][step]
+            triangles += [np.column_stack([p + a, p + b, q + d]), np.column_stack([p + a, q + d, q + c])]
+            labels += [np.full(len(p), SIDEWALK, np.uint8)] * 2
+        return Mesh(corners.reshape(-1, 3), np.concatenate(triangles)), np.concatenate(labels).astype(np.uint8)
+
+    def _corner_distance(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Distance to the carriageway at cell corners: the mean of the cells around."""
+        b = self.beside
+        n, m = b.shape
+        low_i, high_i, low_j, high_j = np.maximum(i - 1, 0), np.minimum(i, n - 1), np.maximum(j - 1, 0), np.minimum(j, m - 1)
+        mean = (b[low_i, low_j] + b[low_i, high_j] + b[high_i, low_j] + b[high_i, high_j]) / 4
+        return np.asarray(mean, np.float32)
+
+
+def _rounded_corners(beside: NDArray[np.float32], radius: float = 3.0) -> NDArray[np.float32]:
+    """Close the carriageway by ``radius`` metres, so that kerbs turn round corners in an arc."""
+    inside = cv2.distanceTransform((beside < radius).astype(np.uint8), cv2.DIST_L2, 5) * CELL
+    closed = (inside > radius) & (beside < radius)
+    return np.where(closed & (beside >= 0), np.float32(-0.01), np.minimum(beside, 1e3)).astype(np.float32)

@@ -1,0 +1,130 @@
+"""Road networks: centre lines between crossings, with widths; and routes over them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from semloc_logs.simulation.objects import resample
+from semloc_logs.simulation.world import F64
+
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Road:
+    """A road between crossings ``a`` and ``b``: centre line (n, 2) about every metre, half the carriageway, pavement width, parking lanes."""
+
+    a: int
+    b: int
+    path: F64
+    half_width: float
+    sidewalk: float
+    parking: bool
+
+    @property
+    def lane(self) -> float:
+        """Distance of the driven line from the centre line."""
+        return max(1.2, (self.half_width - (2.1 if self.parking else 0.0)) / 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoadNetwork:
+    """Crossings (k, 2) and the roads between them."""
+
+    crossings: F64
+    roads: tuple[Road, ...]
+
+    def neighbours(self, crossing: int) -> list[tuple[int, int]]:
+        """(road, other crossing) of every road at a crossing."""
+        return [(k, r.b if r.a == crossing else r.a) for k, r in enumerate(self.roads) if crossing in (r.a, r.b)]
+
+
+def _road(rng: Rng, a: int, b: int, path: F64, narrow: float) -> Road:
+    parking = bool(rng.random() < 0.55)
+    half = rng.uniform(2.6, 4.2) * narrow + (2.1 if parking else 0.0)
+    sidewalk = 0.0 if rng.random() < 0.12 else rng.uniform(1.2, 3.8)
+    return Road(a, b, path, float(half), float(sidewalk), parking)
+
+
+def grid_network(rng: Rng, columns: int, rows: int, block: float) -> RoadNetwork:
+    """A bent grid of ``columns`` x ``rows`` crossings about ``block`` metres apart, some roads missing, none a dead end."""
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij")
+    stretch = rng.uniform(0.75, 1.3)
+    crossings = (
+        np.column_stack([x.ravel() * block * stretch, y.ravel() * block / stretch]) + rng.normal(size=(columns * rows, 2)) * 0.1 * block
+    )
+    shear, turn = rng.normal() * 0.15, rng.uniform(0, 2 * np.pi)
+    crossings = crossings @ np.array([[1, 0], [shear, 1]]) @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    pairs = [(i * rows + j, (i + 1) * rows + j) for i in range(columns - 1) for j in range(rows)]
+    pairs += [(i * rows + j, i * rows + j + 1) for i in range(columns) for j in range(rows - 1)]
+    degree = np.bincount(np.array(pairs).ravel(), minlength=len(crossings))
+    kept = []
+    for a, b in pairs:
+        if min(degree[a], degree[b]) > 2 and rng.random() < 0.25:
+            degree[[a, b]] -= 1
+        else:
+            kept.append((a, b))
+    narrow = rng.uniform(0.85, 1.3)
+    roads = tuple(_road(rng, a, b, _bend(rng, crossings[a], crossings[b]), narrow) for a, b in kept)
+    return RoadNetwork(crossings, roads)
+
+
+def _bend(rng: Rng, start: F64, end: F64) -> F64:
+    """A curved line between two points: a sum of two half waves across the straight one."""
+    length = float(np.linalg.norm(end - start))
+    u = np.linspace(0, 1, max(3, int(length)))
+    across = np.array([-(end - start)[1], (end - start)[0]]) / length
+    bow = length * (rng.normal() * 0.05 * np.sin(np.pi * u) + rng.normal() * 0.025 * np.sin(2 * np.pi * u))
+    return resample(start + (end - start) * u[:, None] + across * bow[:, None], 1.0)
+
+
+def path_network(rng: Rng, path: F64) -> RoadNetwork:
+    """Roads along a driven path (n, 2 or 3), parts that are driven again left out; side streets branch off here and there."""
+    points = resample(np.asarray(path, np.float64)[:, :2], 1.0)
+    from scipy.spatial import cKDTree
+
+    fresh = np.ones(len(points), bool)
+    pairs = cKDTree(points).query_pairs(7.0, output_type="ndarray")
+    late = pairs.max(1, initial=0)[np.abs(np.diff(pairs, axis=1)).ravel() > 40]
+    fresh[late] = False
+    crossings: list[F64] = []
+    roads: list[Road] = []
+    narrow = rng.uniform(0.9, 1.25)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], fresh.astype(np.int8), [0]])))
+    for start, stop in edges.reshape(-1, 2):
+        for first in range(int(start), int(stop) - 5, 150):
+            piece = points[max(first - 8 * (first == start), 0) : min(first + 151, int(stop) + 8)]
+            crossings += [piece[0], piece[-1]]
+            roads.append(_road(rng, len(crossings) - 2, len(crossings) - 1, piece, narrow))
+    return RoadNetwork(np.array(crossings), tuple(roads))
+
+
+def random_route(rng: Rng, network: RoadNetwork, length: float) -> list[tuple[int, bool]]:
+    """Roads to drive in a row, (road, forwards), at least ``length`` metres, without turning back at a crossing."""
+    road = int(rng.integers(len(network.roads)))
+    forwards = bool(rng.random() < 0.5)
+    route, driven = [(road, forwards)], len(network.roads[road].path) * 1.0
+    while driven < length:
+        here = network.roads[road].b if forwards else network.roads[road].a
+        choices = [c for c in network.neighbours(here) if c[0] != road] or network.neighbours(here)
+        road, _ = choices[int(rng.integers(len(choices)))]
+        forwards = network.roads[road].a == here
+        route.append((road, forwards))
+        driven += len(network.roads[road].path)
+    return route
+
+
+def lane_path(network: RoadNetwork, route: list[tuple[int, bool]]) -> F64:
+    """The line (n, 2) that a car drives along a route, on the right, about every metre, corners cut not rounded."""
+    pieces = []
+    for index, forwards in route:
+        road = network.roads[index]
+        centre = road.path if forwards else road.path[::-1]
+        tangent = np.gradient(centre, axis=0)
+        tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+        lane = centre + road.lane * np.column_stack([tangent[:, 1], -tangent[:, 0]])
+        trim = min(int(road.half_width + 2), len(lane) // 3)
+        pieces.append(lane[trim : len(lane) - trim])
+    return np.concatenate(pieces)

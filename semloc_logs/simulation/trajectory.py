@@ -1,0 +1,70 @@
+"""Vehicle trajectories along driven lines, and the odometry that a drifting estimator would make of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from semloc_logs.geometry import inverse
+from semloc_logs.simulation.objects import resample
+from semloc_logs.simulation.world import F64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses of the base frame (on the ground under the vehicle): true ``world_T_base`` and drifting ``odom_T_base`` (n, 4, 4)."""
+
+    stamps_ns: NDArray[np.int64]
+    world_T_base: F64
+    odom_T_base: F64
+
+
+def smooth_line(line: F64, sigma: float = 2.5) -> F64:
+    """A driven line (n, 2) with corners rounded over about ``sigma`` metres, points every half metre."""
+    points = resample(line, 0.5)
+    return np.column_stack([gaussian_filter1d(points[:, k], sigma / 0.5, mode="nearest") for k in (0, 1)])
+
+
+def poses_along(line: F64, at: F64, height: Callable[[F64, F64], F64], rng: np.random.Generator, shake: float = 0.004) -> F64:
+    """``world_T_base`` (m, 4, 4) at arc lengths ``at`` (m,) of a smooth line: yaw from the tangent, roll and pitch from ``height``."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    position = np.column_stack([np.interp(at, along, line[:, k]) for k in (0, 1)])
+    ahead = np.column_stack([np.interp(np.minimum(at + 0.6, along[-1]), along, line[:, k]) for k in (0, 1)])
+    behind = np.column_stack([np.interp(np.maximum(at - 0.6, 0), along, line[:, k]) for k in (0, 1)])
+    yaw = np.arctan2(*(ahead - behind).T[::-1])
+    heading = np.column_stack([np.cos(yaw), np.sin(yaw)])
+    left = np.column_stack([-heading[:, 1], heading[:, 0]])
+    z, rise, tilt = height(*position.T), _slope(height, position, heading), _slope(height, position, left)
+    noise = gaussian_filter1d(rng.normal(size=(len(at), 2)), 2.0, axis=0) * 2.5 * shake
+    out = np.tile(np.eye(4), (len(at), 1, 1))
+    euler = np.column_stack([yaw, -np.arctan(rise) + noise[:, 0], np.arctan(tilt) + noise[:, 1]])
+    out[:, :3, :3] = Rotation.from_euler("ZYX", euler).as_matrix()
+    out[:, :2, 3], out[:, 2, 3] = position, z
+    return out
+
+
+def _slope(height: Callable[[F64, F64], F64], position: F64, direction: F64, step: float = 1.3) -> F64:
+    ahead, behind = position + step * direction, position - step * direction
+    return (height(*ahead.T) - height(*behind.T)) / (2 * step)
+
+
+def drifting_odometry(world_T_base: F64, rng: np.random.Generator, drift: float = 0.007) -> F64:
+    """``odom_T_base`` (n, 4, 4) starting at identity: each step wrong at random and by a slowly wandering bias, about ``drift`` of the way."""
+    steps = inverse(world_T_base[:-1]) @ world_T_base[1:]
+    n = len(steps)
+    length = np.linalg.norm(steps[:, :3, 3], axis=1, keepdims=True)
+    scale = 1 + drift * rng.normal() + drift * gaussian_filter1d(rng.normal(size=(n, 1)), 30, axis=0, mode="nearest") * 8
+    bias = gaussian_filter1d(rng.normal(size=(n, 3)), 40, axis=0, mode="nearest") * 10
+    turn = (0.02 * drift * bias + 0.01 * drift * rng.normal(size=(n, 3))) * length * [0.2, 0.2, 1.0]
+    wrong = steps.copy()
+    wrong[:, :3, 3] = steps[:, :3, 3] * scale + rng.normal(size=(n, 3)) * 0.1 * drift * np.sqrt(length)
+    wrong[:, :3, :3] = Rotation.from_rotvec(turn).as_matrix() @ steps[:, :3, :3]
+    out = np.tile(np.eye(4), (n + 1, 1, 1))
+    for k in range(n):
+        out[k + 1] = out[k] @ wrong[k]
+    return out
