@@ -1,0 +1,200 @@
+"""All settings with their defaults beside them: defaults < YAML file < environment (``SEMLOC_FUSION__VOXEL_SIZE``) < flags.
+
+Unknown keys are refused at every level, by name. Lengths that are ``None`` follow the voxel size (0.30 m is the paper's street
+scale; a room at 0.05 m is a street in miniature) and are filled in by :meth:`Settings.resolved`, the only place that does so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
+
+from semloc_logs.errors import SettingsError
+
+STREET_VOXEL = 0.30
+LabelSource = Literal["auto", "log", "onnx", "geometry", "uniform"]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Fusion(_Section):
+    """Keyframes, submaps and the voxel map (paper 3.1)."""
+
+    voxel_size: float = Field(0.30, gt=0.005, le=5.0, description="edge of a voxel (m)")
+    min_range: float | None = Field(None, description="points nearer than this to the sensor are dropped (m); default 3 voxels")
+    max_range: float | None = Field(None, description="points farther than this are not fused, only carved (m); default 50 m at 0.30 m voxels")
+    keyframe_distance: float | None = Field(None, description="a frame becomes a keyframe after this travel (m); default 2 voxels")
+    keyframe_angle: float = Field(0.175, gt=0, description="or after this turn (rad)")
+    keyframe_resolution: float | None = Field(None, description="keyframes keep one point a cell of this size (m); default a third of a voxel")
+    submap_length: float | None = Field(None, description="length of road in a submap (m); default 100 m at 0.30 m voxels")
+    submap_overlap: float = Field(0.5, ge=0.0, lt=1.0, description="share of a submap that the next one repeats")
+    hit: float = Field(0.85, gt=0, description="log-odds added to a voxel that a ray ends in")
+    miss: float = Field(0.40, gt=0, description="log-odds taken from a voxel that a ray passes")
+    clamp: tuple[float, float] = Field((-2.0, 3.5), description="bounds of the log-odds (OctoMap)")
+
+
+class Labels(_Section):
+    """Where the classes come from (paper 3.1); always recorded in session.json and in every table."""
+
+    source: LabelSource = Field("auto", description="auto: labels of the log if it has any, else geometry; uniform: one class")
+    space: str | None = Field(None, description="label space of the log's ids (a file of schemas/label_spaces); default: guessed and noted")
+
+
+class Descriptor(_Section):
+    """Subvolumes and their descriptors (paper 3.2)."""
+
+    variant: Literal["auto", "semantic", "geometric"] = Field("auto", description="auto: semantic where labels come from a log, else geometric")
+    stride: int = Field(4, description="database subvolumes every so many voxels in x and y (4 or 8)")
+    query_stride: int = Field(8, description="query subvolumes every so many voxels in x and y (4 or 8)")
+    min_occupied: int = Field(40, ge=1, description="subvolumes with fewer occupied voxels are not described")
+    weights: Path | None = Field(None, description="safetensors file instead of the shipped weights")
+    vocabulary: Path | None = Field(None, description="safetensors file instead of the shipped vocabulary")
+
+
+class Query(_Section):
+    """What is asked of the database."""
+
+    frames: int = Field(5, ge=1, description="keyframes fused into a query; acc. of the paper is 5")
+    length: float | None = Field(None, description="or all keyframes within this stretch of road (m)")
+    every: float | None = Field(None, description="distance between queries (m); default 2 m at 0.30 m voxels")
+    every_angle: float = Field(0.349, gt=0, description="or turn between queries (rad)")
+    radius: float | None = Field(None, description="a query map is cut off at this distance (m); default 30 m at 0.30 m voxels")
+
+
+class Closures(_Section):
+    """From word matches to accepted closures (paper 3.4, 3.5)."""
+
+    headings: int = Field(18, ge=1, description="yaw hypotheses about gravity")
+    neighbours: int = Field(5, ge=1, description="nearest database words of each query word (K)")
+    probes: int = Field(8, ge=1, description="nearest vocabulary cells searched for each query word")
+    hypotheses: int = Field(96, ge=1, description="pooled hypotheses of a query that are verified")
+    refined: int = Field(12, ge=1, description="best verified hypotheses that are aligned")
+    kappa: float = Field(10.0, gt=0, description="kappa of the paper in voxels (3 m at 0.30 m)")
+    min_probability: float = Field(0.99, ge=0.0, le=1.0, description="closures below this are rejected")
+    exclude_seconds: float = Field(30.0, ge=0, description="within a session, keyframes nearer in time than this are no revisit")
+    exclude_distance: float | None = Field(None, description="nor nearer along the road than this (m); default 50 m at 0.30 m voxels")
+    rejected_per_query: int = Field(3, ge=0, description="best rejected hypotheses of a query that are reported")
+
+
+class Training(_Section):
+    """The encoder-decoder's training (supplement 1)."""
+
+    samples: int = Field(60_000, ge=32, description="subvolume pairs seen")
+    batch: int = Field(32, ge=2)
+    dropout: float = Field(0.10, ge=0, lt=1, description="share of the input's voxels that are dropped to unobserved")
+    reconstruction_weight: float = Field(10.0, description="weight of the reconstruction loss against the prior's")
+    occupied_weight: float = Field(10.0, description="weight of occupied voxels within it")
+    contrastive_weight: float = Field(10.0, ge=0, description="weight of the contrastive term beside completion; 0 is the paper")
+    shift: float = Field(0.6, ge=0, description="random shift of the contrastive view, largest per axis (m at 0.30 m voxels)")
+    turn: float = Field(0.175, ge=0, description="random turn of the contrastive view, largest (rad)")
+    seed: int = 0
+
+
+class Settings(BaseSettings):
+    """The whole configuration; see each section."""
+
+    model_config = SettingsConfigDict(extra="forbid", frozen=True, env_prefix="SEMLOC_", env_nested_delimiter="__")
+
+    fusion: Fusion = Fusion()
+    labels: Labels = Labels()
+    descriptor: Descriptor = Descriptor()
+    query: Query = Query()
+    closures: Closures = Closures()
+    training: Training = Training()
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        return (init_settings,)  # files, environment and flags are merged by load(), so that each level can be refused by name
+
+    def resolved(self) -> Settings:
+        """The same settings with every ``None`` length filled in from the voxel size."""
+        v = self.fusion.voxel_size
+        scale = v / STREET_VOXEL
+
+        def fill(section: _Section, **derived: float) -> dict[str, Any]:
+            return {k: x for k, x in derived.items() if getattr(section, k) is None}
+
+        fusion = fill(
+            self.fusion,
+            min_range=3 * v,
+            max_range=50 * scale,
+            keyframe_distance=2 * v,
+            keyframe_resolution=v / 3,
+            submap_length=100 * scale,
+        )
+        query = fill(self.query, every=2 * scale, radius=30 * scale)
+        closures = fill(self.closures, exclude_distance=50 * scale)
+        return self.model_copy(
+            update={
+                "fusion": self.fusion.model_copy(update=fusion),
+                "query": self.query.model_copy(update=query),
+                "closures": self.closures.model_copy(update=closures),
+            }
+        )
+
+    def fingerprint(self, *sections: str) -> str:
+        """Hash of the named sections: what a stage's outputs depend on."""
+        dumped = self.model_dump(mode="json", include=set(sections))
+        return hashlib.sha256(json.dumps(dumped, sort_keys=True).encode()).hexdigest()[:16]
+
+    def dump(self) -> str:
+        """YAML that :func:`load` reads back to the same settings."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+def load(file: Path | None = None, assignments: Mapping[str, str] | None = None, environment: Mapping[str, str] | None = None) -> Settings:
+    """Settings from defaults < ``file`` (YAML) < ``environment`` < ``assignments`` (``key.path`` -> YAML value).
+
+    Raises SettingsError naming the key when it is unknown or its value impossible.
+    """
+    merged: dict[str, Any] = {}
+    if file is not None:
+        try:
+            content = yaml.safe_load(file.read_text())
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as problem:
+            raise SettingsError(f"Settings file {file} cannot be read as YAML: {problem}".replace("\n", " ")) from None
+        if content is not None and not isinstance(content, dict):
+            raise SettingsError(f"Settings file {file} does not hold a mapping of sections such as 'fusion:'.")
+        merged = content or {}
+    for name, value in (environment or {}).items():
+        if name.startswith("SEMLOC_") and "__" in name:
+            _assign(merged, name[len("SEMLOC_") :].lower().replace("__", "."), value)
+    for key, value in (assignments or {}).items():
+        _assign(merged, key, value)
+    try:
+        return Settings.model_validate(merged)
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        key = ".".join(str(p) for p in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise SettingsError(f"Unknown setting '{key}': 'semloc run --dump-config' prints every key.") from None
+        raise SettingsError(f"Setting '{key}' cannot be {first.get('input')!r}: {first['msg']}.") from None
+
+
+def _assign(tree: dict[str, Any], key: str, value: str) -> None:
+    *parents, last = key.split(".")
+    for part in parents:
+        child = tree.setdefault(part, {})
+        if not isinstance(child, dict):
+            raise SettingsError(f"Unknown setting '{key}': '{part}' is not a section.")
+        tree = child
+    try:
+        tree[last] = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise SettingsError(f"Setting '{key}' has a value that is not YAML: {value!r}.") from None

@@ -1,0 +1,103 @@
+"""Training pairs: incomplete subvolumes from one or five frames beside complete ones from the fused map of all (paper 3.2).
+
+Pairs are packed into Parquet shards, one for each scene, so that training starts, stops and resumes without making them again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from semloc_logs import geometry
+from semloc_logs.settings import Fusion, Training
+from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, turn
+from semloc_logs.tables import replacing_file
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
+
+U8 = NDArray[np.uint8]
+PER_FRAME = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneFrame:
+    """Points (n, 3) and sensor centre (3,) in the base frame, classes (n,), and the pose of the base in the level map frame."""
+
+    points: NDArray[np.float32]
+    origin: NDArray[np.float32]
+    label: U8
+    map_T_base: NDArray[np.float64]
+
+
+def fuse(frames: Iterable[SceneFrame], fusion: Fusion) -> BlockMap:
+    """The semantic map of some frames."""
+    fuser = Fuser(fusion)
+    for f in frames:
+        fuser.add(geometry.apply(f.map_T_base, f.points), f.label, geometry.apply(f.map_T_base, f.origin[None])[0])
+    return fuser.finish()
+
+
+def _dense(blocks: BlockMap) -> tuple[U8, NDArray[np.int64]]:
+    low, high = blocks.bounds()
+    return blocks.dense(low, tuple((high - low).tolist())), low.astype(np.int64)
+
+
+def occupied(state: U8) -> NDArray[np.bool_]:
+    """Where voxel states are occupied, of whatever class."""
+    return (state != FREE_STATE) & (state != UNOBSERVED_STATE)
+
+
+def cut_pairs(frames: Sequence[SceneFrame], fusion: Fusion, training: Training, rng: np.random.Generator, min_occupied: int = 40) -> list[tuple[U8, U8, U8]]:
+    """(incomplete (48, 48, 32), complete (32, 32, 32), complete seen a little shifted and turned (48, 48, 32)) voxel states."""
+    v = fusion.voxel_size
+    scale = v / 0.30
+    whole, whole_low = _dense(fuse(frames, fusion))
+    surface = np.argwhere(occupied(whole)) + whole_low
+    out = []
+    for i in range(len(frames)):
+        some = frames[i : i + 1] if rng.random() < 0.5 else frames[max(0, i - 2) : i + 3]
+        part, part_low = _dense(fuse(some, fusion))
+        seen = np.argwhere(occupied(part)) + part_low
+        here = frames[i].map_T_base[:2, 3] / v
+        seen = seen[np.linalg.norm(seen[:, :2] - here, axis=1) < 30 * scale / v]
+        if not len(seen):
+            continue
+        for _ in range(PER_FRAME):
+            xy = seen[rng.integers(len(seen)), :2] + rng.uniform(-12, 12, 2)
+            column = surface[(np.abs(surface[:, :2] - xy) < SIZE / 2).all(1), 2]
+            if len(column) < min_occupied:
+                continue
+            # the map's layers are 8 voxels apart: the lowest surface lies anywhere in the lowest eight voxels, or a little above
+            bottom = np.percentile(column, 5) - rng.uniform(0, 9)
+            centre = np.array([*xy, np.floor(bottom) + SIZE / 2])
+            yaw = rng.uniform(0, 2 * np.pi)
+            incomplete, other, complete = (np.empty(s, np.uint8) for s in ((WIDE, WIDE, SIZE), (WIDE, WIDE, SIZE), (SIZE, SIZE, SIZE)))
+            turn(part, part_low, yaw, centre, incomplete)
+            if occupied(incomplete[MARGIN:-MARGIN, MARGIN:-MARGIN]).sum() < min_occupied:
+                continue
+            turn(whole, whole_low, yaw, centre, complete)
+            shift = training.shift / 0.30 * np.array([*rng.uniform(-1, 1, 2), rng.uniform(-0.8, 0.8)])
+            turn(whole, whole_low, yaw + rng.uniform(-training.turn, training.turn), centre + shift, other)
+            out.append((incomplete, complete, other))
+    return out
+
+
+def write_shard(path: Path, pairs: Sequence[tuple[U8, U8, U8]]) -> None:
+    """One Parquet file with a row for each pair."""
+    names = ("incomplete", "complete", "other")
+    columns = {n: pa.array([p[k].tobytes() for p in pairs], pa.binary()) for k, n in enumerate(names)}
+    with replacing_file(path) as temporary:
+        pq.write_table(pa.table(columns), temporary, compression="zstd", use_dictionary=False, row_group_size=256)
+
+
+def read_shard(path: Path) -> tuple[U8, U8, U8]:
+    """Arrays (n, 48, 48, 32), (n, 32, 32, 32) and (n, 48, 48, 32) of a shard."""
+    table = pq.read_table(path)
+    shapes = ((WIDE, WIDE, SIZE), (SIZE, SIZE, SIZE), (WIDE, WIDE, SIZE))
+    a, b, c = (np.frombuffer(b"".join(table[k].to_pylist()), np.uint8).reshape(-1, *s) for k, s in enumerate(shapes))
+    return a, b, c

@@ -1,0 +1,202 @@
+"""Training of the encoder-decoder on packed pairs (paper 3.2 and 4.3, supplement 1), resumable from a checkpoint.
+
+Beside the paper's completion loss a contrastive term (InfoNCE over the batch) pulls the descriptor of an incomplete subvolume towards
+that of the complete one seen a little shifted and turned, which is what the database holds; ``training.contrastive_weight=0`` is the
+paper. Adam replaces ADADELTA because the shipped runs see few samples.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.nn import functional as F
+
+from semloc_logs.errors import SettingsError, WorkspaceError
+from semloc_logs.settings import Training
+from semloc_logs.subvolumes.cut import CLASSES, code_table
+from semloc_logs.subvolumes.network import Completion, descriptors
+from semloc_logs.subvolumes.pairs import read_shard
+from semloc_logs.tables import replacing_file
+
+RATE = 1.5e-3
+TEMPERATURE = 0.1
+POOL = 48  # steps that draw from the same three shards
+
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Of one step: samples seen so far, losses, share of the batch's incomplete subvolumes whose partner is nearest."""
+
+    samples: int
+    loss: float
+    reconstruction: float
+    contrastive: float
+    matched: float
+
+
+def _batches(shards: Sequence[Path], training: Training, first_step: int, steps: int) -> Iterator[tuple[U8, U8, U8]]:
+    """Batches of a fixed random sequence, from step ``first_step`` on; half of each from one scene, so that negatives are hard."""
+    pool: list[tuple[U8, U8, U8]] = []
+    chosen = -1
+    for step in range(first_step, steps):
+        if step // POOL != chosen:
+            chosen = step // POOL
+            draw = np.random.default_rng((training.seed, chosen))
+            pool = [read_shard(shards[k]) for k in draw.permutation(len(shards))[:3]]
+        rng = np.random.default_rng((training.seed, 1, step))
+        half = training.batch // 2
+        parts = [(pool[k], n) for k, n in zip(rng.permutation(len(pool)), (half, training.batch - half), strict=False)]
+        if len(parts) == 1:
+            parts = [(parts[0][0], training.batch)]
+        picked = [[a[rng.choice(len(s[0]), n, replace=len(s[0]) < n)] for a in s] for s, n in parts]
+        arrays = [np.concatenate([p[k] for p in picked]) for k in range(3)]
+        # quarter turns and mirror images of the whole triple are as good as new streets
+        quarter, mirror = int(rng.integers(4)), bool(rng.integers(2))
+        turned = [np.rot90(a[:, ::-1] if mirror else a, quarter, axes=(1, 2)) for a in arrays]
+        a, b, c = (np.ascontiguousarray(t) for t in turned)
+        a[rng.random(a.shape, np.float32) < training.dropout] = 253
+        yield a, b, c
+
+
+def _targets(complete: U8, table: U8, classes: int) -> tuple[Tensor, Tensor]:
+    """Class indices of the complete subvolumes and which voxels count: unobserved ones and occupied ones of unknown class do not."""
+    codes = table[complete]
+    known = codes <= classes
+    return torch.from_numpy(np.where(known, codes, 0).astype(np.int64)), torch.from_numpy(known)
+
+
+def train(
+    variant: str,
+    shards: Sequence[Path],
+    training: Training,
+    checkpoint: Path,
+    on_step: Callable[[Progress], None] = lambda _: None,
+    save_every: int = 100,
+) -> Completion:
+    """Train from scratch or from ``checkpoint``, which is renewed every ``save_every`` steps; returns the finished network.
+
+    Raises SettingsError without shards and WorkspaceError when the checkpoint is of another run.
+    """
+    if not shards:
+        raise SettingsError("There is nothing to train on: give sessions with keyframes, or scenes to simulate.")
+    torch.manual_seed(training.seed)
+    model = Completion(variant)
+    optimiser = torch.optim.Adam(model.parameters(), lr=RATE)
+    steps = math.ceil(training.samples / training.batch)
+    done = _resume(checkpoint, model, optimiser, training) if checkpoint.exists() else 0
+    table, classes = code_table(variant), CLASSES[variant]
+    for step, (part, whole, other) in enumerate(_batches(shards, training, done, steps), start=done):
+        for group in optimiser.param_groups:
+            group["lr"] = RATE * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
+        noise = torch.from_numpy(np.random.default_rng((training.seed, 2, step)).standard_normal((len(part), 256), np.float32))
+        target, known = _targets(whole, table, classes)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            logits, mu, log_variance = model(torch.from_numpy(table[part]), noise)
+            partner = model.encoder(torch.from_numpy(table[other]))[:, :, 0, 0]
+        entropy = F.cross_entropy(logits, target, reduction="none").float()
+        weight = torch.where(target < classes, training.occupied_weight, 1.0) * known
+        reconstruction = (entropy * weight).sum() / weight.sum()
+        mu, log_variance = mu.float(), log_variance.float()
+        prior = 0.5 * (mu.square() + log_variance.exp() - 1 - log_variance).mean()
+        similarity = descriptors(mu) @ descriptors(partner).T / TEMPERATURE
+        own = torch.arange(len(part))
+        contrastive = 0.5 * (F.cross_entropy(similarity, own) + F.cross_entropy(similarity.T, own))
+        loss = training.reconstruction_weight * reconstruction + prior + training.contrastive_weight * contrastive
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
+        optimiser.step()
+        matched = float((similarity.argmax(1) == own).float().mean())
+        on_step(Progress((step + 1) * training.batch, float(loss.detach()), float(reconstruction.detach()), float(contrastive.detach()), matched))
+        if (step + 1) % save_every == 0 or step + 1 == steps:
+            _save(checkpoint, model, optimiser, training, step + 1)
+    return model
+
+
+def _save(path: Path, model: Completion, optimiser: torch.optim.Adam, training: Training, step: int) -> None:
+    tensors = {f"model.{k}": v.contiguous() for k, v in model.state_dict().items()}
+    for i, p in enumerate(model.parameters()):
+        tensors |= {f"adam.{i}.{k}": v.contiguous() for k, v in optimiser.state.get(p, {}).items() if isinstance(v, Tensor)}
+    note = {"step": str(step), "training": training.model_dump_json()}
+    with replacing_file(path) as temporary:
+        save_file(tensors, temporary, metadata=note)
+
+
+def _resume(path: Path, model: Completion, optimiser: torch.optim.Adam, training: Training) -> int:
+    try:
+        with safe_open(path, "pt") as handle:
+            note = handle.metadata() or {}
+        tensors = load_file(path)
+    except (OSError, SafetensorError) as problem:
+        raise WorkspaceError(f"Checkpoint {path} cannot be read ({problem}): remove it to start over.") from None
+    if json.loads(note.get("training", "null")) != training.model_dump(mode="json"):
+        raise WorkspaceError(f"Checkpoint {path} is of a training with other settings: remove it to start over.")
+    model.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
+    for i, p in enumerate(model.parameters()):
+        state = {k: tensors[f"adam.{i}.{k}"] for k in ("step", "exp_avg", "exp_avg_sq") if f"adam.{i}.{k}" in tensors}
+        if state:
+            optimiser.state[p] = state
+    return int(note["step"])
+
+
+def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
+    """The network in bf16 with a model card in the file's metadata."""
+    tensors = {k: v.to(torch.bfloat16).contiguous() for k, v in model.state_dict().items()}
+    with replacing_file(path) as temporary:
+        save_file(tensors, temporary, metadata={**card, "variant": model.encoder.variant})
+
+
+@torch.inference_mode()
+def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, float]:
+    """How well the subvolumes of a held-out shard are completed, beside the trivial answers, and found again.
+
+    ``accuracy``: share of the complete map's observed voxels with the right label (the paper's figure); ``iou``: mean over the
+    classes that occur; ``unobserved_accuracy``: over voxels that the input did not observe; ``all_free``, ``copy_input``: accuracy
+    of the two trivial answers; ``recall5``: share of incomplete subvolumes with their partner among the five nearest.
+    """
+    variant = model.encoder.variant
+    table, classes = code_table(variant), CLASSES[variant]
+    confusion = np.zeros((classes + 1, classes + 1), np.int64)
+    right = seen = free = copied = hidden = hidden_right = 0
+    ours, theirs = [], []
+    for i in range(0, len(pairs[0]), 32):
+        part, whole, other = (a[i : i + 32] for a in pairs)
+        logits, mu, _ = model(torch.from_numpy(table[part]), None)
+        ours.append(descriptors(mu))
+        theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 0, 0]))
+        said = logits[:, : classes + 1].argmax(1).numpy()
+        target, known = (t.numpy() for t in _targets(whole, table, classes))
+        given = table[part[:, 8:-8, 8:-8]]
+        seen += int(known.sum())
+        right += int((known & (said == target)).sum())
+        free += int((known & (target == classes)).sum())
+        copied += int((known & (given == target)).sum())
+        unseen = known & (given == classes + 1)
+        hidden += int(unseen.sum())
+        hidden_right += int((unseen & (said == target)).sum())
+        np.add.at(confusion, (target[known], said[known]), 1)
+    inter = np.diag(confusion)[:classes]
+    union = confusion.sum(0)[:classes] + confusion.sum(1)[:classes] - inter
+    occurs = confusion.sum(1)[:classes] > 0
+    rank = torch.cdist(torch.cat(ours), torch.cat(theirs))
+    recall = (rank < rank.diag()[:, None]).sum(1).lt(5).float().mean()
+    return {
+        "accuracy": right / max(seen, 1),
+        "all_free": free / max(seen, 1),
+        "copy_input": copied / max(seen, 1),
+        "unobserved_accuracy": hidden_right / max(hidden, 1),
+        "iou": float((inter[occurs] / union[occurs]).mean()) if occurs.any() else 0.0,
+        "recall5": float(recall),
+    }

@@ -1,0 +1,61 @@
+"""Which way is up: the direction that the map's own floors and walls agree on, near a prior (IMU or frame convention)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+
+def find_up(normals: NDArray[np.floating], weights: NDArray[np.floating], prior: F64, within: float = 0.7) -> F64:
+    """The unit direction within ``within`` radians of ``prior`` that most horizontal surfaces have as their normal.
+
+    ``normals`` (n, 3) of unit length, any sign, with ``weights`` (n,). Walls count too: their normals are perpendicular to it.
+    The sum of both over candidates taken from the normals is maximised, then the optimum is refined to the least-squares direction
+    of the surfaces within 10, 5, 3 and 2 degrees. The prior is returned when there is nothing to see.
+    """
+    prior = np.asarray(prior, float) / np.linalg.norm(prior)
+    n, w = np.asarray(normals, float), np.asarray(weights, float)
+    flip = np.where(n @ prior < 0, -1.0, 1.0)
+    n = n * flip[:, None]
+    near = np.flatnonzero((n @ prior > np.cos(within)) & (w > 0))
+    if len(near) < 50:
+        return prior
+    rng = np.random.default_rng(0)
+    candidates = np.concatenate([n[rng.choice(near, min(500, len(near)), replace=False, p=w[near] / w[near].sum())], prior[None]])
+    some = rng.choice(len(n), min(8000, len(n)), replace=False)
+    up = candidates[int(np.argmax([_agreement(n[some] @ c, w[some]) for c in candidates]))]
+    for degrees in (10.0, 5.0, 3.0, 2.0, 2.0, 2.0):
+        sine = np.sin(np.radians(degrees))
+        dot = n @ up
+        floor, wall = np.abs(dot) > np.cos(np.radians(degrees)), np.abs(dot) < sine
+        a = (n[floor] * w[floor, None]).T @ n[floor] - 0.5 * (n[wall] * w[wall, None]).T @ n[wall]
+        vector = np.linalg.eigh(a)[1][:, -1]
+        up = vector if vector @ prior > 0 else -vector
+    return np.asarray(up)
+
+
+def _agreement(dot: F64, weight: F64) -> float:
+    """How much weight lies within about 3 degrees of horizontal, and half as much of what is vertical."""
+    wide = 2 * 0.05**2
+    return float((weight * (np.exp(-(1 - np.abs(dot)) * 2 / wide) + 0.5 * np.exp(-(dot**2) / wide))).sum())
+
+
+def ground_height(level_points: NDArray[np.floating], origin_z: float, scale: float = 1.0) -> float:
+    """Height of the ground below a sensor at ``origin_z`` from points (n, 3) in a level frame around it, metres.
+
+    The mode of the heights of what is at least 0.3 m below the sensor and within 15 m, else the lowest 2 %.
+    """
+    near = level_points[np.linalg.norm(level_points[:, :2], axis=1) < 15 * scale] if len(level_points) else level_points
+    if not len(near):
+        return origin_z - 1.7 * scale
+    z = near[:, 2]
+    low = z[(z < origin_z - 0.3 * scale) & (z > origin_z - 5 * scale)]
+    if len(low) < 100:
+        return float(np.percentile(z, 2))
+    step = 0.1 * scale
+    bins = np.floor(low / step).astype(np.int64)
+    values, counts = np.unique(bins, return_counts=True)
+    best = values[np.argmax(counts)]
+    return float(np.median(low[np.abs(bins - best) <= 1]))
