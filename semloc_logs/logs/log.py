@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from semloc_logs.frames import Frame
 
@@ -25,16 +25,24 @@ class Stream:
     count: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Message:
-    """A message as recorded. ``schema`` names its definition to the log that it comes from."""
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """How the messages of a stream are laid out: ``text`` in the schema language ``encoding``; both empty when the log has none."""
+
+    name: str
+    encoding: str  # ros2msg, ros2idl, ros1msg, protobuf (a FileDescriptorSet), jsonschema
+    text: bytes
+
+
+class Message(NamedTuple):
+    """A message as recorded; ``type`` and ``encoding`` are those of its :class:`Stream`."""
 
     topic: str
     type: str
     encoding: str
     log_time_ns: int
     data: bytes | memoryview
-    schema: int = 0
+    definition: Definition
 
 
 class Log(Protocol):

@@ -1,0 +1,155 @@
+"""Pictures and depth images as recorded (raw, JPEG, PNG, compressedDepth) to arrays."""
+
+from __future__ import annotations
+
+import struct
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.frames import F32
+from semloc_logs.logs.definitions import UndecodableError
+from semloc_logs.logs.rvl import decode_rvl
+
+Image = NDArray[np.uint8] | NDArray[np.uint16]
+
+# encoding: (type of a value, channels, OpenCV conversion to RGB or None)
+_RAW: dict[str, tuple[str, int, int | None]] = {
+    "mono8": ("u1", 1, None),
+    "8uc1": ("u1", 1, None),
+    "mono16": ("u2", 1, None),
+    "16uc1": ("u2", 1, None),
+    "32fc1": ("f4", 1, None),
+    "rgb8": ("u1", 3, None),
+    "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
+    "8uc3": ("u1", 3, cv2.COLOR_BGR2RGB),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
+    "bgra8": ("u1", 4, cv2.COLOR_BGRA2RGB),
+    "8uc4": ("u1", 4, cv2.COLOR_BGRA2RGB),
+    "rgb16": ("u2", 3, None),
+    "bgr16": ("u2", 3, cv2.COLOR_BGR2RGB),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+}
+# OpenCV names a Bayer pattern after its second row and column
+for _pattern, _code in (
+    ("rggb", cv2.COLOR_BayerBG2RGB),
+    ("bggr", cv2.COLOR_BayerRG2RGB),
+    ("gbrg", cv2.COLOR_BayerGR2RGB),
+    ("grbg", cv2.COLOR_BayerGB2RGB),
+):
+    _RAW[f"bayer_{_pattern}8"] = ("u1", 1, _code)
+    _RAW[f"bayer_{_pattern}16"] = ("u2", 1, _code)
+
+_LABEL_WORDS = ("label", "segment", "semantic", "mask", "class")
+_MAX_PIXELS = 1 << 28
+_COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
+
+
+def decode_raw(data: bytes | memoryview, width: int, height: int, step: int, encoding: str, big_endian: bool) -> Image | F32:
+    """(h, w), (h, w, 3) RGB, or float32 (h, w) for 32FC1. UndecodableError when the size does not fit the data."""
+    try:
+        kind, channels, conversion = _RAW[encoding.strip().lower()]
+    except KeyError:
+        raise UndecodableError(f"the image encoding {encoding[:40]!r} is not supported") from None
+    value = np.dtype((">" if big_endian else "<") + kind)
+    row = width * channels * value.itemsize
+    step = max(step, row) if height > 1 else row
+    if width <= 0 or height <= 0 or (height - 1) * step + row > len(data):
+        raise UndecodableError(f"{width} x {height} pixels of {encoding} do not fit its {len(data)} bytes")
+    shape, strides = (height, width, channels), (step, channels * value.itemsize, value.itemsize)
+    pixels = np.ndarray(shape, value, buffer=data, strides=strides)
+    pixels = np.ascontiguousarray(pixels, value.newbyteorder("="))
+    if channels == 1:
+        pixels = pixels[:, :, 0]
+    if conversion is None:
+        return pixels
+    try:
+        return np.asarray(cv2.cvtColor(pixels, conversion))
+    except cv2.error as error:
+        raise UndecodableError(f"{width} x {height} pixels of {encoding} cannot be converted") from error
+
+
+def decode_compressed(data: bytes | memoryview) -> Image:
+    """A JPEG or PNG picture, grey as (h, w) and colour as (h, w, 3) RGB; 16 bits stay 16 bits."""
+    data = bytes(data)
+    width, height = _claimed_size(data)
+    # deflate shrinks at most 1032-fold, and JPEG needs some bits for each block of 64 pixels
+    if width * height > min(_MAX_PIXELS, 1100 * max(len(data), 1)):
+        raise UndecodableError(f"its {len(data)} bytes claim {width} x {height} pixels")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise UndecodableError("its picture is damaged") from error
+    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        raise UndecodableError("its picture is damaged")
+    if pixels.ndim == 2:
+        return np.asarray(pixels)
+    if pixels.shape[2] == 2:  # grey with opacity
+        return np.ascontiguousarray(pixels[:, :, 0])
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB))
+
+
+def decode_compressed_depth(data: bytes | memoryview, format_: str) -> F32:
+    """Metres of ROS's compressedDepth: 12 bytes of quantisation parameters, then a PNG or RVL picture of 16 bits."""
+    if len(data) < _COMPRESSED_DEPTH_HEAD.size:
+        raise UndecodableError("its depth image is cut off")
+    _, quant_a, quant_b = _COMPRESSED_DEPTH_HEAD.unpack_from(data)
+    body = data[_COMPRESSED_DEPTH_HEAD.size :]
+    raw = decode_rvl(body) if "rvl" in format_.lower() else decode_compressed(body)
+    if raw.ndim != 2 or raw.dtype != np.uint16:
+        raise UndecodableError("its depth image is no picture of 16 bits")
+    if format_.strip().lower().startswith("32fc1"):  # stored as inverse depth
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            metres = np.float32(quant_a) / (raw.astype(np.float32) - np.float32(quant_b))
+        metres[raw == 0] = 0
+        return depth_metres(metres)
+    return depth_metres(raw)
+
+
+def depth_metres(raw: Image | F32) -> F32:
+    """Metres (h, w) of millimetres (uint16) or metres (float32); what is not measured becomes 0."""
+    if raw.dtype == np.uint16:
+        metres = raw.astype(np.float32) * np.float32(0.001)
+        metres[raw == 65535] = 0
+        return metres
+    metres = np.array(raw, np.float32)
+    metres[~(np.isfinite(metres) & (metres > 0))] = 0
+    return metres
+
+
+def is_depth(topic: str, encoding: str) -> bool:
+    """Whether a raw picture is depth: 32FC1, and 16 bits unless they are called labels; mono16 only if called depth."""
+    name, encoding = topic.lower(), encoding.strip().lower()
+    if encoding == "32fc1":
+        return True
+    if encoding == "16uc1":
+        return "depth" in name or not any(word in name for word in _LABEL_WORDS)
+    return encoding == "mono16" and "depth" in name
+
+
+def _claimed_size(data: bytes) -> tuple[int, int]:
+    """Width and height in the head of a JPEG or PNG, so that nothing is allocated for a claim that cannot be true."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 24:
+        width, height = struct.unpack_from(">II", data, 16)
+        return int(width), int(height)
+    if data.startswith(b"\xff\xd8"):
+        position = 2
+        while position + 9 <= len(data):
+            if data[position] != 0xFF:
+                break
+            marker = data[position + 1]
+            if marker == 0xFF:
+                position += 1
+            elif marker in (0x01, *range(0xD0, 0xD9)):
+                position += 2
+            elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+                height, width = struct.unpack_from(">HH", data, position + 5)
+                return int(width), int(height)
+            else:
+                position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        raise UndecodableError("its JPEG picture is damaged")
+    raise UndecodableError("its picture is neither JPEG nor PNG")
