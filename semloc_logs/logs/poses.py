@@ -1,0 +1,140 @@
+"""A pose stream: where a frame was at any time, and an honest None where nobody knows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs import geometry
+from semloc_logs.frames import F64, PoseSample, TransformSample
+
+EDGE_NS = 100_000_000  # a stamp may lie this far outside of the stream: the nearest pose serves
+PERIODS_PER_GAP = 3.0  # a stream slower than max_gap / 3 may skip two poses before its hole counts as a gap
+LONGEST_GAP = 5.0  # s; nothing that drives is interpolated over more than this, however slow its stream
+_PERIOD_WINDOW = 256  # poses that the period is estimated from: the newest ones
+
+
+class PoseTrack:
+    """Poses at strictly increasing stamps, which may still grow.
+
+    ``max_gap`` (s) is the longest hole that is interpolated, or three median periods of a slow stream. With ``keep_seconds`` only the
+    newest stretch is remembered (at least that long), so memory is bounded. ``duplicates``, ``backwards`` and ``invalid`` count what
+    was refused: equal stamps, stamps before the newest one, and matrices that are no rigid transforms.
+    """
+
+    def __init__(self, max_gap: float = 1.0, keep_seconds: float | None = None) -> None:
+        self.max_gap = max_gap
+        self.duplicates = 0
+        self.backwards = 0
+        self.invalid = 0
+        self._keep_ns = None if keep_seconds is None else round(keep_seconds * 1e9)
+        self._stamps = np.empty(16, np.int64)
+        self._rows = np.empty((16, 3, 4))
+        self._n = 0
+        self._limit: tuple[int, int] | None = None  # (count it was computed at, ns)
+
+    def __len__(self) -> int:
+        return self._n
+
+    def add(self, sample: PoseSample | TransformSample) -> bool:
+        """Appends the sample's ``frame_T_child`` at its header stamp; False when it was refused and counted."""
+        return self.append(sample.header.stamp_ns, sample.frame_T_child)
+
+    def append(self, stamp_ns: int, pose: F64) -> bool:
+        """Appends a pose (4, 4); False when it was refused and counted."""
+        if self._n and stamp_ns <= self._stamps[self._n - 1]:
+            if stamp_ns == self._stamps[self._n - 1]:
+                self.duplicates += 1
+            else:
+                self.backwards += 1
+            return False
+        if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3]) - 1.0) > 1e-3:
+            self.invalid += 1
+            return False
+        if self._n == len(self._stamps):
+            self._make_room()
+        self._stamps[self._n] = stamp_ns
+        self._rows[self._n] = pose[:3]
+        self._n += 1
+        return True
+
+    def _make_room(self) -> None:
+        first = 0
+        if self._keep_ns is not None:
+            first = int(np.searchsorted(self._stamps, self._stamps[self._n - 1] - self._keep_ns))
+        kept = self._n - first
+        size = max(16, 2 * kept)
+        stamps, rows = np.empty(size, np.int64), np.empty((size, 3, 4))
+        stamps[:kept], rows[:kept] = self._stamps[first : self._n], self._rows[first : self._n]
+        self._stamps, self._rows, self._n = stamps, rows, kept
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Stamps (n,), strictly increasing. A view: not to be written to."""
+        return self._stamps[: self._n]
+
+    @property
+    def poses(self) -> F64:
+        """Poses (n, 4, 4)."""
+        return self._matrices(0, self._n)
+
+    @property
+    def start_ns(self) -> int | None:
+        """The oldest stamp that is remembered."""
+        return int(self._stamps[0]) if self._n else None
+
+    @property
+    def end_ns(self) -> int | None:
+        """The newest stamp."""
+        return int(self._stamps[self._n - 1]) if self._n else None
+
+    def gap_limit_ns(self) -> int:
+        """The longest hole between two poses that is interpolated: ``max_gap`` or three median periods, at most 5 s."""
+        # the estimate is renewed now and then: a median for every frame would cost more than the interpolation
+        if self._limit is None or not self._limit[0] <= self._n < self._limit[0] + max(1, self._limit[0] // 4):
+            limit = self.max_gap
+            if self._n > 2:
+                period = float(np.median(np.diff(self.stamps_ns[-_PERIOD_WINDOW:]))) * 1e-9
+                limit = max(limit, min(PERIODS_PER_GAP * period, LONGEST_GAP))
+            self._limit = (self._n, round(limit * 1e9))
+        return self._limit[1]
+
+    def at(self, stamp_ns: int) -> F64 | None:
+        """The pose (4, 4) at ``stamp_ns``; None in a gap and more than 0.1 s outside of the stream."""
+        poses, known = self.at_many(np.array([stamp_ns], np.int64))
+        return poses[0] if known[0] else None
+
+    def at_many(self, stamps_ns: NDArray[np.int64]) -> tuple[F64, NDArray[np.bool_]]:
+        """Poses (m, 4, 4) at ``stamps_ns`` (m,) and which of them are known (m,); unknown ones are identity."""
+        at = np.asarray(stamps_ns, np.int64)
+        poses = np.tile(np.eye(4), (len(at), 1, 1))
+        if self._n == 0:
+            return poses, np.zeros(len(at), bool)
+        stamps = self.stamps_ns
+        right = np.searchsorted(stamps, at, side="left")
+        left = np.clip(np.where(stamps[np.minimum(right, self._n - 1)] == at, right, right - 1), 0, self._n - 1)
+        right = np.clip(right, 0, self._n - 1)
+        known = (at >= stamps[0] - EDGE_NS) & (at <= stamps[-1] + EDGE_NS)
+        known &= stamps[right] - stamps[left] <= self.gap_limit_ns()
+        if known.any():
+            first, last = int(left[known].min()), int(right[known].max()) + 1
+            poses[known] = geometry.interpolate(stamps[first:last], self._matrices(first, last), at[known])
+        return poses, known
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """Holes that are not interpolated: (stamp before, stamp after)."""
+        stamps = self.stamps_ns
+        holes = np.flatnonzero(np.diff(stamps) > self.gap_limit_ns())
+        return [(int(stamps[i]), int(stamps[i + 1])) for i in holes]
+
+    def length(self) -> float:
+        """Metres travelled, gaps left out."""
+        rows, stamps = self._rows[: self._n], self.stamps_ns
+        steps = np.linalg.norm(np.diff(rows[:, :, 3], axis=0), axis=1)
+        return float(steps[np.diff(stamps) <= self.gap_limit_ns()].sum())
+
+    def _matrices(self, first: int, last: int) -> F64:
+        out = np.zeros((last - first, 4, 4))
+        out[:, :3] = self._rows[first:last]
+        out[:, 3, 3] = 1.0
+        return out
