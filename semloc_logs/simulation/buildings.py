@@ -82,8 +82,7 @@ def _roof(rng: Rng, width: float, depth: float, height: float, roof: str) -> Mes
             box(0.6, 0.8, min(rise, 6.0) + 1.0, rng.uniform(-0.35, 0.35) * width, depth / 2 + rng.uniform(-0.1, 0.1) * depth, height)
         )
     if roof != "cross" and rng.random() < 0.4:
-        for x in np.linspace(-0.3, 0.3, int(rng.integers(1, 4))) * width:
-            parts.append(box(1.4, 1.8, 1.5, x, 1.6, height))
+        parts += [box(1.4, 1.8, 1.5, x, 1.6, height) for x in np.linspace(-0.3, 0.3, int(rng.integers(1, 4))) * width]
     return merge(*parts)
 
 

@@ -27,6 +27,7 @@ class Ground:
     kind: NDArray[np.uint8] = field(init=False)  # ROAD, SIDEWALK, TERRAIN; 255 = no ground
     beside: NDArray[np.float32] = field(init=False)  # metres from the edge of the carriageway, negative on it
     free: NDArray[np.bool_] = field(init=False)
+    paved: NDArray[np.bool_] = field(init=False)  # terrain that is stone or asphalt: drives, yards, squares
     _waves: F64 = field(init=False)
     _bank: tuple[float, float] = field(init=False)
 
@@ -49,6 +50,7 @@ class Ground:
         kind = np.where(field_ < 0, ROAD, np.where(walk.reshape(shape) < 0, SIDEWALK, TERRAIN))
         self.kind = np.where(field_ > MARGIN, 255, kind).astype(np.uint8)
         self.free = self.kind == TERRAIN
+        self.paved = np.zeros_like(self.free)
         wavelength = self.rng.uniform([25, 60, 90, 150], [60, 120, 200, 400])
         slope = self.rng.uniform(0, [0.006, 0.012, 0.02, 0.03])
         angle, phase = self.rng.uniform(0, 2 * np.pi, (2, 4))
@@ -59,7 +61,7 @@ class Ground:
     def slope_height(self, x: F64, y: F64) -> F64:
         """Height of the carriageway's surface in metres at plan positions (n,)."""
         kx, ky, phase, size = self._waves
-        return (np.sin(np.multiply.outer(x, kx) + np.multiply.outer(y, ky) + phase) * size).sum(-1)
+        return np.asarray((np.sin(np.multiply.outer(x, kx) + np.multiply.outer(y, ky) + phase) * size).sum(-1))
 
     def cell(self, x: F64, y: F64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Raster cells of plan positions (n,), kept inside."""
@@ -82,6 +84,10 @@ class Ground:
         """Whether all plan points (n, 2) are free ground."""
         return bool(self.free[self.cell(points[:, 0], points[:, 1])].all())
 
+    def pave(self, points: F64) -> None:
+        """Make plan points (n, 2) stone or asphalt where they are not road."""
+        self.paved[self.cell(points[:, 0], points[:, 1])] = True
+
     def take(self, points: F64) -> None:
         """Mark plan points (n, 2) as built upon."""
         self.free[self.cell(points[:, 0], points[:, 1])] = False
@@ -90,14 +96,19 @@ class Ground:
         """The ground with its kerbs, heights absolute, and the label of each triangle."""
         i, j = np.nonzero(self.kind != 255)
         kind = self.kind[i, j]
+        label = np.where(self.paved[i, j] & (kind == TERRAIN), SIDEWALK, kind)
+        slope = np.stack(np.gradient(self.beside, CELL))
         corners = np.zeros((len(i), 4, 3))
         for k, (di, dj) in enumerate(((0, 0), (1, 0), (1, 1), (0, 1))):
             x, y = self.corner[0] + CELL * (i + di), self.corner[1] + CELL * (j + dj)
-            at = self._corner_distance(i + di, j + dj)
+            at = _at_corners(self.beside, i + di, j + dj)
+            # corners next to the kerb move onto it, so that it runs smooth across the raster
+            near = np.where(np.abs(at) < 0.6 * CELL, at, 0.0)
+            x, y = (c - near * _at_corners(g, i + di, j + dj) for c, g in zip((x, y), slope, strict=True))
             corners[:, k] = np.column_stack([x, y, self.slope_height(x, y) + self._step(x, y, kind, at)])
         start = 4 * np.arange(len(i), dtype=np.int64)[:, None]
-        triangles = [start + [0, 1, 2], start + [0, 2, 3]]
-        labels = [kind, kind]
+        triangles = [start + np.array([0, 1, 2]), start + np.array([0, 2, 3])]
+        labels = [label, label]
         number = np.full(self.kind.shape, -1, np.int64)
         number[i, j] = np.arange(len(i))
         for (a, b), (c, d), here, there in (((1, 2), (0, 3), np.s_[:-1, :], np.s_[1:, :]), ((3, 2), (0, 1), np.s_[:, :-1], np.s_[:, 1:])):
@@ -107,13 +118,14 @@ class Ground:
             labels += [np.full(len(p), SIDEWALK, np.uint8)] * 2
         return Mesh(corners.reshape(-1, 3), np.concatenate(triangles)), np.concatenate(labels).astype(np.uint8)
 
-    def _corner_distance(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Distance to the carriageway at cell corners: the mean of the cells around."""
-        b = self.beside
-        n, m = b.shape
-        low_i, high_i, low_j, high_j = np.maximum(i - 1, 0), np.minimum(i, n - 1), np.maximum(j - 1, 0), np.minimum(j, m - 1)
-        mean = (b[low_i, low_j] + b[low_i, high_j] + b[high_i, low_j] + b[high_i, high_j]) / 4
-        return np.asarray(mean, np.float32)
+
+
+def _at_corners(raster: NDArray[np.float32], i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float32]:
+    """A raster at the corners (i, j) of its cells: the mean of the cells around."""
+    n, m = raster.shape
+    low_i, high_i, low_j, high_j = np.maximum(i - 1, 0), np.minimum(i, n - 1), np.maximum(j - 1, 0), np.minimum(j, m - 1)
+    mean = (raster[low_i, low_j] + raster[low_i, high_j] + raster[high_i, low_j] + raster[high_i, high_j]) / 4
+    return np.asarray(mean, np.float32)
 
 
 def _rounded_corners(beside: NDArray[np.float32], radius: float = 3.0) -> NDArray[np.float32]:

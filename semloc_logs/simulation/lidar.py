@@ -69,7 +69,7 @@ def full_sweep(
     max_range: float | None = None,
     sector: tuple[float, float] | None = None,
 ) -> Sweep:
-    """One turn of the sensor standing at ``world_T_lidar`` (4, 4); fewer ``columns``, a shorter range or an azimuth ``sector`` on demand."""
+    """One turn of the sensor standing at ``world_T_lidar`` (4, 4); fewer ``columns``, a shorter range, an azimuth ``sector`` if asked."""
     directions, ring, turn = beam_directions(model, columns or model.columns, sector)
     far = min(max_range or model.max_range, model.max_range)
     rotation = world_T_lidar[:3, :3].astype(np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from semloc_logs.simulation.objects import resample
 from semloc_logs.simulation.world import F64
@@ -14,7 +15,7 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Road:
-    """A road between crossings ``a`` and ``b``: centre line (n, 2) about every metre, half the carriageway, pavement width, parking lanes."""
+    """A road between crossings ``a`` and ``b``: centre line (n, 2) about every metre, half the carriageway, pavement, parking lanes."""
 
     a: int
     b: int
@@ -26,7 +27,7 @@ class Road:
     @property
     def lane(self) -> float:
         """Distance of the driven line from the centre line."""
-        return max(1.2, (self.half_width - (2.1 if self.parking else 0.0)) / 2)
+        return max(1.2, (self.half_width - (2.0 if self.parking else 0.0)) / 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +44,7 @@ class RoadNetwork:
 
 def _road(rng: Rng, a: int, b: int, path: F64, narrow: float) -> Road:
     parking = bool(rng.random() < 0.55)
-    half = rng.uniform(2.6, 4.2) * narrow + (2.1 if parking else 0.0)
+    half = rng.uniform(2.3, 3.7) * narrow + (2.0 if parking else 0.0)
     sidewalk = 0.0 if rng.random() < 0.12 else rng.uniform(1.2, 3.8)
     return Road(a, b, path, float(half), float(sidewalk), parking)
 
@@ -83,8 +84,6 @@ def _bend(rng: Rng, start: F64, end: F64) -> F64:
 def path_network(rng: Rng, path: F64) -> RoadNetwork:
     """Roads along a driven path (n, 2 or 3), parts that are driven again left out; side streets branch off here and there."""
     points = resample(np.asarray(path, np.float64)[:, :2], 1.0)
-    from scipy.spatial import cKDTree
-
     fresh = np.ones(len(points), bool)
     pairs = cKDTree(points).query_pairs(7.0, output_type="ndarray")
     late = pairs.max(1, initial=0)[np.abs(np.diff(pairs, axis=1)).ravel() > 40]

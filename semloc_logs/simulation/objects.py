@@ -1,4 +1,4 @@
-"""What stands in a street: vehicles, people, trees, hedges, fences, poles. Each is a list of (mesh, label) about its own origin, z = 0 its foot."""
+"""What stands in a street: vehicles, people, trees, hedges, fences, poles. Each is a list of (mesh, label) about its foot."""
 
 from __future__ import annotations
 
@@ -126,8 +126,8 @@ def tree(rng: Rng, size: float = 1.0, kind: str | None = None) -> Parts:
         for k in range(int(rng.integers(1, 5)) if kind != "column" else 1):
             shrink = 1.0 if k == 0 else rng.uniform(0.4, 0.75)
             radii = (radius * shrink * rng.uniform(0.85, 1.15), radius * shrink * rng.uniform(0.85, 1.15), half * shrink)
-            count = int(np.clip(28 * radii[0] * radii[2], 60, 700) * rng.uniform(0.6, 1.2))
-            blob = leaf_cloud(rng, radii, count, rng.uniform(0.28, 0.5))
+            count = int(np.clip(48 * radii[0] * radii[2], 80, 1200) * rng.uniform(0.6, 1.2))
+            blob = leaf_cloud(rng, radii, count, rng.uniform(0.25, 0.45))
             offset = np.zeros(3) if k == 0 else rng.normal(size=3) * [0.5 * radius, 0.5 * radius, 0.4 * half]
             blobs.append(Mesh(blob.vertices + offset + [0, 0, clear + half], blob.triangles))
         crown = merge(*blobs)
@@ -140,11 +140,11 @@ def tree(rng: Rng, size: float = 1.0, kind: str | None = None) -> Parts:
 
 
 def _cone_crown(rng: Rng, radius: float, height: float, clear: float) -> Mesh:
-    count = int(np.clip(22 * radius * height, 150, 900))
+    count = int(np.clip(40 * radius * height, 150, 1500))
     up = 1 - np.sqrt(rng.uniform(0, 1, count))
     angle, out = rng.uniform(0, 2 * np.pi, count), radius * (1 - up) * rng.uniform(0.55, 1.1, count) ** 0.6
     centre = np.column_stack([out * np.cos(angle), out * np.sin(angle), clear + up * height])
-    corners = centre[:, None, :] + rng.normal(size=(count, 3, 3)) * [0.25, 0.25, 0.15]
+    corners = centre[:, None, :] + rng.uniform(-1, 1, (count, 3, 3)) * [0.35, 0.35, 0.2]
     return Mesh(corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int64).reshape(-1, 3))
 
 
@@ -220,7 +220,7 @@ def hedge(rng: Rng, path: F64) -> Parts:
     pick = rng.integers(0, len(points), count)
     centre = np.column_stack([points[pick] + rng.normal(size=(count, 2)) * (0.45 * width), height * np.sqrt(rng.uniform(0, 1.1, count))])
     centre[:, :2] += rng.uniform(-0.4, 0.4, (count, 2)) * np.gradient(points, axis=0)[pick]
-    corners = centre[:, None, :] + rng.normal(size=(count, 3, 3)) * (0.12 + wild * 0.5)
+    corners = centre[:, None, :] + rng.uniform(-1, 1, (count, 3, 3)) * (0.15 + wild * 0.6)
     leaves = Mesh(corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int64).reshape(-1, 3))
     return [(merge(core, leaves), VEGETATION)]
 

@@ -32,6 +32,7 @@ class _Style:
     tree_size: float
     lamp_pitch: float
     parked: float
+    paved: float
 
 
 def _style(rng: Rng, town: Rng) -> _Style:
@@ -40,8 +41,8 @@ def _style(rng: Rng, town: Rng) -> _Style:
     favourite = kinds[int(town.integers(len(kinds)))]
     kind = favourite if rng.random() < 0.6 else kinds[int(rng.integers(len(kinds)))]
     setback, storeys, plot, gap, built, garden = {
-        "suburb": (6.0, 1.8, 13.0, 5.0, 0.9, 0.8),
-        "rows": (3.0, 2.5, 7.0, 0.0, 0.97, 0.4),
+        "suburb": (4.5, 1.9, 12.0, 4.0, 0.92, 1.3),
+        "rows": (2.5, 2.5, 7.0, 0.0, 0.97, 0.7),
         "city": (0.5, 4.5, 16.0, 0.8, 0.95, 0.1),
         "park": (9.0, 1.5, 14.0, 25.0, 0.15, 2.5),
         "country": (8.0, 1.5, 15.0, 20.0, 0.35, 1.4),
@@ -64,6 +65,7 @@ def _style(rng: Rng, town: Rng) -> _Style:
         rng.uniform(0.45, 1.0),
         rng.uniform(22, 40),
         rng.uniform(0.1, 0.85),
+        {"city": 0.8, "rows": 0.4, "yards": 0.6}.get(kind, 0.1),
     )
 
 
@@ -145,13 +147,24 @@ class _Street:
             parts = building(rng, width, depth, height, str(rng.choice(style.roofs)))
             self.put(parts, x, y, yaw + np.pi)
             self.ground.take(cells)
+        self.pave(side, style, u - gap / 2, width + gap, walk, setback)
         if style.setback > 1.5:
             self.frontage(side, style, u - gap / 2, u + width + gap / 2, walk, house)
         self.garden(side, style, u - gap / 2, width + gap, walk, setback + (depth if house else 0.0), house)
 
+    def pave(self, side: _Side, style: _Style, u: float, width: float, walk: float, setback: float) -> None:
+        """Stone between the pavement and the house: all of it, or a drive beside the house."""
+        drive = self.rng.uniform(2.4, 4.5)
+        whole = self.rng.random() < style.paved
+        a, b, far = (u, u + width, setback + 1.0) if whole else (u + width - drive, u + width, setback + self.rng.uniform(2, 9))
+        if whole or self.rng.random() < 0.6:
+            us, vs = np.arange(a, b, 0.4), np.arange(walk - 0.5, far, 0.4)
+            rows = np.array([[side.at(float(p), 0.0)[:2], side.at(float(p), 10.0)[:2]] for p in us])
+            self.ground.pave((rows[:, :1] + (rows[:, 1:] - rows[:, :1]) * (vs / 10.0)[None, :, None]).reshape(-1, 2))
+
     def frontage(self, side: _Side, style: _Style, u0: float, u1: float, walk: float, house: bool) -> None:
         rng = self.rng
-        if style.frontage == "none" or rng.random() < (0.3 if house else 0.6):
+        if style.frontage == "none" or rng.random() < (0.2 if house else 0.5):
             return
         opening = rng.uniform(2.5, 4.0)
         start = rng.uniform(u0, max(u0 + 0.1, u1 - opening))
@@ -255,12 +268,12 @@ def build_street(path: F64 | RoadNetwork, seed: int, condition: int = 0) -> Worl
     ground = street_ground(network, seed)
     street = _Street(ground, seed, condition)
     town = int(street.rng.integers(2**31))
-    mesh, labels = ground.mesh()
-    street.static.add(mesh, labels, ground="none")
     for road in network.roads:
         for sign in (1, -1):
             street.side(_Side(road, sign), _style(street.rng, np.random.default_rng(town)))
     street.backlands()
+    mesh, labels = ground.mesh()
+    street.static.add(mesh, labels, ground="none")
     static, moving = street.static.build(), street.moving.build()
     return World(
         np.concatenate([static.vertices, moving.vertices]),

@@ -54,7 +54,7 @@ def _slope(height: Callable[[F64, F64], F64], position: F64, direction: F64, ste
 
 
 def drifting_odometry(world_T_base: F64, rng: np.random.Generator, drift: float = 0.007) -> F64:
-    """``odom_T_base`` (n, 4, 4) starting at identity: each step wrong at random and by a slowly wandering bias, about ``drift`` of the way."""
+    """``odom_T_base`` (n, 4, 4) starting at identity: steps wrong at random and by a wandering bias, about ``drift`` of the way."""
     steps = inverse(world_T_base[:-1]) @ world_T_base[1:]
     n = len(steps)
     length = np.linalg.norm(steps[:, :3, 3], axis=1, keepdims=True)

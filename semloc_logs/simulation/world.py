@@ -126,7 +126,7 @@ def box(length: float, width: float, height: float, x: float = 0.0, y: float = 0
 def quads(corners: F64) -> Mesh:
     """Flat or folded quads (n, 4, 3)."""
     start = 4 * np.arange(len(corners), dtype=np.int64)[:, None]
-    triangles = np.concatenate([start + [0, 1, 2], start + [0, 2, 3]])
+    triangles = np.concatenate([start + np.array([0, 1, 2]), start + np.array([0, 2, 3])])
     return Mesh(corners.reshape(-1, 3), triangles)
 
 
@@ -145,8 +145,8 @@ def extrude(outline: F64, bottom: float, top: float) -> Mesh:
     n = len(outline)
     low = np.column_stack([outline, np.full(n, bottom)])
     high = np.column_stack([outline, np.full(n, top)])
-    middle = np.append(outline.mean(0), 0.0)
-    vertices = np.concatenate([low, high, [middle + [0, 0, bottom]], [middle + [0, 0, top]]])
+    middle = outline.mean(0)
+    vertices = np.concatenate([low, high, [np.append(middle, bottom)], [np.append(middle, top)]])
     i = np.arange(n, dtype=np.int64)
     j = (i + 1) % n
     sides = np.concatenate([np.column_stack([i, j, j + n]), np.column_stack([i, j + n, i + n])])
@@ -215,5 +215,5 @@ def leaf_cloud(rng: np.random.Generator, radii: tuple[float, float, float], coun
         lumps += 0.16 * np.sin(direction @ wave + rng.uniform(0, 2 * np.pi))
     radius = lumps * (hollow + (1 - hollow) * rng.uniform(0, 1, count) ** 0.7)
     centre = direction * radius[:, None] * np.asarray(radii)
-    corners = centre[:, None, :] + rng.normal(size=(count, 3, 3)) * (0.6 * size)
+    corners = centre[:, None, :] + rng.uniform(-0.8, 0.8, (count, 3, 3)) * size
     return Mesh(corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int64).reshape(-1, 3))
