@@ -109,6 +109,11 @@ def _names(field: Any) -> list[str]:
     return _names(inner)
 
 
+def is_standard(type_: str) -> bool:
+    """Whether a ROS 2 type can be decoded without a definition in the log."""
+    return type_ in _standard_types("ros2")
+
+
 @cache
 def _standard_types(generation: str) -> dict[str, Any]:
     types: dict[str, Any] = dict(get_typestore(Stores.ROS2_HUMBLE).fielddefs)

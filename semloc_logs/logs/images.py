@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -61,14 +62,14 @@ def decode_raw(data: bytes | memoryview, width: int, height: int, step: int, enc
     if width <= 0 or height <= 0 or (height - 1) * step + row > len(data):
         raise UndecodableError(f"{width} x {height} pixels of {encoding} do not fit its {len(data)} bytes")
     shape, strides = (height, width, channels), (step, channels * value.itemsize, value.itemsize)
-    pixels = np.ndarray(shape, value, buffer=data, strides=strides)
-    pixels = np.ascontiguousarray(pixels, value.newbyteorder("="))
+    strided = np.ndarray(shape, value, buffer=data, strides=strides)
+    pixels: Any = np.ascontiguousarray(strided, value.newbyteorder("="))
     if channels == 1:
         pixels = pixels[:, :, 0]
     if conversion is None:
-        return pixels
+        return cast("Image | F32", pixels)
     try:
-        return np.asarray(cv2.cvtColor(pixels, conversion))
+        return cast("Image", cv2.cvtColor(pixels, conversion))
     except cv2.error as error:
         raise UndecodableError(f"{width} x {height} pixels of {encoding} cannot be converted") from error
 
@@ -87,10 +88,10 @@ def decode_compressed(data: bytes | memoryview) -> Image:
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         raise UndecodableError("its picture is damaged")
     if pixels.ndim == 2:
-        return np.asarray(pixels)
+        return cast("Image", pixels)
     if pixels.shape[2] == 2:  # grey with opacity
-        return np.ascontiguousarray(pixels[:, :, 0])
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB))
+        return cast("Image", np.ascontiguousarray(pixels[:, :, 0]))
+    return cast("Image", cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB))
 
 
 def decode_compressed_depth(data: bytes | memoryview, format_: str) -> F32:

@@ -95,7 +95,7 @@ class McapLog(BaseLog):
             opcode, length = _RECORD.unpack(read_exactly(self._file, 8, _RECORD.size, self._size))
             if opcode != Opcode.HEADER:
                 return ""
-            return self._parse(Header.read, read_exactly(self._file, 17, length, self._size)).profile
+            return str(self._parse(Header.read, read_exactly(self._file, 17, length, self._size)).profile)
         except LogError:
             return ""  # the walk over the file will name the damage
 
@@ -111,7 +111,9 @@ class McapLog(BaseLog):
             return None  # not closed, truncated, or closed without a summary (0)
         summary = read_exactly(self._file, summary_start, footer_at - summary_start, self._size)
         if crc and zlib.crc32(tail[: _FOOTER.size - 4], zlib.crc32(summary)) != crc:
-            self._problems.add(f"{self._name}: the index at byte {summary_start} does not match its checksum, so the whole file was walked.")
+            self._problems.add(
+                f"{self._name}: the index at byte {summary_start} does not match its checksum, so the whole file was walked."
+            )
             return None
         try:
             return self._trusted_summary(summary)
@@ -249,7 +251,9 @@ class McapLog(BaseLog):
                 else:
                     self._define(opcode, data[start:end])
         except LogError as error:
-            self._problems.add(f"{self._name}: the chunk at byte {offset} is damaged inside: {error}; {len(found)} messages of it are used.")
+            self._problems.add(
+                f"{self._name}: the chunk at byte {offset} is damaged inside: {error}; {len(found)} messages of it are used."
+            )
         return found
 
     def _define(self, opcode: int, body: bytes) -> None:

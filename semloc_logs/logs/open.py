@@ -50,6 +50,6 @@ def _what_it_is(head: bytes) -> str:
         return "is zstd-compressed; decompress it with 'unzstd', or give the folder of its ROS 2 bag."
     if head.startswith((b"\x1f\x8b", b"PK\x03\x04", b"BZh", b"\xfd7zXZ")):
         return "is an archive; unpack it first."
-    if len(head) < len(mcap_log.MAGIC) and mcap_log.MAGIC.startswith(head) or rosbag1_log.MAGIC.startswith(head):
+    if mcap_log.MAGIC.startswith(head) or rosbag1_log.MAGIC.startswith(head):
         return "is cut off within its first bytes; record or copy it again."
     return "is no log: it starts neither like an MCAP file nor like a ROS 1 bag nor like a ROS 2 sqlite3 bag."

@@ -145,7 +145,8 @@ def _unpack(data: bytes, compression: str, size: int) -> bytes:
 
 
 class _Engine(Protocol):
-    eof: bool
+    @property
+    def eof(self) -> bool: ...
 
     def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
 

@@ -67,7 +67,9 @@ class Rosbag1Log(BaseLog):
         magic = read_exactly(self._file, 0, min(self._size, len(MAGIC)), self._size)
         if magic != MAGIC:
             known = magic.startswith(b"#ROSBAG V")
-            raise LogError("only bags of format 2.0 are supported; convert it with rosbag migrate" if known else "it does not start like a ROS 1 bag")
+            raise LogError(
+                "only bags of format 2.0 are supported; convert it with rosbag migrate" if known else "it does not start like a ROS 1 bag"
+            )
         counts = None
         try:
             head, _, _ = self._record(len(MAGIC))

@@ -40,7 +40,8 @@ class Rosbag2Log(BaseLog):
     @property
     def problems(self) -> list[str]:
         """What was skipped and why, in sentences."""
-        return [*self._problems.sentences(), *(p for file in self._files for p in file.problems)]
+        every = [*self._problems.sentences(), *(p for file in self._files for p in file.problems)]
+        return list(dict.fromkeys(every))  # splits of one bag often share a problem
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` (None: of all) of all files in log-time order."""
@@ -159,7 +160,9 @@ class Rosbag2Log(BaseLog):
                     written += len(piece)
                     free = shutil.disk_usage(self._folder.name).free
                     if free < MAX_CHUNK // 8:
-                        raise LogError(f"{path} needs more than the {written} bytes that {self._folder.name} can take; decompress it first.")
+                        raise LogError(
+                            f"{path} needs more than the {written} bytes that {self._folder.name} can take; decompress it first."
+                        )
                     plain.write(piece)
         except (zstandard.ZstdError, OSError) as error:
             if not target.exists() or target.stat().st_size == 0:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import zstandard
 
 from semloc_logs.errors import LogError
+from semloc_logs.logs.definitions import is_standard
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.names import ros2_type
 from semloc_logs.logs.reading import MAX_CHUNK, BaseLog, decompress
@@ -24,28 +27,27 @@ class SqliteLog(BaseLog):
     def __init__(self, path: Path, name: str = "") -> None:
         super().__init__(path, "rosbag2")
         self._name = name or path.name
+        self._damaged = False
         self._topics: dict[int, tuple[str, str, str, Definition]] = {}
         try:
             self._database = _connect(path)
         except (sqlite3.Error, OSError) as error:
-            raise LogError(f"{path} cannot be read as a sqlite3 bag: {error}.") from error
+            raise LogError(f"{path} cannot be read as a sqlite3 bag: {error}; try to recover it with 'sqlite3 FILE .recover'.") from error
         try:
             self._open()
         except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
             self._database.close()
             raise LogError(f"{path} cannot be read as a sqlite3 bag: {error}.") from error
+        self._name_undefined()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` (None: of all) in log-time order; damage ends the iteration with a sentence."""
         wanted = [i for i, (topic, *_) in self._topics.items() if topics is None or topic in topics]
         if not wanted:
             return
-        marks = ",".join("?" * len(wanted))
-        # the order of recording breaks ties, so that two readings agree
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY timestamp, id"
         read = 0
         try:
-            for topic_id, log_time, data in self._database.execute(query, wanted):
+            for topic_id, log_time, data in self._rows(wanted):
                 topic, type_, encoding, definition = self._topics[topic_id]
                 read += 1
                 if not isinstance(data, bytes) or not isinstance(log_time, int):
@@ -60,6 +62,23 @@ class SqliteLog(BaseLog):
                 yield Message(topic, type_, encoding, log_time, data, definition)
         except (sqlite3.Error, OverflowError, MemoryError) as error:
             self._problems.add(f"{self._name}: reading ended after {read} messages because the file is damaged ({error}).")
+
+    def _rows(self, topic_ids: list[int]) -> Iterator[tuple[int, Any, Any]]:
+        """(topic id, log time, data) in log-time order; the order of recording breaks ties, so that two readings agree."""
+        marks = ",".join("?" * len(topic_ids))
+        columns, where = "SELECT topic_id, timestamp, data FROM messages", f"WHERE topic_id IN ({marks})"
+        if not self._damaged:
+            yield from self._database.execute(f"{columns} {where} ORDER BY timestamp, id", topic_ids)
+            return
+        # an index may be what is damaged: without it, and only as far as the table can be read
+        times: list[tuple[int, int]] = []
+        with contextlib.suppress(sqlite3.Error):
+            for time, row in self._database.execute(f"SELECT timestamp, id FROM messages NOT INDEXED {where}", topic_ids):
+                if isinstance(time, int):
+                    times.append((time, row))
+        for _, row in sorted(times):
+            with contextlib.suppress(sqlite3.Error):
+                yield from self._database.execute(f"{columns} WHERE id = ?", (row,))
 
     def close(self) -> None:
         """Releases the file."""
@@ -85,8 +104,16 @@ class SqliteLog(BaseLog):
         self.streams = [Stream(*kind, counts[kind]) for kind in sorted({t[:3] for t in self._topics.values()})]
         self.encoding = "ros2"
 
+    def _name_undefined(self) -> None:
+        """Bags of old distributions hold no definitions: what is not a standard type cannot be decoded by anybody."""
+        for topic, type_, encoding, definition in self._topics.values():
+            counted = any(s.count for s in self.streams if (s.topic, s.type) == (topic, type_))
+            if counted and encoding == "cdr" and not definition.text and not is_standard(type_):
+                self._problems.add(f"{topic}: messages of type {type_} cannot be decoded because the log does not define the type.")
+
     def _recount(self, counts: Counter[tuple[str, str, str]], error: sqlite3.DatabaseError) -> None:
         """Counts what a damaged file still gives away."""
+        self._damaged = True
         self._problems.add(f"{self._name}: the file is damaged ({error}); what can be read of it is used.")
         counts.clear()
         self.start_ns = self.end_ns = None
@@ -107,6 +134,7 @@ class SqliteLog(BaseLog):
 
 def _connect(path: Path) -> sqlite3.Connection:
     """Opens for reading only; a bag in a folder that cannot be written needs ``immutable``, one with a journal must not have it."""
+    _refuse_cut_off(path)
     address = f"file:{quote(str(path.absolute()))}"
     for mode in ("mode=ro", "mode=ro&immutable=1"):
         database = sqlite3.connect(f"{address}?{mode}", uri=True, check_same_thread=False)
@@ -123,6 +151,16 @@ def _connect(path: Path) -> sqlite3.Connection:
         else:
             return database
     raise LogError(f"{path} cannot be opened.")
+
+
+def _refuse_cut_off(path: Path) -> None:
+    """sqlite3 only says that such a file is malformed."""
+    with path.open("rb") as file:
+        head, size = file.read(100), file.seek(0, 2)
+    page = int.from_bytes(head[16:18], "big")
+    claimed = int.from_bytes(head[28:32], "big") * (65536 if page == 1 else page)
+    if len(head) < 100 or (claimed > size and head[24:28] == head[92:96]):  # the count is valid if the two agree
+        raise LogError(f"{path} is cut off: it has {size} of {claimed} bytes; copy or record it again.")
 
 
 def _decompress(data: bytes) -> bytes:
