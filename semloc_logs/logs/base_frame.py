@@ -1,16 +1,20 @@
-"""Which frame of a log is the vehicle: the base frame, and how it hangs on the pose stream and the sensors."""
+"""Which frame of a log is the vehicle, the base frame, and where it is at any time."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from semloc_logs.frames import F64
-from semloc_logs.logs.transforms import TransformTree, frame_name
+from semloc_logs.frames import F64, PoseSample, TransformSample
+from semloc_logs.logs.poses import PoseTrack
+from semloc_logs.logs.roles import Roles
+from semloc_logs.logs.transforms import Edge, TransformTree, frame_name
 
 BASE_LINK = "base_link"
+_LATE_TF_NS = 1_000_000_000  # a pose waits so long for the transform that leads to the base frame
 
 
 @dataclass(frozen=True)
@@ -25,13 +29,6 @@ class BaseFrame:
     pose_frame: str | None
     assumed: str | None = None
     notes: tuple[str, ...] = ()
-
-    def base_T(self, tree: TransformTree, frame_id: str, stamp_ns: int) -> F64 | None:
-        """``base_T_frame`` (4, 4) at a time; None when nothing says where that frame is."""
-        found = tree.lookup(self.name, frame_id, stamp_ns)
-        if found is None and self.assumed is not None and frame_name(frame_id) == self.assumed:
-            return np.eye(4)
-        return found
 
 
 def choose_base_frame(tree: TransformTree, sensors: Sequence[str], pose_child: str | None, pose_topic: str | None) -> BaseFrame:
@@ -62,3 +59,111 @@ def choose_base_frame(tree: TransformTree, sensors: Sequence[str], pose_child: s
         f"record /tf_static if the sensor sits elsewhere."
     )
     return BaseFrame(child, child, assumed=first, notes=(note,))
+
+
+class BasePoses:
+    """Poses and transforms of a log as they come -> ``session_T_base`` and ``base_T_sensor``.
+
+    Poses stay raw until :meth:`settle` has chosen the base frame. ``static_count``: static TF messages that are still to come, from
+    the log's own statistics; once they are all there, nobody has to wait for more.
+    """
+
+    def __init__(self, roles: Roles, static_count: int = 0) -> None:
+        self.tree = TransformTree()
+        self.track = PoseTrack()
+        self.base: BaseFrame | None = None
+        self.session_frame = ""
+        self._roles = roles
+        self._has_topic = roles.pose is not None and roles.pose not in (*roles.tf, *roles.tf_static)
+        self._child: str | None = None
+        self._edge: Edge | None = None
+        self._raw: deque[tuple[int, F64]] = deque()
+        self._static_count = static_count
+        self._static_times: set[tuple[str, int]] = set()
+
+    def take(self, sample: PoseSample | TransformSample) -> None:
+        """A sample of the pose topic or of TF."""
+        header = sample.header
+        if self._has_topic and header.topic == self._roles.pose:
+            if self._child is None:
+                self._child, self.session_frame = frame_name(sample.child_frame_id), frame_name(header.frame_id)
+            self._raw.append((header.stamp_ns, sample.frame_T_child))
+            self._move()
+        elif isinstance(sample, TransformSample):
+            if header.topic in self._roles.tf_static:
+                sample = replace(sample, static=True)
+                self._static_times.add((header.topic, header.log_time_ns))
+            self.tree.add(sample)
+            if self._edge == (frame_name(header.frame_id), frame_name(sample.child_frame_id)) and not sample.static:
+                self._raw.append((header.stamp_ns, sample.frame_T_child))
+                self._move()
+
+    def settle(self, sensors: Sequence[str], *, is_patient: bool, must: bool) -> bool:
+        """Chooses the base frame once the transforms that decide it are there, or now if it ``must``; False: not yet.
+
+        ``is_patient``: a pose edge in TF that is not called odom may still be topped by a better one. With a pose topic that has
+        nothing yet, the answer stays False even if it must: its frame is unknown.
+        """
+        edge = None
+        if self._has_topic:
+            child = self._child
+            if child is None:
+                return False
+        else:
+            edge = self._pose_edge(sensors)
+            if not must and self._roles.tf and (edge is None or (is_patient and not edge[0].endswith("odom"))):
+                return False
+            child = edge[1] if edge else None
+        if not must and not self._is_settled(sensors, child):
+            return False
+        self.base = choose_base_frame(self.tree, sensors, child, self._roles.pose or "TF")
+        if edge is not None:
+            self._edge, self.session_frame = edge, edge[0]
+            track = self.tree.track(*edge)
+            if track is not None:
+                self._raw.extend(zip(track.stamps_ns.tolist(), track.poses, strict=True))
+        self._move()
+        return True
+
+    def finish(self) -> None:
+        """No more transforms will come: poses that wait for one are given up."""
+        self._move(is_end=True)
+
+    def base_T(self, frame_id: str, stamp_ns: int) -> F64 | None:
+        """``base_T_frame`` (4, 4) at a time; None when nothing says where that frame is."""
+        if self.base is None:
+            return None
+        if self.base.assumed is not None and frame_name(frame_id) == self.base.assumed:
+            return np.eye(4)
+        return self.tree.lookup(self.base.name, frame_id, stamp_ns)
+
+    def has_passed(self, stamp_ns: int) -> bool:
+        """Whether the poses reach beyond ``stamp_ns``, or there is nothing to wait for."""
+        if self.base is None or self.base.pose_frame is None:
+            return self.base is not None
+        return self.track.end_ns is not None and self.track.end_ns >= stamp_ns
+
+    def _pose_edge(self, sensors: Sequence[str]) -> Edge | None:
+        frames = [*sensors, BASE_LINK, "base_footprint"]
+        return next((edge for frame in frames if (edge := self.tree.pose_edge(frame)) is not None), None)
+
+    def _is_settled(self, sensors: Sequence[str], child: str | None) -> bool:
+        if child == "" or not (self._roles.tf or self._roles.tf_static):
+            return True
+        if all(self.tree.connected(BASE_LINK, f) for f in (*sensors, *([child] if child else []))):
+            return True
+        return not self._roles.tf and len(self._static_times) >= self._static_count
+
+    def _move(self, is_end: bool = False) -> None:
+        """Raw poses -> poses of the base frame, as soon as the transform between the two is known at their time."""
+        base = self.base
+        if base is None or base.pose_frame is None:
+            return
+        while self._raw:
+            stamp_ns, pose = self._raw[0]
+            child_T_base = self.tree.lookup(base.pose_frame, base.name, stamp_ns)
+            if child_T_base is None and not is_end and self._raw[-1][0] - stamp_ns < _LATE_TF_NS:
+                return
+            self._raw.popleft()
+            if child_T_base is not None:
+                self.track.append(stamp_ns, pose @ child_T_base)

@@ -133,6 +133,14 @@ class PoseTrack:
         steps = np.linalg.norm(np.diff(rows[:, :, 3], axis=0), axis=1)
         return float(steps[np.diff(stamps) <= self.gap_limit_ns()].sum())
 
+    def to_json(self) -> dict[str, object]:
+        """What is known about the stream, in numbers."""
+        gaps = [[before, after] for before, after in self.gaps()]
+        return {
+            "count": self._n, "start_ns": self.start_ns, "end_ns": self.end_ns, "gaps": gaps, "length_m": round(self.length(), 3),
+            "duplicates": self.duplicates, "backwards": self.backwards, "invalid": self.invalid,
+        }  # fmt: skip
+
     def _matrices(self, first: int, last: int) -> F64:
         out = np.zeros((last - first, 4, 4))
         out[:, :3] = self._rows[first:last]

@@ -7,6 +7,7 @@ Frame names are compared without leading slash. Edges form an undirected graph, 
 from __future__ import annotations
 
 from collections import deque
+from itertools import pairwise
 
 import numpy as np
 
@@ -73,7 +74,7 @@ class TransformTree:
     def is_static(self, target: str, source: str) -> bool:
         """Whether the frames are connected by static edges alone."""
         path = self._path(frame_name(target), frame_name(source))
-        return path is not None and not any(self._moving_edge(a, b) for a, b in zip(path, path[1:], strict=False))
+        return path is not None and not any(self._moving_edge(a, b) for a, b in pairwise(path))
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
         """``target_T_source`` (4, 4), dynamic edges interpolated at ``stamp_ns``; None when unconnected or unknown at that time."""
@@ -81,7 +82,7 @@ class TransformTree:
         if path is None:
             return None
         result = np.eye(4)
-        for here, there in zip(path, path[1:], strict=False):
+        for here, there in pairwise(path):
             step = self._step(here, there, stamp_ns)
             if step is None:
                 return None

@@ -1,0 +1,53 @@
+"""LIDAR sweeps -> points in the base frame, freed of the vehicle's own motion during the sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs import geometry
+from semloc_logs.frames import F32, F64, LidarFrame
+
+LONGEST_SWEEP_NS = 1_000_000_000  # point times that span more are no sweep but garbage
+_BIN_NS = 1_000_000  # within a millisecond a vehicle at 30 m/s moves 3 cm
+
+PosesAt = Callable[[NDArray[np.int64]], tuple[F64, NDArray[np.bool_]]]
+
+
+def sweep_in_base(
+    frame: LidarFrame, base_T_sensor: F64, poses_at: PosesAt | None, *, min_range: float, max_range: float
+) -> tuple[F32, NDArray[np.uint32] | None, bool]:
+    """Points (n, 3) of a sweep in the base frame at its stamp, their labels, and whether the motion during the sweep was taken out.
+
+    ``poses_at`` gives ``session_T_base`` (m, 4, 4) at stamps (m,) and which of them are known; without all of them, or without point
+    times, the sweep stays as it was measured. Points nearer than ``min_range`` or beyond ``max_range`` (m, from the sensor) are dropped.
+    """
+    distance = np.linalg.norm(frame.points, axis=1)
+    kept = (distance >= min_range) & (distance <= max_range)
+    points = frame.points[kept]
+    label = None if frame.label is None else frame.label[kept]
+    if frame.offset_ns is not None and poses_at is not None and len(points):
+        moved = deskew(points, frame.offset_ns[kept], frame.header.stamp_ns, base_T_sensor, poses_at)
+        if moved is not None:
+            return moved, label, True
+    return geometry.apply(base_T_sensor, points).astype(np.float32), label, False
+
+
+def deskew(points: F32, offset_ns: NDArray[np.int64], stamp_ns: int, base_T_sensor: F64, poses_at: PosesAt) -> F32 | None:
+    """Points (n, 3) measured at ``stamp_ns + offset_ns`` in the moving sensor, in the base frame at ``stamp_ns``; None without poses."""
+    first, last = int(offset_ns.min()), int(offset_ns.max())
+    if last == first or last - first > LONGEST_SWEEP_NS or max(abs(first), abs(last)) > 2 * LONGEST_SWEEP_NS:
+        return None
+    bins = (offset_ns - first) // _BIN_NS
+    centres = stamp_ns + first + np.arange(int(bins.max()) + 1, dtype=np.int64) * _BIN_NS + _BIN_NS // 2
+    # the last bin's centre may lie behind the last point: no pose is needed there
+    stamps = np.append(np.minimum(centres, stamp_ns + last), stamp_ns)
+    poses, known = poses_at(stamps)
+    if not known.all():
+        return None
+    base_T_moving = (geometry.inverse(poses[-1]) @ poses[:-1] @ base_T_sensor).astype(np.float32)
+    motion = base_T_moving[bins]
+    moved: F32 = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3]
+    return moved

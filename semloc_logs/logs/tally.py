@@ -1,0 +1,59 @@
+"""What became of the frames of each topic: counted, and told in sentences."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import UTC, datetime
+
+_WHY = {
+    "no pose": "no pose is known at their time ({spans}): the pose stream has a gap there, or its clock differs from the sensor's",
+    "no transform": "no transform leads from their frame to the base frame: record /tf_static, or leave the topic out with --topic",
+    "no calibration": "no CameraInfo belongs to them: record it, or name it with --topic camera_info=TOPIC",
+    "unusable calibration": "their CameraInfo cannot be used",
+    "no depth": "they are colour or 8-bit pictures, not depth: choose another topic with --topic depth=TOPIC",
+    "no points": "they have no points within the range limits",
+}
+
+
+class Tally:
+    """Frames seen, used and left out by topic and reason."""
+
+    def __init__(self) -> None:
+        self.seen: Counter[str] = Counter()
+        self.used: Counter[str] = Counter()
+        self._left_out: Counter[tuple[str, str]] = Counter()
+        self._spans: dict[str, tuple[int, int]] = {}
+
+    def saw(self, topic: str, stamp_ns: int) -> None:
+        """Counts a frame."""
+        self.seen[topic] += 1
+        first, last = self._spans.get(topic, (stamp_ns, stamp_ns))
+        self._spans[topic] = (min(first, stamp_ns), max(last, stamp_ns))
+
+    def leave_out(self, topic: str, reason: str) -> None:
+        """Counts a frame that gives no cloud; ``reason`` is one of the keys that have a sentence."""
+        self._left_out[topic, reason] += 1
+
+    def left_out(self, topic: str) -> dict[str, int]:
+        """Reason -> frames of ``topic``."""
+        return {reason: count for (t, reason), count in sorted(self._left_out.items()) if t == topic}
+
+    def sentences(self, poses: tuple[int | None, int | None]) -> list[str]:
+        """One sentence for each topic and reason; ``poses``: the first and last stamp of the pose stream."""
+        told = []
+        for (topic, reason), count in sorted(self._left_out.items()):
+            spans = f"frames {span(*self._spans[topic])}, poses {span(*poses)}"
+            told.append(f"{topic}: {count} of {self.seen[topic]} frames are left out: {_WHY[reason].format(spans=spans)}.")
+        return told
+
+
+def span(start_ns: int | None, end_ns: int | None) -> str:
+    """A time range for people."""
+    return "none" if start_ns is None or end_ns is None else f"{_time(start_ns)} to {_time(end_ns)}"
+
+
+def _time(stamp_ns: int) -> str:
+    try:
+        return datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+    except (OverflowError, ValueError, OSError):
+        return f"{stamp_ns} ns"
