@@ -119,7 +119,6 @@ class Ground:
         return Mesh(corners.reshape(-1, 3), np.concatenate(triangles)), np.concatenate(labels).astype(np.uint8)
 
 
-
 def _at_corners(raster: NDArray[np.float32], i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float32]:
     """A raster at the corners (i, j) of its cells: the mean of the cells around."""
     n, m = raster.shape

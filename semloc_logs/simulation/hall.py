@@ -7,7 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from semloc_logs.simulation import objects
-from semloc_logs.simulation.world import BUILDING, F64, FENCE, POLE, ROAD, UNLABELLED, WALL, Mesh, MeshBuilder, World, box, cylinder, place
+from semloc_logs.simulation.world import (
+    BUILDING,
+    F64,
+    FENCE,
+    POLE,
+    ROAD,
+    UNLABELLED,
+    WALL,
+    Mesh,
+    MeshBuilder,
+    World,
+    box,
+    cylinder,
+    merge,
+    place,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,8 +63,8 @@ def build_hall(seed: int, condition: int = 0) -> World:
 def _shell(builder: MeshBuilder, plan: _Plan, rng: np.random.Generator) -> None:
     """Floor, ceiling, walls with doors set back, pipes under the ceiling."""
     w, d = plan.size
-    builder.add(box(w + 1, d + 1, 0.3, w / 2, d / 2, -0.3), ROAD, ground="none")
-    builder.add(box(w + 1, d + 1, 0.3, w / 2, d / 2, plan.height), BUILDING, ground="none")
+    builder.add(box(w + 4, d + 4, 0.3, w / 2, d / 2, -0.3), ROAD, ground="none")
+    builder.add(box(w + 4, d + 4, 0.3, w / 2, d / 2, plan.height), BUILDING, ground="none")
     for length, yaw, x, y in ((w, 0.0, 0.0, 0.0), (d, np.pi / 2, w, 0.0), (w, np.pi, w, d), (d, -np.pi / 2, 0.0, d)):
         u = 0.0
         while u < length:
@@ -93,8 +108,6 @@ def _fill(builder: MeshBuilder, plan: _Plan, rng: np.random.Generator, change: n
 
 def _rack(rng: np.random.Generator, height: float) -> Mesh:
     """A rack 3.6 m long along x with goods on some of its boards."""
-    from semloc_logs.simulation.world import merge
-
     top, deep = min(height - 0.4, rng.uniform(1.8, 4.0)), rng.uniform(0.5, 1.1)
     meshes = [box(0.08, 0.08, top, sx * 1.8, sy * deep / 2) for sx in (-1, 0, 1) for sy in (-1, 1)]
     for z in np.arange(0.15, top, rng.uniform(0.5, 1.3)):

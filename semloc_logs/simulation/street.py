@@ -37,16 +37,16 @@ class _Style:
 
 def _style(rng: Rng, town: Rng) -> _Style:
     """A side's style: a kind drawn from what the town has, then all of it varied."""
-    kinds = ("suburb", "suburb", "rows", "city", "city", "park", "country", "yards")
+    kinds = ("suburb", "suburb", "rows", "rows", "city", "city", "park", "country", "yards")
     favourite = kinds[int(town.integers(len(kinds)))]
     kind = favourite if rng.random() < 0.6 else kinds[int(rng.integers(len(kinds)))]
     setback, storeys, plot, gap, built, garden = {
-        "suburb": (4.5, 1.9, 12.0, 4.0, 0.92, 1.3),
-        "rows": (2.5, 2.5, 7.0, 0.0, 0.97, 0.7),
-        "city": (0.5, 4.5, 16.0, 0.8, 0.95, 0.1),
-        "park": (9.0, 1.5, 14.0, 25.0, 0.15, 2.5),
-        "country": (8.0, 1.5, 15.0, 20.0, 0.35, 1.4),
-        "yards": (7.0, 1.7, 28.0, 8.0, 0.8, 0.3),
+        "suburb": (3.5, 2.0, 12.0, 3.0, 0.95, 2.0),
+        "rows": (2.0, 2.6, 7.0, 0.0, 0.97, 1.1),
+        "city": (0.5, 4.5, 16.0, 0.8, 0.97, 0.2),
+        "park": (6.0, 1.5, 14.0, 25.0, 0.15, 5.0),
+        "country": (6.0, 1.6, 15.0, 14.0, 0.5, 3.0),
+        "yards": (5.0, 1.9, 28.0, 6.0, 0.85, 0.6),
     }[kind]
     frontage = {"city": "none", "park": "none", "yards": "fence"}.get(kind, "any")
     roofs = {"city": ("flat", "gable", "hip"), "yards": ("flat", "flat", "gable"), "rows": ("gable", "cross")}.get(
@@ -158,7 +158,7 @@ class _Street:
         whole = self.rng.random() < style.paved
         a, b, far = (u, u + width, setback + 1.0) if whole else (u + width - drive, u + width, setback + self.rng.uniform(2, 9))
         if whole or self.rng.random() < 0.6:
-            us, vs = np.arange(a, b, 0.4), np.arange(walk - 0.5, far, 0.4)
+            us, vs = np.arange(a, b, 0.3), np.arange(walk - 0.5, far, 0.3)
             rows = np.array([[side.at(float(p), 0.0)[:2], side.at(float(p), 10.0)[:2]] for p in us])
             self.ground.pave((rows[:, :1] + (rows[:, 1:] - rows[:, :1]) * (vs / 10.0)[None, :, None]).reshape(-1, 2))
 
@@ -171,8 +171,8 @@ class _Street:
         make = [objects.hedge, objects.fence, objects.garden_wall][int(rng.integers(3)) if style.frontage == "any" else 1]
         state = int(rng.integers(2**31))
         for a, b in ((u0, start), (start + opening, u1)):
-            line = side.line(a, b, walk + 0.4)
-            if b - a > 2 and self.ground.allowed(line):
+            line = side.line(a + 0.4, b - 0.4, walk + 0.6)
+            if b - a > 2.5 and self.ground.allowed(line):
                 self.put_line(make(np.random.default_rng(state), line))
                 self.ground.take(line)
         if rng.random() < 0.5 and style.setback > 5:
@@ -188,9 +188,9 @@ class _Street:
             near = rng.random() < (0.5 if house else 0.7)
             v = rng.uniform(walk + 0.8, max(walk + 1.0, walk + style.setback)) if near else behind + rng.uniform(1, 22)
             x, y, _ = side.at(u + rng.uniform(0, width), v)
-            if not self.ground.allowed(np.array([[x, y], [x + 1, y], [x - 1, y], [x, y + 1], [x, y - 1]])):
+            if not self.ground.allowed(np.array([[x, y], [x + 0.6, y], [x - 0.6, y], [x, y + 0.6], [x, y - 0.6]])):
                 continue
-            if rng.random() < 0.45:
+            if rng.random() < 0.4:
                 self.put_tree(x, y, rng.uniform(0.3, 1.1))
             else:
                 self.put(objects.bush(rng), x, y, rng.uniform(0, 6.3))

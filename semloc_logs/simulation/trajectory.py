@@ -25,7 +25,7 @@ class Trajectory:
 
 
 def smooth_line(line: F64, sigma: float = 2.5) -> F64:
-    """A driven line (n, 2) with corners rounded over about ``sigma`` metres, points every half metre."""
+    """A driven line (n, 2) with corners rounded over about ``sigma`` metres, points about every half metre."""
     points = resample(line, 0.5)
     return np.column_stack([gaussian_filter1d(points[:, k], sigma / 0.5, mode="nearest") for k in (0, 1)])
 

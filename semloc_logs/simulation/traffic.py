@@ -1,0 +1,51 @@
+"""Vehicles that drive through a simulated street while the sensor does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from semloc_logs.geometry import inverse
+from semloc_logs.simulation import objects
+from semloc_logs.simulation.ground import Ground
+from semloc_logs.simulation.trajectory import poses_along
+from semloc_logs.simulation.world import F64, Mesh, MeshBuilder, Scene
+
+KEEP_OFF = 6.5  # m between the centres of the own and another vehicle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Traffic:
+    """``vehicles`` each with a line (n, 2) that it drives, its place on it at time 0 in metres and its speed in m/s."""
+
+    ground: Ground
+    vehicles: tuple[tuple[objects.Parts, F64, float, float], ...]
+
+    def scene(self, seconds: float, world_T_base: F64) -> Scene | None:
+        """All vehicles at a time, without those that the own vehicle at ``world_T_base`` (4, 4) would touch; None if there are none."""
+        builder = MeshBuilder(self.ground.height)
+        base_T_world = inverse(world_T_base)
+        for parts, line, start, speed in self.vehicles:
+            length = 0.5 * (len(line) - 1)
+            at = (start + speed * seconds) % length
+            pose = poses_along(line, np.array([at]), self.ground.slope_height, np.random.default_rng(0), shake=0.0)[0]
+            offset = (base_T_world @ pose)[:3, 3]
+            if np.hypot(offset[0], 3 * offset[1]) < KEEP_OFF:
+                continue
+            for mesh, label in parts:
+                builder.add(Mesh(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], mesh.triangles), label, ground="none")
+        world = builder.build()
+        return Scene(world) if len(world.triangles) else None
+
+
+def random_traffic(rng: np.random.Generator, ground: Ground, lines: list[F64], density: float) -> Traffic:
+    """About ``density`` vehicles every 100 m of smooth lines (n, 2) with points every half metre (of :func:`trajectory.smooth_line`)."""
+    vehicles = []
+    for line in lines:
+        length = 0.5 * (len(line) - 1)
+        for _ in range(rng.poisson(density * length / 100)):
+            kind = rng.random()
+            make = objects.car if kind < 0.8 else objects.van if kind < 0.92 else objects.truck
+            vehicles.append((make(rng), line, float(rng.uniform(0, length)), float(rng.uniform(4, 11))))
+    return Traffic(ground, tuple(vehicles))
