@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -27,7 +27,6 @@ from mcap.records import (
     DataEnd,
     Footer,
     Header,
-    McapRecord,
     Message,
     MessageIndex,
     Metadata,
@@ -38,13 +37,14 @@ from mcap.records import (
 )
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.mcap_scan import SUMMARY_ORDER, Summary, scan
+from semloc_logs.logs.mcap_scan import SUMMARY_ORDER, Summary, raw, scan
 
 MAGIC = b"\x89MCAP0\r\n"
 METADATA_PREFIX = "semloc/"
 RUN_KEY = "semloc.run_id"  # in the metadata of each of our channels
 CHUNK_SIZE = 1 << 20  # bytes of a chunk before compression
 _DATA_END_SIZE, _FOOTER_SIZE = 9 + 4, 9 + 20
+_PADDING = 256  # bytes by which a DataEnd record may be longer than the specification says
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +105,8 @@ def read_ending(file: BinaryIO, path: Path) -> Ending:
     own = _own_metadata(file, groups, data_end)
     summary = _complete_summary(groups, path) or scan(file, data_end, path)
     ending = Ending(data_end, crc, summary, False) if own is None else _without_own(own, summary, path)
-    for raw in ending.summary.groups.get(Opcode.CHANNEL, ()):
-        channel = _parse(Channel.read, raw[9:], path, ending.offset)
+    for record in ending.summary.groups.get(Opcode.CHANNEL, ()):
+        channel = _parse(Channel.read, record[9:], path, ending.offset)
         if RUN_KEY in channel.metadata:
             raise LogError(
                 f"{path} holds results on {channel.topic} that another tool moved or followed by other records, so they cannot be"
@@ -117,9 +117,7 @@ def read_ending(file: BinaryIO, path: Path) -> Ending:
 
 def empty_ending(profile: str, library: str) -> tuple[bytes, Ending]:
     """The first bytes of a new file, and the ending that continues it."""
-    builder = RecordBuilder()
-    Header(profile, library).write(builder)
-    start = MAGIC + builder.end()
+    start = MAGIC + raw(Header(profile, library))
     return start, Ending(len(start), zlib.crc32(start), Summary({}, Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0), 0), False)
 
 
@@ -130,16 +128,17 @@ def compose(
     offset, summary = ending.offset, ending.summary
     old = summary.statistics
     schemas, ours = _number(summary, channels if messages else ())
-    groups: dict[int, list[bytes]] = {opcode: list(raws) for opcode, raws in summary.groups.items()}
-    groups.setdefault(Opcode.SCHEMA, []).extend(_raw(s) for s in schemas)
-    groups.setdefault(Opcode.CHANNEL, []).extend(_raw(c) for c in ours)
+    groups: dict[int, list[bytes]] = {opcode: list(entries) for opcode, entries in summary.groups.items()}
+    groups.setdefault(Opcode.SCHEMA, []).extend(raw(s) for s in schemas)
+    groups.setdefault(Opcode.CHANNEL, []).extend(raw(c) for c in ours)
     numbered = _sequenced(messages, [c.id for c in ours])
     # a log whose messages lie outside of chunks has to stay so: readers that find one chunk index look nowhere else
+    indexes: list[ChunkIndex] = []
     if summary.loose_messages:
-        body, indexes = b"".join(_raw(r) for r in (*schemas, *ours, *numbered)), []
+        body = b"".join(raw(r) for r in (*schemas, *ours, *numbered))
     else:
         body, indexes = _chunks(offset, schemas, ours, numbered)
-    groups.setdefault(Opcode.CHUNK_INDEX, []).extend(_raw(i) for i in indexes)
+    groups.setdefault(Opcode.CHUNK_INDEX, []).extend(raw(i) for i in indexes)
     record = Metadata(
         name,
         {
@@ -153,9 +152,9 @@ def compose(
             "channel_ids": " ".join(str(c.id) for c in ours),
         },
     )
-    raw = _raw(record)
-    groups.setdefault(Opcode.METADATA_INDEX, []).append(_raw(MetadataIndex(offset + len(body), len(raw), name)))
-    body += raw
+    metadata_raw = raw(record)
+    groups.setdefault(Opcode.METADATA_INDEX, []).append(raw(MetadataIndex(offset + len(body), len(metadata_raw), name)))
+    body += metadata_raw
     counts = dict(old.channel_message_counts) | {c.id: sum(m.channel == k for m in messages) for k, c in enumerate(ours)}
     times = [m.log_time_ns for m in messages] + ([old.message_start_time, old.message_end_time] if old.message_count else [])
     statistics = Statistics(
@@ -169,8 +168,8 @@ def compose(
         metadata_count=old.metadata_count + 1,
         schema_count=old.schema_count + len(schemas),
     )
-    groups[Opcode.STATISTICS] = [_raw(statistics)]
-    body += _raw(DataEnd(zlib.crc32(body, ending.crc) if ending.crc else 0))
+    groups[Opcode.STATISTICS] = [raw(statistics)]
+    body += raw(DataEnd(zlib.crc32(body, ending.crc) if ending.crc else 0))
     return body + _summary(offset + len(body), groups)
 
 
@@ -193,23 +192,34 @@ def _locate(file: BinaryIO, path: Path) -> tuple[int, int, dict[int, list[bytes]
     end = file.read()
     if len(end) != _FOOTER_SIZE + len(MAGIC) or end[-8:] != MAGIC or end[:9] != struct.pack("<BQ", Opcode.FOOTER, 20):
         raise cut
-    summary_start, offset_start, summary_crc = struct.unpack("<QQI", end[9:29])
+    summary_start, _, summary_crc = struct.unpack("<QQI", end[9:29])
     footer_at = size - len(end)
-    data_end = (summary_start or footer_at) - _DATA_END_SIZE
-    if data_end < len(MAGIC) or data_end + _DATA_END_SIZE > footer_at:
+    summary_start = summary_start or footer_at
+    if not len(MAGIC) + _DATA_END_SIZE <= summary_start <= footer_at:
         raise cut
-    file.seek(data_end)
-    record = file.read(_DATA_END_SIZE)
-    if record[:9] != struct.pack("<BQ", Opcode.DATA_END, 4):
+    file.seek(max(0, summary_start - _DATA_END_SIZE - _PADDING))
+    before = file.read(min(summary_start, _DATA_END_SIZE + _PADDING))
+    record = _data_end(before)
+    if record is None:
         raise cut
+    data_end = summary_start - len(record)
     groups: dict[int, list[bytes]] = {}
-    data = file.read(footer_at - data_end - _DATA_END_SIZE)
+    data = file.read(footer_at - summary_start)
     if summary_crc and zlib.crc32(end[:25], zlib.crc32(data)) != summary_crc:
         raise LogError(f"{path} has a damaged summary (checksum at offset {size - 12}); recover it with `mcap recover {path} -o OUT.mcap`.")
-    for opcode, raw in _split(data, cut):
+    for opcode, entry in _split(data, cut):
         if opcode != Opcode.SUMMARY_OFFSET:
-            groups.setdefault(opcode, []).append(raw)
-    return data_end, struct.unpack("<I", record[9:])[0], groups
+            groups.setdefault(opcode, []).append(entry)
+    return data_end, struct.unpack("<I", record[9:13])[0], groups
+
+
+def _data_end(before: bytes) -> bytes | None:
+    """The DataEnd record at the end of ``before``; a writer may have extended it by some bytes."""
+    for padding in range(len(before) - _DATA_END_SIZE + 1):
+        record = before[len(before) - _DATA_END_SIZE - padding :]
+        if record[:9] == struct.pack("<BQ", Opcode.DATA_END, 4 + padding):
+            return record
+    return None
 
 
 def _split(data: bytes, error: LogError) -> Iterator[tuple[int, bytes]]:
@@ -230,7 +240,7 @@ def _complete_summary(groups: Mapping[int, list[bytes]], path: Path) -> Summary 
     if len(groups.get(Opcode.STATISTICS, ())) != 1:
         return None
     counted: Statistics = _parse(Statistics.read, groups[Opcode.STATISTICS][0][9:], path, 0)
-    listed = {opcode: len({raw[9:11] for raw in groups.get(opcode, ())}) for opcode in (Opcode.SCHEMA, Opcode.CHANNEL)}
+    listed = {opcode: len({entry[9:11] for entry in groups.get(opcode, ())}) for opcode in (Opcode.SCHEMA, Opcode.CHANNEL)}
     listed |= {o: len(groups.get(o, ())) for o in (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)}
     expected = {
         Opcode.SCHEMA: counted.schema_count,
@@ -247,10 +257,10 @@ def _complete_summary(groups: Mapping[int, list[bytes]], path: Path) -> Summary 
 
 def _own_metadata(file: BinaryIO, groups: Mapping[int, list[bytes]], data_end: int) -> Metadata | None:
     """Our metadata record, if ours are the last records of the data section and exactly as we wrote them."""
-    for raw in groups.get(Opcode.METADATA_INDEX, ()):
-        if raw[29 : 29 + len(METADATA_PREFIX)] != METADATA_PREFIX.encode():
+    for entry in groups.get(Opcode.METADATA_INDEX, ()):
+        if entry[29 : 29 + len(METADATA_PREFIX)] != METADATA_PREFIX.encode():
             continue
-        offset = int.from_bytes(raw[9:17], "little")
+        offset = int.from_bytes(entry[9:17], "little")
         if not 0 < offset < data_end:
             continue
         file.seek(offset)
@@ -258,7 +268,7 @@ def _own_metadata(file: BinaryIO, groups: Mapping[int, list[bytes]], data_end: i
         if len(record) < 9 or record[0] != Opcode.METADATA or 9 + int.from_bytes(record[1:9], "little") != len(record):
             continue
         try:
-            found = Metadata.read(ReadDataStream(BytesIO(record[9:])))
+            found: Metadata = Metadata.read(ReadDataStream(BytesIO(record[9:])))
             start = int(found.metadata["start"])
             digest = found.metadata["records_sha256"]
         except (KeyError, ValueError, struct.error, McapError):
@@ -287,9 +297,9 @@ def _without_own(own: Metadata, summary: Summary, path: Path) -> Ending:
         drop = {opcode: {struct.pack("<H", int(i)) for i in texts} for opcode, texts in ids.items()}
     except (KeyError, ValueError, struct.error) as error:
         raise LogError(f"{path}: the metadata record {own.name!r} is not one of ours; annotate the original log.") from error
-    groups = {opcode: list(raws) for opcode, raws in summary.groups.items()}
+    groups = {opcode: list(entries) for opcode, entries in summary.groups.items()}
     for opcode, gone in drop.items():
-        groups[opcode] = [raw for raw in groups.get(opcode, ()) if raw[9:11] not in gone]
+        groups[opcode] = [entry for entry in groups.get(opcode, ()) if entry[9:11] not in gone]
     chunks = groups.get(Opcode.CHUNK_INDEX, [])
     groups[Opcode.CHUNK_INDEX] = [r for r in chunks if int.from_bytes(r[25:33], "little") < start]
     groups[Opcode.METADATA_INDEX] = [r for r in groups.get(Opcode.METADATA_INDEX, ()) if int.from_bytes(r[9:17], "little") < start]
@@ -336,19 +346,19 @@ def _chunks(offset: int, schemas: list[Schema], channels: list[Channel], message
     compressor = zstandard.ZstdCompressor(level=3)
     at = 0
     while at < len(messages):
-        data = bytearray(b"".join(_raw(r) for r in (*schemas, *channels)) if at == 0 else b"")
+        data = bytearray(b"".join(raw(r) for r in (*schemas, *channels)) if at == 0 else b"")
         first, index = at, dict[int, MessageIndex]()
         while at < len(messages) and (at == first or len(data) < CHUNK_SIZE):
             m = messages[at]
             index.setdefault(m.channel_id, MessageIndex(m.channel_id, [])).records.append((m.log_time, len(data)))
-            data += _raw(m)
+            data += raw(m)
             at += 1
         packed, times = compressor.compress(bytes(data)), [m.log_time for m in messages[first:at]]
-        chunk = _raw(Chunk("zstd", packed, max(times), min(times), zlib.crc32(data), len(data)))
+        chunk = raw(Chunk("zstd", packed, max(times), min(times), zlib.crc32(data), len(data)))
         start, offsets, tail = offset + len(body), dict[int, int](), b""
         for channel_id, entry in index.items():
             offsets[channel_id] = start + len(chunk) + len(tail)
-            tail += _raw(entry)
+            tail += raw(entry)
         indexes.append(ChunkIndex(len(chunk), start, "zstd", len(packed), max(times), len(tail), offsets, min(times), len(data)))
         body += chunk + tail
     return body, indexes
@@ -362,15 +372,9 @@ def _summary(start: int, groups: Mapping[int, list[bytes]]) -> bytes:
             offsets.append(SummaryOffset(opcode, start + len(out), len(group)))
             out += group
     offset_start = start + len(out)
-    out += b"".join(_raw(o) for o in offsets)
+    out += b"".join(raw(o) for o in offsets)
     footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
-    return out + _raw(Footer(start, offset_start, zlib.crc32(footer, zlib.crc32(out)))) + MAGIC
-
-
-def _raw(record: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    record.write(builder)
-    return builder.end()  # type: ignore[no-any-return]
+    return out + raw(Footer(start, offset_start, zlib.crc32(footer, zlib.crc32(out)))) + MAGIC
 
 
 def _parse(read: Any, body: bytes, path: Path, offset: int) -> Any:

@@ -25,7 +25,7 @@ class ClosureRecord:
     """A row of closures.parquet, and where it lies for those who look at the log.
 
     ``covariance`` has 36 numbers. ``session_T_query`` (4, 4) is the pose of the query's base frame in the *target's* session frame, None
-    when the target has no poses. ``session_position`` (3,) is the place of this log's end in this log's session frame, None when it has no poses.
+    when the target has no poses. ``session_position`` (3,) is the place of this log's end in this log's session frame, None without poses.
     """
 
     query_session: str
@@ -57,11 +57,15 @@ class ClosureRecord:
             for name in COLUMNS:
                 value = row[name]
                 kind = _TYPES[name]
-                values[name] = tuple(float(x) for x in value) if kind is tuple else kind(value)  # type: ignore[attr-defined, operator]
+                values[name] = tuple(float(x) for x in value) if kind is tuple else kind(value)  # type: ignore[attr-defined]
         except (KeyError, TypeError, ValueError) as error:
-            raise ContractError(f"A row of closures.parquet lacks a good value for {error}; write the table again with `semloc close`.") from error
+            raise ContractError(
+                f"A row of closures.parquet lacks a good value for {error}; write the table again with `semloc close`."
+            ) from error
         if len(values["covariance"]) != 36:  # type: ignore[arg-type]
-            raise ContractError("The covariance of a row of closures.parquet has not 36 numbers; write the table again with `semloc close`.")
+            raise ContractError(
+                "The covariance of a row of closures.parquet has not 36 numbers; write the table again with `semloc close`."
+            )
         return cls(**values, session_T_query=session_T_query, session_position=session_position)  # type: ignore[arg-type]
 
     def columns(self) -> dict[str, object]:
@@ -77,7 +81,7 @@ class ClosureRecord:
         session_T_query = np.eye(4) if self.session_T_query is None else self.session_T_query
         session_R_target = session_T_query[:3, :3] @ self.target_T_query()[:3, :3].T
         turn = np.kron(np.eye(2), session_R_target)
-        return turn @ np.array(self.covariance).reshape(6, 6) @ turn.T
+        return np.asarray(turn @ np.array(self.covariance).reshape(6, 6) @ turn.T)
 
 
 COLUMNS = tuple(f.name for f in fields(ClosureRecord) if not f.name.startswith("session_"))
@@ -98,6 +102,10 @@ class Mark:
     size: float  # diameter of the sphere, m
     text: str
     color: tuple[float, float, float, float]
+
+    def text_position(self) -> F64:
+        """Above the sphere (3,)."""
+        return np.asarray(self.position + np.array([0.0, 0.0, 1.5 * self.size]))
 
 
 class Encoder(Protocol):
@@ -141,14 +149,17 @@ def encode(
     """Channels and messages for the closures in which ``session`` takes part, in log-time order.
 
     ``log_times`` maps the stamp of an end to the receive time of the log at that frame; an end without one takes its stamp, moved into
-    the log's time range. ``size`` is the diameter of the markers in metres; ``metadata`` goes to the channels. Channels without messages are left out.
+    the log's time range. ``size`` is the diameter of the markers in metres; ``metadata`` goes to the channels. Channels without messages
+    are left out.
     """
     encoder = _encoder(facts.encoding)
     messages: list[NewMessage] = []
     mine = [c for c in closures if session in (c.query_session, c.target_session)]
     for c in mine:
-        if not all(np.all(np.isfinite(v)) for v in c.columns().values() if not isinstance(v, str)):
-            raise ContractError(f"The closure of {c.query_session} at {c.query_stamp_ns} ns has a number that is not finite; run `semloc close`.")
+        if not np.isfinite([*c.covariance, c.t_x, c.t_y, c.t_z, c.q_x, c.q_y, c.q_z, c.q_w, c.overlap, c.probability]).all():
+            raise ContractError(
+                f"The closure of {c.query_session} at {c.query_stamp_ns} ns has a number that is not finite; run `semloc close`."
+            )
     for key, closure in enumerate(sorted(mine, key=_order)):
         is_query = closure.query_session == session
         stamp = closure.query_stamp_ns if is_query else closure.target_stamp_ns
@@ -168,7 +179,7 @@ def channel_metadata(run: str, version: str) -> dict[str, str]:
 
 
 def _encoder(encoding: Encoding) -> Encoder:
-    if encoding in ("ros1", "ros2"):
+    if encoding == "ros1" or encoding == "ros2":
         from semloc_logs.logs.channels_ros import RosEncoder
 
         return RosEncoder(1 if encoding == "ros1" else 2)

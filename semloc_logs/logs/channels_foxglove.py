@@ -21,7 +21,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from semloc_logs.geometry import translation_quaternion
 from semloc_logs.logs.amend import NewChannel
-from semloc_logs.logs.channels import TOPICS, ClosureRecord, F64, Mark
+from semloc_logs.logs.channels import F64, TOPICS, ClosureRecord, Mark
 from semloc_logs.schemas import read_text
 
 _STRING, _INT64, _INT32, _DOUBLE = (
@@ -78,7 +78,7 @@ class FoxgloveEncoder:
         sphere = entity.spheres.add(size=dict.fromkeys("xyz", mark.size), color=color)
         _set_pose(sphere.pose, mark.position)
         text = entity.texts.add(billboard=True, font_size=mark.size, color=color, text=mark.text)
-        _set_pose(text.pose, mark.position + [0.0, 0.0, 1.5 * mark.size])
+        _set_pose(text.pose, mark.text_position())
         if mark.other is not None:
             points = [Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in (mark.position, mark.other)]
             line = entity.lines.add(type=LinePrimitive.LINE_LIST, thickness=mark.size / 5, points=points, color=color)
@@ -87,7 +87,7 @@ class FoxgloveEncoder:
 
     def _bytes(self, message: Message) -> bytes:
         if self.encoding == "protobuf":
-            return message.SerializeToString(deterministic=True)
+            return bytes(message.SerializeToString(deterministic=True))
         return json.dumps(_json_value(message), allow_nan=False).encode()
 
 
@@ -143,7 +143,7 @@ def _is_repeated(field: FieldDescriptor) -> bool:
 def _json_value(message: Message) -> dict[str, Any]:
     """A message as Foxglove's JSON, every field present."""
     if message.DESCRIPTOR.full_name in ("google.protobuf.Timestamp", "google.protobuf.Duration"):
-        return {"sec": message.seconds, "nsec": message.nanos}  # type: ignore[attr-defined]
+        return {"sec": message.seconds, "nsec": message.nanos}
     out = {}
     for field in message.DESCRIPTOR.fields:
         value = getattr(message, field.name)

@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.geometry import translation_quaternion
 from semloc_logs.logs.amend import NewChannel
-from semloc_logs.logs.channels import TOPICS, ClosureRecord, F64, Mark
+from semloc_logs.logs.channels import F64, TOPICS, ClosureRecord, Mark
 from semloc_logs.schemas import read_text
 
 CLOSURE = "semloc_msgs/msg/LoopClosure"
@@ -53,8 +53,7 @@ class RosEncoder:
         if mark.other is not None:
             ends = [self._point(mark.position), self._point(mark.other)]
             markers.append(self._marker(mark, _LINE_LIST, "semloc/closures", np.zeros(3), (mark.size / 5, 0.0, 0.0), points=ends))
-        above = mark.position + [0.0, 0.0, 1.5 * mark.size]
-        markers.append(self._marker(mark, _TEXT, "semloc/names", above, (0.0, 0.0, mark.size), text=mark.text))
+        markers.append(self._marker(mark, _TEXT, "semloc/names", mark.text_position(), (0.0, 0.0, mark.size), text=mark.text))
         return self._bytes(self._new(MARKERS, markers=markers))
 
     def _marker(
@@ -122,4 +121,4 @@ def definition(name: str, version: int) -> str:
     if name != CLOSURE:
         return str(text)
     separator = "=" * 80
-    return read_text("messages/LoopClosure.msg") + separator + str(text).split(separator, 1)[1]
+    return str(read_text("messages/LoopClosure.msg")) + separator + str(text).split(separator, 1)[1]

@@ -189,15 +189,16 @@ def _summarise(found: _Found) -> Summary:
     groups: dict[int, list[bytes]] = {
         Opcode.SCHEMA: [found.schemas[k] for k in sorted(found.schemas)],
         Opcode.CHANNEL: [found.channels[k] for k in sorted(found.channels)],
-        Opcode.STATISTICS: [_raw(statistics)],
-        Opcode.CHUNK_INDEX: [_raw(i) for i in chunks],
-        Opcode.ATTACHMENT_INDEX: [_raw(i) for i in found.attachments],
-        Opcode.METADATA_INDEX: [_raw(i) for i in found.metadata],
+        Opcode.STATISTICS: [raw(statistics)],
+        Opcode.CHUNK_INDEX: [raw(i) for i in chunks],
+        Opcode.ATTACHMENT_INDEX: [raw(i) for i in found.attachments],
+        Opcode.METADATA_INDEX: [raw(i) for i in found.metadata],
     }
     return Summary(groups, statistics, found.loose)
 
 
-def _raw(record: McapRecord) -> bytes:
+def raw(record: McapRecord) -> bytes:
+    """The bytes of a record, its opcode and length included."""
     builder = RecordBuilder()
     record.write(builder)
-    return builder.end()  # type: ignore[no-any-return]
+    return bytes(builder.end())  # type: ignore[no-untyped-call]

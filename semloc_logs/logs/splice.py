@@ -40,16 +40,20 @@ class _Saved:
 
 
 @contextlib.contextmanager
-def locked(path: Path) -> Iterator[int]:
-    """A descriptor for reading and writing ``path`` under an advisory lock; ``LogError`` when another process holds it."""
+def locked(path: Path, *, shared: bool = False) -> Iterator[int]:
+    """A descriptor of ``path`` under an advisory lock: for reading and writing, or, ``shared`` with others, for reading.
+
+    Raises ``LogError`` when the file cannot be opened so, or when another process holds the lock.
+    """
     try:
-        fd = os.open(path, os.O_RDWR)
+        fd = os.open(path, os.O_RDONLY if shared else os.O_RDWR)
     except OSError as error:
-        raise LogError(f"{path} cannot be opened for writing ({error.strerror}); write a copy with `-o OUT.mcap` instead.") from error
+        advice = "give a readable log" if shared else "write a copy with `-o OUT.mcap` instead"
+        raise LogError(f"{path} cannot be opened ({error.strerror}); {advice}.") from error
     try:
         if fcntl is not None:
             try:
-                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(fd, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
             except OSError as error:
                 raise LogError(f"{path} is being written by another process; wait until it is done.") from error
         yield fd
