@@ -130,6 +130,14 @@ def guess_roles(streams: Sequence[Stream], overrides: Mapping[str, str] | None =
     )  # fmt: skip
 
 
+def no_sensor(roles: Roles, streams: Sequence[Stream]) -> str:
+    """Why a log without LIDAR and depth cannot be fused, and what to name."""
+    listed = ", ".join(f"{s.topic} ({s.type or 'unknown type'})" for s in streams if s.count) or "none"
+    if roles.stereo_left is not None:
+        return f"The stereo pair {roles.stereo_left}, {roles.stereo_right} has no depth stream beside it; record depth or a LIDAR."
+    return f"There is no LIDAR and no depth stream; its topics are {listed}; name one with --topic lidar=TOPIC or --topic depth=TOPIC."
+
+
 def _kind(message_type: str) -> str:
     return re.split(r"[/.]", message_type)[-1].lower()
 

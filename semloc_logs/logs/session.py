@@ -18,9 +18,9 @@ from semloc_logs.logs.gravity import Accelerometer
 from semloc_logs.logs.log import Log, Stream
 from semloc_logs.logs.merge import merged_frames, merged_streams
 from semloc_logs.logs.open import open_log
-from semloc_logs.logs.roles import Roles, find_roles
+from semloc_logs.logs.roles import Roles, find_roles, no_sensor
 from semloc_logs.logs.sweeps import LONGEST_SWEEP_NS, sweep_in_base
-from semloc_logs.logs.tally import Tally
+from semloc_logs.logs.tally import Tally, never_moves, no_poses, without_unused
 
 MAX_WAITING = 64  # frames that wait for their pose and transforms
 MAX_WAITING_BYTES = 512 << 20
@@ -75,7 +75,7 @@ class Session:
         except RoleError as error:
             raise RoleError(f"{self.name}: {error}") from error
         if not self.roles.lidar and not self.roles.depth:
-            raise RoleError(f"{self.name}: {_no_sensor(self.roles, self.streams)}")
+            raise RoleError(f"{self.name}: {no_sensor(self.roles, self.streams)}")
         self.min_range, self.max_range, self.stride = min_range, max_range, stride
         self._begin()
 
@@ -109,15 +109,19 @@ class Session:
     @property
     def skipped(self) -> list[str]:
         """Sentences about data that could not be used."""
-        several = len(self.logs) > 1
-        said = [f"{log.path.name}: {p}" if several else p for log in self.logs for p in log.problems]
+        unused = {s.topic for s in self.streams if self.roles.role_of(s.topic) is None}
+        said = [self._told(log, p) for log in self.logs for p in without_unused(log.problems, unused)]
         return list(dict.fromkeys([*said, *self._depth.lost, *self._lost]))
+
+    def _told(self, log: Log, problem: str) -> str:
+        return f"{log.path.name}: {problem}" if len(self.logs) > 1 and not problem.startswith(log.path.name) else problem
 
     @property
     def problems(self) -> list[str]:
         """Everything worth saying: lost data first, then what was assumed."""
         assumed = self._where.base.notes if self._where.base else ()
-        return list(dict.fromkeys([*self.skipped, *self._depth.notes, *assumed, *self._notes]))
+        said = [self._told(log, p) for log in self.logs for p in log.problems]
+        return list(dict.fromkeys([*self.skipped, *said, *self._depth.notes, *assumed, *self._notes]))
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -299,14 +303,9 @@ class Session:
             self._notes.append(f"Poses that are {' and '.join(refused)} were left out.")
         if track.invalid:
             self._lost.append(f"{track.invalid} poses are no rigid transforms and were left out.")
+        self._notes.extend(never_moves(self.roles.pose or "TF", track))
         if self._where.base is not None and self._where.base.pose_frame is None:
-            self._notes.append(NO_POSES.format(name=self.name))
-
-
-NO_POSES = (
-    "{name} has no pose stream: its frames can be searched one by one, but no map is built; "
-    "record an odometry or TF, or name the topic with --topic pose=TOPIC."
-)
+            self._notes.append(no_poses(self.name))
 
 
 def _size(frame: RangeFrame) -> int:
@@ -320,10 +319,3 @@ def _sweep_ns(frame: RangeFrame) -> int:
     if not isinstance(frame, LidarFrame) or frame.offset_ns is None or not len(frame.offset_ns):
         return 0
     return min(max(0, int(frame.offset_ns.max())), LONGEST_SWEEP_NS)
-
-
-def _no_sensor(roles: Roles, streams: Sequence[Stream]) -> str:
-    listed = ", ".join(f"{s.topic} ({s.type or 'unknown type'})" for s in streams if s.count) or "none"
-    if roles.stereo_left is not None:
-        return f"the stereo pair {roles.stereo_left}, {roles.stereo_right} has no depth stream beside it; record depth or a LIDAR."
-    return f"no LIDAR and no depth stream; its topics are {listed}; name one with --topic lidar=TOPIC or --topic depth=TOPIC."

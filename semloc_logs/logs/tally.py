@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 
+from semloc_logs.logs.poses import PoseTrack
+
+_STANDSTILL_NS = 10_000_000_000  # a vehicle may well stand so long, but a log of nothing else is worth a sentence
 _WHY = {
     "no pose": "no pose is known at their time ({spans}): the pose stream has a gap there, or its clock differs from the sensor's",
     "no transform": "no transform leads from their frame to the base frame: record /tf_static, or leave the topic out with --topic",
@@ -45,6 +49,29 @@ class Tally:
             spans = f"frames {span(*self._spans[topic])}, poses {span(*poses)}"
             told.append(f"{topic}: {count} of {self.seen[topic]} frames are left out: {_WHY[reason].format(spans=spans)}.")
         return told
+
+
+def no_poses(name: str) -> str:
+    """What follows from a log without any pose."""
+    return (
+        f"{name} has no pose stream: its frames can be searched one by one, but no map is built; "
+        f"record an odometry or TF, or name the topic with --topic pose=TOPIC."
+    )
+
+
+def never_moves(topic: str, track: PoseTrack) -> list[str]:
+    """A sentence about a pose stream whose position is constant: odometry that was never filled in. Empty when all is well."""
+    start_ns, end_ns = track.start_ns, track.end_ns
+    if start_ns is None or end_ns is None or end_ns - start_ns < _STANDSTILL_NS or track.length() > 0.0:
+        return []
+    return [
+        f"{topic} gives the same position for {(end_ns - start_ns) * 1e-9:.0f} s: name another with --topic pose=TOPIC if the vehicle moved."
+    ]
+
+
+def without_unused(problems: Sequence[str], unused: Collection[str]) -> list[str]:
+    """The problems of a log apart from those of topics that nobody asks for: they begin with the topic's name."""
+    return [p for p in problems if p.partition(": ")[0] not in unused]
 
 
 def span(start_ns: int | None, end_ns: int | None) -> str:
