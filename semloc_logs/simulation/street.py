@@ -135,13 +135,19 @@ class _Street:
         """A plot of land: a house perhaps, its garden, frontage and drive."""
         rng = self.rng
         depth = float(np.clip(rng.uniform(0.6, 1.1) * min(width, 14.0), 6, 18))
-        setback = walk + max(0.0, style.setback * rng.uniform(0.85, 1.15))
-        x, y, yaw = side.at(u + width / 2, setback)
-        c, s = np.cos(yaw), np.sin(yaw)
-        gx, gy = np.meshgrid(np.arange(-width / 2, width / 2 + 0.1, 0.5), np.arange(-0.5, depth + 0.1, 0.5))
-        # the house's +y looks away from the road, which lies to the left of the traffic on this side
-        cells = np.column_stack([x + c * gx.ravel() + s * gy.ravel(), y + s * gx.ravel() - c * gy.ravel()])
-        house = rng.random() < style.built and self.ground.allowed(cells)
+        setback = walk + max(0.3, style.setback * rng.uniform(0.85, 1.15))
+        gx, gy = np.meshgrid(np.arange(-width / 2 + 0.2, width / 2, 0.5), np.arange(0.2, depth + 0.1, 0.5))
+        house = bool(rng.random() < style.built)
+        for further in (0.0, 0.8, 2.0, 4.0):  # where the road bends a house has to stand further back
+            x, y, yaw = side.at(u + width / 2, setback + further)
+            c, s = np.cos(yaw), np.sin(yaw)
+            # the house's +y looks away from the road, which lies to the left of the traffic on this side
+            cells = np.column_stack([x + c * gx.ravel() + s * gy.ravel(), y + s * gx.ravel() - c * gy.ravel()])
+            if self.ground.allowed(cells):
+                setback += further
+                break
+        else:
+            house = False
         if house:
             height = 2.9 * max(1.0, style.storeys * rng.uniform(0.75, 1.3)) + rng.uniform(0, 1.0)
             parts = building(rng, width, depth, height, str(rng.choice(style.roofs)))
@@ -239,14 +245,14 @@ class _Street:
     def backlands(self) -> None:
         """Trees, sheds and houses in what is left behind the plots."""
         rng, ground = self.rng, self.ground
-        i, j = np.nonzero(ground.free & (ground.beside > 14))
-        for k in rng.integers(0, max(1, len(i)), int(len(i) * 0.25 / 120) if len(i) else 0):
+        i, j = np.nonzero(ground.free & (ground.beside > 5))
+        for k in rng.integers(0, max(1, len(i)), int(len(i) * 0.25 / 80) if len(i) else 0):
             x, y = ground.corner + 0.5 * (np.array([i[k], j[k]]) + 0.5)
             size = rng.uniform(3, 11, 2)
             g = np.stack(np.meshgrid(np.arange(-0.5, 0.51, 0.1), np.arange(-0.5, 0.51, 0.1)), -1).reshape(-1, 2)
             yaw = rng.uniform(0, np.pi)
             cells = (g * size) @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]]) + [x, y]
-            if rng.random() < 0.3 and ground.allowed(cells):
+            if rng.random() < 0.35 and ground.allowed(cells):
                 shape = building(rng, float(size[0]), float(size[1]), rng.uniform(2.3, 7), str(rng.choice(["flat", "gable", "hip"])))
                 self.put([(place(m, 0, -size[1] / 2), label) for m, label in shape], x, y, yaw)
                 ground.take(cells)
