@@ -92,9 +92,8 @@ class RosEncoder:
 
     def _header(self, stamp_ns: int, frame_id: str) -> Any:
         seq = {"seq": 0} if self.version == 1 else {}
-        limit = (1 << 32) - 1 if self.version == 1 else (1 << 31) - 1
-        sec, nanosec = divmod(max(0, stamp_ns), 10**9)
-        return self._new("std_msgs/msg/Header", **seq, stamp=self._time("time", min(sec, limit), nanosec), frame_id=frame_id)
+        sec, nanosec = divmod(max(0, stamp_ns), 10**9)  # the exact stamps are in the columns
+        return self._new("std_msgs/msg/Header", **seq, stamp=self._time("time", min(sec, (1 << 31) - 1), nanosec), frame_id=frame_id)
 
     def _time(self, kind: str, sec: int, nanosec: int) -> Any:
         return self._new(f"builtin_interfaces/msg/{kind.capitalize()}", sec=sec, nanosec=nanosec)
