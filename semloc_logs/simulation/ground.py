@@ -97,7 +97,7 @@ class Ground:
         i, j = np.nonzero(self.kind != 255)
         kind = self.kind[i, j]
         label = np.where(self.paved[i, j] & (kind == TERRAIN), SIDEWALK, kind)
-        slope = np.stack(np.gradient(self.beside, CELL))
+        slope = [np.asarray(np.gradient(self.beside, CELL, axis=k), np.float32) for k in (0, 1)]
         corners = np.zeros((len(i), 4, 3))
         for k, (di, dj) in enumerate(((0, 0), (1, 0), (1, 1), (0, 1))):
             x, y = self.corner[0] + CELL * (i + di), self.corner[1] + CELL * (j + dj)

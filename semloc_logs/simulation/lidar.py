@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.geometry import interpolate
 from semloc_logs.simulation.world import BUILDING, CAR, F64, Scene
 
 F32 = NDArray[np.float32]
@@ -70,16 +71,16 @@ def full_sweep(
     max_range: float | None = None,
     sector: tuple[float, float] | None = None,
     traffic: Scene | None = None,
+    world_T_end: F64 | None = None,
 ) -> Sweep:
     """One turn of the sensor standing at ``world_T_lidar`` (4, 4); fewer ``columns``, a shorter range, an azimuth ``sector`` if asked.
 
     ``traffic`` is a second scene, of what moves, that hides the first where it is nearer.
+    With ``world_T_end`` the sensor moves during the turn and each point is in the frame of its own moment, as real ones are.
     """
     directions, ring, turn = beam_directions(model, columns or model.columns, sector)
     far = min(max_range or model.max_range, model.max_range)
-    rotation = world_T_lidar[:3, :3].astype(np.float32)
-    rays = directions @ rotation.T
-    origin = np.broadcast_to(world_T_lidar[:3, 3].astype(np.float32), rays.shape)
+    rays, origin = _rays(directions, turn, world_T_lidar, world_T_end)
     distance, triangle, normal = scene.cast(origin, rays)
     labels = np.where(triangle >= 0, scene.labels[triangle], 255).astype(np.uint8)
     if traffic is not None:
@@ -93,12 +94,21 @@ def full_sweep(
     cosine = np.abs(np.einsum("ij,ij->i", normal, ray)) / length
     # the echo weakens with the square of the range and with the cosine of incidence; weak ones are lost at random
     strength = np.clip(cosine, 0.02, 1) * (25.0 / np.maximum(distance, 5.0)) ** 2
-    end = world_T_lidar[:3, 3] + ray * distance[:, None]
+    end = origin[hit] + ray * distance[:, None]
     kept = rng.random(len(hit)) < 0.985 * (1 - np.exp(-9.0 * strength)) * np.where(_glass(end, labels), 0.35, 1.0)
     hit, distance, labels, cosine = hit[kept], distance[kept], labels[kept], cosine[kept]
     distance = distance + rng.normal(size=len(hit)) * model.noise * (1 + 0.5 * (1 - cosine))
     points = (directions[hit] * distance[:, None]).astype(np.float32)
     return Sweep(points, labels, ring[hit], turn[hit])
+
+
+def _rays(directions: F32, turn: F64, start: F64, end: F64 | None) -> tuple[F32, F32]:
+    """Directions and origins (n, 3) in the world for rays of a sensor that stands at ``start`` or moves from there to ``end``."""
+    if end is None:
+        return directions @ start[:3, :3].T.astype(np.float32), np.broadcast_to(start[:3, 3].astype(np.float32), directions.shape)
+    moments, inverse = np.unique(turn, return_inverse=True)
+    poses = interpolate(np.array([0, 10**9]), np.stack([start, end]), (moments * 1e9).astype(np.int64))[inverse].astype(np.float32)
+    return np.einsum("nij,nj->ni", poses[:, :3, :3], directions), np.ascontiguousarray(poses[:, :3, 3])
 
 
 def sweep(scene: Scene, world_T_lidar: F64, rng: np.random.Generator, model: LidarModel, **options: object) -> tuple[F32, U8]:
@@ -110,7 +120,8 @@ def sweep(scene: Scene, world_T_lidar: F64, rng: np.random.Generator, model: Lid
 def _glass(world_points: F64, labels: U8) -> NDArray[np.bool_]:
     """Which points (n, 3) lie on panes, that mostly give no echo: fixed patches of facades and of vehicles."""
     patch = _hash(np.floor(world_points / [1.1, 1.1, 1.3]).astype(np.int64)) % 100
-    return ((labels == BUILDING) & (patch < 14)) | ((labels >= CAR) & (labels <= CAR + 2) & (patch < 40))
+    pane: NDArray[np.bool_] = ((labels == BUILDING) & (patch < 14)) | ((labels >= CAR) & (labels <= CAR + 2) & (patch < 40))
+    return pane
 
 
 def _hash(cells: NDArray[np.int64], seed: int = 0) -> NDArray[np.int64]:

@@ -20,7 +20,7 @@ from semloc_logs.simulation.traffic import Traffic, random_traffic
 from semloc_logs.simulation.trajectory import poses_along, smooth_line
 from semloc_logs.simulation.world import F64, Scene, World
 
-TrainingFrame = tuple[NDArray[np.float32], F64, NDArray[np.uint8], F64]
+TrainingFrame = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], F64]
 RAYS = 60_000  # a sweep at most
 RANGE = 60.0  # m
 
@@ -36,7 +36,7 @@ class _Drive:
 def training_session(seed: int, frames: int = 60) -> Iterator[TrainingFrame]:
     """A drive of ``frames`` sweeps through a random street, or with every sixth seed a walk through a hall.
 
-    Yields (points (n, 3) float32 in the base frame, sensor origin (3,) in the base frame, labels (n,) uint8 Cityscapes train ids with
+    Yields (points (n, 3) float32 and sensor origin (3,) float32 in the base frame, labels (n,) uint8 Cityscapes train ids with
     255 = none, ``world_T_base`` (4, 4)). The base frame is on the ground under the vehicle, x ahead, z up. The second part of most drives
     comes back along the first in the other direction or in the same one; poses are true. The same arguments give the same frames.
     """
@@ -55,12 +55,12 @@ def _frames(
 ) -> Iterator[TrainingFrame]:
     base_T_lidar = np.eye(4)
     base_T_lidar[2, 3] = model.height
-    origin = base_T_lidar[:3, 3]
+    origin = base_T_lidar[:3, 3].astype(np.float32)
     scene = Scene(drive.world)
     for pose, seconds in zip(drive.world_T_base, drive.seconds, strict=True):
         moving = drive.traffic.scene(float(seconds), pose) if drive.traffic else None
         turn = full_sweep(scene, pose @ base_T_lidar, rng, model, columns=columns, max_range=RANGE, sector=sector, traffic=moving)
-        yield turn.points + origin.astype(np.float32), origin.copy(), turn.labels, pose
+        yield turn.points + origin, origin.copy(), turn.labels, pose
 
 
 def _network(rng: np.random.Generator, length: float) -> RoadNetwork:
@@ -73,7 +73,7 @@ def _network(rng: np.random.Generator, length: float) -> RoadNetwork:
 
 
 def _street(rng: np.random.Generator, seed: int, frames: int) -> _Drive:
-    spacing = rng.uniform(1.5, 3.0)
+    spacing = float(rng.uniform(1.5, 3.0))
     returning = rng.random() < 0.6
     once = int(np.ceil(frames * 0.6)) if returning else frames
     network = _network(rng, once * spacing)
@@ -81,19 +81,19 @@ def _street(rng: np.random.Generator, seed: int, frames: int) -> _Drive:
     line = smooth_line(lane_path(network, route))
     back = smooth_line(lane_path(network, [(road, not forwards) for road, forwards in route[::-1]]))
     ground = street_ground(network, seed)
-    poses = poses_along(line, 10 + spacing * np.arange(once), ground.slope_height, rng)
+    poses = poses_along(line, 10 + spacing * np.arange(once, dtype=np.float64), ground.slope_height, rng)
     if returning:
         opposite = rng.random() < 0.7
         other = back if opposite else line + rng.normal() * 0.7
         start = max(0.0, 0.5 * len(other) - once * spacing - 30) if opposite else 12.0 + rng.uniform(0, 20)
-        again = poses_along(other, start + spacing * np.arange(frames - once), ground.slope_height, rng)
+        again = poses_along(other, start + spacing * np.arange(frames - once, dtype=np.float64), ground.slope_height, rng)
         poses = np.concatenate([poses, again])
-    seconds = np.arange(frames) * spacing / rng.uniform(5, 10)
+    seconds = np.arange(frames, dtype=np.float64) * spacing / rng.uniform(5, 10)
     traffic = random_traffic(rng, ground, [line, back], float(rng.choice([0.0, 0.6, 1.5])))
     return _Drive(build_street(network, seed), poses, seconds, traffic)
 
 
 def _hall(rng: np.random.Generator, seed: int, frames: int) -> _Drive:
     line = smooth_line(hall_walk(seed, 0.7 * frames + 10), 0.8)
-    poses = poses_along(line, 1 + 0.7 * np.arange(frames), lambda x, y: np.zeros_like(x), rng, shake=0.01)
+    poses = poses_along(line, 1 + 0.7 * np.arange(frames, dtype=np.float64), lambda x, y: np.zeros_like(x), rng, shake=0.01)
     return _Drive(build_hall(seed), poses, np.arange(frames, dtype=np.float64), None)

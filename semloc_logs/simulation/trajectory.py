@@ -53,18 +53,39 @@ def _slope(height: Callable[[F64, F64], F64], position: F64, direction: F64, ste
     return (height(*ahead.T) - height(*behind.T)) / (2 * step)
 
 
+def drive(
+    line: F64, height: Callable[[F64, F64], F64], rng: np.random.Generator, *, start_ns: int, rate_hz: float = 20.0, speed: float = 7.0
+) -> Trajectory:
+    """A car drives all of a smooth line at about ``speed`` m/s, slower in bends; poses at ``rate_hz`` from ``start_ns`` on."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    tangent = np.gradient(line, along, axis=0)
+    bend = np.linalg.norm(gaussian_filter1d(np.gradient(tangent, along, axis=0), 4, axis=0), axis=1)
+    wander = gaussian_filter1d(rng.normal(size=len(along)), 60, mode="nearest") * 2.0
+    pace = np.clip(np.minimum(speed + wander, np.sqrt(1.8 / np.maximum(bend, 1e-3))), 2.0, 1.5 * speed)
+    pace = gaussian_filter1d(pace, 8, mode="nearest")
+    seconds = np.concatenate([[0.0], np.cumsum(np.diff(along) / pace[1:])])
+    at = np.arange(0.0, seconds[-1], 1.0 / rate_hz)
+    poses = poses_along(line, np.interp(at, seconds, along), height, rng)
+    stamps = start_ns + np.round(at * 1e9).astype(np.int64)
+    return Trajectory(stamps, poses, drifting_odometry(poses, rng))
+
+
 def drifting_odometry(world_T_base: F64, rng: np.random.Generator, drift: float = 0.007) -> F64:
-    """``odom_T_base`` (n, 4, 4) starting at identity: steps wrong at random and by a wandering bias, about ``drift`` of the way."""
+    """``odom_T_base`` (n, 4, 4) starting at identity, wrong by about ``drift`` of the way after some hundred metres.
+
+    The scale is wrong by a constant, the heading by a rate that wanders over 40 m, and every step by a little of its own.
+    """
     steps = inverse(world_T_base[:-1]) @ world_T_base[1:]
-    n = len(steps)
     length = np.linalg.norm(steps[:, :3, 3], axis=1, keepdims=True)
-    scale = 1 + drift * rng.normal() + drift * gaussian_filter1d(rng.normal(size=(n, 1)), 30, axis=0, mode="nearest") * 8
-    bias = gaussian_filter1d(rng.normal(size=(n, 3)), 40, axis=0, mode="nearest") * 10
-    turn = (0.02 * drift * bias + 0.01 * drift * rng.normal(size=(n, 3))) * length * [0.2, 0.2, 1.0]
+    way = np.cumsum(length)
+    nodes = np.arange(0.0, (way[-1] if len(way) else 0.0) + 2.0)
+    rate = gaussian_filter1d(rng.normal(size=(len(nodes), 3)), 40, axis=0, mode="nearest") * np.sqrt(2 * np.sqrt(np.pi) * 40)
+    bias = np.column_stack([np.interp(way, nodes, rate[:, k]) for k in range(3)]) * [0.15, 0.15, 1.0]
+    turn = 0.01 * drift * bias * length + 0.004 * drift * rng.normal(size=bias.shape) * np.sqrt(length)
     wrong = steps.copy()
-    wrong[:, :3, 3] = steps[:, :3, 3] * scale + rng.normal(size=(n, 3)) * 0.1 * drift * np.sqrt(length)
-    wrong[:, :3, :3] = Rotation.from_rotvec(turn).as_matrix() @ steps[:, :3, :3]
-    out = np.tile(np.eye(4), (n + 1, 1, 1))
-    for k in range(n):
-        out[k + 1] = out[k] @ wrong[k]
+    wrong[:, :3, 3] = steps[:, :3, 3] * (1 + 0.6 * drift * rng.normal()) + 0.3 * drift * rng.normal(size=bias.shape) * np.sqrt(length)
+    wrong[:, :3, :3] = steps[:, :3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+    out = np.tile(np.eye(4), (len(steps) + 1, 1, 1))
+    for k, step in enumerate(wrong):
+        out[k + 1] = out[k] @ step
     return out

@@ -1,0 +1,126 @@
+"""Whole simulated sessions in a folder: logs, true trajectories and the truth file of `semloc evaluate`."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from semloc_logs.errors import SemlocError, SettingsError
+from semloc_logs.simulation.drive import simulate_drive
+from semloc_logs.simulation.lidar import MODELS
+from semloc_logs.simulation.log import FORMATS, write_session, write_truth
+from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, random_route
+from semloc_logs.simulation.street import build_street, street_ground
+from semloc_logs.simulation.traffic import random_traffic
+from semloc_logs.simulation.trajectory import drive, smooth_line
+from semloc_logs.simulation.world import F64
+
+_BLOCK = 85.0  # m between crossings
+_START_NS = 1_760_000_000_000_000_000
+_DAY_NS = 86_400_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """A session to simulate: file name, driven lane line (n, 2) and the number of its conditions."""
+
+    file: str
+    line: F64
+    condition: int
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """The lidar by its name in ``lidar.MODELS``, sweeps a second, columns a turn (None: the model's own), share of wrong labels."""
+
+    name: str = "hdl32"
+    rate_hz: float = 2.0
+    columns: int | None = None
+    label_noise: float = 0.0
+
+
+def simulate_sessions(
+    directory: Path | str,
+    *,
+    seed: int = 0,
+    sessions: int = 2,
+    length_m: float = 500.0,
+    sensor: str = "hdl32",
+    rate_hz: float = 2.0,
+    format: str = "mcap",
+    label_noise: float = 0.0,
+    overwrite: bool = False,
+) -> Path:
+    """Drive ``sessions`` times about ``length_m`` metres through one random town, each time by another route; the path of truth.json.
+
+    Between sessions parked cars, people and a few trees change. ``sensor`` is a name in ``lidar.MODELS``, ``format`` ``mcap`` or ``bag``.
+    SettingsError for impossible values, SemlocError when the files are there already and ``overwrite`` is false.
+    """
+    if sessions < 1:
+        raise SettingsError(f"{sessions} sessions cannot be simulated: give at least 1")
+    if not (math.isfinite(length_m) and 50 <= length_m <= 100_000):
+        raise SettingsError(f"a simulated session cannot be {length_m} m long: give between 50 and 100000 m")
+    if format not in FORMATS:
+        raise SettingsError(f"logs cannot be simulated as {format!r}: choose one of {', '.join(FORMATS)}")
+    side = max(2, math.ceil(math.sqrt(length_m / _BLOCK / 2.5)))
+    network = grid_network(np.random.default_rng([seed, 61]), side, side + int(side < 3), _BLOCK)
+    planned = []
+    for k in range(sessions):
+        route = random_route(np.random.default_rng([seed, 62, k]), network, length_m + 30)
+        line = smooth_line(lane_path(network, route))
+        planned.append(Session(f"session_{k}{FORMATS[format]}", line[: int(length_m / 0.5)], k))
+    return write_sessions(directory, network, planned, seed=seed, sensor=Sensor(sensor, rate_hz, None, label_noise), overwrite=overwrite)
+
+
+def write_sessions(
+    directory: Path | str, network: RoadNetwork, sessions: Sequence[Session], *, seed: int, sensor: Sensor, overwrite: bool = False
+) -> Path:
+    """Simulate and write the sessions, their trajectories (.tum) and, last of all, truth.json; its path."""
+    if sensor.name not in MODELS:
+        raise SettingsError(f"there is no simulated sensor {sensor.name!r}: choose one of {', '.join(MODELS)}")
+    if not 0.05 <= sensor.rate_hz <= 10:
+        raise SettingsError(f"a simulated lidar cannot turn {sensor.rate_hz} times a second: give between 0.05 and 10 Hz")
+    if not 0 <= sensor.label_noise <= 1:
+        raise SettingsError(f"a share of {sensor.label_noise} wrong labels is impossible: give between 0 and 1")
+    folder = Path(directory)
+    truth = folder / "truth.json"
+    there = [p.name for p in (truth, *(folder / s.file for s in sessions)) if p.exists()]
+    if there and not overwrite:
+        raise SemlocError(f"{folder} already has {there[0]}: choose another folder or overwrite it")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        truth.unlink(missing_ok=True)
+    except OSError as error:
+        raise SemlocError(f"{folder} cannot be written ({error.strerror}): choose another folder") from error
+    for session in sessions:
+        _write(folder, network, session, seed, sensor)
+    entries = {s.file: {"trajectory": Path(s.file).with_suffix(".tum").name} for s in sessions}
+    part = truth.with_suffix(".part")
+    part.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
+    part.replace(truth)
+    return truth
+
+
+def _write(folder: Path, network: RoadNetwork, session: Session, seed: int, sensor: Sensor) -> None:
+    rng = np.random.default_rng([seed, 63, session.condition])
+    ground = street_ground(network, seed)
+    start_ns = _START_NS + session.condition * _DAY_NS
+    trajectory = drive(session.line, ground.slope_height, rng, start_ns=start_ns, speed=float(rng.uniform(6, 8)))
+    traffic = random_traffic(rng, ground, [session.line], 0.4)
+    frames = simulate_drive(
+        build_street(network, seed, session.condition),
+        trajectory,
+        MODELS[sensor.name],
+        rate_hz=sensor.rate_hz,
+        seed=seed + session.condition,
+        columns=sensor.columns,
+        traffic=traffic,
+        label_noise=sensor.label_noise,
+    )
+    write_session(folder / session.file, trajectory, frames)
+    write_truth((folder / session.file).with_suffix(".tum"), trajectory)
