@@ -137,11 +137,17 @@ class BasePoses:
             return np.eye(4)
         return self.tree.lookup(self.base.name, frame_id, stamp_ns)
 
-    def has_passed(self, stamp_ns: int) -> bool:
+    def poses_have_passed(self, stamp_ns: int) -> bool:
         """Whether the poses reach beyond ``stamp_ns``, or there is nothing to wait for."""
         if self.base is None or self.base.pose_frame is None:
             return self.base is not None
         return self.track.end_ns is not None and self.track.end_ns >= stamp_ns
+
+    def transforms_have_passed(self, frame_id: str, stamp_ns: int) -> bool:
+        """Whether :meth:`base_T` has its final answer."""
+        if self.base is None:
+            return False
+        return frame_name(frame_id) == self.base.assumed or self.tree.has_passed(self.base.name, frame_id, stamp_ns)
 
     def _pose_edge(self, sensors: Sequence[str]) -> Edge | None:
         frames = [*sensors, BASE_LINK, "base_footprint"]
@@ -161,9 +167,10 @@ class BasePoses:
             return
         while self._raw:
             stamp_ns, pose = self._raw[0]
-            child_T_base = self.tree.lookup(base.pose_frame, base.name, stamp_ns)
-            if child_T_base is None and not is_end and self._raw[-1][0] - stamp_ns < _LATE_TF_NS:
+            is_late = is_end or self._raw[-1][0] - stamp_ns >= _LATE_TF_NS
+            if not is_late and not self.tree.has_passed(base.pose_frame, base.name, stamp_ns):
                 return
+            child_T_base = self.tree.lookup(base.pose_frame, base.name, stamp_ns)
             self._raw.popleft()
             if child_T_base is not None:
                 self.track.append(stamp_ns, pose @ child_T_base)

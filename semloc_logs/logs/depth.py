@@ -18,7 +18,7 @@ _LABELS_KEPT = 80  # more than the depth images that may wait for their pose
 
 
 class Unprojector:
-    """Viewing rays of a depth camera, computed once and used for every image of ``shape`` (h, w).
+    """Viewing rays of a depth camera, computed once and used for every image of that height and width.
 
     ``rectified``: the picture is undistorted, so the projection matrix P holds, not K and D. ``stride`` None thins images of more than
     200,000 pixels. LogError when the calibration cannot be used.
@@ -36,7 +36,7 @@ class Unprojector:
             matrix, distortion = camera.P[:, :3], np.zeros(0)
         if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
             raise LogError(f"{where} has no focal length: the camera is not calibrated; name another with --topic camera_info=TOPIC.")
-        self.shape = (height, width)
+        self._width = width
         self.step = stride or (2 if height * width > DENSE_PIXELS else 1)
         rows, columns = np.mgrid[0 : height : self.step, 0 : width : self.step]
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
@@ -50,8 +50,8 @@ class Unprojector:
         with np.errstate(invalid="ignore"):
             distance = z * self._lengths
             kept = np.flatnonzero((z > 0) & (distance >= min_range) & (distance <= max_range))
-        columns = -(-self.shape[1] // self.step)
-        pixels = kept // columns * self.step * self.shape[1] + kept % columns * self.step
+        columns = -(-self._width // self.step)
+        pixels = kept // columns * self.step * self._width + kept % columns * self.step
         return self._rays[kept] * z[kept, None], pixels
 
 
@@ -107,7 +107,7 @@ class DepthClouds:
         self._roles = roles
         self._stride = stride
         self._labels: dict[str, deque[DepthFrame | ImageFrame]] = {}
-        self._unprojectors: dict[str, tuple[Camera, Unprojector | None]] = {}
+        self._unprojectors: dict[str, tuple[Camera, tuple[int, ...], Unprojector | None]] = {}
 
     def take_label(self, frame: DepthFrame | ImageFrame) -> None:
         """Remembers a frame of a label topic."""
@@ -137,15 +137,15 @@ class DepthClouds:
 
     def _unprojector(self, topic: str, camera: Camera, shape: tuple[int, ...]) -> Unprojector | None:
         known = self._unprojectors.get(topic)
-        if known is not None and _same_calibration(known[0], camera) and (known[1] is None or known[1].shape == shape):
-            return known[1]
+        if known is not None and _same_calibration(known[0], camera) and known[1] == shape:
+            return known[2]
         unprojector = None
         try:
             is_rectified = "rect" in topic
             unprojector = Unprojector(camera, shape[0], shape[1], rectified=is_rectified, stride=self._stride)
         except LogError as error:
             self.lost.setdefault(str(error))
-        self._unprojectors[topic] = (camera, unprojector)
+        self._unprojectors[topic] = (camera, shape, unprojector)
         return unprojector
 
     def _label(self, frame: DepthFrame | ImageFrame, shape: tuple[int, ...]) -> NDArray[np.uint32] | None:

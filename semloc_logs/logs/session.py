@@ -250,7 +250,7 @@ class Session:
                 return
             frame = self._waiting.popleft()
             self._waiting_bytes -= _size(frame)
-            cloud = self._cloud(frame)
+            cloud = self._cloud(frame, is_end=is_end)
             if isinstance(cloud, str):
                 self._tally.leave_out(frame.header.topic, cloud)
             else:
@@ -268,9 +268,10 @@ class Session:
             return False
         if not isinstance(frame, LidarFrame) and not self._depth.has_all(frame):
             return False
-        return self._where.has_passed(stamp_ns + _sweep_ns(frame)) and self._where.base_T(frame.header.frame_id, stamp_ns) is not None
+        where = self._where
+        return where.poses_have_passed(stamp_ns + _sweep_ns(frame)) and where.transforms_have_passed(frame.header.frame_id, stamp_ns)
 
-    def _cloud(self, frame: RangeFrame) -> PosedCloud | str:
+    def _cloud(self, frame: RangeFrame, *, is_end: bool) -> PosedCloud | str:
         """The cloud of a frame, or the reason why there is none."""
         header, base = frame.header, self._where.base
         if base is None:
@@ -278,7 +279,9 @@ class Session:
         base_T_sensor = self._where.base_T(header.frame_id, header.stamp_ns)
         if base_T_sensor is None:
             return "no transform"
-        pose = None if base.pose_frame is None else self._where.track.at(header.stamp_ns)
+        # before the poses have come so far, nobody knows whether the frame lies in a gap: the nearest pose serves at the end only
+        is_known = base.pose_frame is not None and (is_end or self._where.poses_have_passed(header.stamp_ns))
+        pose = self._where.track.at(header.stamp_ns) if is_known else None
         if base.pose_frame is not None and pose is None:
             return "no pose"
         if isinstance(frame, LidarFrame):

@@ -64,9 +64,8 @@ def never_moves(topic: str, track: PoseTrack) -> list[str]:
     start_ns, end_ns = track.start_ns, track.end_ns
     if start_ns is None or end_ns is None or end_ns - start_ns < _STANDSTILL_NS or track.length() > 0.0:
         return []
-    return [
-        f"{topic} gives the same position for {(end_ns - start_ns) * 1e-9:.0f} s: name another with --topic pose=TOPIC if the vehicle moved."
-    ]
+    seconds = (end_ns - start_ns) * 1e-9
+    return [f"{topic} gives the same position for {seconds:.0f} s: name another with --topic pose=TOPIC if the vehicle moved."]
 
 
 def without_unused(problems: Sequence[str], unused: Collection[str]) -> list[str]:

@@ -89,6 +89,13 @@ class TransformTree:
             result = result @ step
         return result
 
+    def has_passed(self, target: str, source: str, stamp_ns: int) -> bool:
+        """Whether the frames are connected and all dynamic edges between them have reached ``stamp_ns``: a lookup will not change."""
+        path = self._path(frame_name(target), frame_name(source))
+        edges = [] if path is None else [edge for a, b in pairwise(path) for edge in ((a, b), (b, a))]
+        ends = [self._moving[edge].end_ns for edge in edges if edge in self._moving]
+        return path is not None and all(end is not None and end >= stamp_ns for end in ends)
+
     def track(self, parent: str, child: str) -> PoseTrack | None:
         """The remembered history of a dynamic edge."""
         return self._moving.get((frame_name(parent), frame_name(child)))

@@ -1,0 +1,141 @@
+"""Pose streams: interpolation, gaps, refused samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+
+from semloc_logs.frames import Header, PoseSample
+from semloc_logs.geometry import Array, yaw_transform
+from semloc_logs.logs.poses import PoseTrack
+
+S = 1_000_000_000
+EPOCH = 1_700_000_000 * S
+
+
+def track(*seconds: float, max_gap: float = 1.0) -> PoseTrack:
+    """A vehicle at 2 m/s along x."""
+    made = PoseTrack(max_gap)
+    for t in seconds:
+        made.append(EPOCH + round(t * S), yaw_transform(0.1 * t, (2.0 * t, 0.0, 0.0)))
+    return made
+
+
+def at(poses: PoseTrack, seconds: float) -> Array | None:
+    return poses.at(EPOCH + round(seconds * S))
+
+
+def test_interpolates_between_two_poses() -> None:
+    pose = at(track(0.0, 0.5, 1.0), 0.75)
+    assert pose is not None
+    np.testing.assert_allclose(pose, yaw_transform(0.075, (1.5, 0.0, 0.0)), atol=1e-9)
+
+
+def test_exact_stamps_give_the_recorded_pose_even_beside_a_gap() -> None:
+    poses = track(0.0, 0.1, 9.0)
+    for t in (0.1, 9.0):
+        pose = at(poses, t)
+        assert pose is not None
+        assert pose[0, 3] == pytest.approx(2.0 * t)
+
+
+def test_gap_and_outside_are_unknown() -> None:
+    poses = track(*np.arange(0, 1.01, 0.1), 5.0, 5.1)
+    assert at(poses, 3.0) is None
+    assert at(poses, -0.11) is None
+    assert at(poses, 5.21) is None
+    before = at(poses, -0.09)
+    assert before is not None
+    assert before[0, 3] == 0.0
+
+
+def test_one_pose_serves_a_tenth_of_a_second() -> None:
+    poses = track(1.0)
+    assert at(poses, 1.09) is not None
+    assert at(poses, 0.91) is not None
+    assert at(poses, 1.11) is None
+
+
+def test_gap_is_judged_by_the_period_of_a_slow_stream() -> None:
+    slow = track(*np.arange(0, 20, 0.5), 21.0)  # 2 Hz, then 1.5 s of nothing
+    assert slow.gap_limit_ns() == 3 * S // 2
+    assert at(slow, 20.2) is not None
+    fast = track(*np.arange(0, 20, 0.1), 21.4)
+    assert fast.gap_limit_ns() == S
+    assert at(fast, 20.5) is None
+    very_slow = track(*np.arange(0, 100, 10))
+    assert at(very_slow, 5.0) is None  # nobody interpolates over ten seconds
+
+
+def test_duplicates_jumps_back_and_nonsense_are_counted() -> None:
+    poses = track(0.0, 0.5)
+    assert not poses.append(EPOCH + S // 2, np.eye(4))
+    assert not poses.append(EPOCH, np.eye(4))
+    assert not poses.append(EPOCH + S, np.full((4, 4), np.nan))
+    assert not poses.append(EPOCH + S, np.diag([2.0, 1.0, 1.0, 1.0]))
+    assert (poses.duplicates, poses.backwards, poses.invalid, len(poses)) == (1, 1, 2, 2)
+    assert np.all(np.diff(poses.stamps_ns) > 0)
+
+
+def test_samples_are_taken_at_their_header_stamp() -> None:
+    poses = PoseTrack()
+    assert poses.add(PoseSample(Header("/odom", 5, 9, "odom"), "base_link", yaw_transform(0.0, (1.0, 2.0, 3.0))))
+    assert poses.start_ns == poses.end_ns == 5
+
+
+def test_grows_and_forgets() -> None:
+    poses = PoseTrack(keep_seconds=2.0)
+    for k in range(5000):
+        poses.append(EPOCH + k * S // 100, yaw_transform(0.0, (k * 0.01, 0.0, 0.0)))
+    assert 200 <= len(poses) <= 800
+    assert poses.end_ns == EPOCH + 4999 * S // 100
+    pose = poses.at(EPOCH + 4998 * S // 100 + S // 200)
+    assert pose is not None
+    assert pose[0, 3] == pytest.approx(49.985)
+    assert poses.at(EPOCH) is None
+
+
+def test_length_and_gaps() -> None:
+    poses = track(*np.arange(0, 1.01, 0.1), 5.0, 5.5)
+    assert poses.gaps() == [(EPOCH + S, EPOCH + 5 * S)]
+    assert poses.length() == pytest.approx(2.0 + 1.0)
+    told = poses.to_json()
+    assert told["count"] == 13
+    assert told["length_m"] == 3.0
+
+
+def test_an_empty_track_knows_nothing() -> None:
+    poses = PoseTrack()
+    assert poses.at(0) is None
+    assert poses.gaps() == []
+    assert poses.length() == 0.0
+    assert poses.poses.shape == (0, 4, 4)
+
+
+@given(st.lists(st.integers(0, 4000), min_size=2, max_size=30, unique=True), st.lists(st.integers(-300, 4300), min_size=1, max_size=20))
+def test_agrees_with_a_slow_version(milliseconds: list[int], asked: list[int]) -> None:
+    stamps = np.sort(np.array(milliseconds)) * 1_000_000 + EPOCH
+    rng = np.random.default_rng(len(milliseconds))
+    rotations = Rotation.random(len(stamps), random_state=rng)
+    positions = rng.normal(size=(len(stamps), 3))
+    poses = PoseTrack()
+    for stamp, rotation, position in zip(stamps.tolist(), rotations.as_matrix(), positions, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, position
+        assert poses.append(stamp, pose)
+    limit = poses.gap_limit_ns()
+    for ms in asked:
+        t = ms * 1_000_000 + EPOCH
+        found = poses.at(t)
+        inside = int(np.clip(t, stamps[0], stamps[-1]))
+        k = max(int(np.searchsorted(stamps, inside)), 1)
+        is_exact = inside in stamps
+        is_known = abs(t - inside) <= 100_000_000 and (is_exact or stamps[k] - stamps[k - 1] <= limit)
+        assert (found is not None) == is_known
+        if found is not None:
+            w = (inside - stamps[k - 1]) / (stamps[k] - stamps[k - 1])
+            np.testing.assert_allclose(found[:3, 3], (1 - w) * positions[k - 1] + w * positions[k], atol=1e-9)
+            np.testing.assert_allclose(found[:3, :3], Slerp([0, 1], rotations[k - 1 : k + 1])(w).as_matrix(), atol=1e-7)

@@ -1,0 +1,159 @@
+"""Roles by type and name, overrides, ambiguity."""
+
+from __future__ import annotations
+
+import pytest
+
+from semloc_logs.errors import RoleError
+from semloc_logs.logs.log import Stream
+from semloc_logs.logs.roles import Roles, find_roles, guess_roles
+
+CLOUD, IMAGE, JPEG, INFO = (
+    "sensor_msgs/msg/PointCloud2",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/CameraInfo",
+)
+ODOM, POSE, POSE_COV = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+TF, IMU, FIX = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
+
+
+def log(topics: dict[str, str]) -> list[Stream]:
+    return [Stream(topic, kind, "cdr", 10) for topic, kind in sorted(topics.items())]
+
+
+def roles(topics: dict[str, str], **overrides: str) -> Roles:
+    return find_roles(log(topics), overrides)
+
+
+def test_a_car_with_everything() -> None:
+    found = roles(
+        {
+            "/lidar_top/points": CLOUD, "/lidar_rear/points": CLOUD, "/map": CLOUD, "/odometry": ODOM, "/tf": TF, "/tf_static": TF,
+            "/imu/data": IMU, "/imu/data_raw": IMU, "/fix": FIX, "/cam_front/image_raw/compressed": JPEG, "/cam_front/camera_info": INFO,
+            "/cam_back/image_raw/compressed": JPEG, "/cam_back/camera_info": INFO, "/rosout": "rosgraph_msgs/msg/Log",
+        }
+    )  # fmt: skip
+    assert found.lidar == ("/lidar_rear/points", "/lidar_top/points")
+    assert (found.pose, found.imu, found.gnss) == ("/odometry", "/imu/data", "/fix")
+    assert (found.tf, found.tf_static) == (("/tf",), ("/tf_static",))
+    assert found.info_of["/cam_back/image_raw/compressed"] == "/cam_back/camera_info"
+    assert found.role_of("/rosout") is None
+    assert found.role_of("/map") is None
+    assert any("--topic lidar=/map" in note for note in found.notes)
+
+
+def test_depth_camera_with_both_infos_and_a_posestamped() -> None:
+    found = roles(
+        {
+            "/camera/pose": POSE, "/camera/color/image/compressed": JPEG, "/camera/depth/image/compressedDepth": JPEG,
+            "/camera/color/camera_info": INFO, "/camera/depth/camera_info": INFO, "/camera/depth/points": CLOUD,
+        }
+    )  # fmt: skip
+    assert found.depth == ("/camera/depth/image/compressedDepth",)
+    assert found.image == ("/camera/color/image/compressed",)
+    assert found.info_of[found.depth[0]] == "/camera/depth/camera_info"
+    assert found.info_of[found.image[0]] == "/camera/color/camera_info"
+    assert found.pose == "/camera/pose"
+    assert found.lidar == ()  # the depth image once more
+
+
+def test_the_same_picture_through_two_transports_counts_once() -> None:
+    found = roles({"/d/depth": IMAGE, "/d/depth/compressedDepth": JPEG, "/d/rgb/image_raw": IMAGE, "/d/rgb/image_raw/compressed": JPEG})
+    assert found.depth == ("/d/depth",)
+    assert found.image == ("/d/rgb/image_raw",)
+
+
+@pytest.mark.parametrize(
+    ("labelled", "expected"), [(False, "/camera/depth/image_rect_raw"), (True, "/camera/aligned_depth_to_color/image_raw")]
+)
+def test_one_depth_stream_for_each_camera(labelled: bool, expected: str) -> None:
+    topics = {"/camera/depth/image_rect_raw": IMAGE, "/camera/aligned_depth_to_color/image_raw": IMAGE}
+    if labelled:
+        topics["/camera/color/labels"] = IMAGE
+    found = roles(topics)
+    assert found.depth == (expected,)
+    assert found.label_image == (("/camera/color/labels",) if labelled else ())
+
+
+def test_label_images_but_not_their_coloured_version() -> None:
+    found = roles({"/unet/raw_segmentation_mask": IMAGE, "/unet/colored_segmentation_mask": IMAGE, "/depth/image": IMAGE})
+    assert found.label_image == ("/unet/raw_segmentation_mask",)
+    assert found.label_of == {"/depth/image": "/unet/raw_segmentation_mask"}
+
+
+def test_stereo_pairs() -> None:
+    found = roles({"/cam0/image_raw": IMAGE, "/cam1/image_raw": IMAGE, "/cam0/camera_info": INFO, "/cam1/camera_info": INFO})
+    assert (found.stereo_left, found.stereo_right) == ("/cam0/image_raw", "/cam1/image_raw")
+    assert found.info_of["/cam1/image_raw"] == "/cam1/camera_info"
+    assert found.role_of("/cam0/image_raw") == "stereo_left"
+    assert roles({"/left/image": IMAGE, "/other/image": IMAGE}).stereo_left is None
+
+
+@pytest.mark.parametrize(
+    ("topics", "expected"),
+    [
+        ({"/a": POSE, "/b": ODOM}, "/b"),
+        ({"/amcl_pose": POSE_COV, "/pose": POSE}, "/amcl_pose"),
+        ({"/wheel/odom": ODOM, "/odom": ODOM}, "/odom"),
+        ({"/odometry/filtered": ODOM, "/odom": ODOM}, "/odometry/filtered"),
+        ({"/ground_truth/odometry": ODOM}, "/ground_truth/odometry"),
+        ({"/move_base/goal": POSE, "/pose": POSE}, "/pose"),
+        ({"/semloc/pose": POSE_COV, "/camera/pose": POSE}, "/camera/pose"),
+        ({"/semloc/pose": POSE_COV}, None),
+        ({"/vrpn/pose": POSE, "/camera/pose": POSE, "/camera/depth/image": IMAGE}, "/camera/pose"),
+        ({"/ego": "foxglove.PoseInFrame", "/tf": "foxglove.FrameTransform"}, "/ego"),
+    ],
+)
+def test_which_pose(topics: dict[str, str], expected: str | None) -> None:
+    assert roles(topics).pose == expected
+
+
+def test_two_equal_poses_are_for_the_user_to_choose() -> None:
+    topics = {"/a/odom": ODOM, "/b/odom": ODOM}
+    with pytest.raises(RoleError, match="--topic pose=/a/odom or --topic pose=/b/odom"):
+        roles(topics)
+    guessed = guess_roles(log(topics))
+    assert guessed.pose is None
+    assert len(guessed.problems) == 1
+    assert roles(topics, pose="/b/odom").pose == "/b/odom"
+    assert roles(topics, pose="b/odom").pose == "/b/odom"
+    assert roles(topics, pose="none").pose is None
+
+
+def test_overrides_that_cannot_be() -> None:
+    topics = {"/points": CLOUD, "/odom": ODOM}
+    with pytest.raises(RoleError, match=r"no role 'laser'.*lidar, depth"):
+        roles(topics, laser="/points")
+    with pytest.raises(RoleError, match=r"no topic '/pionts'.*/odom \(nav_msgs/msg/Odometry\), /points"):
+        roles(topics, lidar="/pionts")
+    with pytest.raises(RoleError, match="Odometry cannot be the lidar"):
+        roles(topics, lidar="/odom")
+    with pytest.raises(RoleError, match="takes one topic"):
+        roles(topics | {"/odom2": ODOM}, pose="/odom,/odom2")
+
+
+def test_an_override_takes_the_topic_from_its_guessed_role() -> None:
+    topics = {"/front/depth": IMAGE, "/front/camera_info": INFO, "/x": IMAGE, "/a": CLOUD, "/b": CLOUD}
+    found = roles(topics, label_image="/x", lidar="/b,/a")
+    assert found.label_image == ("/x",)
+    assert found.image == ()
+    assert found.lidar == ("/b", "/a")
+    assert found.label_of == {"/front/depth": "/x"}
+
+
+def test_streams_without_messages_play_no_role() -> None:
+    assert find_roles([Stream("/odom", ODOM, "cdr", 0), Stream("/pose", POSE, "cdr", 4)]).pose == "/pose"
+
+
+def test_foxglove_types() -> None:
+    found = roles(
+        {
+            "/lidar": "foxglove.PointCloud", "/cam": "foxglove.CompressedImage", "/cam_calibration": "foxglove.CameraCalibration",
+            "/tf": "foxglove.FrameTransforms", "/gps": "foxglove.LocationFix",
+        }
+    )  # fmt: skip
+    assert found.to_json() == {
+        "lidar": ["/lidar"], "image": ["/cam"], "camera_info": ["/cam_calibration"], "tf": ["/tf"], "gnss": ["/gps"],
+    }  # fmt: skip
+    assert found.info_of == {"/cam": "/cam_calibration"}
