@@ -50,6 +50,8 @@ class Layout:
 
 def decode_points(data: bytes | memoryview, layout: Layout, fields: Sequence[Field], stamp_ns: int) -> Points:
     """Points whose position is finite and not exactly zero. UndecodableError when the layout does not fit the data."""
+    if layout.width == 0 or layout.height == 0:
+        return Points(np.empty((0, 3), np.float32), None, None, None)  # its fields may be missing too
     rows = _rows(data, layout, fields)
     columns = {name.lower(): name for name in reversed(rows.dtype.names or ())}
     for axis in "xyz":
@@ -99,8 +101,6 @@ def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> 
             "itemsize": max(step, 1),
         }
     )
-    if width == 0 or height == 0:
-        return np.empty((0, 0), dtype)
     needed = (height - 1) * row + width * step
     if step <= 0 or needed > len(data):
         raise UndecodableError(f"{width} x {height} points of {step} bytes need {needed} bytes, but it has {len(data)}")
@@ -115,7 +115,7 @@ def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64] | 
     """
     if time.size == 0:
         return np.zeros(0, np.int64)
-    low, high = time.min().item(), time.max().item()  # type: ignore[attr-defined]
+    low, high = time.min().item(), time.max().item()
     if not (np.isfinite(low) and np.isfinite(high)):
         return None
     units = (1, 1_000, 1_000_000, 1_000_000_000) if time.dtype.kind in "iu" else (1_000_000_000, 1_000_000, 1_000, 1)

@@ -56,7 +56,7 @@ class Decoder:
             reason = str(error)
         except _BAD_VALUES as error:
             reason = f"its values make no sense ({type(error).__name__}: {str(error)[:120]})"
-        self._problems.skip(message.topic, f"{message.type} at log time {message.log_time_ns} ns: {reason}")
+        self._problems.skip("decoding", message.topic, f"{message.type} at log time {message.log_time_ns} ns: {reason}")
         return []
 
     def _parse(self, message: Message) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -20,6 +21,7 @@ from semloc_logs.logs.names import ros2_type
 Parser = Callable[[bytes | memoryview], Any]
 _MAX_TEXT = 1 << 20  # a definition with all that it depends on has some kilobytes
 _MAX_ARRAY = 4096  # fixed arrays of strings or messages are unrolled into code
+_IDL_NOISE = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/|^[ \t]*#[^\n]*', re.DOTALL | re.MULTILINE)  # texts, comments, includes
 _IDL_SEPARATOR = "=" * 80 + "\n"
 
 
@@ -91,6 +93,9 @@ def _idl_types(text: str) -> dict[str, Any]:
     types: dict[str, Any] = {}
     for section in text.split(_IDL_SEPARATOR):
         body = section.partition("\n")[2] if section.startswith("IDL: ") else section
+        body = _IDL_NOISE.sub(lambda found: '""' if found[0][0] == '"' else " ", body)
+        if "<<" in body or "*" in body:  # constants are computed by the parser, and a few lines could ask for a number without end
+            raise UndecodableError("its definition computes constants, which is not supported")
         if body.strip():
             types.update(get_types_from_idl(body))
     return types

@@ -19,6 +19,7 @@ from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
 from semloc_logs.errors import LogError
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.names import ros2_type
+from semloc_logs.logs.problems import Problems
 from semloc_logs.logs.reading import BaseLog, decompress, encoding_of, in_log_time_order, read_exactly
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -44,8 +45,8 @@ class Part(NamedTuple):
 class McapLog(BaseLog):
     """An MCAP file of any profile. LogError unless it starts as one."""
 
-    def __init__(self, path: Path, name: str = "") -> None:
-        super().__init__(path, "mcap")
+    def __init__(self, path: Path, name: str = "", problems: Problems | None = None) -> None:
+        super().__init__(path, "mcap", problems)
         self._name = name or path.name
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -170,7 +171,7 @@ class McapLog(BaseLog):
             closed = opcode in (Opcode.DATA_END, Opcode.FOOTER)
             position = end
         self._parts += loose
-        if not closed:
+        if not closed or read_exactly(self._file, self._size - len(MAGIC), len(MAGIC), self._size) != MAGIC:
             self._problems.add(
                 f"{self._name}: the file is damaged or cut off at byte {position} of {self._size}; "
                 f"the {sum(counts.values())} messages before it are used."

@@ -24,14 +24,14 @@ _STEP = 1 << 22
 class BaseLog:
     """The parts of :class:`~semloc_logs.logs.log.Log` that do not depend on the container."""
 
-    def __init__(self, path: Path, format: str) -> None:
+    def __init__(self, path: Path, format: str, problems: Problems | None = None) -> None:
         self.path = path
         self.format = format
         self.encoding = ""
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         self.streams: list[Stream] = []
-        self._problems = Problems()
+        self._problems = Problems() if problems is None else problems
         self._decoder = Decoder(self._problems)
 
     @property
@@ -45,7 +45,7 @@ class BaseLog:
 
     def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
         """The decoded messages of ``topics`` in log-time order."""
-        self._problems.forget_skipped(topics)
+        self._problems.forget_skipped("decoding", topics)
         for message in self.messages(topics):
             yield from self._decoder.frames(message)
 

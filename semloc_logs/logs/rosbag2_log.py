@@ -37,12 +37,6 @@ class Rosbag2Log(BaseLog):
             self.close()
             raise
 
-    @property
-    def problems(self) -> list[str]:
-        """What was skipped and why, in sentences."""
-        every = [*self._problems.sentences(), *(p for file in self._files for p in file.problems)]
-        return list(dict.fromkeys(every))  # splits of one bag often share a problem
-
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` (None: of all) of all files in log-time order."""
         parts = [(f.start_ns, partial(self._load, f, topics)) for f in self._files if f.start_ns is not None]
@@ -144,8 +138,8 @@ class Rosbag2Log(BaseLog):
             with path.open("rb") as file:
                 head = file.read(16)
         if head.startswith(b"SQLite format 3\0"):
-            return SqliteLog(path, name)
-        return McapLog(path, name)
+            return SqliteLog(path, name, self._problems)
+        return McapLog(path, name, self._problems)
 
     def _unpack(self, path: Path) -> Path:
         """A decompressed copy in a temporary folder that lives as long as this log."""

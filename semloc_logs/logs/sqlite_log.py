@@ -16,6 +16,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.definitions import is_standard
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.names import ros2_type
+from semloc_logs.logs.problems import Problems
 from semloc_logs.logs.reading import MAX_CHUNK, BaseLog, decompress
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message starts like this
@@ -24,8 +25,8 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message starts like this
 class SqliteLog(BaseLog):
     """A ``.db3`` file. LogError unless it holds the tables of rosbag2."""
 
-    def __init__(self, path: Path, name: str = "") -> None:
-        super().__init__(path, "rosbag2")
+    def __init__(self, path: Path, name: str = "", problems: Problems | None = None) -> None:
+        super().__init__(path, "rosbag2", problems)
         self._name = name or path.name
         self._damaged = False
         self._topics: dict[int, tuple[str, str, str, Definition]] = {}
@@ -45,19 +46,21 @@ class SqliteLog(BaseLog):
         wanted = [i for i, (topic, *_) in self._topics.items() if topics is None or topic in topics]
         if not wanted:
             return
+        stage = f"reading {self._name}"
+        self._problems.forget_skipped(stage, topics)
         read = 0
         try:
             for topic_id, log_time, data in self._rows(wanted):
                 topic, type_, encoding, definition = self._topics[topic_id]
                 read += 1
                 if not isinstance(data, bytes) or not isinstance(log_time, int):
-                    self._problems.skip(topic, f"row {read} of {self._name} holds no bytes or no time")
+                    self._problems.skip(stage, topic, f"row {read} of {self._name} holds no bytes or no time")
                     continue
                 if data.startswith(ZSTD_MAGIC):
                     try:
                         data = _decompress(data)
                     except LogError as error:
-                        self._problems.skip(topic, f"at {log_time} ns {error}")
+                        self._problems.skip(stage, topic, f"at {log_time} ns {error}")
                         continue
                 yield Message(topic, type_, encoding, log_time, data, definition)
         except (sqlite3.Error, OverflowError, MemoryError) as error:

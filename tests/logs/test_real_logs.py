@@ -1,0 +1,112 @@
+"""Logs recorded by others, where they are at hand."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semloc_logs.errors import LogError
+from semloc_logs.frames import DepthFrame, LidarFrame
+from semloc_logs.logs.log import Log
+from semloc_logs.logs.open import open_log
+
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+ODD = SHARED / "odd_logs"
+pytestmark = pytest.mark.skipif(not SHARED.is_dir(), reason="no folder shared beside the checkout")
+
+
+def frames(log: Log) -> Counter[tuple[str, str]]:
+    return Counter((f.header.topic, type(f).__name__) for f in log.frames())
+
+
+@pytest.mark.parametrize("name", ["empty-file.bag", "not_a_bag.bag", "lfs_pointer.bag", "lfs_pointer.mcap", "no such file"])
+def test_what_is_no_log_is_refused(name: str) -> None:
+    with pytest.raises(LogError, match=name):
+        open_log(ODD / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        (
+            "nav2_turtlebot.mcap",
+            {("/amcl_pose", "PoseSample"): 135, ("/odom", "PoseSample"): 2639, ("/tf", "TransformSample"): 7284}
+            | {("/tf_static", "TransformSample"): 29},
+        ),
+        (
+            "husky_imu_gnss_odometry.bag",
+            {("/fix", "NavSatSample"): 989, ("/husky_velocity_controller/odom", "PoseSample"): 3952, ("/imu/data", "ImuSample"): 11865},
+        ),
+        ("example-lz4.bag", {("/tf", "TransformSample"): 2688, ("/tf_static", "TransformSample"): 1}),
+        ("example-bz2.bag", {("/tf", "TransformSample"): 2688, ("/tf_static", "TransformSample"): 1}),
+        ("one_cloud_lz4.bag", {("/pointcloud2", "LidarFrame"): 1}),
+        (
+            "foxglove_json_camera.mcap",
+            {("/camera_calibration", "Camera"): 10, ("/camera_calibration/custom", "Camera"): 10, ("/image/compressed", "ImageFrame"): 10},
+        ),
+        ("tf_example_ros2", {("/tf", "TransformSample"): 517, ("/tf_static", "TransformSample"): 1}),
+        ("no-messages.bag", {}),
+        ("example-unsorted-chunks.bag", {}),
+        ("ros2_message_zstd", {}),
+        ("ros2_no_metadata", {}),
+        ("chatter_no_metadata.db3", {}),
+    ],
+)
+def test_odd_logs_are_read_without_a_problem(name: str, expected: dict[tuple[str, str], int]) -> None:
+    log = open_log(ODD / name)
+    assert frames(log) == expected
+    assert sum(s.count for s in log.streams) == sum(1 for _ in log.messages())
+    assert log.problems == []
+
+
+def test_a_type_without_definition_is_named_and_the_rest_read() -> None:
+    log = open_log(ODD / "ros2_utm_drive_a")
+    assert frames(log) == {("/gps", "NavSatSample"): 107, ("/odometry", "PoseSample"): 2143, ("/vehicle_pose", "PoseSample"): 2034}
+    [sentence] = log.problems
+    assert sentence.startswith("/vehicle_command_ackermann: messages of type ackermann_msgs/msg/AckermannDriveStamped cannot be decoded")
+
+
+def test_the_conformance_files_of_the_format() -> None:
+    paths = sorted((ODD / "mcap_conformance").glob("*.mcap"))
+    assert len(paths) > 300
+    for path in paths:
+        log = open_log(path)
+        kind = path.stem.split("-")[0]
+        count = sum(1 for _ in log.messages())
+        assert count == {"OneMessage": 1, "TenMessages": 10, "TenMessagesOneAttachment": 10}.get(kind, 0), path
+        assert count == sum(s.count for s in log.streams), path
+        assert list(log.frames()) == []
+        assert log.problems == [], path
+        log.close()
+
+
+def test_a_truncated_drive(tmp_path: Path) -> None:
+    whole = (SHARED / "logs" / "basement_a.mcap").read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole[: len(whole) * 6 // 10])
+    log = open_log(path)
+    found = Counter(m.topic for m in log.messages())
+    assert sum(found.values()) >= 60
+    assert {s.topic: s.count for s in log.streams} == found
+    assert len(log.problems) == 1
+    assert "cut.mcap" in log.problems[0]
+
+
+def test_labels_of_a_real_sweep() -> None:
+    [sweep] = open_log(SHARED / "logs" / "kitti00_000052.mcap").frames(["/velodyne_points"])
+    assert isinstance(sweep, LidarFrame)
+    assert sweep.label is not None
+    assert len(sweep.points) == len(sweep.label) > 50_000
+    assert {40, 50, 70} <= set((sweep.label & 0xFFFF).tolist())  # road, building, vegetation of SemanticKITTI
+
+
+@pytest.mark.parametrize("name", ["room_a.mcap", "room_b"])
+def test_depth_of_a_real_room(name: str) -> None:
+    topics = ["/camera/depth/image", "/camera/depth/image/compressedDepth"]
+    depth = next(open_log(SHARED / "logs" / name).frames(topics))
+    assert isinstance(depth, DepthFrame)
+    assert depth.depth.shape == (480, 640)
+    assert 0.3 < float(np.median(depth.depth[depth.depth > 0])) < 5
