@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs import geometry
 from semloc_logs.errors import LogError, RoleError
 from semloc_logs.frames import F64, Camera, DepthFrame, Frame, ImageFrame, ImuSample, LidarFrame, PosedCloud, PoseSample, TransformSample
 from semloc_logs.logs.base_frame import BasePoses
@@ -19,7 +18,7 @@ from semloc_logs.logs.log import Log, Stream
 from semloc_logs.logs.merge import merged_frames, merged_streams
 from semloc_logs.logs.open import open_log
 from semloc_logs.logs.roles import Roles, find_roles, no_sensor
-from semloc_logs.logs.sweeps import LONGEST_SWEEP_NS, sweep_in_base
+from semloc_logs.logs.sweeps import LONGEST_SWEEP_NS, in_base, sweep_in_base
 from semloc_logs.logs.tally import Tally, never_moves, no_poses, without_unused
 
 MAX_WAITING = 64  # frames that wait for their pose and transforms
@@ -292,7 +291,7 @@ class Session:
             found = self._depth.points(frame, self.min_range, self.max_range)
             if isinstance(found, str):
                 return found
-            points, label = geometry.apply(base_T_sensor, found[0]).astype(np.float32), found[1]
+            points, label = in_base(base_T_sensor, found[0]), found[1]
         if not len(points):
             return "no points"
         self._sensors[header.frame_id] = base_T_sensor

@@ -32,7 +32,15 @@ def sweep_in_base(
         moved = deskew(points, frame.offset_ns[kept], frame.header.stamp_ns, base_T_sensor, poses_at)
         if moved is not None:
             return moved, label, True
-    return geometry.apply(base_T_sensor, points).astype(np.float32), label, False
+    return in_base(base_T_sensor, points), label, False
+
+
+def in_base(base_T_sensor: F64, points: F32) -> F32:
+    """Points (n, 3) of a sensor in the base frame, in single precision: a hundred metres to 0.01 mm."""
+    matrix = base_T_sensor.astype(np.float32)
+    # not a matrix product: BLAS would wake its threads for three columns, which costs more than the work on a busy machine
+    moved: F32 = np.einsum("ij,nj->ni", matrix[:3, :3], points) + matrix[:3, 3]
+    return moved
 
 
 def deskew(points: F32, offset_ns: NDArray[np.int64], stamp_ns: int, base_T_sensor: F64, poses_at: PosesAt) -> F32 | None:
