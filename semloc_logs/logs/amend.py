@@ -105,14 +105,20 @@ def read_ending(file: BinaryIO, path: Path) -> Ending:
     own = _own_metadata(file, groups, data_end)
     summary = _complete_summary(groups, path) or scan(file, data_end, path)
     ending = Ending(data_end, crc, summary, False) if own is None else _without_own(own, summary, path)
-    for record in ending.summary.groups.get(Opcode.CHANNEL, ()):
-        channel = _parse(Channel.read, record[9:], path, ending.offset)
+    for channel in definitions(ending, path)[1]:
         if RUN_KEY in channel.metadata:
             raise LogError(
                 f"{path} holds results on {channel.topic} that another tool moved or followed by other records, so they cannot be"
                 " replaced; annotate the original log, or remove the /semloc/ topics with `mcap filter` first."
             )
     return ending
+
+
+def definitions(ending: Ending, path: Path) -> tuple[list[Schema], list[Channel]]:
+    """Schemas and channels of a file; ``LogError`` where they make no sense."""
+    groups = ending.summary.groups
+    schemas = [_parse(Schema.read, record[9:], path, ending.offset) for record in groups.get(Opcode.SCHEMA, ())]
+    return schemas, [_parse(Channel.read, record[9:], path, ending.offset) for record in groups.get(Opcode.CHANNEL, ())]
 
 
 def empty_ending(profile: str, library: str) -> tuple[bytes, Ending]:

@@ -5,22 +5,29 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Channel, Header
+from mcap.records import Header
 
 from semloc_logs import __version__
 from semloc_logs.errors import LogError
-from semloc_logs.logs.amend import MAGIC, METADATA_PREFIX, Ending, compose, content_end, empty_ending, hash_range, read_ending, read_header
-from semloc_logs.logs.channels import ClosureRecord, Encoding, LogFacts, channel_metadata, encode, run_id
+from semloc_logs.logs.amend import (
+    MAGIC,
+    METADATA_PREFIX,
+    Ending,
+    compose,
+    content_end,
+    definitions,
+    empty_ending,
+    hash_range,
+    read_ending,
+    read_header,
+)
+from semloc_logs.logs.channels import ClosureRecord, Encoding, LogFacts, channel_metadata, encode, is_old_marker, run_id
 from semloc_logs.logs.rosbag_copy import QOS_KEY, bag_facts, opened, write_copy
 from semloc_logs.logs.splice import SIDE_SUFFIX, copy_start, locked, recover, recover_locked, replace_end, sync_folder
 
@@ -105,7 +112,7 @@ def annotate_copy(
             return report
     with locked(log, shared=True) as source, os.fdopen(os.dup(source), "rb") as original, _published(output) as file:
         ending = read_ending(original, log)
-        data, report = results.end(output, ending, _mcap_facts(read_header(original, log), ending))
+        data, report = results.end(output, ending, _mcap_facts(log, read_header(original, log), ending))
         copy_start(source, file.fileno(), ending.offset)
         _finish(file, ending.offset, data)
         return report
@@ -133,7 +140,7 @@ def annotate_in_place(
         recover_locked(log, fd)
         with os.fdopen(os.dup(fd), "rb") as file:
             ending = read_ending(file, log)
-            data, report = results.end(log, ending, _mcap_facts(read_header(file, log), ending))
+            data, report = results.end(log, ending, _mcap_facts(log, read_header(file, log), ending))
         replace_end(log, fd, ending.offset, data)
         return report
 
@@ -157,9 +164,9 @@ def annotate_sidecar(
         with log.open("rb") as original:
             header = read_header(original, log)
             try:
-                facts = _mcap_facts(header, read_ending(original, log))
+                facts = _mcap_facts(log, header, read_ending(original, log))
             except LogError:  # a log that is cut off has its profile at least
-                facts = _mcap_facts(header, empty_ending("", "")[1])
+                facts = _mcap_facts(log, header, empty_ending("", "")[1])
     else:
         with opened(log) as readers:
             facts = bag_facts(log, readers)
@@ -194,9 +201,9 @@ def _file_fingerprint(path: Path) -> str:
         return str(hash_range(file, 0, stop).hexdigest())
 
 
-def _mcap_facts(header: Header, ending: Ending) -> LogFacts:
+def _mcap_facts(log: Path, header: Header, ending: Ending) -> LogFacts:
     """What our channels need to know of an MCAP log: the encoding of most of its channels, unless its profile says so."""
-    channels = [Channel.read(ReadDataStream(BytesIO(raw[9:]))) for raw in ending.summary.groups.get(Opcode.CHANNEL, ())]
+    schemas, channels = definitions(ending, log)
     counted = Counter(c.message_encoding for c in channels if c.message_encoding in _ENCODINGS)
     most = max(sorted(counted), key=lambda e: counted[e], default="json")
     by_profile: dict[str, Encoding] = {"ros1": "ros1", "ros2": "ros2"}
@@ -205,7 +212,9 @@ def _mcap_facts(header: Header, ending: Ending) -> LogFacts:
     statistics = ending.summary.statistics
     profile = {"ros1": "ros1", "ros2": "ros2"}.get(encoding, header.profile)
     metadata = {QOS_KEY: qos[0] if qos else ""} if encoding == "ros2" else {}
-    return LogFacts(encoding, profile, metadata, statistics.message_start_time, statistics.message_end_time, statistics.message_count)
+    old_markers = encoding == "ros2" and any(is_old_marker(s.name, s.data) for s in schemas)
+    start, end = statistics.message_start_time, statistics.message_end_time
+    return LogFacts(encoding, profile, metadata, start, end, statistics.message_count, old_markers)
 
 
 def _marker_size(settings: Mapping[str, str]) -> float:
@@ -241,7 +250,8 @@ def _published(output: Path) -> Iterator[BinaryIO]:
     """A file that becomes ``output`` when the block ends well, and vanishes when it does not."""
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        fd, name = tempfile.mkstemp(prefix=f".{output.name}.", suffix=".tmp", dir=output.parent)
+        name = output.with_name(f".{output.name}.{os.getpid()}.tmp")
+        fd = os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
     except OSError as error:
         raise LogError(f"{output} cannot be written ({error.strerror}); give another output.") from error
     try:
@@ -249,9 +259,6 @@ def _published(output: Path) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)  # mkstemp makes files that nobody else may read
         os.replace(name, output)
         sync_folder(output.parent)
     except BaseException as error:

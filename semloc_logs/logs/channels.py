@@ -119,7 +119,10 @@ class Encoder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LogFacts:
-    """What has to be known of a log to write into it: encoding, profile, metadata for new channels, first and last receive time."""
+    """What has to be known of a log to write into it: encoding, profile, metadata for new channels, first and last receive time.
+
+    ``old_markers``: the log defines visualization_msgs/Marker as ROS 2 did before Humble; readers know one definition of a type.
+    """
 
     encoding: Encoding
     profile: str
@@ -127,6 +130,13 @@ class LogFacts:
     start_ns: int
     end_ns: int
     messages: int
+    old_markers: bool = False
+
+
+def is_old_marker(name: str, definition: bytes) -> bool:
+    """Whether a ROS 2 definition contains visualization_msgs/Marker as it was before Humble."""
+    own = name.startswith("visualization_msgs/msg/Marker")
+    return (own or b"MSG: visualization_msgs/Marker\n" in definition) and b"mesh_file" not in definition
 
 
 def run_id(closures: Sequence[ClosureRecord], session: str, settings: Mapping[str, str], version: str) -> str:
@@ -152,7 +162,7 @@ def encode(
     the log's time range. ``size`` is the diameter of the markers in metres; ``metadata`` goes to the channels. Channels without messages
     are left out.
     """
-    encoder = _encoder(facts.encoding)
+    encoder = _encoder(facts)
     messages: list[NewMessage] = []
     mine = [c for c in closures if session in (c.query_session, c.target_session)]
     for c in mine:
@@ -178,11 +188,12 @@ def channel_metadata(run: str, version: str) -> dict[str, str]:
     return {RUN_KEY: run, "semloc.version": version}
 
 
-def _encoder(encoding: Encoding) -> Encoder:
+def _encoder(facts: LogFacts) -> Encoder:
+    encoding = facts.encoding
     if encoding == "ros1" or encoding == "ros2":
         from semloc_logs.logs.channels_ros import RosEncoder
 
-        return RosEncoder(1 if encoding == "ros1" else 2)
+        return RosEncoder(1 if encoding == "ros1" else 2, old_markers=facts.old_markers)
     from semloc_logs.logs.channels_foxglove import FoxgloveEncoder
 
     return FoxgloveEncoder(encoding)

@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.geometry import translation_quaternion
@@ -21,18 +22,18 @@ _SPHERE, _LINE_LIST, _TEXT = 2, 5, 9  # values of visualization_msgs/Marker.type
 
 
 class RosEncoder:
-    """Messages of ROS ``version`` 1 or 2."""
+    """Messages of ROS ``version`` 1 or 2, with ``old_markers`` those of ROS 2 before Humble."""
 
-    def __init__(self, version: int) -> None:
+    def __init__(self, version: int, *, old_markers: bool = False) -> None:
         self.version = version
-        self.store = _store(version)
+        self.store = _store(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_FOXY if old_markers else Stores.ROS2_HUMBLE)
 
     def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]:
         encoding, schema_encoding = ("ros1", "ros1msg") if self.version == 1 else ("cdr", "ros2msg")
         out = []
         for topic, name in zip(TOPICS, (CLOSURE, POSE, MARKERS), strict=True):
             shown = name if self.version == 2 else name.replace("/msg/", "/")
-            out.append(NewChannel(topic, encoding, shown, schema_encoding, definition(name, self.version).encode(), metadata))
+            out.append(NewChannel(topic, encoding, shown, schema_encoding, self._definition(name).encode(), metadata))
         return out
 
     def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes:
@@ -70,16 +71,7 @@ class RosEncoder:
             "points": points or [],
             "text": text,
         }
-        empty = {"action": 0, "frame_locked": False, "colors": [], "mesh_resource": "", "mesh_use_embedded_materials": False}
-        nothing = np.zeros(0, np.uint8)
-        if self.version == 1:
-            more = {"lifetime": self._time("duration", 0, 0)}
-        else:
-            texture = self._new("sensor_msgs/msg/CompressedImage", header=self._header(0, ""), format="", data=nothing)
-            mesh = self._new("visualization_msgs/msg/MeshFile", filename="", data=nothing)
-            lifetime = self._time("duration", 0, 0)
-            more = {"lifetime": lifetime, "texture_resource": "", "texture": texture, "uv_coordinates": [], "mesh_file": mesh}
-        return self._new("visualization_msgs/msg/Marker", **given, **empty, **more)
+        return self._new("visualization_msgs/msg/Marker", **given)
 
     def _pose(self, position: F64, quaternion: F64) -> Any:
         x, y, z, w = (float(v) for v in quaternion)
@@ -91,33 +83,39 @@ class RosEncoder:
         return self._new("geometry_msgs/msg/Point", x=x, y=y, z=z)
 
     def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        seq = {"seq": 0} if self.version == 1 else {}
         sec, nanosec = divmod(max(0, stamp_ns), 10**9)  # the exact stamps are in the columns
-        return self._new("std_msgs/msg/Header", **seq, stamp=self._time("time", min(sec, (1 << 31) - 1), nanosec), frame_id=frame_id)
-
-    def _time(self, kind: str, sec: int, nanosec: int) -> Any:
-        return self._new(f"builtin_interfaces/msg/{kind.capitalize()}", sec=sec, nanosec=nanosec)
+        stamp = self._new("builtin_interfaces/msg/Time", sec=min(sec, (1 << 31) - 1), nanosec=nanosec)
+        return self._new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
     def _new(self, name: str, **values: Any) -> Any:
-        return self.store.types[name](**values)
+        """A message with the given fields; what the definition has beyond them is empty or zero."""
+        fields = self.store.fielddefs[name][1]
+        return self.store.types[name](**{field: values[field] if field in values else self._empty(*kind) for field, kind in fields})
+
+    def _empty(self, kind: int, detail: Any) -> Any:
+        if kind == Nodetype.NAME:
+            return self._new(detail)
+        if kind == Nodetype.BASE:
+            return "" if detail[0] == "string" else False if detail[0] == "bool" else 0
+        element, size = detail  # a sequence or an array
+        return np.zeros(size, element[1][0]) if element[0] == Nodetype.BASE else []
 
     def _bytes(self, message: Any) -> bytes:
         name = message.__msgtype__
         write = self.store.serialize_ros1 if self.version == 1 else self.store.serialize_cdr
         return bytes(write(message, name))
 
+    def _definition(self, name: str) -> str:
+        """The definition of a message type with those of the types in it, as MCAP wants it."""
+        text, _ = self.store.generate_msgdef(name, ros_version=self.version)
+        if name != CLOSURE:
+            return str(text)
+        separator = "=" * 80
+        return str(read_text("messages/LoopClosure.msg")) + separator + str(text).split(separator, 1)[1]
+
 
 @cache
-def _store(version: int) -> Any:
-    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+def _store(distribution: Stores) -> Any:
+    store = get_typestore(distribution)
     store.register(get_types_from_msg(read_text("messages/LoopClosure.msg"), CLOSURE))
     return store
-
-
-def definition(name: str, version: int) -> str:
-    """The definition of a message type with those of the types in it, as MCAP wants it."""
-    text, _ = _store(version).generate_msgdef(name, ros_version=version)
-    if name != CLOSURE:
-        return str(text)
-    separator = "=" * 80
-    return str(read_text("messages/LoopClosure.msg")) + separator + str(text).split(separator, 1)[1]

@@ -15,7 +15,7 @@ from rosbags.rosbag2.metadata import dump_qos_v8
 from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.channels import LogFacts
+from semloc_logs.logs.channels import LogFacts, is_old_marker
 
 QOS_KEY = "offered_qos_profiles"
 
@@ -38,7 +38,10 @@ def bag_facts(log: Path, readers: Sequence[Any]) -> LogFacts:
         profiles = [] if ros1 else [dump_qos_v8(c.ext.offered_qos_profiles) for r in readers for c in r.connections]
     metadata = {} if ros1 else {QOS_KEY: next(filter(None, profiles), "")}
     name = "ros1" if ros1 else "ros2"
-    return LogFacts("ros1" if ros1 else "ros2", name, metadata, start, end, sum(r.message_count for r in readers))
+    old_markers = not ros1 and any(
+        is_old_marker(c.msgtype, c.msgdef.data.encode()) for r in readers for c in r.connections if c.msgdef.data
+    )
+    return LogFacts("ros1" if ros1 else "ros2", name, metadata, start, end, sum(r.message_count for r in readers), old_markers)
 
 
 def write_copy(log: Path, readers: Sequence[Any], file: BinaryIO, library: str) -> int:

@@ -132,6 +132,24 @@ def test_qos_of_the_log_is_kept(tmp_path: Path) -> None:
     assert all(profiles == [qos] for profiles in found.values())
 
 
+def test_markers_are_defined_as_in_the_log(tmp_path: Path) -> None:
+    """A reader that knows one definition of a type reads the log's own markers and ours."""
+    store = get_typestore(Stores.ROS2_FOXY)
+    kind = "visualization_msgs/msg/MarkerArray"
+    with Writer2(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/theirs", kind, typestore=store)
+        writer.write(connection, 1, store.serialize_cdr(store.types[kind](markers=[]), kind))
+    log, out = tmp_path / "bag" / "bag.mcap", tmp_path / "out.mcap"
+    for source in (log, tmp_path / "bag"):
+        annotate_copy(source, out, [closure()], "a", {}, log_times={}, overwrite=True)
+        with AnyReader([out]) as reader:
+            definitions = {c.msgdef.data for c in reader.connections if c.msgtype == kind}
+            assert len(definitions) == 1
+            ((c, _, raw),) = reader.messages([c for c in reader.connections if c.topic == "/semloc/markers"])
+            message: Any = reader.deserialize(raw, c.msgtype)
+        assert [m.text for m in message.markers] == ["", "b 0.97"]
+
+
 def test_output_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
     log, out = bag1(tmp_path / "log.bag"), tmp_path / "out.mcap"
     out.write_bytes(b"precious")
