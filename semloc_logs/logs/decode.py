@@ -51,6 +51,7 @@ class Decoder:
         if convert is None:
             return []
         try:
+            _check_time(message.log_time_ns)
             return list(convert(self._parse(message), message))
         except UndecodableError as error:
             reason = str(error)
@@ -77,6 +78,13 @@ class Decoder:
 # -- parts that several messages share
 
 
+def _check_time(time_ns: int) -> int:
+    """Nanoseconds that fit 64-bit integers, also after a difference of two."""
+    if abs(time_ns) >= 1 << 62:
+        raise UndecodableError(f"its time of {time_ns} ns is impossible")
+    return time_ns
+
+
 def _stamp_ns(time: Any, message: Message) -> int:
     """Nanoseconds of a ROS time, a protobuf timestamp or a JSON {sec, nsec}; log time where a message has none."""
     if time is None:
@@ -84,7 +92,7 @@ def _stamp_ns(time: Any, message: Message) -> int:
     for seconds, nanoseconds in (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec")):
         s, n = getattr(time, seconds, None), getattr(time, nanoseconds, None)
         if s is not None and n is not None:
-            return int(s) * 1_000_000_000 + int(n)
+            return _check_time(int(s) * 1_000_000_000 + int(n))
     raise UndecodableError("its time stamp has neither seconds nor nanoseconds")
 
 

@@ -83,6 +83,8 @@ class Rosbag2Log(BaseLog):
         try:
             with path.open("rb") as file:
                 text = file.read(_MAX_METADATA)
+            if b"<<" in text:
+                raise ValueError("it merges mappings")  # a few such lines can expand without end
             information = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))["rosbag2_bagfile_information"]
         except FileNotFoundError:
             return {}

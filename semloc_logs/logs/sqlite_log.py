@@ -101,7 +101,10 @@ class SqliteLog(BaseLog):
             for id_, count in execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"):
                 if id_ in self._topics:
                     counts[self._topics[id_][:3]] += count
-            self.start_ns, self.end_ns = execute("SELECT MIN(timestamp), MAX(timestamp) FROM messages").fetchone()
+            start, end = execute("SELECT MIN(timestamp), MAX(timestamp) FROM messages").fetchone()
+            if not (isinstance(start, int) and isinstance(end, int)) and sum(counts.values()):
+                raise sqlite3.DatabaseError("time stamps are no integers")
+            self.start_ns, self.end_ns = start, end
         except sqlite3.DatabaseError as error:
             self._recount(counts, error)
         self.streams = [Stream(*kind, counts[kind]) for kind in sorted({t[:3] for t in self._topics.values()})]

@@ -399,3 +399,9 @@ def test_types_of_no_use_are_no_problem() -> None:
     problems = Problems()
     assert Decoder(problems).frames(Message("/c", "std_msgs/msg/String", "cdr", 1, b"", NOTHING)) == []
     assert problems.sentences() == []
+
+
+def test_impossible_times_are_named() -> None:
+    frames, problems = json_frames("foxglove.LocationFix", {"timestamp": {"sec": 1 << 60, "nsec": 0}, "latitude": 1, "longitude": 2})
+    assert frames == []
+    assert "is impossible" in problems.sentences()[0]

@@ -89,7 +89,7 @@ def recorded(kind: str) -> dict[str, bytes]:
             channel = writer.register_channel(topic, "cdr", writer.register_schema(message.__msgtype__, "ros2msg", text))
             data = bytes(ROS2.serialize_cdr(message, message.__msgtype__))
             writer.add_message(channel, log_time=k, publish_time=k, data=data)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
         return {"x.mcap": path.read_bytes()}
 
 

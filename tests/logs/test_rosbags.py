@@ -163,7 +163,9 @@ def test_missing_and_unlisted_files_are_named(tmp_path: Path) -> None:
     assert any("claims 30 messages, but the files hold 20" in p for p in log.problems)
 
 
-@pytest.mark.parametrize("text", ["", "[", "a: b", "rosbag2_bagfile_information: 3", "x: &a [*a]", "- " * 3000, "\0"])
+@pytest.mark.parametrize(
+    "text", ["", "[", "a: b", "rosbag2_bagfile_information: 3", "x: &a [*a]", "- " * 3000, "\0", "a: &a {b: 1}\nc: {<<: [*a, *a]}"]
+)
 def test_unusable_metadata_is_no_obstacle(tmp_path: Path, text: str) -> None:
     folder = bag2(tmp_path / "x", TIMES)
     (folder / "metadata.yaml").write_text(text)
@@ -192,6 +194,15 @@ def test_a_damaged_message_is_skipped_alone(tmp_path: Path) -> None:
     assert len(list(log.frames())) == len(TIMES) - 3
     assert len(list(log.frames())) == len(TIMES) - 3
     assert sorted(p[:22] for p in log.problems) == ["/a: 1 message skipped;"] * 2 + ["/b: 1 message skipped;"]
+
+
+def test_times_of_another_type_are_skipped(tmp_path: Path) -> None:
+    folder = bag2(tmp_path / "x", TIMES)
+    with sqlite3.connect(folder / "x.db3") as database:
+        database.execute("UPDATE messages SET timestamp = 'noon' WHERE id = 30")
+    log = open_log(folder)
+    assert [m.log_time_ns for m in log.messages()] == TIMES[:-1]
+    assert (log.start_ns, log.end_ns) == (TIMES[0], TIMES[-2])
 
 
 def test_undefined_types_are_named(tmp_path: Path) -> None:
