@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F64, ImuSample
+from semloc_logs.logs.poses import is_time
 
 MAX_SAMPLES = 16_384  # beyond, every second sample is forgotten and only every 2nd (4th, ...) taken: the whole log at bounded memory
 _MIN_FORCE, _MAX_FORCE = 0.5, 30.0  # of the mean; some drivers report g instead of m/s^2, linear acceleration without gravity is near 0
@@ -27,7 +28,8 @@ class Accelerometer:
         """Takes a sample; one of another frame or with NaN is left out."""
         if self.frame_id is None:
             self.frame_id = sample.header.frame_id
-        if sample.header.frame_id != self.frame_id or not np.isfinite(sample.acceleration).all():
+        is_number = np.isfinite(sample.acceleration).all() and is_time(sample.header.stamp_ns)
+        if sample.header.frame_id != self.frame_id or not is_number:
             return
         self._seen += 1
         if self._seen % self._every:

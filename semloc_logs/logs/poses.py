@@ -11,7 +11,14 @@ from semloc_logs.frames import F64, PoseSample, TransformSample
 EDGE_NS = 100_000_000  # a stamp may lie this far outside of the stream: the nearest pose serves
 PERIODS_PER_GAP = 3.0  # a stream slower than max_gap / 3 may skip two poses before its hole counts as a gap
 LONGEST_GAP = 5.0  # s; nothing that drives is interpolated over more than this, however slow its stream
+_FARTHEST = 1e8  # m; positions in Earth-centred frames are below 1e7
+_FIRST_NS, _LAST_NS = -(1 << 60), 1 << 62  # the years 1933 to 2116: sums and differences still fit 64 bits
 _PERIOD_WINDOW = 256  # poses that the period is estimated from: the newest ones
+
+
+def is_time(stamp_ns: int) -> bool:
+    """Whether a stamp can be calculated with in 64 bits; damaged messages hold others."""
+    return _FIRST_NS < stamp_ns < _LAST_NS
 
 
 class PoseTrack:
@@ -42,13 +49,14 @@ class PoseTrack:
 
     def append(self, stamp_ns: int, pose: F64) -> bool:
         """Appends a pose (4, 4); False when it was refused and counted."""
-        if self._n and stamp_ns <= self._stamps[self._n - 1]:
+        if self._n and is_time(stamp_ns) and stamp_ns <= self._stamps[self._n - 1]:
             if stamp_ns == self._stamps[self._n - 1]:
                 self.duplicates += 1
             else:
                 self.backwards += 1
             return False
-        if not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3]) - 1.0) > 1e-3:
+        is_number = np.isfinite(pose).all() and np.abs(pose[:3, 3]).max() < _FARTHEST and is_time(stamp_ns)
+        if not is_number or abs(np.linalg.det(pose[:3, :3]) - 1.0) > 1e-3:
             self.invalid += 1
             return False
         if self._n == len(self._stamps):
@@ -101,6 +109,8 @@ class PoseTrack:
 
     def at(self, stamp_ns: int) -> F64 | None:
         """The pose (4, 4) at ``stamp_ns``; None in a gap and more than 0.1 s outside of the stream."""
+        if not is_time(stamp_ns):
+            return None
         poses, known = self.at_many(np.array([stamp_ns], np.int64))
         return poses[0] if known[0] else None
 

@@ -24,7 +24,8 @@ def sweep_in_base(
     ``poses_at`` gives ``session_T_base`` (m, 4, 4) at stamps (m,) and which of them are known; without all of them, or without point
     times, the sweep stays as it was measured. Points nearer than ``min_range`` or beyond ``max_range`` (m, from the sensor) are dropped.
     """
-    distance = np.linalg.norm(frame.points, axis=1)
+    with np.errstate(over="ignore"):  # damaged floats may be 1e38
+        distance = np.linalg.norm(frame.points, axis=1)
     kept = (distance >= min_range) & (distance <= max_range)
     points = frame.points[kept]
     label = None if frame.label is None else frame.label[kept]

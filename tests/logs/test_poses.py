@@ -80,6 +80,16 @@ def test_duplicates_jumps_back_and_nonsense_are_counted() -> None:
     assert np.all(np.diff(poses.stamps_ns) > 0)
 
 
+def test_hostile_numbers_are_refused() -> None:
+    poses = track(0.0, 0.5)
+    assert not poses.append(2**70, np.eye(4))
+    assert not poses.append(EPOCH + S, yaw_transform(0.0, (1e300, 0.0, 0.0)))
+    assert poses.invalid == 2
+    assert poses.at(2**70) is None
+    assert poses.at(-(2**70)) is None
+    assert np.isfinite(poses.length())
+
+
 def test_samples_are_taken_at_their_header_stamp() -> None:
     poses = PoseTrack()
     assert poses.add(PoseSample(Header("/odom", 5, 9, "odom"), "base_link", yaw_transform(0.0, (1.0, 2.0, 3.0))))
