@@ -88,8 +88,9 @@ class Closures(_Section):
 class Training(_Section):
     """The encoder-decoder's training (supplement 1)."""
 
-    samples: int = Field(60_000, ge=32, description="subvolume pairs seen")
-    batch: int = Field(32, ge=2)
+    samples: int = Field(250_000, ge=32, description="subvolumes seen, nine of each cut pair")
+    scenes: int = Field(60, ge=1, description="simulated scenes that pairs are cut from, when no session is given")
+    batch: int = Field(12, ge=2, description="pairs of a step")
     dropout: float = Field(0.10, ge=0, lt=1, description="share of the input's voxels that are dropped to unobserved")
     reconstruction_weight: float = Field(10.0, description="weight of the reconstruction loss against the prior's")
     occupied_weight: float = Field(10.0, description="weight of occupied voxels within it")

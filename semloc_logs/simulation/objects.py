@@ -68,7 +68,7 @@ def car(rng: Rng) -> Parts:
 
 
 def van(rng: Rng) -> Parts:
-    """A delivery van or a small bus along +x; vans count as cars, as in SemanticKITTI's other vehicles they are rare."""
+    """A delivery van along +x; Cityscapes counts vans as cars."""
     length, width, height = rng.uniform(4.8, 6.2), rng.uniform(1.9, 2.1), rng.uniform(1.9, 2.7)
     a = length / 2
     outline = np.array(
@@ -92,7 +92,8 @@ def person(rng: Rng) -> Parts:
     """A standing or walking person."""
     height, stride = rng.uniform(1.5, 1.9), rng.uniform(0.05, 0.3)
     legs = [place(cylinder(0.08, 0.47 * height, 6), sign * stride / 2, sign * 0.09) for sign in (-1, 1)]
-    torso = Mesh(cylinder(0.2, 0.38 * height, 8, 0.17, z=0.45 * height).vertices * [0.65, 1.15, 1.0], cylinder(0.2, 1.0, 8).triangles)
+    round_torso = cylinder(0.2, 0.38 * height, 8, 0.17, z=0.45 * height)
+    torso = Mesh(round_torso.vertices * [0.65, 1.15, 1.0], round_torso.triangles)
     return [(merge(*legs, torso, ellipsoid((0.1, 0.09, 0.13), 0.92 * height, 4, 6)), PERSON)]
 
 
@@ -257,13 +258,6 @@ def garden_wall(rng: Rng, path: F64) -> Parts:
         rail = upright_quads(points[:-1], points[1:], height + 0.76, height + 0.82)
         parts.append((merge(bars, rail), FENCE))
     return parts
-
-
-def guard_rail(path: F64) -> Parts:
-    """A crash barrier along a plan path; drape it."""
-    points = resample(path, 2.0)
-    band = upright_quads(points[:-1], points[1:], 0.45, 0.75)
-    return [(merge(band, *[box(0.1, 0.1, 0.7, x, y) for x, y in points]), FENCE)]
 
 
 def awning(width: float, depth: float, height: float) -> Mesh:

@@ -113,11 +113,10 @@ class _Street:
             self.static.add(mesh, label, ground="drape")
 
     def put_tree(self, x: float, y: float, size: float, kind: str | None = None) -> None:
-        """A tree, or in a few sessions of a hundred its stump."""
-        parts = objects.tree(self.rng, size, kind)
-        if self.change.random() < 0.03:
-            return
-        self.put(parts, x, y, self.rng.uniform(0, 6.3))
+        """A tree, that is missing in three sessions of a hundred."""
+        parts, yaw = objects.tree(self.rng, size, kind), self.rng.uniform(0, 6.3)
+        if self.change.random() >= 0.03:
+            self.put(parts, x, y, yaw)
 
     def side(self, side: _Side, style: _Style) -> None:
         """Everything along one side of a road."""

@@ -7,6 +7,8 @@ as a 4x4x4 convolution. The descriptor is the mean mu of the latent code, scaled
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -15,6 +17,23 @@ from semloc_logs.subvolumes.cut import CLASSES
 
 LATENT = 256
 EMBEDDING = 8
+
+
+class _LookUp(torch.autograd.Function):
+    """``F.embedding`` for a few codes and many voxels: its own backward pass scatters row by row and takes five times as long."""
+
+    @staticmethod
+    def forward(ctx: Any, codes: Tensor, weight: Tensor) -> Tensor:
+        ctx.save_for_backward(codes)
+        ctx.rows = len(weight)
+        return F.embedding(codes, weight)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor]:
+        (codes,) = ctx.saved_tensors
+        flat, grad = codes.reshape(-1), grads[0].reshape(-1, grads[0].shape[-1])
+        columns = [torch.bincount(flat, grad[:, c].float(), minlength=ctx.rows) for c in range(grad.shape[1])]
+        return None, torch.stack(columns, 1).to(grad.dtype)
 
 
 class Encoder(nn.Module):
@@ -32,9 +51,11 @@ class Encoder(nn.Module):
         self.log_variance = nn.Linear(latent, latent)
 
     def forward(self, codes: Tensor) -> Tensor:
-        x = self.embedding(codes.int()).permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
+        reduced = torch.is_autocast_enabled("cpu")  # looked up in the precision of the convolutions: no copy of the volume
+        weight = self.embedding.weight.to(torch.get_autocast_dtype("cpu")) if reduced else self.embedding.weight
+        x = _LookUp.apply(codes.int(), weight).permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
         for block in self.blocks:
-            x = F.max_pool3d(F.relu(block(x)), 2)
+            x = F.relu(F.max_pool3d(block(x), 2))  # the paper's order gives the same, at eight times the cost of the ReLU
         x = x[:, :, 1:-1, 1:-1]  # the pooled margin has served
         mu: Tensor = self.mean(x)[..., 0]
         return mu
@@ -67,13 +88,15 @@ class Completion(nn.Module):
         self.to(memory_format=torch.channels_last_3d)
 
     def forward(self, codes: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits of the completed subvolume, mu and log-variance (b, 256) of wide subvolumes (b, 48, 48, 32)."""
-        mu = self.encoder(codes)[:, :, 0, 0]
+        """Logits of the completed middle subvolume, mu (b, 256, 3, 3) of all and log-variance (b, 256) of the middle one of ``codes``
+        (b, 64, 64, 32); without ``noise`` (b, 256) the mean is decoded."""
+        every = self.encoder(codes)
+        mu = every[:, :, every.shape[2] // 2, every.shape[3] // 2]
         log_variance = self.encoder.log_variance(torch.tanh(mu)).clamp(-8.0, 4.0)
         code = mu if noise is None else mu + noise * torch.exp(0.5 * log_variance)
-        return self.decoder(code), mu, log_variance
+        return self.decoder(code), every, log_variance
 
 
 def descriptors(mu: Tensor) -> Tensor:
-    """Unit-length descriptors from mu (n, 256)."""
-    return F.normalize(mu.float(), dim=1)
+    """Unit-length descriptors (b * i * j, 256) from mu (b, 256, i, j)."""
+    return F.normalize(mu.float().permute(0, 2, 3, 1).reshape(-1, mu.shape[1]), dim=1)

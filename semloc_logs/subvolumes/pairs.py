@@ -1,6 +1,7 @@
 """Training pairs: incomplete subvolumes from one or five frames beside complete ones from the fused map of all (paper 3.2).
 
-Pairs are packed into Parquet shards, one for each scene, so that training starts, stops and resumes without making them again.
+A pair is wider than a subvolume: the encoder run over it gives 3 x 3 descriptors, 8 voxels apart, so that each pair brings nine
+examples, eight of them hard. Pairs are packed into Parquet shards, one for each scene, so that training starts, stops and resumes without making them again.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from numpy.typing import NDArray
 
 from semloc_logs import geometry
 from semloc_logs.settings import Fusion, Training
-from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, turn
+from semloc_logs.subvolumes.cut import SIZE, WIDE, turn
 from semloc_logs.tables import replacing_file
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
 
 U8 = NDArray[np.uint8]
-PER_FRAME = 16
+PER_FRAME = 12
+BROAD = WIDE + 16  # edge of a pair in x and y (voxels)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +55,10 @@ def occupied(state: U8) -> NDArray[np.bool_]:
 
 
 def cut_pairs(frames: Sequence[SceneFrame], fusion: Fusion, training: Training, rng: np.random.Generator, min_occupied: int = 40) -> list[tuple[U8, U8, U8]]:
-    """(incomplete (48, 48, 32), complete (32, 32, 32), complete seen a little shifted and turned (48, 48, 32)) voxel states."""
+    """(incomplete (64, 64, 32), complete (32, 32, 32), complete seen a little shifted and turned (64, 64, 32)) voxel states.
+
+    The middle subvolume of the incomplete one, at least, has ``min_occupied`` occupied voxels.
+    """
     v = fusion.voxel_size
     scale = v / 0.30
     whole, whole_low = _dense(fuse(frames, fusion))
@@ -76,9 +81,9 @@ def cut_pairs(frames: Sequence[SceneFrame], fusion: Fusion, training: Training, 
             bottom = np.percentile(column, 5) - rng.uniform(0, 9)
             centre = np.array([*xy, np.floor(bottom) + SIZE / 2])
             yaw = rng.uniform(0, 2 * np.pi)
-            incomplete, other, complete = (np.empty(s, np.uint8) for s in ((WIDE, WIDE, SIZE), (WIDE, WIDE, SIZE), (SIZE, SIZE, SIZE)))
+            incomplete, other, complete = (np.empty(s, np.uint8) for s in ((BROAD, BROAD, SIZE), (BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE)))
             turn(part, part_low, yaw, centre, incomplete)
-            if occupied(incomplete[MARGIN:-MARGIN, MARGIN:-MARGIN]).sum() < min_occupied:
+            if occupied(incomplete[16:-16, 16:-16]).sum() < min_occupied:
                 continue
             turn(whole, whole_low, yaw, centre, complete)
             shift = training.shift / 0.30 * np.array([*rng.uniform(-1, 1, 2), rng.uniform(-0.8, 0.8)])
@@ -96,8 +101,8 @@ def write_shard(path: Path, pairs: Sequence[tuple[U8, U8, U8]]) -> None:
 
 
 def read_shard(path: Path) -> tuple[U8, U8, U8]:
-    """Arrays (n, 48, 48, 32), (n, 32, 32, 32) and (n, 48, 48, 32) of a shard."""
+    """Arrays (n, 64, 64, 32), (n, 32, 32, 32) and (n, 64, 64, 32) of a shard."""
     table = pq.read_table(path)
-    shapes = ((WIDE, WIDE, SIZE), (SIZE, SIZE, SIZE), (WIDE, WIDE, SIZE))
+    shapes = ((BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE), (BROAD, BROAD, SIZE))
     a, b, c = (np.frombuffer(b"".join(table[k].to_pylist()), np.uint8).reshape(-1, *s) for k, s in enumerate(shapes))
     return a, b, c

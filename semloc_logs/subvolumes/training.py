@@ -25,12 +25,13 @@ from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.cut import CLASSES, code_table
 from semloc_logs.subvolumes.network import Completion, descriptors
-from semloc_logs.subvolumes.pairs import read_shard
+from semloc_logs.subvolumes.pairs import occupied, read_shard
 from semloc_logs.tables import replacing_file
 
 RATE = 1.5e-3
 TEMPERATURE = 0.1
-POOL = 48  # steps that draw from the same three shards
+MIN_OCCUPIED = 40
+POOL = 96  # steps that draw from the same three shards
 
 U8 = NDArray[np.uint8]
 
@@ -70,6 +71,13 @@ def _batches(shards: Sequence[Path], training: Training, first_step: int, steps:
         yield a, b, c
 
 
+def _seen(part: U8) -> NDArray[np.bool_]:
+    """Which of the 3 x 3 subvolumes of each wide one hold enough occupied voxels to be described, flat (b * 9,)."""
+    columns = occupied(part).sum(3)
+    counts = [[columns[:, 8 + 8 * i : 40 + 8 * i, 8 + 8 * j : 40 + 8 * j].sum((1, 2)) for j in range(3)] for i in range(3)]
+    return np.ascontiguousarray(np.array(counts).transpose(2, 0, 1).reshape(-1) >= MIN_OCCUPIED)
+
+
 def _targets(complete: U8, table: U8, classes: int) -> tuple[Tensor, Tensor]:
     """Class indices of the complete subvolumes and which voxels count: unobserved ones and occupied ones of unknown class do not."""
     codes = table[complete]
@@ -94,24 +102,26 @@ def train(
     torch.manual_seed(training.seed)
     model = Completion(variant)
     optimiser = torch.optim.Adam(model.parameters(), lr=RATE)
-    steps = math.ceil(training.samples / training.batch)
+    steps = math.ceil(training.samples / (training.batch * 9))
     done = _resume(checkpoint, model, optimiser, training) if checkpoint.exists() else 0
     table, classes = code_table(variant), CLASSES[variant]
     for step, (part, whole, other) in enumerate(_batches(shards, training, done, steps), start=done):
         for group in optimiser.param_groups:
             group["lr"] = RATE * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
+        seen = torch.from_numpy(_seen(part))
         noise = torch.from_numpy(np.random.default_rng((training.seed, 2, step)).standard_normal((len(part), 256), np.float32))
         target, known = _targets(whole, table, classes)
         with torch.autocast("cpu", dtype=torch.bfloat16):
             logits, mu, log_variance = model(torch.from_numpy(table[part]), noise)
-            partner = model.encoder(torch.from_numpy(table[other]))[:, :, 0, 0]
+            with torch.no_grad():  # the complete view is the goal; a gradient through it too would cost a third more
+                partner = model.encoder(torch.from_numpy(table[other]))
         entropy = F.cross_entropy(logits, target, reduction="none").float()
         weight = torch.where(target < classes, training.occupied_weight, 1.0) * known
         reconstruction = (entropy * weight).sum() / weight.sum()
-        mu, log_variance = mu.float(), log_variance.float()
-        prior = 0.5 * (mu.square() + log_variance.exp() - 1 - log_variance).mean()
-        similarity = descriptors(mu) @ descriptors(partner).T / TEMPERATURE
-        own = torch.arange(len(part))
+        middle, log_variance = mu[:, :, 1, 1].float(), log_variance.float()
+        prior = 0.5 * (middle.square() + log_variance.exp() - 1 - log_variance).mean()
+        similarity = descriptors(mu)[seen] @ descriptors(partner)[seen].T / TEMPERATURE
+        own = torch.arange(len(similarity))
         contrastive = 0.5 * (F.cross_entropy(similarity, own) + F.cross_entropy(similarity.T, own))
         loss = training.reconstruction_weight * reconstruction + prior + training.contrastive_weight * contrastive
         optimiser.zero_grad(set_to_none=True)
@@ -119,7 +129,7 @@ def train(
         torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
         optimiser.step()
         matched = float((similarity.argmax(1) == own).float().mean())
-        on_step(Progress((step + 1) * training.batch, float(loss.detach()), float(reconstruction.detach()), float(contrastive.detach()), matched))
+        on_step(Progress((step + 1) * training.batch * 9, float(loss.detach()), float(reconstruction.detach()), float(contrastive.detach()), matched))
         if (step + 1) % save_every == 0 or step + 1 == steps:
             _save(checkpoint, model, optimiser, training, step + 1)
     return model
@@ -174,11 +184,11 @@ def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, 
     for i in range(0, len(pairs[0]), 32):
         part, whole, other = (a[i : i + 32] for a in pairs)
         logits, mu, _ = model(torch.from_numpy(table[part]), None)
-        ours.append(descriptors(mu))
-        theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 0, 0]))
+        ours.append(descriptors(mu[:, :, 1:2, 1:2]))
+        theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 1:2, 1:2]))
         said = logits[:, : classes + 1].argmax(1).numpy()
         target, known = (t.numpy() for t in _targets(whole, table, classes))
-        given = table[part[:, 8:-8, 8:-8]]
+        given = table[part[:, 16:-16, 16:-16]]
         seen += int(known.sum())
         right += int((known & (said == target)).sum())
         free += int((known & (target == classes)).sum())

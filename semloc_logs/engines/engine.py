@@ -1,0 +1,94 @@
+"""Engines run picklable tasks with a plain function and give the results in the order of the tasks."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import Protocol, TypeVar
+
+from semloc_logs.errors import SemlocError, SettingsError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+class Engine(Protocol):
+    """Runs independent tasks; results come in the order of the tasks, errors as they are raised."""
+
+    jobs: int
+
+    def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]: ...
+
+    def close(self) -> None: ...
+
+
+class Serial:
+    """Everything in this process, one task after the other."""
+
+    jobs = 1
+
+    def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
+        return map(function, tasks)
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+class Processes:
+    """``jobs`` worker processes (spawned, so that threads of the parent cannot hurt them), each with its share of the cores."""
+
+    def __init__(self, jobs: int) -> None:
+        self.jobs = jobs
+        self._pool: ProcessPoolExecutor | None = None
+
+    def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
+        if self._pool is None:
+            context = multiprocessing.get_context("spawn")
+            share = max(1, cores() // self.jobs)
+            self._pool = ProcessPoolExecutor(self.jobs, context, initializer=limit_threads, initargs=(share,))
+        waiting: deque[Future[Result]] = deque()
+        try:
+            for task in tasks:  # a bounded number of tasks in flight: their results may be large
+                waiting.append(self._pool.submit(function, task))
+                if len(waiting) >= 2 * self.jobs:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        except BrokenProcessPool:
+            self._pool = None
+            raise SemlocError(
+                "A worker process ended abruptly, most likely for lack of memory: run again with fewer --jobs; finished work is kept."
+            ) from None
+
+    def close(self) -> None:
+        """Stop the workers."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+
+ENGINES = ("serial", "processes")
+
+
+def make_engine(name: str, jobs: int | None = None) -> Engine:
+    """The engine called ``name`` with ``jobs`` workers (default: the cores that this process may use)."""
+    if name == "serial":
+        return Serial()
+    if name == "processes":
+        return Processes(jobs or cores())
+    raise SettingsError(f"Unknown engine '{name}': there are {', '.join(ENGINES)}.")
+
+
+def cores() -> int:
+    """Cores that this process may use, as SLURM or the affinity mask say."""
+    slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
+    return int(slurm) if slurm.isdigit() and int(slurm) else len(os.sched_getaffinity(0))
+
+
+def limit_threads(threads: int) -> None:
+    """Keep the thread pools of the numerical libraries within ``threads``; for workers, before they load any."""
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ[variable] = str(threads)

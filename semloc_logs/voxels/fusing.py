@@ -1,0 +1,266 @@
+"""Fusing one session: log -> keyframes, submaps and the session map (paper 3.1). One pass over the log, bounded memory."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import semloc_logs
+from semloc_logs import contracts
+from semloc_logs.errors import LogError
+from semloc_logs.frames import PosedCloud
+from semloc_logs.geometry import apply, inverse, rotation_between
+from semloc_logs.labels.geometry import classify
+from semloc_logs.labels.shape import shape
+from semloc_logs.labels.space import SKY, UNLABELLED, guess_space, to_cityscapes
+from semloc_logs.logs.session import Session, open_session
+from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.tables import replacing_folder, write_json, write_table
+from semloc_logs.voxels.gravity import find_up, ground_height
+from semloc_logs.voxels.grid import BlockMap, Fuser
+from semloc_logs.voxels.picture import draw_map
+from semloc_logs.voxels.selection import KeyframeSelector, road_distance, submap_ranges, thin
+from semloc_logs.voxels.store import PART, Keyframe, blocks_path, part_path, pose_columns, read_blocks, read_keyframe, write_blocks, write_keyframes, write_voxels
+from semloc_logs.workspace import SessionFolder
+
+F64 = NDArray[np.float64]
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class FuseTask:
+    """One session to fuse; picklable."""
+
+    logs: tuple[Path, ...]
+    folder: SessionFolder
+    settings: Settings  # resolved
+    topics: dict[str, str] = field(default_factory=dict)
+    fingerprint: str = ""
+
+
+@dataclass(slots=True, eq=False)
+class _Raw:
+    """A keyframe before labels: what is known during the pass."""
+
+    header: Any
+    pose: F64 | None  # session_T_base
+    origin: NDArray[np.float32]
+
+
+@dataclass(slots=True, eq=False)
+class _Normals:
+    """Normals of a bounded number of keyframes, evenly spread over the log, for the direction of gravity."""
+
+    every: int = 1
+    seen: int = 0
+    kept: list[tuple[int, F64, F64]] = field(default_factory=list)
+
+    def add(self, cloud: PosedCloud, points: NDArray[np.float32], cell: float) -> None:
+        if self.seen % self.every == 0:
+            some = points[thin(points, cell)][:12_000]
+            s = shape(some, 12)
+            weight = np.where((s.planar > 0.5) & (s.scattered < 0.15), s.planar, 0.0).astype(float)
+            turned = s.normal.astype(float) if cloud.session_T_base is None else s.normal @ cloud.session_T_base[:3, :3].T
+            keep = weight > 0
+            self.kept.append((self.seen, turned[keep], weight[keep]))
+            if len(self.kept) > 60:
+                self.every *= 2
+                self.kept = [k for k in self.kept if k[0] % self.every == 0]
+        self.seen += 1
+
+
+def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Write keyframes/, blocks/, voxels/, frames.parquet, trajectory.parquet, map.png and, last, session.json; returns the latter.
+
+    Raises LogError when the log has nothing to fuse, RoleError when its streams leave open what to use.
+    """
+    settings = task.settings
+    fusion = settings.fusion
+    scale = fusion.voxel_size / STREET_VOXEL
+    session = open_session(
+        [*task.logs],
+        task.topics,
+        min_range=fusion.min_range or 0.0,
+        max_range=2.0 * (fusion.max_range or 50.0),
+    )
+    try:
+        with tempfile.TemporaryDirectory(prefix="semloc-") as scratch:
+            raws, normals = _collect(session, task, Path(scratch), on_progress)
+            if not raws:
+                raise LogError(f"{session.name} gave no usable points: {'; '.join(session.problems) or 'its sensor streams are empty'}")
+            posed = raws[0].pose is not None
+            session_T_map, level = _level(session, raws, normals, posed)
+            poses = np.array([inverse(session_T_map) @ r.pose if r.pose is not None else level(i) for i, r in enumerate(raws)])
+            source, space = _label_source(settings, Path(scratch), len(raws), session)
+            metadata = {
+                "schema_version": 1,
+                "voxel_size": fusion.voxel_size,
+                "session_T_map": session_T_map.tolist(),
+                "label_space": "cityscapes",
+                "label_source": source,
+                "version": semloc_logs.__version__,
+            }
+            grounds: list[float] = []
+            counts: list[int] = []
+
+            def labelled(first: int) -> Iterator[Keyframe]:
+                for i in range(first, min(first + PART, len(raws))):
+                    points, ids = _load_raw(Path(scratch), i)
+                    points_level = apply(poses[i], points)
+                    ground = ground_height(points_level - np.r_[poses[i][:2, 3], 0.0], float(apply(poses[i], raws[i].origin[None])[0, 2]), scale)
+                    label = _labels(points_level, ids, source, space, scale)
+                    keep = label != SKY
+                    grounds.append(ground)
+                    counts.append(int(keep.sum()))
+                    yield Keyframe(points[keep], label[keep])
+
+            with replacing_folder(task.folder.keyframes) as folder:
+                for first in range(0, len(raws), PART):
+                    stamps = [r.header.stamp_ns for r in raws[first : first + PART]]
+                    write_keyframes(part_path(folder, first), first, stamps, labelled(first), metadata)
+                    on_progress(f"labelled {min(first + PART, len(raws))} of {len(raws)} keyframes")
+        distance = road_distance(poses) if posed else np.zeros(len(poses))
+        frames = {
+            "keyframe": np.arange(len(raws)),
+            "stamp_ns": [r.header.stamp_ns for r in raws],
+            "log_time_ns": [r.header.log_time_ns for r in raws],
+            "topic": [r.header.topic for r in raws],
+            "posed": [posed] * len(raws),
+            "distance": distance,
+            "ground_z": grounds,
+            "points": counts,
+            **{f"origin_{c}": np.array([r.origin[k] for r in raws], np.float32) for k, c in enumerate("xyz")},
+            **pose_columns(poses),
+        }
+        write_table(task.folder.frames, contracts.table("frames", frames), metadata, ("keyframe",))
+        stamps_ns, track = session.trajectory()
+        write_table(task.folder.trajectory, contracts.table("trajectory", {"stamp_ns": stamps_ns, **pose_columns(track)}), metadata, ("stamp_ns",))
+        origins = np.array([r.origin for r in raws])
+        submaps = _submaps(task, poses, origins, np.array(grounds), distance, posed, metadata, on_progress)
+        ids = range(len(submaps))
+        voxels = write_voxels(task.folder.voxels, (read_blocks(blocks_path(task.folder.blocks, i)) for i in ids), metadata)
+        draw_map(task.folder.voxels, poses[:, :3, 3] if posed else np.zeros((0, 3)), fusion.voxel_size, task.folder.picture)
+        content = {
+            **session.to_json(),
+            "name": task.folder.name,
+            "fingerprint": task.fingerprint,
+            "settings": settings.model_dump(mode="json", include={"fusion", "labels"}),
+            **metadata,
+            "posed": posed,
+            "keyframes": len(raws),
+            "submaps": submaps,
+            "voxels": voxels,
+            "skipped": session.skipped,
+        }
+        write_json(task.folder.session_json, content)
+        return content
+    finally:
+        session.close()
+
+
+def _collect(session: Session, task: FuseTask, scratch: Path, on_progress: Callable[[str], None]) -> tuple[list[_Raw], _Normals]:
+    """The one pass over the log: keyframes' thinned points into ``scratch``, their poses and a sample of normals."""
+    fusion = task.settings.fusion
+    cell = fusion.keyframe_resolution or 0.1
+    selector, normals, raws = KeyframeSelector(fusion), _Normals(), list[_Raw]()
+    for cloud in session.clouds():
+        if not selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
+            continue
+        keep = thin(cloud.points, cell)
+        points = cloud.points[keep]
+        np.save(scratch / f"{len(raws)}.npy", points)
+        if cloud.label is not None:
+            np.save(scratch / f"{len(raws)}-label.npy", cloud.label[keep])
+        raws.append(_Raw(cloud.header, cloud.session_T_base, cloud.origin))
+        normals.add(cloud, points, 2 * cell)
+        if len(raws) % 50 == 0:
+            on_progress(f"read {len(raws)} keyframes")
+    return raws, normals
+
+
+def _load_raw(scratch: Path, i: int) -> tuple[NDArray[np.float32], NDArray[np.uint32] | None]:
+    label = scratch / f"{i}-label.npy"
+    return np.load(scratch / f"{i}.npy"), np.load(label) if label.exists() else None
+
+
+def _level(session: Session, raws: list[_Raw], normals: _Normals, posed: bool) -> tuple[F64, Callable[[int], F64]]:
+    """``session_T_map`` (4, 4), a rotation, and for a log without poses the level pose of each keyframe by its number."""
+    optical = session.base_frame.endswith("_optical") or session.base_frame in {c.header.frame_id for c in session.cameras.values()}
+    up_in_base = np.array([0.0, -1.0, 0.0]) if optical else UP
+    if posed:
+        prior = session.imu_up_in_session()
+        if prior is None:
+            rotations = np.array([r.pose[:3, :3] for r in raws if r.pose is not None])
+            # a vehicle's frames follow REP 103, and so does its odometry; a camera's world may be any of its frames
+            prior = (rotations @ up_in_base).mean(0) if optical else UP
+        kept = normals.kept
+        up = find_up(np.concatenate([k[1] for k in kept]), np.concatenate([k[2] for k in kept]), prior)
+        session_T_map = np.eye(4)
+        session_T_map[:3, :3] = rotation_between(UP, up)
+        return session_T_map, lambda _: np.eye(4)
+    found = {k[0]: find_up(k[1], k[2], up_in_base) for k in normals.kept}
+    keys = np.array(sorted(found))
+
+    def level(i: int) -> F64:
+        out = np.eye(4)
+        out[:3, :3] = rotation_between(found[int(keys[np.argmin(np.abs(keys - i))])], UP)
+        return out
+
+    return np.eye(4), level
+
+
+def _label_source(settings: Settings, scratch: Path, count: int, session: Session) -> tuple[str, str]:
+    """Source ("log", "geometry" or "uniform") and the log's label space ("" without labels)."""
+    source = settings.labels.source
+    first = next((i for i in range(count) if (scratch / f"{i}-label.npy").exists()), None)
+    if source == "onnx":
+        raise LogError("labels.source=onnx is not available in this version: use auto, log, geometry or uniform.")
+    if source == "log" and first is None:
+        raise LogError(f"{session.name} has no labels (a 'label' field of the points or a label image): use --set labels.source=geometry.")
+    if source in ("geometry", "uniform") or first is None:
+        return ("uniform" if source == "uniform" else "geometry"), ""
+    return "log", settings.labels.space or guess_space(np.load(scratch / f"{first}-label.npy"))
+
+
+def _labels(points: F64, ids: NDArray[np.uint32] | None, source: str, space: str, scale: float) -> NDArray[np.uint8]:
+    """Classes (n,) of level points (n, 3)."""
+    if source == "log":
+        return to_cityscapes(ids, space) if ids is not None else np.full(len(points), UNLABELLED, np.uint8)
+    if source == "geometry":
+        return classify(points, shape(points), scale)
+    return np.full(len(points), UNLABELLED, np.uint8)
+
+
+def fuse_keyframes(folder: SessionFolder, keyframes: range | list[int], poses: F64, origins: NDArray[np.floating], settings: Settings, radius: float | None = None) -> BlockMap:
+    """The map of some keyframes at ``poses`` (n, 4, 4) map_T_base by keyframe; points beyond ``radius`` of the sensor are left out."""
+    fuser = Fuser(settings.fusion)
+    for i in keyframes:
+        frame = read_keyframe(folder.keyframes, i)
+        points, label = frame.points, frame.label
+        if radius is not None:
+            near = np.linalg.norm(points - origins[i], axis=1) < radius
+            points, label = points[near], label[near]
+        fuser.add(apply(poses[i], points), label, apply(poses[i], origins[i][None])[0])
+    return fuser.finish()
+
+
+def _submaps(
+    task: FuseTask, poses: F64, origins: NDArray[np.floating], grounds: F64, distance: F64, posed: bool, metadata: dict[str, Any], on_progress: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Fuse and write every submap; returns what session.json says of them."""
+    fusion = task.settings.fusion
+    ranges = submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else [(i, i + 1) for i in range(len(poses))]
+    out = []
+    with replacing_folder(task.folder.blocks) as folder:
+        for i, (first, last) in enumerate(ranges):
+            blocks = fuse_keyframes(task.folder, range(first, last), poses, origins, task.settings)
+            write_blocks(blocks_path(folder, i), blocks, {**metadata, "submap": i})
+            out.append({"id": i, "first": first, "last": last - 1, "ground_z": float(np.median(grounds[first:last])), "blocks": len(blocks.keys)})
+            on_progress(f"fused submap {i + 1} of {len(ranges)}")
+    return out

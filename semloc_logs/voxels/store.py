@@ -1,0 +1,155 @@
+"""Keyframes, blocks and voxels as Parquet: what fusion keeps (DESIGN: contracts, workspace)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from semloc_logs import contracts
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.geometry import transform, translation_quaternion
+from semloc_logs.tables import read_table, replacing_folder, write_table
+from semloc_logs.voxels.grid import SCALE, BlockMap
+from semloc_logs.voxels.keys import morton, pack, unpack
+
+PART = 64  # keyframes in a file; a row group each
+TILE = 256  # voxels along the edge of a tile of the session map
+POSE = ("t_x", "t_y", "t_z", "q_x", "q_y", "q_z", "q_w")
+
+
+def pose_columns(poses: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Columns t_x .. q_w of transforms (n, 4, 4)."""
+    poses = np.asarray(poses, float).reshape(-1, 4, 4)
+    values = np.concatenate(translation_quaternion(poses), axis=1) if len(poses) else np.zeros((0, 7))
+    return dict(zip(POSE, values.T, strict=True))
+
+
+def poses_of(table: pa.Table) -> NDArray[np.float64]:
+    """Transforms (n, 4, 4) of the columns t_x .. q_w."""
+    if not table.num_rows:
+        return np.zeros((0, 4, 4))
+    values = np.stack([table[c].to_numpy() for c in POSE], 1)
+    return transform(values[:, :3], values[:, 3:])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """Points (n, 3) in the base frame with classes (n,)."""
+
+    points: NDArray[np.float32]
+    label: NDArray[np.uint8]
+
+
+def part_path(folder: Path, keyframe: int) -> Path:
+    """The file that holds ``keyframe``."""
+    return folder / f"part-{keyframe // PART:05d}.parquet"
+
+
+def write_keyframes(path: Path, first: int, stamps_ns: Sequence[int], keyframes: Iterable[Keyframe], metadata: dict[str, Any]) -> None:
+    """One part: keyframes ``first``, ``first`` + 1, ... each in a row group of its own. ``path`` lies in a folder that is renamed later."""
+    schema = contracts.schema("keyframes").with_metadata({"semloc": _json(metadata)})
+    with pq.ParquetWriter(path, schema, compression="zstd", use_byte_stream_split=["x", "y", "z"], use_dictionary=["keyframe", "stamp_ns", "label"]) as writer:
+        for k, (stamp, frame) in enumerate(zip(stamps_ns, keyframes, strict=True), start=first):
+            n = len(frame.points)
+            p = np.round(frame.points * 512) / 512  # 2 mm: below any sensor's noise, and packs well
+            columns = {"keyframe": np.full(n, k, np.int32), "stamp_ns": np.full(n, stamp, np.int64), "label": frame.label}
+            columns |= {c: p[:, i].astype(np.float32) for i, c in enumerate("xyz")}
+            writer.write_table(contracts.table("keyframes", columns), row_group_size=max(n, 1))
+
+
+def _json(metadata: dict[str, Any]) -> str:
+    import json
+
+    return json.dumps(metadata, sort_keys=True)
+
+
+def read_keyframe(folder: Path, keyframe: int) -> Keyframe:
+    """WorkspaceError when the part is missing or damaged."""
+    path = part_path(folder, keyframe)
+    try:
+        table = pq.ParquetFile(path).read_row_group(keyframe % PART, columns=["x", "y", "z", "label"])
+    except (OSError, pa.ArrowException) as problem:
+        raise WorkspaceError(f"{path} cannot be read ({str(problem).splitlines()[0]}): fuse the session again with --overwrite.") from None
+    points = np.stack([table[c].to_numpy() for c in "xyz"], 1)
+    return Keyframe(points, table["label"].to_numpy())
+
+
+def blocks_path(folder: Path, submap: int) -> Path:
+    """The file of a submap in ``blocks/`` or ``words/``."""
+    return folder / f"submap-{submap:05d}.parquet"
+
+
+def write_blocks(path: Path, blocks: BlockMap, metadata: dict[str, Any]) -> None:
+    """The full observed state of one submap."""
+    b = unpack(blocks.keys)
+    columns: dict[str, Any] = {"bx": b[:, 0], "by": b[:, 1], "bz": b[:, 2]}
+    for name, values in (("state", blocks.state), ("log_odds", blocks.log_odds), ("hits", blocks.hits)):
+        width = 4096 * values.itemsize
+        columns[name] = pa.FixedSizeBinaryArray.from_buffers(pa.binary(width), len(b), [None, pa.py_buffer(np.ascontiguousarray(values))])
+    schema = contracts.schema("blocks")
+    table = pa.table([pa.array(columns[n], schema.field(n).type) if n[0] == "b" else columns[n] for n in schema.names], schema=schema)
+    write_table(path, table, metadata, ("bx", "by", "bz"))
+
+
+def read_blocks(path: Path) -> BlockMap:
+    """Inverse of :func:`write_blocks`."""
+    table = read_table(path).combine_chunks()
+    keys = pack(np.stack([table[c].to_numpy() for c in ("bx", "by", "bz")], 1)) if table.num_rows else np.zeros(0, np.int64)
+
+    def values(name: str, dtype: type) -> NDArray[Any]:
+        if not table.num_rows:
+            return np.zeros((0, 4096), dtype)
+        array = table[name].chunk(0)
+        flat = np.frombuffer(array.buffers()[1], dtype)
+        return flat[array.offset * 4096 : (array.offset + len(array)) * 4096].reshape(-1, 4096)
+
+    return BlockMap(keys, values("log_odds", np.int8), values("state", np.uint8), values("hits", np.uint16))
+
+
+def write_voxels(folder: Path, submaps: Iterable[BlockMap], metadata: dict[str, Any]) -> int:
+    """The session map: the union of the submaps' occupied voxels in tiles of 256 voxels; returns the number of voxels.
+
+    Where submaps overlap the one with more votes speaks. Rows spill to one part for each tile and submap first, so memory holds a
+    submap and then a tile, whatever the length of the log.
+    """
+    total = 0
+    with replacing_folder(folder) as temporary:
+        spill = temporary / ".spill"
+        spill.mkdir()
+        tiles: dict[tuple[int, int], list[Path]] = {}
+        for n, blocks in enumerate(submaps):
+            ijk, label, log_odds, hits = blocks.occupied()
+            rows = np.concatenate([ijk, label[:, None], log_odds[:, None], hits[:, None]], 1).astype(np.int32)
+            key = pack(np.concatenate([ijk[:, :2] // TILE, np.zeros((len(ijk), 1), np.int32)], 1))
+            for k in np.unique(key):
+                x, y, _ = unpack(np.array([k]))[0].tolist()
+                path = spill / f"{x}_{y}-{n}.npy"
+                np.save(path, rows[key == k])
+                tiles.setdefault((x, y), []).append(path)
+        for (x, y), paths in sorted(tiles.items()):
+            rows = np.concatenate([np.load(p) for p in paths])
+            code = morton(rows[:, :3])
+            order = np.lexsort((-rows[:, 5], code))
+            rows, code = rows[order], code[order]
+            rows = rows[np.r_[True, code[1:] != code[:-1]]]
+            _write_tile(temporary / f"tile={x}_{y}" / "part-0.parquet", rows, metadata)
+            total += len(rows)
+        for path in spill.iterdir():
+            path.unlink()
+        spill.rmdir()
+        if not tiles:
+            _write_tile(temporary / "tile=0_0" / "part-0.parquet", np.zeros((0, 6), np.int32), metadata)
+    return total
+
+
+def _write_tile(path: Path, rows: NDArray[np.int32], metadata: dict[str, Any]) -> None:
+    columns: dict[str, Any] = dict(zip(("ix", "iy", "iz"), rows[:, :3].T, strict=True))
+    columns |= {"label": rows[:, 3].astype(np.uint8), "occupancy": (rows[:, 4] / SCALE).astype(np.float32), "hits": rows[:, 5].astype(np.uint16)}
+    write_table(path, contracts.table("voxels", columns), metadata)

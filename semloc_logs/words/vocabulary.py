@@ -1,0 +1,130 @@
+"""The semantic vocabulary (paper 3.4): hierarchical k-means over descriptors with a 64-bit Hamming embedding (Jegou et al. 2008).
+
+The first level has up to 256 cells in the space of the descriptors, the second up to 256 children of each in the 64 projected
+dimensions that the codes are made of. Thresholds of the code are the medians of each cell, so within a cell half of all bits are set.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from semloc_logs.errors import SettingsError
+from semloc_logs.tables import replacing_file
+
+BITS = 64
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vocabulary:
+    """``cells`` (c, 256) unit centroids, ``projection`` (64, 256), ``thresholds`` (c, 64), ``children`` (c, k, 64) centroids."""
+
+    cells: F32
+    projection: F32
+    thresholds: F32
+    children: F32
+
+    def nearest_cells(self, descriptors: F32, probes: int) -> NDArray[np.int32]:
+        """The ``probes`` nearest cells (n, probes) of descriptors (n, 256), nearest first."""
+        similarity = descriptors @ self.cells.T
+        probes = min(probes, len(self.cells))
+        part = np.argpartition(-similarity, probes - 1, axis=1)[:, :probes]
+        order = np.argsort(-np.take_along_axis(similarity, part, 1), axis=1, kind="stable")
+        return np.take_along_axis(part, order, 1).astype(np.int32)
+
+    def codes(self, descriptors: F32, cell: NDArray[np.integer]) -> NDArray[np.uint64]:
+        """64-bit codes (n,) of descriptors (n, 256) under the thresholds of ``cell`` (n,); bit b is projection b."""
+        bits = descriptors @ self.projection.T > self.thresholds[cell]
+        return np.packbits(bits, axis=1, bitorder="little").view("<u8").astype(np.uint64).reshape(-1)
+
+    def words(self, descriptors: F32) -> tuple[NDArray[np.uint16], NDArray[np.uint64]]:
+        """Word (cell * 256 + child) and code of each descriptor (n, 256)."""
+        if not len(descriptors):
+            return np.zeros(0, np.uint16), np.zeros(0, np.uint64)
+        cell = self.nearest_cells(descriptors, 1)[:, 0]
+        projected = descriptors @ self.projection.T
+        child = np.zeros(len(cell), np.int64)
+        for c in np.unique(cell):
+            mine = cell == c
+            k = self.children[c]
+            child[mine] = np.argmin((k**2).sum(1) - 2 * projected[mine] @ k.T, axis=1)
+        return (cell.astype(np.int64) * 256 + child).astype(np.uint16), self.codes(descriptors, cell)
+
+
+def _kmeans(data: F32, k: int, rng: np.random.Generator, rounds: int = 15) -> F32:
+    """Lloyd's algorithm from distinct random points; an empty cluster takes the point farthest from its centroid."""
+    centroids = data[rng.choice(len(data), k, replace=False)].copy()
+    for _ in range(rounds):
+        distance = (centroids**2).sum(1) - 2 * data @ centroids.T
+        nearest = distance.argmin(1)
+        count = np.bincount(nearest, minlength=k)
+        sums = np.zeros_like(centroids)
+        np.add.at(sums, nearest, data)
+        full = count > 0
+        centroids[full] = sums[full] / count[full, None]
+        if not full.all():
+            worst = np.argsort(-distance[np.arange(len(data)), nearest])
+            centroids[~full] = data[worst[: int((~full).sum())]]
+    return centroids
+
+
+def train_vocabulary(descriptors: F32, cells: int = 256, children: int = 16, seed: int = 0) -> Vocabulary:
+    """A vocabulary of ``cells`` x ``children`` words from unit descriptors (n, 256); fewer where there are not enough.
+
+    Raises SettingsError below 256 descriptors.
+    """
+    n = len(descriptors)
+    if n < 256:
+        raise SettingsError(f"A vocabulary needs at least 256 descriptors, not {n}: describe more sessions.")
+    rng = np.random.default_rng(seed)
+    cells = int(min(cells, max(8, n // 64)))
+    centroids = _kmeans(descriptors, cells, rng)
+    centroids /= np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), 1e-9)
+    cell = (descriptors @ centroids.T).argmax(1)
+    # principal directions of what is left within the cells, rotated at random so that every bit says equally much
+    rest = descriptors - centroids[cell]
+    directions = np.linalg.eigh(rest.T @ rest)[1][:, ::-1][:, :BITS]
+    rotation = np.linalg.qr(rng.standard_normal((BITS, BITS)))[0]
+    projection = (directions @ rotation).T.astype(np.float32)
+    projected = descriptors @ projection.T
+    overall = np.median(projected, axis=0)
+    thresholds = np.tile(overall, (cells, 1)).astype(np.float32)
+    kids = np.zeros((cells, children, BITS), np.float32)
+    for c in range(cells):
+        mine = projected[cell == c]
+        if len(mine) >= 8:
+            thresholds[c] = np.median(mine, axis=0)
+        if len(mine) >= children:
+            kids[c] = _kmeans(mine, children, rng, 8)
+        elif len(mine):
+            kids[c] = mine[rng.choice(len(mine), children)]
+    return Vocabulary(centroids.astype(np.float32), projection, thresholds, kids)
+
+
+def save_vocabulary(path: Path, vocabulary: Vocabulary, card: dict[str, str]) -> None:
+    """Half precision safetensors; ``card`` says what it was trained on."""
+    arrays = {k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds", "children")}
+    with replacing_file(path) as temporary:
+        save_file(arrays, temporary, metadata=card)
+
+
+@lru_cache(maxsize=8)
+def load_vocabulary(variant: str, path: Path | None = None) -> Vocabulary:
+    """The shipped vocabulary of ``variant``, or that of a file. Raises SettingsError when the file does not hold one."""
+    try:
+        if path is not None:
+            arrays = load_file(path)
+        else:
+            with as_file(files("semloc_logs.words") / "vocabularies" / f"{variant}.safetensors") as shipped:
+                arrays = load_file(shipped)
+        return Vocabulary(*(arrays[k].astype(np.float32) for k in ("cells", "projection", "thresholds", "children")))
+    except (OSError, SafetensorError, KeyError) as problem:
+        raise SettingsError(f"{path or 'The shipped vocabulary'}: no vocabulary of the {variant} variant ({problem}).") from None

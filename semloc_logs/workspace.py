@@ -1,0 +1,87 @@
+"""Every path of a workspace, and nothing else (DESIGN: contracts, workspace)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class SessionFolder:
+    """WORK/sessions/SESSION."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def session_json(self) -> Path:
+        return self.path / "session.json"
+
+    @property
+    def trajectory(self) -> Path:
+        return self.path / "trajectory.parquet"
+
+    @property
+    def frames(self) -> Path:
+        return self.path / "frames.parquet"
+
+    @property
+    def keyframes(self) -> Path:
+        return self.path / "keyframes"
+
+    @property
+    def voxels(self) -> Path:
+        return self.path / "voxels"
+
+    @property
+    def blocks(self) -> Path:
+        return self.path / "blocks"
+
+    @property
+    def words(self) -> Path:
+        return self.path / "words"
+
+    @property
+    def words_json(self) -> Path:
+        return self.path / "words.json"
+
+    @property
+    def picture(self) -> Path:
+        return self.path / "map.png"
+
+
+@dataclass(frozen=True, slots=True)
+class Workspace:
+    """WORK."""
+
+    path: Path
+
+    def session(self, name: str) -> SessionFolder:
+        return SessionFolder(self.path / "sessions" / name)
+
+    def sessions(self) -> list[SessionFolder]:
+        """Sessions that were fused, by name."""
+        return [SessionFolder(p.parent) for p in sorted((self.path / "sessions").glob("*/session.json"))]
+
+    @property
+    def closures(self) -> Path:
+        return self.path / "closures.parquet"
+
+    @property
+    def rejected(self) -> Path:
+        return self.path / "rejected.parquet"
+
+    @property
+    def annotated(self) -> Path:
+        return self.path / "annotated"
+
+    @property
+    def picture(self) -> Path:
+        return self.path / "closures.png"
+
+    @property
+    def summary(self) -> Path:
+        return self.path / "run.json"
