@@ -1,0 +1,168 @@
+"""Streets: the road is where the network says, and a seed is a world."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from semloc_logs.simulation.hall import build_hall, hall_walk
+from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route
+from semloc_logs.simulation.street import build_street, street_ground
+from semloc_logs.simulation.traffic import random_traffic
+from semloc_logs.simulation.trajectory import drifting_odometry, drive, poses_along, smooth_line
+from semloc_logs.simulation.world import ROAD, SIDEWALK, TERRAIN, Scene, World
+
+
+@pytest.fixture(scope="module")
+def network() -> RoadNetwork:
+    return grid_network(np.random.default_rng(4), 2, 2, 50.0)
+
+
+@pytest.fixture(scope="module")
+def world(network: RoadNetwork) -> World:
+    return build_street(network, 4)
+
+
+def same(a: World, b: World) -> bool:
+    return all(x.tobytes() == y.tobytes() for x, y in ((a.vertices, b.vertices), (a.triangles, b.triangles), (a.labels, b.labels)))
+
+
+def faces(world: World) -> set[bytes]:
+    """Every triangle with its label, whatever the numbers of its vertices."""
+    corners = world.vertices[world.triangles].reshape(-1, 9)
+    return {c.tobytes() + bytes([label]) for c, label in zip(corners, world.labels.tolist(), strict=True)}
+
+
+def test_a_seed_is_a_world(network: RoadNetwork, world: World) -> None:
+    assert same(world, build_street(network, 4))
+    assert not same(world, build_street(network, 5))
+
+
+def test_a_condition_changes_some_of_it(network: RoadNetwork, world: World) -> None:
+    other = build_street(network, 4, condition=1)
+    first, second = faces(world), faces(other)
+    common = len(first & second)
+    assert common < len(first)
+    assert common > 0.8 * max(len(first), len(second))
+
+
+def test_labels_are_train_ids_and_triangles_are_in_range(world: World) -> None:
+    assert {ROAD, SIDEWALK, 2, 5, 8, TERRAIN} <= set(np.unique(world.labels).tolist()) <= ({*range(19), 255} - {10})
+    assert world.triangles.min() == 0
+    assert world.triangles.max() == len(world.vertices) - 1
+    assert np.isfinite(world.vertices).all()
+
+
+def test_the_driven_lane_is_road_at_the_height_of_the_poses(network: RoadNetwork, world: World) -> None:
+    route = random_route(np.random.default_rng(0), network, 150)
+    line = smooth_line(lane_path(network, route))
+    ground = street_ground(network, 4)
+    poses = poses_along(line, np.arange(3.0, 140.0), ground.slope_height, np.random.default_rng(0))
+    origins = poses[:, :3, 3] + [0, 0, 0.25]
+    down = np.tile(np.array([0, 0, -1], np.float32), (len(origins), 1))
+    distance, triangle, _ = Scene(world).cast(origins.astype(np.float32), down)
+    assert (world.labels[triangle] == ROAD).all()
+    assert np.abs(distance - 0.25).max() < 0.03
+
+
+def test_kerbs_are_12_centimetres(network: RoadNetwork) -> None:
+    ground = street_ground(network, 4)
+    road, walk = (np.argwhere(ground.kind == kind)[::50] for kind in (ROAD, SIDEWALK))
+    for cells, step in ((road, 0.0), (walk, 0.12)):
+        x, y = (ground.corner + 0.5 * (cells + 0.5)).T
+        np.testing.assert_allclose(ground.height(x, y) - ground.slope_height(x, y), step, atol=1e-12)
+
+
+def test_grids_have_no_dead_ends() -> None:
+    for seed in range(20):
+        network = grid_network(np.random.default_rng(seed), 4, 3, 80.0)
+        degree = np.bincount([c for road in network.roads for c in (road.a, road.b)], minlength=12)
+        assert degree.min() >= 2
+
+
+def test_routes_are_connected_and_never_turn_back() -> None:
+    network = grid_network(np.random.default_rng(1), 3, 3, 80.0)
+    route = random_route(np.random.default_rng(2), network, 1500)
+    ends = [(r.a, r.b) if forwards else (r.b, r.a) for r, forwards in ((network.roads[k], f) for k, f in route)]
+    assert all(before[1] == after[0] for before, after in pairwise(ends))
+    assert all(a[0] != b[0] for a, b in pairwise(route))
+
+
+def test_traffic_keeps_to_the_right() -> None:
+    network = path_network(np.random.default_rng(0), np.column_stack([np.arange(100.0), np.zeros(100)]))
+    lane, back = (lane_path(network, [(0, forwards)]) for forwards in (True, False))
+    expected = network.roads[0].lane
+    np.testing.assert_allclose(lane[:, 1], -expected)
+    np.testing.assert_allclose(back[:, 1], expected)
+
+
+def test_a_path_that_is_driven_twice_is_one_road() -> None:
+    there = np.column_stack([np.arange(0.0, 120.0), np.zeros(120)])
+    network = path_network(np.random.default_rng(0), np.concatenate([there, there[::-1] + np.array([0.0, 2.0])]))
+    assert sum(len(road.path) for road in network.roads) < 160
+
+
+def test_poses_point_along_the_line_and_up_the_slope() -> None:
+    line = np.column_stack([np.linspace(0, 50, 101), np.linspace(0, 50, 101)])
+    pose = poses_along(line, np.array([20.0]), lambda x, y: 0.1 * x, np.random.default_rng(0), shake=0.0)[0]
+    slope = 0.1 / np.sqrt(2)
+    np.testing.assert_allclose(pose[:3, 0], np.array([1 / np.sqrt(2), 1 / np.sqrt(2), slope]) / np.hypot(1, slope), atol=1e-6)
+    np.testing.assert_allclose(pose[:3, 3], [20 / np.sqrt(2), 20 / np.sqrt(2), 2 / np.sqrt(2)], atol=1e-6)
+
+
+def test_odometry_drifts_by_about_a_hundredth() -> None:
+    line = smooth_line(np.array([[0.0, 0], [200, 0], [200, 150], [0, 150]]))
+    share = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        trajectory = drive(line, lambda x, y: 0 * x, rng, start_ns=10**18)
+        np.testing.assert_array_equal(trajectory.odom_T_base[0], np.eye(4))
+        np.testing.assert_allclose(np.linalg.det(trajectory.odom_T_base[-1][:3, :3]), 1.0)
+        first = np.linalg.inv(trajectory.world_T_base[0])
+        share.append(np.linalg.norm((first @ trajectory.world_T_base[-1] - trajectory.odom_T_base[-1])[:3, 3]) / 550)
+    assert 0.002 < np.median(share) < 0.012
+    assert max(share) < 0.03
+
+
+def test_perfect_odometry_follows_the_truth() -> None:
+    line = smooth_line(np.array([[0.0, 0], [60, 0], [60, 50]]))
+    truth = drive(line, lambda x, y: 0.02 * x, np.random.default_rng(1), start_ns=0).world_T_base
+    np.testing.assert_allclose(drifting_odometry(truth, np.random.default_rng(0), drift=0.0), np.linalg.inv(truth[0]) @ truth, atol=1e-9)
+
+
+def test_drives_are_as_fast_as_asked_and_slow_down_in_bends() -> None:
+    line = smooth_line(np.array([[0.0, 0], [150, 0], [150, 150]]))
+    trajectory = drive(line, lambda x, y: 0 * x, np.random.default_rng(3), start_ns=0, speed=8.0)
+    step = np.linalg.norm(np.diff(trajectory.world_T_base[:, :2, 3], axis=0), axis=1) * 20
+    corner = np.linalg.norm(trajectory.world_T_base[:-1, :2, 3] - [149, 1], axis=1) < 3
+    assert step[corner].max() < 5.5
+    assert np.median(step) == pytest.approx(8.0, abs=1.5)
+
+
+def test_traffic_keeps_off_the_own_vehicle(network: RoadNetwork) -> None:
+    ground = street_ground(network, 4)
+    line = smooth_line(lane_path(network, random_route(np.random.default_rng(0), network, 150)))
+    traffic = random_traffic(np.random.default_rng(1), ground, [line], 5.0)
+    assert len(traffic.vehicles) > 2
+    _, _, start, _ = traffic.vehicles[0]
+    pose = poses_along(line, np.array([start]), ground.slope_height, np.random.default_rng(0), shake=0.0)[0]
+    scene = traffic.scene(0.0, pose)
+    assert scene is not None
+    down = np.array([[0, 0, -1]], np.float32)
+    assert np.isinf(scene.cast((pose[:3, 3] + [0, 0, 5]).astype(np.float32)[None], down)[0]).all()
+
+
+def test_halls_are_closed_and_walked_inside() -> None:
+    for seed in (5, 11):
+        world = build_hall(seed)
+        assert same(world, build_hall(seed))
+        path = smooth_line(hall_walk(seed, 60.0), 0.8)[5:-5:10]
+        rng = np.random.default_rng(0)
+        directions = rng.normal(size=(2000, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        origins = np.column_stack([path[rng.integers(0, len(path), 2000)], np.full(2000, 1.5)])
+        distance, _, _ = Scene(world).cast(origins.astype(np.float32), directions.astype(np.float32))
+        assert np.isinf(distance).mean() < 0.01
+        assert distance[np.isfinite(distance)].max() < 80
