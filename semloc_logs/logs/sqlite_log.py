@@ -20,6 +20,8 @@ from semloc_logs.logs.problems import Problems
 from semloc_logs.logs.reading import MAX_CHUNK, BaseLog, decompress
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message starts like this
+# the sentence of an error quotes the file, so that it may itself be no UTF-8
+_DAMAGE = (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError)
 
 
 class SqliteLog(BaseLog):
@@ -32,11 +34,11 @@ class SqliteLog(BaseLog):
         self._topics: dict[int, tuple[str, str, str, Definition]] = {}
         try:
             self._database = _connect(path)
-        except (sqlite3.Error, OSError) as error:
+        except (*_DAMAGE, OSError) as error:
             raise LogError(f"{path} cannot be read as a sqlite3 bag: {error}; try to recover it with 'sqlite3 FILE .recover'.") from error
         try:
             self._open()
-        except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
+        except (*_DAMAGE, ValueError, TypeError) as error:
             self._database.close()
             raise LogError(f"{path} cannot be read as a sqlite3 bag: {error}.") from error
         self._name_undefined()
@@ -63,7 +65,7 @@ class SqliteLog(BaseLog):
                         self._problems.skip(stage, topic, f"at {log_time} ns {error}")
                         continue
                 yield Message(topic, type_, encoding, log_time, data, definition)
-        except (sqlite3.Error, OverflowError, MemoryError) as error:
+        except _DAMAGE as error:
             self._problems.add(f"{self._name}: reading ended after {read} messages because the file is damaged ({error}).")
 
     def _rows(self, topic_ids: list[int]) -> Iterator[tuple[int, Any, Any]]:
@@ -75,12 +77,12 @@ class SqliteLog(BaseLog):
             return
         # an index may be what is damaged: without it, and only as far as the table can be read
         times: list[tuple[int, int]] = []
-        with contextlib.suppress(sqlite3.Error):
+        with contextlib.suppress(*_DAMAGE):
             for time, row in self._database.execute(f"SELECT timestamp, id FROM messages NOT INDEXED {where}", topic_ids):
                 if isinstance(time, int):
                     times.append((time, row))
         for _, row in sorted(times):
-            with contextlib.suppress(sqlite3.Error):
+            with contextlib.suppress(*_DAMAGE):
                 yield from self._database.execute(f"{columns} WHERE id = ?", (row,))
 
     def close(self) -> None:
@@ -105,7 +107,7 @@ class SqliteLog(BaseLog):
             if not (isinstance(start, int) and isinstance(end, int)) and sum(counts.values()):
                 raise sqlite3.DatabaseError("time stamps are no integers")
             self.start_ns, self.end_ns = start, end
-        except sqlite3.DatabaseError as error:
+        except _DAMAGE as error:
             self._recount(counts, error)
         self.streams = [Stream(*kind, counts[kind]) for kind in sorted({t[:3] for t in self._topics.values()})]
         self.encoding = "ros2"
@@ -117,7 +119,7 @@ class SqliteLog(BaseLog):
             if counted and encoding == "cdr" and not definition.text and not is_standard(type_):
                 self._problems.add(f"{topic}: messages of type {type_} cannot be decoded because the log does not define the type.")
 
-    def _recount(self, counts: Counter[tuple[str, str, str]], error: sqlite3.DatabaseError) -> None:
+    def _recount(self, counts: Counter[tuple[str, str, str]], error: BaseException) -> None:
         """Counts what a damaged file still gives away."""
         self._damaged = True
         self._problems.add(f"{self._name}: the file is damaged ({error}); what can be read of it is used.")
@@ -145,13 +147,14 @@ def _connect(path: Path) -> sqlite3.Connection:
     for mode in ("mode=ro", "mode=ro&immutable=1"):
         database = sqlite3.connect(f"{address}?{mode}", uri=True, check_same_thread=False)
         try:
+            database.text_factory = lambda text: text.decode(errors="replace")
             database.execute("PRAGMA trusted_schema = OFF")
             database.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
         except sqlite3.OperationalError:
             database.close()
             if "immutable" in mode:
                 raise
-        except sqlite3.Error:
+        except _DAMAGE:
             database.close()
             raise
         else:
