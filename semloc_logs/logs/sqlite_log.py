@@ -104,7 +104,7 @@ class SqliteLog(BaseLog):
                 if id_ in self._topics:
                     counts[self._topics[id_][:3]] += count
             start, end = execute("SELECT MIN(timestamp), MAX(timestamp) FROM messages").fetchone()
-            if not (isinstance(start, int) and isinstance(end, int)) and sum(counts.values()):
+            if any(counts.values()) and not (isinstance(start, int) and isinstance(end, int)):
                 raise sqlite3.DatabaseError("time stamps are no integers")
             self.start_ns, self.end_ns = start, end
         except _DAMAGE as error:
