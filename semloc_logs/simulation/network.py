@@ -95,7 +95,9 @@ def path_network(rng: Rng, path: F64) -> RoadNetwork:
     for start, stop in edges.reshape(-1, 2):
         for first in range(int(start), int(stop) - 5, 150):
             piece = points[max(first - 8 * (first == start), 0) : min(first + 151, int(stop) + 8)]
-            crossings += [piece[0], piece[-1]]
+            if first == start:
+                crossings.append(piece[0])
+            crossings.append(piece[-1])
             roads.append(_road(rng, len(crossings) - 2, len(crossings) - 1, piece, narrow))
     return RoadNetwork(np.array(crossings), tuple(roads))
 

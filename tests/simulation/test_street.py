@@ -104,6 +104,12 @@ def test_a_path_that_is_driven_twice_is_one_road() -> None:
     assert sum(len(road.path) for road in network.roads) < 160
 
 
+def test_a_long_path_can_be_driven_from_end_to_end() -> None:
+    network = path_network(np.random.default_rng(0), np.column_stack([np.arange(0.0, 400.0), 20 * np.sin(np.arange(400) / 60)]))
+    assert len(network.roads) == 3
+    assert [(road.a, road.b) for road in network.roads] == [(0, 1), (1, 2), (2, 3)]
+
+
 def test_poses_point_along_the_line_and_up_the_slope() -> None:
     line = np.column_stack([np.linspace(0, 50, 101), np.linspace(0, 50, 101)])
     pose = poses_along(line, np.array([20.0]), lambda x, y: 0.1 * x, np.random.default_rng(0), shake=0.0)[0]
