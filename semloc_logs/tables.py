@@ -17,6 +17,8 @@ import pyarrow.parquet as pq
 from semloc_logs.errors import ContractError, WorkspaceError
 
 ROW_GROUP = 131_072
+_UMASK = os.umask(0o022)
+os.umask(_UMASK)
 
 
 def fsync_folder(folder: Path) -> None:
@@ -36,6 +38,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         with temporary.open("rb+") as written:
+            os.fchmod(written.fileno(), 0o666 & ~_UMASK)  # some writers make private files
             os.fsync(written.fileno())
         os.replace(temporary, path)
         fsync_folder(path.parent)

@@ -1,0 +1,253 @@
+"""One query against the database: words -> hypotheses -> verified alignments -> closures and rejections (paper 3.4, 3.5)."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.hypotheses import Hypothesis, pool
+from semloc_logs.alignment.icp import Fit
+from semloc_logs.alignment.pyramid import tau
+from semloc_logs.alignment.verify import Candidate, Features, Query, coarse_fit, fine_fit, same_place, search_hypotheses, structure_scores
+from semloc_logs.closures.acceptance import reason, shipped
+from semloc_logs.closures.database import Database, open_database
+from semloc_logs.closures.queries import SessionMap, build_query
+from semloc_logs.geometry import inverse
+from semloc_logs.labels.space import cityscapes
+from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.subvolumes.cut import turn
+from semloc_logs.subvolumes.describe import describe_map, load_encoder
+from semloc_logs.workspace import Workspace
+
+F64 = NDArray[np.float64]
+INFLATION = 30.0  # of the covariance: neighbouring points share their errors
+FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
+
+
+@dataclass(frozen=True, slots=True)
+class CloseTask:
+    """Some queries of one session against target sessions; picklable."""
+
+    work: Path
+    session: str
+    keyframes: tuple[int, ...]
+    targets: tuple[str, ...]
+    settings_json: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """A verified hypothesis with everything that is reported; ``accepted`` or with a ``reason``."""
+
+    query_session: str
+    target_session: str
+    query_keyframe: int
+    target_keyframe: int
+    query_stamp_ns: int
+    target_stamp_ns: int
+    target_T_query: F64
+    covariance: F64
+    overlap: float
+    probability: float
+    inliers: int
+    words: int
+    features: Features
+    reason: str
+
+    @property
+    def accepted(self) -> bool:
+        return not self.reason
+
+
+def close_queries(task: CloseTask) -> list[list[Alignment]]:
+    """For each keyframe of the task the alignments found, best first: at most one accepted for each target session."""
+    database = open_database(task.work, task.targets, task.settings_json)
+    session = SessionMap(Workspace(task.work).session(task.session))
+    return [close_query(database, session, k) for k in task.keyframes]
+
+
+def close_query(database: Database, session: SessionMap, keyframe: int) -> list[Alignment]:
+    """Alignments of the query at ``keyframe`` with every target session, best first."""
+    settings = database.settings
+    query, query_T_base = build_query(session, keyframe, settings)
+    if not len(query.structure[0]):
+        return []
+    hypotheses = find_hypotheses(database, session, keyframe, query)
+    candidates = verify_hypotheses(database, query, hypotheses)
+    out: list[Alignment] = []
+    by_session: dict[str, list[Candidate]] = defaultdict(list)
+    for c in candidates:
+        by_session[database.places[c.group].session].append(c)
+    for found in by_session.values():
+        out += _align(database, session, keyframe, query, query_T_base, found)
+    return sorted(out, key=lambda a: (-a.probability, -a.features.structure, a.target_session, a.target_stamp_ns))
+
+
+def allowed_places(database: Database, session: SessionMap, keyframe: int) -> dict[str, NDArray[np.bool_]]:
+    """Which submaps may answer, by the variant of the words that they are asked with: semantic where both label sources know classes.
+
+    Of the query's own session those that come near the query neither in time nor along the road.
+    """
+    closures = database.settings.closures
+    forced = database.settings.descriptor.variant
+    out: dict[str, NDArray[np.bool_]] = {}
+    for g, place in enumerate(database.places):
+        target = database.sessions[place.session]
+        if place.session == session.folder.name:
+            submap = target.submaps[place.submap]
+            first, last = submap["first"], submap["last"]
+            seconds = np.array([target.stamps_ns[first], target.stamps_ns[last]]) - session.stamps_ns[keyframe]
+            road = np.array([target.distance[first], target.distance[last]]) - session.distance[keyframe]
+            if not session.posed or _gap(seconds) < closures.exclude_seconds * 1e9 or _gap(road) < (closures.exclude_distance or 0.0):
+                continue
+        variant = ("semantic" if session.has_classes and target.has_classes else "geometric") if forced == "auto" else forced
+        out.setdefault(variant, np.zeros(len(database.places), bool))[g] = True
+    return out
+
+
+def _gap(interval: NDArray[np.number]) -> float:
+    """Distance of 0 from the interval (2,)."""
+    return float(max(interval.min(), -interval.max(), 0.0))
+
+
+def find_hypotheses(database: Database, session: SessionMap, keyframe: int, query: Query) -> list[Hypothesis]:
+    """Word matches of the query in all headings, pooled."""
+    settings = database.settings
+    closures, v = settings.closures, settings.fusion.voxel_size
+    parts: list[tuple[NDArray[np.int64], F64, F64, F64]] = []
+    low, high = query.blocks.bounds()
+    state = query.blocks.dense(low, tuple((high - low).tolist()))
+    half = -(-int((settings.query.radius or 30.0) / v + 16) // 8) * 8
+    box = np.empty((2 * half, 2 * half, int(high[2] - low[2])), np.uint8)
+    middle = np.array([0.0, 0.0, (low[2] + high[2]) / 2])
+    ground = float(session.ground_z[keyframe] - session.map_T_base[keyframe][2, 3])
+    for variant, allowed in allowed_places(database, session, keyframe).items():
+        words, encoder = database.words(variant), load_encoder(variant, settings.descriptor.weights)
+        for heading in range(closures.headings):
+            yaw = 2 * np.pi * heading / closures.headings
+            turn(state, low.astype(np.int64), -yaw, middle, box)
+            corner = np.array([-half, -half, low[2]])
+            d = describe_map(box, corner, ground, v, encoder, settings.descriptor.query_stride, settings.descriptor.min_occupied)
+            m = words.index.search(d.descriptor, closures.neighbours, closures.probes, allowed)
+            if len(m.query):
+                shift = words.centre[m.entry] - d.centre[m.query] * v
+                parts.append((words.group[m.entry], np.full(len(m.query), yaw), shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3))
+    if not parts:
+        return []
+    group, yaws, shift, weight = (np.concatenate([p[k] for p in parts]) for k in range(4))
+    return pool(group, yaws, shift, weight, 2.4 * v / STREET_VOXEL, closures.hypotheses)
+
+
+def verify_hypotheses(database: Database, query: Query, hypotheses: list[Hypothesis]) -> list[Candidate]:
+    """The best candidates after the search over the voxel pyramid."""
+    targets = {h.group: database.target(h.group) for h in hypotheses}
+    return search_hypotheses(hypotheses, targets, query, database.settings.closures)
+
+
+def _align(
+    database: Database, session: SessionMap, keyframe: int, query: Query, query_T_base: F64, candidates: list[Candidate]
+) -> list[Alignment]:
+    """Candidates of one target session, aligned on the points, compared with each other, judged."""
+    settings = database.settings
+    v = settings.fusion.voxel_size
+    fitted: list[tuple[float, Candidate, Fit, int]] = []
+    for c in candidates[:5]:
+        near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
+        fit = coarse_fit(c, database.surface(c.group, near), query)
+        structure, coverage, _, _ = structure_scores(query, database.target(c.group), fit.target_T_query)
+        fitted.append((structure * min(1.0, coverage / 0.5), c, fit, near))
+    fitted.sort(key=lambda f: -f[0])
+    distinct_places: list[tuple[float, Candidate, Fit, int]] = []
+    for f in fitted:
+        if not any(same_place(f[2].target_T_query, o[2].target_T_query, v) for o in distinct_places):
+            distinct_places.append(f)
+    out = []
+    for rank, f in enumerate(distinct_places[: max(1, settings.closures.rejected_per_query)]):
+        others = [o[0] for o in distinct_places if o is not f]
+        out.append(_judge(database, session, keyframe, query, query_T_base, f, max(others, default=0.0), rank == 0))
+    return out
+
+
+def _judge(
+    database: Database,
+    session: SessionMap,
+    keyframe: int,
+    query: Query,
+    query_T_base: F64,
+    fitted: tuple[float, Candidate, Fit, int],
+    second: float,
+    is_best: bool,
+) -> Alignment:
+    """The alignment of one candidate with its features, probability, covariance and, if it is not accepted, the reason."""
+    settings = database.settings
+    v = settings.fusion.voxel_size
+    score, candidate, _, near = fitted
+    place = database.places[candidate.group]
+    target_session, target = database.sessions[place.session], database.target(candidate.group)
+    fine = fine_fit(fitted[2].target_T_query, database.surface(candidate.group, near), query.points, v)
+    T = fine.target_T_query
+    structure, coverage, contradiction, count = structure_scores(query, target, T)
+    weakest = _stiffness(fine)
+    features = Features(
+        structure=structure,
+        coverage=coverage,
+        contradiction=contradiction,
+        fit=fine.inliers,
+        rmse=fine.rmse / v,
+        distinct=second / max(score, 1e-6),
+        support=float(np.log10(count + 1)),
+        stiffness=float(np.log10(weakest + 1)),
+    )
+    probability = shipped().probability(features)
+    same_source = session.json["label_source"] == target_session.json["label_source"]
+    overlap, inliers = tau(query.blocks, target.blocks, v, T, settings.closures.kappa * v, None if same_source else cityscapes().coarse)
+    map_T_query_base = T @ query_T_base
+    nearest = database.nearest_keyframe(candidate.group, map_T_query_base[:3, 3])
+    map_T_target = target_session.map_T_base[nearest]
+    least = settings.closures.min_probability
+    why = "" if probability >= least and is_best else reason(features, probability, least)
+    if probability >= least and not is_best:
+        why = "another place of the same session fits better"
+    return Alignment(
+        query_session=session.folder.name,
+        target_session=place.session,
+        query_keyframe=keyframe,
+        target_keyframe=nearest,
+        query_stamp_ns=int(session.stamps_ns[keyframe]),
+        target_stamp_ns=int(target_session.stamps_ns[nearest]),
+        target_T_query=inverse(map_T_target) @ map_T_query_base,
+        covariance=_covariance(fine, map_T_query_base, map_T_target),
+        overlap=overlap,
+        probability=probability,
+        inliers=inliers,
+        words=candidate.votes,
+        features=features,
+        reason=why,
+    )
+
+
+def _stiffness(fit: Fit) -> float:
+    """Least information about the position, the rotation being free: how many points hold the weakest direction."""
+    H = fit.information
+    if not np.isfinite(H).all() or np.linalg.matrix_rank(H) < 6:
+        return 0.0
+    reduced = H[:3, :3] - H[:3, 3:] @ np.linalg.solve(H[3:, 3:], H[3:, :3])
+    return float(max(np.linalg.eigvalsh(reduced).min(), 0.0))
+
+
+def _covariance(fit: Fit, map_T_query: F64, map_T_target: F64) -> F64:
+    """Covariance (6, 6) of target_T_query from the fit's information, in the target's axes (DESIGN: closures.parquet)."""
+    H = fit.information + 1e-3 * np.eye(6) * max(np.trace(fit.information) / 6, 1.0)
+    noise = max(fit.rmse if np.isfinite(fit.rmse) else 1.0, 0.02) ** 2
+    about_centre = INFLATION * noise * np.linalg.inv(H)
+    x, y, z = map_T_query[:3, 3] - fit.centre
+    A = np.eye(6)
+    A[:3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turned = np.zeros((6, 6))
+    turned[:3, :3] = turned[3:, 3:] = map_T_target[:3, :3].T
+    C = turned @ A @ about_centre @ A.T @ turned.T + FLOOR
+    return np.asarray((C + C.T) / 2)

@@ -1,0 +1,118 @@
+"""Queries: which keyframes ask, and the small map that each asks with (paper 3, acc. of 4.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.verify import Query, thin_points
+from semloc_logs.geometry import apply, inverse, rotation_angle
+from semloc_logs.settings import Settings
+from semloc_logs.tables import read_json, read_table
+from semloc_logs.voxels.fusing import fuse_keyframes
+from semloc_logs.voxels.store import poses_of, read_keyframe
+from semloc_logs.workspace import SessionFolder
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(eq=False)
+class SessionMap:
+    """A fused session as closing needs it: its keyframes' poses, and what session.json says."""
+
+    folder: SessionFolder
+
+    @cached_property
+    def json(self) -> dict[str, Any]:
+        return read_json(self.folder.session_json)
+
+    @cached_property
+    def frames(self) -> pa.Table:
+        return read_table(self.folder.frames)
+
+    @cached_property
+    def map_T_base(self) -> F64:
+        """Poses (n, 4, 4) of the keyframes."""
+        return poses_of(self.frames)
+
+    @cached_property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        return np.asarray(self.frames["stamp_ns"].to_numpy())
+
+    @cached_property
+    def distance(self) -> F64:
+        return np.asarray(self.frames["distance"].to_numpy())
+
+    @cached_property
+    def ground_z(self) -> F64:
+        return np.asarray(self.frames["ground_z"].to_numpy())
+
+    @cached_property
+    def origins(self) -> F64:
+        return np.stack([self.frames[f"origin_{c}"].to_numpy() for c in "xyz"], 1).astype(float)
+
+    @property
+    def posed(self) -> bool:
+        return bool(self.json["posed"])
+
+    @property
+    def submaps(self) -> list[dict[str, Any]]:
+        return list(self.json["submaps"])
+
+    @property
+    def has_classes(self) -> bool:
+        """Whether labels come from a log or a model, so that the semantic network understands them."""
+        return self.json["label_source"] in ("log", "onnx")
+
+
+def query_keyframes(session: SessionMap, settings: Settings) -> list[int]:
+    """Keyframes that ask: every ``query.every`` metres or ``query.every_angle`` of turning; all of them in a log without poses."""
+    if not session.posed:
+        return list(range(len(session.stamps_ns)))
+    every, angle = settings.query.every or 2.0, settings.query.every_angle
+    chosen: list[int] = []
+    for i, pose in enumerate(session.map_T_base):
+        if chosen:
+            moved = inverse(session.map_T_base[chosen[-1]]) @ pose
+            if np.linalg.norm(moved[:3, 3]) < every and rotation_angle(moved[:3, :3]) < angle:
+                continue
+        chosen.append(i)
+    return chosen
+
+
+def query_members(session: SessionMap, keyframe: int, settings: Settings) -> list[int]:
+    """The keyframes fused into the query of ``keyframe``: ``query.frames`` around it, or all within ``query.length`` of road."""
+    n = len(session.stamps_ns)
+    if not session.posed:
+        return [keyframe]
+    if settings.query.length is not None:
+        half = settings.query.length / 2
+        return np.flatnonzero(np.abs(session.distance - session.distance[keyframe]) <= half).tolist()
+    count = min(settings.query.frames, n)
+    first = min(max(0, keyframe - count // 2), n - count)
+    return list(range(first, first + count))
+
+
+def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple[Query, F64]:
+    """The query map in a level frame whose origin is the base at ``keyframe``, and the level ``query_T_base`` (4, 4) of it.
+
+    The frame keeps the map's axes: only the origin moves, so voxels stay small numbers.
+    """
+    members = query_members(session, keyframe, settings)
+    query_T_map = np.eye(4)
+    query_T_map[:3, 3] = -session.map_T_base[keyframe][:3, 3]
+    poses = query_T_map @ session.map_T_base
+    radius = settings.query.radius or 30.0
+    blocks = fuse_keyframes(session.folder, members, poses, session.origins, settings, radius)
+    clouds = []
+    for i in members:
+        points = read_keyframe(session.folder.keyframes, i).points
+        near = np.linalg.norm(points - session.origins[i], axis=1) < radius
+        clouds.append(apply(poses[i], points[near]))
+    v = settings.fusion.voxel_size
+    return Query(blocks, thin_points(np.concatenate(clouds), v / 2), v), poses[keyframe]

@@ -1,0 +1,77 @@
+"""Closures of all queries together: each place once, as tables, and as rows for the log's channels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs import contracts
+from semloc_logs.alignment.verify import FEATURES
+from semloc_logs.closures.closing import Alignment
+from semloc_logs.closures.queries import SessionMap
+from semloc_logs.tables import read_table, write_table
+from semloc_logs.voxels.store import pose_columns
+
+
+def unique_closures(accepted: Sequence[Alignment], positions: dict[str, NDArray[np.float64]], spacing: float) -> list[Alignment]:
+    """Accepted alignments without those found from both ends, sorted by query session and time.
+
+    Two are the same when their ends are the same two places to within ``spacing`` metres of road position; the more probable one stays.
+    ``positions`` gives the keyframes' positions (n, 3) by session.
+    """
+
+    def ends(a: Alignment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return positions[a.query_session][a.query_keyframe], positions[a.target_session][a.target_keyframe]
+
+    kept: list[Alignment] = []
+    by_pair: dict[tuple[str, str], list[Alignment]] = {}
+    for a in sorted(accepted, key=lambda a: (-a.probability, -a.features.structure, a.query_session, a.query_stamp_ns)):
+        q, t = ends(a)
+        twins = by_pair.get((a.target_session, a.query_session), [])
+        if any(np.linalg.norm(ends(o)[1] - q) < spacing and np.linalg.norm(ends(o)[0] - t) < spacing for o in twins):
+            continue
+        by_pair.setdefault((a.query_session, a.target_session), []).append(a)
+        kept.append(a)
+    return sorted(kept, key=lambda a: (a.query_session, a.query_stamp_ns, a.target_session, a.target_stamp_ns))
+
+
+def _columns(rows: Sequence[Alignment]) -> dict[str, Any]:
+    return {
+        "query_session": [a.query_session for a in rows],
+        "target_session": [a.target_session for a in rows],
+        "query_stamp_ns": [a.query_stamp_ns for a in rows],
+        "target_stamp_ns": [a.target_stamp_ns for a in rows],
+        **pose_columns(np.array([a.target_T_query for a in rows])),
+        "overlap": [a.overlap for a in rows],
+        "probability": [a.probability for a in rows],
+        "inliers": [a.inliers for a in rows],
+        "words": [a.words for a in rows],
+    }
+
+
+def write_closures(path: Path, rows: Sequence[Alignment], metadata: dict[str, Any]) -> None:
+    """closures.parquet."""
+    columns = _columns(rows) | {"covariance": [a.covariance.ravel().tolist() for a in rows]}
+    write_table(path, contracts.table("closures", columns), metadata, ("query_session", "query_stamp_ns"))
+
+
+def write_rejected(path: Path, rows: Sequence[Alignment], metadata: dict[str, Any]) -> None:
+    """rejected.parquet: also the reason and the features that acceptance looked at."""
+    ordered = sorted(rows, key=lambda a: (a.query_session, a.query_stamp_ns, -a.probability, a.target_session, a.target_stamp_ns))
+    columns = _columns(ordered) | {"reason": [a.reason for a in ordered]} | {n: [getattr(a.features, n) for a in ordered] for n in FEATURES}
+    write_table(path, contracts.table("rejected", columns), metadata, ("query_session", "query_stamp_ns"))
+
+
+def read_closures(path: Path) -> list[dict[str, Any]]:
+    """Rows of closures.parquet."""
+    rows: list[dict[str, Any]] = read_table(path).to_pylist()
+    return rows
+
+
+def keyframe_at(session: SessionMap, stamp_ns: int) -> int:
+    """The keyframe with this stamp, or the nearest."""
+    return int(np.argmin(np.abs(session.stamps_ns - stamp_ns)))

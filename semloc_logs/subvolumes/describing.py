@@ -1,0 +1,57 @@
+"""Describing the submaps of a session: blocks -> semantic words (paper 3.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.settings import Settings
+from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
+from semloc_logs.voxels.store import blocks_path, read_blocks
+from semloc_logs.workspace import SessionFolder
+
+
+@dataclass(frozen=True, slots=True)
+class DescribeTask:
+    """One submap to describe; picklable."""
+
+    folder: SessionFolder
+    submap: int
+    ground_z: float
+    variants: tuple[str, ...]
+    output: Path
+    metadata: dict[str, Any]
+    settings: Settings  # resolved
+
+
+def describe_submap(folder: SessionFolder, submap: int, ground_z: float, variant: str, settings: Settings) -> Described:
+    """Centres (voxels) and descriptors of every described subvolume of a submap."""
+    blocks = read_blocks(blocks_path(folder.blocks, submap))
+    low, high = blocks.bounds()
+    state = blocks.dense(low, tuple((high - low).tolist()))
+    encoder = load_encoder(variant, settings.descriptor.weights)
+    d = settings.descriptor
+    return describe_map(state, low, ground_z, settings.fusion.voxel_size, encoder, d.stride, d.min_occupied)
+
+
+def variants_for(label_source: str, settings: Settings) -> tuple[str, ...]:
+    """Networks that describe a session: the geometric one always, the semantic one where classes come from a log or a model."""
+    if settings.descriptor.variant != "auto":
+        return (settings.descriptor.variant,)
+    return ("geometric", "semantic") if label_source in ("log", "onnx") else ("geometric",)
+
+
+def word_columns(submap: int, parts: list[tuple[str, NDArray[np.floating], NDArray[np.uint16], NDArray[np.uint64]]]) -> dict[str, Any]:
+    """Columns of words/ from (variant, centres (n, 3) in metres, words (n,), codes (n,)) of one submap."""
+    centre = np.concatenate([p[1] for p in parts]) if parts else np.zeros((0, 3))
+    return {
+        "submap": np.full(len(centre), submap),
+        "variant": [p[0] for p in parts for _ in range(len(p[1]))],
+        **{c: centre[:, k].astype(np.float32) for k, c in enumerate("xyz")},
+        "word": np.concatenate([p[2] for p in parts]) if parts else [],
+        "code": np.concatenate([p[3] for p in parts]) if parts else [],
+    }
