@@ -48,7 +48,9 @@ def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
         else:
             with as_file(files("semloc_logs.subvolumes") / "weights" / f"{variant}.safetensors") as path:
                 tensors = load_file(path)
-        encoder.load_state_dict({k.removeprefix("encoder."): v.float() for k, v in tensors.items() if k.startswith("encoder.")})
+        found = {k.removeprefix("encoder."): v.float() for k, v in tensors.items() if k.startswith("encoder.")}
+        counters = {k: v for k, v in encoder.state_dict().items() if not v.is_floating_point()}  # of no use after training
+        encoder.load_state_dict(counters | found)
     except (OSError, SafetensorError, RuntimeError) as problem:
         raise SettingsError(f"{weights or 'The shipped weights'}: no weights of the {variant} encoder ({str(problem).splitlines()[0]}).") from None
     encoder.to(memory_format=torch.channels_last_3d)

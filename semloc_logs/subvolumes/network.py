@@ -1,8 +1,8 @@
 """The paper's variational encoder-decoder (3.2, supplement 1), written so that it can be run over a whole map at once.
 
 Labels enter through a learned embedding (a factorised first convolution: an occupied, free or unobserved voxel is a table look-up,
-not a vector of L + 2 numbers). Three blocks of 3x3x3 convolution, ReLU and 2x2x2 max-pooling, then a fully connected layer written
-as a 4x4x4 convolution. The descriptor is the mean mu of the latent code, scaled to unit length.
+not a vector of L + 2 numbers). Three blocks of 3x3x3 convolution, 2x2x2 max-pooling and ReLU, then a fully connected layer written
+as a 4x4x4 convolution. Batch normalisation, which the paper lacks, lets it learn from few samples. The descriptor is the mean mu of the latent code, scaled to unit length.
 """
 
 from __future__ import annotations
@@ -47,17 +47,20 @@ class Encoder(nn.Module):
         self.variant = variant
         self.embedding = nn.Embedding(CLASSES[variant] + 3, EMBEDDING)
         self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in ((EMBEDDING, 16), (16, 32), (32, 64)))
+        self.norms = nn.ModuleList(nn.BatchNorm3d(c) for c in (16, 32, 64))
         self.mean = nn.Conv3d(64, latent, 4)
+        # without an affine part: mu keeps the prior's mean and variance, and no direction that all subvolumes share
+        self.centre = nn.BatchNorm3d(latent, affine=False)
         self.log_variance = nn.Linear(latent, latent)
 
     def forward(self, codes: Tensor) -> Tensor:
         reduced = torch.is_autocast_enabled("cpu")  # looked up in the precision of the convolutions: no copy of the volume
         weight = self.embedding.weight.to(torch.get_autocast_dtype("cpu")) if reduced else self.embedding.weight
         x = _LookUp.apply(codes.int(), weight).permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
-        for block in self.blocks:
-            x = F.relu(F.max_pool3d(block(x), 2))  # the paper's order gives the same, at eight times the cost of the ReLU
+        for block, norm in zip(self.blocks, self.norms, strict=True):
+            x = F.relu(norm(F.max_pool3d(block(x), 2)))  # ReLU before pooling, as in the paper, would cost eight times as much
         x = x[:, :, 1:-1, 1:-1]  # the pooled margin has served
-        mu: Tensor = self.mean(x)[..., 0]
+        mu: Tensor = self.centre(self.mean(x))[..., 0]
         return mu
 
 

@@ -61,8 +61,8 @@ def _batches(shards: Sequence[Path], training: Training, first_step: int, steps:
         parts = [(pool[k], n) for k, n in zip(rng.permutation(len(pool)), (half, training.batch - half), strict=False)]
         if len(parts) == 1:
             parts = [(parts[0][0], training.batch)]
-        picked = [[a[rng.choice(len(s[0]), n, replace=len(s[0]) < n)] for a in s] for s, n in parts]
-        arrays = [np.concatenate([p[k] for p in picked]) for k in range(3)]
+        rows = [rng.choice(len(shard[0]), n, replace=len(shard[0]) < n) for shard, n in parts]
+        arrays = [np.concatenate([shard[k][r] for (shard, _), r in zip(parts, rows, strict=True)]) for k in range(3)]
         # quarter turns and mirror images of the whole triple are as good as new streets
         quarter, mirror = int(rng.integers(4)), bool(rng.integers(2))
         turned = [np.rot90(a[:, ::-1] if mirror else a, quarter, axes=(1, 2)) for a in arrays]
@@ -104,6 +104,7 @@ def train(
     optimiser = torch.optim.Adam(model.parameters(), lr=RATE)
     steps = math.ceil(training.samples / (training.batch * 9))
     done = _resume(checkpoint, model, optimiser, training) if checkpoint.exists() else 0
+    model.train()
     table, classes = code_table(variant), CLASSES[variant]
     for step, (part, whole, other) in enumerate(_batches(shards, training, done, steps), start=done):
         for group in optimiser.param_groups:
@@ -163,7 +164,7 @@ def _resume(path: Path, model: Completion, optimiser: torch.optim.Adam, training
 
 def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
     """The network in bf16 with a model card in the file's metadata."""
-    tensors = {k: v.to(torch.bfloat16).contiguous() for k, v in model.state_dict().items()}
+    tensors = {k: v.to(torch.bfloat16).contiguous() for k, v in model.state_dict().items() if v.is_floating_point()}
     with replacing_file(path) as temporary:
         save_file(tensors, temporary, metadata={**card, "variant": model.encoder.variant})
 
@@ -176,6 +177,7 @@ def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, 
     classes that occur; ``unobserved_accuracy``: over voxels that the input did not observe; ``all_free``, ``copy_input``: accuracy
     of the two trivial answers; ``recall5``: share of incomplete subvolumes with their partner among the five nearest.
     """
+    model.eval()
     variant = model.encoder.variant
     table, classes = code_table(variant), CLASSES[variant]
     confusion = np.zeros((classes + 1, classes + 1), np.int64)
