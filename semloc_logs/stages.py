@@ -198,6 +198,7 @@ def close(
         "label_source": ",".join(sorted({m.json["label_source"] for m in maps.values()})),
         "version": semloc_logs.__version__,
         "queries": total,
+        "settings": settings.model_dump(mode="json", include=set(sections)),
     }
     write_rejected(work.rejected, [a for a in found if not a.accepted], metadata)
     write_closures(work.closures, closures, metadata | {"fingerprint": fingerprint})
