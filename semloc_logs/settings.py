@@ -13,33 +13,46 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
 
 from semloc_logs.errors import SettingsError
 
 STREET_VOXEL = 0.30
+MOST_VOXELS = 1000
 LabelSource = Literal["auto", "log", "onnx", "geometry", "uniform"]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Fusion(_Section):
     """Keyframes, submaps and the voxel map (paper 3.1)."""
 
     voxel_size: float = Field(0.30, gt=0.005, le=5.0, description="edge of a voxel (m)")
-    min_range: float | None = Field(None, description="points nearer than this to the sensor are dropped (m); default 3 voxels")
-    max_range: float | None = Field(None, description="points farther than this are not fused, only carved (m); default 50 m at 0.30 m voxels")
-    keyframe_distance: float | None = Field(None, description="a frame becomes a keyframe after this travel (m); default 2 voxels")
+    min_range: float | None = Field(None, ge=0, description="points nearer than this to the sensor are dropped (m); default 3 voxels")
+    max_range: float | None = Field(
+        None, gt=0, description="points farther than this are not fused, only carved (m); default 50 m at 0.30 m voxels"
+    )
+    keyframe_distance: float | None = Field(None, ge=0, description="a frame becomes a keyframe after this travel (m); default 2 voxels")
     keyframe_angle: float = Field(0.175, gt=0, description="or after this turn (rad)")
-    keyframe_resolution: float | None = Field(None, description="keyframes keep one point a cell of this size (m); default a third of a voxel")
-    submap_length: float | None = Field(None, description="length of road in a submap (m); default 100 m at 0.30 m voxels")
+    keyframe_resolution: float | None = Field(
+        None, gt=0, description="keyframes keep one point a cell of this size (m); default a third of a voxel"
+    )
+    submap_length: float | None = Field(None, gt=0, description="length of road in a submap (m); default 100 m at 0.30 m voxels")
     submap_overlap: float = Field(0.5, ge=0.0, lt=1.0, description="share of a submap that the next one repeats")
-    hit: float = Field(0.85, gt=0, description="log-odds added to a voxel that a ray ends in")
-    miss: float = Field(0.40, gt=0, description="log-odds taken from a voxel that a ray passes")
-    clamp: tuple[float, float] = Field((-2.0, 3.5), description="bounds of the log-odds (OctoMap)")
+    hit: float = Field(0.85, ge=0.05, le=6, description="log-odds added to a voxel that a ray ends in")
+    miss: float = Field(0.40, ge=0.05, le=6, description="log-odds taken from a voxel that a ray passes")
+    clamp: tuple[float, float] = Field((-2.0, 3.5), description="bounds of the log-odds (OctoMap), within +-6")
+
+    @model_validator(mode="after")
+    def _check(self) -> Fusion:
+        if not -6 <= self.clamp[0] < 0 < self.clamp[1] <= 6:  # kept as int8 in units of 1/20
+            raise ValueError("clamp needs a bound in [-6, 0) and one in (0, 6]")
+        if self.max_range is not None and self.max_range > MOST_VOXELS * self.voxel_size:  # a sweep is carved in a dense grid
+            raise ValueError(f"max_range reaches more than {MOST_VOXELS} voxels")
+        return self
 
 
 class Labels(_Section):
@@ -52,9 +65,11 @@ class Labels(_Section):
 class Descriptor(_Section):
     """Subvolumes and their descriptors (paper 3.2)."""
 
-    variant: Literal["auto", "semantic", "geometric"] = Field("auto", description="auto: semantic where labels come from a log, else geometric")
-    stride: int = Field(4, description="database subvolumes every so many voxels in x and y (4 or 8)")
-    query_stride: int = Field(8, description="query subvolumes every so many voxels in x and y (4 or 8)")
+    variant: Literal["auto", "semantic", "geometric"] = Field(
+        "auto", description="auto: semantic where labels come from a log, else geometric"
+    )
+    stride: Literal[4, 8] = Field(4, description="database subvolumes every so many voxels in x and y (4 or 8)")
+    query_stride: Literal[4, 8] = Field(8, description="query subvolumes every so many voxels in x and y (4 or 8)")
     min_occupied: int = Field(40, ge=1, description="subvolumes with fewer occupied voxels are not described")
     weights: Path | None = Field(None, description="safetensors file instead of the shipped weights")
     vocabulary: Path | None = Field(None, description="safetensors file instead of the shipped vocabulary")
@@ -64,10 +79,10 @@ class Query(_Section):
     """What is asked of the database."""
 
     frames: int = Field(5, ge=1, description="keyframes fused into a query; acc. of the paper is 5")
-    length: float | None = Field(None, description="or all keyframes within this stretch of road (m)")
-    every: float | None = Field(None, description="distance between queries (m); default 2 m at 0.30 m voxels")
+    length: float | None = Field(None, gt=0, description="or all keyframes within this stretch of road (m)")
+    every: float | None = Field(None, gt=0, description="distance between queries (m); default 2 m at 0.30 m voxels")
     every_angle: float = Field(0.349, gt=0, description="or turn between queries (rad)")
-    radius: float | None = Field(None, description="a query map is cut off at this distance (m); default 30 m at 0.30 m voxels")
+    radius: float | None = Field(None, gt=0, description="a query map is cut off at this distance (m); default 30 m at 0.30 m voxels")
 
 
 class Closures(_Section):
@@ -81,7 +96,7 @@ class Closures(_Section):
     kappa: float = Field(10.0, gt=0, description="kappa of the paper in voxels (3 m at 0.30 m)")
     min_probability: float = Field(0.99, ge=0.0, le=1.0, description="closures below this are rejected")
     exclude_seconds: float = Field(30.0, ge=0, description="within a session, keyframes nearer in time than this are no revisit")
-    exclude_distance: float | None = Field(None, description="nor nearer along the road than this (m); default 50 m at 0.30 m voxels")
+    exclude_distance: float | None = Field(None, ge=0, description="nor nearer along the road than this (m); default 50 m at 0.30 m voxels")
     rejected_per_query: int = Field(3, ge=0, description="best rejected hypotheses of a query that are reported")
 
 
@@ -172,7 +187,7 @@ def load(file: Path | None = None, assignments: Mapping[str, str] | None = None,
             raise SettingsError(f"Settings file {file} cannot be read as YAML: {problem}".replace("\n", " ")) from None
         if content is not None and not isinstance(content, dict):
             raise SettingsError(f"Settings file {file} does not hold a mapping of sections such as 'fusion:'.")
-        merged = content or {}
+        merged = {str(k): {} if v is None else v for k, v in (content or {}).items()}  # a section may be empty
     for name, value in (environment or {}).items():
         if name.startswith("SEMLOC_") and "__" in name:
             _assign(merged, name[len("SEMLOC_") :].lower().replace("__", "."), value)

@@ -26,7 +26,18 @@ from semloc_logs.voxels.gravity import find_up, ground_height
 from semloc_logs.voxels.grid import BlockMap, Fuser
 from semloc_logs.voxels.picture import draw_map
 from semloc_logs.voxels.selection import KeyframeSelector, road_distance, submap_ranges, thin
-from semloc_logs.voxels.store import PART, Keyframe, blocks_path, part_path, pose_columns, read_blocks, read_keyframe, write_blocks, write_keyframes, write_voxels
+from semloc_logs.voxels.store import (
+    PART,
+    Keyframe,
+    blocks_path,
+    part_path,
+    pose_columns,
+    read_blocks,
+    read_keyframe,
+    write_blocks,
+    write_keyframes,
+    write_voxels,
+)
 from semloc_logs.workspace import SessionFolder
 
 F64 = NDArray[np.float64]
@@ -113,7 +124,9 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
                 for i in range(first, min(first + PART, len(raws))):
                     points, ids = _load_raw(Path(scratch), i)
                     points_level = apply(poses[i], points)
-                    ground = ground_height(points_level - np.r_[poses[i][:2, 3], 0.0], float(apply(poses[i], raws[i].origin[None])[0, 2]), scale)
+                    ground = ground_height(
+                        points_level - np.r_[poses[i][:2, 3], 0.0], float(apply(poses[i], raws[i].origin[None])[0, 2]), scale
+                    )
                     label = _labels(points_level, ids, source, space, scale)
                     keep = label != SKY
                     grounds.append(ground)
@@ -140,7 +153,9 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         }
         write_table(task.folder.frames, contracts.table("frames", frames), metadata, ("keyframe",))
         stamps_ns, track = session.trajectory()
-        write_table(task.folder.trajectory, contracts.table("trajectory", {"stamp_ns": stamps_ns, **pose_columns(track)}), metadata, ("stamp_ns",))
+        write_table(
+            task.folder.trajectory, contracts.table("trajectory", {"stamp_ns": stamps_ns, **pose_columns(track)}), metadata, ("stamp_ns",)
+        )
         origins = np.array([r.origin for r in raws])
         submaps = _submaps(task, poses, origins, np.array(grounds), distance, posed, metadata, on_progress)
         ids = range(len(submaps))
@@ -190,7 +205,8 @@ def _load_raw(scratch: Path, i: int) -> tuple[NDArray[np.float32], NDArray[np.ui
 
 
 def _level(session: Session, raws: list[_Raw], normals: _Normals, posed: bool) -> tuple[F64, Callable[[int], F64]]:
-    """``session_T_map`` (4, 4), a rotation, and for a log without poses the level pose of each keyframe by its number."""
+    """``session_T_map`` (4, 4), level and with its origin at the first keyframe, because poses may be in UTM and voxels, words and
+    surfaces want small numbers; and for a log without poses the level pose of each keyframe by its number."""
     optical = session.base_frame.endswith("_optical") or session.base_frame in {c.header.frame_id for c in session.cameras.values()}
     up_in_base = np.array([0.0, -1.0, 0.0]) if optical else UP
     if posed:
@@ -203,6 +219,8 @@ def _level(session: Session, raws: list[_Raw], normals: _Normals, posed: bool) -
         up = find_up(np.concatenate([k[1] for k in kept]), np.concatenate([k[2] for k in kept]), prior)
         session_T_map = np.eye(4)
         session_T_map[:3, :3] = rotation_between(UP, up)
+        if raws[0].pose is not None:
+            session_T_map[:3, 3] = raws[0].pose[:3, 3]
         return session_T_map, lambda _: np.eye(4)
     found = {k[0]: find_up(k[1], k[2], up_in_base) for k in normals.kept}
     keys = np.array(sorted(found))
@@ -237,7 +255,14 @@ def _labels(points: F64, ids: NDArray[np.uint32] | None, source: str, space: str
     return np.full(len(points), UNLABELLED, np.uint8)
 
 
-def fuse_keyframes(folder: SessionFolder, keyframes: range | list[int], poses: F64, origins: NDArray[np.floating], settings: Settings, radius: float | None = None) -> BlockMap:
+def fuse_keyframes(
+    folder: SessionFolder,
+    keyframes: range | list[int],
+    poses: F64,
+    origins: NDArray[np.floating],
+    settings: Settings,
+    radius: float | None = None,
+) -> BlockMap:
     """The map of some keyframes at ``poses`` (n, 4, 4) map_T_base by keyframe; points beyond ``radius`` of the sensor are left out."""
     fuser = Fuser(settings.fusion)
     for i in keyframes:
@@ -251,16 +276,27 @@ def fuse_keyframes(folder: SessionFolder, keyframes: range | list[int], poses: F
 
 
 def _submaps(
-    task: FuseTask, poses: F64, origins: NDArray[np.floating], grounds: F64, distance: F64, posed: bool, metadata: dict[str, Any], on_progress: Callable[[str], None]
+    task: FuseTask,
+    poses: F64,
+    origins: NDArray[np.floating],
+    grounds: F64,
+    distance: F64,
+    posed: bool,
+    metadata: dict[str, Any],
+    on_progress: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     """Fuse and write every submap; returns what session.json says of them."""
     fusion = task.settings.fusion
-    ranges = submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else [(i, i + 1) for i in range(len(poses))]
+    ranges = (
+        submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else [(i, i + 1) for i in range(len(poses))]
+    )
     out = []
     with replacing_folder(task.folder.blocks) as folder:
         for i, (first, last) in enumerate(ranges):
             blocks = fuse_keyframes(task.folder, range(first, last), poses, origins, task.settings)
             write_blocks(blocks_path(folder, i), blocks, {**metadata, "submap": i})
-            out.append({"id": i, "first": first, "last": last - 1, "ground_z": float(np.median(grounds[first:last])), "blocks": len(blocks.keys)})
+            out.append(
+                {"id": i, "first": first, "last": last - 1, "ground_z": float(np.median(grounds[first:last])), "blocks": len(blocks.keys)}
+            )
             on_progress(f"fused submap {i + 1} of {len(ranges)}")
     return out

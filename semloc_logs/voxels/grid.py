@@ -55,7 +55,9 @@ class BlockMap:
             s, e = np.maximum(a, 0), np.minimum(a + BLOCK, shape)
             if (s < e).all():
                 block = state.reshape(BLOCK, BLOCK, BLOCK)
-                out[s[0] : e[0], s[1] : e[1], s[2] : e[2]] = block[s[0] - a[0] : e[0] - a[0], s[1] - a[1] : e[1] - a[1], s[2] - a[2] : e[2] - a[2]]
+                out[s[0] : e[0], s[1] : e[1], s[2] : e[2]] = block[
+                    s[0] - a[0] : e[0] - a[0], s[1] - a[1] : e[1] - a[1], s[2] - a[2] : e[2] - a[2]
+                ]
         return out
 
 
@@ -79,32 +81,36 @@ class Fuser:
     _grid: U8 = field(default_factory=lambda: np.zeros((0, 0, 0), np.uint8))
 
     def add(self, points: NDArray[np.floating], label: U8, origin: NDArray[np.floating]) -> None:
-        """Integrate ``points`` (n, 3) in the map frame seen from ``origin`` (3,), with classes ``label`` (n,) (255 unknown)."""
+        """Integrate ``points`` (n, 3) in the map frame seen from ``origin`` (3,), with classes ``label`` (n,) (255 unknown).
+
+        Points beyond the maximum range carve and do not hit; points that are not finite are left out.
+        """
         v, limit = self.fusion.voxel_size, self.fusion.max_range
         if limit is None:
             raise ValueError("fusion settings must be resolved")
-        if not len(points):
-            return
         start = np.asarray(origin, float) / v
         ends = np.asarray(points, float) / v
         reach = np.linalg.norm(ends - start, axis=1)
+        usable = np.isfinite(reach)
+        if not usable.all():
+            ends, reach, label = ends[usable], reach[usable], label[usable]
+        if not len(ends):
+            return
         hit = reach <= limit / v
         far = ~hit
         ends[far] = start + (ends[far] - start) * (limit / v / reach[far])[:, None]
+        low = np.floor(np.minimum(ends.min(0), start) / BLOCK).astype(np.int64) * BLOCK
+        start, ends = start - low, ends - low  # floors are taken after this step only: rounding then cannot put a cell beside the grid
         cells = np.floor(ends).astype(np.int64)
-        low = np.floor(np.minimum(cells.min(0), np.floor(start)) / BLOCK).astype(np.int64) * BLOCK
-        high = np.floor(np.maximum(cells.max(0), np.floor(start)) / BLOCK).astype(np.int64) * BLOCK + BLOCK
-        size = high - low
+        size = (np.maximum(cells.max(0), np.floor(start).astype(np.int64)) // BLOCK + 1) * BLOCK
         if (size > self._grid.shape).any():
             self._grid = np.zeros(np.maximum(size, self._grid.shape), np.uint8)
-        # one ray for each end voxel, through its first point: the others would carve the same voxels
-        local = cells - low
-        address = (local[:, 0] * size[1] + local[:, 1]) * size[2] + local[:, 2]
-        votes = address[hit] * 256 + label[hit]
-        voted, count = np.unique(votes, return_counts=True)
+        # one ray for each end voxel, through its first point: the others would carve nearly the same voxels
+        address = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+        voted, count = np.unique(address[hit] * 256 + label[hit], return_counts=True)
         _, first = np.unique(address * 2 + far, return_index=True)
         grid = self._grid[: size[0], : size[1], : size[2]]
-        carve(grid, start - low, np.clip(ends[first] - low, 1e-6, size - 1e-6), hit[first])
+        carve(grid, start, ends[first], hit[first])
         offsets = touched_blocks(grid)
         keys = pack(offsets + low // BLOCK)
         slots = np.array([self._slots.setdefault(k, len(self._slots)) for k in keys.tolist()], np.int64)
@@ -114,9 +120,13 @@ class Fuser:
             self._log_odds = grown
         f = self.fusion
         flush(grid, offsets, slots, self._log_odds, *(round(SCALE * a) for a in (f.hit, f.miss, f.clamp[0], f.clamp[1])))
-        where = voted // 256
-        ijk = np.stack([where // (size[1] * size[2]), where // size[2] % size[1], where % size[2]], 1) + low
-        self._votes.append(np.stack([pack(ijk), voted % 256, count], 1))
+        if not len(voted):
+            return
+        slot_of = np.zeros(size // BLOCK, np.int64)
+        slot_of[tuple(offsets.T)] = slots
+        where = np.stack(np.unravel_index(voted // 256, tuple(size.tolist())), 1)
+        voxel = slot_of[tuple((where // BLOCK).T)] * BLOCK**3 + _within(where)
+        self._votes.append(np.stack([voxel, voted % 256, count], 1))
 
     def finish(self) -> BlockMap:
         """The fused map. A voxel is occupied where its log-odds are positive; its class has the most votes (the lower id wins a tie)."""
@@ -131,14 +141,17 @@ class Fuser:
         hits = np.zeros(log_odds.shape, np.uint16)
         if self._votes:
             voxel, label, count = _winners(np.concatenate(self._votes))
-            ijk = unpack(voxel)
-            row = np.searchsorted(keys, pack(ijk // BLOCK))
-            inner = ijk % BLOCK
-            cell = (inner[:, 0] * BLOCK + inner[:, 1]) * BLOCK + inner[:, 2]
+            row, cell = np.argsort(order)[voxel // BLOCK**3], voxel % BLOCK**3
             keep = occupied[row, cell]
             state[row[keep], cell[keep]] = label[keep]
             hits[row[keep], cell[keep]] = np.minimum(count[keep], 65535)
         return BlockMap(keys, log_odds, state, hits)
+
+
+def _within(ijk: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index of voxels (n, 3) within their blocks."""
+    i = ijk % BLOCK
+    return np.asarray((i[:, 0] * BLOCK + i[:, 1]) * BLOCK + i[:, 2])
 
 
 def _winners(votes: NDArray[np.int64]) -> tuple[NDArray[np.int64], U8, NDArray[np.int64]]:

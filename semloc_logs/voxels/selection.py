@@ -57,5 +57,6 @@ def submap_ranges(distance: NDArray[np.float64], length: float, overlap: float) 
         return []
     total, step = float(distance[-1]), length * (1.0 - overlap)
     starts = [0.0] if total <= length else [*np.arange(0.0, total - length, step), total - length]
-    ranges = [(int(np.searchsorted(distance, s)), int(np.searchsorted(distance, s + length, side="right"))) for s in starts]
-    return [r for i, r in enumerate(ranges) if r[0] < r[1] and r not in ranges[:i]]
+    slack = 1e-9 * max(total, 1.0)  # (total - length) + length may round to less than total
+    ranges = [(int(np.searchsorted(distance, s - slack)), int(np.searchsorted(distance, s + length + slack, side="right"))) for s in starts]
+    return [r for r in dict.fromkeys(ranges) if r[0] < r[1]]

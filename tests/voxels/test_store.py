@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import polars as pl
+import pyarrow.parquet as pq
+import pytest
+
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.settings import Settings
+from semloc_logs.tables import read_metadata
+from semloc_logs.voxels.grid import FREE_STATE, BlockMap, Fuser, empty_map
+from semloc_logs.voxels.keys import morton
+from semloc_logs.voxels.store import (
+    PART,
+    TILE,
+    Keyframe,
+    part_path,
+    pose_columns,
+    poses_of,
+    read_blocks,
+    read_keyframe,
+    write_blocks,
+    write_keyframes,
+    write_voxels,
+)
+
+METADATA: dict[str, Any] = {
+    "schema_version": 1,
+    "voxel_size": 0.5,
+    "session_T_map": np.eye(4).tolist(),
+    "label_space": "cityscapes",
+    "label_source": "log",
+    "version": "1",
+}
+
+
+def small_map(seed: int, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), frames: int = 3) -> BlockMap:
+    rng = np.random.default_rng(seed)
+    fuser = Fuser(Settings.model_validate({"fusion": {"voxel_size": 0.5, "max_range": 60.0}}).resolved().fusion)
+    for _ in range(frames):
+        points = rng.uniform(-12, 12, (300, 3)) * [1, 1, 0.2]
+        fuser.add(points + shift, rng.choice(np.array([0, 2, 8, 255], np.uint8), 300), np.array(shift))
+    return fuser.finish()
+
+
+@pytest.mark.parametrize("blocks", [small_map(0), small_map(1, (-300.0, 500.0, 20.0)), empty_map()], ids=["here", "there", "empty"])
+def test_blocks_come_back_exactly(blocks: BlockMap, tmp_path: Path) -> None:
+    path = tmp_path / "submap.parquet"
+    write_blocks(path, blocks, METADATA)
+    found = read_blocks(path)
+    for name in ("keys", "log_odds", "state", "hits"):
+        a, b = getattr(blocks, name), getattr(found, name)
+        np.testing.assert_array_equal(a, b)
+        assert a.dtype == b.dtype
+    assert found.bounds()[0].tolist() == blocks.bounds()[0].tolist()
+    assert read_metadata(path) == METADATA
+
+
+def test_keyframes_come_back_to_the_grid_of_2_mm_each_in_its_row_group(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    sizes = [5, 0, 7, 1]  # a keyframe without points keeps its place
+    frames = [Keyframe(rng.uniform(-80, 80, (n, 3)).astype(np.float32), rng.integers(0, 19, n).astype(np.uint8)) for n in sizes]
+    first = 3 * PART
+    path = part_path(tmp_path, first)
+    write_keyframes(path, first, [10**18 + i for i in range(4)], frames, METADATA)
+    assert pq.ParquetFile(path).num_row_groups == 4
+    for i, frame in enumerate(frames):
+        found = read_keyframe(tmp_path, first + i)
+        np.testing.assert_array_equal(found.label, frame.label)
+        assert found.points.shape == frame.points.shape
+        np.testing.assert_allclose(found.points, frame.points, atol=1 / 1024 + 1e-6)
+        again = tmp_path / "again"
+        again.mkdir(exist_ok=True)
+        write_keyframes(part_path(again, 0), 0, [0], [found], METADATA)
+        np.testing.assert_array_equal(read_keyframe(again, 0).points, found.points)  # what lies on the grid is kept exactly
+    table = pq.read_table(path)
+    assert table["keyframe"].to_pylist() == [first] * 5 + [first + 2] * 7 + [first + 3]
+    assert table["stamp_ns"].to_pylist()[-1] == 10**18 + 3
+    assert read_metadata(path) == METADATA
+
+
+def test_missing_and_damaged_keyframes_and_blocks_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="overwrite"):
+        read_keyframe(tmp_path, 0)
+    write_keyframes(part_path(tmp_path, 0), 0, [1], [Keyframe(np.ones((4, 3), np.float32), np.zeros(4, np.uint8))], METADATA)
+    with pytest.raises(WorkspaceError, match="overwrite"):
+        read_keyframe(tmp_path, 1)  # beyond the last
+    content = part_path(tmp_path, 0).read_bytes()
+    for damaged in (content[:-30], content[: len(content) // 2], b"", b"PAR1" * 10):
+        part_path(tmp_path, 0).write_bytes(damaged)
+        with pytest.raises(WorkspaceError, match="overwrite"):
+            read_keyframe(tmp_path, 0)
+        with pytest.raises(WorkspaceError, match="overwrite"):
+            read_blocks(part_path(tmp_path, 0))
+
+
+def test_poses_as_columns() -> None:
+    poses = np.stack([np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])])
+    poses[1, :3, 3] = [1, 2, 3]
+    columns = pose_columns(poses)
+    assert columns["t_y"].tolist() == [0, 2]
+    assert columns["q_w"].tolist() == [1, 0]
+    assert abs(columns["q_z"][1]) == 1
+    import pyarrow as pa
+
+    np.testing.assert_allclose(poses_of(pa.table(columns)), poses, atol=1e-15)
+    assert [len(v) for v in pose_columns(np.zeros((0, 4, 4))).values()] == [0] * 7
+
+
+def union(submaps: list[BlockMap]) -> dict[tuple[int, ...], tuple[int, int, int]]:
+    """Of each occupied voxel the entry with the most hits; the earlier submap among equals."""
+    out: dict[tuple[int, ...], tuple[int, int, int]] = {}
+    for blocks in submaps:
+        for ijk, label, odds, hits in zip(*(a.tolist() for a in blocks.occupied()), strict=True):
+            if tuple(ijk) not in out or hits > out[tuple(ijk)][2]:
+                out[tuple(ijk)] = (label, odds, hits)
+    return out
+
+
+def test_the_session_map_is_the_union_of_overlapping_submaps(tmp_path: Path) -> None:
+    submaps = [small_map(0), small_map(1, (6.0, 0.0, 0.0), 6), small_map(2, (-6.0, 300.0, 0.0))]
+    expected = union(submaps)
+    assert len(expected) < sum(len(s.occupied()[0]) for s in submaps)  # they do overlap
+    folder = tmp_path / "voxels"
+    assert write_voxels(folder, submaps, METADATA) == len(expected)
+    tiles = sorted(folder.rglob("*.parquet"))
+    assert len(tiles) > 3
+    found: dict[tuple[int, ...], tuple[int, int, int]] = {}
+    for path in tiles:
+        table = pq.ParquetFile(path).read()
+        assert read_metadata(path) == METADATA
+        ijk = np.stack([table[c].to_numpy() for c in ("ix", "iy", "iz")], 1)
+        assert (np.diff(morton(ijk).astype(np.int64)) > 0).all()  # Morton order, none twice
+        assert len(np.unique(ijk[:, :2] // TILE, axis=0)) == 1
+        odds = np.rint(table["occupancy"].to_numpy() * 20).astype(int)
+        for k, *v in zip(ijk.tolist(), table["label"].to_pylist(), odds.tolist(), table["hits"].to_pylist(), strict=True):
+            assert tuple(k) not in found
+            found[tuple(k)] = tuple(v)
+    assert found == expected
+    assert not [p for p in tmp_path.rglob(".*")]
+
+
+def test_the_session_map_in_duckdb_and_polars(tmp_path: Path) -> None:
+    submaps = [small_map(0), small_map(1, (140.0, 0.0, 0.0))]
+    total = write_voxels(tmp_path / "voxels", submaps, METADATA)
+    expected = union(submaps).values()
+    mean = np.mean([odds / 20 for _, odds, _ in expected])
+    rows = duckdb.sql(f"select count(*), avg(occupancy), sum(hits) from '{tmp_path}/voxels/**/*.parquet'").fetchall()
+    assert rows[0][0] == total
+    assert rows[0][1] == pytest.approx(mean, rel=1e-6)
+    assert rows[0][2] == sum(h for *_, h in expected)
+    frame = pl.read_parquet(f"{tmp_path}/voxels/**/*.parquet")
+    assert frame.height == total
+    assert frame.schema["ix"] == pl.Int32
+    assert frame.schema["label"] == pl.UInt8
+    assert frame["occupancy"].mean() == pytest.approx(mean, rel=1e-6)
+
+
+@pytest.mark.parametrize("submaps", [[], [empty_map()], "free only"])
+def test_a_session_map_without_voxels_is_a_table_without_rows(submaps: Any, tmp_path: Path) -> None:
+    if submaps == "free only":
+        fuser = Fuser(Settings().resolved().fusion)
+        fuser.add(np.array([[500.0, 0, 0]]), np.zeros(1, np.uint8), np.zeros(3))
+        submaps = [fuser.finish()]
+        assert (submaps[0].state == FREE_STATE).any()
+    assert write_voxels(tmp_path / "voxels", submaps, METADATA) == 0
+    assert duckdb.sql(f"select count(*) from '{tmp_path}/voxels/**/*.parquet'").fetchall() == [(0,)]
+    assert read_metadata(next((tmp_path / "voxels").rglob("*.parquet"))) == METADATA
+
+
+def test_writing_twice_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_voxels(tmp_path / name, [small_map(0), small_map(1, (140.0, 0.0, 0.0))], METADATA)
+        write_blocks(tmp_path / f"{name}.parquet", small_map(0), METADATA)
+    a = {p.relative_to(tmp_path / "a"): p.read_bytes() for p in (tmp_path / "a").rglob("*.parquet")}
+    b = {p.relative_to(tmp_path / "b"): p.read_bytes() for p in (tmp_path / "b").rglob("*.parquet")}
+    assert a == b
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
