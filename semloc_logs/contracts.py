@@ -50,4 +50,7 @@ def table(name: str, columns: dict[str, Any]) -> pa.Table:
     wanted = schema(name)
     if set(columns) != set(wanted.names):
         raise ContractError(f"Table '{name}' needs the columns {', '.join(wanted.names)}, not {', '.join(columns)}.")
-    return pa.table([pa.array(columns[f.name], f.type) for f in wanted], schema=wanted)
+    try:
+        return pa.table([pa.array(columns[f.name], f.type) for f in wanted], schema=wanted)
+    except (pa.ArrowException, OverflowError) as problem:
+        raise ContractError(f"Table '{name}' cannot hold these columns: {str(problem).splitlines()[0]}.") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import shutil
@@ -48,14 +49,22 @@ def replacing_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder beside ``path`` that takes its place when the block ends well."""
+    """A temporary folder beside ``path`` that takes its place, synced, when the block ends well.
+
+    Two renames do it, so a reader in between, or after a kill in between, finds no folder; never half of one.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    for stale in path.parent.glob(f".{path.name}.*.tmp"):  # of a run that was killed
+    for stale in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):  # of a run that was killed
         shutil.rmtree(stale, ignore_errors=True)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     temporary.mkdir()
     try:
         yield temporary
+        for folder, _, names in os.walk(temporary):
+            for name in names:
+                with open(os.path.join(folder, name), "rb") as written:
+                    os.fsync(written.fileno())
+            fsync_folder(Path(folder))
         if path.exists():
             old = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old.tmp")
             os.replace(path, old)
@@ -101,7 +110,9 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     try:
         return pq.read_table(path, columns=columns, partitioning=None)
     except (OSError, pa.ArrowException) as problem:
-        raise WorkspaceError(f"{path} cannot be read ({str(problem).splitlines()[0]}): run the stage that writes it with --overwrite.") from None
+        raise WorkspaceError(
+            f"{path} cannot be read ({str(problem).splitlines()[0]}): run the stage that writes it with --overwrite."
+        ) from None
 
 
 def read_metadata(path: Path) -> dict[str, Any]:

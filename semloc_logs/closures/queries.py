@@ -86,16 +86,19 @@ def query_keyframes(session: SessionMap, settings: Settings) -> list[int]:
 
 
 def query_members(session: SessionMap, keyframe: int, settings: Settings) -> list[int]:
-    """The keyframes fused into the query of ``keyframe``: ``query.frames`` around it, or all within ``query.length`` of road."""
+    """The keyframes fused into the query of ``keyframe``: ``query.frames`` around it, or all within ``query.length`` of road.
+
+    Poses may jump, between logs or where positions come back: what lies beyond the query's radius is no part of the place.
+    """
     n = len(session.stamps_ns)
     if not session.posed:
         return [keyframe]
+    away = np.abs(session.distance - session.distance[keyframe])
     if settings.query.length is not None:
-        half = settings.query.length / 2
-        return np.flatnonzero(np.abs(session.distance - session.distance[keyframe]) <= half).tolist()
+        return np.flatnonzero(away <= settings.query.length / 2).tolist()
     count = min(settings.query.frames, n)
     first = min(max(0, keyframe - count // 2), n - count)
-    return list(range(first, first + count))
+    return [i for i in range(first, first + count) if away[i] <= (settings.query.radius or 30.0)]
 
 
 def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple[Query, F64]:

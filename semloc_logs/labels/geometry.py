@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from semloc_logs.labels.shape import Shape
 from semloc_logs.labels.space import BUILDING, POLE, ROAD, UNLABELLED, VEGETATION
@@ -35,9 +34,12 @@ def ground_surface(points: NDArray[np.floating], scale: float = 1.0) -> NDArray[
     grid[sorted_address[start]] = points[order[start + np.minimum(count // 20 + (count > 3), count - 1)], 2]
     surface = np.pad(grid.reshape(tuple(shape)), 4, constant_values=np.inf)  # a margin, because roll wraps around
     for step in (1, 2, 4):  # grey erosion by a cone of 20 % slope, in doubling steps
-        neighbours = [np.roll(surface, (dx, dy), (0, 1)) + 0.2 * step * cell * np.hypot(np.sign(dx), np.sign(dy)) for dx in (-step, 0, step) for dy in (-step, 0, step)]
+        neighbours = [
+            np.roll(surface, (dx, dy), (0, 1)) + 0.2 * step * cell * np.hypot(np.sign(dx), np.sign(dy))
+            for dx in (-step, 0, step)
+            for dy in (-step, 0, step)
+        ]
         surface = np.minimum.reduce(neighbours)
-    surface = ndimage.grey_closing(np.where(np.isfinite(surface), surface, 1e6), 1)
     return np.asarray(surface[xy[:, 0] + 4, xy[:, 1] + 4], float)
 
 

@@ -60,13 +60,13 @@ def to_cityscapes(ids: NDArray[np.integer], space: str) -> U8:
         known = np.asarray(ids)
         return np.where((known >= 0) & (known < len(cityscapes().names)), known, UNLABELLED).astype(np.uint8)
     content = yaml.safe_load(read_text(f"label_spaces/{space}.yaml"))
-    values, inverse = np.unique(np.asarray(ids) & content.get("mask", 0xFFFFFFFF), return_inverse=True)
+    values, inverse = np.unique(np.asarray(ids, np.int64) & content.get("mask", 0xFFFFFFFF), return_inverse=True)
     table = np.array([content["to_cityscapes"].get(int(v), UNLABELLED) for v in values], np.uint8)
     return table[inverse].reshape(np.shape(ids))
 
 
 def guess_space(ids: NDArray[np.integer]) -> str:
     """The label space that a log's ids look like: SemanticKITTI has ids above 18 and instances, Cityscapes none but 255."""
-    low = np.unique(np.asarray(ids) & 0xFFFF)
-    instances = bool((np.asarray(ids) > 0xFFFF).any())
+    every = np.unique(np.asarray(ids, np.int64))
+    low, instances = every & 0xFFFF, bool((every > 0xFFFF).any())
     return "semantickitti" if instances or bool(((low > 18) & (low != UNLABELLED)).any()) else "cityscapes"

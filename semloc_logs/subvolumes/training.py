@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
@@ -97,6 +98,7 @@ def train(
 
     Raises SettingsError without shards and WorkspaceError when the checkpoint is of another run.
     """
+    shards = [path for path in shards if pq.read_metadata(path).num_rows]
     if not shards:
         raise SettingsError("There is nothing to train on: give sessions with keyframes, or scenes to simulate.")
     torch.manual_seed(training.seed)
@@ -118,19 +120,24 @@ def train(
                 partner = model.encoder(torch.from_numpy(table[other]))
         entropy = F.cross_entropy(logits, target, reduction="none").float()
         weight = torch.where(target < classes, training.occupied_weight, 1.0) * known
-        reconstruction = (entropy * weight).sum() / weight.sum()
+        reconstruction = (entropy * weight).sum() / weight.sum().clamp(min=1.0)
         middle, log_variance = mu[:, :, 1, 1].float(), log_variance.float()
         prior = 0.5 * (middle.square() + log_variance.exp() - 1 - log_variance).mean()
         similarity = descriptors(mu)[seen] @ descriptors(partner)[seen].T / TEMPERATURE
         own = torch.arange(len(similarity))
-        contrastive = 0.5 * (F.cross_entropy(similarity, own) + F.cross_entropy(similarity.T, own))
+        some = len(own) > 0  # dropout can take the last subvolume that is full enough, and the mean of nothing is NaN
+        contrastive = 0.5 * (F.cross_entropy(similarity, own) + F.cross_entropy(similarity.T, own)) if some else mu.new_zeros(())
         loss = training.reconstruction_weight * reconstruction + prior + training.contrastive_weight * contrastive
         optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
         optimiser.step()
-        matched = float((similarity.argmax(1) == own).float().mean())
-        on_step(Progress((step + 1) * training.batch * 9, float(loss.detach()), float(reconstruction.detach()), float(contrastive.detach()), matched))
+        matched = float((similarity.argmax(1) == own).float().mean()) if some else 0.0
+        on_step(
+            Progress(
+                (step + 1) * training.batch * 9, float(loss.detach()), float(reconstruction.detach()), float(contrastive.detach()), matched
+            )
+        )
         if (step + 1) % save_every == 0 or step + 1 == steps:
             _save(checkpoint, model, optimiser, training, step + 1)
     return model
@@ -140,7 +147,7 @@ def _save(path: Path, model: Completion, optimiser: torch.optim.Adam, training: 
     tensors = {f"model.{k}": v.contiguous() for k, v in model.state_dict().items()}
     for i, p in enumerate(model.parameters()):
         tensors |= {f"adam.{i}.{k}": v.contiguous() for k, v in optimiser.state.get(p, {}).items() if isinstance(v, Tensor)}
-    note = {"step": str(step), "training": training.model_dump_json()}
+    note = {"step": str(step), "training": training.model_dump_json(), "variant": model.encoder.variant}
     with replacing_file(path) as temporary:
         save_file(tensors, temporary, metadata=note)
 
@@ -150,16 +157,24 @@ def _resume(path: Path, model: Completion, optimiser: torch.optim.Adam, training
         with safe_open(path, "pt") as handle:
             note = handle.metadata() or {}
         tensors = load_file(path)
-    except (OSError, SafetensorError) as problem:
+        same = (
+            json.loads(note["training"]) == training.model_dump(mode="json")
+            and note.get("variant", model.encoder.variant) == model.encoder.variant
+        )
+        step = int(note["step"])
+    except (OSError, SafetensorError, KeyError, ValueError) as problem:
         raise WorkspaceError(f"Checkpoint {path} cannot be read ({problem}): remove it to start over.") from None
-    if json.loads(note.get("training", "null")) != training.model_dump(mode="json"):
+    if not same:
         raise WorkspaceError(f"Checkpoint {path} is of a training with other settings: remove it to start over.")
-    model.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
+    try:
+        model.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
+    except RuntimeError:
+        raise WorkspaceError(f"Checkpoint {path} is of another network: remove it to start over.") from None
     for i, p in enumerate(model.parameters()):
         state = {k: tensors[f"adam.{i}.{k}"] for k in ("step", "exp_avg", "exp_avg_sq") if f"adam.{i}.{k}" in tensors}
         if state:
             optimiser.state[p] = state
-    return int(note["step"])
+    return step
 
 
 def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:

@@ -33,7 +33,9 @@ def _popcount(x: np.uint64) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _nearest(codes: U64, cells: I32, starts: NDArray[np.int64], listed: U64, group: I32, allowed: NDArray[np.bool_], k: int) -> tuple[I32, I32]:
+def _nearest(
+    codes: U64, cells: I32, starts: NDArray[np.int64], listed: U64, group: I32, allowed: NDArray[np.bool_], k: int
+) -> tuple[I32, I32]:
     """The k nearest allowed entries (n, k) of each query, -1 where there are fewer, and their distances, nearest first."""
     n, probes = cells.shape
     entry = np.full((n, k), -1, np.int32)
@@ -41,7 +43,7 @@ def _nearest(codes: U64, cells: I32, starts: NDArray[np.int64], listed: U64, gro
     for q in range(n):
         for p in range(probes):
             cell = cells[q, p]
-            code = codes[q * probes + p]
+            code = codes[q, p]
             for e in range(starts[cell], starts[cell + 1]):
                 if not allowed[group[e]]:
                     continue
@@ -74,7 +76,7 @@ class Index:
             empty = np.zeros(0, np.int32)
             return Matches(empty, empty, empty)
         cells = self.vocabulary.nearest_cells(descriptors, probes)
-        codes = self.vocabulary.codes(np.repeat(descriptors, cells.shape[1], axis=0), cells.reshape(-1))
+        codes = self.vocabulary.codes(descriptors, cells)
         entry, distance = _nearest(codes, cells, self._starts, self._codes, self._group, allowed, k)
         query, rank = np.nonzero(entry >= 0)
         return Matches(query.astype(np.int32), self.order[entry[query, rank]].astype(np.int32), distance[query, rank])
