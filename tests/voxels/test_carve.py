@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -23,7 +25,7 @@ def crossed(origin: F64, end: F64) -> tuple[set[tuple[int, ...]], set[tuple[int,
             }
     ordered = sorted(times)
     sure, maybe = set(), set()
-    for a, b in zip(ordered, ordered[1:], strict=False):
+    for a, b in itertools.pairwise(ordered):
         middle = origin + d * (a + b) / 2
         cell = tuple(np.floor(middle).astype(int).tolist())
         maybe.add(cell)

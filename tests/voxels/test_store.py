@@ -141,7 +141,7 @@ def test_the_session_map_is_the_union_of_overlapping_submaps(tmp_path: Path) -> 
             assert tuple(k) not in found
             found[tuple(k)] = tuple(v)
     assert found == expected
-    assert not [p for p in tmp_path.rglob(".*")]
+    assert not list(tmp_path.rglob(".*"))
 
 
 def test_the_session_map_in_duckdb_and_polars(tmp_path: Path) -> None:
