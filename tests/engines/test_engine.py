@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from semloc_logs.engines import ENGINES, Engine, make_engine
+from semloc_logs.engines.engine import cores
+from semloc_logs.errors import LogError, SemlocError, SettingsError
+
+TASKS = """
+import os, time
+from semloc_logs.errors import LogError
+
+def slow_square(n):
+    time.sleep(0.05 if n % 3 == 0 else 0)  # later tasks overtake
+    return n * n, os.getpid()
+
+def picky(n):
+    if n == 3:
+        raise LogError("drive.mcap: task 3 is damaged, remove it")
+    return n
+
+def dies(n):
+    if n == 2:
+        os._exit(9)
+    return n
+
+def threads(_):
+    return {k: os.environ.get(k) for k in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+"""
+
+
+@pytest.fixture
+def tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """Functions in a module that spawned workers can import too."""
+    (tmp_path / "tasks_of_engine_tests.py").write_text(TASKS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield importlib.import_module("tasks_of_engine_tests")
+    del sys.modules["tasks_of_engine_tests"]
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> Iterator[Engine]:
+    made = make_engine(request.param, 2)
+    yield made
+    made.close()
+
+
+def test_results_come_in_the_order_of_the_tasks(engine: Engine, tasks: ModuleType) -> None:
+    found = list(engine.map(tasks.slow_square, (n for n in range(13))))
+    assert [value for value, _ in found] == [n * n for n in range(13)]
+    elsewhere = {pid for _, pid in found} != {os.getpid()}
+    assert elsewhere == (engine.jobs > 1)
+    assert list(engine.map(tasks.slow_square, [])) == []
+    assert [value for value, _ in engine.map(tasks.slow_square, [5])] == [25]  # the engine can be used again
+
+
+def test_an_exception_arrives_as_raised_after_what_came_before(engine: Engine, tasks: ModuleType) -> None:
+    results = engine.map(tasks.picky, range(8))
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(LogError, match=r"^drive\.mcap: task 3 is damaged, remove it$"):
+        next(results)
+    assert list(engine.map(tasks.picky, [1, 2])) == [1, 2]
+
+
+def test_tasks_are_taken_as_they_are_needed(engine: Engine, tasks: ModuleType) -> None:
+    """Results may be large: not all tasks are in flight at once."""
+    taken = []
+
+    def source() -> Iterator[int]:
+        for n in range(100):
+            taken.append(n)
+            yield n
+
+    results = engine.map(tasks.picky, source())
+    assert next(results) == 0
+    assert len(taken) <= 2 * engine.jobs + 1
+
+
+def test_a_worker_that_dies_is_an_error_with_advice(tasks: ModuleType) -> None:
+    engine = make_engine("processes", 2)
+    try:
+        with pytest.raises(SemlocError, match="--jobs"):
+            list(engine.map(tasks.dies, range(5)))
+        assert list(engine.map(tasks.dies, [0, 1])) == [0, 1]  # a new pool serves what comes next
+    finally:
+        engine.close()
+
+
+def test_workers_share_the_cores(tasks: ModuleType) -> None:
+    engine = make_engine("processes", cores() + 1)
+    try:
+        assert next(engine.map(tasks.threads, [0]))["OMP_NUM_THREADS"] == "1"
+    finally:
+        engine.close()
+
+
+def test_unknown_engines_are_refused_by_name() -> None:
+    with pytest.raises(SettingsError, match="'slurm'"):
+        make_engine("slurm")
+
+
+def test_cores_that_the_scheduler_grants(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "7")
+    assert cores() == 7
+    for odd in ("", "0", "many"):
+        monkeypatch.setenv("SLURM_CPUS_PER_TASK", odd)
+        assert cores() == len(os.sched_getaffinity(0))
