@@ -26,3 +26,7 @@ class WorkspaceError(SemlocError):
 
 class ContractError(SemlocError):
     """A table or message does not have the columns that its contract in ``schemas/`` promises."""
+
+
+class TruthError(SemlocError):
+    """A truth file of ``semloc evaluate`` is missing or does not say what it should."""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import Protocol, TypeVar
+from typing import NoReturn, Protocol, TypeVar
 
 from semloc_logs.errors import SemlocError, SettingsError
 
@@ -23,7 +25,11 @@ class Engine(Protocol):
 
     def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]: ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release the workers once their tasks are done."""
+
+    def stop(self) -> None:
+        """End the workers now; what they were writing is cleaned up."""
 
 
 class Serial:
@@ -37,6 +43,9 @@ class Serial:
     def close(self) -> None:
         """Nothing to release."""
 
+    def stop(self) -> None:
+        """Nothing to end."""
+
 
 class Processes:
     """``jobs`` worker processes (spawned, so that threads of the parent cannot hurt them), each with its share of the cores."""
@@ -49,11 +58,11 @@ class Processes:
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
             share = max(1, cores() // self.jobs)
-            self._pool = ProcessPoolExecutor(self.jobs, context, initializer=limit_threads, initargs=(share,))
+            self._pool = ProcessPoolExecutor(self.jobs, context, initializer=_prepare_worker, initargs=(share,))
         waiting: deque[Future[Result]] = deque()
         try:
             for task in tasks:  # a bounded number of tasks in flight: their results may be large
-                waiting.append(self._pool.submit(function, task))
+                waiting.append(self._pool.submit(_run, function, task))
                 if len(waiting) >= 2 * self.jobs:
                     yield waiting.popleft().result()
             while waiting:
@@ -68,6 +77,14 @@ class Processes:
         """Stop the workers."""
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
+
+    def stop(self) -> None:
+        """End the workers now: they unwind, so that temporary files go, and leave."""
+        if self._pool is not None:
+            for worker in list((getattr(self._pool, "_processes", None) or {}).values()):  # public as terminate_workers() from 3.14 on
+                worker.terminate()
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
 
 
 ENGINES = ("serial", "processes")
@@ -92,3 +109,31 @@ def limit_threads(threads: int) -> None:
     """Keep the thread pools of the numerical libraries within ``threads``; for workers, before they load any."""
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ[variable] = str(threads)
+
+
+def _prepare_worker(threads: int) -> None:
+    """A worker leaves when told to (SIGTERM) or when its parent is gone, and leaves Ctrl-C to the parent."""
+    limit_threads(threads)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+
+
+def _leave(number: int, _: object) -> NoReturn:
+    signal.signal(number, signal.SIG_IGN)  # once is enough; the unwinding must not be interrupted
+    raise SystemExit(128 + number)
+
+
+def _leave_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _run(function: Callable[[Task], Result], task: Task) -> Result:
+    """In a worker: the pool would hand SystemExit to the parent as a result and live on."""
+    try:
+        return function(task)
+    except SystemExit as leaving:
+        os._exit(leaving.code if isinstance(leaving.code, int) else 1)

@@ -1,0 +1,65 @@
+"""semloc close."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from .console import console
+from .options import (
+    Command,
+    EngineChoice,
+    console_options,
+    engine_options,
+    json_option,
+    overwrite_option,
+    query_options,
+    settings_options,
+    work_option,
+)
+from .results import finish, report_json, show_closures
+
+if TYPE_CHECKING:
+    from semloc_logs.settings import Settings
+
+
+@click.command(cls=Command)
+@work_option
+@click.option("--query", "queries", metavar="SESSION", multiple=True, help="Session that asks; repeatable; default: all.")
+@click.option("--target", "targets", metavar="SESSION", multiple=True, help="Session that is asked; repeatable; default: all.")
+@click.option("--no-self", is_flag=True, help="Do not look for revisits within a session.")
+@query_options
+@overwrite_option
+@json_option
+@engine_options
+@settings_options
+@console_options
+def command(
+    work: Path,
+    queries: tuple[str, ...],
+    targets: tuple[str, ...],
+    no_self: bool,
+    overwrite: bool,
+    as_json: bool,
+    engine: EngineChoice,
+    settings: Settings,
+) -> int:
+    """Words -> loop closures: every session asks all others, and itself apart from what is near in time; writes closures.parquet.
+
+    \b
+    Example:  semloc close -w work --query tuesday --target monday --query-every 5
+    """
+    from semloc_logs.closures.results import read_closures
+    from semloc_logs.stages import close
+    from semloc_logs.workspace import Workspace
+
+    workspace = Workspace(work)
+    with console.progress(), engine.open(len(workspace.sessions())) as opened:
+        report = close(workspace, queries, targets, settings, opened, console.note, not no_self, overwrite)
+    if as_json:
+        console.result_json(report_json(report, work) | {"closures": read_closures(workspace.closures)})
+    else:
+        show_closures(workspace)
+    return finish(report)

@@ -1,0 +1,57 @@
+"""semloc demo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from .console import console
+from .evaluate import show_evaluation
+from .options import Command, EngineChoice, console_options, engine_options, json_option, overwrite_option, settings_options
+from .results import finish, report_json, session_logs
+
+if TYPE_CHECKING:
+    from semloc_logs.settings import Settings
+
+
+@click.command(cls=Command)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder of the logs and the workspace."
+)
+@overwrite_option
+@json_option
+@engine_options
+@settings_options
+@console_options
+def command(output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, settings: Settings) -> int:
+    """Everything once: two drives round a simulated block on two days, their maps, closures, the truth, and an annotated log to look at.
+
+    \b
+    Example:  semloc demo -o /tmp/demo
+    """
+    from semloc_logs.evaluation.truth import evaluate_closures
+    from semloc_logs.simulation.demo import simulate_demo
+    from semloc_logs.stages import run
+    from semloc_logs.workspace import Workspace
+
+    logs, truth, workspace = [output / "monday.mcap", output / "tuesday.bag"], output / "truth.json", Workspace(output / "work")
+    with console.progress():
+        if overwrite or not truth.exists():
+            console.note(f"Simulating two drives in {output}")
+            simulate_demo(output)
+        with engine.open(len(logs)) as opened:
+            report = run(session_logs(logs), workspace, settings, {}, opened, console.note, "copy", overwrite)
+    result = evaluate_closures(workspace, truth, settings)
+    if as_json:
+        console.result_json(report_json(report, workspace.path) | {"evaluation": result.to_json()})
+        return finish(report)
+    show_evaluation(result)
+    console.result(f"Closures:      {workspace.closures}")
+    for path in sorted(workspace.annotated.glob("*.mcap")):
+        console.result(f"Annotated log: {path}")
+    if workspace.picture.exists():
+        console.result(f"Picture:       {workspace.picture}")
+    console.result(", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in report.seconds.items()))
+    return finish(report)

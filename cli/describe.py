@@ -1,0 +1,42 @@
+"""semloc describe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from .console import console
+from .options import Command, EngineChoice, console_options, engine_options, json_option, overwrite_option, settings_options, work_option
+from .results import finish, report_json, show_report
+
+if TYPE_CHECKING:
+    from semloc_logs.settings import Settings
+
+
+@click.command(cls=Command)
+@click.argument("sessions", metavar="[SESSION...]", nargs=-1)
+@work_option
+@overwrite_option
+@json_option
+@engine_options
+@settings_options
+@console_options
+def command(sessions: tuple[str, ...], work: Path, overwrite: bool, as_json: bool, engine: EngineChoice, settings: Settings) -> int:
+    """Maps -> semantic words: every occupied subvolume of the sessions' submaps (all sessions by default) becomes a word and a 64-bit code.
+
+    \b
+    Example:  semloc describe -w work monday tuesday
+    """
+    from semloc_logs.stages import describe
+    from semloc_logs.workspace import Workspace
+
+    workspace = Workspace(work)
+    with console.progress(), engine.open(len(sessions) or len(workspace.sessions())) as opened:
+        report = describe(workspace, sessions, settings, opened, console.note, overwrite)
+    if as_json:
+        console.result_json(report_json(report, work))
+    else:
+        show_report("Described", report)
+    return finish(report)

@@ -1,0 +1,67 @@
+"""semloc fuse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from .console import console
+from .options import (
+    Command,
+    EngineChoice,
+    console_options,
+    engine_options,
+    json_option,
+    logs_argument,
+    overwrite_option,
+    settings_options,
+    topic_option,
+    work_option,
+)
+from .results import checked_name, finish, report_json, show_report
+
+if TYPE_CHECKING:
+    from semloc_logs.settings import Settings
+
+
+@click.command(cls=Command)
+@logs_argument
+@work_option
+@click.option("--session", metavar="NAME", help="Name of the session; default: the first log's file stem or folder name.")
+@topic_option
+@overwrite_option
+@json_option
+@engine_options
+@settings_options
+@console_options
+def command(
+    logs: tuple[Path, ...],
+    work: Path,
+    session: str | None,
+    topics: dict[str, str],
+    overwrite: bool,
+    as_json: bool,
+    engine: EngineChoice,
+    settings: Settings,
+) -> int:
+    """Logs -> the semantic map of one session: keyframes, submaps, voxels, trajectory. Several logs are one session, recorded back to back.
+
+    Nothing is done again that is there for the same content, settings and version. Lengths are metres.
+
+    \b
+    Example:  semloc fuse monday_0.mcap monday_1.mcap -w work --session monday
+    """
+    from semloc_logs.stages import fuse, session_name
+    from semloc_logs.workspace import Workspace
+
+    name = checked_name(session or session_name(logs[0]))
+    with console.progress(), engine.open(1) as opened:
+        report = fuse({name: logs}, Workspace(work), settings, topics, opened, console.note, overwrite)
+    if as_json:
+        console.result_json(report_json(report, work))
+    else:
+        show_report("Fused", report)
+        console.result(f"Map: {Workspace(work).session(name).picture}")
+    return finish(report)

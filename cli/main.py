@@ -1,0 +1,144 @@
+"""The `semloc` program: commands loaded when called, errors as one sentence and an exit code.
+
+Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but some input was skipped; 130 and 143 interrupted.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib import import_module
+from typing import Any, NoReturn
+
+import click
+
+from semloc_logs import __version__
+from semloc_logs.errors import SemlocError, SettingsError
+
+from .console import console
+
+COMMANDS = {  # name -> (module, what --help says), in the order of the story
+    "inspect": ("inspect_log", "What is in a log, and what stands in the way."),
+    "run": ("run", "Logs -> loop closures: fuse, describe, close, annotate."),
+    "fuse": ("fuse", "Logs -> the semantic map of one session."),
+    "describe": ("describe", "Maps -> semantic words."),
+    "close": ("close", "Words -> loop closures."),
+    "annotate": ("annotate", "Closures -> channels of a log."),
+    "evaluate": ("evaluate", "Closures against the truth."),
+    "export": ("export", "Poses, pose graph or map for other programs."),
+    "simulate": ("simulate", "Drive logs through a procedural town, with truth."),
+    "train": ("train", "Learn the descriptor."),
+    "vocabulary": ("vocabulary", "Learn the words."),
+    "demo": ("demo", "Everything once, on two simulated sessions."),
+    "benchmark": ("benchmark", "Figures of speed, measured here and now."),
+}
+
+
+class Terminated(BaseException):
+    """SIGTERM, as an exception, so that everything unwinds."""
+
+
+class Program(click.Group):
+    """Commands by name; each module is imported when its command is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        found: click.Command = import_module(f".{COMMANDS[cmd_name][0]}", __package__).command
+        return found
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, says) for name, (_, says) in COMMANDS.items()])
+
+    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **__: Any) -> NoReturn:
+        """Run and exit with the code that DESIGN promises."""
+        console.reset()
+        warnings.simplefilter("ignore")  # numerical libraries' remarks are no sentences for a user
+        before = None
+        with suppress(ValueError):  # not in the main thread of an embedding program
+            before = signal.signal(signal.SIGTERM, _terminate)
+        try:
+            code = self._guarded(args, prog_name)
+        finally:
+            if before is not None:
+                signal.signal(signal.SIGTERM, before)
+        sys.exit(code)
+
+    def _guarded(self, args: Sequence[str] | None, prog_name: str | None) -> int:
+        try:
+            code = super().main(args, prog_name or "semloc", standalone_mode=False)
+            return code if isinstance(code, int) else 0
+        except click.exceptions.Abort:
+            console.error("Interrupted; finished work is kept, run the same command again to go on.")
+            return 128 + signal.SIGINT
+        except Terminated:
+            console.error("Terminated; finished work is kept, run the same command again to go on.")
+            return 128 + signal.SIGTERM
+        except click.ClickException as problem:
+            if console.log_format == "json":
+                console.error(problem.format_message())
+            else:
+                problem.show()
+            return problem.exit_code
+        except SettingsError as problem:
+            console.error(str(problem))
+            return 2
+        except SemlocError as problem:
+            console.error(str(problem))
+            return 1
+        except OSError as problem:
+            _explain(problem)
+            where = problem.filename or "A file"
+            console.error(f"{where} cannot be read or written ({problem.strerror or problem}): check the path, permissions and disk space.")
+            return 1
+        except MemoryError as problem:
+            _explain(problem)
+            console.error("There is not enough memory: use fewer --jobs, or larger voxels.")
+            return 1
+        except Exception as problem:
+            _explain(problem)
+            frames = traceback.extract_tb(problem.__traceback__)
+            where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+            detail = " ".join(str(problem).split())[:200]
+            console.error(f"Unexpected {type(problem).__name__}{where} ({detail}): run again with -v for the traceback and report it.")
+            return 1
+
+
+def _explain(problem: BaseException) -> None:
+    if console.verbosity > 0:
+        click.echo("".join(traceback.format_exception(problem)), err=True, nl=False)
+
+
+def _terminate(number: int, _: object) -> NoReturn:
+    signal.signal(number, signal.SIG_IGN)  # once is enough; the unwinding must not be interrupted
+    raise Terminated
+
+
+@click.group(
+    cls=Program,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done but some input was skipped.",
+)
+@click.version_option(__version__, prog_name="semloc")
+def program() -> None:
+    """Where has a drive been before? Semantic loop closures from recorded drive logs (.mcap, .bag, .db3, ROS 2 bag folders).
+
+    \b
+    semloc demo                              everything once, on two simulated sessions
+    semloc inspect A.mcap                    what is in a log, and what stands in the way
+    semloc run A.mcap B.bag -w work          logs -> maps -> words -> closures, resumable
+    """
+
+
+def main() -> NoReturn:
+    """The console script."""
+    program.main()

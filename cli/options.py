@@ -1,0 +1,206 @@
+"""Options that commands share, and what becomes of them: settings, topics, an engine."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .console import console
+
+if TYPE_CHECKING:
+    from semloc_logs.engines import Engine
+    from semloc_logs.settings import Settings
+
+Function = Callable[..., Any]
+
+FLAGS = {  # options that are short for a setting
+    "query_frames": "query.frames",
+    "query_length": "query.length",
+    "query_every": "query.every",
+    "samples": "training.samples",
+    "scenes": "training.scenes",
+    "seed": "training.seed",
+}
+
+
+class Command(click.Command):
+    """A command that answers --dump-config before it asks for the arguments that it needs otherwise."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if "--dump-config" in args and any(p.name == "dump_config" for p in self.params):
+            given = self.make_parser(ctx).parse_args(args=list(args))[0]
+            for parameter in self.params:
+                if parameter.name in given and parameter.name in {"config", "assignments", *FLAGS}:
+                    parameter.handle_parse_result(ctx, given, [])
+            click.echo(_explained(_settings(ctx.params)), nl=False)
+            ctx.exit(0)
+        return super().parse_args(ctx, args)
+
+
+def path_option(*names: str, help: str, required: bool = False) -> Callable[[Function], Function]:
+    """An option that takes a path, which need not exist."""
+    return click.option(*names, type=click.Path(path_type=Path), required=required, help=help)
+
+
+logs_argument = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+work_option = path_option("-w", "--work", required=True, help="Workspace folder.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+overwrite_option = click.option("--overwrite", is_flag=True, help="Do finished work again; replace existing outputs.")
+
+
+def _set_verbosity(_: click.Context, parameter: click.Parameter, count: int) -> None:
+    if count:
+        console.verbosity = count if parameter.name == "verbose" else -1
+
+
+def _set_log_format(_: click.Context, __: click.Parameter, value: str) -> None:
+    console.log_format = value
+
+
+def console_options(function: Function) -> Function:
+    """-v, -q and --log-format."""
+    eager: dict[str, Any] = {"expose_value": False, "is_eager": True}
+    for decorate in (
+        click.option(
+            "-q", "--quiet", count=True, callback=_set_verbosity, help="No notes and no progress; warnings and errors only.", **eager
+        ),
+        click.option(
+            "-v", "--verbose", count=True, callback=_set_verbosity, help="All notes, and the traceback of an unexpected error.", **eager
+        ),
+        click.option(
+            "--log-format",
+            type=click.Choice(["text", "json"]),
+            default="text",
+            callback=_set_log_format,
+            help="Form of what goes to stderr.",
+            **eager,
+        ),
+    ):
+        function = decorate(function)
+    return function
+
+
+def _pairs(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    out = {}
+    for value in values:
+        key, equals, rest = value.partition("=")
+        if not equals or not key or not rest:
+            raise click.BadParameter(f"{value!r} is not of the form NAME=VALUE")
+        out[key] = rest
+    return out
+
+
+topic_option = click.option(
+    "--topic",
+    "topics",
+    metavar="ROLE=TOPIC",
+    multiple=True,
+    callback=_pairs,
+    help="Topic that plays a role, such as lidar=/points; repeatable.",
+)
+
+
+def settings_options(function: Function) -> Function:
+    """--config, --set and --dump-config; the command gets ``settings``, lengths filled in from the voxel size."""
+
+    @click.option("--config", type=click.Path(path_type=Path), help="YAML file of settings.")
+    @click.option(
+        "--set",
+        "assignments",
+        metavar="KEY.PATH=VALUE",
+        multiple=True,
+        callback=_pairs,
+        help="One setting, such as fusion.voxel_size=0.3 (m); repeatable.",
+    )
+    @click.option("--dump-config", is_flag=True, help="Print all settings, explained, and exit.")
+    @functools.wraps(function)
+    def with_settings(*args: Any, dump_config: bool, **options: Any) -> Any:
+        settings = _settings(options)
+        rest = {k: v for k, v in options.items() if k not in {"config", "assignments", *FLAGS}}
+        return function(*args, settings=settings.resolved(), **rest)
+
+    return with_settings
+
+
+def _settings(options: Mapping[str, Any]) -> Settings:
+    from semloc_logs.settings import load
+
+    assignments = dict(options.get("assignments") or {})
+    assignments |= {key: str(options[flag]) for flag, key in FLAGS.items() if options.get(flag) is not None}
+    return load(options.get("config"), assignments, os.environ)
+
+
+def _explained(settings: Settings) -> str:
+    """YAML that --config reads back, each line with its meaning."""
+    lines = []
+    for section, values in settings:
+        document = (type(values).__doc__ or "").strip().rstrip(".")
+        lines.append(f"{section}:  # {document}" if document else f"{section}:")
+        for name, value in values.model_dump(mode="json").items():
+            meaning = type(values).model_fields[name].description
+            lines.append(f"  {name}: {_yaml_value(value)}" + (f"  # {meaning}" if meaning else ""))
+    return "\n".join(lines) + "\n"
+
+
+def _yaml_value(value: object) -> str:
+    import yaml
+
+    return str(yaml.safe_dump(value, default_flow_style=True, width=1000)).removesuffix("...\n").strip()
+
+
+def query_options(function: Function) -> Function:
+    """What is asked of the database."""
+    for decorate in (
+        click.option("--query-every", type=float, metavar="M", help="Distance between queries (m); default 2 m at 0.30 m voxels."),
+        click.option("--query-length", type=float, metavar="M", help="A query is fused from this stretch of road (m) instead."),
+        click.option("--query-frames", type=int, metavar="N", help="A query is fused from so many keyframes; default 5."),
+    ):
+        function = decorate(function)
+    return function
+
+
+@dataclass(frozen=True, slots=True)
+class EngineChoice:
+    """What --engine and --jobs said."""
+
+    name: str | None
+    jobs: int | None
+
+    @contextmanager
+    def open(self, tasks: int) -> Iterator[Engine]:
+        """The engine for so many sessions or scenes; its workers end with the block, at once if the block fails."""
+        from semloc_logs.engines import make_engine
+        from semloc_logs.engines.engine import cores
+
+        is_parallel = (self.jobs or cores()) > 1 and (tasks > 1 or self.jobs is not None)
+        engine = make_engine(self.name or ("processes" if is_parallel else "serial"), self.jobs)
+        try:
+            yield engine
+        except BaseException:
+            engine.stop()
+            raise
+        engine.close()
+
+
+def engine_options(function: Function) -> Function:
+    """--engine and --jobs; the command gets ``engine``, an EngineChoice."""
+
+    @click.option(
+        "--engine",
+        "engine_name",
+        type=click.Choice(["serial", "processes"]),
+        help="Where work runs; default: processes for several sessions on several cores.",
+    )
+    @click.option("--jobs", type=click.IntRange(1, 1024), metavar="N", help="Worker processes; default: the cores of this machine.")
+    @functools.wraps(function)
+    def with_engine(*args: Any, engine_name: str | None, jobs: int | None, **options: Any) -> Any:
+        return function(*args, engine=EngineChoice(engine_name, jobs), **options)
+
+    return with_engine

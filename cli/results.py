@@ -1,0 +1,93 @@
+"""What several commands print about a run: closures as a table, and what was skipped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .console import console
+
+if TYPE_CHECKING:
+    from semloc_logs.stages import Report
+    from semloc_logs.workspace import Workspace
+
+SHOWN = 20  # rows of a table; files have them all
+
+
+def session_logs(logs: Iterable[Path]) -> dict[str, Sequence[Path]]:
+    """Each log is a session; UsageError when two have the same name."""
+    from semloc_logs.stages import session_name
+
+    out: dict[str, Sequence[Path]] = {}
+    for log in logs:
+        name = session_name(log)
+        if name in out:
+            raise click.UsageError(
+                f"{out[name][0]} and {log} would both be session '{name}': rename one, or fuse them one by one with --session."
+            )
+        out[name] = (log,)
+    return out
+
+
+def checked_name(name: str) -> str:
+    """A session's name; UsageError when it cannot be a folder's."""
+    if not name or name.startswith(".") or "/" in name or "\0" in name:
+        raise click.UsageError(f"A session cannot be called {name!r}: its name becomes a folder's.")
+    return name
+
+
+def finish(*reports: Report) -> int:
+    """Print what was skipped or failed; the exit code."""
+    sentences = list(dict.fromkeys(s for r in reports for s in (*r.skipped, *r.failed)))
+    for sentence in sentences:
+        console.warn(sentence)
+    return 3 if sentences else 0
+
+
+def report_json(report: Report, work: Path) -> dict[str, Any]:
+    """A stage's report as --json prints it."""
+    keys = ("done", "kept", "skipped", "failed")
+    return {"work": str(work), **{k: getattr(report, k) for k in keys}, "seconds": report.seconds, "closures": report.closures}
+
+
+def show_report(verb: str, report: Report) -> None:
+    """What was done, for people."""
+    if report.done:
+        console.result(f"{verb}: {', '.join(report.done)}")
+    if report.kept:
+        console.result(f"Done before: {', '.join(report.kept)} (--overwrite does it again)")
+
+
+def show_closures(work: Workspace) -> None:
+    """The closures of a workspace as a table, and where they lie."""
+    import numpy as np
+
+    from semloc_logs.closures.results import read_closures
+
+    rows = read_closures(work.closures)
+    drawn = []
+    for r in rows[:SHOWN]:
+        yaw = np.degrees(2 * np.arctan2(r["q_z"], r["q_w"]))
+        drawn.append(
+            (
+                r["query_session"],
+                f"{r['query_stamp_ns'] / 1e9:.1f}",
+                r["target_session"],
+                f"{r['target_stamp_ns'] / 1e9:.1f}",
+                f"{np.linalg.norm([r['t_x'], r['t_y'], r['t_z']]):.2f}",
+                f"{(yaw + 180) % 360 - 180:.0f}",
+                f"{r['overlap']:.2f}",
+                f"{r['probability']:.4f}",
+            )
+        )
+    if rows:
+        columns = ("query", "stamp (s)", "target", "stamp (s)", "apart (m)", "yaw (deg)", "overlap#", "probability#")
+        console.table("", columns, drawn)
+    if len(rows) > SHOWN:
+        console.result(f"... and {len(rows) - SHOWN} more.")
+    console.result(f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in {work.rejected}")
+    if work.picture.exists():
+        console.result(f"Picture: {work.picture}")

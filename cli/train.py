@@ -1,0 +1,77 @@
+"""semloc train."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from .console import console
+from .options import Command, EngineChoice, console_options, engine_options, json_option, path_option, settings_options
+
+if TYPE_CHECKING:
+    from semloc_logs.engines import Engine
+    from semloc_logs.settings import Settings
+
+
+@click.command(cls=Command)
+@click.option(
+    "--variant",
+    type=click.Choice(["semantic", "geometric", "both"]),
+    default="both",
+    show_default=True,
+    help="Network with classes, without, or both.",
+)
+@path_option("-o", "--output", required=True, help="Folder of the weights.")
+@path_option("-w", "--work", help="Train on the fused sessions of this workspace instead of simulated scenes.")
+@click.option("--scenes", type=int, metavar="N", help="Simulated scenes; default: training.scenes.")
+@click.option("--samples", type=int, metavar="N", help="Subvolumes seen in training; default: training.samples.")
+@path_option("--checkpoint", help="Folder of checkpoints and packed pairs; default: OUTPUT/checkpoint.")
+@json_option
+@engine_options
+@settings_options
+@console_options
+def command(
+    variant: str, output: Path, work: Path | None, checkpoint: Path | None, as_json: bool, engine: EngineChoice, settings: Settings
+) -> int:
+    """Learn the descriptor, self-supervised: an encoder-decoder completes what few frames saw to what all frames saw.
+
+    Two scenes (or stretches of road) are held out and measured at the end. Can be interrupted: the same command goes on from the
+    checkpoint. Use the result with --set descriptor.weights=FILE, and train a vocabulary for it.
+
+    \b
+    Example:  semloc train --variant semantic -o weights --scenes 60 --samples 250000
+    """
+    from semloc_logs.engines.engine import cores
+    from semloc_logs.learning import learn_descriptor, use_threads
+
+    folder = checkpoint or output / "checkpoint"
+    with console.progress():
+        with engine.open(settings.training.scenes) as opened:
+            shards = packed_shards(folder, work, settings, opened)
+        use_threads(engine.jobs or cores())
+        scores = {}
+        for name in ("semantic", "geometric") if variant == "both" else (variant,):
+            weights = output / f"{name}.safetensors"
+            scores[name] = learn_descriptor(name, shards, settings, folder / f"{name}.safetensors", weights, console.note)
+            console.note(f"{weights} written")
+    if as_json:
+        console.result_json({name: {"weights": str(output / f"{name}.safetensors"), **found} for name, found in scores.items()})
+    else:
+        figures = sorted({figure for found in scores.values() for figure in found})
+        rows = [(figure, *(f"{found[figure]:.4f}" for found in scores.values())) for figure in figures]
+        console.table("On two held-out scenes", ("figure", *(f"{name}#" for name in scores)), rows)
+        for name in scores:
+            console.result(str(output / f"{name}.safetensors"))
+    return 0
+
+
+def packed_shards(folder: Path, work: Path | None, settings: Settings, engine: Engine) -> list[Path]:
+    """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes."""
+    from semloc_logs.learning import session_shards, simulated_shards
+    from semloc_logs.workspace import Workspace
+
+    if work is None:
+        return simulated_shards(folder, settings, engine, console.note)
+    return session_shards(folder, Workspace(work).sessions(), settings, engine, console.note)

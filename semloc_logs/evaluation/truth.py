@@ -1,0 +1,295 @@
+"""Closures against the truth: which are right, how far off, and how many of the revisits were found (DESIGN: closures.parquet)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from semloc_logs.closures.queries import SessionMap, query_keyframes
+from semloc_logs.closures.results import read_closures
+from semloc_logs.errors import TruthError, WorkspaceError
+from semloc_logs.geometry import interpolate, inverse, rotation_angle, transform
+from semloc_logs.settings import Closures, Query, Settings
+from semloc_logs.tables import read_metadata, read_table
+from semloc_logs.voxels.store import poses_of
+from semloc_logs.workspace import Workspace
+
+CORRECT_M, CORRECT_DEG = 1.0, 5.0
+REVISIT_M = 5.0
+SLACK_NS = 100_000_000  # a pose is known so far beyond the ends of its trajectory
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueTrack:
+    """True poses ``common_T_base`` (n, 4, 4) of a session at ascending ``stamps_ns`` (n,)."""
+
+    stamps_ns: I64
+    common_T_base: F64
+
+    def at(self, stamps_ns: I64) -> tuple[F64, NDArray[np.bool_]]:
+        """Poses (m, 4, 4) and whether they are known (m,)."""
+        if not len(self.stamps_ns):
+            return np.tile(np.eye(4), (len(stamps_ns), 1, 1)), np.zeros(len(stamps_ns), bool)
+        known = (stamps_ns >= self.stamps_ns[0] - SLACK_NS) & (stamps_ns <= self.stamps_ns[-1] + SLACK_NS)
+        return interpolate(self.stamps_ns, self.common_T_base, stamps_ns), known
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One closure; without errors, and neither correct nor false, when the truth does not know an end."""
+
+    query_session: str
+    target_session: str
+    query_stamp_ns: int
+    target_stamp_ns: int
+    probability: float
+    error_m: float | None
+    error_deg: float | None
+    correct: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """The figures: medians over all judged closures; ``recall`` = ``answered`` / ``possible`` queries, None without possible ones."""
+
+    rows: list[Judged]
+    queries: int
+    possible: int
+    answered: int
+
+    @property
+    def closures(self) -> int:
+        return len(self.rows)
+
+    @property
+    def correct(self) -> int:
+        return sum(r.correct is True for r in self.rows)
+
+    @property
+    def false(self) -> int:
+        return sum(r.correct is False for r in self.rows)
+
+    @property
+    def unjudged(self) -> int:
+        return sum(r.correct is None for r in self.rows)
+
+    @property
+    def median_error_m(self) -> float | None:
+        return _median(r.error_m for r in self.rows)
+
+    @property
+    def median_error_deg(self) -> float | None:
+        return _median(r.error_deg for r in self.rows)
+
+    @property
+    def recall(self) -> float | None:
+        return self.answered / self.possible if self.possible else None
+
+    def to_json(self) -> dict[str, Any]:
+        """As ``semloc evaluate --json`` prints it."""
+        figures = (
+            "closures",
+            "correct",
+            "false",
+            "unjudged",
+            "median_error_m",
+            "median_error_deg",
+            "recall",
+            "queries",
+            "possible",
+            "answered",
+        )
+        return {name: getattr(self, name) for name in figures} | {"rows": [asdict(r) for r in self.rows]}
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.median(known)) if known else None
+
+
+def evaluate_closures(work: Workspace, truth: Path, settings: Settings, *, self_closures: bool = True) -> Evaluation:
+    """The closures of a workspace against the file ``truth``; queries are counted with the settings that the closures were made with.
+
+    A query is possible when a keyframe of another session, or one of its own that is not excluded as near in time or along the road, truly
+    lies within 5 m. It is answered when a correct closure has it at either end: a closure found from both ends is reported once.
+    Raises TruthError when the truth file is missing or wrong, WorkspaceError without closures.
+    """
+    settings = _settings_of(work, settings.resolved())
+    sessions = {f.name: SessionMap(f) for f in work.sessions()}
+    tracks = read_truth(truth, sessions)
+    rows = [_judge(row, tracks) for row in read_closures(work.closures)]
+    queries, possible, answered = _count_queries(sessions, tracks, rows, settings, self_closures)
+    return Evaluation(rows, queries, possible, answered)
+
+
+def _settings_of(work: Workspace, settings: Settings) -> Settings:
+    """``settings`` with the sections that closures.parquet was made with, where it says so."""
+    recorded = read_metadata(work.closures).get("settings")
+    if not isinstance(recorded, dict):
+        return settings
+    try:
+        update = {"query": Query.model_validate(recorded["query"]), "closures": Closures.model_validate(recorded["closures"])}
+    except (KeyError, ValueError):
+        raise WorkspaceError(f"{work.closures} was made by another version: run 'semloc close -w {work.path} --overwrite'.") from None
+    return settings.model_copy(update=update)
+
+
+def _judge(row: Mapping[str, Any], tracks: Mapping[str, TrueTrack]) -> Judged:
+    ends = [_pose(tracks.get(row[f"{end}_session"]), row[f"{end}_stamp_ns"]) for end in ("query", "target")]
+    error_m = error_deg = correct = None
+    if ends[0] is not None and ends[1] is not None:
+        found = transform(np.array([row[f"t_{c}"] for c in "xyz"]), np.array([row[f"q_{c}"] for c in "xyzw"]))
+        rest = inverse(inverse(ends[1]) @ ends[0]) @ found
+        error_m, error_deg = float(np.linalg.norm(rest[:3, 3])), float(np.degrees(rotation_angle(rest[:3, :3])))
+        correct = error_m <= CORRECT_M and error_deg <= CORRECT_DEG
+    names = ("query_session", "target_session", "query_stamp_ns", "target_stamp_ns", "probability")
+    return Judged(*(row[n] for n in names), error_m, error_deg, correct)
+
+
+def _pose(track: TrueTrack | None, stamp_ns: int) -> F64 | None:
+    if track is None:
+        return None
+    poses, known = track.at(np.array([stamp_ns]))
+    return poses[0] if known[0] else None
+
+
+# -- recall
+
+
+def _count_queries(
+    sessions: Mapping[str, SessionMap], tracks: Mapping[str, TrueTrack], rows: list[Judged], settings: Settings, self_closures: bool
+) -> tuple[int, int, int]:
+    """Queries of known true pose, those of them that are possible, and those of the latter that are answered."""
+    positions: dict[str, F64] = {}
+    known: dict[str, NDArray[np.bool_]] = {}
+    for name, track in tracks.items():
+        poses, known[name] = track.at(sessions[name].stamps_ns)
+        positions[name] = poses[:, :3, 3]
+    trees = {name: cKDTree(p[known[name]]) for name, p in positions.items() if known[name].any()}
+    right = _correct_ends(sessions, rows)
+    counts = [0, 0, 0]
+    for name in trees:
+        mine = sessions[name]
+        for k in query_keyframes(mine, settings):
+            if not known[name][k]:
+                continue
+            counts[0] += 1
+            here = positions[name][k]
+            others = any(tree.query(here)[0] <= REVISIT_M for other, tree in trees.items() if other != name)
+            if not (others or (self_closures and _revisits_itself(mine, positions[name], known[name], k, settings.closures))):
+                continue
+            counts[1] += 1
+            counts[2] += _is_answered(positions[name], k, right.get(name, []), settings.query.every or 2.0)
+    return counts[0], counts[1], counts[2]
+
+
+def _correct_ends(sessions: Mapping[str, SessionMap], rows: list[Judged]) -> dict[str, list[tuple[int, bool]]]:
+    """Keyframes at the ends of correct closures by session, and whether they were the query."""
+    out: dict[str, list[tuple[int, bool]]] = {}
+    for row in rows:
+        if row.correct:
+            for session, stamp, is_query in (
+                (row.query_session, row.query_stamp_ns, True),
+                (row.target_session, row.target_stamp_ns, False),
+            ):
+                keyframe = int(np.argmin(np.abs(sessions[session].stamps_ns - stamp)))
+                out.setdefault(session, []).append((keyframe, is_query))
+    return out
+
+
+def _is_answered(positions: F64, keyframe: int, ends: list[tuple[int, bool]], spacing: float) -> bool:
+    """As the query itself, or as the target of a closure found from the other end, within one query spacing."""
+    return any(k == keyframe if is_query else float(np.linalg.norm(positions[k] - positions[keyframe])) < spacing for k, is_query in ends)
+
+
+def _revisits_itself(session: SessionMap, positions: F64, known: NDArray[np.bool_], keyframe: int, closures: Closures) -> bool:
+    if not session.posed:
+        return False
+    near = known & (np.linalg.norm(positions - positions[keyframe], axis=1) <= REVISIT_M)
+    later = np.abs(session.stamps_ns - session.stamps_ns[keyframe]) >= closures.exclude_seconds * 1e9
+    farther = np.abs(session.distance - session.distance[keyframe]) >= (closures.exclude_distance or 0.0)
+    return bool((near & later & farther).any())
+
+
+# -- files
+
+
+def read_truth(path: Path, sessions: Mapping[str, SessionMap]) -> dict[str, TrueTrack]:
+    """The true tracks of those ``sessions`` that the file knows. Raises TruthError when it is missing or wrong, or knows none."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as problem:
+        raise TruthError(
+            f"Truth file {path} cannot be read as JSON ({problem}): give a file that maps a log's name to its truth."
+        ) from None
+    if not isinstance(content, dict) or not all(isinstance(entry, dict) for entry in content.values()):
+        raise TruthError(f"Truth file {path} does not map each log's name to an object with 'T_common_session' or 'trajectory'.")
+    tracks = {}
+    for file, entry in content.items():
+        name = next((n for n in (file, Path(file).stem) if n in sessions), None)
+        if name is not None:
+            tracks[name] = _track(path, file, entry, sessions[name])
+    if not tracks:
+        raise TruthError(
+            f"Truth file {path} knows {', '.join(content) or 'no log'}, but the workspace has the sessions {', '.join(sessions) or 'none'}."
+        )
+    return tracks
+
+
+def _track(path: Path, file: str, entry: Mapping[str, Any], session: SessionMap) -> TrueTrack:
+    if "trajectory" in entry:
+        return read_tum(path.parent / str(entry["trajectory"]))
+    try:
+        common_T_session = np.asarray(entry["T_common_session"], float)
+        if common_T_session.shape != (4, 4) or not np.isfinite(common_T_session).all():
+            raise ValueError
+        R = common_T_session[:3, :3]
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or not np.allclose(common_T_session[3], (0, 0, 0, 1)):
+            raise ValueError
+    except (KeyError, ValueError, TypeError):
+        raise TruthError(
+            f"Truth file {path}: {file} needs 'T_common_session', a rigid 4x4 matrix of numbers, or 'trajectory', a TUM file."
+        ) from None
+    table = read_table(session.folder.trajectory)
+    return TrueTrack(np.asarray(table["stamp_ns"].to_numpy()), common_T_session @ poses_of(table))
+
+
+def read_tum(path: Path) -> TrueTrack:
+    """A TUM file: seconds, position (m) and quaternion xyzw on each line; stamps exact to the nanosecond.
+
+    Raises TruthError when it is missing, or a line does not say this.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError) as problem:
+        raise TruthError(f"Trajectory {path} cannot be read ({problem}).") from None
+    rows: dict[int, list[float]] = {}
+    for number, line in enumerate(lines, start=1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            stamp_ns, values = int(Decimal(words[0]) * 10**9), [float(w) for w in words[1:8]]
+            if len(values) != 7 or not np.isfinite(values).all() or not np.linalg.norm(values[3:]) > 1e-6 or abs(stamp_ns) >= 2**63:
+                raise ValueError
+        except (ValueError, OverflowError, InvalidOperation):
+            raise TruthError(
+                f"Trajectory {path}, line {number}: there should be seconds, x y z (m) and a quaternion qx qy qz qw."
+            ) from None
+        rows[stamp_ns] = values
+    if not rows:
+        raise TruthError(f"Trajectory {path} holds no poses.")
+    stamps = sorted(rows)
+    values_of = np.array([rows[s] for s in stamps])
+    return TrueTrack(np.array(stamps, np.int64), transform(values_of[:, :3], values_of[:, 3:]))

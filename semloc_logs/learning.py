@@ -1,0 +1,115 @@
+"""Learning the descriptor and the words, beside the pipeline: shards of pairs -> weights -> vocabulary, all resumable."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import semloc_logs
+from semloc_logs.engines import Engine
+from semloc_logs.errors import SettingsError
+from semloc_logs.settings import Settings, Training
+from semloc_logs.simulation.training_data import make_shard, scene_tasks
+from semloc_logs.subvolumes.describe import load_encoder
+from semloc_logs.subvolumes.own_sessions import cut_stretch, stretch_tasks
+from semloc_logs.subvolumes.pairs import read_shard
+from semloc_logs.subvolumes.sampling import shard_descriptors
+from semloc_logs.subvolumes.training import Progress, completion_scores, save_weights, train
+from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
+from semloc_logs.workspace import SessionFolder
+
+Note = Callable[[str], None]
+HELD_OUT = 2  # shards that only measure
+SCORED = 600  # pairs of each of them
+REPORT_SECONDS = 2.0
+
+
+def simulated_shards(folder: Path, settings: Settings, engine: Engine, note: Note) -> list[Path]:
+    """Pairs from ``training.scenes`` simulated scenes; those that are there for the same settings stay."""
+    tasks = scene_tasks(_shard_folder(folder, "simulated", settings), settings.training.scenes, settings)
+    out = []
+    for shard in engine.map(make_shard, tasks):
+        out.append(shard)
+        note(f"scene {len(out)} of {len(tasks)}")
+    return out
+
+
+def session_shards(folder: Path, sessions: Sequence[SessionFolder], settings: Settings, engine: Engine, note: Note) -> list[Path]:
+    """Pairs from fused sessions with poses, a shard for each stretch of road. Raises SettingsError when there is none."""
+    tasks = stretch_tasks(_shard_folder(folder, "sessions", settings), sessions, settings)
+    if not tasks:
+        raise SettingsError(
+            "No session of the workspace has poses and enough keyframes to train on: fuse longer drives with 'semloc fuse'."
+        )
+    out = []
+    for shard in engine.map(cut_stretch, tasks):
+        out.append(shard)
+        note(f"stretch {len(out)} of {len(tasks)}")
+    return out
+
+
+def _shard_folder(folder: Path, kind: str, settings: Settings) -> Path:
+    """Shards of other settings lie in another folder."""
+    t = settings.training
+    relevant = settings.model_copy(update={"training": Training(seed=t.seed, shift=t.shift, turn=t.turn)})
+    return folder / f"{kind}-{relevant.fingerprint('fusion', 'training')}"
+
+
+def learn_descriptor(
+    variant: str, shards: Sequence[Path], settings: Settings, checkpoint: Path, output: Path, note: Note
+) -> dict[str, float]:
+    """Train ``variant`` on all but the last two shards, measure on those, write the weights with a card; the scores.
+
+    Goes on from ``checkpoint`` if it is there. Raises SettingsError with fewer than three shards.
+    """
+    if len(shards) <= HELD_OUT:
+        raise SettingsError(
+            f"Training needs at least {HELD_OUT + 1} scenes or stretches of road, not {len(shards)}: two of them only measure."
+        )
+    training = settings.training
+    started, spoke, first = time.monotonic(), 0.0, -1
+
+    def tell(step: Progress) -> None:
+        nonlocal spoke, first
+        now = time.monotonic()
+        if first < 0:
+            first = step.samples
+        if now - spoke >= REPORT_SECONDS or step.samples >= training.samples:
+            spoke = now
+            rate = (step.samples - first) / max(now - started, 1e-9)
+            losses = f"reconstruction {step.reconstruction:.3f}, contrastive {step.contrastive:.3f}, matched {step.matched:.0%}"
+            note(f"{variant}: {min(step.samples, training.samples)} of {training.samples} samples, {rate:.0f} a second, {losses}")
+
+    model = train(variant, shards[:-HELD_OUT], training, checkpoint, tell)
+    held_out = [tuple(part[:SCORED] for part in read_shard(shard)) for shard in shards[-HELD_OUT:]]
+    part, whole, other = (np.concatenate([pairs[k] for pairs in held_out]) for k in range(3))
+    scores = completion_scores(model, (part, whole, other))
+    save_weights(output, model, _card(settings, shards, scores=scores))
+    return scores
+
+
+def learn_vocabulary(variant: str, shards: Sequence[Path], settings: Settings, output: Path, pairs_per_shard: int) -> int:
+    """A vocabulary from the descriptors of the shards' complete views; the number of descriptors."""
+    descriptors = shard_descriptors(shards, load_encoder(variant, settings.descriptor.weights), pairs_per_shard)
+    vocabulary = train_vocabulary(descriptors, seed=settings.training.seed)
+    save_vocabulary(output, vocabulary, _card(settings, shards, variant=variant, descriptors=len(descriptors)))
+    return len(descriptors)
+
+
+def use_threads(count: int) -> None:
+    """Let the network use so many cores."""
+    torch.set_num_threads(count)
+
+
+def _card(settings: Settings, shards: Sequence[Path], **facts: Any) -> dict[str, str]:
+    """What a model was made of, as strings for the file's metadata."""
+    training = settings.training
+    said = {"version": semloc_logs.__version__, "samples": training.samples, "shards": len(shards), "seed": training.seed}
+    said |= {"voxel_size": settings.fusion.voxel_size, "training": training.model_dump(mode="json"), **facts}
+    return {k: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for k, v in said.items()}
