@@ -240,7 +240,7 @@ def _record(work: Workspace, mine: SessionMap, name: str, row: dict[str, Any]) -
     own_end = keyframe_at(mine, row["query_stamp_ns"] if row["query_session"] == name else row["target_stamp_ns"])
     position = (np.array(mine.json["session_T_map"]) @ mine.map_T_base[own_end])[:3, 3]
     is_query = row["query_session"] == name
-    return ClosureRecord.from_row(row, session_T_query=session_T_query if is_query else None, session_position=tuple(position.tolist()))
+    return ClosureRecord.from_row(row, session_T_query=session_T_query if is_query else None, session_position=position)
 
 
 # -- run -------------------------------------------------------------------------------------------------------------------------
