@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import save_file
+
+from semloc_logs.errors import SettingsError
+from semloc_logs.subvolumes import describe
+from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table
+from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, random_encoder
+from semloc_logs.subvolumes.network import Completion, Decoder, Encoder, descriptors
+from semloc_logs.subvolumes.pairs import occupied
+from semloc_logs.subvolumes.training import save_weights
+
+U8 = NDArray[np.uint8]
+LOW = np.array([-64, 32, -16])
+V = 0.3
+
+
+def world(seed: int = 0, size: tuple[int, int, int] = (56, 48, 40)) -> U8:
+    """Ground with a step, walls, posts, free space above, holes that nobody saw."""
+    rng = np.random.default_rng(seed)
+    s = np.full(size, 254, np.uint8)
+    height = np.where(np.arange(size[0])[:, None] < size[0] // 2, 12, 21) + np.zeros(size[1], int)
+    for x, y in np.ndindex(*size[:2]):
+        s[x, y, : height[x, y]] = 253
+        s[x, y, height[x, y]] = rng.choice([0, 1, 9])
+    for _ in range(8):
+        x, y = rng.integers(0, size[0] - 12), rng.integers(0, size[1] - 12)
+        s[x : x + rng.integers(1, 12), y : y + rng.integers(1, 4), 13 : rng.integers(20, 38)] = rng.choice([2, 5, 8, 255])
+    s[rng.random(size) < 0.2] = 253
+    return s
+
+
+@contextmanager
+def full_precision() -> Iterator[None]:
+    """describe_map with its autocast switched off."""
+    before = describe.torch.autocast
+    describe.torch.autocast = lambda *a, **k: before("cpu", enabled=False)  # type: ignore[misc, assignment]
+    try:
+        yield
+    finally:
+        describe.torch.autocast = before  # type: ignore[misc]
+
+
+def one_by_one(state: U8, found: Described, encoder: Encoder) -> NDArray[np.float32]:
+    """Each described subvolume cut out of the map with its margin and encoded alone."""
+    out = []
+    padded = np.pad(state, ((64, 64), (64, 64), (64, 64)), constant_values=253)
+    for centre in found.centre:
+        corner = (centre - SIZE / 2).astype(int) - LOW + 64
+        x, y, z = corner - [MARGIN, MARGIN, 0]
+        crop = padded[x : x + WIDE, y : y + WIDE, z : z + SIZE]
+        with torch.inference_mode():
+            out.append(descriptors(encoder(torch.from_numpy(code_table(encoder.variant)[crop])[None])).numpy()[0])
+    return np.array(out)
+
+
+@pytest.mark.parametrize("variant", ["semantic", "geometric"])
+def test_a_map_at_once_is_its_subvolumes_one_by_one(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(describe, "PATCH", 40)  # several patches
+    state, encoder = world(), random_encoder(variant)
+    with full_precision():
+        found = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
+    assert len(found.descriptor) > 30
+    np.testing.assert_allclose(np.linalg.norm(found.descriptor, axis=1), 1, atol=1e-5)
+    some = np.arange(0, len(found.centre), len(found.centre) // 7)
+    single = one_by_one(state, Described(found.centre[some], found.descriptor[some]), encoder)
+    np.testing.assert_allclose(found.descriptor[some], single, atol=1e-5)
+    reduced = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
+    np.testing.assert_array_equal(reduced.centre, found.centre)
+    assert np.abs(reduced.descriptor - found.descriptor).max() < 1e-2
+    assert len(np.unique(found.centre[:, 2])) > 1  # the step in the ground needs more than one layer
+
+
+def test_a_finer_stride_contains_the_coarser_one() -> None:
+    state, encoder = world(), random_encoder("semantic")
+    ground = (12 - 16) * V
+    coarse, fine = (describe_map(state, LOW, ground, V, encoder, s, 40) for s in (8, 4))
+    row = {tuple(c): i for i, c in enumerate(fine.centre.tolist())}
+    assert len(row) == len(fine.centre)  # no place twice
+    same = [row[tuple(c)] for c in coarse.centre.tolist()]
+    np.testing.assert_allclose(fine.descriptor[same], coarse.descriptor, atol=1e-2)
+    assert len(fine.centre) > 3 * len(coarse.centre)
+    assert set(np.unique((fine.centre[:, :2] - SIZE / 2 - LOW[:2]) % 4)) == {0.0}
+
+
+def test_what_is_described_holds_enough_and_starts_at_its_lowest_surface() -> None:
+    state = world()
+    padded = np.pad(state, 64, constant_values=253)
+    found = describe_map(state, LOW, (12 - 16) * V, V, random_encoder("geometric"), 8, 400)
+    bottoms = []
+    for centre in found.centre:
+        x, y, z = (centre - SIZE / 2).astype(int) - LOW + 64
+        part = occupied(padded[x : x + SIZE, y : y + SIZE, z : z + SIZE])
+        assert part.sum() >= 400
+        bottoms.append(int(np.argmax(part.sum((0, 1)) > 20)))
+    assert max(bottoms) <= 8  # the lowest surface lies in the lowest eight voxels
+    everywhere = describe_map(state, LOW, (12 - 16) * V, V, random_encoder("geometric"), 8, 1)
+    assert len(everywhere.centre) > len(found.centre)
+
+
+def test_a_map_described_in_other_words_of_its_own_position() -> None:
+    """Descriptors follow the content, not the coordinates; a shift by whole strides moves the centres."""
+    state, encoder = world(), random_encoder("geometric")
+    a = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
+    b = describe_map(state, LOW + [800, -160, 24], (12 - 16 + 24) * V, V, encoder, 8, 40)
+    np.testing.assert_array_equal(a.descriptor, b.descriptor)
+    np.testing.assert_array_equal(a.centre + np.array([800, -160, 24]), b.centre)
+
+
+@pytest.mark.parametrize("state", [np.full((40, 40, 16), 254, np.uint8), np.full((16, 16, 16), 253, np.uint8), np.zeros((0, 0, 0), np.uint8)])
+def test_maps_with_nothing_occupied(state: U8) -> None:
+    found = describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 1)
+    assert found.centre.shape == (0, 3)
+    assert found.descriptor.shape == (0, 256)
+
+
+def test_a_single_voxel_and_a_small_map() -> None:
+    state = np.full((16, 16, 16), 253, np.uint8)
+    state[8, 8, 8] = 2
+    assert len(describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 2).centre) == 0
+    state[6:10, 6:10, 8:12] = 2
+    found = describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 20)
+    assert len(found.centre) > 0
+    assert np.abs(found.centre[:, :2] - 8).max() <= SIZE
+
+
+def test_other_strides_are_refused() -> None:
+    with pytest.raises(SettingsError, match="stride"):
+        describe_map(world(), LOW, 0.0, V, random_encoder("geometric"), 6, 40)
+
+
+def test_shapes_of_the_network() -> None:
+    codes = torch.zeros((2, WIDE, WIDE, SIZE), dtype=torch.uint8)
+    encoder = random_encoder("semantic")
+    with torch.inference_mode():
+        assert encoder(codes).shape == (2, 256, 1, 1)
+        assert encoder(torch.zeros((1, WIDE + 24, WIDE + 8, SIZE), dtype=torch.uint8)).shape == (1, 256, 4, 2)
+        assert Decoder("semantic")(torch.zeros(3, 256)).shape == (3, 21, 32, 32, 32)
+        logits, mu, log_variance = Completion("geometric").eval()(torch.zeros((2, 64, 64, 32), dtype=torch.uint8), None)
+    assert (logits.shape, mu.shape, log_variance.shape) == ((2, 3, 32, 32, 32), (2, 256, 3, 3), (2, 256))
+    parameters = sum(p.numel() for p in Completion("semantic").parameters())
+    assert 0.5e6 < parameters < 3e6  # about one million, as in the paper
+
+
+def test_random_encoders_are_the_same_for_a_seed() -> None:
+    a, b, c = random_encoder("geometric", 1), random_encoder("geometric", 1), random_encoder("geometric", 2)
+    assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
+    assert not all(torch.equal(x, y) for x, y in zip(a.parameters(), c.parameters(), strict=True))
+
+
+def test_weights_come_back_and_other_files_are_refused(tmp_path: Path) -> None:
+    model = Completion("geometric").eval()
+    path = tmp_path / "weights.safetensors"
+    save_weights(path, model, {"trained_on": "nothing"})
+    encoder = load_encoder("geometric", path)
+    state = world()
+    a = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
+    b = describe_map(state, LOW, (12 - 16) * V, V, model.encoder, 8, 40)
+    assert (a.descriptor * b.descriptor).sum(1).min() > 0.999  # bf16 of the weights
+    with pytest.raises(SettingsError, match="semantic"):
+        load_encoder("semantic", path)  # of the other variant
+    odd = tmp_path / "odd.safetensors"
+    for content in (b"", b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ", b"x" * 100):
+        odd.write_bytes(content)
+        with pytest.raises(SettingsError, match=r"odd\.safetensors"):
+            load_encoder("geometric", odd)
+    save_file({"encoder.mean.bias": torch.zeros(3)}, odd)
+    with pytest.raises(SettingsError, match=r"odd\.safetensors"):
+        load_encoder("geometric", odd)
+    with pytest.raises(SettingsError, match="missing"):
+        load_encoder("geometric", tmp_path / "missing")

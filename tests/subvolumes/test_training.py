@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from semloc_logs.errors import SettingsError, WorkspaceError
+from semloc_logs.settings import Settings, Training
+from semloc_logs.subvolumes import training
+from semloc_logs.subvolumes.cut import code_table
+from semloc_logs.subvolumes.pairs import BROAD, SIZE, SceneFrame, cut_pairs, occupied, read_shard, write_shard
+from semloc_logs.subvolumes.training import Progress, _batches, _seen, _targets, completion_scores, train
+
+U8 = NDArray[np.uint8]
+Pair = tuple[U8, U8, U8]
+
+
+def pair(rng: np.random.Generator) -> Pair:
+    """A floor and some boxes; half of it unseen in the incomplete view."""
+    whole = np.full((BROAD, BROAD, SIZE), 254, np.uint8)
+    whole[:, :, 4] = 0
+    for _ in range(10):
+        x, y, h = rng.integers(0, BROAD - 8), rng.integers(0, BROAD - 8), rng.integers(6, 30)
+        whole[x : x + 6, y : y + 6, 5:h] = rng.choice([2, 8])
+    part = whole.copy()
+    part[rng.random(part.shape) < 0.5] = 253
+    return part, np.ascontiguousarray(whole[16:-16, 16:-16]), whole
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder, rng = tmp_path_factory.mktemp("shards"), np.random.default_rng(0)
+    paths = [folder / "a.parquet", folder / "b.parquet", folder / "empty.parquet"]
+    for path, n in zip(paths, (5, 3, 0), strict=True):
+        write_shard(path, [pair(rng) for _ in range(n)])
+    return paths
+
+
+def test_shards_come_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    pairs = [pair(rng) for _ in range(3)]
+    write_shard(tmp_path / "shard", pairs)
+    found = read_shard(tmp_path / "shard")
+    for k in range(3):
+        np.testing.assert_array_equal(found[k], np.stack([p[k] for p in pairs]))
+    write_shard(tmp_path / "none", [])
+    assert [a.shape[0] for a in read_shard(tmp_path / "none")] == [0, 0, 0]
+
+
+def test_the_three_views_of_a_batch_belong_together(tmp_path: Path) -> None:
+    """Row n of a shard is full of the value n, and its corner tells how a view was turned."""
+    paths = []
+    for s in range(4):
+        paths.append(tmp_path / f"{s}")
+        rows = []
+        for n in range(6):
+            views = [np.full(shape, 10 * s + n, np.uint8) for shape in ((BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE), (BROAD, BROAD, SIZE))]
+            for view in views:
+                view[0, : len(view) // 2, 0] = 200  # half an edge: no quarter turn and no mirror image looks alike
+            rows.append((views[0], views[1], views[2]))
+        write_shard(paths[-1], rows)
+    settings = Training(batch=5, dropout=0.1)
+    turns, scenes = set(), set()
+    for a, b, c in _batches(paths, settings, 0, 40):
+        assert a.shape == (5, BROAD, BROAD, SIZE)
+        assert b.shape == (5, SIZE, SIZE, SIZE)
+        for n in range(5):
+            value = int(b[n, 5, 5, 5])
+            assert int(c[n, 9, 9, 9]) == value
+            assert set(np.unique(a[n]).tolist()) == {value, 200, 253}
+            marks = [frozenset(map(tuple, (np.argwhere(view[n, :, :, 0] == 200) * 64 // len(view[n]) // 32).tolist())) for view in (a, b, c)]
+            assert marks[0] == marks[1] == marks[2]
+            turns.add(marks[0] | {(len(np.unique(np.argwhere(c[n, :, :, 0] == 200)[:, 0])) > 1, -1)})
+            scenes.add(value // 10)
+        assert 0.05 < (a == 253).mean() < 0.15
+        assert not (b == 253).any()
+        assert not (c == 253).any()
+        assert len({int(v) // 10 for v in b[:, 5, 5, 5]}) == 2  # half of a batch from one scene
+    assert len(turns) == 8  # all quarter turns and mirror images
+    assert len(scenes) == 3  # a pool
+
+
+def test_batches_are_the_same_each_time_and_from_any_step(shards: list[Path]) -> None:
+    settings = Training(batch=3)
+    whole = list(_batches(shards[:2], settings, 0, 5))
+    rest = list(_batches(shards[:2], settings, 3, 5))
+    assert len(whole) == 5
+    for x, y in zip(whole[3:], rest, strict=True):
+        for a, b in zip(x, y, strict=True):
+            np.testing.assert_array_equal(a, b)
+    other = next(_batches(shards[:2], Training(batch=3, seed=1), 0, 5))
+    assert not np.array_equal(whole[0][0], other[0])
+
+
+def test_which_subvolumes_are_described_and_which_voxels_count() -> None:
+    part = np.full((2, BROAD, BROAD, SIZE), 253, np.uint8)
+    part[1, 8:16, 8:13, 3] = 2  # 40 voxels in the corner of the first subvolume only
+    seen = _seen(part).reshape(2, 3, 3)
+    assert not seen[0].any()
+    assert np.argwhere(seen[1]).tolist() == [[0, 0]]
+    target, known = _targets(np.array([0, 18, 254, 253, 255], np.uint8), code_table("semantic"), 19)
+    assert known.tolist() == [True, True, True, False, False]
+    assert target[known].tolist() == [0, 18, 19]
+
+
+def short(steps: int, **more: float) -> Training:
+    return Training.model_validate({"batch": 2, "samples": max(32, steps * 18), **more})
+
+
+def test_the_loss_goes_down(shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "RATE", 0.05)  # of a warm-up over fifty steps
+    seen: list[Progress] = []
+    model = train("geometric", shards[:1], short(6), tmp_path / "checkpoint", seen.append)
+    assert [p.samples for p in seen] == [18 * (i + 1) for i in range(6)]
+    assert seen[-1].reconstruction < 0.8 * seen[0].reconstruction
+    assert seen[-1].loss < seen[0].loss
+    assert all(np.isfinite([p.loss, p.contrastive, p.matched]).all() for p in seen)
+    scores = completion_scores(model, tuple(a[:2] for a in read_shard(shards[0])))  # type: ignore[arg-type]
+    assert set(scores) == {"accuracy", "all_free", "copy_input", "unobserved_accuracy", "iou", "recall5"}
+    assert all(0 <= v <= 1 for v in scores.values())
+    assert scores["all_free"] > 0.5
+    assert scores["recall5"] == 1  # two of two are among the five nearest
+
+
+class _Stop(Exception):
+    pass
+
+
+def test_a_training_that_was_stopped_ends_where_an_unbroken_one_does(shards: list[Path], tmp_path: Path) -> None:
+    settings = short(4)
+    whole = train("geometric", shards, settings, tmp_path / "whole")
+
+    def stop(progress: Progress) -> None:
+        if progress.samples == 3 * 18:
+            raise _Stop
+
+    checkpoint = tmp_path / "broken"
+    with pytest.raises(_Stop):
+        train("geometric", shards, settings, checkpoint, stop, save_every=2)
+    seen: list[Progress] = []
+    resumed = train("geometric", shards, settings, checkpoint, seen.append, save_every=2)
+    assert [p.samples for p in seen] == [54, 72]  # from the checkpoint, not from the start
+    for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    for odd, message in ((short(4, seed=1), "settings"), (short(5), "settings")):
+        with pytest.raises(WorkspaceError, match=message):
+            train("geometric", shards, odd, checkpoint)
+    with pytest.raises(WorkspaceError, match="settings"):
+        train("semantic", shards, settings, checkpoint)
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    with pytest.raises(WorkspaceError, match="broken"):
+        train("geometric", shards, settings, checkpoint)
+
+
+def test_nothing_to_train_on(shards: list[Path], tmp_path: Path) -> None:
+    for paths in ([], shards[2:]):
+        with pytest.raises(SettingsError, match="nothing to train on"):
+            train("geometric", paths, short(4), tmp_path / "checkpoint")
+    assert pq.read_metadata(shards[2]).num_rows == 0
+
+
+def test_a_batch_without_anything_to_describe_keeps_the_weights_finite(tmp_path: Path) -> None:
+    bare = np.full((BROAD, BROAD, SIZE), 254, np.uint8)
+    bare[32, 32, :3] = 2
+    write_shard(tmp_path / "shard", [(bare, bare[16:-16, 16:-16], bare)])
+    model = train("geometric", [tmp_path / "shard"], short(1), tmp_path / "checkpoint", save_every=1)
+    assert all(torch.isfinite(p).all() for p in model.parameters())
+
+
+def test_pairs_are_cut_from_the_same_place() -> None:
+    """A street of two fronts, driven along; the incomplete view never shows what the complete one does not know."""
+    rng = np.random.default_rng(0)
+    fusion = Settings().resolved().fusion
+    front = np.c_[rng.uniform(-10, 10, 6000), rng.choice([-5.0, 5.0], 6000) + rng.normal(0, 0.02, 6000), rng.uniform(0, 5, 6000)]
+    road = np.c_[rng.uniform(-10, 10, 4000), rng.uniform(-5, 5, 4000), rng.normal(0, 0.02, 4000)]
+    world = np.concatenate([front, road]).astype(np.float32)
+    label = np.r_[np.full(6000, 2), np.full(4000, 0)].astype(np.uint8)
+    frames = []
+    for x in (-2.0, 0.0, 2.0):
+        T = np.eye(4)
+        T[:3, 3] = x, 0, 1.7
+        some = rng.random(len(world)) < 0.4
+        frames.append(SceneFrame(world[some] - np.float32([x, 0, 1.7]), np.zeros(3, np.float32), label[some], T))
+    settings = Training(shift=0.0, turn=0.0)
+    pairs = cut_pairs(frames, fusion, settings, np.random.default_rng(1))
+    assert len(pairs) > 10
+    for part, whole, other in pairs:
+        assert (part.shape, whole.shape, other.shape) == ((BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE), (BROAD, BROAD, SIZE))
+        np.testing.assert_array_equal(other[16:-16, 16:-16], whole)  # without shift and turn the same view
+        middle = part[16:-16, 16:-16]
+        assert occupied(middle).sum() >= 40
+        both = occupied(middle) & (whole != 253)
+        assert (occupied(middle) & (whole == 253)).sum() == 0
+        assert (middle[both] == whole[both]).mean() > 0.9
+    again = cut_pairs(frames, fusion, settings, np.random.default_rng(1))
+    assert all(np.array_equal(a, b) for x, y in zip(pairs, again, strict=True) for a, b in zip(x, y, strict=True))
+    moved = cut_pairs(frames, fusion, Training(), np.random.default_rng(1))
+    assert any(not np.array_equal(o[16:-16, 16:-16], w) for _, w, o in moved)
