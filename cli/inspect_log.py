@@ -44,8 +44,8 @@ def command(logs: tuple[Path, ...], topics: dict[str, str], as_json: bool) -> in
     else:
         for content in found:
             _show(content)
-    for problem in failed:
-        console.warn(str(problem))
+    for refused in failed:
+        console.warn(str(refused))
     for content in found:
         for sentence in content["skipped"]:
             console.warn(f"{content['path']}: {sentence}")

@@ -154,7 +154,7 @@ def _judge(row: Mapping[str, Any], tracks: Mapping[str, TrueTrack]) -> Judged:
         error_m, error_deg = float(np.linalg.norm(rest[:3, 3])), float(np.degrees(rotation_angle(rest[:3, :3])))
         correct = error_m <= CORRECT_M and error_deg <= CORRECT_DEG
     names = ("query_session", "target_session", "query_stamp_ns", "target_stamp_ns", "probability")
-    return Judged(*(row[n] for n in names), error_m, error_deg, correct)
+    return Judged(**{n: row[n] for n in names}, error_m=error_m, error_deg=error_deg, correct=correct)
 
 
 def _pose(track: TrueTrack | None, stamp_ns: int) -> F64 | None:

@@ -1,0 +1,94 @@
+"""One import direction, read from the source: a module imports only what stands before it in the story."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+ORDER = [
+    "errors",
+    "schemas",
+    "geometry",
+    "settings",
+    "contracts",
+    "tables",
+    "frames",
+    "workspace",
+    "logs",
+    "labels",
+    "voxels",
+    "subvolumes",
+    "words",
+    "alignment",
+    "closures",
+    "simulation",
+    "evaluation",
+    "exports",
+    "engines",
+    "learning",
+    "stages",
+]
+# the words are learned from descriptors, and a submap's words are written in one task: words may look at subvolumes, not the reverse
+SOURCES = sorted((ROOT / "semloc_logs").rglob("*.py"))
+CLI = sorted((ROOT / "cli").rglob("*.py"))
+
+
+def _imports(path: Path) -> Iterator[tuple[str, int]]:
+    """Absolute names of imported modules and the number of leading dots."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((name.name, 0) for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module or "", node.level
+
+
+def _noun(path: Path) -> str:
+    relative = path.relative_to(ROOT / "semloc_logs")
+    return relative.parts[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_module_imports_only_what_stands_before_it(path: Path) -> None:
+    here = _noun(path)
+    if here == "__init__":
+        assert not [m for m, _ in _imports(path) if m.startswith("semloc_logs")]
+        return
+    for module, level in _imports(path):
+        assert level == 0, f"{path} imports relatively"
+        parts = module.split(".")
+        if parts[0] == "semloc_logs" and len(parts) > 1:
+            assert parts[1] in ORDER, f"{path} imports {module}, which has no place in the order"
+            assert ORDER.index(parts[1]) <= ORDER.index(here), f"{path} imports {module}, which stands behind it"
+
+
+def test_every_module_has_a_place() -> None:
+    assert {_noun(p) for p in SOURCES} - {"__init__"} <= set(ORDER)
+
+
+@pytest.mark.parametrize("path", [*SOURCES, *CLI, *sorted((ROOT / "tests").rglob("*.py"))], ids=lambda p: str(p.relative_to(ROOT)))
+def test_nobody_imports_the_checkouts_cli(path: Path) -> None:
+    assert not [m for m, level in _imports(path) if level == 0 and m.split(".")[0] in ("cli", "schemas")]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_only_the_cli_prints_or_exits(path: Path) -> None:
+    calls = [node.func for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
+    assert not [c for c in calls if isinstance(c, ast.Name) and c.id in ("print", "input", "exit", "quit", "breakpoint")]
+    assert not [
+        c for c in calls if isinstance(c, ast.Attribute) and c.attr == "exit" and isinstance(c.value, ast.Name) and c.value.id == "sys"
+    ]
+
+
+@pytest.mark.parametrize("path", CLI, ids=lambda p: p.name)
+def test_cli_imports_its_siblings_relatively_and_nothing_heavy(path: Path) -> None:
+    light = {"semloc_logs", "semloc_logs.errors"}
+    at_import = [n for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.Import | ast.ImportFrom)]
+    for node in at_import:
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module or ""]
+        if isinstance(node, ast.ImportFrom) and node.level:
+            continue
+        for name in names:
+            assert name in light or not name.startswith("semloc_logs"), f"{path.name} imports {name} before it is needed"
+            assert name.split(".")[0] not in {"torch", "numba", "pyarrow", "scipy", "cv2", "pydantic", "numpy", "rich"}
