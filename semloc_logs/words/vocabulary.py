@@ -120,7 +120,8 @@ def train_vocabulary(descriptors: F32, cells: int = 256, children: int = 16, see
 
 def save_vocabulary(path: Path, vocabulary: Vocabulary, card: dict[str, str]) -> None:
     """Half precision safetensors; ``card`` says what it was trained on."""
-    arrays = {k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds", "children")}
+    # safetensors writes the memory as it lies, whatever the strides say: a transposed array would come back scrambled
+    arrays = {k: np.ascontiguousarray(getattr(vocabulary, k), np.float16) for k in ("cells", "projection", "thresholds", "children")}
     with replacing_file(path) as temporary:
         save_file(arrays, temporary, metadata=card)
 

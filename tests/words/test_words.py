@@ -1,0 +1,262 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from safetensors.numpy import save_file
+
+from semloc_logs.errors import SettingsError
+from semloc_logs.words.index import Index
+from semloc_logs.words.vocabulary import BITS, Vocabulary, _kmeans, load_vocabulary, save_vocabulary, train_vocabulary
+
+F32 = NDArray[np.float32]
+TOLERANCE = 2.0**-9  # of a similarity: descriptors are rounded to 2^-11
+
+
+def unit(seed: int, n: int, centres: int = 12, spread: float = 0.7) -> F32:
+    """Unit vectors (n, 256) in clusters."""
+    rng = np.random.default_rng(seed)
+    c = np.random.default_rng(99).standard_normal((centres, 256))
+    v = c[rng.integers(0, centres, n)] + spread * rng.standard_normal((n, 256))
+    return (v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def vocabulary() -> Vocabulary:
+    return train_vocabulary(unit(0, 1500), cells=10, children=4)
+
+
+def test_the_shape_and_scale_of_a_vocabulary(vocabulary: Vocabulary) -> None:
+    assert [getattr(vocabulary, k).shape for k in ("cells", "projection", "thresholds", "children")] == [
+        (10, 256),
+        (BITS, 256),
+        (10, BITS),
+        (10, 4, BITS),
+    ]
+    np.testing.assert_allclose(np.linalg.norm(vocabulary.cells, axis=1), 1, atol=0.01)
+    np.testing.assert_allclose(vocabulary.projection @ vocabulary.projection.T, np.eye(BITS), atol=0.02)
+    for k in ("cells", "projection", "children"):
+        a = getattr(vocabulary, k)
+        assert (a * 2048 == np.round(a * 2048)).all()
+
+
+def test_cells_are_the_nearest_ones(vocabulary: Vocabulary) -> None:
+    d = unit(1, 300)
+    similarity = d @ vocabulary.cells.T
+    ordered = -np.sort(-similarity, axis=1)
+    for probes in (1, 3, 10, 50):
+        found = vocabulary.nearest_cells(d, probes)
+        assert found.shape == (300, min(probes, 10))
+        np.testing.assert_allclose(np.take_along_axis(similarity, found, 1), ordered[:, :probes], atol=TOLERANCE)
+        assert all(len(set(row)) == len(row) for row in found.tolist())
+
+
+def slow_code(vocabulary: Vocabulary, d: F32, cell: int) -> tuple[int, F32]:
+    margin = vocabulary.projection.astype(float) @ d - vocabulary.thresholds[cell]
+    return sum(1 << b for b in range(BITS) if margin[b] > 0), np.abs(margin)
+
+
+def test_codes_are_the_signs_of_the_projections(vocabulary: Vocabulary) -> None:
+    d = unit(2, 50)
+    cell = np.arange(50) % 10
+    codes = vocabulary.codes(d, cell)
+    assert codes.dtype == np.uint64
+    for i in range(50):
+        expected, margin = slow_code(vocabulary, d[i], int(cell[i]))
+        differing = expected ^ int(codes[i])
+        assert all(margin[b] < TOLERANCE for b in range(BITS) if differing >> b & 1)
+    both = vocabulary.codes(d, np.stack([cell, (cell + 1) % 10], 1))
+    assert both[:, 0].tolist() == codes.tolist()
+    assert both[:, 1].tolist() == vocabulary.codes(d, (cell + 1) % 10).tolist()
+    words, of_words = vocabulary.words(d)
+    own = vocabulary.nearest_cells(d, 1)[:, 0]
+    assert (words // 256).tolist() == own.tolist()
+    assert (words % 256).max() < 4
+    assert of_words.tolist() == vocabulary.codes(d, own).tolist()
+    assert [len(a) for a in vocabulary.words(d[:0])] == [0, 0]
+
+
+def test_bits_are_balanced_in_each_cell_and_say_something(vocabulary: Vocabulary) -> None:
+    d = unit(0, 1500)
+    word, code = vocabulary.words(d)
+    bits = np.unpackbits(code.view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
+    for cell in range(10):
+        mine = bits[word // 256 == cell]
+        if len(mine) >= 30:
+            assert 0.35 < mine.mean(0).min()
+            assert mine.mean(0).max() < 0.65
+    near = np.clip(d + 0.01 * np.random.default_rng(0).standard_normal(d.shape), -1, 1).astype(np.float32)
+    near /= np.linalg.norm(near, axis=1, keepdims=True)
+    moved = vocabulary.codes(near, word // 256)
+    distance = np.array([bin(int(a) ^ int(b)).count("1") for a, b in zip(code, moved, strict=True)])
+    other = np.array([bin(int(a) ^ int(b)).count("1") for a, b in zip(code, np.roll(code, 7), strict=True)])
+    assert distance.mean() < 12 < 25 < other.mean()
+
+
+def slow_search(
+    v: Vocabulary, word: NDArray[np.uint16], code: NDArray[np.uint64], group: NDArray[np.int64], d: F32, k: int, probes: int, allowed: NDArray[np.bool_]
+) -> list[list[int]]:
+    """Distances of the k nearest allowed entries in the probed cells, of each query."""
+    cells = v.nearest_cells(d, probes)
+    out = []
+    for q in range(len(d)):
+        found = []
+        for cell in cells[q]:
+            own = int(v.codes(d[q : q + 1], cell[None])[0])
+            for e in np.flatnonzero((word // 256 == cell) & allowed[group]):
+                found.append(bin(own ^ int(code[e])).count("1"))
+        out.append(sorted(found)[:k])
+    return out
+
+
+@given(st.integers(0, 1000), st.integers(1, 9), st.integers(1, 12), st.lists(st.booleans(), min_size=5, max_size=5))
+@settings(max_examples=15, deadline=None)
+def test_the_nearest_words_are_those_of_brute_force(seed: int, k: int, probes: int, allow: list[bool]) -> None:
+    v = TRAINED
+    d, q = unit(seed, 200), unit(seed + 1, 8)
+    word, code = v.words(d)
+    group = np.random.default_rng(seed).integers(0, 5, 200)
+    allowed = np.array(allow)
+    index = Index(v, word, code, group)
+    m = index.search(q, k, probes, allowed)
+    expected = slow_search(v, word, code, group, q, k, probes, allowed)
+    cells = v.nearest_cells(q, probes)
+    for i in range(len(q)):
+        mine = m.query == i
+        assert m.distance[mine].tolist() == expected[i]
+        entries = m.entry[mine]
+        assert len(set(entries.tolist())) == len(entries)
+        assert allowed[group[entries]].all()
+        for e, distance in zip(entries, m.distance[mine], strict=True):
+            cell = word[e] // 256
+            assert cell in cells[i]
+            assert bin(int(code[e]) ^ int(v.codes(q[i : i + 1], np.array([cell]))[0])).count("1") == distance
+
+
+TRAINED = train_vocabulary(unit(0, 600), cells=9, children=3)
+
+
+def test_a_word_finds_itself_first_and_fewer_entries_than_asked_for_come_back() -> None:
+    d = unit(3, 40)
+    word, code = TRAINED.words(d)
+    index = Index(TRAINED, word, code, np.zeros(40, np.int64))
+    m = index.search(d, 100, 9, np.array([True]))
+    assert np.bincount(m.query).tolist() == [40] * 40  # all there are, once
+    first = np.r_[True, np.diff(m.query) > 0]
+    assert (m.distance[first] == 0).all()
+    one = index.search(d, 1, 1, np.array([True]))
+    assert (one.distance == 0).all()
+    assert (code[one.entry] == code).all()
+
+
+def test_searches_with_nothing_to_find() -> None:
+    d = unit(3, 5)
+    word, code = TRAINED.words(d)
+    for index, query, allowed in (
+        (Index(TRAINED, word, code, np.zeros(5, np.int64)), d, np.array([False])),
+        (Index(TRAINED, word, code, np.zeros(5, np.int64)), d[:0], np.array([True])),
+        (Index(TRAINED, word[:0], code[:0], np.zeros(0, np.int64)), d, np.array([True])),
+    ):
+        m = index.search(query, 5, 3, allowed)
+        assert [len(a) for a in (m.query, m.entry, m.distance)] == [0, 0, 0]
+
+
+def test_kmeans_finds_clusters_that_lie_apart() -> None:
+    rng = np.random.default_rng(0)
+    centres = np.array([[0.0, 0], [10, 0], [0, 10], [10, 10], [20, 20]])
+    data = np.concatenate([c + 0.1 * rng.standard_normal((40, 2)) for c in centres]).astype(np.float32)
+    found = _kmeans(data, 5, np.random.default_rng(3))
+    assert sum(((data - found[np.argmin(((data[:, None] - found) ** 2).sum(2), 1)]) ** 2).sum(1)) < 0.25 * sum(((data - data.mean(0)) ** 2).sum(1))
+    assert np.isfinite(found).all()
+
+
+def test_an_empty_cluster_takes_the_point_farthest_from_its_centroid() -> None:
+    class Picks:
+        """A generator that starts two of three centroids in one place."""
+
+        def choice(self, n: int, k: int, replace: bool) -> NDArray[np.int64]:
+            return np.array([0, 1, 2])
+
+    data = np.array([[0, 0], [0, 0], [5, 0], [5, 0.1], [5, 4], [-0.1, 0]], np.float32)
+    found = _kmeans(data, 3, Picks(), rounds=15)  # type: ignore[arg-type]
+    assert [5.0, 4.0] in found.tolist()
+
+
+def test_training_is_repeatable_and_small_data_give_fewer_words() -> None:
+    a, b = train_vocabulary(unit(0, 600), cells=9, children=3), TRAINED
+    for k in ("cells", "projection", "thresholds", "children"):
+        np.testing.assert_array_equal(getattr(a, k), getattr(b, k))
+    assert len(train_vocabulary(unit(0, 512), cells=256, children=2).cells) == 8
+    with pytest.raises(SettingsError, match="256 descriptors"):
+        train_vocabulary(unit(0, 255))
+
+
+def test_vocabularies_come_back_and_code_the_same(vocabulary: Vocabulary, tmp_path: Path) -> None:
+    path = tmp_path / "vocabulary.safetensors"
+    save_vocabulary(path, vocabulary, {"trained_on": "random"})
+    found = load_vocabulary("geometric", path)
+    for k in ("cells", "projection", "children"):
+        np.testing.assert_array_equal(getattr(found, k), getattr(vocabulary, k))
+    np.testing.assert_allclose(found.thresholds, vocabulary.thresholds, atol=1e-3)
+    d = unit(5, 200)
+    word, code = found.words(d)
+    own_word, own_code = vocabulary.words(d)
+    assert word.tolist() == own_word.tolist()
+    different = np.unpackbits((code ^ own_code).view(np.uint8)).sum()
+    assert different < 0.002 * 64 * 200  # the thresholds alone lose digits
+    again = tmp_path / "again.safetensors"
+    save_vocabulary(again, found, {"trained_on": "random"})
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_files_that_hold_no_vocabulary_are_refused_by_name(vocabulary: Vocabulary, tmp_path: Path) -> None:
+    arrays = {k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds", "children")}
+    odd = {"missing": None, "bytes": b"x" * 50, "empty": b""}
+    odd_arrays = {
+        "fewer": {k: v for k, v in arrays.items() if k != "children"},
+        "narrow": arrays | {"cells": arrays["cells"][:, :128].copy()},
+        "unequal": arrays | {"thresholds": arrays["thresholds"][:5].copy()},
+        "flat": arrays | {"children": arrays["children"].reshape(-1)},
+        "many": {k: v if k == "projection" else np.concatenate([v] * 26) for k, v in arrays.items()},  # 260 cells do not fit a byte
+    }
+    for name, content in odd.items():
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+    for name, some in odd_arrays.items():
+        save_file(some, tmp_path / name)
+    for name in (*odd, *odd_arrays):
+        with pytest.raises(SettingsError, match=name):
+            load_vocabulary("geometric", tmp_path / name)
+
+
+SCRIPT = """
+import sys, hashlib, numpy as np
+from semloc_logs.words.vocabulary import train_vocabulary, Vocabulary
+rng = np.random.default_rng(0)
+unit = lambda n: (lambda v: (v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32))(rng.standard_normal((n, 256)))
+grid = lambda a: (np.round(a * 2048) / 2048).astype(np.float32)
+thresholds = rng.uniform(-0.1, 0.1, (200, 64)).astype(np.float32)
+v = Vocabulary(grid(unit(200)), grid(unit(64)), thresholds, grid(rng.uniform(-0.1, 0.1, (200, 5, 64))))
+d = unit(3000)
+digest = hashlib.sha256()
+for a in (*v.words(d), v.nearest_cells(d, 8), (grid(d) @ v.cells.T)):
+    digest.update(np.ascontiguousarray(a).tobytes())
+one = np.concatenate([v.words(d[i : i + 7])[1] for i in range(0, 3000, 7)])
+assert (one == v.words(d)[1]).all()
+print(digest.hexdigest())
+"""
+
+
+def test_words_do_not_depend_on_the_number_of_threads() -> None:
+    found = set()
+    for threads in ("1", "2", "3"):
+        environment = os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
+        found.add(subprocess.run([sys.executable, "-c", SCRIPT], env=environment, check=True, capture_output=True, text=True).stdout)
+    assert len(found) == 1
