@@ -43,10 +43,12 @@ def align(query: F64, surface: Surface, target_T_query: F64, radii: tuple[float,
     Gauss-Newton on the distances to the target's tangent planes (point distances where the surface is not planar), Cauchy weights.
     """
     T = target_T_query.copy()
+    if not len(query):
+        return Fit(T, 0.0, 0, float("inf"), np.zeros((6, 6)), T[:3, 3].copy())
     information = np.zeros((6, 6))
     inliers = np.zeros(len(query), bool)
     residual = np.zeros(0)
-    centre = apply(T, query).mean(0) if len(query) else np.zeros(3)
+    centre = T[:3, 3]
     for radius in radii:
         for _ in range(iterations):
             moved = apply(T, query)

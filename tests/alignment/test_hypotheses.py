@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from semloc_logs.alignment.hypotheses import pool
+
+
+def slow_pool(group: list[int], yaw: list[float], t: np.ndarray, weight: list[float], cell: float) -> list[tuple[float, int, float, tuple[float, ...]]]:
+    """Votes of every cell of both grids, in dictionaries: (weight, group, yaw, mean translation)."""
+    out = []
+    for offset in (0.0, 0.5):
+        votes = defaultdict(list)
+        for i in range(len(group)):
+            votes[(group[i], yaw[i], *np.floor(t[i] / cell + offset).tolist())].append(i)
+        for (g, y, *_), members in votes.items():
+            total = sum(weight[i] for i in members)
+            mean = sum(weight[i] * t[i] for i in members) / total
+            out.append((total, g, y, tuple(mean.tolist())))
+    return sorted(out, key=lambda h: -h[0])
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_votes_are_those_of_a_dictionary(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 60
+    group, yaw = rng.integers(0, 3, n), rng.choice([0.0, 0.5, 1.0], n)
+    t = rng.uniform(-3, 3, (n, 3)) * [1, 1, 0.3]
+    weight = rng.uniform(0.1, 1.0, n)
+    found = pool(group, yaw, t, weight, 1.2, 500)
+    expected = slow_pool(group.tolist(), yaw.tolist(), t, weight.tolist(), 1.2)
+    by_weight = {round(w, 9): (g, y, m) for w, g, y, m in expected}
+    for h in found:
+        g, y, mean = by_weight[round(h.weight, 9)]
+        assert (h.group, h.pose[0]) == (g, y)
+        np.testing.assert_allclose(h.pose[1:], mean, atol=1e-9)
+        members = (group == g) & (yaw == y) & (np.abs(t - mean).max(1) < 1.2)
+        assert 1 <= h.votes <= members.sum()
+    weights = [h.weight for h in found]
+    assert weights == sorted(weights, reverse=True)
+    assert weights[0] == pytest.approx(expected[0][0])
+    for w, g, y, mean in expected:  # every cell is there, itself or as its twin of the other grid
+        assert any(h.group == g and h.pose[0] == y and np.abs(np.array(h.pose[1:]) - mean).max() < 0.3 and h.weight >= w - 1e-9 for h in found)
+
+
+def test_the_heaviest_are_kept() -> None:
+    group = np.zeros(11, np.int64)
+    t = np.array([[0.5, 0.5, 0.5]] * 5 + [[9.5, 0.5, 0.5]] * 4 + [[20.5, 0.5, 0.5]] * 2)
+    found = pool(group, np.zeros(11), t, np.ones(11), 2.0, 2)
+    assert [(h.votes, h.weight, h.pose) for h in found] == [(5, 5.0, (0.0, 0.5, 0.5, 0.5)), (4, 4.0, (0.0, 9.5, 0.5, 0.5))]
+
+
+def test_a_pose_at_a_cell_border_is_counted_whole() -> None:
+    t = np.array([[1.99, 0.5, 0.5], [2.01, 0.5, 0.5], [1.98, 0.5, 0.5], [2.02, 0.5, 0.5]])
+    found = pool(np.zeros(4, np.int64), np.zeros(4), t, np.ones(4), 2.0, 10)
+    assert found[0].votes == 4
+    np.testing.assert_allclose(found[0].pose, (0, 2.0, 0.5, 0.5))
+
+
+def test_matches_of_other_submaps_and_headings_do_not_add_up() -> None:
+    t = np.full((3, 3), 0.3)
+    found = pool(np.array([0, 1, 1]), np.array([0.0, 0.0, 0.5]), t, np.ones(3), 1.0, 10)
+    assert sorted((h.group, h.pose[0], h.votes) for h in found) == [(0, 0.0, 1), (1, 0.0, 1), (1, 0.5, 1)]
+    assert pool(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0), 1.0, 5) == []

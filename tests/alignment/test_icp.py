@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.icp import Fit, align
+from semloc_logs.alignment.verify import surface_of
+from semloc_logs.closures.closing import _covariance
+from semloc_logs.geometry import apply, exp_se3, inverse, rotation_angle, yaw_transform
+
+F64 = NDArray[np.float64]
+RADII = (1.0, 0.5, 0.2)
+
+
+def room(rng: np.random.Generator, n: int, noise: float = 0.01, corridor: bool = False) -> F64:
+    """Walls, floor and ceiling of a room of 8 x 5 x 3 m with a slanted panel and a pillar; a corridor has two walls and a floor only."""
+    long = 40.0 if corridor else 8.0
+    u, v = rng.uniform(0, 1, (2, n))
+    sides = [
+        np.c_[u * long - long / 2, np.full(n, -2.5), v * 3],
+        np.c_[u * long - long / 2, np.full(n, 2.5), v * 3],
+        np.c_[u * long - long / 2, v * 5 - 2.5, np.zeros(n)],
+    ]
+    if not corridor:
+        sides += [
+            np.c_[np.full(n, -4), u * 5 - 2.5, v * 3],
+            np.c_[np.full(n, 4), u * 5 - 2.5, v * 3],
+            np.c_[u * 8 - 4, v * 5 - 2.5, np.full(n, 3)],
+            np.c_[u * 2 - 1, v + u - 1, 3 * v],
+        ]
+    points = np.concatenate(sides)
+    return points + rng.normal(0, noise, points.shape)
+
+
+def error(found: F64, truth: F64) -> tuple[float, float]:
+    d = inverse(truth) @ found
+    return float(np.linalg.norm(d[:3, 3])), rotation_angle(d[:3, :3])
+
+
+def fit(truth: F64, start: F64, seed: int = 0, noise: float = 0.01) -> Fit:
+    """The query is the room seen from the frame of ``truth``, sampled anew."""
+    rng = np.random.default_rng(seed)
+    target = surface_of(room(rng, 1500, noise))
+    return align(apply(inverse(truth), room(rng, 700, noise)), target, start, RADII, 15)
+
+
+SMALL = exp_se3(np.array([0.15, -0.2, 0.1]), np.array([0.03, -0.02, 0.06]))
+
+
+@pytest.mark.parametrize("truth", [np.eye(4), yaw_transform(2.5, (3.0, -1.0, 0.5)), exp_se3(np.array([1.0, 2, 3]), np.array([0.3, -0.2, 1.0]))])
+def test_a_known_transform_is_found_to_a_millimetre(truth: F64) -> None:
+    found = fit(truth, truth @ SMALL, noise=0.004)
+    distance, angle = error(found.target_T_query, truth)
+    assert distance < 0.001
+    assert angle < 0.0005
+    assert found.inliers > 0.98
+    assert 0.004 < found.rmse < 0.012  # the noise of the points and of the planes
+    assert error(truth @ SMALL, truth)[0] > 0.2  # there was something to find
+
+
+def test_forward_and_backward_are_inverse() -> None:
+    rng = np.random.default_rng(1)
+    a, b = room(rng, 1200), apply(inverse(yaw_transform(0.7, (1.0, 0.0, 0.0))), room(rng, 1200))
+    T = yaw_transform(0.7, (1.0, 0.0, 0.0))
+    there = align(b, surface_of(a), T @ SMALL, RADII, 15).target_T_query
+    back = align(a, surface_of(b), inverse(T @ SMALL), RADII, 15).target_T_query
+    distance, angle = error(there @ back, np.eye(4))
+    assert distance < 0.002
+    assert angle < 0.0007
+
+
+def test_far_from_the_origin_the_result_is_the_same() -> None:
+    """Rotations act about the query's centre, so coordinates of kilometres do no harm."""
+    rng = np.random.default_rng(2)
+    target, query = room(rng, 1200), room(rng, 600)
+    shift = yaw_transform(0.0, (30_000.0, -20_000.0, 500.0))
+    near = align(query, surface_of(target), SMALL, RADII, 15)
+    far = align(query, surface_of(apply(shift, target)), shift @ SMALL, RADII, 15)
+    assert error(inverse(shift) @ far.target_T_query, near.target_T_query)[0] < 1e-4
+    both = align(apply(shift, query), surface_of(apply(shift, target)), shift @ SMALL @ inverse(shift), RADII, 15)
+    assert error(apply_both(shift, both.target_T_query), near.target_T_query)[0] < 1e-4
+    np.testing.assert_allclose(far.information, near.information, rtol=0.02, atol=2)
+
+
+def apply_both(shift: F64, T: F64) -> F64:
+    return inverse(shift) @ T @ shift
+
+
+def test_outliers_are_not_followed() -> None:
+    rng = np.random.default_rng(3)
+    target = surface_of(room(rng, 1500))
+    query = np.concatenate([room(rng, 500), rng.uniform((-4, -2.5, 0), (4, 2.5, 3), (1500, 3))])
+    found = align(query, target, SMALL, RADII, 20)
+    assert error(found.target_T_query, np.eye(4))[0] < 0.01
+    assert 0.5 < found.inliers < 0.95
+
+
+def test_nothing_to_align() -> None:
+    target = surface_of(room(np.random.default_rng(0), 100))
+    for query in (np.zeros((0, 3)), np.full((50, 3), 1e4), np.zeros((5, 3))):
+        found = align(query, target, SMALL, RADII)
+        assert found.inliers == 0
+        assert found.rmse == np.inf
+        assert not found.information.any()
+        np.testing.assert_array_equal(found.target_T_query, SMALL)
+    empty = align(room(np.random.default_rng(0), 100), surface_of(np.zeros((0, 3))), SMALL, RADII)
+    assert empty.count == 0
+
+
+def test_covariance_of_a_room_and_of_a_corridor() -> None:
+    rng = np.random.default_rng(4)
+    for corridor in (False, True):
+        target = surface_of(room(rng, 1500, corridor=corridor))
+        found = align(room(rng, 700, corridor=corridor)[:, :3], target, SMALL if not corridor else exp_se3(np.zeros(3), np.zeros(3)), RADII, 15)
+        C = _covariance(found, np.eye(4), np.eye(4))
+        assert np.linalg.eigvalsh(C).min() > 0
+        np.testing.assert_allclose(C, C.T)
+        values, vectors = np.linalg.eigh(C[:3, :3])
+        if corridor:
+            assert abs(vectors[0, -1]) > 0.99  # the corridor runs along x
+            assert values[-1] > 3 * values[-2]
+        else:
+            assert values[-1] < 3 * values[0]
+            assert np.sqrt(values[-1]) < 0.05
+
+
+@pytest.mark.xfail(reason="the regularisation mixes metres and radians: what nothing holds is said to be known to centimetres")
+def test_covariance_says_what_is_not_known() -> None:
+    rng = np.random.default_rng(4)
+    found = align(room(rng, 700, corridor=True), surface_of(room(rng, 1500, corridor=True)), np.eye(4), RADII, 15)
+    assert _covariance(found, np.eye(4), np.eye(4))[0, 0] > 0.3**2
+
+
+def test_covariance_lies_in_the_axes_of_the_target() -> None:
+    """A corridor along the map's x is one along -y for a target that looks along the map's y."""
+    rng = np.random.default_rng(5)
+    found = align(room(rng, 700, corridor=True), surface_of(room(rng, 1500, corridor=True)), np.eye(4), RADII, 15)
+    C = _covariance(found, np.eye(4), yaw_transform(np.pi / 2, (3.0, 2.0, 0.0)))
+    assert abs(np.linalg.eigh(C[:3, :3])[1][1, -1]) > 0.99
+
+
+def test_covariance_grows_with_the_lever_arm() -> None:
+    """A base frame far from what was aligned is less certain across the arm by angle times distance."""
+    rng = np.random.default_rng(6)
+    found = align(room(rng, 700), surface_of(room(rng, 1500)), np.eye(4), RADII, 15)
+    near = _covariance(found, np.eye(4), np.eye(4))
+    far = _covariance(found, yaw_transform(0.0, (100.0, 0.0, 0.0)), np.eye(4))
+    np.testing.assert_allclose(far[3:, 3:], near[3:, 3:])
+    centre = found.centre[0]
+    expected = near[1, 1] + ((100 - centre) ** 2 - centre**2) * (near[5, 5] - 1e-6)
+    assert far[1, 1] == pytest.approx(expected, rel=0.05)
+    assert far[0, 0] < 2 * near[0, 0] + 1e-6
+
+
+def test_errors_of_many_fits_stay_within_the_covariance() -> None:
+    """Whitened errors of repeated fits to new samples: not overconfident, and not without any meaning."""
+    squared = []
+    for seed in range(12):
+        found = fit(np.eye(4), exp_se3(np.array([0.05, 0.02, -0.03]), np.array([0.01, 0.0, 0.02])), seed)
+        C = _covariance(found, found.target_T_query, np.eye(4))
+        e = found.target_T_query[:3, 3]
+        squared.append(float(e @ np.linalg.solve(C[:3, :3], e)))
+    assert np.mean(squared) < 3  # three degrees of freedom

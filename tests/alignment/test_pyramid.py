@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.hypotheses import Hypothesis
+from semloc_logs.alignment.pyramid import ANY_BIT, FREE_BIT, build_pyramid, class_bits, look_up, pose_matrix, search, tau, yaw_between
+from semloc_logs.alignment.verify import Query, Target, same_place, search_hypotheses, structure_mask, structure_scores
+from semloc_logs.geometry import apply, exp_se3, inverse, yaw_transform
+from semloc_logs.labels.space import cityscapes
+from semloc_logs.settings import Settings
+from semloc_logs.voxels.grid import FREE_STATE, UNLABELLED, UNOBSERVED_STATE, BlockMap, empty_map
+from semloc_logs.voxels.keys import BLOCK, pack
+
+V = 0.5
+U8 = NDArray[np.uint8]
+Cell = tuple[int, ...]
+COARSE = cityscapes().coarse
+
+
+def block_map(cells: dict[Cell, int]) -> BlockMap:
+    """A map with these voxel states."""
+    blocks: dict[Cell, U8] = {}
+    for ijk, state in cells.items():
+        block = tuple(c // BLOCK for c in ijk)
+        blocks.setdefault(block, np.full((BLOCK,) * 3, UNOBSERVED_STATE, np.uint8))[tuple(c % BLOCK for c in ijk)] = state
+    if not blocks:
+        return empty_map()
+    keys = pack(np.array(list(blocks)))
+    state = np.stack(list(blocks.values())).reshape(-1, BLOCK**3)[np.argsort(keys)]
+    occupied = (state != FREE_STATE) & (state != UNOBSERVED_STATE)
+    return BlockMap(np.sort(keys), np.where(occupied, 20, -20).astype(np.int8), state, occupied.astype(np.uint16))
+
+
+def random_cells(seed: int, n: int = 120, low: int = -9, high: int = 11) -> dict[Cell, int]:
+    rng = np.random.default_rng(seed)
+    states = np.array([0, 2, 2, 5, 8, 13, 255, 254, 254, 254])
+    return {tuple(c): int(rng.choice(states)) for c in rng.integers(low, high, (n, 3)).tolist()}
+
+
+def occupied(state: int) -> bool:
+    return state not in (FREE_STATE, UNOBSERVED_STATE)
+
+
+def test_class_bits_by_hand() -> None:
+    states = np.array([0, 2, 5, 8, 13, 11, 255, 254, 253], np.uint8)
+    assert class_bits(states, COARSE).tolist() == [64 + 1, 64 + 2, 64 + 4, 64 + 8, 64 + 16, 64 + 32, 64, 0, 0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_masks_are_those_of_slow_loops(seed: int) -> None:
+    cells = random_cells(seed)
+    levels = build_pyramid(block_map(cells), V, COARSE)
+    assert [level.cell for level in levels] == [V, 2 * V, 4 * V]
+    for factor, level in zip((1, 2, 4), levels, strict=True):
+        corner = np.rint(level.corner / V).astype(int)
+        assert (corner % 4 == 0).all()
+        expected = np.zeros(level.mask.shape, np.uint8)
+        for ijk, state in cells.items():
+            if not occupied(state):
+                continue
+            bits = ANY_BIT | (1 << COARSE[state] if COARSE[state] < 6 else 0)
+            at = (np.array(ijk) - corner) // factor
+            for d in np.ndindex(3, 3, 3):
+                expected[tuple(at + np.array(d) - 1)] |= bits
+        if factor == 1:
+            for ijk, state in cells.items():
+                at = tuple(np.array(ijk) - corner)
+                if state == FREE_STATE and expected[at] == 0:
+                    expected[at] = FREE_BIT
+        np.testing.assert_array_equal(level.mask, expected)
+
+
+def test_look_ups_of_points() -> None:
+    level = build_pyramid(block_map({(0, 0, 0): 2, (9, 9, 9): 254}), V, COARSE)[0]
+    points = np.array([[0.25, 0.25, 0.25], [-0.25, 0.7, 0.99], [1.01, 0.2, 0.2], [4.75, 4.75, 4.75], [1e6, 0, 0], [-1e6, 0, 0]])
+    assert look_up(level, points).tolist() == [ANY_BIT | 2, ANY_BIT | 2, 0, FREE_BIT, 0, 0]
+
+
+def slow_tau(query: dict[Cell, int], target: dict[Cell, int], T: NDArray[np.float64], kappa: float, coarse: bool) -> tuple[float, int]:
+    """Each occupied query voxel against all observed target voxels."""
+    observed = np.array([c for c, s in target.items() if s != UNOBSERVED_STATE], float).reshape(-1, 3)
+    states = [s for s in target.values() if s != UNOBSERVED_STATE]
+    aligned = total = 0
+    for ijk, state in query.items():
+        if not occupied(state):
+            continue
+        total += 1
+        p = T[:3, :3] @ ((np.array(ijk) + 0.5) * V) + T[:3, 3]
+        if not len(observed):
+            continue
+        distance = np.linalg.norm((observed + 0.5) * V - p, axis=1)
+        n = int(np.argmin(distance))
+        same = COARSE[states[n]] == COARSE[state] if coarse else states[n] == state
+        aligned += distance[n] < kappa and occupied(states[n]) and bool(same)
+    return aligned / total, aligned
+
+
+@given(st.integers(0, 10_000), st.floats(-3.2, 3.2), st.tuples(*[st.floats(-4, 4)] * 3), st.booleans(), st.sampled_from([0.7, 1.5, 5.0]))
+@settings(max_examples=40, deadline=None)
+def test_tau_is_that_of_brute_force(seed: int, yaw: float, t: tuple[float, float, float], coarse: bool, kappa: float) -> None:
+    query, target = random_cells(seed, 40), random_cells(seed + 1, 300)
+    T = yaw_transform(yaw, (t[0] + 1e-7, t[1] + 1e-7, t[2] + 1e-7)) @ exp_se3(np.zeros(3), np.array([0.03, -0.02, 0.0]))
+    found = tau(block_map(query), block_map(target), V, T, kappa, COARSE if coarse else None)
+    assert found == pytest.approx(slow_tau(query, target, T, kappa, coarse))
+
+
+def test_tau_of_a_map_with_itself_and_with_nothing() -> None:
+    cells = random_cells(3)
+    blocks = block_map(cells)
+    n = sum(occupied(s) for s in cells.values())
+    assert tau(blocks, blocks, V, np.eye(4), 3.0) == (1.0, n)
+    shifted = block_map({tuple(np.array(c) + [3, -40, 7]): s for c, s in cells.items()})
+    assert tau(blocks, shifted, V, yaw_transform(0.0, (3 * V, -40 * V, 7 * V)), 3.0) == (1.0, n)
+    for query, target in ((empty_map(), blocks), (blocks, empty_map()), (block_map({(0, 0, 0): 254}), blocks)):
+        assert tau(query, target, V, np.eye(4), 3.0) == (0.0, 0)
+    assert tau(blocks, blocks, V, yaw_transform(0.0, (1e5, 0.0, 0.0)), 3.0) == (0.0, 0)
+
+
+def test_free_space_counts_against_an_alignment_in_tau() -> None:
+    """The closest observed voxel decides, not some occupied one within kappa."""
+    query = block_map({(0, 0, 0): 2})
+    assert tau(query, block_map({(2, 0, 0): 2}), V, np.eye(4), 3.0)[0] == 1
+    assert tau(query, block_map({(2, 0, 0): 2, (0, 0, 1): 254}), V, np.eye(4), 3.0)[0] == 0
+    assert tau(query, block_map({(2, 0, 0): 3}), V, np.eye(4), 3.0)[0] == 0
+    assert tau(query, block_map({(2, 0, 0): 3}), V, np.eye(4), 3.0, COARSE)[0] == 1  # building and wall are construction
+    assert tau(query, block_map({(6, 0, 0): 2}), V, np.eye(4), 3.0)[0] == 0  # at kappa, not below it
+
+
+def town(seed: int = 0) -> dict[Cell, int]:
+    """Ground, fronts, a pole, a bush: no symmetry."""
+    cells: dict[Cell, int] = {}
+    for x in range(-30, 31):
+        for y in range(-30, 31):
+            cells[(x, y, -4)] = 0 if abs(y) < 8 else 1
+    for z in range(-3, 9):
+        for x in range(-28, 12):
+            cells[(x, 12, z)] = 2
+        for y in range(-25, -10):
+            cells[(17, y, z)] = 2
+        cells[(6, -9, z)] = 5
+        cells[(-14, -11, z)] = 5
+        for x in range(-9, -1):
+            cells[(x, -16 + x, z)] = 8
+    return cells
+
+
+def points_of(cells: dict[Cell, int]) -> NDArray[np.float64]:
+    return (np.array([c for c, s in cells.items() if occupied(s)]) + 0.5) * V
+
+
+def moved(cells: dict[Cell, int], T: NDArray[np.float64]) -> dict[Cell, int]:
+    """The map seen from the query's frame: voxel centres by inverse(T), dense enough by two samples an axis."""
+    out: dict[Cell, int] = {}
+    back = inverse(T)
+    for d in np.ndindex(2, 2, 2):
+        centres = (np.array(list(cells)) + 0.25 + 0.5 * np.array(d)) * V
+        for p, s in zip(apply(back, centres), cells.values(), strict=True):
+            out[tuple(np.floor(p / V).astype(int).tolist())] = s
+    return out
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.4])
+def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
+    truth = yaw_transform(yaw, (3.3, -2.1, 0.4))
+    target, query_cells = Target(block_map(town()), V), moved(town(), truth)
+    query = Query(block_map(query_cells), points_of(query_cells), V)
+    assert query.evidence.weights.sum() == pytest.approx(1)
+    start = np.array([yaw + 0.12, 3.3 + 1.1, -2.1 - 0.9, 0.4 + 0.4])
+    steps = np.array([-1.0, 0.0, 1.0])
+    score, pose = search(target.pyramid[2], query.evidence, start, (-0.12, 0.0, 0.12), 1.0 * steps, 0.5 * steps)
+    score, pose = search(target.pyramid[0], query.evidence, pose, np.linspace(-0.1, 0.1, 9), 0.5 * steps, 0.25 * steps)
+    assert score > 0.9
+    found = pose_matrix(pose)
+    assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 2.5 * V
+    assert yaw_between(found, truth) < np.radians(5)
+    away, _ = search(target.pyramid[0], query.evidence, start + [0.5, 4, 4, 2], (0.0,), (0.0,), (0.0,))
+    assert away < 0.7 * score
+
+    wrong = [Hypothesis(0, (yaw + 1.2 * k, 9.0 - k, 6.0 * k, 0.0), 3, 1.0) for k in (1, 2, 3)]
+    near = Hypothesis(0, (yaw + 0.15, 4.2, -3.0, 0.5), 2, 0.5)
+    closures = Settings().closures
+    candidates = search_hypotheses([*wrong, near], {0: target}, query, closures)
+    best = candidates[0]
+    assert same_place(best.target_T_query, truth, V)
+    assert best.votes == 2
+    assert [c.score for c in candidates] == sorted((c.score for c in candidates), reverse=True)
+    assert len(candidates) <= closures.refined
+    twice = search_hypotheses([near, near], {0: target}, query, closures)
+    assert len(twice) == 1  # hypotheses that have met are one
+
+
+def test_structure_scores_by_hand() -> None:
+    target = Target(block_map({(0, 0, 0): 2, (0, 0, 1): 254, (4, 0, 0): 254, (8, 0, 0): 8}), V)
+    query_cells = {
+        (0, 0, 0): 2,  # on its class
+        (1, 0, 0): 2,  # beside it
+        (4, 0, 0): 5,  # in free space
+        (8, 0, 0): 2,  # on another class
+        (12, 0, 0): 2,  # where nothing was observed
+        (0, 1, 0): 0,  # ground and cars are no structure
+        (0, 0, 1): 13,
+    }
+    query = Query(block_map(query_cells), points_of(query_cells), V)
+    assert structure_scores(query, target, np.eye(4)) == (2 / 4, 4 / 5, 1 / 5, 2)
+    bare = Query(block_map({(0, 0, 0): 0}), np.zeros((1, 3)), V)
+    assert structure_scores(bare, target, np.eye(4)) == (0.0, 0.0, 0.0, 0)
+    assert structure_mask(np.array([0, 1, 9, 2, 5, 8, 13, 255], np.uint8)).tolist() == [False, False, False, True, True, True, False, True]
+
+
+def test_evidence_of_unlabelled_voxels_asks_for_anything_occupied() -> None:
+    query = Query(block_map({(0, 0, 0): UNLABELLED, (3, 0, 0): 2}), np.zeros((1, 3)), V)
+    bits = dict(zip(map(tuple, query.evidence.centres.tolist()), query.evidence.bits.tolist(), strict=True))
+    assert bits == {(0.25, 0.25, 0.25): ANY_BIT, (1.75, 0.25, 0.25): 2}
+
+
+def test_the_same_place() -> None:
+    a = yaw_transform(1.0, (2.0, 3.0, 0.0))
+    assert same_place(a, yaw_transform(1.0 + np.radians(4), (2.0 + 3 * V, 3.0, 0.0)), V)
+    assert not same_place(a, yaw_transform(1.0, (2.0 + 3.5 * V, 3.0, 0.0)), V)
+    assert not same_place(a, yaw_transform(1.0 - np.radians(6), (2.0, 3.0, 0.0)), V)
+    assert yaw_between(yaw_transform(3.1), yaw_transform(-3.1)) == pytest.approx(2 * np.pi - 6.2)
