@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+
 from semloc_logs.cli.main import COMMANDS, program
 
 ROOT = Path(__file__).resolve().parents[1]

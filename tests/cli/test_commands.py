@@ -1,0 +1,349 @@
+"""What each command hands to the pipeline and prints of its answer; the stages themselves are stand-ins or hand-made files."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+from mcap.writer import Writer
+
+from semloc_logs import contracts, stages
+from semloc_logs.cli.main import program
+from semloc_logs.logs.annotate import AnnotateReport
+from semloc_logs.stages import Report
+from semloc_logs.tables import write_table
+from semloc_logs.voxels.store import pose_columns
+from semloc_logs.workspace import Workspace
+
+
+def semloc(*args: object, **options: Any) -> Result:
+    return CliRunner().invoke(program, [str(a) for a in args], prog_name="semloc", **options)
+
+
+def _write_closures(work: Workspace, count: int = 2) -> None:
+    columns: dict[str, Any] = {
+        "query_session": ["tuesday"] * count,
+        "target_session": ["monday"] * count,
+        "query_stamp_ns": [k * 10**9 for k in range(count)],
+        "target_stamp_ns": [k * 10**9 for k in range(count)],
+        **pose_columns(np.tile(np.eye(4), (count, 1, 1))),
+        "covariance": [np.eye(6).ravel().tolist()] * count,
+        "overlap": [0.625] * count,
+        "probability": [0.9987] * count,
+        "inliers": [1] * count,
+        "words": [1] * count,
+    }
+    write_table(work.closures, contracts.table("closures", columns), {"schema_version": 1})
+
+
+@pytest.fixture
+def called(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str, Report], dict[str, Any]]:
+    """Puts a stand-in for a stage; the dict holds the arguments of its call."""
+
+    def put(stage: str, answer: Any) -> dict[str, Any]:
+        seen: dict[str, Any] = {}
+
+        def stand_in(*args: Any, **options: Any) -> Any:
+            names = getattr(stages, f"_original_{stage}").__code__.co_varnames
+            seen.update(zip(names, args, strict=False), **options)
+            return answer
+
+        monkeypatch.setattr(stages, f"_original_{stage}", getattr(stages, stage), raising=False)
+        monkeypatch.setattr(stages, stage, stand_in)
+        return seen
+
+    _write_closures(Workspace(tmp_path / "work"))
+    return put
+
+
+# -- settings
+
+
+def _dumped(*args: object, **options: Any) -> Any:
+    done = semloc("run", "--dump-config", *args, **options)
+    assert done.exit_code == 0, done.stderr
+    return yaml.safe_load(done.stdout)
+
+
+def test_settings_come_from_defaults_then_file_then_environment_then_flags(tmp_path: Path) -> None:
+    file = tmp_path / "s.yaml"
+    file.write_text("fusion: {voxel_size: 0.4, hit: 0.7}\nquery: {frames: 2, length: 11}\n")
+    environment = {"SEMLOC_FUSION__VOXEL_SIZE": "0.5", "SEMLOC_QUERY__FRAMES": "3"}
+    assert _dumped()["fusion"]["voxel_size"] == 0.3
+    assert _dumped("--config", file)["fusion"]["voxel_size"] == 0.4
+    assert _dumped("--config", file, env=environment)["fusion"]["voxel_size"] == 0.5
+    all_of_it = _dumped("--config", file, "--set", "fusion.voxel_size=0.6", "--query-frames", 4, env=environment)
+    assert all_of_it["fusion"]["voxel_size"] == 0.6
+    assert all_of_it["fusion"]["hit"] == 0.7
+    assert all_of_it["query"]["frames"] == 4
+    assert all_of_it["query"]["length"] == 11
+
+
+def test_what_dump_config_prints_is_read_back(tmp_path: Path) -> None:
+    first = semloc("run", "--dump-config", "--set", "closures.min_probability=0.5", "--set", "fusion.clamp=[-1, 2]").stdout
+    (tmp_path / "s.yaml").write_text(first)
+    assert semloc("run", "--dump-config", "--config", tmp_path / "s.yaml").stdout == first
+
+
+@pytest.mark.parametrize(
+    ("args", "environment", "names"),
+    [
+        (["--set", "fusion.voxel_sizee=0.3"], {}, "fusion.voxel_sizee"),
+        (["--set", "fussion.voxel_size=0.3"], {}, "fussion"),
+        (["--set", "fusion.voxel_size=small"], {}, "fusion.voxel_size"),
+        ([], {"SEMLOC_QUERY__FRAME": "3"}, "query.frame"),
+        (["--query-every", "-1"], {}, "query.every"),
+        (["--config", "/no/such/file.yaml"], {}, "/no/such/file.yaml"),
+    ],
+)
+def test_wrong_settings_are_named_and_2(tmp_path: Path, args: list[str], environment: dict[str, str], names: str) -> None:
+    done = semloc("run", "a.mcap", "-w", tmp_path / "w", *args, env=environment)
+    assert done.exit_code == 2
+    assert names in done.stderr
+    assert not (tmp_path / "w").exists()
+
+
+@pytest.mark.parametrize("value", ["fusion.voxel_size", "=1", "fusion.voxel_size="])
+def test_set_needs_a_name_and_a_value(value: str) -> None:
+    assert semloc("run", "a.mcap", "-w", "w", "--set", value).exit_code == 2
+
+
+# -- run, fuse, describe, close
+
+
+def test_run_makes_each_log_a_session(called: Any, tmp_path: Path) -> None:
+    seen = called("run", Report(done=["fuse monday"], seconds={"fuse": 1.25}, closures=2))
+    (tmp_path / "tuesday").mkdir()
+    logs = (tmp_path / "monday.mcap", tmp_path / "tuesday")
+    done = semloc(
+        "run", *logs, "-w", tmp_path / "work", "--topic", "lidar=/points", "--query-frames", 3, "--annotate", "copy", "--overwrite"
+    )
+    assert done.exit_code == 0, done.stderr
+    assert {name: list(paths) for name, paths in seen["sessions"].items()} == {"monday": [logs[0]], "tuesday": [logs[1]]}
+    assert seen["topics"] == {"lidar": "/points"}
+    assert seen["settings"].query.frames == 3
+    assert seen["settings"].fusion.max_range == 50.0  # resolved
+    assert (seen["annotation"], seen["overwrite"]) == ("copy", True)
+    assert "0.9987" in done.stdout
+    assert f"2 loop closures in {tmp_path / 'work/closures.parquet'}" in done.stdout
+    assert "fuse 1.2 s" in done.stdout
+
+
+def test_run_prints_its_report_as_json(called: Any, tmp_path: Path) -> None:
+    called(
+        "run",
+        Report(done=["fuse a"], kept=["describe a"], skipped=["a: lost."], failed=["b is no log."], seconds={"fuse": 1.5}, closures=7),
+    )
+    done = semloc("run", "a.mcap", "-w", tmp_path / "work", "--json")
+    assert done.exit_code == 3
+    assert json.loads(done.stdout) == {
+        "work": str(tmp_path / "work"),
+        "done": ["fuse a"],
+        "kept": ["describe a"],
+        "skipped": ["a: lost."],
+        "failed": ["b is no log."],
+        "seconds": {"fuse": 1.5},
+        "closures": 7,
+    }
+    assert done.stderr.splitlines() == ["Warning: a: lost.", "Warning: b is no log."]
+
+
+def test_two_logs_of_one_name_are_refused(tmp_path: Path) -> None:
+    done = semloc("run", tmp_path / "x/a.mcap", tmp_path / "y/a.bag", "-w", tmp_path / "w")
+    assert done.exit_code == 2
+    assert "session 'a'" in done.stderr
+
+
+def test_long_lists_of_closures_are_cut_short(called: Any, tmp_path: Path) -> None:
+    _write_closures(Workspace(tmp_path / "work"), 50)
+    called("run", Report(closures=50))
+    done = semloc("run", "a.mcap", "-w", tmp_path / "work")
+    assert done.stdout.count("0.9987") == 20
+    assert "... and 30 more." in done.stdout
+
+
+def test_fuse_makes_all_logs_one_session(called: Any, tmp_path: Path) -> None:
+    seen = called("fuse", Report(done=["drive"]))
+    assert semloc("fuse", "a_0.mcap", "a_1.mcap", "-w", tmp_path / "work", "--session", "drive").exit_code == 0
+    assert {n: [str(p) for p in logs] for n, logs in seen["sessions"].items()} == {"drive": ["a_0.mcap", "a_1.mcap"]}
+    semloc("fuse", "a_0.mcap", "a_1.mcap", "-w", tmp_path / "work")
+    assert list(seen["sessions"]) == ["a_0"]
+
+
+@pytest.mark.parametrize("name", ["../x", "a/b", "", ".hidden"])
+def test_a_session_needs_a_name_that_is_a_folder(name: str, tmp_path: Path) -> None:
+    done = semloc("fuse", "a.mcap", "-w", tmp_path / "w", f"--session={name}")
+    assert (done.exit_code == 2) if name else (done.exit_code == 1)  # an empty name is none
+    assert not (tmp_path / "x").exists()
+
+
+def test_skipped_input_is_3(called: Any, tmp_path: Path) -> None:
+    called("fuse", Report(done=["a"], skipped=["a.mcap is cut off at byte 100.", "a.mcap is cut off at byte 100."]))
+    done = semloc("fuse", "a.mcap", "-w", tmp_path / "work")
+    assert done.exit_code == 3
+    assert done.stderr == "Warning: a.mcap is cut off at byte 100.\n"
+
+
+def test_describe_and_close_take_sessions(called: Any, tmp_path: Path) -> None:
+    described, closed = called("describe", Report(done=["a"])), called("close", Report(done=["closures"], closures=2))
+    assert semloc("describe", "a", "b", "-w", tmp_path / "work").exit_code == 0
+    assert described["names"] == ("a", "b")
+    done = semloc(
+        "close", "-w", tmp_path / "work", "--query", "a", "--query", "b", "--target", "c", "--no-self", "--query-length", 12.5, "--json"
+    )
+    assert done.exit_code == 0
+    assert (closed["queries"], closed["targets"], closed["self_closures"]) == (("a", "b"), ("c",), False)
+    assert closed["settings"].query.length == 12.5
+    assert len(json.loads(done.stdout)["closures"]) == 2
+
+
+def test_a_workspace_without_sessions_is_1(tmp_path: Path) -> None:
+    for command in (["describe"], ["close"], ["export", "--format", "tum"]):
+        done = semloc(*command, "-w", tmp_path / "w")
+        assert done.exit_code == 1
+        assert "no fused session" in done.stderr
+
+
+# -- annotate
+
+
+@pytest.mark.parametrize(
+    "outputs", [[], ["-o", "x.mcap", "--in-place"], ["--in-place", "--sidecar", "x.mcap"], ["-o", "x", "--sidecar", "y"]]
+)
+def test_annotate_needs_exactly_one_output(outputs: list[str]) -> None:
+    done = semloc("annotate", "a.mcap", "-w", "w", *outputs)
+    assert done.exit_code == 2
+    assert "exactly one" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("outputs", "mode", "output"),
+    [(["-o", "x.mcap"], "copy", Path("x.mcap")), (["--in-place"], "in-place", None), (["--sidecar", "y.mcap"], "sidecar", Path("y.mcap"))],
+)
+def test_annotate_hands_on_what_was_asked(called: Any, outputs: list[str], mode: str, output: Path | None) -> None:
+    seen = called("annotate", AnnotateReport(Path("x.mcap"), "run", "ros2", 3, 9, 1234, True))
+    done = semloc("annotate", "a.mcap", "-w", "w", *outputs, "--session", "other", "--json")
+    assert done.exit_code == 0, done.stderr
+    assert (seen["mode"], seen["output"], seen["session"], seen["overwrite"]) == (mode, output, "other", False)
+    assert json.loads(done.stdout)["closures"] == 3
+
+
+# -- inspect
+
+
+def _log(path: Path, messages: int = 3) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("Note", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel("/note", "json", schema)
+        for k in range(messages):
+            writer.add_message(channel, k * 10**9, b"{}", k * 10**9)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def test_inspect_prints_an_object_or_an_array(tmp_path: Path) -> None:
+    a, b = _log(tmp_path / "a.mcap"), _log(tmp_path / "b.mcap", 5)
+    one = json.loads(semloc("inspect", a, "--json").stdout)
+    assert one["path"] == str(a)
+    assert one["format"] == "mcap"
+    assert one["streams"] == [{"topic": "/note", "type": "Note", "role": None, "count": 3}]
+    assert one["problems"]
+    both = json.loads(semloc("inspect", a, b, "--json").stdout)
+    assert [log["streams"][0]["count"] for log in both] == [3, 5]
+
+
+def test_inspect_for_people(tmp_path: Path) -> None:
+    done = semloc("inspect", _log(tmp_path / "a.mcap"))
+    assert done.exit_code == 0
+    assert "/note" in done.stdout
+    assert done.stderr == ""
+
+
+def test_inspect_of_what_is_no_log_is_1(tmp_path: Path) -> None:
+    (tmp_path / "empty.bag").touch()
+    done = semloc("inspect", tmp_path / "empty.bag", "--json")
+    assert done.exit_code == 1
+    assert "is empty" in done.stderr
+    assert done.stdout == ""
+
+
+def test_inspect_goes_on_after_a_bad_log(tmp_path: Path) -> None:
+    (tmp_path / "empty.bag").touch()
+    done = semloc("inspect", tmp_path / "empty.bag", _log(tmp_path / "a.mcap"), "--json")
+    assert done.exit_code == 3
+    assert [log["path"] for log in json.loads(done.stdout)] == [str(tmp_path / "a.mcap")]
+    assert "is empty" in done.stderr
+
+
+def test_inspect_says_3_when_data_are_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lost = {"path": "a.mcap", "skipped": ["/points: 3 messages cannot be read."], "problems": [], "streams": []}
+    monkeypatch.setattr("semloc_logs.logs.inspect.inspect_log", lambda *_: lost)
+    done = semloc("inspect", "a.mcap", "--json")
+    assert done.exit_code == 3
+    assert done.stderr == "Warning: a.mcap: /points: 3 messages cannot be read.\n"
+
+
+@pytest.mark.parametrize(
+    ("args", "code"), [(["inspect", "{log}"], 0), (["fuse", "{log}", "-w", "{work}"], 1), (["run", "{log}", "-w", "{work}"], 1)]
+)
+def test_commands_that_open_a_log_repair_it_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], code: int) -> None:
+    repaired: list[Path] = []
+    for module in ("semloc_logs.logs.annotate", "semloc_logs.stages"):
+        monkeypatch.setattr(f"{module}.recover", lambda path: bool(repaired.append(path)))
+    log = _log(tmp_path / "a.mcap")
+    done = semloc(*(a.format(log=log, work=tmp_path / "w") for a in args))
+    assert done.exit_code == code
+    assert repaired == [log]
+
+
+# -- simulate, train, vocabulary, benchmark
+
+
+def test_simulate_refuses_the_impossible(tmp_path: Path) -> None:
+    assert semloc("simulate", "-o", tmp_path / "s", "--length", 1).exit_code == 2
+    assert semloc("simulate", "-o", tmp_path / "s", "--sensor", "sonar").exit_code == 2
+    assert not (tmp_path / "s").exists()
+
+
+def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained: list[tuple[str, int, int]] = []
+
+    def learn(variant: str, shards: list[Path], settings: Any, checkpoint: Path, output: Path, note: Any) -> dict[str, float]:
+        trained.append((variant, len(shards), settings.training.samples))
+        assert checkpoint == tmp_path / "w/checkpoint" / f"{variant}.safetensors"
+        return {"accuracy": 0.875}
+
+    monkeypatch.setattr("semloc_logs.learning.simulated_shards", lambda folder, settings, *_: [Path("s")] * settings.training.scenes)
+    monkeypatch.setattr("semloc_logs.learning.learn_descriptor", learn)
+    monkeypatch.setattr("semloc_logs.learning.use_threads", lambda _: None)
+    done = semloc("train", "-o", tmp_path / "w", "--scenes", 5, "--samples", 900, "--engine", "serial", "--json")
+    assert done.exit_code == 0, done.stderr
+    assert trained == [("semantic", 5, 900), ("geometric", 5, 900)]
+    assert json.loads(done.stdout)["semantic"]["accuracy"] == 0.875
+    assert "0.8750" in semloc("train", "-o", tmp_path / "w", "--variant", "semantic", "--samples", 900, "--engine", "serial").stdout
+
+
+def test_vocabulary_needs_a_variant(tmp_path: Path) -> None:
+    assert semloc("vocabulary", "-o", tmp_path / "v.safetensors").exit_code == 2
+
+
+def test_benchmark_prints_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = {"messages": {"ours": 400.0, "unit": "MB/s", "peer": 200.0}, "clouds": {"ours": 2.5, "unit": "ms"}}
+    monkeypatch.setattr("semloc_logs.evaluation.benchmarks.BENCHMARKS", {"reading": lambda _: figures})
+    assert json.loads(semloc("benchmark", "reading", "--json").stdout) == figures
+    assert "200" in semloc("benchmark", "reading").stdout
+    done = semloc("benchmark", "nothing")
+    assert done.exit_code == 2
+    assert "reading" in done.stderr
+
+
+def test_all_logs_failing_is_1(tmp_path: Path) -> None:
+    done = semloc("run", tmp_path / "no.mcap", "-w", tmp_path / "w")
+    assert done.exit_code == 1
+    assert "no.mcap" in done.stderr

@@ -1,0 +1,253 @@
+"""Exit codes, streams and start-up of the program, whatever the command."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+
+from semloc_logs.cli import main as main_module
+from semloc_logs.cli.console import console
+from semloc_logs.cli.main import COMMANDS, program
+from semloc_logs.cli.options import Command, EngineChoice, console_options
+from semloc_logs.errors import LogError, RoleError, SettingsError, WorkspaceError
+
+HEAVY = ("torch", "numba", "pyarrow", "scipy", "cv2", "pydantic", "numpy", "rich", "rosbags", "mcap")
+
+
+def semloc(*args: str, **options: Any) -> Result:
+    return CliRunner().invoke(program, list(args), prog_name="semloc", **options)
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A program whose command 'run' raises what the test says."""
+
+    def make(problem: BaseException | int) -> None:
+        @click.command(cls=Command)
+        @console_options
+        def command() -> int:
+            console.note("working")
+            console.result("answer")
+            if isinstance(problem, BaseException):
+                raise problem
+            return problem
+
+        monkeypatch.setattr(main_module.Program, "get_command", lambda *_: command)
+
+    return make
+
+
+@pytest.mark.parametrize("args", [["--help"], ["run", "--help"], ["--version"], ["benchmark", "--help"], ["nothing"]])
+def test_start_up_imports_nothing_heavy(args: list[str]) -> None:
+    code = f"import sys; sys.argv = ['semloc', *{args!r}]\nfrom semloc_logs.cli.main import main\ntry: main()\nexcept SystemExit: pass\n"
+    code += f"print('HEAVY', *[m for m in {HEAVY!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=30)
+    assert done.stdout.splitlines()[-1] == "HEAVY"
+
+
+def test_help_answers_at_once() -> None:
+    command = [sys.executable, "-P", "-c", "from semloc_logs.cli.main import program; program.main(['--help'])"]
+    taken = []
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(command, check=True, timeout=30, stdout=subprocess.DEVNULL)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        taken.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
+    assert min(taken) < 0.3  # seconds of processor time; about 0.1 on an idle machine
+
+
+def test_help_lists_every_command() -> None:
+    done = semloc("--help")
+    assert done.exit_code == 0
+    for name, (_, says) in COMMANDS.items():
+        assert name in done.output
+        assert says.split(",")[0] in done.output
+
+
+@pytest.mark.parametrize(
+    ("problem", "code", "says"),
+    [
+        (LogError("a.mcap is empty; record it again."), 1, "Error: a.mcap is empty; record it again."),
+        (RoleError("There is no LIDAR."), 1, "Error: There is no LIDAR."),
+        (WorkspaceError("work has no session."), 1, "Error: work has no session."),
+        (SettingsError("Unknown setting 'x'."), 2, "Error: Unknown setting 'x'."),
+        (click.UsageError("Give one."), 2, "Error: Give one."),
+        (PermissionError(13, "Permission denied", "/data/x"), 1, "Error: /data/x cannot be read or written (Permission denied)"),
+        (OSError(28, "No space left on device"), 1, "No space left on device"),
+        (MemoryError(), 1, "Error: There is not enough memory"),
+        (ZeroDivisionError("division by zero"), 1, "Error: Unexpected ZeroDivisionError at "),
+        (KeyboardInterrupt(), 130, "Interrupted"),
+        (main_module.Terminated(), 143, "Terminated"),
+    ],
+)
+def test_every_error_is_one_sentence_and_a_code(failing: Any, problem: BaseException, code: int, says: str) -> None:
+    failing(problem)
+    done = semloc("run")
+    assert done.exit_code == code
+    assert done.stdout == "answer\n"
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("Error")]
+    assert len(errors) == 1
+
+
+def test_the_traceback_of_an_unexpected_error_is_shown_with_v(failing: Any) -> None:
+    failing(ZeroDivisionError("division by zero"))
+    done = semloc("run", "-v")
+    assert done.exit_code == 1
+    assert "Traceback (most recent call last)" in done.stderr
+    failing(LogError("An expected one."))
+    assert "Traceback" not in semloc("run", "-v").stderr
+
+
+@pytest.mark.parametrize("code", [0, 3])
+def test_the_codes_of_commands_are_the_programs(failing: Any, code: int) -> None:
+    failing(code)
+    assert semloc("run").exit_code == code
+
+
+def test_results_and_notes_go_to_different_streams(failing: Any) -> None:
+    failing(0)
+    done = semloc("run")
+    assert (done.stdout, done.stderr) == ("answer\n", "working\n")
+    assert semloc("run", "-q").stderr == ""
+
+
+def test_notes_as_json_lines(failing: Any) -> None:
+    failing(LogError("It is gone."))
+    done = semloc("run", "--log-format", "json")
+    lines = [json.loads(line) for line in done.stderr.splitlines()]
+    assert [(line["level"], line["message"]) for line in lines] == [("info", "working"), ("error", "It is gone.")]
+
+
+def test_usage_errors_as_json_lines() -> None:
+    done = semloc("run", "--log-format", "json")
+    assert done.exit_code == 2
+    assert "LOG" in json.loads(done.stderr)["message"]
+
+
+@pytest.mark.parametrize(
+    "args", [["nothing"], ["run"], ["run", "--no-such-option"], ["evaluate", "-w", "x"], ["run", "a.mcap", "-w", "w", "--jobs", "0"]]
+)
+def test_wrong_usage_is_2(args: list[str]) -> None:
+    done = semloc(*args)
+    assert done.exit_code == 2
+    assert "Error: " in done.stderr
+    assert done.stdout == ""
+
+
+def test_progress_lines_are_few_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    console.reset()
+    for k in range(1, 101):
+        console.note(f"query {k} of 100")
+    console.note("done")
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "query 1 of 100"
+    assert said[-2:] == ["query 100 of 100", "done"]
+    assert len(said) < 10
+
+
+def test_numbers_that_are_none_are_null_in_json(capsys: pytest.CaptureFixture[str]) -> None:
+    console.result_json({"a": float("nan"), "b": [float("inf"), 1.5], "c": Path("x")})
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.5], "c": "x"}
+
+
+@pytest.mark.parametrize(
+    ("name", "jobs", "tasks", "cores", "kind"),
+    [
+        (None, None, 1, 8, "Serial"),
+        (None, None, 2, 8, "Processes"),
+        (None, None, 2, 1, "Serial"),
+        (None, 3, 1, 8, "Processes"),
+        (None, 1, 5, 8, "Serial"),
+        ("serial", 4, 5, 8, "Serial"),
+        ("processes", None, 1, 1, "Processes"),
+    ],
+)
+def test_default_engine(monkeypatch: pytest.MonkeyPatch, name: str | None, jobs: int | None, tasks: int, cores: int, kind: str) -> None:
+    monkeypatch.setattr("semloc_logs.engines.engine.cores", lambda: cores)
+    with EngineChoice(name, jobs).open(tasks) as engine:
+        assert type(engine).__name__ == kind
+        assert engine.jobs == (1 if kind == "Serial" else jobs or cores)
+
+
+# -- interruption, with real processes and signals
+
+SLOW = """
+import os, sys, tempfile, time
+from pathlib import Path
+
+def nap(folder):
+    with tempfile.TemporaryDirectory(dir=folder) as mine:
+        (Path(folder).parent / f"pid-{os.getpid()}").touch()
+        time.sleep(100)
+"""
+NAPPING = """
+import click, slow, sys
+from semloc_logs.cli.main import Program, program
+from semloc_logs.cli.options import EngineChoice
+
+@click.command()
+def nap():
+    with EngineChoice(sys.argv[2], 2).open(2) as engine:
+        list(engine.map(slow.nap, [sys.argv[1]] * 2))
+
+Program.get_command = lambda *_: nap
+if __name__ == "__main__":
+    program.main(["nap"])
+"""
+
+
+def _start(folder: Path, engine: str, workers: int) -> tuple[subprocess.Popen[str], list[int]]:
+    """A program whose tasks sleep in a temporary folder inside ``folder``/busy, once they do; and the processes they run in."""
+    (folder / "slow.py").write_text(SLOW)
+    (folder / "napping.py").write_text(NAPPING)
+    (folder / "busy").mkdir()
+    command = [sys.executable, str(folder / "napping.py"), str(folder / "busy"), engine]
+    started = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = time.monotonic() + 40
+    while len(pids := [int(p.name[4:]) for p in folder.glob("pid-*")]) < workers:
+        assert time.monotonic() < deadline, "the workers did not start"
+        assert started.poll() is None, started.stderr and started.stderr.read()
+        time.sleep(0.05)
+    return started, pids
+
+
+def _are_gone(pids: list[int]) -> bool:
+    deadline = time.monotonic() + 15
+    while time.monotonic() < deadline:
+        if not [p for p in pids if Path(f"/proc/{p}").exists() and "Z" not in Path(f"/proc/{p}/stat").read_text().split()[2]]:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize(("engine", "workers"), [("serial", 1), ("processes", 2)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_an_interrupted_program_cleans_up(tmp_path: Path, engine: str, workers: int, number: signal.Signals, code: int) -> None:
+    started, pids = _start(tmp_path, engine, workers)
+    os.killpg(started.pid, number)  # as a terminal does it: workers get it too
+    _, said = started.communicate(timeout=30)
+    assert started.returncode == code
+    assert "Traceback" not in said
+    assert _are_gone(pids)
+    assert list((tmp_path / "busy").iterdir()) == []
+
+
+def test_workers_leave_with_a_killed_parent(tmp_path: Path) -> None:
+    started, pids = _start(tmp_path, "processes", 2)
+    started.kill()
+    started.wait(timeout=20)
+    assert _are_gone(pids)
+    assert list((tmp_path / "busy").iterdir()) == []
+    if started.stderr:
+        started.stderr.close()
