@@ -187,11 +187,17 @@ def test_the_columns_of_closures_are_those_promised() -> None:
     schema = contracts.schema("closures")
     assert schema.names == names.split()
     assert schema.field("covariance").type == pa.list_(pa.float64(), 36)
-    assert [str(schema.field(n).type) for n in ("query_stamp_ns", "t_x", "probability", "inliers")] == ["int64", "double", "double", "int32"]
+    assert [str(schema.field(n).type) for n in ("query_stamp_ns", "t_x", "probability", "inliers")] == [
+        "int64",
+        "double",
+        "double",
+        "int32",
+    ]
 
 
 @pytest.mark.parametrize(
-    "change", [{"extra": [1, 2, 3]}, {"word": None}, {"word": [1, 2]}, {"word": [1, 2, 70000]}, {"word": [1, -1, 2]}, {"x": ["a", "b", "c"]}]
+    "change",
+    [{"extra": [1, 2, 3]}, {"word": None}, {"word": [1, 2]}, {"word": [1, 2, 70000]}, {"word": [1, -1, 2]}, {"x": ["a", "b", "c"]}],
 )
 def test_columns_that_break_the_contract_are_refused(change: dict[str, object]) -> None:
     broken = columns() | change

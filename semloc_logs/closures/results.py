@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from semloc_logs import contracts
 from semloc_logs.alignment.verify import FEATURES
@@ -27,14 +28,16 @@ def unique_closures(accepted: Sequence[Alignment], positions: dict[str, NDArray[
     def ends(a: Alignment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return positions[a.query_session][a.query_keyframe], positions[a.target_session][a.target_keyframe]
 
+    trees = {name: cKDTree(p) for name, p in positions.items()}
     kept: list[Alignment] = []
-    by_pair: dict[tuple[str, str], list[Alignment]] = {}
+    by_target: dict[tuple[str, str, int], list[Alignment]] = {}
     for a in sorted(accepted, key=lambda a: (-a.probability, -a.features.structure, a.query_session, a.query_stamp_ns)):
         q, t = ends(a)
-        twins = by_pair.get((a.target_session, a.query_session), [])
-        if any(np.linalg.norm(ends(o)[1] - q) < spacing and np.linalg.norm(ends(o)[0] - t) < spacing for o in twins):
+        near = trees[a.query_session].query_ball_point(q, spacing)
+        twins = (o for k in near for o in by_target.get((a.target_session, a.query_session, k), ()))
+        if any(np.linalg.norm(ends(o)[0] - t) < spacing for o in twins):
             continue
-        by_pair.setdefault((a.query_session, a.target_session), []).append(a)
+        by_target.setdefault((a.query_session, a.target_session, a.target_keyframe), []).append(a)
         kept.append(a)
     return sorted(kept, key=lambda a: (a.query_session, a.query_stamp_ns, a.target_session, a.target_stamp_ns))
 

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from semloc_logs.alignment.hypotheses import pool
 
 
-def slow_pool(group: list[int], yaw: list[float], t: np.ndarray, weight: list[float], cell: float) -> list[tuple[float, int, float, tuple[float, ...]]]:
+def slow_pool(
+    group: list[int], yaw: list[float], t: np.ndarray, weight: list[float], cell: float
+) -> list[tuple[float, int, float, tuple[float, ...]]]:
     """Votes of every cell of both grids, in dictionaries: (weight, group, yaw, mean translation)."""
     out = []
     for offset in (0.0, 0.5):
@@ -45,7 +47,9 @@ def test_votes_are_those_of_a_dictionary(seed: int) -> None:
     assert weights == sorted(weights, reverse=True)
     assert weights[0] == pytest.approx(expected[0][0])
     for w, g, y, mean in expected:  # every cell is there, itself or as its twin of the other grid
-        assert any(h.group == g and h.pose[0] == y and np.abs(np.array(h.pose[1:]) - mean).max() < 0.3 and h.weight >= w - 1e-9 for h in found)
+        assert any(
+            h.group == g and h.pose[0] == y and np.abs(np.array(h.pose[1:]) - mean).max() < 0.3 and h.weight >= w - 1e-9 for h in found
+        )
 
 
 def test_the_heaviest_are_kept() -> None:

@@ -48,7 +48,9 @@ def fit(truth: F64, start: F64, seed: int = 0, noise: float = 0.01) -> Fit:
 SMALL = exp_se3(np.array([0.15, -0.2, 0.1]), np.array([0.03, -0.02, 0.06]))
 
 
-@pytest.mark.parametrize("truth", [np.eye(4), yaw_transform(2.5, (3.0, -1.0, 0.5)), exp_se3(np.array([1.0, 2, 3]), np.array([0.3, -0.2, 1.0]))])
+@pytest.mark.parametrize(
+    "truth", [np.eye(4), yaw_transform(2.5, (3.0, -1.0, 0.5)), exp_se3(np.array([1.0, 2, 3]), np.array([0.3, -0.2, 1.0]))]
+)
 def test_a_known_transform_is_found_to_a_millimetre(truth: F64) -> None:
     found = fit(truth, truth @ SMALL, noise=0.004)
     distance, angle = error(found.target_T_query, truth)
@@ -112,7 +114,9 @@ def test_covariance_of_a_room_and_of_a_corridor() -> None:
     rng = np.random.default_rng(4)
     for corridor in (False, True):
         target = surface_of(room(rng, 1500, corridor=corridor))
-        found = align(room(rng, 700, corridor=corridor)[:, :3], target, SMALL if not corridor else exp_se3(np.zeros(3), np.zeros(3)), RADII, 15)
+        found = align(
+            room(rng, 700, corridor=corridor)[:, :3], target, SMALL if not corridor else exp_se3(np.zeros(3), np.zeros(3)), RADII, 15
+        )
         C = _covariance(found, np.eye(4), np.eye(4))
         assert np.linalg.eigvalsh(C).min() > 0
         np.testing.assert_allclose(C, C.T)

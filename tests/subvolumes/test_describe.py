@@ -115,7 +115,9 @@ def test_a_map_described_in_other_words_of_its_own_position() -> None:
     np.testing.assert_array_equal(a.centre + np.array([800, -160, 24]), b.centre)
 
 
-@pytest.mark.parametrize("state", [np.full((40, 40, 16), 254, np.uint8), np.full((16, 16, 16), 253, np.uint8), np.zeros((0, 0, 0), np.uint8)])
+@pytest.mark.parametrize(
+    "state", [np.full((40, 40, 16), 254, np.uint8), np.full((16, 16, 16), 253, np.uint8), np.zeros((0, 0, 0), np.uint8)]
+)
 def test_maps_with_nothing_occupied(state: U8) -> None:
     found = describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 1)
     assert found.centre.shape == (0, 3)

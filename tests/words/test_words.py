@@ -101,7 +101,14 @@ def test_bits_are_balanced_in_each_cell_and_say_something(vocabulary: Vocabulary
 
 
 def slow_search(
-    v: Vocabulary, word: NDArray[np.uint16], code: NDArray[np.uint64], group: NDArray[np.int64], d: F32, k: int, probes: int, allowed: NDArray[np.bool_]
+    v: Vocabulary,
+    word: NDArray[np.uint16],
+    code: NDArray[np.uint64],
+    group: NDArray[np.int64],
+    d: F32,
+    k: int,
+    probes: int,
+    allowed: NDArray[np.bool_],
 ) -> list[list[int]]:
     """Distances of the k nearest allowed entries in the probed cells, of each query."""
     cells = v.nearest_cells(d, probes)
@@ -173,7 +180,9 @@ def test_kmeans_finds_clusters_that_lie_apart() -> None:
     centres = np.array([[0.0, 0], [10, 0], [0, 10], [10, 10], [20, 20]])
     data = np.concatenate([c + 0.1 * rng.standard_normal((40, 2)) for c in centres]).astype(np.float32)
     found = _kmeans(data, 5, np.random.default_rng(3))
-    assert sum(((data - found[np.argmin(((data[:, None] - found) ** 2).sum(2), 1)]) ** 2).sum(1)) < 0.25 * sum(((data - data.mean(0)) ** 2).sum(1))
+    assert sum(((data - found[np.argmin(((data[:, None] - found) ** 2).sum(2), 1)]) ** 2).sum(1)) < 0.25 * sum(
+        ((data - data.mean(0)) ** 2).sum(1)
+    )
     assert np.isfinite(found).all()
 
 

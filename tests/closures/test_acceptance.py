@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from semloc_logs.alignment.verify import FEATURES, Features
+from semloc_logs.closures.acceptance import Calibration, fit_logistic, reason, shipped
+
+GOOD = Features(structure=0.95, coverage=0.9, contradiction=0.02, fit=0.95, rmse=0.1, distinct=0.2, support=3.0, stiffness=3.0)
+
+
+def test_features_are_named_in_their_order() -> None:
+    assert tuple(f.name for f in dataclasses.fields(Features)) == FEATURES
+
+
+def test_probability_by_hand() -> None:
+    model = Calibration((2.0, 0, 0, 0, 0, -1.0, 0, 0), (0.0,) * 8, (1.0,) * 8, 0.5)
+    one = dataclasses.replace(GOOD, structure=0.25, distinct=0.5)
+    assert model.probability(one) == pytest.approx(1 / (1 + np.exp(-0.5)))
+    clipped = dataclasses.replace(one, structure=7.0, distinct=-3.0)
+    assert model.probability(clipped) == pytest.approx(1 / (1 + np.exp(-2.5)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_probabilities_are_numbers_whatever_the_features(value: float) -> None:
+    for name in FEATURES:
+        p = shipped().probability(dataclasses.replace(GOOD, **{name: value}))
+        assert 0 <= p <= 1
+
+
+def test_the_shipped_calibration_knows_good_from_bad() -> None:
+    bad = Features(structure=0.2, coverage=0.3, contradiction=0.5, fit=0.2, rmse=0.9, distinct=0.98, support=1.0, stiffness=0.5)
+    assert shipped().probability(GOOD) > 0.95
+    assert shipped().probability(bad) < 0.01
+    for name, worse in (("structure", 0.5), ("contradiction", 0.4), ("distinct", 1.1)):
+        assert shipped().probability(dataclasses.replace(GOOD, **{name: worse})) <= shipped().probability(GOOD)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"coverage": 0.1}, "10% of the query's structure falls into observed space"),
+        ({"structure": 0.3}, "30% of the query's structure lies on structure"),
+        ({"distinct": 0.9}, "another place fits nearly as well"),
+        ({"fit": 0.4}, "40% of the points lie on a surface"),
+        ({}, "too weak"),
+    ],
+)
+def test_reasons(change: dict[str, float], said: str) -> None:
+    text = reason(dataclasses.replace(GOOD, **change), 0.1234, 0.99)
+    assert said in text
+    assert text.startswith("probability 0.123 below 0.99: ")
+
+
+def test_logistic_regression_recovers_known_weights() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(0, 1, (20_000, 3)) * [1, 5, 0.1] + [0, 20, -1]
+    weights, bias = np.array([1.5, -0.4, 10.0]), 17.0
+    right = rng.random(20_000) < 1 / (1 + np.exp(-(x @ weights + bias)))
+    assert 0.2 < right.mean() < 0.8
+    w, b = fit_logistic(x, right, ridge=1e-3)
+    np.testing.assert_allclose(w, weights, rtol=0.08)
+    assert b == pytest.approx(bias, rel=0.08)
+
+
+def test_logistic_regression_of_separable_and_of_constant_features_stays_finite() -> None:
+    x = np.c_[np.linspace(-1, 1, 40), np.full(40, 3.0)]
+    w, b = fit_logistic(x, x[:, 0] > 0)
+    p = 1 / (1 + np.exp(-(x @ w + b)))
+    assert np.isfinite(w).all()
+    assert ((p > 0.5) == (x[:, 0] > 0)).all()
+    w, b = fit_logistic(x, np.ones(40, bool))
+    assert (1 / (1 + np.exp(-(x @ w + b))) > 0.99).all()

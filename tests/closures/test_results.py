@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from semloc_logs import contracts
+from semloc_logs.alignment.verify import FEATURES, Features
+from semloc_logs.closures.closing import Alignment
+from semloc_logs.closures.results import read_closures, unique_closures, write_closures, write_rejected
+from semloc_logs.geometry import yaw_transform
+from semloc_logs.tables import read_metadata, read_table
+
+SECOND = 10**9
+# three sessions along the same road, a keyframe every metre
+ROAD = np.c_[np.arange(100.0), np.zeros(100), np.zeros(100)]
+POSITIONS = {"a": ROAD, "b": ROAD + [0, 500, 0], "c": ROAD}
+
+
+def alignment(query: str, i: int, target: str, j: int, probability: float = 0.995, **more: Any) -> Alignment:
+    rng = np.random.default_rng(i)
+    half = rng.standard_normal((6, 6))
+    features = Features(0.9, 0.9, 0.0, 0.9, 0.1, 0.2, 3.0, 3.0)
+    made = Alignment(
+        query_session=query,
+        target_session=target,
+        query_keyframe=i,
+        target_keyframe=j,
+        query_stamp_ns=i * SECOND,
+        target_stamp_ns=j * SECOND,
+        target_T_query=yaw_transform(0.1 * i, (0.5, 0.25, -0.1)),
+        covariance=half @ half.T,
+        overlap=0.75,
+        probability=probability,
+        inliers=1000 + i,
+        words=i,
+        features=features,
+        reason="",
+    )
+    return dataclasses.replace(made, **more)
+
+
+def keys(rows: list[Alignment]) -> list[tuple[str, int, str, int]]:
+    return [(a.query_session, a.query_keyframe, a.target_session, a.target_keyframe) for a in rows]
+
+
+@pytest.mark.parametrize("swap", [False, True])
+def test_of_a_closure_found_from_both_ends_the_more_probable_stays(swap: bool) -> None:
+    one, other = alignment("a", 10, "b", 40, 0.995), alignment("b", 41, "a", 11, 0.999)
+    rows = [other, one] if swap else [one, other]
+    assert keys(unique_closures(rows, POSITIONS, 2.0)) == [("b", 41, "a", 11)]
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [("a", 10, "b", 40), ("b", 40, "a", 13)],  # one end too far away
+        [("a", 10, "b", 40), ("b", 43, "a", 10)],  # the other
+        [("a", 10, "b", 40), ("a", 11, "b", 41)],  # two queries of one session are two closures
+        [("a", 10, "b", 40), ("b", 40, "c", 10)],  # other sessions
+        [("a", 10, "a", 60), ("a", 12, "a", 62)],
+    ],
+)
+def test_what_is_not_a_twin_stays(rows: list[tuple[str, int, str, int]]) -> None:
+    assert sorted(keys(unique_closures([alignment(*r) for r in rows], POSITIONS, 2.0))) == sorted(rows)
+
+
+def test_a_session_that_closes_with_itself() -> None:
+    rows = [alignment("a", 10, "a", 60, 0.993), alignment("a", 60, "a", 10, 0.996), alignment("a", 90, "a", 10)]
+    assert keys(unique_closures(rows, POSITIONS, 2.0)) == [("a", 60, "a", 10), ("a", 90, "a", 10)]
+
+
+def test_closures_are_sorted_by_session_and_time_whatever_the_order() -> None:
+    rows = [alignment("b", 5, "a", 50), alignment("a", 30, "b", 80), alignment("a", 7, "c", 20), alignment("a", 7, "b", 90)]
+    expected = [("a", 7, "b", 90), ("a", 7, "c", 20), ("a", 30, "b", 80), ("b", 5, "a", 50)]
+    for order in ([0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]):
+        assert keys(unique_closures([rows[i] for i in order], POSITIONS, 2.0)) == expected
+    assert unique_closures([], POSITIONS, 2.0) == []
+
+
+def test_many_closures_of_one_pair_of_sessions_take_no_quadratic_time() -> None:
+    n = 3000
+    road = np.c_[np.arange(n) * 5.0, np.zeros(n), np.zeros(n)]
+    rows = [alignment("a", i, "b", i, 0.995) for i in range(n)] + [alignment("b", i, "a", i, 0.994) for i in range(n)]
+    kept = unique_closures(rows, {"a": road, "b": road}, 2.0)
+    assert len(kept) == n
+    assert {a.query_session for a in kept} == {"a"}
+
+
+@pytest.mark.parametrize("n", [0, 3])
+def test_closures_as_a_table(n: int, tmp_path: Path) -> None:
+    rows = [alignment("a", i, "b", i + 50) for i in range(n)]
+    write_closures(tmp_path / "closures.parquet", rows, {"schema_version": 1})
+    table = read_table(tmp_path / "closures.parquet")
+    assert table.schema.equals(contracts.schema("closures"))
+    assert read_metadata(tmp_path / "closures.parquet") == {"schema_version": 1}
+    found = read_closures(tmp_path / "closures.parquet")
+    assert len(found) == n
+    for a, row in zip(rows, found, strict=True):
+        assert (row["query_session"], row["target_session"], row["query_stamp_ns"]) == ("a", "b", a.query_stamp_ns)
+        assert (row["t_x"], row["t_y"], row["t_z"]) == (0.5, 0.25, -0.1)
+        assert row["q_z"] == pytest.approx(np.sin(0.05 * a.query_keyframe))
+        assert row["q_w"] == pytest.approx(np.cos(0.05 * a.query_keyframe))
+        np.testing.assert_array_equal(np.array(row["covariance"]).reshape(6, 6), a.covariance)
+        assert (row["overlap"], row["probability"], row["inliers"], row["words"]) == (0.75, 0.995, a.inliers, a.words)
+
+
+@pytest.mark.parametrize("n", [0, 3])
+def test_rejections_as_a_table(n: int, tmp_path: Path) -> None:
+    rows = [alignment("a", 5, "b", i, 0.1 * i, reason=f"because {i}") for i in range(n)]
+    write_rejected(tmp_path / "rejected.parquet", rows, {})
+    table = read_table(tmp_path / "rejected.parquet")
+    assert table.schema.equals(contracts.schema("rejected"))
+    assert table["reason"].to_pylist() == [f"because {i}" for i in reversed(range(n))]  # the most probable first
+    for name in FEATURES:
+        assert table[name].to_pylist() == [getattr(a.features, name) for a in rows]
