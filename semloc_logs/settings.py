@@ -82,7 +82,7 @@ class Query(_Section):
     length: float | None = Field(None, gt=0, description="or all keyframes within this stretch of road (m)")
     every: float | None = Field(None, gt=0, description="distance between queries (m); default 2 m at 0.30 m voxels")
     every_angle: float = Field(0.349, gt=0, description="or turn between queries (rad)")
-    radius: float | None = Field(None, gt=0, description="a query map is cut off at this distance (m); default 30 m at 0.30 m voxels")
+    radius: float | None = Field(None, gt=0, description="a query map is cut off at this distance (m); default 24 m at 0.30 m voxels")
 
 
 class Closures(_Section):
@@ -92,7 +92,7 @@ class Closures(_Section):
     neighbours: int = Field(5, ge=1, description="nearest database words of each query word (K)")
     probes: int = Field(8, ge=1, description="nearest vocabulary cells searched for each query word")
     hypotheses: int = Field(96, ge=1, description="pooled hypotheses of a query that are verified")
-    refined: int = Field(12, ge=1, description="best verified hypotheses that are aligned")
+    refined: int = Field(24, ge=1, description="best verified hypotheses that are aligned")
     kappa: float = Field(10.0, gt=0, description="kappa of the paper in voxels (3 m at 0.30 m)")
     min_probability: float = Field(0.99, ge=0.0, le=1.0, description="closures below this are rejected")
     exclude_seconds: float = Field(30.0, ge=0, description="within a session, keyframes nearer in time than this are no revisit")
@@ -154,7 +154,7 @@ class Settings(BaseSettings):
             keyframe_resolution=v / 3,
             submap_length=100 * scale,
         )
-        query = fill(self.query, every=2 * scale, radius=30 * scale)
+        query = fill(self.query, every=2 * scale, radius=24 * scale)
         closures = fill(self.closures, exclude_distance=50 * scale)
         return self.model_copy(
             update={

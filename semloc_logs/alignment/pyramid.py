@@ -88,8 +88,12 @@ def _score(mask: U8, corner: F64, cell: float, centres: F64, bits: U8, weights: 
         x = int(np.floor((c * centres[n, 0] - s * centres[n, 1] + t[0] - corner[0]) / cell))
         y = int(np.floor((s * centres[n, 0] + c * centres[n, 1] + t[1] - corner[1]) / cell))
         z = int(np.floor((centres[n, 2] + t[2] - corner[2]) / cell))
-        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz and mask[x, y, z] & bits[n]:
-            total += weights[n]
+        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+            found = mask[x, y, z]
+            if found & bits[n]:
+                total += weights[n]
+            elif found & FREE_BIT:  # only the finest level knows
+                total -= weights[n]
     return total
 
 
@@ -98,7 +102,7 @@ def _search(
     mask: U8, corner: F64, cell: float, centres: F64, bits: U8, weights: F64, start: F64, yaws: F64, steps: F64, lifts: F64
 ) -> tuple[float, F64]:
     """Best of all combinations of turns ``yaws``, shifts ``steps`` (both axes) and ``lifts`` around ``start`` (yaw, x, y, z)."""
-    best, best_pose = -1.0, start.copy()
+    best, best_pose = -2.0, start.copy()
     t = np.empty(3)
     for dyaw in yaws:
         c, s = np.cos(start[0] + dyaw), np.sin(start[0] + dyaw)
@@ -116,7 +120,7 @@ def _search(
 
 
 def search(level: Level, evidence: Evidence, start: F64, yaws: Sequence[float], steps: Sequence[float], lifts: Sequence[float]) -> tuple[float, F64]:
-    """Best weighted share of aligned query voxels near ``start`` (yaw, x, y, z) of ``target_T_query``, and the pose that has it."""
+    """Best weighted share of aligned query voxels, less that of those in free space, near ``start`` (yaw, x, y, z) of ``target_T_query``, and the pose that has it."""
     e = evidence
     arrays = [np.asarray(a, float) for a in (start, yaws, steps, lifts)]
     value, pose = _search(level.mask, level.corner, level.cell, e.centres, e.bits, e.weights, *arrays)

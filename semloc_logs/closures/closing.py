@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.hypotheses import Hypothesis, pool
 from semloc_logs.alignment.icp import Fit
 from semloc_logs.alignment.pyramid import tau
-from semloc_logs.alignment.verify import Candidate, Features, Query, coarse_fit, fine_fit, same_place, search_hypotheses, structure_scores
+from semloc_logs.alignment.verify import Candidate, Features, Query, Target, coarse_fit, fine_fit, same_place, search_hypotheses, structure_scores
 from semloc_logs.closures.acceptance import reason, shipped
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.queries import SessionMap, build_query
@@ -24,6 +24,7 @@ from semloc_logs.subvolumes.describe import describe_map, load_encoder
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
+ALIGNED = 8  # candidates of a target session that are fitted on the points
 INFLATION = 30.0  # of the covariance: neighbouring points share their errors
 FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
 
@@ -121,7 +122,7 @@ def find_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
     parts: list[tuple[NDArray[np.int64], F64, F64, F64]] = []
     low, high = query.blocks.bounds()
     state = query.blocks.dense(low, tuple((high - low).tolist()))
-    half = -(-int((settings.query.radius or 30.0) / v + 16) // 8) * 8
+    half = -(-int((settings.query.radius or 24.0) / v + 16) // 8) * 8
     box = np.empty((2 * half, 2 * half, int(high[2] - low[2])), np.uint8)
     middle = np.array([0.0, 0.0, (low[2] + high[2]) / 2])
     ground = float(session.ground_z[keyframe] - session.map_T_base[keyframe][2, 3])
@@ -152,24 +153,38 @@ def _align(
     database: Database, session: SessionMap, keyframe: int, query: Query, query_T_base: F64, candidates: list[Candidate]
 ) -> list[Alignment]:
     """Candidates of one target session, aligned on the points, compared with each other, judged."""
-    settings = database.settings
-    v = settings.fusion.voxel_size
+    v = database.settings.fusion.voxel_size
     fitted: list[tuple[float, Candidate, Fit, int]] = []
-    for c in candidates[:5]:
+    for c in candidates[:ALIGNED]:
         near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
         fit = coarse_fit(c, database.surface(c.group, near), query)
-        structure, coverage, _, _ = structure_scores(query, database.target(c.group), fit.target_T_query)
-        fitted.append((structure * min(1.0, coverage / 0.5), c, fit, near))
-    fitted.sort(key=lambda f: -f[0])
-    distinct_places: list[tuple[float, Candidate, Fit, int]] = []
-    for f in fitted:
-        if not any(same_place(f[2].target_T_query, o[2].target_T_query, v) for o in distinct_places):
-            distinct_places.append(f)
-    out = []
-    for rank, f in enumerate(distinct_places[: max(1, settings.closures.rejected_per_query)]):
-        others = [o[0] for o in distinct_places if o is not f]
-        out.append(_judge(database, session, keyframe, query, query_T_base, f, max(others, default=0.0), rank == 0))
-    return out
+        fitted.append((_score(query, database.target(c.group), fit), c, fit, near))
+    best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
+    fine = []
+    for _, c, fit, near in best:
+        better = fine_fit(fit.target_T_query, database.surface(c.group, near), query.points, v)
+        fine.append((_score(query, database.target(c.group), better), c, better, near))
+    fine = _distinct(fine, v)
+    scores = [f[0] for f in fine]
+    return [
+        _judge(database, session, keyframe, query, query_T_base, f, max((x for o, x in enumerate(scores) if o != rank), default=0.0), rank == 0)
+        for rank, f in enumerate(fine)
+    ]
+
+
+def _score(query: Query, target: Target, fit: Fit) -> float:
+    """What alignments of one query are ranked by: aligned structure, less what contradicts free space."""
+    structure, coverage, contradiction, _ = structure_scores(query, target, fit.target_T_query)
+    return structure * min(1.0, coverage / 0.5) - contradiction
+
+
+def _distinct(fitted: list[tuple[float, Candidate, Fit, int]], voxel_size: float) -> list[tuple[float, Candidate, Fit, int]]:
+    """Best first, each place once."""
+    kept: list[tuple[float, Candidate, Fit, int]] = []
+    for f in sorted(fitted, key=lambda f: -f[0]):
+        if not any(same_place(f[2].target_T_query, o[2].target_T_query, voxel_size) for o in kept):
+            kept.append(f)
+    return kept
 
 
 def _judge(
@@ -185,10 +200,9 @@ def _judge(
     """The alignment of one candidate with its features, probability, covariance and, if it is not accepted, the reason."""
     settings = database.settings
     v = settings.fusion.voxel_size
-    score, candidate, _, near = fitted
+    score, candidate, fine, near = fitted
     place = database.places[candidate.group]
     target_session, target = database.sessions[place.session], database.target(candidate.group)
-    fine = fine_fit(fitted[2].target_T_query, database.surface(candidate.group, near), query.points, v)
     T = fine.target_T_query
     structure, coverage, contradiction, count = structure_scores(query, target, T)
     weakest = _stiffness(fine)
@@ -198,7 +212,7 @@ def _judge(
         contradiction=contradiction,
         fit=fine.inliers,
         rmse=fine.rmse / v,
-        distinct=second / max(score, 1e-6),
+        distinct=max(second, 0.0) / max(score, 1e-3),
         support=float(np.log10(count + 1)),
         stiffness=float(np.log10(weakest + 1)),
     )

@@ -113,7 +113,7 @@ class Database:
         def make() -> Surface:
             ids = np.arange(submap["first"], submap["last"] + 1)
             away = np.linalg.norm(session.map_T_base[ids, :3, 3] - session.map_T_base[keyframe, :3, 3], axis=1)
-            radius = 1.2 * (self.settings.query.radius or 30.0)
+            radius = 1.2 * (self.settings.query.radius or 24.0)
             clouds = []
             for i in np.sort(ids[np.argsort(away, kind="stable")[:SURFACE_KEYFRAMES]]):
                 points = read_keyframe(session.folder.keyframes, int(i)).points

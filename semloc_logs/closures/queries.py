@@ -98,7 +98,7 @@ def query_members(session: SessionMap, keyframe: int, settings: Settings) -> lis
         return np.flatnonzero(away <= settings.query.length / 2).tolist()
     count = min(settings.query.frames, n)
     first = min(max(0, keyframe - count // 2), n - count)
-    return [i for i in range(first, first + count) if away[i] <= (settings.query.radius or 30.0)]
+    return [i for i in range(first, first + count) if away[i] <= (settings.query.radius or 24.0)]
 
 
 def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple[Query, F64]:
@@ -110,7 +110,7 @@ def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple
     query_T_map = np.eye(4)
     query_T_map[:3, 3] = -session.map_T_base[keyframe][:3, 3]
     poses = query_T_map @ session.map_T_base
-    radius = settings.query.radius or 30.0
+    radius = settings.query.radius or 24.0
     blocks = fuse_keyframes(session.folder, members, poses, session.origins, settings, radius)
     clouds = []
     for i in members:

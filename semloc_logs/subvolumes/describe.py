@@ -27,7 +27,8 @@ U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 BELOW_GROUND = 1.0  # of the lowest layer (m at 0.30 m voxels)
 LAYER = 8
-PATCH = 192  # voxels along the edge of the part of a map that is encoded at once
+RARE = 0.05  # a layer with a smaller share of the subvolumes is not worth a pass of the network
+PATCH = 256  # voxels along the edge of the part of a map that is encoded at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,9 +110,12 @@ def describe_map(state: U8, low: NDArray[np.integer], ground_z: float, voxel_siz
     bottom = bottom_z + SIZE  # of layer 0 in the box
     inner = occupied(box[MARGIN:-MARGIN, MARGIN:-MARGIN])
     layer = _layers(inner, bottom, stride)
+    filled_columns = inner.sum(2, dtype=np.int64)
     table = code_table(encoder.variant)
     centres, found = [], []
-    for index in np.unique(layer):
+    has_enough = _window_sums(filled_columns, stride) >= min_occupied
+    values, counts = np.unique(layer[has_enough], return_counts=True)
+    for index in values[counts >= RARE * counts.sum()]:
         z = bottom + LAYER * int(index)
         if z < 0 or z + SIZE > height:
             continue

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
+from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.voxels.store import blocks_path, read_blocks
 from semloc_logs.workspace import SessionFolder
 
@@ -29,11 +30,15 @@ class DescribeTask:
 
 
 def describe_submap(folder: SessionFolder, submap: int, ground_z: float, variant: str, settings: Settings) -> Described:
-    """Centres (voxels) and descriptors of every described subvolume of a submap."""
+    """Centres (voxels) and descriptors of every described subvolume of a submap, by the encoder of ``variant``."""
+    return describe_submap_with(folder, submap, ground_z, load_encoder(variant, settings.descriptor.weights), settings)
+
+
+def describe_submap_with(folder: SessionFolder, submap: int, ground_z: float, encoder: Encoder, settings: Settings) -> Described:
+    """As :func:`describe_submap`, by any encoder."""
     blocks = read_blocks(blocks_path(folder.blocks, submap))
     low, high = blocks.bounds()
     state = blocks.dense(low, tuple((high - low).tolist()))
-    encoder = load_encoder(variant, settings.descriptor.weights)
     d = settings.descriptor
     return describe_map(state, low, ground_z, settings.fusion.voxel_size, encoder, d.stride, d.min_occupied)
 

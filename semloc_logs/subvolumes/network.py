@@ -36,6 +36,15 @@ class _LookUp(torch.autograd.Function):
         return None, torch.stack(columns, 1).to(grad.dtype)
 
 
+def _halve(x: Tensor) -> Tensor:
+    """2x2x2 max-pooling; without gradients as three maxima, which take half the time of the library's kernel in bf16."""
+    if torch.is_grad_enabled() and x.requires_grad:
+        return F.max_pool3d(x, 2)
+    x = torch.maximum(x[:, :, ::2], x[:, :, 1::2])
+    x = torch.maximum(x[:, :, :, ::2], x[:, :, :, 1::2])
+    return torch.maximum(x[..., ::2], x[..., 1::2])
+
+
 class Encoder(nn.Module):
     """Codes (b, x, y, 32) uint8 with a margin of 8 voxels in x and y -> mu (b, 256, (x - 40) / 8, (y - 40) / 8).
 
@@ -58,7 +67,7 @@ class Encoder(nn.Module):
         weight = self.embedding.weight.to(torch.get_autocast_dtype("cpu")) if reduced else self.embedding.weight
         x = _LookUp.apply(codes.int(), weight).permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
         for block, norm in zip(self.blocks, self.norms, strict=True):
-            x = F.relu(norm(F.max_pool3d(block(x), 2)))  # ReLU before pooling, as in the paper, would cost eight times as much
+            x = F.relu(norm(_halve(block(x))))  # ReLU before pooling, as in the paper, would cost eight times as much
         x = x[:, :, 1:-1, 1:-1]  # the pooled margin has served
         mu: Tensor = self.centre(self.mean(x))[..., 0]
         return mu

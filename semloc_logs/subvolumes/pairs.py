@@ -100,9 +100,10 @@ def write_shard(path: Path, pairs: Sequence[tuple[U8, U8, U8]]) -> None:
         pq.write_table(pa.table(columns), temporary, compression="zstd", use_dictionary=False, row_group_size=256)
 
 
-def read_shard(path: Path) -> tuple[U8, U8, U8]:
-    """Arrays (n, 64, 64, 32), (n, 32, 32, 32) and (n, 64, 64, 32) of a shard."""
-    table = pq.read_table(path)
+def read_shard(path: Path, draw: int | None = None) -> tuple[U8, U8, U8]:
+    """Arrays (n, 64, 64, 32), (n, 32, 32, 32) and (n, 64, 64, 32) of a shard, or of its row group number ``draw`` modulo their count."""
+    shard = pq.ParquetFile(path)
+    table = shard.read() if draw is None else shard.read_row_group(draw % shard.num_row_groups)
     shapes = ((BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE), (BROAD, BROAD, SIZE))
     a, b, c = (np.frombuffer(b"".join(table[k].to_pylist()), np.uint8).reshape(-1, *s) for k, s in enumerate(shapes))
     return a, b, c

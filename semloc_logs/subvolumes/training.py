@@ -32,7 +32,8 @@ from semloc_logs.tables import replacing_file
 RATE = 1.5e-3
 TEMPERATURE = 0.1
 MIN_OCCUPIED = 40
-POOL = 96  # steps that draw from the same three shards
+POOL, SCENES = 96, 12  # steps that draw from the same scenes, and how many
+FREEZE = 0.4  # of the steps: from then on batch normalisation uses its running statistics, as it will when it describes
 
 U8 = NDArray[np.uint8]
 
@@ -49,21 +50,18 @@ class Progress:
 
 
 def _batches(shards: Sequence[Path], training: Training, first_step: int, steps: int) -> Iterator[tuple[U8, U8, U8]]:
-    """Batches of a fixed random sequence, from step ``first_step`` on; half of each from one scene, so that negatives are hard."""
+    """Batches of a fixed random sequence, from step ``first_step`` on, each of several scenes: their neighbours are negatives enough."""
     pool: list[tuple[U8, U8, U8]] = []
     chosen = -1
     for step in range(first_step, steps):
         if step // POOL != chosen:
             chosen = step // POOL
             draw = np.random.default_rng((training.seed, chosen))
-            pool = [read_shard(shards[k]) for k in draw.permutation(len(shards))[:3]]
+            pool = [read_shard(shards[k], int(draw.integers(1 << 16))) for k in draw.permutation(len(shards))[:SCENES]]
         rng = np.random.default_rng((training.seed, 1, step))
-        half = training.batch // 2
-        parts = [(pool[k], n) for k, n in zip(rng.permutation(len(pool)), (half, training.batch - half), strict=False)]
-        if len(parts) == 1:
-            parts = [(parts[0][0], training.batch)]
-        rows = [rng.choice(len(shard[0]), n, replace=len(shard[0]) < n) for shard, n in parts]
-        arrays = [np.concatenate([shard[k][r] for (shard, _), r in zip(parts, rows, strict=True)]) for k in range(3)]
+        sizes = np.bincount(rng.integers(len(pool), size=training.batch), minlength=len(pool))
+        rows = [rng.choice(len(shard[0]), n, replace=len(shard[0]) < n) for shard, n in zip(pool, sizes, strict=True)]
+        arrays = [np.concatenate([shard[k][r] for shard, r in zip(pool, rows, strict=True)]) for k in range(3)]
         # quarter turns and mirror images of the whole triple are as good as new streets
         quarter, mirror = int(rng.integers(4)), bool(rng.integers(2))
         turned = [np.rot90(a[:, ::-1] if mirror else a, quarter, axes=(1, 2)) for a in arrays]
@@ -109,6 +107,10 @@ def train(
     model.train()
     table, classes = code_table(variant), CLASSES[variant]
     for step, (part, whole, other) in enumerate(_batches(shards, training, done, steps), start=done):
+        if step >= FREEZE * steps:
+            for part_of_model in model.modules():
+                if isinstance(part_of_model, torch.nn.BatchNorm3d):
+                    part_of_model.eval()
         for group in optimiser.param_groups:
             group["lr"] = RATE * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
         seen = torch.from_numpy(_seen(part))
