@@ -55,6 +55,7 @@ def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
     except (OSError, SafetensorError, RuntimeError) as problem:
         raise SettingsError(f"{weights or 'The shipped weights'}: no weights of the {variant} encoder ({str(problem).splitlines()[0]}).") from None
     encoder.to(memory_format=torch.channels_last_3d)
+    torch.set_num_threads(1)  # more cores are used by more processes: the same sums in the same order, whatever the engine
     return encoder.eval()
 
 
