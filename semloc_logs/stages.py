@@ -22,13 +22,21 @@ from semloc_logs.closures.results import keyframe_at, read_closures, unique_clos
 from semloc_logs.engines import Engine
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError
 from semloc_logs.geometry import transform
-from semloc_logs.logs.annotate import AnnotateReport, ClosureRecord, annotate_copy, annotate_in_place, annotate_sidecar, content_fingerprint, recover
+from semloc_logs.logs.annotate import (
+    AnnotateReport,
+    ClosureRecord,
+    annotate_copy,
+    annotate_in_place,
+    annotate_sidecar,
+    content_fingerprint,
+    recover,
+)
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describing import DescribeTask, variants_for
 from semloc_logs.tables import read_json, read_metadata, replacing_folder, write_json
 from semloc_logs.voxels.fusing import FuseTask, fuse_session
 from semloc_logs.voxels.store import blocks_path
-from semloc_logs.words.indexing import index_submap
+from semloc_logs.words.indexing import index_submap, write_words
 from semloc_logs.workspace import SessionFolder, Workspace
 
 Note = Callable[[str], None]
@@ -63,7 +71,13 @@ def _hash(*parts: str) -> str:
 
 
 def fuse(
-    sessions: Mapping[str, Sequence[Path]], work: Workspace, settings: Settings, topics: Mapping[str, str], engine: Engine, note: Note, overwrite: bool = False
+    sessions: Mapping[str, Sequence[Path]],
+    work: Workspace,
+    settings: Settings,
+    topics: Mapping[str, str],
+    engine: Engine,
+    note: Note,
+    overwrite: bool = False,
 ) -> Report:
     """Logs -> keyframes, submaps and map of each session. A session that fails is named in ``failed``; the others go on."""
     report, tasks = Report(), []
@@ -86,7 +100,8 @@ def fuse(
         else:
             report.done.append(name)
             report.skipped += outcome["skipped"]
-            note(f"{name}: {outcome['keyframes']} keyframes, {len(outcome['submaps'])} submaps, {outcome['voxels']} voxels, labels from {outcome['label_source']}")
+            made = f"{outcome['keyframes']} keyframes, {len(outcome['submaps'])} submaps, {outcome['voxels']} voxels"
+            note(f"{name}: {made}, labels from {outcome['label_source']}")
     if report.failed and not report.done and not report.kept:
         raise LogError(" ".join(report.failed))
     return report
@@ -131,11 +146,24 @@ def describe(work: Workspace, names: Sequence[str], settings: Settings, engine: 
         metadata = {k: session[k] for k in keys}
         with replacing_folder(folder.words) as output:
             tasks = [
-                DescribeTask(folder, s["id"], s["ground_z"], variants_for(session["label_source"], settings), blocks_path(output, s["id"]), metadata, settings)
+                DescribeTask(
+                    folder,
+                    s["id"],
+                    s["ground_z"],
+                    variants_for(session["label_source"], settings),
+                    blocks_path(output, s["id"]),
+                    metadata,
+                    settings,
+                )
                 for s in session["submaps"]
             ]
-            words = sum(n for _, n in engine.map(index_submap, tasks))
-        write_json(folder.words_json, {"fingerprint": fingerprint, "words": words, "settings": settings.model_dump(mode="json", include={"descriptor"})})
+            words = sum(engine.map(index_submap, tasks))
+            if not tasks:
+                write_words(blocks_path(output, 0), 0, [], metadata)
+        write_json(
+            folder.words_json,
+            {"fingerprint": fingerprint, "words": words, "settings": settings.model_dump(mode="json", include={"descriptor"})},
+        )
         report.done.append(folder.name)
         note(f"{folder.name}: {words} words")
     return report
@@ -152,7 +180,9 @@ def _sessions(work: Workspace, names: Sequence[str]) -> list[SessionFolder]:
     missing = [n for n in names if n not in known]
     if missing or not known:
         listed = ", ".join(known) or "none"
-        raise WorkspaceError(f"{work.path} has no fused session {', '.join(missing) or 'at all'} (there are: {listed}): run 'semloc fuse' first.")
+        raise WorkspaceError(
+            f"{work.path} has no fused session {', '.join(missing) or 'at all'} (there are: {listed}): run 'semloc fuse' first."
+        )
     return [known[n] for n in names] if names else list(known.values())
 
 
@@ -160,7 +190,14 @@ def _sessions(work: Workspace, names: Sequence[str]) -> list[SessionFolder]:
 
 
 def close(
-    work: Workspace, queries: Sequence[str], targets: Sequence[str], settings: Settings, engine: Engine, note: Note, self_closures: bool = True, overwrite: bool = False
+    work: Workspace,
+    queries: Sequence[str],
+    targets: Sequence[str],
+    settings: Settings,
+    engine: Engine,
+    note: Note,
+    self_closures: bool = True,
+    overwrite: bool = False,
 ) -> Report:
     """Words -> closures.parquet and rejected.parquet: every session of ``queries`` against all of ``targets`` (all if empty)."""
     asking, asked = _sessions(work, queries), _sessions(work, targets)
@@ -171,7 +208,12 @@ def close(
     sections = ("fusion", "labels", "descriptor", "query", "closures")
     fingerprint = _hash(settings.fingerprint(*sections), str(self_closures), repr(len(asking)), *inputs)
     report = Report()
-    if not overwrite and work.rejected.exists() and work.closures.exists() and read_metadata(work.closures).get("fingerprint") == fingerprint:
+    if (
+        not overwrite
+        and work.rejected.exists()
+        and work.closures.exists()
+        and read_metadata(work.closures).get("fingerprint") == fingerprint
+    ):
         report.kept.append("closures")
         report.closures = len(read_closures(work.closures))
         return report
@@ -211,7 +253,9 @@ def close(
 # -- annotate --------------------------------------------------------------------------------------------------------------------
 
 
-def annotate(log: Path, work: Workspace, settings: Settings, *, output: Path | None, mode: str, overwrite: bool = False, session: str | None = None) -> AnnotateReport:
+def annotate(
+    log: Path, work: Workspace, settings: Settings, *, output: Path | None, mode: str, overwrite: bool = False, session: str | None = None
+) -> AnnotateReport:
     """Closures that the log takes part in -> channels. ``mode`` is copy, in-place or sidecar; all but in-place need ``output``."""
     recover(log)
     name = session or session_name(log)
@@ -277,18 +321,22 @@ def run(
     if annotation != "none":
         for name in names:
             for log in sessions[name]:
-                output = None if annotation == "in-place" else work.annotated / f"{name if log.is_dir() else log.stem}{'.semloc' if annotation == 'sidecar' else ''}.mcap"
+                output = (
+                    None
+                    if annotation == "in-place"
+                    else work.annotated / f"{name if log.is_dir() else log.stem}{'.semloc' if annotation == 'sidecar' else ''}.mcap"
+                )
                 made = annotate(log, work, settings, output=output, mode=annotation, overwrite=True, session=name)
                 note(f"{name}: {made.messages} messages in {made.path}")
         total.seconds["annotate"] = round(time.perf_counter() - clock, 3)
-    write_json(work.summary, {"version": semloc_logs.__version__, "seconds": total.seconds, "skipped": total.skipped, "failed": total.failed, "closures": total.closures})
+    write_json(
+        work.summary,
+        {
+            "version": semloc_logs.__version__,
+            "seconds": total.seconds,
+            "skipped": total.skipped,
+            "failed": total.failed,
+            "closures": total.closures,
+        },
+    )
     return total
-
-
-def closure_text(row: Mapping[str, Any]) -> str:
-    """One line about a closure."""
-    t = (row["t_x"], row["t_y"], row["t_z"])
-    yaw = 2 * np.degrees(np.arctan2(row["q_z"], row["q_w"]))
-    return f"{row['query_session']} @ {row['query_stamp_ns']} -> {row['target_session']} @ {row['target_stamp_ns']}: {np.linalg.norm(t):.2f} m, yaw {(yaw + 180) % 360 - 180:.1f} deg, probability {row['probability']:.4f}"
-
-

@@ -46,7 +46,10 @@ def pool(group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, ce
     found.sort(key=lambda h: (-h.weight, h.group, h.pose))
     kept: list[Hypothesis] = []
     for h in found:  # the same cell found twice is one hypothesis
-        if not any(h.group == o.group and h.pose[0] == o.pose[0] and max(abs(a - b) for a, b in zip(h.pose, o.pose, strict=True)) < cell / 4 for o in kept):
+        if not any(
+            h.group == o.group and h.pose[0] == o.pose[0] and max(abs(a - b) for a, b in zip(h.pose, o.pose, strict=True)) < cell / 4
+            for o in kept
+        ):
             kept.append(h)
         if len(kept) == most:
             break

@@ -119,8 +119,13 @@ def _search(
     return best, best_pose
 
 
-def search(level: Level, evidence: Evidence, start: F64, yaws: Sequence[float], steps: Sequence[float], lifts: Sequence[float]) -> tuple[float, F64]:
-    """Best weighted share of aligned query voxels, less that of those in free space, near ``start`` (yaw, x, y, z) of ``target_T_query``, and the pose that has it."""
+def search(
+    level: Level, evidence: Evidence, start: F64, yaws: Sequence[float], steps: Sequence[float], lifts: Sequence[float]
+) -> tuple[float, F64]:
+    """Best weighted share of aligned query voxels, less that of those in free space, near ``start``, and the pose that has it.
+
+    Poses are (yaw, x, y, z) of ``target_T_query``.
+    """
     e = evidence
     arrays = [np.asarray(a, float) for a in (start, yaws, steps, lifts)]
     value, pose = _search(level.mask, level.corner, level.cell, e.centres, e.bits, e.weights, *arrays)
@@ -144,7 +149,9 @@ def look_up(level: Level, points: F64) -> U8:
     return np.asarray(_look_up(level.mask, level.corner, level.cell, np.ascontiguousarray(points, float)))
 
 
-def tau(query: BlockMap, target: BlockMap, voxel_size: float, target_T_query: F64, kappa: float, coarse: U8 | None = None) -> tuple[float, int]:
+def tau(
+    query: BlockMap, target: BlockMap, voxel_size: float, target_T_query: F64, kappa: float, coarse: U8 | None = None
+) -> tuple[float, int]:
     """The paper's overlap ratio (3.5) and the number of aligned voxels.
 
     For each occupied query voxel the closest *observed* target voxel is taken; it counts as aligned when that one is occupied, of

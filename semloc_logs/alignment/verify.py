@@ -16,7 +16,18 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.icp import Fit, Surface, align
-from semloc_logs.alignment.pyramid import ANY_BIT, FREE_BIT, Evidence, Level, build_pyramid, class_bits, look_up, pose_matrix, search, yaw_between
+from semloc_logs.alignment.pyramid import (
+    ANY_BIT,
+    FREE_BIT,
+    Evidence,
+    Level,
+    build_pyramid,
+    class_bits,
+    look_up,
+    pose_matrix,
+    search,
+    yaw_between,
+)
 from semloc_logs.geometry import apply
 from semloc_logs.labels.shape import shape
 from semloc_logs.labels.space import GROUND, cityscapes
@@ -114,13 +125,19 @@ class Candidate:
 
 
 def search_hypotheses(hypotheses: Sequence[Hypothesis], targets: dict[int, Target], query: Query, closures: Closures) -> list[Candidate]:
-    """The ``closures.refined`` best candidates, best first, after a search over yaw and shift at 4, 2 and 1 voxels around each hypothesis."""
+    """The ``closures.refined`` best candidates, best first, after a search at 4, 2 and 1 voxels around each hypothesis."""
     v = query.voxel_size
     turn = np.pi / closures.headings
     state = [(h, np.array(h.pose), 0.0) for h in hypotheses]
     plan = (
         (2, (-0.67 * turn, 0.0, 0.67 * turn), (-4 * v, 0.0, 4 * v), (-4 * v, 0.0, 4 * v), 3 * closures.refined),
-        (1, tuple(turn * np.linspace(-0.4, 0.4, 5)), tuple(v * np.array([-4.0, -2.0, 0.0, 2.0, 4.0])), (-2 * v, 0.0, 2 * v), 2 * closures.refined),
+        (
+            1,
+            tuple(turn * np.linspace(-0.4, 0.4, 5)),
+            tuple(v * np.array([-4.0, -2.0, 0.0, 2.0, 4.0])),
+            (-2 * v, 0.0, 2 * v),
+            2 * closures.refined,
+        ),
         (0, tuple(turn * np.linspace(-0.12, 0.12, 5)), tuple(v * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])), (-v, 0.0, v), closures.refined),
     )
     for level, yaws, steps, lifts, keep in plan:
@@ -131,7 +148,10 @@ def search_hypotheses(hypotheses: Sequence[Hypothesis], targets: dict[int, Targe
         moved.sort(key=lambda m: (-m[2], m[0].group, tuple(m[1])))
         state = []
         for m in moved:  # hypotheses that have met are one
-            if not any(o[0].group == m[0].group and np.abs(o[1][1:] - m[1][1:]).max() < 2 * v and abs(np.sin(o[1][0] - m[1][0])) < 0.05 for o in state):
+            if not any(
+                o[0].group == m[0].group and np.abs(o[1][1:] - m[1][1:]).max() < 2 * v and abs(np.sin(o[1][0] - m[1][0])) < 0.05
+                for o in state
+            ):
                 state.append(m)
             if len(state) == keep:
                 break

@@ -12,13 +12,23 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.hypotheses import Hypothesis, pool
 from semloc_logs.alignment.icp import Fit
 from semloc_logs.alignment.pyramid import tau
-from semloc_logs.alignment.verify import Candidate, Features, Query, Target, coarse_fit, fine_fit, same_place, search_hypotheses, structure_scores
+from semloc_logs.alignment.verify import (
+    Candidate,
+    Features,
+    Query,
+    Target,
+    coarse_fit,
+    fine_fit,
+    same_place,
+    search_hypotheses,
+    structure_scores,
+)
 from semloc_logs.closures.acceptance import reason, shipped
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.queries import SessionMap, build_query
 from semloc_logs.geometry import inverse
 from semloc_logs.labels.space import cityscapes
-from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.cut import turn
 from semloc_logs.subvolumes.describe import describe_map, load_encoder
 from semloc_logs.workspace import Workspace
@@ -136,7 +146,9 @@ def find_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
             m = words.index.search(d.descriptor, closures.neighbours, closures.probes, allowed)
             if len(m.query):
                 shift = words.centre[m.entry] - d.centre[m.query] * v
-                parts.append((words.group[m.entry], np.full(len(m.query), yaw), shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3))
+                parts.append(
+                    (words.group[m.entry], np.full(len(m.query), yaw), shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3)
+                )
     if not parts:
         return []
     group, yaws, shift, weight = (np.concatenate([p[k] for p in parts]) for k in range(4))
@@ -167,7 +179,9 @@ def _align(
     fine = _distinct(fine, v)
     scores = [f[0] for f in fine]
     return [
-        _judge(database, session, keyframe, query, query_T_base, f, max((x for o, x in enumerate(scores) if o != rank), default=0.0), rank == 0)
+        _judge(
+            database, session, keyframe, query, query_T_base, f, max((x for o, x in enumerate(scores) if o != rank), default=0.0), rank == 0
+        )
         for rank, f in enumerate(fine)
     ]
 
@@ -200,7 +214,7 @@ def _judge(
     """The alignment of one candidate with its features, probability, covariance and, if it is not accepted, the reason."""
     settings = database.settings
     v = settings.fusion.voxel_size
-    score, candidate, fine, near = fitted
+    score, candidate, fine, _ = fitted
     place = database.places[candidate.group]
     target_session, target = database.sessions[place.session], database.target(candidate.group)
     T = fine.target_T_query

@@ -80,9 +80,13 @@ class Database:
                 mine = np.flatnonzero(np.array(table["variant"].to_pylist(), dtype=object) == variant)
                 centre = np.stack([table[c].to_numpy()[mine] for c in "xyz"], 1).astype(float)
                 parts.append((centre, table["word"].to_numpy()[mine], table["code"].to_numpy()[mine], np.full(len(mine), g)))
-            centre, word, code, group = (np.concatenate([p[k] for p in parts]) if parts else np.zeros((0, 3) if k == 0 else 0) for k in range(4))
+            centre, word, code, group = (
+                np.concatenate([p[k] for p in parts]) if parts else np.zeros((0, 3) if k == 0 else 0) for k in range(4)
+            )
             vocabulary = load_vocabulary(variant, self.settings.descriptor.vocabulary)
-            self._words[variant] = Words(Index(vocabulary, word.astype(np.uint16), code.astype(np.uint64), group), centre, group.astype(np.int64))
+            self._words[variant] = Words(
+                Index(vocabulary, word.astype(np.uint16), code.astype(np.uint64), group), centre, group.astype(np.int64)
+            )
         return self._words[variant]
 
     def target(self, group: int) -> Target:

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from semloc_logs.alignment.verify import FEATURES
 from semloc_logs.closures.acceptance import fit_logistic
@@ -80,8 +82,6 @@ def judge(a: Alignment, query: TrueTrack, target: TrueTrack) -> Judged:
     q = query.at(np.array([a.query_stamp_ns]))[0][0]
     t = target.at(np.array([a.target_stamp_ns]))[0][0]
     true = inverse(t) @ q
-    from scipy.spatial.transform import Rotation
-
     turn = a.target_T_query[:3, :3] @ true[:3, :3].T
     x = np.r_[a.target_T_query[:3, 3] - true[:3, 3], Rotation.from_matrix(turn).as_rotvec()]
     nees = float(x @ np.linalg.solve(a.covariance, x))
@@ -112,7 +112,10 @@ def calibrate(rows: Sequence[Judged]) -> dict[str, Any]:
     right = np.array([r.right for r in clear])
     low, high = np.quantile(x, 0.01, axis=0), np.quantile(x, 0.99, axis=0)
     weights, bias = fit_logistic(np.clip(x, low, high), right)
-    features = {n: {"weight": round(float(weights[i]), 4), "low": round(float(low[i]), 4), "high": round(float(high[i]), 4)} for i, n in enumerate(FEATURES)}
+    features = {
+        n: {"weight": round(float(weights[i]), 4), "low": round(float(low[i]), 4), "high": round(float(high[i]), 4)}
+        for i, n in enumerate(FEATURES)
+    }
     return {"bias": round(bias, 4), "features": features, "alignments": len(clear), "right": int(right.sum())}
 
 
@@ -121,8 +124,10 @@ def reliability(rows: Sequence[Judged], edges: Sequence[float] = (0.0, 0.1, 0.5,
     p = np.array([r.alignment.probability for r in rows])
     right = np.array([r.right for r in rows])
     out = []
-    for a, b in zip(edges, edges[1:], strict=False):
+    for a, b in pairwise(edges):
         mine = (p >= a) & ((p < b) | (b == edges[-1]))
         if mine.any():
-            out.append({"from": a, "to": b, "alignments": int(mine.sum()), "said": float(p[mine].mean()), "right": float(right[mine].mean())})
+            out.append(
+                {"from": a, "to": b, "alignments": int(mine.sum()), "said": float(p[mine].mean()), "right": float(right[mine].mean())}
+            )
     return out

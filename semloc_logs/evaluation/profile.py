@@ -28,7 +28,9 @@ def profile_pipeline(logs: Sequence[Path], settings: Settings, functions: int = 
     with tempfile.TemporaryDirectory(prefix="semloc-profile-") as folder:
         work = Workspace(Path(folder))
         profiler = cProfile.Profile()
-        report = profiler.runcall(run, {session_name(log): [log] for log in logs}, work, settings, {}, make_engine("serial"), lambda _: None)
+        report = profiler.runcall(
+            run, {session_name(log): [log] for log in logs}, work, settings, {}, make_engine("serial"), lambda _: None
+        )
         queries = int(read_metadata(work.closures)["queries"])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform.startswith("linux") else 1024**2)
     figures: Figures = {f"{stage}": {"ours": seconds, "unit": "s"} for stage, seconds in report.seconds.items()}

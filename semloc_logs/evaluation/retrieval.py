@@ -68,7 +68,9 @@ def word_recall(
     return WordRecall(float(exact[possible].mean()), float(coded[possible].mean()), int(possible.sum()), len(centre), radius)
 
 
-def _query_words(query: SessionMap, keyframe: int, targetmap_T_querymap: F64, settings: Settings, encoder: Encoder) -> tuple[Described, F64]:
+def _query_words(
+    query: SessionMap, keyframe: int, targetmap_T_querymap: F64, settings: Settings, encoder: Encoder
+) -> tuple[Described, F64]:
     """Words of the query turned to the nearest heading of the search, and the transform of their frame into the target's map frame."""
     v = settings.fusion.voxel_size
     asked, _ = build_query(query, keyframe, settings)

@@ -53,7 +53,9 @@ def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
         counters = {k: v for k, v in encoder.state_dict().items() if not v.is_floating_point()}  # of no use after training
         encoder.load_state_dict(counters | found)
     except (OSError, SafetensorError, RuntimeError) as problem:
-        raise SettingsError(f"{weights or 'The shipped weights'}: no weights of the {variant} encoder ({str(problem).splitlines()[0]}).") from None
+        raise SettingsError(
+            f"{weights or 'The shipped weights'}: no weights of the {variant} encoder ({str(problem).splitlines()[0]})."
+        ) from None
     encoder.to(memory_format=torch.channels_last_3d)
     torch.set_num_threads(1)  # more cores are used by more processes: the same sums in the same order, whatever the engine
     return encoder.eval()
@@ -87,7 +89,9 @@ def _layers(filled: NDArray[np.bool_], bottom: int, stride: int) -> NDArray[np.i
 
 
 @torch.inference_mode()
-def describe_map(state: U8, low: NDArray[np.integer], ground_z: float, voxel_size: float, encoder: Encoder, stride: int, min_occupied: int) -> Described:
+def describe_map(
+    state: U8, low: NDArray[np.integer], ground_z: float, voxel_size: float, encoder: Encoder, stride: int, min_occupied: int
+) -> Described:
     """Describe the box ``state`` (x, y, z) of voxel states whose corner is voxel ``low`` of the map; ``ground_z`` in metres.
 
     ``stride`` is 4 or 8 voxels. Positions are multiples of it in the map's voxel grid only if ``low`` is.

@@ -6,9 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
 from semloc_logs.subvolumes.network import Encoder
@@ -48,15 +45,3 @@ def variants_for(label_source: str, settings: Settings) -> tuple[str, ...]:
     if settings.descriptor.variant != "auto":
         return (settings.descriptor.variant,)
     return ("geometric", "semantic") if label_source in ("log", "onnx") else ("geometric",)
-
-
-def word_columns(submap: int, parts: list[tuple[str, NDArray[np.floating], NDArray[np.uint16], NDArray[np.uint64]]]) -> dict[str, Any]:
-    """Columns of words/ from (variant, centres (n, 3) in metres, words (n,), codes (n,)) of one submap."""
-    centre = np.concatenate([p[1] for p in parts]) if parts else np.zeros((0, 3))
-    return {
-        "submap": np.full(len(centre), submap),
-        "variant": [p[0] for p in parts for _ in range(len(p[1]))],
-        **{c: centre[:, k].astype(np.float32) for k, c in enumerate("xyz")},
-        "word": np.concatenate([p[2] for p in parts]) if parts else [],
-        "code": np.concatenate([p[3] for p in parts]) if parts else [],
-    }

@@ -2,7 +2,8 @@
 
 Labels enter through a learned embedding (a factorised first convolution: an occupied, free or unobserved voxel is a table look-up,
 not a vector of L + 2 numbers). Three blocks of 3x3x3 convolution, 2x2x2 max-pooling and ReLU, then a fully connected layer written
-as a 4x4x4 convolution. Batch normalisation, which the paper lacks, lets it learn from few samples. The descriptor is the mean mu of the latent code, scaled to unit length.
+as a 4x4x4 convolution. Batch normalisation, which the paper lacks, lets it learn from few samples. The descriptor is the mean mu of
+the latent code, scaled to unit length.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Training pairs: incomplete subvolumes from one or five frames beside complete ones from the fused map of all (paper 3.2).
 
 A pair is wider than a subvolume: the encoder run over it gives 3 x 3 descriptors, 8 voxels apart, so that each pair brings nine
-examples, eight of them hard. Pairs are packed into Parquet shards, one for each scene, so that training starts, stops and resumes without making them again.
+examples, eight of them hard. Pairs are packed into Parquet shards, one for each scene, so that training starts, stops and resumes
+without making them again.
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ def occupied(state: U8) -> NDArray[np.bool_]:
     return (state != FREE_STATE) & (state != UNOBSERVED_STATE)
 
 
-def cut_pairs(frames: Sequence[SceneFrame], fusion: Fusion, training: Training, rng: np.random.Generator, min_occupied: int = 40) -> list[tuple[U8, U8, U8]]:
+def cut_pairs(
+    frames: Sequence[SceneFrame], fusion: Fusion, training: Training, rng: np.random.Generator, min_occupied: int = 40
+) -> list[tuple[U8, U8, U8]]:
     """(incomplete (64, 64, 32), complete (32, 32, 32), complete seen a little shifted and turned (64, 64, 32)) voxel states.
 
     The middle subvolume of the incomplete one, at least, has ``min_occupied`` occupied voxels.

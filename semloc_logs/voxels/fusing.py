@@ -23,7 +23,7 @@ from semloc_logs.logs.session import Session, open_session
 from semloc_logs.settings import STREET_VOXEL, Settings
 from semloc_logs.tables import replacing_folder, write_json, write_table
 from semloc_logs.voxels.gravity import find_up, ground_height
-from semloc_logs.voxels.grid import BlockMap, Fuser
+from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map
 from semloc_logs.voxels.picture import draw_map
 from semloc_logs.voxels.selection import KeyframeSelector, road_distance, submap_ranges, thin
 from semloc_logs.voxels.store import (
@@ -287,9 +287,8 @@ def _submaps(
 ) -> list[dict[str, Any]]:
     """Fuse and write every submap; returns what session.json says of them."""
     fusion = task.settings.fusion
-    ranges = (
-        submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else [(i, i + 1) for i in range(len(poses))]
-    )
+    # without poses there is no map: the keyframes only ask
+    ranges = submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else []
     out = []
     with replacing_folder(task.folder.blocks) as folder:
         for i, (first, last) in enumerate(ranges):
@@ -299,4 +298,6 @@ def _submaps(
                 {"id": i, "first": first, "last": last - 1, "ground_z": float(np.median(grounds[first:last])), "blocks": len(blocks.keys)}
             )
             on_progress(f"fused submap {i + 1} of {len(ranges)}")
+        if not ranges:
+            write_blocks(blocks_path(folder, 0), empty_map(), metadata)
     return out

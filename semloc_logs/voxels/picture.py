@@ -21,7 +21,9 @@ def colour_table() -> NDArray[np.uint8]:
     return table
 
 
-def bird_view(ijk: NDArray[np.integer], label: NDArray[np.uint8], low: NDArray[np.integer], shape: tuple[int, int], step: int = 1) -> NDArray[np.uint8]:
+def bird_view(
+    ijk: NDArray[np.integer], label: NDArray[np.uint8], low: NDArray[np.integer], shape: tuple[int, int], step: int = 1
+) -> NDArray[np.uint8]:
     """RGB picture (height, width, 3), x right, y up, of voxels (n, 3); the highest voxel of a column shows, brighter when higher."""
     image = np.full((shape[1], shape[0], 3), 255, np.uint8)
     if not len(ijk):
@@ -48,7 +50,11 @@ def draw_map(voxels: Path, trajectory: NDArray[np.floating], voxel_size: float, 
     image = bird_view(ijk, label, low, (int(size[0]), int(size[1])), step)
     zoom = max(1, 1000 // max(image.shape[:2]))
     image = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
-    line = np.stack([(track[:, 0] - low[0]) / step * zoom, (size[1] - 1 - (track[:, 1] - low[1]) / step) * zoom], 1) if len(track) else np.zeros((0, 2))
+    line = (
+        np.stack([(track[:, 0] - low[0]) / step * zoom, (size[1] - 1 - (track[:, 1] - low[1]) / step) * zoom], 1)
+        if len(track)
+        else np.zeros((0, 2))
+    )
     cv2.polylines(image, [np.round(line).astype(np.int32).reshape(-1, 1, 2)], False, (255, 0, 0), max(2, zoom))
     for point in line[:1]:
         cv2.circle(image, tuple(np.round(point).astype(int).tolist()), 4 * max(1, zoom), (0, 160, 0), -1)

@@ -55,7 +55,9 @@ def part_path(folder: Path, keyframe: int) -> Path:
 def write_keyframes(path: Path, first: int, stamps_ns: Sequence[int], keyframes: Iterable[Keyframe], metadata: dict[str, Any]) -> None:
     """One part: keyframes ``first``, ``first`` + 1, ... each in a row group of its own. ``path`` lies in a folder that is renamed later."""
     schema = contracts.schema("keyframes").with_metadata({"semloc": _json(metadata)})
-    with pq.ParquetWriter(path, schema, compression="zstd", use_byte_stream_split=["x", "y", "z"], use_dictionary=["keyframe", "stamp_ns", "label"]) as writer:
+    with pq.ParquetWriter(
+        path, schema, compression="zstd", use_byte_stream_split=["x", "y", "z"], use_dictionary=["keyframe", "stamp_ns", "label"]
+    ) as writer:
         for k, (stamp, frame) in enumerate(zip(stamps_ns, keyframes, strict=True), start=first):
             n = len(frame.points)
             p = np.round(frame.points * 512) / 512  # 2 mm: below any sensor's noise, and packs well
@@ -151,5 +153,9 @@ def write_voxels(folder: Path, submaps: Iterable[BlockMap], metadata: dict[str, 
 
 def _write_tile(path: Path, rows: NDArray[np.int32], metadata: dict[str, Any]) -> None:
     columns: dict[str, Any] = dict(zip(("ix", "iy", "iz"), rows[:, :3].T, strict=True))
-    columns |= {"label": rows[:, 3].astype(np.uint8), "occupancy": (rows[:, 4] / SCALE).astype(np.float32), "hits": rows[:, 5].astype(np.uint16)}
+    columns |= {
+        "label": rows[:, 3].astype(np.uint8),
+        "occupancy": (rows[:, 4] / SCALE).astype(np.float32),
+        "hits": rows[:, 5].astype(np.uint16),
+    }
     write_table(path, contracts.table("voxels", columns), metadata)

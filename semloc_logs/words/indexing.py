@@ -2,21 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from semloc_logs import contracts
-from semloc_logs.subvolumes.describing import DescribeTask, describe_submap, word_columns
+from semloc_logs.subvolumes.describing import DescribeTask, describe_submap
 from semloc_logs.tables import write_table
 from semloc_logs.words.vocabulary import load_vocabulary
 
+Part = tuple[str, NDArray[np.floating], NDArray[np.uint16], NDArray[np.uint64]]  # variant, centres (n, 3) in metres, words, codes
 
-def index_submap(task: DescribeTask) -> tuple[Path, int]:
-    """Write the words of one submap in all of the task's variants; returns the path and the number of words."""
-    parts = []
+
+def index_submap(task: DescribeTask) -> int:
+    """Write the words of one submap in all of the task's variants; returns their number."""
+    parts: list[Part] = []
     for variant in task.variants:
         described = describe_submap(task.folder, task.submap, task.ground_z, variant, task.settings)
         word, code = load_vocabulary(variant, task.settings.descriptor.vocabulary).words(described.descriptor)
         parts.append((variant, described.centre * task.settings.fusion.voxel_size, word, code))
-    table = contracts.table("words", word_columns(task.submap, parts))
-    write_table(task.output, table, task.metadata)
-    return task.output, table.num_rows
+    return write_words(task.output, task.submap, parts, task.metadata)
+
+
+def write_words(path: Path, submap: int, parts: Sequence[Part], metadata: dict[str, Any]) -> int:
+    """One table of words/; returns the number of its rows."""
+    centre = np.concatenate([np.zeros((0, 3)), *(p[1] for p in parts)])
+    columns = {
+        "submap": np.full(len(centre), submap),
+        "variant": [p[0] for p in parts for _ in range(len(p[1]))],
+        **{c: centre[:, k].astype(np.float32) for k, c in enumerate("xyz")},
+        "word": np.concatenate([np.zeros(0, np.uint16), *(p[2] for p in parts)]),
+        "code": np.concatenate([np.zeros(0, np.uint64), *(p[3] for p in parts)]),
+    }
+    write_table(path, contracts.table("words", columns), metadata)
+    return len(centre)
