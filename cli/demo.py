@@ -15,6 +15,8 @@ from .results import finish, report_json, session_logs
 if TYPE_CHECKING:
     from semloc_logs.settings import Settings
 
+QUERY_EVERY = 10.0  # m; a demonstration need not ask every two metres
+
 
 @click.command(cls=Command)
 @click.option(
@@ -36,6 +38,7 @@ def command(output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, 
     from semloc_logs.stages import run
     from semloc_logs.workspace import Workspace
 
+    settings = settings.model_copy(update={"query": settings.query.model_copy(update={"every": QUERY_EVERY})})
     logs, truth, workspace = [output / "monday.mcap", output / "tuesday.bag"], output / "truth.json", Workspace(output / "work")
     with console.progress():
         if overwrite or not truth.exists():

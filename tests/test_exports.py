@@ -1,0 +1,135 @@
+"""Exports of hand-made sessions, checked number by number."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from semloc_logs import contracts
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.exports import export
+from semloc_logs.geometry import yaw_transform
+from semloc_logs.tables import write_json, write_table
+from semloc_logs.voxels.store import pose_columns
+from semloc_logs.workspace import Workspace
+
+METADATA = {"schema_version": 1}
+
+
+def _session(work: Workspace, name: str, poses: np.ndarray[Any, Any]) -> None:
+    """Keyframes at 0, 1, ... s; the map frame lies 100 m along x in the session frame."""
+    folder, n = work.session(name), len(poses)
+    session_T_map = yaw_transform(0.0, (100.0, 0.0, 0.0))
+    stamps = 1_500_000_000 + np.arange(n) * 10**9
+    columns: dict[str, Any] = {"stamp_ns": stamps, **pose_columns(poses)}
+    trajectory = {"stamp_ns": stamps, **pose_columns(session_T_map @ poses)}
+    write_table(folder.trajectory, contracts.table("trajectory", trajectory), METADATA)
+    frames = {
+        **columns,
+        "keyframe": np.arange(n),
+        "log_time_ns": stamps,
+        "topic": ["/points"] * n,
+        "posed": [True] * n,
+        "distance": np.arange(n, dtype=float),
+        "ground_z": np.zeros(n),
+        "points": np.zeros(n, int),
+        **{f"origin_{c}": np.zeros(n, np.float32) for c in "xyz"},
+    }
+    write_table(folder.frames, contracts.table("frames", frames), METADATA)
+    voxels = {"ix": [0, 2], "iy": [1, 1], "iz": [-1, 0], "label": [2, 255], "occupancy": [1.0, 2.0], "hits": [3, 4]}
+    write_table(folder.voxels / "tile=0_0/part-0.parquet", contracts.table("voxels", voxels), METADATA)
+    write_json(folder.session_json, {"posed": True, "session_T_map": session_T_map.tolist(), "voxel_size": 0.5})
+
+
+@pytest.fixture
+def work(tmp_path: Path) -> Workspace:
+    work = Workspace(tmp_path / "work")
+    _session(work, "a", np.array([yaw_transform(0.0, (x, 0.0, 0.0)) for x in (0.0, 3.0)]))
+    _session(work, "b", np.array([yaw_transform(np.pi / 2, (x, 0.0, 0.0)) for x in (0.0, 1.0, 2.0)]))
+    return work
+
+
+def _close(work: Workspace) -> None:
+    """b's keyframe 2 is seen from a's keyframe 1, turned by 90 degrees; it is sure of x in the target's axes and unsure of y."""
+    covariance = np.diag([0.01, 0.04, 0.09, 0.001, 0.002, 0.004])
+    columns: dict[str, Any] = {
+        "query_session": ["b"],
+        "target_session": ["a"],
+        "query_stamp_ns": [3_500_000_000],
+        "target_stamp_ns": [2_500_000_000],
+        **pose_columns(yaw_transform(np.pi / 2, (1.0, 2.0, 0.0))),
+        "covariance": [covariance.ravel().tolist()],
+        "overlap": [0.5],
+        "probability": [0.99],
+        "inliers": [1],
+        "words": [1],
+    }
+    write_table(work.closures, contracts.table("closures", columns), METADATA)
+
+
+def test_tum_has_seconds_and_session_poses(work: Workspace, tmp_path: Path) -> None:
+    (path,) = export(work, ["a"], "tum", tmp_path)
+    assert path.read_text() == "1.500000000 100 0 0 0 0 0 1\n2.500000000 103 0 0 0 0 0 1\n"
+
+
+def test_kitti_has_three_by_four_matrices(work: Workspace, tmp_path: Path) -> None:
+    (path,) = export(work, ["a"], "kitti", tmp_path)
+    assert path.name == "a.txt"
+    np.testing.assert_allclose(np.loadtxt(path)[1], [1, 0, 0, 103, 0, 1, 0, 0, 0, 0, 1, 0])
+
+
+def test_ply_has_voxel_centres_in_the_session_frame(work: Workspace, tmp_path: Path) -> None:
+    paths = export(work, [], "ply", tmp_path)
+    assert [p.name for p in paths] == ["a.ply", "b.ply"]
+    head, _, body = paths[0].read_bytes().partition(b"end_header\n")
+    assert b"element vertex 2\n" in head
+    kinds = {"float": "<f4", "uchar": "u1"}
+    fields = [(line.split()[2], kinds[line.split()[1]]) for line in head.decode().splitlines() if line.startswith("property")]
+    rows = np.frombuffer(body, fields)
+    np.testing.assert_allclose([rows[c] for c in "xyz"], [[100.25, 101.25], [0.75, 0.75], [-0.25, 0.25]])
+    assert rows["label"].tolist() == [2, 255]
+    assert rows[["red", "green", "blue"]].tolist() == [(70, 70, 70), (128, 128, 128)]
+
+
+def test_g2o_has_odometry_and_closures(work: Workspace, tmp_path: Path) -> None:
+    _close(work)
+    (path,) = export(work, [], "g2o", tmp_path)
+    lines = [line.split() for line in path.read_text().splitlines()]
+    vertices = [line for line in lines if line[0] == "VERTEX_SE3:QUAT"]
+    edges = [line for line in lines if line[0] == "EDGE_SE3:QUAT"]
+    assert [int(v[1]) for v in vertices] == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose([float(x) for x in vertices[1][2:]], [3, 0, 0, 0, 0, 0, 1])
+    assert [(int(e[1]), int(e[2])) for e in edges] == [(0, 1), (2, 3), (3, 4), (1, 4)]
+    # odometry over 3 m: 2 cm + 1 % is 5 cm; the first step of b goes along its -y
+    information = [float(x) for x in edges[0][10:]]
+    assert len(information) == 21
+    assert information[0] == pytest.approx(1 / 0.05**2)
+    np.testing.assert_allclose([float(x) for x in edges[1][3:6]], [0, -1, 0], atol=1e-9)
+    # the closure: x of the target is -y of the query, so the query's y is the sure one
+    closure = [float(x) for x in edges[3][3:]]
+    np.testing.assert_allclose(closure[:7], [1, 2, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-9)
+    full = np.zeros((6, 6))
+    full[np.triu_indices(6)] = closure[7:]
+    np.testing.assert_allclose(np.diag(full), [1 / 0.04, 1 / 0.01, 1 / 0.09, 1 / 0.002, 1 / 0.001, 1 / 0.004])
+    np.testing.assert_allclose(full - np.diag(np.diag(full)), 0, atol=1e-9)
+
+
+def test_g2o_of_some_sessions_leaves_out_the_others(work: Workspace, tmp_path: Path) -> None:
+    _close(work)
+    (path,) = export(work, ["b"], "g2o", tmp_path)
+    assert path.read_text().count("EDGE") == 2
+    assert path.read_text().count("VERTEX") == 3
+
+
+def test_unknown_sessions_are_named(work: Workspace, tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match=r"no fused session c \(there are: a, b\)"):
+        export(work, ["c"], "tum", tmp_path)
+
+
+def test_files_of_the_workspace_are_not_touched(work: Workspace, tmp_path: Path) -> None:
+    before = {p: p.read_bytes() for p in work.path.rglob("*") if p.is_file()}
+    export(work, [], "tum", tmp_path / "out")
+    assert {p: p.read_bytes() for p in work.path.rglob("*") if p.is_file()} == before
+    assert json.loads(work.session("a").session_json.read_text())["voxel_size"] == 0.5

@@ -1,0 +1,178 @@
+"""Learning on tiny shards: what is trained, held out, resumed and written on the card."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file
+
+from semloc_logs import contracts
+from semloc_logs.engines import make_engine
+from semloc_logs.errors import SettingsError
+from semloc_logs.geometry import apply, yaw_transform
+from semloc_logs.learning import learn_descriptor, learn_vocabulary, session_shards
+from semloc_logs.settings import Settings, load
+from semloc_logs.subvolumes.own_sessions import session_frames, stretch_tasks
+from semloc_logs.subvolumes.pairs import read_shard, write_shard
+from semloc_logs.tables import write_json, write_table
+from semloc_logs.voxels.store import Keyframe, part_path, pose_columns, write_keyframes
+from semloc_logs.workspace import SessionFolder
+
+METADATA = {"schema_version": 1}
+
+
+def _settings(**training: Any) -> Settings:
+    return load(assignments={f"training.{k}": str(v) for k, v in training.items()}).resolved()
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
+    """Four shards of six pairs each: a floor, and walls at random places."""
+    folder, rng = tmp_path_factory.mktemp("shards"), np.random.default_rng(0)
+    paths = []
+    for n in range(4):
+        pairs = []
+        for _ in range(6):
+            world = np.full((64, 64, 32), 254, np.uint8)
+            world[:, :, 8] = 0
+            x, y = rng.integers(20, 40, 2)
+            world[x, :, 8:24] = 2
+            world[:, y, 8:16] = 8
+            part = np.where(rng.random(world.shape) < 0.5, 253, world).astype(np.uint8)
+            pairs.append((part, np.ascontiguousarray(world[16:-16, 16:-16]), world))
+        paths.append(folder / f"scene-{n}.parquet")
+        write_shard(paths[-1], pairs)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield paths
+    torch.set_num_threads(threads)
+
+
+def test_a_descriptor_is_learned_measured_and_described(shards: list[Path], tmp_path: Path) -> None:
+    settings, notes = _settings(samples=54, batch=2, seed=5), list[str]()
+    output, checkpoint = tmp_path / "geometric.safetensors", tmp_path / "checkpoint.safetensors"
+    scores = learn_descriptor("geometric", shards, settings, checkpoint, output, notes.append)
+    assert {"accuracy", "recall5"} <= set(scores)
+    assert all(0 <= s <= 1 for s in scores.values())
+    assert "54 of 54 samples" in notes[-1]
+    with safe_open(output, "pt") as handle:
+        card = handle.metadata()
+    assert json.loads(card["scores"]) == pytest.approx(scores)
+    assert (card["variant"], card["samples"], card["seed"], card["shards"]) == ("geometric", "54", "5", "4")
+    # the finished checkpoint is not trained again, and gives the same network
+    first, notes = load_file(output), []
+    assert learn_descriptor("geometric", shards, settings, checkpoint, output, notes.append) == pytest.approx(scores)
+    assert notes == []
+    assert all(torch.equal(tensor, first[name]) for name, tensor in load_file(output).items())
+
+
+def test_two_scenes_are_too_few(shards: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="at least 3"):
+        learn_descriptor("geometric", shards[:2], _settings(), tmp_path / "c", tmp_path / "w", lambda _: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_vocabulary_belongs_to_its_weights(shards: list[Path], tmp_path: Path) -> None:
+    settings = _settings(samples=36, batch=2)
+    weights = tmp_path / "geometric.safetensors"
+    learn_descriptor("geometric", shards, settings, tmp_path / "c.safetensors", weights, lambda _: None)
+    own = settings.model_copy(update={"descriptor": settings.descriptor.model_copy(update={"weights": weights})})
+    output = tmp_path / "words.safetensors"
+    # 24 pairs of nine descriptors are fewer than 256: three times the same shards are enough
+    with pytest.raises(SettingsError, match="256"):
+        learn_vocabulary("geometric", shards, own, output, 6)
+    assert learn_vocabulary("geometric", [*shards, *shards], own, output, 6) == 8 * 6 * 9
+    with safe_open(output, "np") as handle:
+        assert handle.metadata()["descriptors"] == "432"
+        assert handle.get_tensor("projection").shape == (64, 256)
+
+
+# -- sessions of one's own
+
+
+def _session(folder: SessionFolder, n: int, posed: bool = True) -> list[np.ndarray[Any, Any]]:
+    """A drive along x, 1 m a keyframe, between two walls; the points of each keyframe."""
+    rng = np.random.default_rng(3)
+    poses = np.array([yaw_transform(0.0, (float(k), 0.0, 1.5)) for k in range(n)])
+    clouds = []
+    for pose in poses:
+        x = pose[0, 3] + rng.uniform(-15, 15, 3000)
+        ground = np.stack([x, rng.uniform(-6, 6, 3000), np.zeros(3000)], 1)
+        walls = np.stack([x, np.where(rng.random(3000) < 0.5, -6.0, 6.0), rng.uniform(0, 5, 3000)], 1)
+        clouds.append((np.concatenate([ground, walls]) - pose[:3, 3]).astype(np.float32))
+    label = np.repeat([0, 2], 3000).astype(np.uint8)
+    stamps = (np.arange(n) * 10**9).tolist()
+    frames = {
+        "keyframe": np.arange(n),
+        "stamp_ns": stamps,
+        "log_time_ns": stamps,
+        "topic": ["/points"] * n,
+        "posed": [posed] * n,
+        "distance": np.arange(n, dtype=float),
+        "ground_z": np.zeros(n),
+        "points": np.full(n, 6000),
+        "origin_x": np.full(n, 0.25, np.float32),
+        "origin_y": np.zeros(n, np.float32),
+        "origin_z": np.zeros(n, np.float32),
+        **pose_columns(poses),
+    }
+    write_table(folder.frames, contracts.table("frames", frames), METADATA)
+    folder.keyframes.mkdir()
+    for first in range(0, n, 64):
+        part = range(first, min(first + 64, n))
+        write_keyframes(
+            part_path(folder.keyframes, first), first, [stamps[k] for k in part], (Keyframe(clouds[k], label) for k in part), METADATA
+        )
+    write_json(folder.session_json, {"posed": posed})
+    return clouds
+
+
+def test_session_frames_are_the_keyframes(tmp_path: Path) -> None:
+    folder = SessionFolder(tmp_path / "sessions/drive")
+    clouds = _session(folder, 70)
+    frames = session_frames(folder, 60, 68)
+    assert len(frames) == 8
+    np.testing.assert_allclose(frames[5].points, clouds[65], atol=0.002)
+    np.testing.assert_allclose(frames[5].map_T_base, yaw_transform(0.0, (65.0, 0.0, 1.5)))
+    np.testing.assert_allclose(frames[5].origin, (0.25, 0, 0))
+    assert np.bincount(frames[5].label).tolist() == [3000, 0, 3000]
+    heights = apply(frames[5].map_T_base, frames[5].points)[:, 2]
+    assert heights[:3000].max() < 0.01
+    assert len(session_frames(folder)) == 70
+
+
+def test_stretches_cover_the_road_once(tmp_path: Path) -> None:
+    folder = SessionFolder(tmp_path / "sessions/drive")
+    _session(folder, 130)
+    tasks = stretch_tasks(tmp_path / "shards", [folder], load().resolved())
+    assert [t.last - t.first for t in tasks][:2] == [61, 61]
+    assert tasks[-1].last == 130
+    assert len({t.shard for t in tasks}) == len(tasks)
+
+
+def test_sessions_become_shards_of_pairs_once(tmp_path: Path) -> None:
+    folder = SessionFolder(tmp_path / "sessions/drive")
+    _session(folder, 12)
+    settings = load().resolved()
+    (shard,) = session_shards(tmp_path / "shards", [folder], settings, make_engine("serial"), lambda _: None)
+    part, whole, other = read_shard(shard)
+    assert len(part) == len(whole) == len(other) > 20
+    assert {0, 2, 254} <= set(np.unique(whole).tolist())
+    written = shard.stat().st_mtime_ns
+    session_shards(tmp_path / "shards", [folder], settings, make_engine("serial"), lambda _: None)
+    assert shard.stat().st_mtime_ns == written
+    other_voxels = load(assignments={"fusion.voxel_size": "0.2"}).resolved()
+    assert session_shards(tmp_path / "shards", [folder], other_voxels, make_engine("serial"), lambda _: None) != [shard]
+
+
+def test_sessions_without_poses_teach_nothing(tmp_path: Path) -> None:
+    folder = SessionFolder(tmp_path / "sessions/drive")
+    _session(folder, 12, posed=False)
+    assert session_frames(folder) == []
+    with pytest.raises(SettingsError, match="poses"):
+        session_shards(tmp_path / "shards", [folder], load().resolved(), make_engine("serial"), lambda _: None)
