@@ -294,8 +294,13 @@ def test_inspect_says_3_when_data_are_lost(tmp_path: Path, monkeypatch: pytest.M
 )
 def test_commands_that_open_a_log_repair_it_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], code: int) -> None:
     repaired: list[Path] = []
+
+    def recover(path: Path) -> bool:
+        repaired.append(path)
+        return False
+
     for module in ("semloc_logs.logs.annotate", "semloc_logs.stages"):
-        monkeypatch.setattr(f"{module}.recover", lambda path: bool(repaired.append(path)))
+        monkeypatch.setattr(f"{module}.recover", recover)
     log = _log(tmp_path / "a.mcap")
     done = semloc(*(a.format(log=log, work=tmp_path / "w") for a in args))
     assert done.exit_code == code

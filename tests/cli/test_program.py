@@ -32,15 +32,14 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
     """A program whose command 'run' raises what the test says."""
 
     def make(problem: BaseException | int) -> None:
-        @click.command(cls=Command)
-        @console_options
-        def command() -> int:
+        def answer() -> int:
             console.note("working")
             console.result("answer")
             if isinstance(problem, BaseException):
                 raise problem
             return problem
 
+        command = click.command("run", cls=Command)(console_options(answer))
         monkeypatch.setattr(main_module.Program, "get_command", lambda *_: command)
 
     return make
