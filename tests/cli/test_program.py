@@ -39,7 +39,8 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
                 raise problem
             return problem
 
-        command = click.command("run", cls=Command)(console_options(answer))
+        decorate: Any = click.command("run", cls=Command)
+        command = decorate(console_options(answer))
         monkeypatch.setattr(main_module.Program, "get_command", lambda *_: command)
 
     return make
