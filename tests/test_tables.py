@@ -35,9 +35,14 @@ def test_a_file_is_replaced_at_the_end_of_the_block(tmp_path: Path) -> None:
 def test_an_exception_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("old")
-    with pytest.raises(RuntimeError, match="stop"), replacing_file(path) as temporary:
-        temporary.write_text("half")
-        raise RuntimeError("stop")
+
+    def half() -> None:
+        with replacing_file(path) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        half()
     assert path.read_text() == "old"
     assert not leftovers(tmp_path)
 
@@ -57,9 +62,14 @@ def test_an_exception_leaves_the_old_folder(tmp_path: Path) -> None:
     path = tmp_path / "folder"
     path.mkdir()
     (path / "a").write_text("old")
-    with pytest.raises(RuntimeError, match="stop"), replacing_folder(path) as temporary:
-        (temporary / "a").write_text("half")
-        raise RuntimeError("stop")
+
+    def half() -> None:
+        with replacing_folder(path) as temporary:
+            (temporary / "a").write_text("half")
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        half()
     assert (path / "a").read_text() == "old"
     assert not leftovers(tmp_path)
 
@@ -183,7 +193,8 @@ def test_every_contract_is_a_schema() -> None:
 
 
 def test_the_columns_of_closures_are_those_promised() -> None:
-    names = "query_session target_session query_stamp_ns target_stamp_ns t_x t_y t_z q_x q_y q_z q_w covariance overlap probability inliers words"
+    names = "query_session target_session query_stamp_ns target_stamp_ns t_x t_y t_z q_x q_y q_z q_w "
+    names += "covariance overlap probability inliers words"
     schema = contracts.schema("closures")
     assert schema.names == names.split()
     assert schema.field("covariance").type == pa.list_(pa.float64(), 36)

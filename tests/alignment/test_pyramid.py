@@ -24,9 +24,9 @@ COARSE = cityscapes().coarse
 def block_map(cells: dict[Cell, int]) -> BlockMap:
     """A map with these voxel states."""
     blocks: dict[Cell, U8] = {}
-    for ijk, state in cells.items():
+    for ijk, value in cells.items():
         block = tuple(c // BLOCK for c in ijk)
-        blocks.setdefault(block, np.full((BLOCK,) * 3, UNOBSERVED_STATE, np.uint8))[tuple(c % BLOCK for c in ijk)] = state
+        blocks.setdefault(block, np.full((BLOCK,) * 3, UNOBSERVED_STATE, np.uint8))[tuple(c % BLOCK for c in ijk)] = value
     if not blocks:
         return empty_map()
     keys = pack(np.array(list(blocks)))
@@ -113,7 +113,7 @@ def test_tau_of_a_map_with_itself_and_with_nothing() -> None:
     blocks = block_map(cells)
     n = sum(occupied(s) for s in cells.values())
     assert tau(blocks, blocks, V, np.eye(4), 3.0) == (1.0, n)
-    shifted = block_map({tuple(np.array(c) + [3, -40, 7]): s for c, s in cells.items()})
+    shifted = block_map({tuple((np.array(c) + np.array([3, -40, 7])).tolist()): s for c, s in cells.items()})
     assert tau(blocks, shifted, V, yaw_transform(0.0, (3 * V, -40 * V, 7 * V)), 3.0) == (1.0, n)
     for query, target in ((empty_map(), blocks), (blocks, empty_map()), (block_map({(0, 0, 0): 254}), blocks)):
         assert tau(query, target, V, np.eye(4), 3.0) == (0.0, 0)
@@ -170,14 +170,15 @@ def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
     query = Query(block_map(query_cells), points_of(query_cells), V)
     assert query.evidence.weights.sum() == pytest.approx(1)
     start = np.array([yaw + 0.12, 3.3 + 1.1, -2.1 - 0.9, 0.4 + 0.4])
-    steps = np.array([-1.0, 0.0, 1.0])
-    score, pose = search(target.pyramid[2], query.evidence, start, (-0.12, 0.0, 0.12), 1.0 * steps, 0.5 * steps)
-    score, pose = search(target.pyramid[0], query.evidence, pose, np.linspace(-0.1, 0.1, 9), 0.5 * steps, 0.25 * steps)
+    steps = (-1.0, 0.0, 1.0)
+    half, quarter = tuple(0.5 * s for s in steps), tuple(0.25 * s for s in steps)
+    score, pose = search(target.pyramid[2], query.evidence, start, (-0.12, 0.0, 0.12), steps, half)
+    score, pose = search(target.pyramid[0], query.evidence, pose, np.linspace(-0.1, 0.1, 9).tolist(), half, quarter)
     assert score > 0.9
     found = pose_matrix(pose)
     assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 2.5 * V
     assert yaw_between(found, truth) < np.radians(5)
-    away, _ = search(target.pyramid[0], query.evidence, start + [0.5, 4, 4, 2], (0.0,), (0.0,), (0.0,))
+    away, _ = search(target.pyramid[0], query.evidence, start + np.array([0.5, 4, 4, 2]), (0.0,), (0.0,), (0.0,))
     assert away < 0.7 * score
 
     wrong = [Hypothesis(0, (yaw + 1.2 * k, 9.0 - k, 6.0 * k, 0.0), 3, 1.0) for k in (1, 2, 3)]
@@ -195,7 +196,7 @@ def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
 
 def test_structure_scores_by_hand() -> None:
     target = Target(block_map({(0, 0, 0): 2, (0, 0, 1): 254, (4, 0, 0): 254, (8, 0, 0): 8}), V)
-    query_cells = {
+    query_cells: dict[Cell, int] = {
         (0, 0, 0): 2,  # on its class
         (1, 0, 0): 2,  # beside it
         (4, 0, 0): 5,  # in free space

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from semloc_logs import contracts
@@ -87,7 +86,7 @@ def test_members_beyond_a_jump_are_left_out(tmp_path: Path) -> None:
 def test_the_query_map_lies_around_its_keyframe(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     poses = np.array([yaw_transform(0.5, (1000.0 + 0.5 * i, 50.0, 3.0)) for i in range(5)])
-    clouds = [rng.uniform(-40, 40, (400, 3)).astype(np.float32) * np.float32([1, 1, 0.1]) for _ in range(5)]
+    clouds = [rng.uniform(-40, 40, (400, 3)).astype(np.float32) * np.array([1, 1, 0.1], np.float32) for _ in range(5)]
     s = session(tmp_path, poses, clouds)
     query, query_T_base = build_query(s, 2, settings(radius=20.0))
     np.testing.assert_allclose(query_T_base, yaw_transform(0.5), atol=1e-12)

@@ -17,7 +17,7 @@ from semloc_logs.tables import read_metadata, read_table
 SECOND = 10**9
 # three sessions along the same road, a keyframe every metre
 ROAD = np.c_[np.arange(100.0), np.zeros(100), np.zeros(100)]
-POSITIONS = {"a": ROAD, "b": ROAD + [0, 500, 0], "c": ROAD}
+POSITIONS = {"a": ROAD, "b": ROAD + np.array([0, 500, 0]), "c": ROAD}
 
 
 def alignment(query: str, i: int, target: str, j: int, probability: float = 0.995, **more: Any) -> Alignment:

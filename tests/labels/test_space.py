@@ -12,8 +12,11 @@ INTEGERS = [np.uint8, np.int16, np.uint32, np.int64]
 
 def test_cityscapes_has_its_19_classes_in_order() -> None:
     space = cityscapes()
-    names = "road sidewalk building wall fence pole,traffic light,traffic sign,vegetation terrain sky person rider car truck bus train motorcycle bicycle"
-    assert " ".join(space.names) == names.replace(",", " ")
+    names = (
+        "road sidewalk building wall fence pole traffic_light traffic_sign vegetation terrain sky "
+        "person rider car truck bus train motorcycle bicycle"
+    )
+    assert space.names == tuple(n.replace("_", " ") for n in names.split())
     assert space.names[SKY] == "sky"
     assert [space.names[i] for i in (BUILDING, POLE, VEGETATION)] == ["building", "pole", "vegetation"]
     assert np.flatnonzero(space.dynamic).tolist() == list(range(11, 19))

@@ -1,8 +1,9 @@
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -38,15 +39,11 @@ def world(seed: int = 0, size: tuple[int, int, int] = (56, 48, 40)) -> U8:
     return s
 
 
-@contextmanager
+@contextlib.contextmanager
 def full_precision() -> Iterator[None]:
     """describe_map with its autocast switched off."""
-    before = describe.torch.autocast
-    describe.torch.autocast = lambda *a, **k: before("cpu", enabled=False)  # type: ignore[misc, assignment]
-    try:
+    with mock.patch.object(torch, "autocast", return_value=contextlib.nullcontext()):
         yield
-    finally:
-        describe.torch.autocast = before  # type: ignore[misc]
 
 
 def one_by_one(state: U8, found: Described, encoder: Encoder) -> NDArray[np.float32]:
@@ -110,7 +107,7 @@ def test_a_map_described_in_other_words_of_its_own_position() -> None:
     """Descriptors follow the content, not the coordinates; a shift by whole strides moves the centres."""
     state, encoder = world(), random_encoder("geometric")
     a = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
-    b = describe_map(state, LOW + [800, -160, 24], (12 - 16 + 24) * V, V, encoder, 8, 40)
+    b = describe_map(state, LOW + np.array([800, -160, 24]), (12 - 16 + 24) * V, V, encoder, 8, 40)
     np.testing.assert_array_equal(a.descriptor, b.descriptor)
     np.testing.assert_array_equal(a.centre + np.array([800, -160, 24]), b.centre)
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import Settings, Training
 from semloc_logs.subvolumes import training
-from semloc_logs.subvolumes.cut import code_table
-from semloc_logs.subvolumes.pairs import BROAD, SIZE, SceneFrame, cut_pairs, occupied, read_shard, write_shard
+from semloc_logs.subvolumes.cut import SIZE, code_table
+from semloc_logs.subvolumes.pairs import BROAD, SceneFrame, cut_pairs, occupied, read_shard, write_shard
 from semloc_logs.subvolumes.training import Progress, _batches, _seen, _targets, completion_scores, train
 
 U8 = NDArray[np.uint8]
@@ -185,7 +185,7 @@ def test_pairs_are_cut_from_the_same_place() -> None:
         T = np.eye(4)
         T[:3, 3] = x, 0, 1.7
         some = rng.random(len(world)) < 0.4
-        frames.append(SceneFrame(world[some] - np.float32([x, 0, 1.7]), np.zeros(3, np.float32), label[some], T))
+        frames.append(SceneFrame(world[some] - np.array([x, 0, 1.7], np.float32), np.zeros(3, np.float32), label[some], T))
     settings = Training(shift=0.0, turn=0.0)
     pairs = cut_pairs(frames, fusion, settings, np.random.default_rng(1))
     assert len(pairs) > 10

@@ -1,11 +1,10 @@
 from __future__ import annotations
 
+import json
 import math
 import shutil
 import tempfile
 from pathlib import Path
-
-import json
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ SHARED = Path(__file__).resolve().parents[3] / "shared"
 def noisy(rng: np.random.Generator, direction: F64, n: int, degrees: float) -> F64:
     """Unit normals scattered around a direction, of random sign."""
     v = direction + rng.normal(0, np.radians(degrees), (n, 3))
-    return v / np.linalg.norm(v, axis=1, keepdims=True) * rng.choice([-1.0, 1.0], (n, 1))
+    return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True) * rng.choice([-1.0, 1.0], (n, 1)))
 
 
 def degrees_between(a: F64, b: F64) -> float:
@@ -92,7 +91,7 @@ def test_ground_height(scale: float) -> None:
     far = np.c_[rng.uniform(30, 40, (9000, 2)), np.full(9000, -3.0)]  # down the hill
     points = scale * np.concatenate([ground, house, below, far])
     assert ground_height(points, 0.0, scale) == pytest.approx(-1.73 * scale, abs=0.02 * scale)
-    assert ground_height(points + [0, 0, 7.0], 7.0, scale) == pytest.approx(7 - 1.73 * scale, abs=0.02 * scale)
+    assert ground_height(points + np.array([0, 0, 7.0]), 7.0, scale) == pytest.approx(7 - 1.73 * scale, abs=0.02 * scale)
     assert ground_height(np.zeros((0, 3)), 2.0, scale) == pytest.approx(2 - 1.7 * scale)
     few = scale * np.c_[np.zeros((50, 2)), np.linspace(-2, 0, 50)]
     assert ground_height(few, 0.0, scale) == pytest.approx(np.percentile(few[:, 2], 2))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,11 @@ from semloc_logs.voxels.carve import FREE, HIT, carve
 from semloc_logs.voxels.grid import FREE_STATE, UNLABELLED, UNOBSERVED_STATE, BlockMap, Fuser
 from semloc_logs.voxels.keys import BLOCK
 
-Cell = tuple[int, int, int]
+Cell = tuple[int, ...]
 Frame = tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]
 
 
-def fusion(voxel: float = 0.5, reach: float = 6.0, **more: float) -> Fusion:
+def fusion(voxel: float = 0.5, reach: float = 6.0, **more: Any) -> Fusion:
     return Settings(fusion=Fusion(voxel_size=voxel, max_range=reach, **more)).resolved().fusion
 
 
@@ -38,7 +39,8 @@ def as_dictionary(blocks: BlockMap) -> dict[Cell, tuple[int, int, int]]:
         corner = one.bounds()[0]
         for cell in np.argwhere(one.log_odds.reshape(shape) != -128):
             at = tuple(cell)
-            out[tuple((cell + corner).tolist())] = tuple(int(a.reshape(shape)[at]) for a in (one.log_odds, one.state, one.hits))
+            odds, state, hits = (int(a.reshape(shape)[at]) for a in (one.log_odds, one.state, one.hits))
+            out[tuple((cell + corner).tolist())] = odds, state, hits
         assert (one.state[one.log_odds == -128] == UNOBSERVED_STATE).all()
     assert len(low) == len(high)
     return out

@@ -149,7 +149,7 @@ def test_the_session_map_in_duckdb_and_polars(tmp_path: Path) -> None:
     total = write_voxels(tmp_path / "voxels", submaps, METADATA)
     expected = union(submaps).values()
     mean = np.mean([odds / 20 for _, odds, _ in expected])
-    rows = duckdb.sql(f"select count(*), avg(occupancy), sum(hits) from '{tmp_path}/voxels/**/*.parquet'").fetchall()
+    rows = duckdb.connect().execute(f"select count(*), avg(occupancy), sum(hits) from '{tmp_path}/voxels/**/*.parquet'").fetchall()
     assert rows[0][0] == total
     assert rows[0][1] == pytest.approx(mean, rel=1e-6)
     assert rows[0][2] == sum(h for *_, h in expected)
@@ -168,7 +168,7 @@ def test_a_session_map_without_voxels_is_a_table_without_rows(submaps: Any, tmp_
         submaps = [fuser.finish()]
         assert (submaps[0].state == FREE_STATE).any()
     assert write_voxels(tmp_path / "voxels", submaps, METADATA) == 0
-    assert duckdb.sql(f"select count(*) from '{tmp_path}/voxels/**/*.parquet'").fetchall() == [(0,)]
+    assert duckdb.connect().execute(f"select count(*) from '{tmp_path}/voxels/**/*.parquet'").fetchall() == [(0,)]
     assert read_metadata(next((tmp_path / "voxels").rglob("*.parquet"))) == METADATA
 
 
