@@ -41,7 +41,7 @@ class Fusion(_Section):
         None, gt=0, description="keyframes keep one point a cell of this size (m); default a third of a voxel"
     )
     submap_length: float | None = Field(None, gt=0, description="length of road in a submap (m); default 100 m at 0.30 m voxels")
-    submap_overlap: float = Field(0.5, ge=0.0, lt=1.0, description="share of a submap that the next one repeats")
+    submap_overlap: float = Field(0.25, ge=0.0, lt=1.0, description="share of a submap that the next one repeats")
     hit: float = Field(0.85, ge=0.05, le=6, description="log-odds added to a voxel that a ray ends in")
     miss: float = Field(0.40, ge=0.05, le=6, description="log-odds taken from a voxel that a ray passes")
     clamp: tuple[float, float] = Field((-2.0, 3.5), description="bounds of the log-odds (OctoMap), within +-6")
@@ -70,6 +70,7 @@ class Descriptor(_Section):
     )
     stride: Literal[4, 8] = Field(4, description="database subvolumes every so many voxels in x and y (4 or 8)")
     query_stride: Literal[4, 8] = Field(8, description="query subvolumes every so many voxels in x and y (4 or 8)")
+    reach: float | None = Field(None, description="database subvolumes lie this near to the road (m); default 30 m at 0.30 m voxels")
     min_occupied: int = Field(40, ge=1, description="subvolumes with fewer occupied voxels are not described")
     weights: Path | None = Field(None, description="safetensors file instead of the shipped weights")
     vocabulary: Path | None = Field(None, description="safetensors file instead of the shipped vocabulary")
@@ -155,10 +156,12 @@ class Settings(BaseSettings):
             submap_length=100 * scale,
         )
         query = fill(self.query, every=2 * scale, radius=24 * scale)
+        descriptor = fill(self.descriptor, reach=30 * scale)
         closures = fill(self.closures, exclude_distance=50 * scale)
         return self.model_copy(
             update={
                 "fusion": self.fusion.model_copy(update=fusion),
+                "descriptor": self.descriptor.model_copy(update=descriptor),
                 "query": self.query.model_copy(update=query),
                 "closures": self.closures.model_copy(update=closures),
             }

@@ -129,41 +129,35 @@ def _fingerprint(path: Path) -> str | None:
 def describe(work: Workspace, names: Sequence[str], settings: Settings, engine: Engine, note: Note, overwrite: bool = False) -> Report:
     """Maps -> semantic words, for the sessions ``names`` (all if empty)."""
     report = Report()
-    for folder in _sessions(work, names):
+    folders = _sessions(work, names)
+    sources = {f.name: str(read_json(f.session_json)["label_source"]) for f in folders}
+    for folder in folders:
         session = read_json(folder.session_json)
+        variants = variants_for(sources[folder.name], sources.values(), settings)
         voxel_settings = session["settings"]["fusion"]["voxel_size"]
         if voxel_settings != settings.fusion.voxel_size:
             raise WorkspaceError(
                 f"Session {folder.name} was fused with voxels of {voxel_settings} m, the settings say {settings.fusion.voxel_size} m: "
                 f"give --set fusion.voxel_size={voxel_settings}, or fuse it again."
             )
-        fingerprint = _hash(session["fingerprint"], settings.fingerprint("descriptor"), _weights(settings))
+        fingerprint = _hash(session["fingerprint"], settings.fingerprint("descriptor"), _weights(settings), *variants)
         if not overwrite and _fingerprint(folder.words_json) == fingerprint:
             report.kept.append(folder.name)
             continue
         folder.words_json.unlink(missing_ok=True)
         keys = ("schema_version", "voxel_size", "session_T_map", "label_space", "label_source", "version")
         metadata = {k: session[k] for k in keys}
+        road = SessionMap(folder).road
         with replacing_folder(folder.words) as output:
             tasks = [
-                DescribeTask(
-                    folder,
-                    s["id"],
-                    s["ground_z"],
-                    variants_for(session["label_source"], settings),
-                    blocks_path(output, s["id"]),
-                    metadata,
-                    settings,
-                )
+                DescribeTask(folder, s["id"], s["ground_z"], road(s), variants, blocks_path(output, s["id"]), metadata, settings)
                 for s in session["submaps"]
             ]
             words = sum(engine.map(index_submap, tasks))
             if not tasks:
                 write_words(blocks_path(output, 0), 0, [], metadata)
-        write_json(
-            folder.words_json,
-            {"fingerprint": fingerprint, "words": words, "settings": settings.model_dump(mode="json", include={"descriptor"})},
-        )
+        used = settings.model_dump(mode="json", include={"descriptor"})
+        write_json(folder.words_json, {"fingerprint": fingerprint, "words": words, "variants": list(variants), "settings": used})
         report.done.append(folder.name)
         note(f"{folder.name}: {words} words")
     return report
@@ -201,9 +195,12 @@ def close(
 ) -> Report:
     """Words -> closures.parquet and rejected.parquet: every session of ``queries`` against all of ``targets`` (all if empty)."""
     asking, asked = _sessions(work, queries), _sessions(work, targets)
-    for folder in {f.name: f for f in (*asking, *asked)}.values():
-        if not folder.words_json.exists():
-            raise WorkspaceError(f"Session {folder.name} has no words yet: run 'semloc describe -w {work.path}' first.")
+    maps = {f.name: SessionMap(f) for f in (*asking, *asked)}
+    sources = [str(m.json["label_source"]) for m in maps.values()]
+    for name, m in maps.items():
+        wanted = set(variants_for(str(m.json["label_source"]), sources, settings))
+        if not m.folder.words_json.exists() or not wanted <= set(read_json(m.folder.words_json)["variants"]):
+            raise WorkspaceError(f"Session {name} lacks {' and '.join(sorted(wanted))} words: run 'semloc describe -w {work.path}' first.")
     inputs = [f"{f.name} {_fingerprint(f.words_json)}" for f in (*asking, *asked)]
     sections = ("fusion", "labels", "descriptor", "query", "closures")
     fingerprint = _hash(settings.fingerprint(*sections), str(self_closures), repr(len(asking)), *inputs)
@@ -217,7 +214,6 @@ def close(
         report.kept.append("closures")
         report.closures = len(read_closures(work.closures))
         return report
-    maps = {f.name: SessionMap(f) for f in (*asking, *asked)}
     tasks = []
     for folder in asking:
         others = tuple(sorted(f.name for f in asked if self_closures or f.name != folder.name))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.verify import Query, thin_points
 from semloc_logs.geometry import apply, inverse, rotation_angle
 from semloc_logs.settings import Settings
+from semloc_logs.subvolumes.describing import KNOWS_CLASSES
 from semloc_logs.tables import read_json, read_table
 from semloc_logs.voxels.fusing import fuse_keyframes
 from semloc_logs.voxels.store import poses_of, read_keyframe
@@ -64,10 +65,14 @@ class SessionMap:
     def submaps(self) -> list[dict[str, Any]]:
         return list(self.json["submaps"])
 
+    def road(self, submap: dict[str, Any]) -> F64:
+        """Positions (m, 2) of a submap's keyframes in the map frame, metres."""
+        return self.map_T_base[submap["first"] : submap["last"] + 1, :2, 3]
+
     @property
     def has_classes(self) -> bool:
         """Whether labels come from a log or a model, so that the semantic network understands them."""
-        return self.json["label_source"] in ("log", "onnx")
+        return self.json["label_source"] in KNOWS_CLASSES
 
 
 def query_keyframes(session: SessionMap, settings: Settings) -> list[int]:

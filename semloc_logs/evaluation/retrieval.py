@@ -12,7 +12,7 @@ from semloc_logs.geometry import inverse
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import turn
 from semloc_logs.subvolumes.describe import Described, describe_map
-from semloc_logs.subvolumes.describing import describe_submap_with
+from semloc_logs.subvolumes.describing import describe_submap
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.words.index import Index
 from semloc_logs.words.vocabulary import Vocabulary, train_vocabulary
@@ -48,7 +48,7 @@ def word_recall(
     Without a ``vocabulary`` one is trained on the database's own descriptors.
     """
     v = settings.fusion.voxel_size
-    parts = [describe_submap_with(target.folder, s["id"], s["ground_z"], encoder, settings) for s in target.submaps]
+    parts = [describe_submap(target.folder, s["id"], s["ground_z"], target.road(s), encoder, settings) for s in target.submaps]
     centre = np.concatenate([p.centre for p in parts]) * v
     descriptor = np.concatenate([p.descriptor for p in parts])
     asked, target_T_asked = _query_words(query, keyframe, targetmap_T_querymap, settings, encoder)

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load_file
+from scipy.spatial import cKDTree
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import STREET_VOXEL
@@ -90,11 +91,20 @@ def _layers(filled: NDArray[np.bool_], bottom: int, stride: int) -> NDArray[np.i
 
 @torch.inference_mode()
 def describe_map(
-    state: U8, low: NDArray[np.integer], ground_z: float, voxel_size: float, encoder: Encoder, stride: int, min_occupied: int
+    state: U8,
+    low: NDArray[np.integer],
+    ground_z: float,
+    voxel_size: float,
+    encoder: Encoder,
+    stride: int,
+    min_occupied: int,
+    road: NDArray[np.floating] | None = None,
+    reach: float = np.inf,
 ) -> Described:
     """Describe the box ``state`` (x, y, z) of voxel states whose corner is voxel ``low`` of the map; ``ground_z`` in metres.
 
-    ``stride`` is 4 or 8 voxels. Positions are multiples of it in the map's voxel grid only if ``low`` is.
+    ``stride`` is 4 or 8 voxels. Positions are multiples of it in the map's voxel grid only if ``low`` is. With a ``road`` (m, 2), metres,
+    only subvolumes whose centre lies within ``reach`` metres of it are described.
     """
     filled = occupied(state)
     if stride not in (4, 8):
@@ -119,13 +129,16 @@ def describe_map(
     table = code_table(encoder.variant)
     centres, found = [], []
     has_enough = _window_sums(filled_columns, stride) >= min_occupied
+    if road is not None:
+        corners = np.moveaxis(np.indices(has_enough.shape), 0, -1) * stride + first + np.asarray(low)[:2]
+        has_enough &= cKDTree(road).query((corners + SIZE / 2) * voxel_size, distance_upper_bound=reach)[0] < reach
     values, counts = np.unique(layer[has_enough], return_counts=True)
     for index in values[counts >= RARE * counts.sum()]:
         z = bottom + LAYER * int(index)
         if z < 0 or z + SIZE > height:
             continue
         enough = _window_sums(inner[:, :, z : z + SIZE].sum(2, dtype=np.int64), stride) >= min_occupied
-        wanted = np.argwhere(enough & (layer == index)) * stride  # corners of the windows within the inner box
+        wanted = np.argwhere(enough & has_enough & (layer == index)) * stride  # corners of the windows within the inner box
         if not len(wanted):
             continue
         codes = table[box[:, :, z : z + SIZE]]

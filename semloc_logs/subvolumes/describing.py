@@ -2,46 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from semloc_logs.settings import Settings
-from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
+from semloc_logs.subvolumes.describe import Described, describe_map
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.voxels.store import blocks_path, read_blocks
 from semloc_logs.workspace import SessionFolder
 
+KNOWS_CLASSES = ("log", "onnx")  # label sources that the semantic network understands
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, eq=False)
 class DescribeTask:
     """One submap to describe; picklable."""
 
     folder: SessionFolder
     submap: int
     ground_z: float
+    road: NDArray[np.float64]
     variants: tuple[str, ...]
     output: Path
     metadata: dict[str, Any]
     settings: Settings  # resolved
 
 
-def describe_submap(folder: SessionFolder, submap: int, ground_z: float, variant: str, settings: Settings) -> Described:
-    """Centres (voxels) and descriptors of every described subvolume of a submap, by the encoder of ``variant``."""
-    return describe_submap_with(folder, submap, ground_z, load_encoder(variant, settings.descriptor.weights), settings)
-
-
-def describe_submap_with(folder: SessionFolder, submap: int, ground_z: float, encoder: Encoder, settings: Settings) -> Described:
-    """As :func:`describe_submap`, by any encoder."""
+def describe_submap(
+    folder: SessionFolder, submap: int, ground_z: float, road: NDArray[np.floating], encoder: Encoder, settings: Settings
+) -> Described:
+    """Centres (voxels) and descriptors of every described subvolume of a submap, near the keyframes' positions ``road`` (m, 2), metres."""
     blocks = read_blocks(blocks_path(folder.blocks, submap))
     low, high = blocks.bounds()
     state = blocks.dense(low, tuple((high - low).tolist()))
     d = settings.descriptor
-    return describe_map(state, low, ground_z, settings.fusion.voxel_size, encoder, d.stride, d.min_occupied)
+    return describe_map(state, low, ground_z, settings.fusion.voxel_size, encoder, d.stride, d.min_occupied, road, d.reach or np.inf)
 
 
-def variants_for(label_source: str, settings: Settings) -> tuple[str, ...]:
-    """Networks that describe a session: the geometric one always, the semantic one where classes come from a log or a model."""
+def variants_for(label_source: str, others: Iterable[str], settings: Settings) -> tuple[str, ...]:
+    """Networks that describe a session among ``others`` (their label sources).
+
+    Semantic where classes come from a log or a model, geometric elsewhere, and both where it must be comparable with either kind.
+    """
     if settings.descriptor.variant != "auto":
         return (settings.descriptor.variant,)
-    return ("geometric", "semantic") if label_source in ("log", "onnx") else ("geometric",)
+    if label_source not in KNOWS_CLASSES:
+        return ("geometric",)
+    return ("semantic",) if all(o in KNOWS_CLASSES for o in others) else ("geometric", "semantic")

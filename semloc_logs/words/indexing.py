@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs import contracts
+from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.describing import DescribeTask, describe_submap
 from semloc_logs.tables import write_table
 from semloc_logs.words.vocabulary import load_vocabulary
@@ -21,7 +22,8 @@ def index_submap(task: DescribeTask) -> int:
     """Write the words of one submap in all of the task's variants; returns their number."""
     parts: list[Part] = []
     for variant in task.variants:
-        described = describe_submap(task.folder, task.submap, task.ground_z, variant, task.settings)
+        encoder = load_encoder(variant, task.settings.descriptor.weights)
+        described = describe_submap(task.folder, task.submap, task.ground_z, task.road, encoder, task.settings)
         word, code = load_vocabulary(variant, task.settings.descriptor.vocabulary).words(described.descriptor)
         parts.append((variant, described.centre * task.settings.fusion.voxel_size, word, code))
     return write_words(task.output, task.submap, parts, task.metadata)
