@@ -29,6 +29,7 @@ ORDER = [
     "engines",
     "learning",
     "stages",
+    "profiling",
 ]
 # the words are learned from descriptors, and a submap's words are written in one task: words may look at subvolumes, not the reverse
 SOURCES = sorted((ROOT / "semloc_logs").rglob("*.py"))

@@ -7,7 +7,7 @@ best and of the rejected alignments gives the probability.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +21,6 @@ from semloc_logs.alignment.verify import FEATURES
 from semloc_logs.closures.acceptance import fit_logistic
 from semloc_logs.closures.closing import Alignment, CloseTask, close_queries
 from semloc_logs.closures.queries import SessionMap, query_keyframes
-from semloc_logs.engines import Engine
 from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, TrueTrack, read_tum
 from semloc_logs.geometry import inverse, rotation_angle
 from semloc_logs.settings import Settings
@@ -29,6 +28,7 @@ from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
+Map = Callable[[Callable[[CloseTask], list[list[Alignment]]], Iterable[CloseTask]], Iterator[list[list[Alignment]]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +88,8 @@ def judge(a: Alignment, query: TrueTrack, target: TrueTrack) -> Judged:
     return Judged(a, float(np.linalg.norm((inverse(true) @ a.target_T_query)[:3, 3])), float(np.degrees(rotation_angle(turn))), nees)
 
 
-def collect(work: Workspace, logs: dict[str, Path], settings: Settings, engine: Engine, every: int) -> list[Judged]:
-    """All alignments of every ``every``-th query of every session with every other session."""
+def collect(work: Workspace, logs: dict[str, Path], settings: Settings, run: Map, every: int) -> list[Judged]:
+    """All alignments of every ``every``-th query of every session with every other session; ``run`` is an engine's ``map``."""
     tracks = {name: read_tum(log.with_suffix(".tum")) for name, log in logs.items()}
     tasks = []
     for name in logs:
@@ -97,7 +97,7 @@ def collect(work: Workspace, logs: dict[str, Path], settings: Settings, engine: 
         others = tuple(sorted(n for n in logs if n != name))
         tasks += [CloseTask(work.path.absolute(), name, (k,), others, settings.model_dump_json()) for k in keyframes]
     out = []
-    for task, results in zip(tasks, engine.map(close_queries, tasks), strict=True):
+    for task, results in zip(tasks, run(close_queries, tasks), strict=True):
         for a in results[0]:
             same_town = a.target_session.split("_")[0] == task.session.split("_")[0]
             wrong = Judged(a, np.inf, 180.0, np.inf)

@@ -14,13 +14,13 @@ from google.protobuf import descriptor_pb2
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from semloc_logs.schemas import read_text
 
 from semloc_logs.errors import ContractError
 from semloc_logs.geometry import transform, yaw_transform
 from semloc_logs.logs.amend import NewChannel, NewMessage
 from semloc_logs.logs.channels import COLUMNS, TOPICS, ClosureRecord, Encoding, LogFacts, channel_metadata, encode, run_id
 from semloc_logs.logs.channels_foxglove import loop_closure_class
+from semloc_logs.schemas import read_text
 
 ENCODINGS: list[Encoding] = ["ros2", "ros1", "protobuf", "json"]
 COVARIANCE = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
