@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 import click
 
 from semloc_logs import __version__
+from semloc_logs.engines.engine import single_threaded
 from semloc_logs.errors import SemlocError, SettingsError
 
 from .console import console
@@ -62,6 +63,7 @@ class Program(click.Group):
     def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **__: Any) -> NoReturn:
         """Run and exit with the code that DESIGN promises."""
         console.reset()
+        single_threaded()
         warnings.simplefilter("ignore")  # numerical libraries' remarks are no sentences for a user
         before = None
         with suppress(ValueError):  # not in the main thread of an embedding program

@@ -48,7 +48,7 @@ class Serial:
 
 
 class Processes:
-    """``jobs`` worker processes (spawned, so that threads of the parent cannot hurt them), each with its share of the cores."""
+    """``jobs`` worker processes (spawned, so that threads of the parent cannot hurt them), one thread each."""
 
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs
@@ -57,8 +57,7 @@ class Processes:
     def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
-            share = max(1, cores() // self.jobs)
-            self._pool = ProcessPoolExecutor(self.jobs, context, initializer=_prepare_worker, initargs=(share,))
+            self._pool = ProcessPoolExecutor(self.jobs, context, initializer=_prepare_worker)
         waiting: deque[Future[Result]] = deque()
         try:
             for task in tasks:  # a bounded number of tasks in flight: their results may be large
@@ -105,15 +104,18 @@ def cores() -> int:
     return int(slurm) if slurm.isdigit() and int(slurm) else len(os.sched_getaffinity(0))
 
 
-def limit_threads(threads: int) -> None:
-    """Keep the thread pools of the numerical libraries within ``threads``; for workers, before they load any."""
+def single_threaded() -> None:
+    """One thread for each numerical library, unless the environment says otherwise; to be called before any of them is loaded.
+
+    Cores are used by processes: many small matrix products lose time by waking threads, and sums keep their order.
+    """
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[variable] = str(threads)
+        os.environ.setdefault(variable, "1")
 
 
-def _prepare_worker(threads: int) -> None:
+def _prepare_worker() -> None:
     """A worker leaves when told to (SIGTERM) or when its parent is gone, and leaves Ctrl-C to the parent."""
-    limit_threads(threads)
+    single_threaded()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
