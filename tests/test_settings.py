@@ -20,7 +20,7 @@ def test_defaults_file_environment_assignments_in_this_order(file: Path) -> None
     environment = {"SEMLOC_FUSION__HIT": "0.8", "SEMLOC_FUSION__MISS": "0.35", "PATH": "/bin", "SEMLOC_HOME": "x"}
     found = load(file, {"fusion.miss": "0.45", "labels.source": "uniform"}, environment)
     f = found.fusion
-    assert (f.submap_overlap, f.voxel_size, f.hit, f.miss) == (0.5, 0.2, 0.8, 0.45)
+    assert (f.clamp, f.voxel_size, f.hit, f.miss) == ((-2.0, 3.5), 0.2, 0.8, 0.45)
     assert found.query.frames == 3
     assert found.labels.source == "uniform"
     assert load() == Settings()

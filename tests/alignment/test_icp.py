@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.icp import Fit, align
+from semloc_logs.alignment.icp import Fit, Surface, _point_information, align
 from semloc_logs.alignment.verify import surface_of
 from semloc_logs.closures.closing import _covariance
 from semloc_logs.geometry import apply, exp_se3, inverse, rotation_angle, yaw_transform
@@ -96,6 +96,28 @@ def test_outliers_are_not_followed() -> None:
     found = align(query, target, SMALL, RADII, 20)
     assert error(found.target_T_query, np.eye(4))[0] < 0.01
     assert 0.5 < found.inliers < 0.95
+
+
+def test_information_of_point_distances_is_that_of_numerical_differences() -> None:
+    rng = np.random.default_rng(0)
+    arm, weight = rng.normal(1, 2, (9, 3)), rng.uniform(0.1, 1, 9)  # not about its mean, so that translation and rotation couple
+    expected = np.zeros((6, 6))
+    for a, w in zip(arm, weight, strict=True):
+        J = np.zeros((3, 6))
+        for k in range(6):
+            step = 1e-6 * np.eye(6)[k]
+            J[:, k] = (apply(exp_se3(step[:3], step[3:]), a[None])[0] - apply(exp_se3(-step[:3], -step[3:]), a[None])[0]) / 2e-6
+        expected += w * J.T @ J
+    np.testing.assert_allclose(_point_information(arm, weight), expected, atol=1e-6)
+
+
+def test_leaves_without_any_plane_hold_an_alignment_too() -> None:
+    rng = np.random.default_rng(1)
+    cloud = rng.uniform(-3, 3, (800, 3))
+    target = surface_of(cloud)
+    flat = Surface(target.points, target.normals, np.zeros(800), target.tree)
+    start = exp_se3(np.array([0.05, -0.04, 0.03]), np.array([0.01, 0.0, -0.02]))
+    assert error(align(cloud[::3], flat, start, (0.5, 0.3), 30).target_T_query, np.eye(4))[0] < 1e-3
 
 
 def test_nothing_to_align() -> None:

@@ -112,6 +112,20 @@ def test_a_map_described_in_other_words_of_its_own_position() -> None:
     np.testing.assert_array_equal(a.centre + np.array([800, -160, 24]), b.centre)
 
 
+def test_the_grid_is_that_of_the_map_wherever_the_content_starts() -> None:
+    """Positions are multiples of the stride from the map's corner, so that overlapping submaps describe the same places."""
+    state, encoder = world(), random_encoder("geometric")
+    state[:5], state[:, :3] = 253, 253
+    ground = (12 - 16) * V
+    a = describe_map(state, LOW, ground, V, encoder, 8, 40)
+    assert set(np.unique((a.centre[:, :2] - SIZE / 2 - LOW[:2]) % 8)) == {0.0}
+    more = np.pad(state, ((24, 16), (40, 8), (16, 0)), constant_values=253)
+    b = describe_map(more, LOW - np.array([24, 40, 16]), ground, V, encoder, 8, 40)
+    order_a, order_b = (np.lexsort(d.centre.T) for d in (a, b))
+    np.testing.assert_array_equal(a.centre[order_a], b.centre[order_b])
+    assert np.abs(a.descriptor[order_a] - b.descriptor[order_b]).max() < 1e-2
+
+
 @pytest.mark.parametrize(
     "state", [np.full((40, 40, 16), 254, np.uint8), np.full((16, 16, 16), 253, np.uint8), np.zeros((0, 0, 0), np.uint8)]
 )

@@ -84,6 +84,13 @@ def test_rays_along_an_axis_inside_cells_and_on_their_borders(axis: int, towards
     assert (np.delete(cells, axis, 1) == 5).all()
 
 
+@pytest.mark.parametrize(("x", "y", "last"), [(0.4045518398215282, 0.23064220899374743, 9), (0.5198330743342318, 0.3527434156964051, 8)])
+def test_rounding_does_not_carry_a_ray_past_its_last_cell(x: float, y: float, last: int) -> None:
+    """The end lies just before a border in x and on one in y, whose crossing times add up to a little more than one."""
+    grid = marked(np.array([x, y, 0.5]), np.array([np.nextafter(1, 0), float(last), 0.5]), True)
+    assert np.argwhere(grid).tolist() == [[0, j, 0] for j in range(last + 1)]
+
+
 def test_start_and_end_in_one_place() -> None:
     grid = marked(np.array([3.0, 4.5, 5.25]), np.array([3.0, 4.5, 5.25]), True)
     assert np.argwhere(grid).tolist() == [[3, 4, 5]]
