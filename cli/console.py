@@ -15,7 +15,7 @@ import click
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-_COUNTED = re.compile(r"(\d+) of (\d+)")
+_COUNTED = re.compile(r"(\d+) of (\d+)|\bread \d+")
 _PLAIN_SECONDS = 5.0  # between progress lines where nobody watches a bar
 
 
@@ -61,14 +61,20 @@ class Console:
     # -- stderr
 
     def note(self, message: str) -> None:
-        """What is going on; a message with 'N of M' in it is progress and may be left out."""
+        """What is going on; a message with 'N of M' or 'read N' in it is progress and may be left out."""
         if self.verbosity < 0:
             return
         counted = _COUNTED.search(message)
         if counted and self._bar is not None and self._task is not None:
-            self._bar.update(self._task, description=message, completed=int(counted[1]), total=int(counted[2]))
+            total = int(counted[2]) if counted[2] else None
+            self._bar.update(self._task, description=message, completed=int(counted[1] or 0), total=total)
             return
-        if counted and self.verbosity == 0 and counted[1] != counted[2] and time.monotonic() - self._spoke < _PLAIN_SECONDS:
+        if (
+            counted
+            and self.verbosity == 0
+            and (counted[1] is None or counted[1] != counted[2])
+            and time.monotonic() - self._spoke < _PLAIN_SECONDS
+        ):
             return
         if counted:
             self._spoke = time.monotonic()

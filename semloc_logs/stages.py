@@ -9,6 +9,7 @@ import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from semloc_logs.closures.closing import Alignment, CloseTask, close_queries
 from semloc_logs.closures.picture import draw_closures
 from semloc_logs.closures.queries import SessionMap, query_keyframes
 from semloc_logs.closures.results import keyframe_at, read_closures, unique_closures, write_closures, write_rejected
-from semloc_logs.engines import Engine
+from semloc_logs.engines import Engine, Serial
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError
 from semloc_logs.geometry import transform
 from semloc_logs.logs.annotate import (
@@ -92,7 +93,9 @@ def fuse(
             report.skipped += read_json(folder.session_json)["skipped"]
         else:
             tasks.append(FuseTask(tuple(Path(log).absolute() for log in logs), folder, settings, dict(topics), fingerprint))
-    for task, outcome in zip(tasks, engine.map(_fuse_one, tasks), strict=True):
+    # only a task in this process can say how far it is
+    fuse_one = partial(_fuse_one, note=note) if isinstance(engine, Serial) else _fuse_one
+    for task, outcome in zip(tasks, engine.map(fuse_one, tasks), strict=True):
         name = task.folder.name
         if isinstance(outcome, SemlocError):
             report.failed.append(str(outcome))
@@ -107,11 +110,11 @@ def fuse(
     return report
 
 
-def _fuse_one(task: FuseTask) -> dict[str, Any] | SemlocError:
+def _fuse_one(task: FuseTask, note: Note = lambda _: None) -> dict[str, Any] | SemlocError:
     """An expected error is a result: one bad log does not end the night's work."""
     try:
         task.folder.session_json.unlink(missing_ok=True)  # what is half replaced must not look done
-        return fuse_session(task)
+        return fuse_session(task, lambda said: note(f"{task.folder.name}: {said}"))
     except SemlocError as problem:
         return problem
 
