@@ -31,7 +31,6 @@ from semloc_logs.alignment.pyramid import (
 from semloc_logs.geometry import apply
 from semloc_logs.labels.shape import shape
 from semloc_logs.labels.space import GROUND, cityscapes
-from semloc_logs.settings import Closures
 from semloc_logs.voxels.grid import BlockMap
 from semloc_logs.voxels.selection import thin
 
@@ -124,21 +123,23 @@ class Candidate:
     votes: int
 
 
-def search_hypotheses(hypotheses: Sequence[Hypothesis], targets: dict[int, Target], query: Query, closures: Closures) -> list[Candidate]:
-    """The ``closures.refined`` best candidates, best first, after a search at 4, 2 and 1 voxels around each hypothesis."""
+def search_hypotheses(
+    hypotheses: Sequence[Hypothesis], targets: dict[int, Target], query: Query, headings: int, most: int
+) -> list[Candidate]:
+    """The ``most`` best candidates, best first, after a search at 4, 2 and 1 voxels around each hypothesis."""
     v = query.voxel_size
-    turn = np.pi / closures.headings
+    turn = np.pi / headings
     state = [(h, np.array(h.pose), 0.0) for h in hypotheses]
     plan = (
-        (2, (-0.67 * turn, 0.0, 0.67 * turn), (-4 * v, 0.0, 4 * v), (-4 * v, 0.0, 4 * v), 3 * closures.refined),
+        (2, (-0.67 * turn, 0.0, 0.67 * turn), (-4 * v, 0.0, 4 * v), (-4 * v, 0.0, 4 * v), 3 * most),
         (
             1,
             tuple(turn * np.linspace(-0.4, 0.4, 5)),
             tuple(v * np.array([-4.0, -2.0, 0.0, 2.0, 4.0])),
             (-2 * v, 0.0, 2 * v),
-            2 * closures.refined,
+            2 * most,
         ),
-        (0, tuple(turn * np.linspace(-0.12, 0.12, 5)), tuple(v * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])), (-v, 0.0, v), closures.refined),
+        (0, tuple(turn * np.linspace(-0.12, 0.12, 5)), tuple(v * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])), (-v, 0.0, v), most),
     )
     for level, yaws, steps, lifts, keep in plan:
         moved = []

@@ -35,6 +35,8 @@ from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
 ALIGNED = 8  # candidates of a target session that are fitted on the points
+LEAST_HYPOTHESES = 16  # for a target session, however many there are
+NORMAL_NOISE = np.radians(2.0)
 INFLATION = 30.0  # of the covariance: neighbouring points share their errors
 FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
 
@@ -152,13 +154,25 @@ def find_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
     if not parts:
         return []
     group, yaws, shift, weight = (np.concatenate([p[k] for p in parts]) for k in range(4))
-    return pool(group, yaws, shift, weight, 2.4 * v / STREET_VOXEL, closures.hypotheses)
+    # each target session has its share, so that one that looks alike everywhere cannot crowd out the others
+    owner = np.array([place.session for place in database.places], dtype=object)[group]
+    most = max(LEAST_HYPOTHESES, closures.hypotheses // len(database.sessions))
+    found: list[Hypothesis] = []
+    for name in database.sessions:
+        mine = np.flatnonzero(owner == name)
+        found += pool(group[mine], yaws[mine], shift[mine], weight[mine], 2.4 * v / STREET_VOXEL, most)
+    return found
 
 
 def verify_hypotheses(database: Database, query: Query, hypotheses: list[Hypothesis]) -> list[Candidate]:
-    """The best candidates after the search over the voxel pyramid."""
-    targets = {h.group: database.target(h.group) for h in hypotheses}
-    return search_hypotheses(hypotheses, targets, query, database.settings.closures)
+    """The best candidates of each target session after the search over the voxel pyramid, best first."""
+    out: list[Candidate] = []
+    keep = max(ALIGNED, database.settings.closures.refined // len(database.sessions))
+    for name in database.sessions:
+        mine = [h for h in hypotheses if database.places[h.group].session == name]
+        targets = {h.group: database.target(h.group) for h in mine}
+        out += search_hypotheses(mine, targets, query, database.settings.closures.headings, keep)
+    return out
 
 
 def _align(
@@ -248,7 +262,7 @@ def _judge(
         query_stamp_ns=int(session.stamps_ns[keyframe]),
         target_stamp_ns=int(target_session.stamps_ns[nearest]),
         target_T_query=inverse(map_T_target) @ map_T_query_base,
-        covariance=_covariance(fine, map_T_query_base, map_T_target),
+        covariance=covariance_of(fine, map_T_query_base, map_T_target, v),
         overlap=overlap,
         probability=probability,
         inliers=inliers,
@@ -267,11 +281,26 @@ def _stiffness(fit: Fit) -> float:
     return float(max(np.linalg.eigvalsh(reduced).min(), 0.0))
 
 
-def _covariance(fit: Fit, map_T_query: F64, map_T_target: F64) -> F64:
-    """Covariance (6, 6) of target_T_query from the fit's information, in the target's axes (DESIGN: closures.parquet)."""
-    H = fit.information + 1e-3 * np.eye(6) * max(np.trace(fit.information) / 6, 1.0)
+def _beyond_noise(information: F64) -> F64:
+    """Information (6, 6) less what normals that are 2 degrees off would pretend, in axes scaled so that lengths and angles compare."""
+    points, arms = float(np.trace(information[:3, :3])), float(np.trace(information[3:, 3:]))
+    if points <= 0:
+        return np.zeros((6, 6))
+    scale = np.r_[1.0, 1.0, 1.0, np.full(3, max(np.sqrt(arms / points), 1e-6))]
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    kept = np.maximum(values - points * np.sin(NORMAL_NOISE) ** 2, 0.0)
+    return np.asarray((vectors * kept) @ vectors.T * np.outer(scale, scale))
+
+
+def covariance_of(fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: float) -> F64:
+    """Covariance (6, 6) of target_T_query from the fit's information, in the target's axes (DESIGN: closures.parquet).
+
+    What noisy normals alone would claim to know is taken off first. Where the points then hold nothing (along a corridor) the error is
+    as large as the search lets it be: 3.3 voxels, 5 degrees.
+    """
     noise = max(fit.rmse if np.isfinite(fit.rmse) else 1.0, 0.02) ** 2
-    about_centre = INFLATION * noise * np.linalg.inv(H)
+    prior = np.diag([1 / (3.3 * voxel_size) ** 2] * 3 + [1 / np.radians(5.0) ** 2] * 3)
+    about_centre = np.linalg.inv(_beyond_noise(fit.information) / (INFLATION * noise) + prior)
     x, y, z = map_T_query[:3, 3] - fit.centre
     A = np.eye(6)
     A[:3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

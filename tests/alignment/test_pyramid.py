@@ -11,7 +11,6 @@ from semloc_logs.alignment.pyramid import ANY_BIT, FREE_BIT, build_pyramid, clas
 from semloc_logs.alignment.verify import Query, Target, same_place, search_hypotheses, structure_mask, structure_scores
 from semloc_logs.geometry import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.labels.space import cityscapes
-from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import FREE_STATE, UNLABELLED, UNOBSERVED_STATE, BlockMap, empty_map
 from semloc_logs.voxels.keys import BLOCK, pack
 
@@ -183,14 +182,13 @@ def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
 
     wrong = [Hypothesis(0, (yaw + 1.2 * k, 9.0 - k, 6.0 * k, 0.0), 3, 1.0) for k in (1, 2, 3)]
     near = Hypothesis(0, (yaw + 0.15, 4.2, -3.0, 0.5), 2, 0.5)
-    closures = Settings().closures
-    candidates = search_hypotheses([*wrong, near], {0: target}, query, closures)
+    candidates = search_hypotheses([*wrong, near], {0: target}, query, 18, 24)
     best = candidates[0]
     assert same_place(best.target_T_query, truth, V)
     assert best.votes == 2
     assert [c.score for c in candidates] == sorted((c.score for c in candidates), reverse=True)
-    assert len(candidates) <= closures.refined
-    twice = search_hypotheses([near, near], {0: target}, query, closures)
+    assert len(candidates) <= 24
+    twice = search_hypotheses([near, near], {0: target}, query, 18, 24)
     assert len(twice) == 1  # hypotheses that have met are one
 
 
