@@ -17,7 +17,6 @@ from typing import Any, NoReturn
 import click
 
 from semloc_logs import __version__
-from semloc_logs.engines.engine import single_threaded
 from semloc_logs.errors import SemlocError, SettingsError
 
 from .console import console
@@ -62,6 +61,8 @@ class Program(click.Group):
 
     def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **__: Any) -> NoReturn:
         """Run and exit with the code that DESIGN promises."""
+        from semloc_logs.engines.engine import single_threaded
+
         console.reset()
         single_threaded()
         warnings.simplefilter("ignore")  # numerical libraries' remarks are no sentences for a user

@@ -24,7 +24,7 @@ from semloc_logs.words.vocabulary import load_vocabulary
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
-KEPT_TARGETS, KEPT_SURFACES = 24, 48  # in memory at once
+KEPT_TARGETS, KEPT_SURFACES = 12, 24  # in memory at once
 SURFACE_KEYFRAMES = 9
 
 
