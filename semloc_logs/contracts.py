@@ -42,7 +42,7 @@ def contract(name: str) -> dict[str, Any]:
 
 def tables() -> list[str]:
     """Names of all table contracts."""
-    return names("parquet", ".json")
+    return list(names("parquet", ".json"))
 
 
 def table(name: str, columns: dict[str, Any]) -> pa.Table:

@@ -20,8 +20,9 @@ from semloc_logs.geometry import inverse
 from semloc_logs.settings import Settings
 from semloc_logs.stages import fuse, run, session_name
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
+from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.tables import read_metadata
-from semloc_logs.words.vocabulary import load_vocabulary
+from semloc_logs.words.vocabulary import Vocabulary, load_vocabulary
 from semloc_logs.workspace import Workspace
 
 Figures = dict[str, dict[str, float | str]]
@@ -81,8 +82,8 @@ def word_recalls(logs: Sequence[Path], truth: Path, settings: Settings) -> Figur
         figures: Figures = {}
         for variant in ("semantic", "geometric"):
             trained = load_encoder(variant, settings.descriptor.weights), load_vocabulary(variant, settings.descriptor.vocabulary)
-            random = [(random_encoder(variant, seed), None) for seed in range(3)]
-            rows = {"ours": [trained], "random weights": random}
+            random: list[tuple[Encoder, Vocabulary | None]] = [(random_encoder(variant, seed), None) for seed in range(3)]
+            rows: dict[str, list[tuple[Encoder, Vocabulary | None]]] = {"ours": [trained], "random weights": random}
             found = {
                 who: [word_recall(query, k, target, T, settings, e, words) for e, words in networks for k, T in pairs]
                 for who, networks in rows.items()

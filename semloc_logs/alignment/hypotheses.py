@@ -41,7 +41,7 @@ def pool(group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, ce
         mean = np.add.reduceat(translation[order] * weight[order, None], start)[best] / total[best, None]
         for i, b in enumerate(best):
             first = order[start[b]]
-            pose = (float(yaw[first]), *(float(v) for v in mean[i]))
+            pose = (float(yaw[first]), float(mean[i, 0]), float(mean[i, 1]), float(mean[i, 2]))
             found.append(Hypothesis(int(group[first]), pose, int(count[b]), float(total[b])))
     found.sort(key=lambda h: (-h.weight, h.group, h.pose))
     kept: list[Hypothesis] = []

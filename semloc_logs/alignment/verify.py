@@ -102,7 +102,7 @@ class Query:
         index = np.concatenate(picked)
         bits = class_bits(label, comparable(False))[index]
         bits = np.where(bits & (ANY_BIT - 1), bits & (ANY_BIT - 1), bits)  # of a known class: that class, else anything occupied
-        return Evidence((ijk[index] + 0.5) * self.voxel_size, bits, np.concatenate(weights))
+        return Evidence((ijk[index].astype(float) + 0.5) * self.voxel_size, bits, np.concatenate(weights).astype(float))
 
     @cached_property
     def structure(self) -> tuple[F64, U8]:
@@ -110,7 +110,8 @@ class Query:
         ijk, label, _, _ = self.blocks.occupied()
         keep = structure_mask(label)
         bits = class_bits(label[keep], comparable(False))
-        return (ijk[keep] + 0.5) * self.voxel_size, np.where(bits & (ANY_BIT - 1), bits & (ANY_BIT - 1), bits)
+        centres: F64 = (ijk[keep].astype(float) + 0.5) * self.voxel_size
+        return centres, np.where(bits & (ANY_BIT - 1), bits & (ANY_BIT - 1), bits).astype(np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,7 +31,7 @@ class Calibration:
 
 @cache
 def shipped() -> Calibration:
-    """The calibration in the package; ``semloc benchmark calibration`` prints how it was made."""
+    """The calibration in the package; ``benchmarks/calibrate.py`` makes it."""
     content = json.loads(files("semloc_logs.closures").joinpath("calibration.json").read_text())
     rows = [content["features"][name] for name in FEATURES]
     return Calibration(tuple(r["weight"] for r in rows), tuple(r["low"] for r in rows), tuple(r["high"] for r in rows), content["bias"])

@@ -85,7 +85,7 @@ class Database:
             )
             vocabulary = load_vocabulary(variant, self.settings.descriptor.vocabulary)
             self._words[variant] = Words(
-                Index(vocabulary, word.astype(np.uint16), code.astype(np.uint64), group), centre, group.astype(np.int64)
+                Index(vocabulary, word.astype(np.uint16), code.astype(np.uint64), group.astype(np.int64)), centre, group.astype(np.int64)
             )
         return self._words[variant]
 

@@ -25,8 +25,8 @@ def draw_closures(work: Workspace, closures: Sequence[Alignment], maps: Mapping[
     and an older picture is removed.
     """
     pairs: dict[tuple[str, str], list[Alignment]] = {}
-    for a in closures:
-        pairs.setdefault((a.query_session, a.target_session), []).append(a)
+    for closure in closures:
+        pairs.setdefault((closure.query_session, closure.target_session), []).append(closure)
     if not pairs:
         work.picture.unlink(missing_ok=True)
         return

@@ -52,7 +52,7 @@ LENGTH = 260.0  # of each drive (m)
 
 def simulate_towns(folder: Path, towns: Sequence[Town] = TOWNS) -> dict[str, Path]:
     """Two drives through each town, by session name SEED_NUMBER; what is there already is kept."""
-    out = {}
+    out: dict[str, Path] = {}
     for town in towns:
         place = folder / str(town.seed)
         if not (place / "truth.json").exists():

@@ -59,7 +59,7 @@ def word_recall(
         return WordRecall(0.0, 0.0, 0, len(centre), radius)
     similarity = asked.descriptor @ descriptor.T
     nearest = np.argsort(-similarity, axis=1, kind="stable")[:, :k]
-    exact = (np.take_along_axis(distance, nearest, 1) < radius).any(1)
+    exact = np.asarray((np.take_along_axis(distance, nearest, 1) < radius).any(1))
     words = vocabulary or train_vocabulary(descriptor)
     index = Index(words, *words.words(descriptor), np.zeros(len(centre), np.int64))
     matches = index.search(asked.descriptor, k, settings.closures.probes, np.ones(1, bool))

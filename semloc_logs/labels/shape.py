@@ -27,7 +27,7 @@ def shape(points: NDArray[np.floating], neighbours: int = 16, radius: float = np
     """Shape of ``points`` (n, 3) from up to ``neighbours`` nearest points within ``radius`` metres; all scattered below 4 points."""
     n = len(points)
     if n < 4:
-        up = np.tile(np.float32([0, 0, 1]), (n, 1))
+        up = np.tile(np.array([0, 0, 1], np.float32), (n, 1))
         zero = np.zeros(n, np.float32)
         return Shape(up, up, zero, zero, zero + 1)
     p = np.asarray(points, np.float64)

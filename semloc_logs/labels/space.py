@@ -49,7 +49,7 @@ def cityscapes() -> Cityscapes:
 
 def spaces() -> list[str]:
     """Names of the label spaces that can be read."""
-    return names("label_spaces", ".yaml")
+    return list(names("label_spaces", ".yaml"))
 
 
 def to_cityscapes(ids: NDArray[np.integer], space: str) -> U8:

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, code_table
-from semloc_logs.subvolumes.network import Encoder, descriptors
+from semloc_logs.subvolumes.network import Encoder, channels_last, descriptors
 from semloc_logs.subvolumes.pairs import occupied
 
 U8 = NDArray[np.uint8]
@@ -57,7 +57,7 @@ def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
         raise SettingsError(
             f"{weights or 'The shipped weights'}: no weights of the {variant} encoder ({str(problem).splitlines()[0]})."
         ) from None
-    encoder.to(memory_format=torch.channels_last_3d)
+    channels_last(encoder)
     torch.set_num_threads(1)  # more cores are used by more processes: the same sums in the same order, whatever the engine
     return encoder.eval()
 
@@ -65,7 +65,9 @@ def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
 def random_encoder(variant: str, seed: int = 0) -> Encoder:
     """An untrained encoder: what training has to beat."""
     torch.manual_seed(seed)
-    return Encoder(variant).to(memory_format=torch.channels_last_3d).eval()
+    encoder = Encoder(variant).eval()
+    channels_last(encoder)
+    return encoder
 
 
 def _window_sums(a: NDArray[np.int64], stride: int) -> NDArray[np.int64]:
@@ -86,7 +88,7 @@ def _layers(filled: NDArray[np.bool_], bottom: int, stride: int) -> NDArray[np.i
     known = np.isfinite(ordered).sum(1)
     quantile = ordered[np.arange(len(ordered)), np.maximum(0, (known * 0.1).astype(int) - (known == 64))]
     layer = np.floor((np.nan_to_num(quantile, nan=float(bottom)) - bottom) / LAYER).astype(np.int64)
-    return layer.reshape(len(range(0, lowest.shape[0] - 7, stride // 4)), -1)
+    return np.asarray(layer.reshape(len(range(0, lowest.shape[0] - 7, stride // 4)), -1))
 
 
 @torch.inference_mode()

@@ -52,7 +52,7 @@ def _dense(blocks: BlockMap) -> tuple[U8, NDArray[np.int64]]:
 
 def occupied(state: U8) -> NDArray[np.bool_]:
     """Where voxel states are occupied, of whatever class."""
-    return (state != FREE_STATE) & (state != UNOBSERVED_STATE)
+    return np.asarray((state != FREE_STATE) & (state != UNOBSERVED_STATE))
 
 
 def cut_pairs(

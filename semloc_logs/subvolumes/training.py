@@ -131,7 +131,7 @@ def train(
         contrastive = 0.5 * (F.cross_entropy(similarity, own) + F.cross_entropy(similarity.T, own)) if some else mu.new_zeros(())
         loss = training.reconstruction_weight * reconstruction + prior + training.contrastive_weight * contrastive
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
         optimiser.step()
         matched = float((similarity.argmax(1) == own).float().mean()) if some else 0.0

@@ -44,4 +44,4 @@ def _spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def morton(ijk: NDArray[np.integer]) -> NDArray[np.uint64]:
     """Morton (Z-order) code of integer coordinates (n, 3) within +-2^20."""
     a = (np.asarray(ijk, np.int64) + _BIAS).astype(np.uint64)
-    return _spread(a[..., 0]) | (_spread(a[..., 1]) << np.uint64(1)) | (_spread(a[..., 2]) << np.uint64(2))
+    return np.asarray(_spread(a[..., 0]) | (_spread(a[..., 1]) << np.uint64(1)) | (_spread(a[..., 2]) << np.uint64(2)))

@@ -49,7 +49,7 @@ def draw_map(voxels: Path, trajectory: NDArray[np.floating], voxel_size: float, 
     size = (high - low + step - 1) // step
     image = bird_view(ijk, label, low, (int(size[0]), int(size[1])), step)
     zoom = max(1, 1000 // max(image.shape[:2]))
-    image = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
+    image = np.asarray(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST), np.uint8)
     line = (
         np.stack([(track[:, 0] - low[0]) / step * zoom, (size[1] - 1 - (track[:, 1] - low[1]) / step) * zoom], 1)
         if len(track)

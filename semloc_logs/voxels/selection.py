@@ -45,7 +45,7 @@ def road_distance(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distance (n,) travelled from the first of poses (n, 4, 4), metres."""
     if not len(poses):
         return np.zeros(0)
-    return np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))]
+    return np.asarray(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
 
 
 def submap_ranges(distance: NDArray[np.float64], length: float, overlap: float) -> list[tuple[int, int]]:

@@ -109,7 +109,7 @@ def read_blocks(path: Path) -> BlockMap:
         if not table.num_rows:
             return np.zeros((0, 4096), dtype)
         array = table[name].chunk(0)
-        flat = np.frombuffer(array.buffers()[1], dtype)
+        flat: NDArray[Any] = np.frombuffer(array.buffers()[1], dtype)
         return flat[array.offset * 4096 : (array.offset + len(array)) * 4096].reshape(-1, 4096)
 
     return BlockMap(keys, values("log_odds", np.int8), values("state", np.uint8), values("hits", np.uint16))
