@@ -35,6 +35,7 @@ def main() -> None:
     for line in reliability(rows):  # under the calibration in the package, not under the new one
         print(line)
     nees = [r.nees for r in rows if r.right]
+    engine.close()
     print("NEES of right alignments (6 degrees of freedom): median", np.median(nees) if nees else None)
 
 

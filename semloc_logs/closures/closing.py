@@ -37,7 +37,7 @@ F64 = NDArray[np.float64]
 ALIGNED = 8  # candidates of a target session that are fitted on the points
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
-INFLATION = 30.0  # of the covariance: neighbouring points share their errors
+INFLATION = 12.0  # of the covariance: neighbouring points share their errors
 FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
 
 
@@ -240,7 +240,7 @@ def _judge(
         contradiction=contradiction,
         fit=fine.inliers,
         rmse=fine.rmse / v,
-        distinct=max(second, 0.0) / max(score, 1e-3),
+        distinct=min(max(second, 0.0) / max(score, 1e-3), 2.0),
         support=float(np.log10(count + 1)),
         stiffness=float(np.log10(weakest + 1)),
     )

@@ -105,13 +105,29 @@ def collect(work: Workspace, logs: dict[str, Path], settings: Settings, run: Map
     return out
 
 
-def calibrate(rows: Sequence[Judged]) -> dict[str, Any]:
-    """The content of calibration.json from judged alignments; alignments between 1 and 3 metres off teach neither side."""
+# The sign with which evidence may count. The plane distances of fitting points (rmse) say more about the sensor than about the place.
+SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0, "distinct": -1, "support": 1, "stiffness": 1}
+
+
+def calibrate(rows: Sequence[Judged], ridge: float = 0.3) -> dict[str, Any]:
+    """The content of calibration.json from judged alignments; alignments between 1 and 3 metres off teach neither side.
+
+    Features whose weight would have the wrong sign are left out one by one: in few towns they stand for something else.
+    """
     clear = [r for r in rows if r.right or r.error_m > 3 * CORRECT_M or r.error_deg > 3 * CORRECT_DEG]
     x = np.array([[getattr(r.alignment.features, n) for n in FEATURES] for r in clear])
     right = np.array([r.right for r in clear])
     low, high = np.quantile(x, 0.01, axis=0), np.quantile(x, 0.99, axis=0)
-    weights, bias = fit_logistic(np.clip(x, low, high), right)
+    signs = np.array([SIGNS[n] for n in FEATURES])
+    used = np.flatnonzero(signs)
+    while True:
+        fitted, bias = fit_logistic(np.clip(x, low, high)[:, used], right, ridge)
+        strength = fitted * signs[used] * x[:, used].std(0)
+        if len(used) == 1 or strength.min() > 0:
+            break
+        used = np.delete(used, int(np.argmin(strength)))
+    weights = np.zeros(len(FEATURES))
+    weights[used] = fitted
     features = {
         n: {"weight": round(float(weights[i]), 4), "low": round(float(low[i]), 4), "high": round(float(high[i]), 4)}
         for i, n in enumerate(FEATURES)
