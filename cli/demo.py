@@ -15,7 +15,7 @@ from .results import finish, report_json, session_logs
 if TYPE_CHECKING:
     from semloc_logs.settings import Settings
 
-QUERY_EVERY = 10.0  # m; a demonstration need not ask every two metres
+QUERY_EVERY = 20.0  # m; a demonstration need not ask every two metres
 
 
 @click.command(cls=Command)

@@ -142,10 +142,12 @@ def search_hypotheses(
         ),
         (0, tuple(turn * np.linspace(-0.12, 0.12, 5)), tuple(v * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])), (-v, 0.0, v), most),
     )
+    full = query.evidence
+    some = Evidence(full.centres[::3].copy(), full.bits[::3].copy(), 3 * full.weights[::3])  # enough for what is a metre off anyway
     for level, yaws, steps, lifts, keep in plan:
         moved = []
         for h, pose, _ in state:
-            score, better = search(targets[h.group].pyramid[level], query.evidence, pose, yaws, steps, lifts)
+            score, better = search(targets[h.group].pyramid[level], some if level else full, pose, yaws, steps, lifts)
             moved.append((h, better, score))
         moved.sort(key=lambda m: (-m[2], m[0].group, tuple(m[1])))
         state = []

@@ -46,7 +46,7 @@ def draw_closures(work: Workspace, closures: Sequence[Alignment], maps: Mapping[
         xy = (points[:, :2] - low) * scale
         return np.stack([xy[:, 0], size[1] - 1 - xy[:, 1]], 1).astype(int)
 
-    radius = max(1, int(0.1 * scale))
+    radius = max(1, round(0.3 * scale))
     for points, colour in ((a, TARGET_COLOUR), (b, QUERY_COLOUR)):
         p = pixels(points)
         p = p[((p >= 0) & (p < size)).all(1)]
