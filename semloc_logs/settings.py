@@ -174,7 +174,7 @@ class Settings(BaseSettings):
 
     def dump(self) -> str:
         """YAML that :func:`load` reads back to the same settings."""
-        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+        return str(yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False))
 
 
 def load(file: Path | None = None, assignments: Mapping[str, str] | None = None, environment: Mapping[str, str] | None = None) -> Settings:
