@@ -40,15 +40,6 @@ MOST_VOXELS = 3000  # of a query that are looked up in a search
 MOST_POINTS = 6000  # of a query that are fitted
 
 
-def comparable(exact: bool) -> U8:
-    """Class id -> index of the set in which two maps are compared (256,): a coarse class, 5 = other too, 255 unlabelled.
-
-    The masks of the pyramid have room for the coarse set; ``tau`` compares exact classes where both maps have the same label source.
-    """
-    del exact
-    return cityscapes().coarse
-
-
 def structure_mask(label: U8) -> NDArray[np.bool_]:
     """Which voxels are structure: neither ground nor of a class that moves."""
     dynamic = np.zeros(256, bool)
@@ -75,7 +66,7 @@ class Target:
     @cached_property
     def pyramid(self) -> list[Level]:
         """Bit masks at 1, 2 and 4 voxels."""
-        return build_pyramid(self.blocks, self.voxel_size, comparable(False))
+        return build_pyramid(self.blocks, self.voxel_size, cityscapes().coarse)
 
 
 @dataclass(eq=False)
@@ -100,7 +91,7 @@ class Query:
             picked.append(index)
             weights.append(np.full(len(index), share / max(len(index), 1)))
         index = np.concatenate(picked)
-        bits = class_bits(label, comparable(False))[index]
+        bits = class_bits(label, cityscapes().coarse)[index]
         bits = np.where(bits & (ANY_BIT - 1), bits & (ANY_BIT - 1), bits)  # of a known class: that class, else anything occupied
         return Evidence((ijk[index].astype(float) + 0.5) * self.voxel_size, bits, np.concatenate(weights).astype(float))
 
@@ -109,7 +100,7 @@ class Query:
         """Centres (n, 3) in metres and class bits (n,) of all structure voxels."""
         ijk, label, _, _ = self.blocks.occupied()
         keep = structure_mask(label)
-        bits = class_bits(label[keep], comparable(False))
+        bits = class_bits(label[keep], cityscapes().coarse)
         centres: F64 = (ijk[keep].astype(float) + 0.5) * self.voxel_size
         return centres, np.where(bits & (ANY_BIT - 1), bits & (ANY_BIT - 1), bits).astype(np.uint8)
 
