@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.geometry import inverse
+from semloc_logs.geometry import inverse, yaw_transform
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 
 FACTORS = (1, 2, 4)
@@ -199,8 +199,6 @@ def _beside_unobserved(state: U8, observed: NDArray[np.int64]) -> NDArray[np.boo
 
 def pose_matrix(pose: F64) -> F64:
     """``target_T_query`` of (yaw, x, y, z)."""
-    from semloc_logs.geometry import yaw_transform
-
     return yaw_transform(float(pose[0]), pose[1:])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.closures.queries import SessionMap, build_query
-from semloc_logs.geometry import inverse
+from semloc_logs.geometry import inverse, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import turn
 from semloc_logs.subvolumes.describe import Described, describe_map
@@ -87,6 +87,4 @@ def _query_words(
     ground = float(query.ground_z[keyframe] - query.map_T_base[keyframe][2, 3])
     d = settings.descriptor
     described = describe_map(box, np.array([-half, -half, low[2]]), ground, v, encoder, d.query_stride, d.min_occupied)
-    turned_T_query = np.eye(4)
-    turned_T_query[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    return described, target_T_query @ inverse(turned_T_query)
+    return described, target_T_query @ inverse(yaw_transform(yaw))
