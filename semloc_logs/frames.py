@@ -112,7 +112,8 @@ class PosedCloud:
     """Labelled or unlabelled points of one sensor at one time in the base frame: what fusion eats.
 
     ``points`` (n, 3) float32 and ``origin`` (3,), the sensor's centre, in the base frame; ``label`` (n,) ids as recorded or None;
-    ``session_T_base`` (4, 4) or None in a log without poses.
+    ``session_T_base`` (4, 4) or None in a log without poses; ``sigma`` (n,) standard deviation of the measured range along the ray in
+    metres, None where it is small beside a voxel (LIDAR).
     """
 
     header: Header
@@ -121,3 +122,4 @@ class PosedCloud:
     session_T_base: F64 | None
     label: NDArray[np.uint32] | None = None
     extra: dict[str, str] = field(default_factory=dict)
+    sigma: F32 | None = None
