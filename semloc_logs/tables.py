@@ -94,12 +94,13 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def write_table(path: Path, table: pa.Table, metadata: dict[str, Any], sorting: tuple[str, ...] = ()) -> None:
-    """Write ``table`` with the JSON ``semloc`` key in its metadata; rows are read back and counted before the rename."""
+def write_table(path: Path, table: pa.Table, metadata: dict[str, Any], sorting: tuple[str, ...] = (), row_group: int = ROW_GROUP) -> None:
+    """Write ``table``, in groups of ``row_group`` rows, with the JSON ``semloc`` key in its metadata; rows are read back and counted
+    before the rename."""
     table = table.replace_schema_metadata({"semloc": json.dumps(metadata, sort_keys=True)})
     columns = [pq.SortingColumn(table.schema.get_field_index(name)) for name in sorting]
     with replacing_file(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd", row_group_size=ROW_GROUP, sorting_columns=columns or None)
+        pq.write_table(table, temporary, compression="zstd", row_group_size=row_group, sorting_columns=columns or None)
         found = pq.read_metadata(temporary).num_rows
         if found != table.num_rows:
             raise ContractError(f"{path}: {found} rows were written of {table.num_rows}; is the disk full?")

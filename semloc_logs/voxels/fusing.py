@@ -159,7 +159,7 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         origins = np.array([r.origin for r in raws])
         submaps = _submaps(task, poses, origins, np.array(grounds), distance, posed, metadata, on_progress)
         ids = range(len(submaps))
-        voxels = write_voxels(task.folder.voxels, (read_blocks(blocks_path(task.folder.blocks, i)) for i in ids), metadata)
+        voxels = write_voxels(task.folder.voxels, (read_blocks(blocks_path(task.folder.blocks, i)) for i in ids), metadata, fusion.clamp)
         draw_map(task.folder.voxels, poses[:, :3, 3] if posed else np.zeros((0, 3)), fusion.voxel_size, task.folder.picture)
         content = {
             **session.to_json(),

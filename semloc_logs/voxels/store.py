@@ -16,11 +16,13 @@ from semloc_logs import contracts
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.geometry import transform, translation_quaternion
 from semloc_logs.tables import read_table, replacing_folder, write_table
+from semloc_logs.voxels.evidence import Tiles, Voxels, resolve
 from semloc_logs.voxels.grid import SCALE, BlockMap
-from semloc_logs.voxels.keys import morton, pack, unpack
+from semloc_logs.voxels.keys import pack, unpack
 
 PART = 64  # keyframes in a file; a row group each
 TILE = 256  # voxels along the edge of a tile of the session map
+VOXEL_ROWS = 65_536  # in Morton order a row group is a compact box, so a bounding box skips most of them
 POSE = ("t_x", "t_y", "t_z", "q_x", "q_y", "q_z", "q_w")
 
 
@@ -115,47 +117,38 @@ def read_blocks(path: Path) -> BlockMap:
     return BlockMap(keys, values("log_odds", np.int8), values("state", np.uint8), values("hits", np.uint16))
 
 
-def write_voxels(folder: Path, submaps: Iterable[BlockMap], metadata: dict[str, Any]) -> int:
-    """The session map: the union of the submaps' occupied voxels in tiles of 256 voxels; returns the number of voxels.
+def write_voxels(folder: Path, submaps: Iterable[BlockMap], metadata: dict[str, Any], clamp: tuple[float, float]) -> int:
+    """The session map: occupied voxels of all ``submaps`` together, in tiles of 256 voxels; returns their number.
 
-    Where submaps overlap the one with more votes speaks. Rows spill to one part for each tile and submap first, so memory holds a
-    submap and then a tile, whatever the length of the log.
+    Where submaps overlap their evidence adds up (:mod:`semloc_logs.voxels.evidence`), clamped to ``clamp`` (log-odds) at the end.
+    Memory holds a submap and the tiles that it touches, whatever the length of the log and however often it comes back.
     """
     total = 0
+    low, high = (round(SCALE * c) for c in clamp)
     with replacing_folder(folder) as temporary:
-        spill = temporary / ".spill"
-        spill.mkdir()
-        tiles: dict[tuple[int, int], list[Path]] = {}
-        for n, blocks in enumerate(submaps):
-            ijk, label, log_odds, hits = blocks.occupied()
-            rows = np.concatenate([ijk, label[:, None], log_odds[:, None], hits[:, None]], 1).astype(np.int32)
-            key = pack(np.concatenate([ijk[:, :2] // TILE, np.zeros((len(ijk), 1), np.int32)], 1))
-            for k in np.unique(key):
-                x, y, _ = unpack(np.array([k]))[0].tolist()
-                path = spill / f"{x}_{y}-{n}.npy"
-                np.save(path, rows[key == k])
-                tiles.setdefault((x, y), []).append(path)
-        for (x, y), paths in sorted(tiles.items()):
-            rows = np.concatenate([np.load(p) for p in paths])
-            code = morton(rows[:, :3])
-            order = np.lexsort((-rows[:, 5], code))
-            rows, code = rows[order], code[order]
-            rows = rows[np.r_[True, code[1:] != code[:-1]]]
-            _write_tile(temporary / f"tile={x}_{y}" / "part-0.parquet", rows, metadata)
-            total += len(rows)
-        for path in spill.iterdir():
-            path.unlink()
-        spill.rmdir()
-        if not tiles:
-            _write_tile(temporary / "tile=0_0" / "part-0.parquet", np.zeros((0, 6), np.int32), metadata)
+        scratch = temporary / ".scratch"
+        scratch.mkdir()
+        tiles = Tiles(scratch, TILE)
+        for blocks in submaps:
+            tiles.add(blocks)
+        for x, y in sorted(tiles.names()):
+            voxels = resolve(tiles.take((x, y)), low, high)
+            if len(voxels.ijk):
+                _write_tile(temporary / f"tile={x}_{y}" / "part-0.parquet", voxels, metadata)
+                total += len(voxels.ijk)
+        scratch.rmdir()
+        if not total:
+            nothing = np.zeros(0, np.int64)
+            empty = Voxels(np.zeros((0, 3), np.int32), nothing.astype(np.uint8), nothing.astype(np.int32), nothing)
+            _write_tile(temporary / "tile=0_0" / "part-0.parquet", empty, metadata)
     return total
 
 
-def _write_tile(path: Path, rows: NDArray[np.int32], metadata: dict[str, Any]) -> None:
-    columns: dict[str, Any] = dict(zip(("ix", "iy", "iz"), rows[:, :3].T, strict=True))
+def _write_tile(path: Path, voxels: Voxels, metadata: dict[str, Any]) -> None:
+    columns: dict[str, Any] = dict(zip(("ix", "iy", "iz"), voxels.ijk.T, strict=True))
     columns |= {
-        "label": rows[:, 3].astype(np.uint8),
-        "occupancy": (rows[:, 4] / SCALE).astype(np.float32),
-        "hits": rows[:, 5].astype(np.uint16),
+        "label": voxels.label,
+        "occupancy": (voxels.log_odds / SCALE).astype(np.float32),
+        "hits": np.minimum(voxels.hits, 65535).astype(np.uint16),
     }
-    write_table(path, contracts.table("voxels", columns), metadata)
+    write_table(path, contracts.table("voxels", columns), metadata, row_group=VOXEL_ROWS)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ import pytest
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Settings
 from semloc_logs.tables import read_metadata
-from semloc_logs.voxels.grid import FREE_STATE, BlockMap, Fuser, empty_map
-from semloc_logs.voxels.keys import morton
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED, BlockMap, Fuser, empty_map
+from semloc_logs.voxels.keys import morton, unpack
 from semloc_logs.voxels.store import (
     PART,
     TILE,
@@ -111,22 +112,37 @@ def test_poses_as_columns() -> None:
     assert [len(v) for v in pose_columns(np.zeros((0, 4, 4))).values()] == [0] * 7
 
 
+CLAMP = (-2.0, 2.0)
+
+
 def union(submaps: list[BlockMap]) -> dict[tuple[int, ...], tuple[int, int, int]]:
-    """Of each occupied voxel the entry with the most hits; the earlier submap among equals."""
-    out: dict[tuple[int, ...], tuple[int, int, int]] = {}
+    """Of each voxel all evidence added up: (class, log-odds in 1/20, votes) where more speaks for occupied than for free."""
+    odds: dict[tuple[int, ...], int] = defaultdict(int)
+    votes: dict[tuple[int, ...], Counter[int]] = defaultdict(Counter)
     for blocks in submaps:
-        for ijk, label, odds, hits in zip(*(a.tolist() for a in blocks.occupied()), strict=True):
-            if tuple(ijk) not in out or hits > out[tuple(ijk)][2]:
-                out[tuple(ijk)] = (label, odds, hits)
+        for key, log_odds, state, hits in zip(unpack(blocks.keys).tolist(), blocks.log_odds, blocks.state, blocks.hits, strict=True):
+            for cell in np.flatnonzero(log_odds != UNOBSERVED).tolist():
+                voxel = tuple(k * 16 + i for k, i in zip(key, (cell // 256, cell // 16 % 16, cell % 16), strict=True))
+                odds[voxel] += int(log_odds[cell])
+                if state[cell] != FREE_STATE:
+                    votes[voxel][int(state[cell])] += int(hits[cell])
+    out = {}
+    for voxel in (v for v, total in odds.items() if total > 0):
+        known = {c: n for c, n in votes[voxel].items() if c != 255}
+        label = min(known, key=lambda c, of=known: (-of[c], c)) if known else 255  # type: ignore[misc]
+        out[voxel] = (label, min(odds[voxel], 40), votes[voxel].total())
     return out
 
 
 def test_the_session_map_is_the_union_of_overlapping_submaps(tmp_path: Path) -> None:
     submaps = [small_map(0), small_map(1, (6.0, 0.0, 0.0), 6), small_map(2, (-6.0, 300.0, 0.0))]
     expected = union(submaps)
-    assert len(expected) < sum(len(s.occupied()[0]) for s in submaps)  # they do overlap
+    lost = {tuple(v) for s in submaps for v in s.occupied()[0].tolist()} - set(expected)
+    assert len(lost) > 10  # occupied in one, carved free in the other
+    assert max(odds for _, odds, _ in expected.values()) == 40
+    assert len(expected) + len(lost) < sum(len(s.occupied()[0]) for s in submaps)  # they do overlap
     folder = tmp_path / "voxels"
-    assert write_voxels(folder, submaps, METADATA) == len(expected)
+    assert write_voxels(folder, submaps, METADATA, CLAMP) == len(expected)
     tiles = sorted(folder.rglob("*.parquet"))
     assert len(tiles) > 3
     found: dict[tuple[int, ...], tuple[int, int, int]] = {}
@@ -146,7 +162,7 @@ def test_the_session_map_is_the_union_of_overlapping_submaps(tmp_path: Path) -> 
 
 def test_the_session_map_in_duckdb_and_polars(tmp_path: Path) -> None:
     submaps = [small_map(0), small_map(1, (140.0, 0.0, 0.0))]
-    total = write_voxels(tmp_path / "voxels", submaps, METADATA)
+    total = write_voxels(tmp_path / "voxels", submaps, METADATA, CLAMP)
     expected = union(submaps).values()
     mean = np.mean([odds / 20 for _, odds, _ in expected])
     rows = duckdb.connect().execute(f"select count(*), avg(occupancy), sum(hits) from '{tmp_path}/voxels/**/*.parquet'").fetchall()
@@ -167,14 +183,14 @@ def test_a_session_map_without_voxels_is_a_table_without_rows(submaps: Any, tmp_
         fuser.add(np.array([[500.0, 0, 0]]), np.zeros(1, np.uint8), np.zeros(3))
         submaps = [fuser.finish()]
         assert (submaps[0].state == FREE_STATE).any()
-    assert write_voxels(tmp_path / "voxels", submaps, METADATA) == 0
+    assert write_voxels(tmp_path / "voxels", submaps, METADATA, CLAMP) == 0
     assert duckdb.connect().execute(f"select count(*) from '{tmp_path}/voxels/**/*.parquet'").fetchall() == [(0,)]
     assert read_metadata(next((tmp_path / "voxels").rglob("*.parquet"))) == METADATA
 
 
 def test_writing_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        write_voxels(tmp_path / name, [small_map(0), small_map(1, (140.0, 0.0, 0.0))], METADATA)
+        write_voxels(tmp_path / name, [small_map(0), small_map(1, (140.0, 0.0, 0.0))], METADATA, CLAMP)
         write_blocks(tmp_path / f"{name}.parquet", small_map(0), METADATA)
     a = {p.relative_to(tmp_path / "a"): p.read_bytes() for p in (tmp_path / "a").rglob("*.parquet")}
     b = {p.relative_to(tmp_path / "b"): p.read_bytes() for p in (tmp_path / "b").rglob("*.parquet")}
