@@ -26,13 +26,18 @@ class Header:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarFrame:
-    """One sweep. ``points`` (n, 3) in the sensor frame; rows with NaN, infinity or exactly zero are already gone."""
+    """One sweep. ``points`` (n, 3) in the sensor frame; rows with NaN, infinity or exactly zero are already gone.
+
+    ``lost`` counts those that were not finite in a cloud that calls itself dense; ``remark`` is a key of what is to be said of it.
+    """
 
     header: Header
     points: F32
     label: NDArray[np.uint32] | None = None  # ids exactly as recorded
     offset_ns: NDArray[np.int64] | None = None  # time of each point minus header.stamp_ns
     ring: NDArray[np.uint16] | None = None
+    lost: int = 0
+    remark: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

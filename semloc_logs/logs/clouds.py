@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 
 from semloc_logs.frames import F32
 from semloc_logs.logs.definitions import UndecodableError
+from semloc_logs.logs.point_times import NO_SENSE, OTHER_CLOCK, offsets_ns, offsets_of_own_clock
 
 LABELS = ("label", "semantic", "class", "objtag")
 RINGS = ("ring", "line")
-TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
-_SWEEP_NS = 1_000_000_000  # no time of a point is further from its header than a second
-_LEAST_SPAN_NS = 5_000_000  # a sweep takes longer than this, which tells milliseconds from microseconds
+TIMES = (
+    "t", "time", "timestamp", "time_stamp", "offset_time", "time_offset", "time_offset_ns", "timestamp_offset", "point_time_offset",
+    "relative_timestamp",
+)  # fmt: skip
+_USED = {"x", "y", "z", *LABELS, *RINGS, *TIMES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +32,17 @@ class Field:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """``points`` (n, 3) with label, time (relative to the header stamp) and ring where recorded."""
+    """``points`` (n, 3) with label, time (relative to the header stamp) and ring where recorded.
+
+    ``not_finite`` counts the positions with NaN or infinity, ``remark`` says what is wrong with the times.
+    """
 
     points: F32
     label: NDArray[np.uint32] | None
     offset_ns: NDArray[np.int64] | None
     ring: NDArray[np.uint16] | None
+    not_finite: int = 0
+    remark: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +64,15 @@ def decode_points(data: bytes | memoryview, layout: Layout, fields: Sequence[Fie
     columns = {name.lower(): name for name in reversed(rows.dtype.names or ())}
     for axis in "xyz":
         if axis not in columns:
-            raise UndecodableError(f"it has no field {axis}")
+            raise UndecodableError(f"it has no field {axis} within the {layout.point_step} bytes of a point")
         if rows.dtype[columns[axis]].kind != "f":
-            raise UndecodableError(f"its field {axis} is no floating point number")
+            raise UndecodableError(f"its field {axis} is no floating point number but {rows.dtype[columns[axis]].name}")
     xyz = np.empty((rows.size, 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes infinite and is dropped below
         for k, axis in enumerate("xyz"):
             xyz[:, k].reshape(rows.shape)[...] = rows[columns[axis]]
     valid = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
+    finite = int(np.count_nonzero(valid))
     valid &= (xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0)
     everything = bool(valid.all())
 
@@ -75,12 +84,26 @@ def decode_points(data: bytes | memoryview, layout: Layout, fields: Sequence[Fie
         return None
 
     label, ring, time = column(LABELS, "iu"), column(RINGS, "iu"), column(TIMES, "iuf")
+    offset, remark = _offsets(time, stamp_ns)
     return Points(
         points=xyz if everything else xyz[valid],
         label=None if label is None else label.astype(np.uint32),
-        offset_ns=None if time is None else offsets_ns(time, stamp_ns),
+        offset_ns=offset,
         ring=None if ring is None else ring.astype(np.uint16),
+        not_finite=len(xyz) - finite,
+        remark=remark,
     )
+
+
+def _offsets(time: NDArray[np.generic] | None, stamp_ns: int) -> tuple[NDArray[np.int64] | None, str]:
+    """Times relative to ``stamp_ns`` where they make sense, and a remark where they do not at once."""
+    if time is None:
+        return None, ""
+    offset = offsets_ns(time, stamp_ns)
+    if offset is not None:
+        return offset, ""
+    offset = offsets_of_own_clock(time)
+    return offset, NO_SENSE if offset is None else OTHER_CLOCK
 
 
 def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> NDArray[np.void]:
@@ -88,9 +111,12 @@ def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> 
     width, height, step, row = layout.width, layout.height, layout.point_step, layout.row_step
     if height <= 1 or row < width * step:
         row = width * step  # often left at zero, or wrong where it does not matter
+    needed = (height - 1) * row + width * step
+    if step <= 0 or needed > len(data):
+        raise UndecodableError(f"{width} x {height} points of {step} bytes need {needed} bytes, but it has {len(data)}")
     names: dict[str, Field] = {}
     for field in fields:
-        if field.name and field.offset >= 0 and field.offset + np.dtype(field.kind).itemsize <= step:
+        if field.name.lower() in _USED and field.offset >= 0 and field.offset + np.dtype(field.kind).itemsize <= step:
             names.setdefault(field.name, field)
     order = ">" if layout.big_endian else "<"
     dtype = np.dtype(
@@ -98,51 +124,7 @@ def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> 
             "names": list(names),
             "formats": [order + f.kind for f in names.values()],
             "offsets": [f.offset for f in names.values()],
-            "itemsize": max(step, 1),
+            "itemsize": step,
         }
     )
-    needed = (height - 1) * row + width * step
-    if step <= 0 or needed > len(data):
-        raise UndecodableError(f"{width} x {height} points of {step} bytes need {needed} bytes, but it has {len(data)}")
     return np.ndarray((height, width), dtype, buffer=data, strides=(row, step))
-
-
-def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64] | None:
-    """Times of points relative to ``stamp_ns``, whatever their unit and origin; None when nothing makes sense of them.
-
-    The unit (s, ms, us, ns) and origin (the stamp, or the epoch) are those with which the points span more than 5 ms and
-    stay within a second of the stamp; failing that (a flash sensor) those that keep them within a second at all.
-    """
-    if time.size == 0:
-        return np.zeros(0, np.int64)
-    low, high = time.min().item(), time.max().item()
-    if not (np.isfinite(low) and np.isfinite(high)):
-        return None
-    units = (1, 1_000, 1_000_000, 1_000_000_000) if time.dtype.kind in "iu" else (1_000_000_000, 1_000_000, 1_000, 1)
-    fallback = None
-    for unit in units:
-        for origin in (0, stamp_ns):
-            # in integers, because nanoseconds since 1970 do not fit a float64; the parts of a second are exact enough as float
-            first, last = _to_ns(low, unit) - origin, _to_ns(high, unit) - origin
-            if max(abs(first), abs(last)) < _SWEEP_NS:
-                if last - first >= _LEAST_SPAN_NS:
-                    return _shift(time, unit, origin)
-                fallback = fallback or (unit, origin)
-    return None if fallback is None else _shift(time, *fallback)
-
-
-def _to_ns(value: float, unit: int) -> int:
-    return int(value) * unit + int((value - int(value)) * unit)
-
-
-def _shift(time: NDArray[np.generic], unit: int, origin: int) -> NDArray[np.int64]:
-    """``time * unit - origin`` as int64; only called where every result is below a second."""
-    if time.dtype.kind in "iu":
-        whole, rest = divmod(origin, unit)
-        # unsigned 64-bit arithmetic wraps, so the small difference is right even where the times are not
-        difference = time.astype(np.uint64) - np.uint64(whole % (1 << 64))
-        return difference.view(np.int64) * np.int64(unit) - np.int64(rest)
-    seconds = time.astype(np.float64)
-    base = np.floor(seconds.min())
-    fraction = np.rint((seconds - base) * unit).astype(np.int64)
-    return np.asarray(fraction + np.int64(int(base) * unit - origin), np.int64)

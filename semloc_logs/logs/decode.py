@@ -27,6 +27,7 @@ from semloc_logs.logs import images
 from semloc_logs.logs.clouds import Field, Layout, decode_points
 from semloc_logs.logs.definitions import Parser, UndecodableError, binary, json_type, parser
 from semloc_logs.logs.log import Definition, Message
+from semloc_logs.logs.point_times import PointTimes
 from semloc_logs.logs.problems import Problems
 
 Convert = Callable[[Any, Message], Iterator[Frame]]
@@ -44,21 +45,25 @@ class Decoder:
         self._problems = problems
         self._parsers: dict[tuple[str, str, int], Parser | UndecodableError] = {}
         self._definitions: list[Definition] = []  # keeps those alive whose id is a key
+        self._times = PointTimes()
 
     def frames(self, message: Message) -> list[Frame]:
         """The frames in ``message``; none when its type is of no use here, or when it cannot be decoded."""
         convert = CONVERTERS.get(json_type(message.type) if message.encoding in ("protobuf", "json") else message.type)
         if convert is None:
             return []
+        found: list[Frame] = []  # keeps what a message gives before its damaged part
         try:
             _check_time(message.log_time_ns)
-            return list(convert(self._parse(message), message))
+            for frame in convert(self._parse(message), message):
+                found.append(self._times.checked(frame) if isinstance(frame, LidarFrame) else frame)
+            return found
         except UndecodableError as error:
             reason = str(error)
         except _BAD_VALUES as error:
             reason = f"its values make no sense ({type(error).__name__}: {str(error)[:120]})"
         self._problems.skip("decoding", message.topic, f"{message.type} at log time {message.log_time_ns} ns: {reason}")
-        return []
+        return found
 
     def _parse(self, message: Message) -> Any:
         key = (message.encoding, message.type, id(message.definition))
@@ -145,9 +150,20 @@ def _transform_stamped(m: Any, message: Message) -> Iterator[Frame]:
     yield TransformSample(_header(m, message), m.child_frame_id, pose, static)
 
 
+def _good_ones(convert: Convert, transforms: Any, message: Message) -> Iterator[Frame]:
+    """The transforms that make sense, and then the error of the first that does not: one bad edge does not cost the others."""
+    damage: list[Exception] = []
+    for transform in transforms:
+        try:
+            yield from convert(transform, message)
+        except (UndecodableError, *_BAD_VALUES) as error:
+            damage.append(error)
+    if damage:
+        raise UndecodableError(f"{len(damage)} of its {len(transforms)} transforms cannot be used ({damage[0]})")
+
+
 def _tf(m: Any, message: Message) -> Iterator[Frame]:
-    for transform in m.transforms:
-        yield from _transform_stamped(transform, message)
+    yield from _good_ones(_transform_stamped, m.transforms, message)
 
 
 def _foxglove_pose(m: Any, message: Message) -> Iterator[Frame]:
@@ -162,8 +178,7 @@ def _foxglove_transform(m: Any, message: Message) -> Iterator[Frame]:
 
 
 def _foxglove_transforms(m: Any, message: Message) -> Iterator[Frame]:
-    for transform in m.transforms or ():
-        yield from _foxglove_transform(transform, message)
+    yield from _good_ones(_foxglove_transform, m.transforms or (), message)
 
 
 # -- inertial and satellite
@@ -200,7 +215,7 @@ def _point_cloud2(m: Any, message: Message) -> Iterator[Frame]:
     fields = [Field(f.name, f.offset, _POINT_KINDS[f.datatype]) for f in m.fields if f.datatype in _POINT_KINDS]
     layout = Layout(m.width, m.height, m.point_step, m.row_step, bool(m.is_bigendian))
     p = decode_points(binary(m.data), layout, fields, header.stamp_ns)
-    yield LidarFrame(header, p.points, p.label, p.offset_ns, p.ring)
+    yield LidarFrame(header, p.points, p.label, p.offset_ns, p.ring, p.not_finite if m.is_dense else 0, p.remark)
 
 
 def _foxglove_cloud(m: Any, message: Message) -> Iterator[Frame]:
@@ -216,7 +231,7 @@ def _foxglove_cloud(m: Any, message: Message) -> Iterator[Frame]:
             frame_T_cloud = _transform(m.pose.position, rotation)
             if not np.array_equal(frame_T_cloud, np.eye(4)):
                 points = geometry.apply(frame_T_cloud, points).astype(np.float32)
-    yield LidarFrame(header, points, p.label, p.offset_ns, p.ring)
+    yield LidarFrame(header, points, p.label, p.offset_ns, p.ring, remark=p.remark)
 
 
 # -- pictures

@@ -86,7 +86,29 @@ def _ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, A
             raise UndecodableError(f"the log does not define the type {name}")
         needed[name] = fields
         missing += [n for field in fields[1] for n in _names(field[1]) if n not in needed]
+    _refuse_lists_of_nothing(needed)
     return needed
+
+
+def _refuse_lists_of_nothing(types: dict[str, Any]) -> None:
+    """Elements without any byte could be claimed in billions by a message of four bytes."""
+    empty: set[str] = set()
+    grown = True
+    while grown:
+        found = {name for name, (_, fields) in types.items() if all(_has_no_bytes(kind, empty) for _, kind in fields)}
+        grown = found != empty
+        empty = found
+    for name, (_, fields) in types.items():
+        for field, (kind, content) in fields:
+            if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and _has_no_bytes(content[0], empty):
+                raise UndecodableError(f"the elements of {name}.{field} have no content")
+
+
+def _has_no_bytes(field: Any, empty: set[str]) -> bool:
+    kind, content = field
+    if kind == Nodetype.NAME:
+        return content in empty
+    return bool(kind == Nodetype.ARRAY and (content[1] == 0 or _has_no_bytes(content[0], empty)))
 
 
 def _idl_types(text: str) -> dict[str, Any]:

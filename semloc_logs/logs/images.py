@@ -46,7 +46,11 @@ for _pattern, _code in (
     _RAW[f"bayer_{_pattern}16"] = ("u2", 1, _code)
 
 _LABEL_WORDS = ("label", "segment", "semantic", "mask", "class")
-_MAX_PIXELS = 1 << 28
+_MAX_PIXELS = 1 << 26  # twice 8K
+_MAX_BYTES = 1 << 28
+_DEFLATE_MOST = 1100  # deflate shrinks at most 1032-fold
+_JPEG_MOST = 512  # pixels a byte: a block of 64 takes a bit at least
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type; a palette becomes colour
 _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
 
 
@@ -77,10 +81,7 @@ def decode_raw(data: bytes | memoryview, width: int, height: int, step: int, enc
 def decode_compressed(data: bytes | memoryview) -> Image:
     """A JPEG or PNG picture, grey as (h, w) and colour as (h, w, 3) RGB; 16 bits stay 16 bits."""
     data = bytes(data)
-    width, height = _claimed_size(data)
-    # deflate shrinks at most 1032-fold, and JPEG needs some bits for each block of 64 pixels
-    if width * height > min(_MAX_PIXELS, 1100 * max(len(data), 1)):
-        raise UndecodableError(f"its {len(data)} bytes claim {width} x {height} pixels")
+    _check_claim(data)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -132,25 +133,36 @@ def is_depth(topic: str, encoding: str) -> bool:
     return encoding == "mono16" and "depth" in name
 
 
-def _claimed_size(data: bytes) -> tuple[int, int]:
-    """Width and height in the head of a JPEG or PNG, so that nothing is allocated for a claim that cannot be true."""
-    if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 24:
-        width, height = struct.unpack_from(">II", data, 16)
-        return int(width), int(height)
-    if data.startswith(b"\xff\xd8"):
-        position = 2
-        while position + 9 <= len(data):
-            if data[position] != 0xFF:
-                break
-            marker = data[position + 1]
-            if marker == 0xFF:
-                position += 1
-            elif marker in (0x01, *range(0xD0, 0xD9)):
-                position += 2
-            elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-                height, width = struct.unpack_from(">HH", data, position + 5)
-                return int(width), int(height)
-            else:
-                position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-        raise UndecodableError("its JPEG picture is damaged")
-    raise UndecodableError("its picture is neither JPEG nor PNG")
+def _check_claim(data: bytes) -> None:
+    """UndecodableError when the size in the head of a JPEG or PNG cannot be true, before anything is allocated for it."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        if len(data) < 33 or data[12:16] != b"IHDR" or data[25] not in _PNG_CHANNELS:
+            raise UndecodableError("its PNG picture is damaged")
+        width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
+        values = width * height * _PNG_CHANNELS[colour]
+        stored = height * (width * (1 if colour == 3 else _PNG_CHANNELS[colour]) * depth // 8)
+        too_many = stored > _DEFLATE_MOST * len(data) or values * max(1, depth // 8) > _MAX_BYTES
+    elif data.startswith(b"\xff\xd8"):
+        width, height = _jpeg_size(data)
+        too_many = width * height > _JPEG_MOST * len(data)
+    else:
+        raise UndecodableError("its picture is neither JPEG nor PNG")
+    if too_many or width * height > _MAX_PIXELS:
+        raise UndecodableError(f"its {len(data)} bytes claim {width} x {height} pixels")
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int]:
+    """Width and height in the frame header of a JPEG picture."""
+    position = 2
+    while position + 9 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xFF:
+            position += 1
+        elif marker in (0x01, *range(0xD0, 0xD9)):
+            position += 2
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, position + 5)
+            return int(width), int(height)
+        else:
+            position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    raise UndecodableError("its JPEG picture is damaged")

@@ -47,6 +47,7 @@ class _Inspection:
         self.cameras: dict[str, Camera] = {}
         self.first: dict[str, LidarFrame | DepthFrame | ImageFrame] = {}
         self.counts: Counter[tuple[str, str, str]] = Counter()
+        self.empty: Counter[str] = Counter()
         self.imu_frame: str | None = None
         self._tries: Counter[str] = Counter()
         self._undecodable = Problems()
@@ -81,6 +82,8 @@ class _Inspection:
             self.cameras.setdefault(frame.header.topic, frame)
         elif isinstance(frame, ImuSample):
             self.imu_frame = frame.header.frame_id
+        elif isinstance(frame, LidarFrame) and not len(frame.points):
+            self.empty[frame.header.topic] += 1
         elif isinstance(frame, LidarFrame | DepthFrame | ImageFrame):
             self.first[frame.header.topic] = frame
 
@@ -129,6 +132,8 @@ class _Inspection:
             told.append(no_sensor(roles, self.log.streams))
         if not len(self.where.track) and not roles.problems:
             told.append(no_poses(self.log.path.name))
+        for topic, count in sorted(self.empty.items()):
+            told.append(f"{topic}: no point with a position in the first {count} cloud{'s' if count > 1 else ''}.")
         for topic in roles.depth:
             told.extend(self._depth_obstacles(topic))
         told.extend(self._pose_obstacles())

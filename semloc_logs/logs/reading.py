@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator
 from heapq import heappop, heappush, heapreplace
 from pathlib import Path
@@ -21,7 +22,7 @@ MAX_CHUNK = 2 << 30  # no recorder writes chunks of 2 GiB; a larger claim is dam
 _STEP = 1 << 22
 
 
-class BaseLog:
+class BaseLog(ABC):
     """The parts of :class:`~semloc_logs.logs.log.Log` that do not depend on the container."""
 
     def __init__(self, path: Path, format: str, problems: Problems | None = None) -> None:
@@ -39,9 +40,9 @@ class BaseLog:
         """What was skipped and why, in sentences."""
         return self._problems.sentences()
 
+    @abstractmethod
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` in log-time order."""
-        raise NotImplementedError
 
     def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
         """The decoded messages of ``topics`` in log-time order."""

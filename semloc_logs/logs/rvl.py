@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.logs.definitions import UndecodableError
 
-_MAX_PIXELS = 1 << 26
+_MAX_PIXELS = 1 << 24  # four times the largest depth camera; an empty picture is a dozen bytes whatever its size
 
 
 def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
@@ -18,12 +18,24 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
         raise UndecodableError("its RVL picture is cut off")
     width, height = struct.unpack_from("<II", data)
     pixels = width * height
-    # an empty picture is a dozen bytes whatever its size, so only reason limits what is allocated
     if pixels > _MAX_PIXELS:
         raise UndecodableError(f"its RVL picture claims {width} x {height} pixels")
-    numbers = _numbers(data[8:])
-    out = np.zeros(pixels, np.int64)
-    runs, at, position = [], 0, 0
+    numbers = _numbers(data[8 : 8 + 16 * pixels + 4])  # a pixel needs two numbers at most, of a nibble or many
+    starts, firsts, counts = (np.array(part, np.int64) for part in _runs(numbers, pixels))
+    inside = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)  # 0, 1, ... within each run
+    coded = numbers[np.repeat(firsts, counts) + inside]
+    out = np.zeros(pixels, np.uint16)
+    # the last bit is the sign of the difference, which is to the value before, also across the zeros between two runs
+    out[np.repeat(starts, counts) + inside] = np.cumsum((coded >> 1) ^ -(coded & 1)).astype(np.uint16)
+    return out.reshape(height, width)
+
+
+def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[list[int], list[int], list[int]]:
+    """For each run of values its first pixel, the place of its first number, and how many there are."""
+    starts: list[int] = []
+    firsts: list[int] = []
+    counts: list[int] = []
+    at = position = 0
     while position < pixels:
         if at + 2 > len(numbers):
             raise UndecodableError("its RVL picture is cut off")
@@ -31,16 +43,12 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
         position += zeros
         if zeros + values == 0 or position + values > pixels or at + 2 + values > len(numbers):
             raise UndecodableError("its RVL picture is damaged")
-        runs.append((position, at + 2, values))
+        starts.append(position)
+        firsts.append(at + 2)
+        counts.append(values)
         position += values
         at += 2 + values
-    value = 0
-    for start, first, count in runs:
-        coded = numbers[first : first + count]
-        run = np.cumsum((coded >> 1) ^ -(coded & 1)) + value  # the last bit is the sign of the difference
-        out[start : start + count] = run
-        value = int(run[-1]) if count else value
-    return out.astype(np.uint16).reshape(height, width)
+    return starts, firsts, counts
 
 
 def _numbers(code: bytes | memoryview) -> NDArray[np.int64]:

@@ -227,6 +227,11 @@ class Session:
         elif isinstance(frame, RangeFrame):
             if topic in roles.lidar or topic in roles.depth:
                 self._tally.saw(topic, frame.header.stamp_ns)
+                if isinstance(frame, LidarFrame):
+                    self._tally.measured(frame)
+                    if not len(frame.points):
+                        self._tally.leave_out(topic, "empty")
+                        return
                 self._waiting.append(frame)
                 self._waiting_bytes += _size(frame)
             elif topic in roles.label_of.values() and not isinstance(frame, LidarFrame):
@@ -300,6 +305,7 @@ class Session:
     def _conclude(self) -> None:
         track = self._where.track
         self._lost.extend(self._tally.sentences((track.start_ns, track.end_ns)))
+        self._notes.extend(self._tally.remarks())
         refused = [f"{n} {what}" for n, what in ((track.duplicates, "repeated"), (track.backwards, "back in time")) if n]
         if refused:
             self._notes.append(f"Poses that are {' and '.join(refused)} were left out.")

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 
+from semloc_logs.frames import LidarFrame
 from semloc_logs.logs.poses import PoseTrack
 
 _STANDSTILL_NS = 10_000_000_000  # a vehicle may well stand so long, but a log of nothing else is worth a sentence
@@ -16,6 +17,11 @@ _WHY = {
     "unusable calibration": "their CameraInfo cannot be used",
     "no depth": "they are colour or 8-bit pictures, not depth: choose another topic with --topic depth=TOPIC",
     "no points": "they have no points within the range limits",
+    "empty": "they hold no points, or none whose position is a number",
+}
+_REMARKS = {
+    "times": "sweeps are used as measured, with the motion of the vehicle in them: their point times are no times within a sweep",
+    "clock": "sweeps have point times of another clock than their header: the first point is taken to be measured at the header's time",
 }
 
 
@@ -27,6 +33,9 @@ class Tally:
         self.used: Counter[str] = Counter()
         self._left_out: Counter[tuple[str, str]] = Counter()
         self._spans: dict[str, tuple[int, int]] = {}
+        self._points: Counter[str] = Counter()
+        self._lost_points: Counter[str] = Counter()
+        self._remarks: Counter[tuple[str, str]] = Counter()
 
     def saw(self, topic: str, stamp_ns: int) -> None:
         """Counts a frame."""
@@ -38,6 +47,18 @@ class Tally:
         """Counts a frame that gives no cloud; ``reason`` is one of the keys that have a sentence."""
         self._left_out[topic, reason] += 1
 
+    def measured(self, frame: LidarFrame) -> None:
+        """Counts the points of a sweep and what was remarked on it."""
+        topic = frame.header.topic
+        self._points[topic] += len(frame.points) + frame.lost
+        self._lost_points[topic] += frame.lost
+        if frame.remark:
+            self._remarks[topic, frame.remark] += 1
+
+    def remarks(self) -> list[str]:
+        """One sentence for each topic and remark on its sweeps: what was assumed, nothing was lost."""
+        return [f"{topic}: {count} of {self.seen[topic]} {_REMARKS[key]}." for (topic, key), count in sorted(self._remarks.items())]
+
     def left_out(self, topic: str) -> dict[str, int]:
         """Reason -> frames of ``topic``."""
         return {reason: count for (t, reason), count in sorted(self._left_out.items()) if t == topic}
@@ -48,6 +69,11 @@ class Tally:
         for (topic, reason), count in sorted(self._left_out.items()):
             spans = f"frames {span(*self._spans[topic])}, poses {span(*poses)}"
             told.append(f"{topic}: {count} of {self.seen[topic]} frames are left out: {_WHY[reason].format(spans=spans)}.")
+        for topic, count in sorted(self._lost_points.items()):
+            if count:
+                told.append(
+                    f"{topic}: {count} of {self._points[topic]} points are left out: they are not finite in clouds that call themselves dense."
+                )
         return told
 
 
