@@ -1,7 +1,11 @@
-"""Ray carving of one frame: which voxels its rays pass (free) and end in (occupied). The hot loop of fusion.
+"""Ray carving of one frame: which voxels its rays end in (occupied) and which they pass (free). The hot loop of fusion.
 
-A frame is marked in a dense local grid first, one ray for each end voxel, hits winning over passes, and the marks are then
-added to hashed blocks: each voxel changes once a frame, as in OctoMap (paper 3.1).
+A frame is marked in a grid of its own first, hits winning over passes, and the marks are then added to hashed blocks: each voxel
+changes once a frame, as in OctoMap (paper 3.1). The grid lies in memory block by block, so that a block is flushed as one run of
+4096 bytes; the address of a voxel is the sum of three table look-ups, one an axis. One ray is walked for each end voxel, that of
+its first point: the others would pass nearly the same voxels.
+
+A mark is a byte: bit 0 says that a ray passed, the bits above hold the weight of the best hit in sixteenths (0: none).
 """
 
 from __future__ import annotations
@@ -12,113 +16,213 @@ from numpy.typing import NDArray
 
 from semloc_logs.voxels.keys import BLOCK
 
-FREE, HIT = 1, 2
+BITS = 12  # of an address within a block
+CLASSES = 20  # of the votes of a frame: 19 and the unlabelled
+FULL_WEIGHT = 16
+
+U8 = NDArray[np.uint8]
+I64 = NDArray[np.int64]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+def addresses(blocks: tuple[int, int, int]) -> tuple[I64, I64, I64]:
+    """Tables for the axes of a grid of ``blocks``: voxel (x, y, z) is at byte ``ax[x] + ay[y] + az[z]``."""
+    _, ny, nz = blocks
+    outer, inner = (ny * nz, nz, 1), (BLOCK * BLOCK, BLOCK, 1)
+
+    def table(axis: int) -> I64:
+        i = np.arange(blocks[axis] * BLOCK)
+        return np.asarray(((i // BLOCK * outer[axis]) << BITS) + i % BLOCK * inner[axis], np.int64)
+
+    return table(0), table(1), table(2)
 
 
 @njit(cache=True, nogil=True)
-def carve(grid: NDArray[np.uint8], origin: NDArray[np.float64], ends: NDArray[np.float64], hit: NDArray[np.bool_]) -> None:
-    """Mark the rays from ``origin`` (3,) to ``ends`` (n, 3), both in voxels from the grid's corner, inside ``grid`` (x, y, z).
+def extent(points: F32, start: F64, per_metre: float, limit: float) -> tuple[F64, F64]:
+    """Lowest and highest coordinate (3,) in voxels that rays from ``start`` (3,) to finite ``points`` (n, 3) in metres reach; rays
+    longer than ``limit`` voxels are cut there. The start is within."""
+    low, high = start.copy(), start.copy()
+    for i in range(len(points)):
+        dx, dy, dz = points[i, 0] * per_metre - start[0], points[i, 1] * per_metre - start[1], points[i, 2] * per_metre - start[2]
+        squared = dx * dx + dy * dy + dz * dz
+        if not np.isfinite(squared):
+            continue
+        scale = limit / np.sqrt(squared) if squared > limit * limit else 1.0
+        x, y, z = start[0] + dx * scale, start[1] + dy * scale, start[2] + dz * scale
+        low[0], low[1], low[2] = min(low[0], x), min(low[1], y), min(low[2], z)
+        high[0], high[1], high[2] = max(high[0], x), max(high[1], y), max(high[2], z)
+    return low, high
 
-    The end voxel becomes HIT where ``hit``; every other voxel of the ray FREE unless it is HIT already. The digital
-    differential analyser of Amanatides and Woo (1987). The grid must hold every ray.
+
+@njit(cache=True, nogil=True)
+def _slot(table: NDArray[np.int32], addresses_of: I64, address: int) -> int:
+    """Where ``address`` is in an open hash table of ray numbers, or the empty place (-1) for it."""
+    mask = len(table) - 1
+    h = (address * 0x9E3779B1 >> 7) & mask
+    while table[h] >= 0 and addresses_of[table[h]] != address:
+        h = (h + 1) & mask
+    return h
+
+
+@njit(cache=True, nogil=True)
+def mark_ends(
+    marks: U8,
+    touched: U8,
+    tables: tuple[I64, I64, I64],
+    points: F32,
+    label: U8,
+    sigma: F32,
+    start: F64,
+    low: I64,
+    per_metre: float,
+    limit: float,
+    voxel_votes: NDArray[np.uint32],
+) -> tuple[I64, F64]:
+    """Mark the end voxels of all rays; returns 2 * address + is_hit (m,) and the rays' ends to carve to (m, 3) in voxels from ``low``.
+
+    ``points`` (n, 3) in metres, ``label`` (n,), ``sigma`` (n,) in metres or (0,): a range of standard deviation sigma hits with the
+    weight min(1, voxel / 2 sigma), the share of its density that the end voxel holds at most, and carves up to 2 sigma before its
+    end. ``start`` (3,) in voxels from ``low`` (3,), ``limit`` in voxels: longer rays carve and do not hit. ``voxel_votes`` (n, 20)
+    zeros: gets the weights of each class in sixteenths, a row a ray.
     """
-    step = np.empty(3, np.int64)
-    cell = np.empty(3, np.int64)
-    last = np.empty(3, np.int64)
-    next_t = np.empty(3)
-    delta_t = np.empty(3)
+    ax, ay, az = tables
+    n = len(points)
+    size = 1024
+    while size < 2 * n:
+        size *= 2
+    hashed = np.full(size, -1, np.int32)
+    address_of = np.empty(n, np.int64)
+    ends = np.empty((n, 3))
+    count, last, row = 0, -1, -1
+    for i in range(n):
+        dx = points[i, 0] * per_metre - low[0] - start[0]
+        dy = points[i, 1] * per_metre - low[1] - start[1]
+        dz = points[i, 2] * per_metre - low[2] - start[2]
+        squared = dx * dx + dy * dy + dz * dz
+        if not np.isfinite(squared):
+            continue
+        is_hit = squared <= limit * limit
+        weight, carved = FULL_WEIGHT, 1.0
+        if not is_hit:
+            scale = limit / np.sqrt(squared)
+            dx, dy, dz = dx * scale, dy * scale, dz * scale
+        elif len(sigma) and sigma[i] > 0:
+            spread = 2 * sigma[i] * per_metre
+            weight = max(1, min(FULL_WEIGHT, int(FULL_WEIGHT / spread)) if spread > 1 else FULL_WEIGHT)
+            carved = max(0.0, 1.0 - spread / max(np.sqrt(squared), 1e-9)) if spread > 1 else 1.0
+        x, y, z = start[0] + dx, start[1] + dy, start[2] + dz
+        address = ax[int(x)] + ay[int(y)] + az[int(z)]
+        # one ray for a hit and one for a pass that end in the same voxel: they differ in what they carve
+        key = address * 2 + is_hit
+        if key != last:
+            last = key
+            touched[address >> BITS] = 1
+            h = _slot(hashed, address_of, key)
+            row = hashed[h]
+            if row < 0:
+                row = count
+                hashed[h] = row
+                address_of[row] = key
+                ends[row, 0], ends[row, 1], ends[row, 2] = start[0] + dx * carved, start[1] + dy * carved, start[2] + dz * carved
+                count += 1
+        if is_hit:
+            if (marks[address] >> 1) < weight:
+                marks[address] = weight << 1
+            voxel_votes[row, min(label[i], CLASSES - 1)] += weight
+        elif marks[address] == 0:
+            marks[address] = 1
+    return address_of[:count], ends[:count]
+
+
+@njit(cache=True, nogil=True)
+def carve(marks: U8, touched: U8, tables: tuple[I64, I64, I64], start: F64, ends: F64) -> None:
+    """Mark the voxels of the rays from ``start`` (3,) to ``ends`` (n, 3), both in voxels within the grid, as passed, and their blocks
+    in ``touched``; not the end voxels themselves, which :func:`mark_ends` has marked.
+
+    The digital differential analyser of Amanatides and Woo (1987).
+    """
+    ax, ay, az = tables
+    x0, y0, z0 = int(start[0]), int(start[1]), int(start[2])
+    first = ax[x0] + ay[y0] + az[z0]
     for r in range(len(ends)):
-        for k in range(3):
-            d = ends[r, k] - origin[k]
-            cell[k] = int(np.floor(origin[k]))
-            last[k] = int(np.floor(ends[r, k]))
-            if d > 0:
-                step[k] = 1
-                next_t[k] = (cell[k] + 1 - origin[k]) / d
-                delta_t[k] = 1.0 / d
-            elif d < 0:
-                step[k] = -1
-                next_t[k] = (cell[k] - origin[k]) / d
-                delta_t[k] = -1.0 / d
+        dx, dy, dz = ends[r, 0] - start[0], ends[r, 1] - start[1], ends[r, 2] - start[2]
+        x, y, z = x0, y0, z0
+        x1, y1, z1 = int(ends[r, 0]), int(ends[r, 1]), int(ends[r, 2])
+        sx, sy, sz = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
+        # an axis that is done waits at infinity: rounding can then never carry the walk past its end
+        tx = ((x + (dx > 0)) - start[0]) / dx if x != x1 else np.inf
+        ty = ((y + (dy > 0)) - start[1]) / dy if y != y1 else np.inf
+        tz = ((z + (dz > 0)) - start[2]) / dz if z != z1 else np.inf
+        stepx, stepy, stepz = (sx / dx if x != x1 else 0.0), (sy / dy if y != y1 else 0.0), (sz / dz if z != z1 else 0.0)
+        address = first
+        for _ in range(abs(x1 - x) + abs(y1 - y) + abs(z1 - z)):
+            marks[address] |= 1
+            touched[address >> BITS] = 1
+            if tx <= ty and tx <= tz:
+                address += ax[x + sx] - ax[x]
+                x += sx
+                tx = tx + stepx if x != x1 else np.inf
+            elif ty <= tz:
+                address += ay[y + sy] - ay[y]
+                y += sy
+                ty = ty + stepy if y != y1 else np.inf
             else:
-                step[k] = 0
-                next_t[k] = np.inf
-                delta_t[k] = np.inf
-            if cell[k] == last[k]:  # this axis is done: rounding can then never carry the walk past its end
-                next_t[k] = np.inf
-        x, y, z = cell[0], cell[1], cell[2]
-        for _ in range(abs(last[0] - x) + abs(last[1] - y) + abs(last[2] - z)):
-            if grid[x, y, z] == 0:
-                grid[x, y, z] = FREE
-            if next_t[0] <= next_t[1] and next_t[0] <= next_t[2]:
-                x += step[0]
-                next_t[0] = next_t[0] + delta_t[0] if x != last[0] else np.inf
-            elif next_t[1] <= next_t[2]:
-                y += step[1]
-                next_t[1] = next_t[1] + delta_t[1] if y != last[1] else np.inf
-            else:
-                z += step[2]
-                next_t[2] = next_t[2] + delta_t[2] if z != last[2] else np.inf
-        if hit[r]:
-            grid[last[0], last[1], last[2]] = HIT
-        elif grid[last[0], last[1], last[2]] == 0:
-            grid[last[0], last[1], last[2]] = FREE
+                address += az[z + sz] - az[z]
+                z += sz
+                tz = tz + stepz if z != z1 else np.inf
 
 
 @njit(cache=True, nogil=True)
-def touched_blocks(grid: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Offsets (m, 3) in blocks of the parts of a block-aligned ``grid`` that hold any mark."""
-    nx, ny, nz = grid.shape[0] // BLOCK, grid.shape[1] // BLOCK, grid.shape[2] // BLOCK
-    out = np.empty((nx * ny * nz, 3), np.int32)
-    n = 0
-    for bx in range(nx):
-        for by in range(ny):
-            for bz in range(nz):
-                found = False
-                for i in range(BLOCK):
-                    for j in range(BLOCK):
-                        for k in range(BLOCK):
-                            if grid[bx * BLOCK + i, by * BLOCK + j, bz * BLOCK + k]:
-                                found = True
-                                break
-                        if found:
-                            break
-                    if found:
-                        break
-                if found:
-                    out[n, 0], out[n, 1], out[n, 2] = bx, by, bz
-                    n += 1
-    return out[:n]
-
-
-@njit(cache=True, nogil=True)
-def flush(
-    grid: NDArray[np.uint8],
-    offsets: NDArray[np.int32],
-    slots: NDArray[np.int64],
-    log_odds: NDArray[np.int8],
-    hit: int,
-    miss: int,
-    low: int,
-    high: int,
-) -> None:
-    """Add the marks of ``grid`` to ``log_odds`` (slots, 4096) int8 in units of 1/20, clamped to [low, high]; -128 is unobserved.
-
-    ``offsets`` (m, 3) are blocks of the grid and ``slots`` (m,) their rows in ``log_odds``. The grid is cleared.
-    """
-    for b in range(len(offsets)):
+def flush(marks: U8, blocks: I64, slots: I64, log_odds: NDArray[np.int8], hit: int, miss: int, low: int, high: int) -> None:
+    """Add the marks of ``blocks`` (m,) to rows ``slots`` (m,) of ``log_odds`` (slots, 4096) int8 in units of 1/20, clamped to
+    [low, high]; -128 is unobserved. A hit adds its weight's share of ``hit``, at least 1. The marks are cleared."""
+    gain = np.empty(256, np.int64)
+    for mark in range(256):
+        gain[mark] = max(1, (hit * (mark >> 1) + FULL_WEIGHT // 2) // FULL_WEIGHT) if mark > 1 else -miss
+    for b in range(len(blocks)):
         row = log_odds[slots[b]]
-        x0, y0, z0 = offsets[b, 0] * BLOCK, offsets[b, 1] * BLOCK, offsets[b, 2] * BLOCK
-        n = 0
-        for i in range(BLOCK):
-            for j in range(BLOCK):
-                for k in range(BLOCK):
-                    mark = grid[x0 + i, y0 + j, z0 + k]
-                    if mark:
-                        old = int(row[n])
-                        if old == -128:
-                            old = 0
-                        value = old + (hit if mark == HIT else -miss)
-                        row[n] = min(max(value, low), high)
-                        grid[x0 + i, y0 + j, z0 + k] = 0
-                    n += 1
+        run = marks[blocks[b] << BITS : (blocks[b] + 1) << BITS]
+        for n in range(len(run)):
+            mark = run[n]
+            if mark:
+                old = int(row[n])
+                row[n] = min(max((0 if old == -128 else old) + gain[mark], low), high)
+                run[n] = 0
+
+
+@njit(cache=True, nogil=True)
+def add_votes(keys: I64, counts: NDArray[np.uint32], used: int, ends: I64, voxel_votes: NDArray[np.uint32], slot_of_block: I64) -> int:
+    """Add a frame's votes to a hash table of ``keys`` ((slot * 4096 + cell) * 32 + class, -1 empty) and ``counts``; returns how
+    many places are used. The table must be large enough. A class gets at least one vote where it has any weight."""
+    mask = len(keys) - 1
+    for r in range(len(ends)):
+        if not ends[r] & 1:
+            continue
+        address = ends[r] >> 1
+        voxel = (slot_of_block[address >> BITS] << BITS) + (address & ((1 << BITS) - 1))
+        for label in range(CLASSES):
+            weight = voxel_votes[r, label]
+            if weight == 0:
+                continue
+            key = voxel * 32 + label
+            h = ((key * 0x9E3779B97F4A7C1) >> 20) & mask
+            while keys[h] >= 0 and keys[h] != key:
+                h = (h + 1) & mask
+            if keys[h] < 0:
+                keys[h] = key
+                used += 1
+            counts[h] += (weight + FULL_WEIGHT - 1) // FULL_WEIGHT
+    return used
+
+
+@njit(cache=True, nogil=True)
+def rehash(keys: I64, counts: NDArray[np.uint32], new_keys: I64, new_counts: NDArray[np.uint32]) -> None:
+    """Move a table of :func:`add_votes` into a larger, empty one."""
+    mask = len(new_keys) - 1
+    for i in range(len(keys)):
+        if keys[i] >= 0:
+            h = ((keys[i] * 0x9E3779B97F4A7C1) >> 20) & mask
+            while new_keys[h] >= 0:
+                h = (h + 1) & mask
+            new_keys[h], new_counts[h] = keys[i], counts[i]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.settings import Fusion
-from semloc_logs.voxels.carve import carve, flush, touched_blocks
+from semloc_logs.voxels.carve import BITS, CLASSES, add_votes, addresses, carve, extent, flush, mark_ends, rehash
 from semloc_logs.voxels.keys import BLOCK, pack, unpack
 
 UNLABELLED = 255  # occupied, class unknown
@@ -17,6 +17,7 @@ UNOBSERVED = -128  # in log-odds
 SCALE = 20  # int8 log-odds are in units of 1/20
 
 U8 = NDArray[np.uint8]
+I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,62 +72,69 @@ def empty_map() -> BlockMap:
 class Fuser:
     """Fuses labelled points frame by frame; :meth:`finish` gives the map.
 
-    Class votes are kept as counted (voxel, class) pairs and resolved at the end, so the result does not depend on their order.
+    Class votes are counted for each (voxel, class), so the classes do not depend on the order of the frames.
     """
 
     fusion: Fusion  # resolved
     _slots: dict[int, int] = field(default_factory=dict)
     _log_odds: NDArray[np.int8] = field(default_factory=lambda: np.zeros((0, BLOCK**3), np.int8))
-    _votes: list[NDArray[np.int64]] = field(default_factory=list)
-    _grid: U8 = field(default_factory=lambda: np.zeros((0, 0, 0), np.uint8))
+    _vote_keys: I64 = field(default_factory=lambda: np.full(1 << 15, -1, np.int64))
+    _vote_counts: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(1 << 15, np.uint32))
+    _votes: int = 0
+    _marks: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
 
-    def add(self, points: NDArray[np.floating], label: U8, origin: NDArray[np.floating]) -> None:
+    def add(self, points: NDArray[np.floating], label: U8, origin: NDArray[np.floating], sigma: NDArray[np.floating] | None = None) -> None:
         """Integrate ``points`` (n, 3) in the map frame seen from ``origin`` (3,), with classes ``label`` (n,) (255 unknown).
 
-        Points beyond the maximum range carve and do not hit; points that are not finite are left out.
+        Points beyond the maximum range carve and do not hit; points that are not finite are left out. ``sigma`` (n,) is the standard
+        deviation of the range in metres: uncertain points count less.
         """
-        v, limit = self.fusion.voxel_size, self.fusion.max_range
-        if limit is None:
+        if self.fusion.max_range is None:
             raise ValueError("fusion settings must be resolved")
-        start = np.asarray(origin, float) / v
-        ends = np.asarray(points, float) / v
-        reach = np.linalg.norm(ends - start, axis=1)
-        usable = np.isfinite(reach)
-        if not usable.all():
-            ends, reach, label = ends[usable], reach[usable], label[usable]
-        if not len(ends):
+        points = np.ascontiguousarray(points)
+        per_metre, limit = 1.0 / self.fusion.voxel_size, self.fusion.max_range / self.fusion.voxel_size
+        start = np.asarray(origin, float) * per_metre
+        if not np.isfinite(start).all():
             return
-        hit = reach <= limit / v
-        far = ~hit
-        ends[far] = start + (ends[far] - start) * (limit / v / reach[far])[:, None]
-        low = np.floor(np.minimum(ends.min(0), start) / BLOCK).astype(np.int64) * BLOCK
-        start, ends = start - low, ends - low  # floors are taken after this step only: rounding then cannot put a cell beside the grid
-        cells = np.floor(ends).astype(np.int64)
-        size = (np.maximum(cells.max(0), np.floor(start).astype(np.int64)) // BLOCK + 1) * BLOCK
-        if (size > self._grid.shape).any():
-            self._grid = np.zeros(np.maximum(size, self._grid.shape), np.uint8)
-        # one ray for each end voxel, through its first point: the others would carve nearly the same voxels
-        address = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
-        voted, count = np.unique(address[hit] * 256 + label[hit], return_counts=True)
-        _, first = np.unique(address * 2 + far, return_index=True)
-        grid = self._grid[: size[0], : size[1], : size[2]]
-        carve(grid, start, ends[first], hit[first])
-        offsets = touched_blocks(grid)
-        keys = pack(offsets + low // BLOCK)
-        slots = np.array([self._slots.setdefault(k, len(self._slots)) for k in keys.tolist()], np.int64)
+        lowest, highest = extent(points, start, per_metre, limit)
+        # a thousandth of a voxel to spare, as positions from the corner are rounded once more
+        low = np.floor((lowest - 1e-3) / BLOCK).astype(np.int64) * BLOCK
+        blocks: tuple[int, int, int] = tuple((np.floor((highest + 1e-3 - low) / BLOCK).astype(np.int64) + 1).tolist())
+        count = blocks[0] * blocks[1] * blocks[2]
+        if count << BITS > len(self._marks):
+            self._marks = np.zeros(count << BITS, np.uint8)
+        tables, touched = addresses(blocks), np.zeros(count, np.uint8)
+        votes = np.zeros((len(points), CLASSES), np.uint32)
+        spread = np.zeros(0, np.float32) if sigma is None else np.asarray(sigma, np.float32)
+        ends, rays = mark_ends(self._marks, touched, tables, points, label, spread, start - low, low, per_metre, limit, votes)
+        carve(self._marks, touched, tables, start - low, rays)
+        found = np.flatnonzero(touched)
+        slots = self._slots_of(np.stack(np.unravel_index(found, blocks), 1) + low // BLOCK)
+        f = self.fusion
+        flush(self._marks, found, slots, self._log_odds, *(round(SCALE * a) for a in (f.hit, f.miss, f.clamp[0], f.clamp[1])))
+        slot_of_block = np.zeros(count, np.int64)
+        slot_of_block[found] = slots
+        self._reserve_votes(int(np.count_nonzero(votes[: len(ends)])))
+        self._votes = add_votes(self._vote_keys, self._vote_counts, self._votes, ends, votes, slot_of_block)
+
+    def _slots_of(self, block: NDArray[np.integer]) -> I64:
+        """Rows of ``_log_odds`` of blocks (m, 3), made where they are new."""
+        slots = np.array([self._slots.setdefault(k, len(self._slots)) for k in pack(block).tolist()], np.int64)
         if len(self._slots) > len(self._log_odds):
             grown = np.full((max(64, 2 * len(self._slots)), BLOCK**3), UNOBSERVED, np.int8)
             grown[: len(self._log_odds)] = self._log_odds
             self._log_odds = grown
-        f = self.fusion
-        flush(grid, offsets, slots, self._log_odds, *(round(SCALE * a) for a in (f.hit, f.miss, f.clamp[0], f.clamp[1])))
-        if not len(voted):
-            return
-        slot_of = np.zeros(size // BLOCK, np.int64)
-        slot_of[tuple(offsets.T)] = slots
-        where = np.stack(np.unravel_index(voted // 256, tuple(size.tolist())), 1)
-        voxel = slot_of[tuple((where // BLOCK).T)] * BLOCK**3 + _within(where)
-        self._votes.append(np.stack([voxel, voted % 256, count], 1))
+        return slots
+
+    def _reserve_votes(self, more: int) -> None:
+        """Room in the hash table of votes for ``more`` at a load of at most a half."""
+        size = len(self._vote_keys)
+        while size < 2 * (self._votes + more):
+            size *= 2
+        if size > len(self._vote_keys):
+            keys, counts = np.full(size, -1, np.int64), np.zeros(size, np.uint32)
+            rehash(self._vote_keys, self._vote_counts, keys, counts)
+            self._vote_keys, self._vote_counts = keys, counts
 
     def finish(self) -> BlockMap:
         """The fused map. A voxel is occupied where its log-odds are positive; its class has the most votes (the lower id wins a tie)."""
@@ -135,34 +143,27 @@ class Fuser:
         keys = np.fromiter(self._slots.keys(), np.int64, len(self._slots))
         order = np.argsort(keys)
         log_odds = self._log_odds[np.fromiter(self._slots.values(), np.int64, len(self._slots))[order]]
-        keys = keys[order]
-        occupied = log_odds > 0
-        state = np.where(occupied, UNLABELLED, np.where(log_odds == UNOBSERVED, UNOBSERVED_STATE, FREE_STATE)).astype(np.uint8)
-        hits = np.zeros(log_odds.shape, np.uint16)
-        if self._votes:
-            voxel, label, count = _winners(np.concatenate(self._votes))
-            row, cell = np.argsort(order)[voxel // BLOCK**3], voxel % BLOCK**3
-            keep = occupied[row, cell]
-            state[row[keep], cell[keep]] = label[keep]
-            hits[row[keep], cell[keep]] = np.minimum(count[keep], 65535)
-        return BlockMap(keys, log_odds, state, hits)
+        used = self._vote_keys >= 0
+        key, count = self._vote_keys[used], self._vote_counts[used]
+        key = (np.argsort(order)[key >> 17] << 17) | (key & 0x1FFFF)  # slots -> rows of the sorted map
+        sort = np.argsort(key)
+        return resolve(keys[order], log_odds, key[sort], np.minimum(count[sort], 65535))
 
 
-def _within(ijk: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of voxels (n, 3) within their blocks."""
-    i = ijk % BLOCK
-    return np.asarray((i[:, 0] * BLOCK + i[:, 1]) * BLOCK + i[:, 2])
-
-
-def _winners(votes: NDArray[np.int64]) -> tuple[NDArray[np.int64], U8, NDArray[np.int64]]:
-    """Voxels, their winning class and the number of all their votes, from rows (voxel, class, count). Known classes beat unknown."""
-    order = np.lexsort((votes[:, 1], votes[:, 0]))
-    votes = votes[order]
-    pair = np.flatnonzero(np.r_[True, (votes[1:, :2] != votes[:-1, :2]).any(1)])
-    total = np.add.reduceat(votes[:, 2], pair)
-    voxel, label = votes[pair, 0], votes[pair, 1]
-    weight = np.where(label == UNLABELLED, 0, total)
-    best = np.lexsort((label, -weight, voxel))
-    first = best[np.r_[True, voxel[best][1:] != voxel[best][:-1]]]
-    group = np.flatnonzero(np.r_[True, voxel[1:] != voxel[:-1]])
-    return voxel[first], label[first].astype(np.uint8), np.add.reduceat(total, group)
+def resolve(keys: I64, log_odds: NDArray[np.int8], vote: I64, count: NDArray[np.integer]) -> BlockMap:
+    """The map of ``log_odds`` (n, 4096) with ``vote`` (m,) ascending: (row * 4096 + cell) * 32 + class, 19 being unlabelled."""
+    occupied = log_odds > 0
+    state = np.where(occupied, UNLABELLED, np.where(log_odds == UNOBSERVED, UNOBSERVED_STATE, FREE_STATE)).astype(np.uint8)
+    hits = np.zeros(log_odds.shape, np.uint16)
+    voxel = vote >> 5
+    keep = occupied.reshape(-1)[voxel]
+    vote, voxel, count = vote[keep], voxel[keep], count[keep].astype(np.int64)
+    if len(vote):
+        label = vote & 31
+        weight = np.where(label == CLASSES - 1, 0, count)  # a known class beats the unlabelled
+        best = np.lexsort((label, -weight, voxel))
+        first = best[np.r_[True, voxel[best][1:] != voxel[best][:-1]]]
+        start = np.flatnonzero(np.r_[True, voxel[1:] != voxel[:-1]])
+        state.reshape(-1)[voxel[first]] = np.where(label[first] == CLASSES - 1, UNLABELLED, label[first])
+        hits.reshape(-1)[voxel[start]] = np.minimum(np.add.reduceat(count, start), 65535)
+    return BlockMap(keys, log_odds, state, hits)
