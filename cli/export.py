@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import click
 
 from .console import console
 from .options import Command, console_options, json_option, path_option, work_option
+
+POINTS = ("ply", "pcd", "las", "laz", "xyz")
 
 
 @click.command(cls=Command)
@@ -16,25 +19,47 @@ from .options import Command, console_options, json_option, path_option, work_op
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["tum", "kitti", "g2o", "ply"]),
+    type=click.Choice(["tum", "kitti", "g2o", *POINTS]),
     required=True,
-    help="Poses, a pose graph with closures, or the map.",
+    help="Poses, a pose graph with closures, or points.",
 )
+@click.option("--what", type=click.Choice(["voxels", "keyframes"]), help="Points: occupied voxels (default) or the keyframes' points.")
+@click.option(
+    "--frame",
+    type=click.Choice(["session", "map"]),
+    help="Points are in the session frame of the log's poses (default), or in the level map frame that starts at the first keyframe.",
+)
+@click.option("--bounds", type=float, nargs=4, metavar="XMIN YMIN XMAX YMAX", help="Only points within this box of that frame (m).")
 @path_option("-o", "--output", help="Folder of the files; default: WORK/export.")
 @json_option
 @console_options
-def command(sessions: tuple[str, ...], work: Path, form: str, output: Path | None, as_json: bool) -> int:
-    """Sessions for other programs: poses of the base frame (tum, kitti), a pose graph with the closures (g2o), the voxel map (ply).
+def command(
+    sessions: tuple[str, ...],
+    work: Path,
+    form: str,
+    what: Literal["voxels", "keyframes"] | None,
+    frame: Literal["session", "map"] | None,
+    bounds: tuple[float, float, float, float] | None,
+    output: Path | None,
+    as_json: bool,
+) -> int:
+    """Sessions for other programs: poses of the base frame (tum, kitti), a pose graph with the closures (g2o), points (ply, pcd, las,
+    laz, xyz) with their classes.
 
-    Poses and maps are in the session frame of the log's pose stream, metres.
+    Poses and points are in the session frame of the log's pose stream, metres; points also in the level map frame.
 
     \b
-    Example:  semloc export -w work --format g2o
+    Example:  semloc export -w work --format las --bounds -50 -50 50 50
     """
-    from semloc_logs.exports import export
+    if form not in POINTS and (what or frame or bounds):
+        raise click.UsageError(f"--what, --frame and --bounds choose points; {form} has none. Formats with points: {', '.join(POINTS)}.")
+    if bounds and not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
+        raise click.BadParameter("the box is empty: give XMIN YMIN XMAX YMAX with XMIN < XMAX and YMIN < YMAX", param_hint="--bounds")
+    from semloc_logs.exports import Selection, export
     from semloc_logs.workspace import Workspace
 
-    paths = export(Workspace(work), sessions, form, output or work / "export")
+    selection = Selection(what or "voxels", frame or "session", bounds)
+    paths = export(Workspace(work), sessions, form, output or work / "export", selection)
     if as_json:
         console.result_json({"files": [str(p) for p in paths]})
     else:

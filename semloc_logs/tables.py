@@ -32,10 +32,10 @@ def fsync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def replacing_file(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that is renamed onto it when the block ends well and removed when it does not."""
+def replacing_file(path: Path, suffix: str = ".tmp") -> Iterator[Path]:
+    """A temporary path beside ``path``, ending in ``suffix``; it is renamed onto ``path`` when the block ends well, else removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{suffix}")
     try:
         yield temporary
         with temporary.open("rb+") as written:

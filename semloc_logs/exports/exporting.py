@@ -1,0 +1,91 @@
+"""Sessions and closures in other programs' formats: poses (TUM, KITTI), a pose graph (g2o), points (PLY, PCD, LAS, LAZ, XYZ)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from semloc_logs.closures.queries import SessionMap
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.exports.clouds import Bounds, SessionPoints
+from semloc_logs.exports.formats import write_las, write_pcd, write_ply, write_xyz
+from semloc_logs.exports.graph import pose_graph
+from semloc_logs.geometry import translation_quaternion
+from semloc_logs.tables import read_table, replacing_file
+from semloc_logs.voxels.store import poses_of
+from semloc_logs.workspace import Workspace
+
+WRITERS: dict[str, Callable[[Path, SessionPoints], None]] = {
+    "ply": write_ply,
+    "pcd": write_pcd,
+    "las": write_las,
+    "laz": write_las,
+    "xyz": write_xyz,
+}
+POINT_FORMATS = tuple(WRITERS)
+FORMATS = ("tum", "kitti", "g2o", *POINT_FORMATS)
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Which points: the map's ``voxels`` or those of the ``keyframes``, in which frame, and within which bounds of it (m) if any."""
+
+    what: Literal["voxels", "keyframes"] = "voxels"
+    frame: Literal["session", "map"] = "session"
+    bounds: Bounds | None = None
+
+
+def export(work: Workspace, names: Sequence[str], form: str, output: Path, selection: Selection | None = None) -> list[Path]:
+    """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
+
+    ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``: one pose graph of all; the point
+    formats: ``selection``, by default the centres of all occupied voxels in the session frame. Raises WorkspaceError when a session
+    is not there or does not fit the format, SemlocError when a library is missing.
+    """
+    known = {f.name: SessionMap(f) for f in work.sessions()}
+    missing = [n for n in names if n not in known]
+    if missing or not known:
+        raise WorkspaceError(
+            f"{work.path} has no fused session {', '.join(missing) or 'at all'} (there are: {', '.join(known) or 'none'})."
+        )
+    sessions = {n: known[n] for n in names or known}
+    if form == "g2o":
+        path = output / "closures.g2o"
+        _write(path, pose_graph(sessions, work).encode())
+        return [path]
+    paths = []
+    for name, session in sessions.items():
+        if form in ("tum", "kitti"):
+            paths.append(output / f"{name}.{'txt' if form == 'kitti' else form}")
+            _write(paths[-1], (tum if form == "tum" else kitti)(session))
+            continue
+        chosen = selection or Selection()
+        points = SessionPoints(session, chosen.what, chosen.frame, chosen.bounds)
+        paths.append(output / f"{name}{'-keyframes' if chosen.what == 'keyframes' else ''}.{form}")
+        with replacing_file(paths[-1], suffix=f".{form}") as temporary:
+            WRITERS[form](temporary, points)
+    return paths
+
+
+def _write(path: Path, content: bytes) -> None:
+    with replacing_file(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def tum(session: SessionMap) -> bytes:
+    """Seconds, position (m), quaternion xyzw of the base frame in the session frame: the whole trajectory."""
+    table = read_table(session.folder.trajectory)
+    t, q = translation_quaternion(poses_of(table))
+    lines = [
+        f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{x:.9g}" for x in (*position, *quaternion))
+        for stamp, position, quaternion in zip(table["stamp_ns"].to_pylist(), t, q, strict=True)
+    ]
+    return "".join(f"{line}\n" for line in lines).encode()
+
+
+def kitti(session: SessionMap) -> bytes:
+    """Twelve numbers a line: the upper 3 x 4 of ``session_T_base`` of each pose of the trajectory, row-major."""
+    poses = poses_of(read_table(session.folder.trajectory))
+    return "".join(" ".join(f"{x:.9g}" for x in pose[:3].ravel()) + "\n" for pose in poses).encode()

@@ -1,0 +1,62 @@
+"""The pose graph of sessions and closures as g2o text, for GTSAM, g2o and Ceres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.results import keyframe_at, read_closures
+from semloc_logs.geometry import inverse, transform, translation_quaternion
+from semloc_logs.workspace import Workspace
+
+F64 = NDArray[np.float64]
+ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD = (0.02, 0.01), (0.002, 0.002)  # fixed part, and part per metre of road
+
+
+def pose_graph(sessions: dict[str, SessionMap], work: Workspace) -> str:
+    """g2o text: keyframes as vertices (each session in its own map frame), odometry between neighbours, closures of closures.parquet.
+
+    Information is of (x y z, rotation vector in radians) in the axes of the edge's second vertex, as GTSAM and Ceres read it. Odometry
+    has no covariance in a workspace; it is given 2 cm + 1 % of the road and 2 mrad + 2 mrad/m.
+    """
+    lines: list[str] = []
+    first: dict[str, int] = {}
+    for name, session in sessions.items():
+        first[name] = sum(len(s.stamps_ns) for s in list(sessions.values())[: len(first)])
+        lines.append(f"# {name}: vertices {first[name]} .. {first[name] + len(session.stamps_ns) - 1}")
+        lines += [f"VERTEX_SE3:QUAT {first[name] + i} {_pose_text(pose)}" for i, pose in enumerate(session.map_T_base)]
+    for name, session in sessions.items():
+        if session.posed:
+            lines += _odometry(first[name], session.map_T_base)
+    for row in read_closures(work.closures) if work.closures.exists() else []:
+        if row["query_session"] in sessions and row["target_session"] in sessions:
+            query, target = (
+                first[row[f"{end}_session"]] + keyframe_at(sessions[row[f"{end}_session"]], row[f"{end}_stamp_ns"])
+                for end in ("query", "target")
+            )
+            target_T_query = transform(np.array([row[f"t_{c}"] for c in "xyz"]), np.array([row[f"q_{c}"] for c in "xyzw"]))
+            turn = np.kron(np.eye(2), target_T_query[:3, :3].T)  # from the target's axes into the query's
+            covariance = turn @ np.array(row["covariance"]).reshape(6, 6) @ turn.T
+            lines.append(_edge(target, query, target_T_query, covariance))
+    return "\n".join(lines) + "\n"
+
+
+def _odometry(first: int, poses: F64) -> list[str]:
+    out = []
+    for i in range(len(poses) - 1):
+        step = inverse(poses[i]) @ poses[i + 1]
+        road = float(np.linalg.norm(step[:3, 3]))
+        sigma = np.repeat([a + b * road for a, b in (ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD)], 3)
+        out.append(_edge(first + i, first + i + 1, step, np.diag(sigma**2)))
+    return out
+
+
+def _edge(a: int, b: int, a_T_b: F64, covariance: F64) -> str:
+    upper = np.linalg.inv(covariance)[np.triu_indices(6)]
+    return f"EDGE_SE3:QUAT {a} {b} {_pose_text(a_T_b)} " + " ".join(f"{x:.9g}" for x in upper)
+
+
+def _pose_text(pose: F64) -> str:
+    t, q = translation_quaternion(pose)
+    return " ".join(f"{x:.9g}" for x in (*t, *q))
