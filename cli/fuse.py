@@ -16,8 +16,10 @@ from .options import (
     json_option,
     logs_argument,
     overwrite_option,
+    pose_options,
     settings_options,
     topic_option,
+    trajectories,
     work_option,
 )
 from .results import checked_name, finish, report_json, show_report
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 @work_option
 @click.option("--session", metavar="NAME", help="Name of the session; default: the first log's file stem or folder name.")
 @topic_option
+@pose_options
 @overwrite_option
 @json_option
 @engine_options
@@ -41,6 +44,9 @@ def command(
     work: Path,
     session: str | None,
     topics: dict[str, str],
+    pose_files: tuple[str, ...],
+    pose_times: tuple[str, ...],
+    pose_frame: str,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -57,8 +63,9 @@ def command(
     from semloc_logs.workspace import Workspace
 
     name = checked_name(session or session_name(logs[0]))
+    poses = trajectories([name], pose_files, pose_times, pose_frame)
     with console.progress(), engine.open(1) as opened:
-        report = fuse({name: logs}, Workspace(work), settings, topics, opened, console.note, overwrite)
+        report = fuse({name: logs}, Workspace(work), settings, topics, opened, console.note, overwrite, poses)
     if as_json:
         console.result_json(report_json(report, work))
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +16,13 @@ from .console import console
 
 if TYPE_CHECKING:
     from semloc_logs.engines import Engine
+    from semloc_logs.logs.trajectory_file import TrajectoryFile
     from semloc_logs.settings import Settings
 
 Function = Callable[..., Any]
 
 FLAGS = {  # options that are short for a setting
+    "odometry": "fusion.odometry",
     "query_frames": "query.frames",
     "query_length": "query.length",
     "query_every": "query.every",
@@ -164,6 +166,58 @@ def query_options(function: Function) -> Function:
     ):
         function = decorate(function)
     return function
+
+
+def pose_options(function: Function) -> Function:
+    """Poses from elsewhere than a stream of the log; the command gets ``pose_files``, ``pose_times`` and ``pose_frame``."""
+    for decorate in (
+        click.option("--pose-frame", metavar="FRAME", default="", help="Frame that the poses of --poses are of; default: the base frame."),
+        click.option(
+            "--pose-times", "pose_times", metavar="[SESSION=]FILE", multiple=True, help="Times of KITTI poses, one in seconds a line."
+        ),
+        click.option(
+            "--poses",
+            "pose_files",
+            metavar="[SESSION=]FILE",
+            multiple=True,
+            help="Trajectory (TUM or KITTI) instead of the log's own poses; SESSION= for each of several logs.",
+        ),
+        click.option(
+            "--odometry",
+            type=click.Choice(["none", "lidar"]),
+            help="lidar: poses from LIDAR odometry instead of the log's own (needs the extra 'odometry').",
+        ),
+    ):
+        function = decorate(function)
+    return function
+
+
+def trajectories(
+    sessions: Iterable[str], pose_files: Iterable[str], pose_times: Iterable[str], pose_frame: str
+) -> dict[str, TrajectoryFile]:
+    """Files of poses by session; UsageError when it is not clear which session a file belongs to."""
+    from semloc_logs.logs.trajectory_file import TrajectoryFile
+
+    names = list(sessions)
+    files, times = _by_session("--poses", names, pose_files), _by_session("--pose-times", names, pose_times)
+    without = [name for name in times if name not in files]
+    if without or (pose_frame and not files):
+        raise click.UsageError(f"{'--pose-times' if without else '--pose-frame'} says something about --poses FILE: give that, too.")
+    return {name: TrajectoryFile(file, times.get(name), pose_frame) for name, file in files.items()}
+
+
+def _by_session(option: str, names: list[str], values: Iterable[str]) -> dict[str, Path]:
+    out: dict[str, Path] = {}
+    for value in values:
+        name, equals, rest = value.partition("=")
+        if not (equals and name in names):
+            name, rest = names[0], value
+            if len(names) > 1:
+                raise click.UsageError(f"{option} {value}: say which session it belongs to with SESSION=FILE ({', '.join(names)}).")
+        if name in out:
+            raise click.UsageError(f"{option} is given twice for session '{name}'.")
+        out[name] = Path(rest)
+    return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,11 @@ from .options import (
     json_option,
     logs_argument,
     overwrite_option,
+    pose_options,
     query_options,
     settings_options,
     topic_option,
+    trajectories,
     work_option,
 )
 from .results import finish, report_json, session_logs, show_closures
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
     help="Also write the closures as channels: to WORK/annotated (copy, sidecar) or into the logs.",
 )
 @topic_option
+@pose_options
 @query_options
 @overwrite_option
 @json_option
@@ -50,6 +53,9 @@ def command(
     work: Path,
     annotation: str,
     topics: dict[str, str],
+    pose_files: tuple[str, ...],
+    pose_times: tuple[str, ...],
+    pose_frame: str,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -64,12 +70,13 @@ def command(
     Example:  semloc run monday.mcap tuesday.bag -w work --annotate copy
     """
     sessions = session_logs(logs)
+    poses = trajectories(sessions, pose_files, pose_times, pose_frame)
     from semloc_logs.stages import run
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(sessions)) as opened:
-        report = run(sessions, workspace, settings, topics, opened, console.note, annotation, overwrite)
+        report = run(sessions, workspace, settings, topics, opened, console.note, annotation, overwrite, poses)
     if as_json:
         console.result_json(report_json(report, work))
     else:

@@ -44,6 +44,9 @@ class Fusion(_Section):
     submap_overlap: float = Field(0.25, ge=0.0, lt=1.0, description="share of a submap that the next one repeats")
     hit: float = Field(0.85, ge=0.05, le=6, description="log-odds added to a voxel that a ray ends in")
     miss: float = Field(0.40, ge=0.05, le=6, description="log-odds taken from a voxel that a ray passes")
+    odometry: Literal["none", "lidar"] = Field(
+        "none", description="lidar: poses from LIDAR odometry (KISS-ICP, the extra 'odometry') instead of those of the log"
+    )
     clamp: tuple[float, float] = Field((-2.0, 3.5), description="bounds of the log-odds (OctoMap), within +-6")
 
     @model_validator(mode="after")

@@ -32,6 +32,7 @@ from semloc_logs.logs.annotate import (
     content_fingerprint,
     recover,
 )
+from semloc_logs.logs.trajectory_file import TrajectoryFile
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describing import DescribeTask, variants_for
 from semloc_logs.tables import read_json, read_metadata, replacing_folder, write_json
@@ -79,20 +80,26 @@ def fuse(
     engine: Engine,
     note: Note,
     overwrite: bool = False,
+    poses: Mapping[str, TrajectoryFile] | None = None,
 ) -> Report:
-    """Logs -> keyframes, submaps and map of each session. A session that fails is named in ``failed``; the others go on."""
+    """Logs -> keyframes, submaps and map of each session. A session that fails is named in ``failed``; the others go on.
+
+    ``poses``: files of poses by session, instead of those of its logs.
+    """
     report, tasks = Report(), []
     for name, logs in sessions.items():
         for log in logs:
             recover(log)
         folder = work.session(name)
         inputs = [content_fingerprint(log) for log in logs]
+        trajectory = (poses or {}).get(name)
+        inputs += [f"poses {trajectory.fingerprint()}"] if trajectory else []
         fingerprint = _hash(settings.fingerprint("fusion", "labels"), repr(sorted(topics.items())), *inputs)
         if not overwrite and _fingerprint(folder.session_json) == fingerprint:
             report.kept.append(name)
             report.skipped += read_json(folder.session_json)["skipped"]
         else:
-            tasks.append(FuseTask(tuple(Path(log).absolute() for log in logs), folder, settings, dict(topics), fingerprint))
+            tasks.append(FuseTask(tuple(Path(log).absolute() for log in logs), folder, settings, dict(topics), fingerprint, trajectory))
     # only a task in this process can say how far it is
     fuse_one = partial(_fuse_one, note=note) if isinstance(engine, Serial) else _fuse_one
     for task, outcome in zip(tasks, engine.map(fuse_one, tasks), strict=True):
@@ -105,6 +112,8 @@ def fuse(
             report.skipped += outcome["skipped"]
             made = f"{outcome['keyframes']} keyframes, {len(outcome['submaps'])} submaps, {outcome['voxels']} voxels"
             note(f"{name}: {made}, labels from {outcome['label_source']}")
+            for problem in (p for p in outcome["problems"] if p not in outcome["skipped"]):
+                note(problem if problem.startswith(name) else f"{name}: {problem}")
     if report.failed and not report.done and not report.kept:
         raise LogError(" ".join(report.failed))
     return report
@@ -298,8 +307,9 @@ def run(
     note: Note,
     annotation: str = "none",
     overwrite: bool = False,
+    poses: Mapping[str, TrajectoryFile] | None = None,
 ) -> Report:
-    """All of it: each log is a session. Resumable; ``annotation`` is none, copy, sidecar or in-place."""
+    """All of it: each log is a session. Resumable; ``annotation`` is none, copy, sidecar or in-place; ``poses`` as in :func:`fuse`."""
     settings = settings.resolved()
     total = Report()
     clock = time.perf_counter()
@@ -312,7 +322,7 @@ def run(
         total.seconds[stage] = round(time.perf_counter() - clock, 3)
         clock = time.perf_counter()
 
-    fused = fuse(sessions, work, settings, topics, engine, note, overwrite)
+    fused = fuse(sessions, work, settings, topics, engine, note, overwrite, poses)
     add("fuse", fused)
     names = [n for n in sessions if work.session(n).session_json.exists()]
     add("describe", describe(work, names, settings, engine, note, overwrite))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
-from semloc_logs.frames import F64, PoseSample, TransformSample
+from semloc_logs.errors import LogError
+from semloc_logs.frames import F64, Frame, PoseSample, TransformSample
 from semloc_logs.logs.poses import PoseTrack
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.transforms import Edge, TransformTree, frame_name
@@ -61,20 +63,55 @@ def choose_base_frame(tree: TransformTree, sensors: Sequence[str], pose_child: s
     return BaseFrame(child, child, assumed=first, notes=(note,))
 
 
+class PoseSource(Protocol):
+    """Poses that are not a stream of the log: of a file, or made from what the log has.
+
+    ``name`` is what sentences call it; ``child`` the frame that its poses are of, "" for the base frame, None while nobody knows;
+    ``is_over`` says that no more poses will come. ``problems`` are about poses that are missing, ``notes`` about what was assumed.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def session_frame(self) -> str: ...
+    @property
+    def child(self) -> str | None: ...
+    @property
+    def is_over(self) -> bool: ...
+    @property
+    def problems(self) -> list[str]: ...
+    @property
+    def notes(self) -> list[str]: ...
+
+    def take(self, frame: Frame) -> None:
+        """A frame of the log, in the order of recording."""
+
+    def poses(self, base_T: Callable[[str, int], F64 | None]) -> Iterator[tuple[int, F64]]:
+        """Stamps (ns) and ``session_T_child`` (4, 4) that are new since the last call; ``base_T`` gives ``base_T_frame`` at a time."""
+
+    def finish(self) -> None:
+        """All frames of the log have been seen."""
+
+    def to_json(self) -> dict[str, object]:
+        """For session.json."""
+
+
 class BasePoses:
     """Poses and transforms of a log as they come -> ``session_T_base`` and ``base_T_sensor``.
 
     Poses stay raw until :meth:`settle` has chosen the base frame. ``static_count``: static TF messages that are still to come, from
-    the log's own statistics; once they are all there, nobody has to wait for more.
+    the log's own statistics; once they are all there, nobody has to wait for more. ``source`` gives the poses instead of the log's
+    pose topic and TF.
     """
 
-    def __init__(self, roles: Roles, static_count: int = 0) -> None:
+    def __init__(self, roles: Roles, static_count: int = 0, source: PoseSource | None = None) -> None:
         self.tree = TransformTree()
         self.track = PoseTrack()
         self.base: BaseFrame | None = None
         self.session_frame = ""
         self._roles = roles
-        self._has_topic = roles.pose is not None and roles.pose not in (*roles.tf, *roles.tf_static)
+        self.source = source
+        self._has_topic = source is None and roles.pose is not None and roles.pose not in (*roles.tf, *roles.tf_static)
         self._child: str | None = None
         self._edge: Edge | None = None
         self._raw: deque[tuple[int, F64]] = deque()
@@ -105,7 +142,11 @@ class BasePoses:
         nothing yet, the answer stays False even if it must: its frame is unknown.
         """
         edge = None
-        if self._has_topic:
+        if self.source is not None:
+            child = self.source.child
+            if child is None:
+                return False
+        elif self._has_topic:
             child = self._child
             if child is None:
                 return False
@@ -116,17 +157,44 @@ class BasePoses:
             child = edge[1] if edge else None
         if not must and not self._is_settled(sensors, child):
             return False
-        self.base = choose_base_frame(self.tree, sensors, child, self._roles.pose or "TF")
+        self.base = self._choose(sensors, child)
         if edge is not None:
             self._edge, self.session_frame = edge, edge[0]
             track = self.tree.track(*edge)
             if track is not None:
                 self._raw.extend(zip(track.stamps_ns.tolist(), track.poses, strict=True))
+        self.pull()
         self._move()
         return True
 
+    def _choose(self, sensors: Sequence[str], child: str | None) -> BaseFrame:
+        source = self.source
+        if source is None:
+            return choose_base_frame(self.tree, sensors, child, self._roles.pose or "TF")
+        self.session_frame = source.session_frame
+        if not child:
+            base = choose_base_frame(self.tree, sensors, None, source.name)
+            return replace(base, pose_frame=base.name)
+        known = {*self.tree.frames, *map(frame_name, sensors)}
+        if frame_name(child) not in known:
+            raise LogError(
+                f"{source.name} gives the poses of '{child}', but the log has no such frame: name one of {', '.join(sorted(known))}."
+            )
+        return choose_base_frame(self.tree, sensors, child, source.name)
+
+    def pull(self) -> None:
+        """Takes what is new from the source of poses, if there is one."""
+        if self.source is not None and self.base is not None:
+            new = list(self.source.poses(self.base_T))
+            if new:
+                self._raw.extend(new)
+                self._move()
+
     def finish(self) -> None:
         """No more transforms will come: poses that wait for one are given up."""
+        if self.source is not None:
+            self.source.finish()
+            self.pull()
         self._move(is_end=True)
 
     def base_T(self, frame_id: str, stamp_ns: int) -> F64 | None:
@@ -141,6 +209,8 @@ class BasePoses:
         """Whether the poses reach beyond ``stamp_ns``, or there is nothing to wait for."""
         if self.base is None or self.base.pose_frame is None:
             return self.base is not None
+        if self.source is not None and self.source.is_over and not self._raw:
+            return True
         return self.track.end_ns is not None and self.track.end_ns >= stamp_ns
 
     def transforms_have_passed(self, frame_id: str, stamp_ns: int) -> bool:
@@ -154,7 +224,7 @@ class BasePoses:
         return next((edge for frame in frames if (edge := self.tree.pose_edge(frame)) is not None), None)
 
     def _is_settled(self, sensors: Sequence[str], child: str | None) -> bool:
-        if child == "" or not (self._roles.tf or self._roles.tf_static):
+        if (child == "" and self.source is None) or not (self._roles.tf or self._roles.tf_static):
             return True
         if all(self.tree.connected(BASE_LINK, f) for f in (*sensors, *([child] if child else []))):
             return True

@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError, RoleError
 from semloc_logs.frames import F64, Camera, DepthFrame, Frame, ImageFrame, ImuSample, LidarFrame, PosedCloud, PoseSample, TransformSample
-from semloc_logs.logs.base_frame import BasePoses
+from semloc_logs.logs.base_frame import BasePoses, PoseSource
 from semloc_logs.logs.depth import DepthClouds
 from semloc_logs.logs.gravity import Accelerometer
 from semloc_logs.logs.log import Log, Stream
 from semloc_logs.logs.merge import merged_frames, merged_streams
+from semloc_logs.logs.odometry import LidarOdometry
 from semloc_logs.logs.open import open_log
 from semloc_logs.logs.roles import Roles, find_roles, no_sensor
 from semloc_logs.logs.sweeps import LONGEST_SWEEP_NS, in_base, sweep_in_base
 from semloc_logs.logs.tally import Tally, never_moves, no_poses, without_unused
+from semloc_logs.logs.trajectory_file import FilePoses, TrajectoryFile
 
 MAX_WAITING = 64  # frames that wait for their pose and transforms
 MAX_WAITING_BYTES = 512 << 20
@@ -35,10 +37,13 @@ def open_session(
     min_range: float = 0.5,
     max_range: float = 80.0,
     stride: int | None = None,
+    poses: TrajectoryFile | None = None,
+    odometry: str = "none",
 ) -> Session:
     """Opens the logs of one session; ``topics`` overrules roles, points outside of the ranges (m, from the sensor) are dropped.
 
-    ``stride`` keeps every n-th pixel of every n-th row of depth images; None: 2 above 200,000 pixels. LogError for a log that cannot
+    ``stride`` keeps every n-th pixel of every n-th row of depth images; None: 2 above 200,000 pixels. ``poses`` is a file of poses, and
+    ``odometry`` "lidar" makes poses of the sweeps: either replaces what the log says. LogError for a log or file that cannot
     be read, RoleError when the streams leave open what to use, or have nothing to make clouds from.
     """
     if not paths:
@@ -47,7 +52,7 @@ def open_session(
     try:
         logs.extend(open_log(Path(path)) for path in paths)
         logs.sort(key=lambda log: (log.start_ns is None, log.start_ns or 0))
-        return Session(logs, topics, min_range=min_range, max_range=max_range, stride=stride)
+        return Session(logs, topics, min_range=min_range, max_range=max_range, stride=stride, poses=poses, odometry=odometry)
     except BaseException:
         for log in logs:
             log.close()
@@ -65,12 +70,15 @@ class Session:
         min_range: float = 0.5,
         max_range: float = 80.0,
         stride: int | None = None,
+        poses: TrajectoryFile | None = None,
+        odometry: str = "none",
     ) -> None:
         self.logs = list(logs)
         self.streams: list[Stream] = merged_streams(self.logs)
         self.name = " + ".join(log.path.name for log in self.logs)
+        self._poses, self._odometry = poses, odometry == "lidar" and poses is None
         try:
-            self.roles: Roles = find_roles(self.streams, topics)
+            self.roles: Roles = self._find_roles(topics or {})
         except RoleError as error:
             raise RoleError(f"{self.name}: {error}") from error
         if not self.roles.lidar and not self.roles.depth:
@@ -78,9 +86,28 @@ class Session:
         self.min_range, self.max_range, self.stride = min_range, max_range, stride
         self._begin()
 
+    def _find_roles(self, topics: Mapping[str, str]) -> Roles:
+        """The roles; poses from elsewhere leave the log's own pose topic unused, and unambiguous."""
+        if self._poses is None and not self._odometry:
+            return find_roles(self.streams, topics)
+        roles = find_roles(self.streams, {**topics, "pose": "none"})
+        if self._odometry and not roles.lidar:  # of several logs some may have a depth camera and poses
+            self._odometry = False
+            return find_roles(self.streams, topics)
+        return roles
+
+    def _pose_source(self) -> PoseSource | None:
+        """Where poses come from if not from a stream of the log."""
+        main = next(iter((*self.roles.lidar, *self.roles.depth)))
+        if self._poses is not None:
+            return FilePoses(self._poses, main, sum(s.count for s in self.streams if s.topic == main))
+        if self._odometry:
+            return LidarOdometry(main, min_range=self.min_range, max_range=self.max_range)
+        return None
+
     def _begin(self) -> None:
         static_count = sum(s.count for s in self.streams if s.topic in self.roles.tf_static)
-        self._where = BasePoses(self.roles, static_count)
+        self._where = BasePoses(self.roles, static_count, self._pose_source())
         self._depth = DepthClouds(self.roles, self.stride)
         self._accelerometer = Accelerometer()
         self._tally = Tally()
@@ -186,6 +213,7 @@ class Session:
             },
             "sweeps_deskewed": self._deskewed,
             "poses": track.to_json(),
+            "pose_source": self._where.source.to_json() if self._where.source else {"kind": "log"},
             "problems": self.problems,
         }
 
@@ -234,6 +262,9 @@ class Session:
                         return
                 self._waiting.append(frame)
                 self._waiting_bytes += _size(frame)
+                if self._where.source is not None:
+                    self._where.source.take(frame)
+                    self._where.pull()
             elif topic in roles.label_of.values() and not isinstance(frame, LidarFrame):
                 self._depth.take_label(frame)
             elif isinstance(frame, ImageFrame) and on_image is not None:
@@ -311,7 +342,11 @@ class Session:
             self._notes.append(f"Poses that are {' and '.join(refused)} were left out.")
         if track.invalid:
             self._lost.append(f"{track.invalid} poses are no rigid transforms and were left out.")
-        self._notes.extend(never_moves(self.roles.pose or "TF", track))
+        source = self._where.source
+        if source is not None:
+            self._lost.extend(source.problems)
+            self._notes.extend(source.notes)
+        self._notes.extend(never_moves(source.name if source else self.roles.pose or "TF", track))
         if self._where.base is not None and self._where.base.pose_frame is None:
             self._notes.append(no_poses(self.name))
 

@@ -81,7 +81,7 @@ def no_poses(name: str) -> str:
     """What follows from a log without any pose."""
     return (
         f"{name} has no pose stream: its frames can be searched one by one, but no map is built; "
-        f"record an odometry or TF, or name the topic with --topic pose=TOPIC."
+        f"for a map use --odometry lidar, give a trajectory with --poses FILE, or name a topic with --topic pose=TOPIC."
     )
 
 

@@ -20,6 +20,7 @@ from semloc_logs.labels.geometry import classify
 from semloc_logs.labels.shape import shape
 from semloc_logs.labels.space import SKY, UNLABELLED, guess_space, to_cityscapes
 from semloc_logs.logs.session import Session, open_session
+from semloc_logs.logs.trajectory_file import TrajectoryFile
 from semloc_logs.settings import STREET_VOXEL, Settings
 from semloc_logs.tables import replacing_folder, write_json, write_table
 from semloc_logs.voxels.gravity import find_up, ground_height
@@ -53,6 +54,7 @@ class FuseTask:
     settings: Settings  # resolved
     topics: dict[str, str] = field(default_factory=dict)
     fingerprint: str = ""
+    poses: TrajectoryFile | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -99,6 +101,8 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         task.topics,
         min_range=fusion.min_range or 0.0,
         max_range=2.0 * (fusion.max_range or 50.0),
+        poses=task.poses,
+        odometry=fusion.odometry,
     )
     try:
         with tempfile.TemporaryDirectory(prefix="semloc-") as scratch:
