@@ -22,7 +22,11 @@ _TYPES = {
     "float64": pa.float64(),
     "string": pa.string(),
     "fixed_size_binary[4096]": pa.binary(4096),
-    "fixed_size_binary[8192]": pa.binary(8192),
+    "list<cell,label,count>": pa.list_(
+        pa.field(
+            "item", pa.struct([pa.field("cell", pa.uint16()), pa.field("label", pa.uint8()), pa.field("count", pa.uint32())]), nullable=True
+        )
+    ),
     "fixed_size_list<double>[36]": pa.list_(pa.float64(), 36),
 }
 

@@ -159,7 +159,7 @@ def tau(
     """
     from scipy.spatial import cKDTree
 
-    ijk, label, _, _ = query.occupied()
+    ijk, label = query.occupied()
     if not len(ijk) or not len(target.keys):
         return 0.0, 0
     centres = (ijk + 0.5) * voxel_size @ target_T_query[:3, :3].T + target_T_query[:3, 3]

@@ -80,7 +80,7 @@ class Query:
     @cached_property
     def evidence(self) -> Evidence:
         """Voxels to look up while searching: structure, and ground with a third of its weight to hold the height."""
-        ijk, label, _, _ = self.blocks.occupied()
+        ijk, label = self.blocks.occupied()
         structure = structure_mask(label)
         rng = np.random.default_rng(0)
         picked, weights = [], []
@@ -98,7 +98,7 @@ class Query:
     @cached_property
     def structure(self) -> tuple[F64, U8]:
         """Centres (n, 3) in metres and class bits (n,) of all structure voxels."""
-        ijk, label, _, _ = self.blocks.occupied()
+        ijk, label = self.blocks.occupied()
         keep = structure_mask(label)
         bits = class_bits(label[keep], cityscapes().coarse)
         centres: F64 = (ijk[keep].astype(float) + 0.5) * self.voxel_size

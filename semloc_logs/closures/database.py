@@ -95,7 +95,7 @@ class Database:
 
         def make() -> Target:
             folder = self.sessions[place.session].folder.blocks
-            return Target(read_blocks(blocks_path(folder, place.submap)), self.settings.fusion.voxel_size)
+            return Target(read_blocks(blocks_path(folder, place.submap), with_votes=False), self.settings.fusion.voxel_size)
 
         found: Target = self._targets.get(group, make)
         return found

@@ -37,7 +37,7 @@ def describe_submap(
     folder: SessionFolder, submap: int, ground_z: float, road: NDArray[np.floating], encoder: Encoder, settings: Settings
 ) -> Described:
     """Centres (voxels) and descriptors of every described subvolume of a submap, near the keyframes' positions ``road`` (m, 2), metres."""
-    blocks = read_blocks(blocks_path(folder.blocks, submap))
+    blocks = read_blocks(blocks_path(folder.blocks, submap), with_votes=False)
     low, high = blocks.bounds()
     state = blocks.dense(low, tuple((high - low).tolist()))
     d = settings.descriptor

@@ -14,7 +14,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from semloc_logs.voxels.grid import FREE_STATE, UNLABELLED, UNOBSERVED, UNOBSERVED_STATE, BlockMap
+from semloc_logs.voxels.grid import UNLABELLED, UNOBSERVED, BlockMap, winners
 from semloc_logs.voxels.keys import BLOCK, morton, unpack
 
 CELLS = BLOCK**3
@@ -48,9 +48,7 @@ class Voxels:
 
 def evidence(blocks: BlockMap, tile: int) -> Iterator[tuple[Tile, Evidence]]:
     """The evidence of one submap, cut into tiles of ``tile`` voxels (a multiple of 16) in x and y, one after the other."""
-    row, cell = np.nonzero((blocks.state != FREE_STATE) & (blocks.state != UNOBSERVED_STATE) & (blocks.hits > 0))
-    ballots = (row * CELLS + cell) * CLASSES + blocks.state[row, cell]
-    votes = blocks.hits[row, cell].astype(np.int64)
+    row = blocks.ballots // (CELLS * CLASSES)
     where = unpack(blocks.keys)[:, :2] // (tile // BLOCK)
     for x, y in np.unique(where, axis=0).tolist():
         rows = np.flatnonzero((where == (x, y)).all(1))
@@ -59,7 +57,7 @@ def evidence(blocks: BlockMap, tile: int) -> Iterator[tuple[Tile, Evidence]]:
         at = np.searchsorted(rows, row)
         mine = (at < len(rows)) & (rows[np.minimum(at, len(rows) - 1)] == row)
         moved = (at[mine] - row[mine]) * (CELLS * CLASSES)
-        yield (x, y), Evidence(blocks.keys[rows], log_odds, ballots[mine] + moved, votes[mine])
+        yield (x, y), Evidence(blocks.keys[rows], log_odds, blocks.ballots[mine] + moved, blocks.votes[mine])
 
 
 def merge(a: Evidence, b: Evidence) -> Evidence:
@@ -88,22 +86,11 @@ def resolve(found: Evidence, low: int, high: int) -> Voxels:
     ijk = unpack(found.keys)[row] * BLOCK + np.stack([cell // 256, cell // 16 % 16, cell % 16], 1).astype(np.int32)
     order = np.argsort(morton(ijk))
     ijk, row, cell = ijk[order], row[order], cell[order]
-    voters, label, hits = _winners(found)
+    voters, label, hits = winners(found.ballots, found.votes)
     at = np.searchsorted(voters, row * CELLS + cell)
     at = np.where(np.r_[voters, -1][at] == row * CELLS + cell, at, len(voters))
     log_odds = np.clip(found.log_odds[row, cell], low, high)
     return Voxels(ijk, np.r_[label, np.uint8(UNLABELLED)][at], log_odds, np.r_[hits, 0][at])
-
-
-def _winners(found: Evidence) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
-    """Voxels (row * 4096 + cell, ascending) that have votes, their class and the number of all their votes."""
-    voxel, label = np.divmod(found.ballots, CLASSES)
-    if not len(voxel):
-        return voxel, label.astype(np.uint8), found.votes
-    weight = np.where(label == UNLABELLED, 0, found.votes)
-    best = np.lexsort((label, -weight, voxel))
-    group = np.flatnonzero(np.r_[True, voxel[1:] != voxel[:-1]])
-    return voxel[group], label[best[group]].astype(np.uint8), np.add.reduceat(found.votes, group)
 
 
 class Tiles:

@@ -23,22 +23,23 @@ I64 = NDArray[np.int64]
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockMap:
     """A finished map: ``keys`` (n,) packed block coordinates ascending, ``log_odds`` (n, 4096) int8 (-128 unobserved), ``state``
-    (n, 4096) uint8: a class, 255 unlabelled, 254 free, 253 unobserved, and ``hits`` (n, 4096) uint16, votes for occupied voxels.
+    (n, 4096) uint8: a class, 255 unlabelled, 254 free, 253 unobserved; and the class votes of every voxel that was ever hit:
+    ``ballots`` (m,) int64 ascending, ``(row * 4096 + cell) * 256 + class``, with their numbers ``votes`` (m,).
 
     Voxel (i, j, k) of a block is at index (i * 16 + j) * 16 + k.
     """
 
-    keys: NDArray[np.int64]
+    keys: I64
     log_odds: NDArray[np.int8]
     state: U8
-    hits: NDArray[np.uint16]
+    ballots: I64
+    votes: I64
 
-    def occupied(self) -> tuple[NDArray[np.int32], U8, NDArray[np.int8], NDArray[np.uint16]]:
-        """Voxel coordinates (m, 3), class, log-odds and hits of the occupied voxels, in block order."""
+    def occupied(self) -> tuple[NDArray[np.int32], U8]:
+        """Voxel coordinates (m, 3) and class of the occupied voxels, in block order."""
         row, cell = np.nonzero((self.state != FREE_STATE) & (self.state != UNOBSERVED_STATE))
         base = unpack(self.keys)[row] * BLOCK
-        ijk = base + np.stack([cell // 256, cell // 16 % 16, cell % 16], 1).astype(np.int32)
-        return ijk, self.state[row, cell], self.log_odds[row, cell], self.hits[row, cell]
+        return base + np.stack([cell // 256, cell // 16 % 16, cell % 16], 1).astype(np.int32), self.state[row, cell]
 
     def bounds(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Lowest voxel and one past the highest voxel of the blocks; two zeros if there are none."""
@@ -65,7 +66,8 @@ class BlockMap:
 def empty_map() -> BlockMap:
     """A map without blocks."""
     shape = (0, BLOCK**3)
-    return BlockMap(np.zeros(0, np.int64), np.zeros(shape, np.int8), np.zeros(shape, np.uint8), np.zeros(shape, np.uint16))
+    nothing = np.zeros(0, np.int64)
+    return BlockMap(nothing, np.zeros(shape, np.int8), np.zeros(shape, np.uint8), nothing, nothing)
 
 
 @dataclass(slots=True, eq=False)
@@ -145,25 +147,26 @@ class Fuser:
         log_odds = self._log_odds[np.fromiter(self._slots.values(), np.int64, len(self._slots))[order]]
         used = self._vote_keys >= 0
         key, count = self._vote_keys[used], self._vote_counts[used]
-        key = (np.argsort(order)[key >> 17] << 17) | (key & 0x1FFFF)  # slots -> rows of the sorted map
-        sort = np.argsort(key)
-        return resolve(keys[order], log_odds, key[sort], np.minimum(count[sort], 65535))
+        row, label = np.argsort(order)[key >> (BITS + 5)], key & 31
+        cell = key >> 5 & (BLOCK**3 - 1)
+        ballots = (row * BLOCK**3 + cell) * 256 + np.where(label == CLASSES - 1, UNLABELLED, label)
+        sort = np.argsort(ballots)
+        ballots, votes = ballots[sort], count[sort].astype(np.int64)
+        state = np.where(log_odds > 0, UNLABELLED, np.where(log_odds == UNOBSERVED, UNOBSERVED_STATE, FREE_STATE)).astype(np.uint8)
+        voxel, winner, _ = winners(ballots, votes)
+        occupied = log_odds.reshape(-1)[voxel] > 0
+        state.reshape(-1)[voxel[occupied]] = winner[occupied]
+        return BlockMap(keys[order], log_odds, state, ballots, votes)
 
 
-def resolve(keys: I64, log_odds: NDArray[np.int8], vote: I64, count: NDArray[np.integer]) -> BlockMap:
-    """The map of ``log_odds`` (n, 4096) with ``vote`` (m,) ascending: (row * 4096 + cell) * 32 + class, 19 being unlabelled."""
-    occupied = log_odds > 0
-    state = np.where(occupied, UNLABELLED, np.where(log_odds == UNOBSERVED, UNOBSERVED_STATE, FREE_STATE)).astype(np.uint8)
-    hits = np.zeros(log_odds.shape, np.uint16)
-    voxel = vote >> 5
-    keep = occupied.reshape(-1)[voxel]
-    vote, voxel, count = vote[keep], voxel[keep], count[keep].astype(np.int64)
-    if len(vote):
-        label = vote & 31
-        weight = np.where(label == CLASSES - 1, 0, count)  # a known class beats the unlabelled
-        best = np.lexsort((label, -weight, voxel))
-        first = best[np.r_[True, voxel[best][1:] != voxel[best][:-1]]]
-        start = np.flatnonzero(np.r_[True, voxel[1:] != voxel[:-1]])
-        state.reshape(-1)[voxel[first]] = np.where(label[first] == CLASSES - 1, UNLABELLED, label[first])
-        hits.reshape(-1)[voxel[start]] = np.minimum(np.add.reduceat(count, start), 65535)
-    return BlockMap(keys, log_odds, state, hits)
+def winners(ballots: I64, votes: I64) -> tuple[I64, U8, I64]:
+    """Voxels (row * 4096 + cell, ascending) that have votes, their class and the number of all their votes.
+
+    The class has most votes; the lowest id wins a tie, and any known class beats unlabelled.
+    """
+    voxel, label = np.divmod(ballots, 256)
+    if not len(voxel):
+        return voxel, label.astype(np.uint8), votes
+    best = np.lexsort((label, np.where(label == UNLABELLED, 0, -votes), voxel))
+    group = np.flatnonzero(np.r_[True, voxel[1:] != voxel[:-1]])
+    return voxel[group], label[best[group]].astype(np.uint8), np.add.reduceat(votes, group)

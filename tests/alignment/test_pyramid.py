@@ -31,7 +31,8 @@ def block_map(cells: dict[Cell, int]) -> BlockMap:
     keys = pack(np.array(list(blocks)))
     state = np.stack(list(blocks.values())).reshape(-1, BLOCK**3)[np.argsort(keys)]
     occupied = (state != FREE_STATE) & (state != UNOBSERVED_STATE)
-    return BlockMap(np.sort(keys), np.where(occupied, 20, -20).astype(np.int8), state, occupied.astype(np.uint16))
+    nothing = np.zeros(0, np.int64)
+    return BlockMap(np.sort(keys), np.where(occupied, 20, -20).astype(np.int8), state, nothing, nothing)
 
 
 def random_cells(seed: int, n: int = 120, low: int = -9, high: int = 11) -> dict[Cell, int]:

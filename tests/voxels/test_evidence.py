@@ -82,15 +82,14 @@ def test_merging_is_the_sum_in_any_order_and_grouping(parts: list[Rows], random:
 
 def submap(free: list[int], occupied: dict[int, tuple[int, int, int]]) -> BlockMap:
     """One block at the origin: cells that are free (log-odds -8), and cells with (class, log-odds, votes)."""
-    log_odds, state, hits = (
-        np.full((1, CELLS), UNOBSERVED, np.int8),
-        np.full((1, CELLS), UNOBSERVED_STATE, np.uint8),
-        np.zeros((1, CELLS), np.uint16),
-    )
+    log_odds, state = np.full((1, CELLS), UNOBSERVED, np.int8), np.full((1, CELLS), UNOBSERVED_STATE, np.uint8)
     log_odds[0, free], state[0, free] = -8, FREE_STATE
+    ballots = {}
     for cell, (label, odds, votes) in occupied.items():
-        log_odds[0, cell], state[0, cell], hits[0, cell] = odds, label, votes
-    return BlockMap(np.array([pack(np.zeros(3, int))]), log_odds, state, hits)
+        log_odds[0, cell], state[0, cell] = odds, label
+        ballots[cell * 256 + label] = votes
+    counted = np.array(sorted(ballots.items()), np.int64).reshape(-1, 2)
+    return BlockMap(np.array([pack(np.zeros(3, int))]), log_odds, state, counted[:, 0], counted[:, 1])
 
 
 def test_free_in_one_submap_counts_against_occupied_in_another(tmp_path: Path) -> None:
@@ -112,7 +111,8 @@ def test_tiles_go_to_disk_and_come_back_and_do_not_grow(tmp_path: Path) -> None:
         keys = pack(np.array([[16 * x + i, 0, 0] for i in range(3)]))
         log_odds = rng.integers(-40, 70, (3, CELLS)).astype(np.int8)
         state = np.where(log_odds > 0, rng.integers(0, 19, (3, CELLS)), FREE_STATE).astype(np.uint8)
-        return BlockMap(keys, log_odds, state, np.where(log_odds > 0, 3, 0).astype(np.uint16))
+        voxel = np.flatnonzero(log_odds > 0)
+        return BlockMap(keys, log_odds, state, voxel * 256 + state.reshape(-1)[voxel], np.full(len(voxel), 3))
 
     tiles, sizes, every = Tiles(tmp_path, 256), [], []
     for _ in range(8):

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from typing import Any
 
@@ -35,12 +35,17 @@ def as_dictionary(blocks: BlockMap) -> dict[Cell, tuple[int, int, int]]:
     low, high = blocks.bounds()
     out: dict[Cell, tuple[int, int, int]] = {}
     shape = (BLOCK, BLOCK, BLOCK)
+    votes: dict[int, int] = defaultdict(int)
+    for ballot, count in zip(blocks.ballots.tolist(), blocks.votes.tolist(), strict=True):
+        votes[ballot // 256] += count
     for n in range(len(blocks.keys)):
-        one = BlockMap(blocks.keys[n : n + 1], blocks.log_odds[n : n + 1], blocks.state[n : n + 1], blocks.hits[n : n + 1])
+        nothing = np.zeros(0, np.int64)
+        one = BlockMap(blocks.keys[n : n + 1], blocks.log_odds[n : n + 1], blocks.state[n : n + 1], nothing, nothing)
         corner = one.bounds()[0]
         for cell in np.argwhere(one.log_odds.reshape(shape) != -128):
             at = tuple(cell)
-            odds, state, hits = (int(a.reshape(shape)[at]) for a in (one.log_odds, one.state, one.hits))
+            odds, state = (int(a.reshape(shape)[at]) for a in (one.log_odds, one.state))
+            hits = votes[n * 4096 + int(np.ravel_multi_index(at, shape))] if odds > 0 else 0
             out[tuple((cell + corner).tolist())] = odds, state, hits
         assert (one.state[one.log_odds == -128] == UNOBSERVED_STATE).all()
     assert len(low) == len(high)
@@ -129,16 +134,16 @@ def state_at(blocks: BlockMap, cell: Cell) -> int:
 def test_votes(labels: list[int], winner: int) -> None:
     blocks = fused([one_point(c) for c in labels], fusion())
     assert state_at(blocks, (6, 0, 0)) == winner
-    ijk, label, log_odds, hits = blocks.occupied()
+    ijk, label = blocks.occupied()
     assert ijk.tolist() == [[6, 0, 0]]
     assert label.tolist() == [winner]
-    assert hits.tolist() == [len(labels)]
-    assert log_odds.tolist() == [min(70, 17 * len(labels))]  # 0.85 each, clamped at 3.5
+    assert {int(b % 256): int(n) for b, n in zip(blocks.ballots, blocks.votes, strict=True)} == Counter(labels)
+    assert blocks.log_odds[blocks.log_odds > 0].tolist() == [min(70, 17 * len(labels))]  # 0.85 each, clamped at 3.5
 
 
 def test_votes_do_not_overflow() -> None:
     blocks = fused([one_point(2, 70_000)], fusion())
-    assert blocks.occupied()[3].tolist() == [65535]
+    assert blocks.votes.tolist() == [70_000]
 
 
 @given(st.permutations(range(6)))
@@ -147,7 +152,7 @@ def test_votes_do_not_depend_on_the_order_of_frames(order: list[int]) -> None:
     f = fusion(clamp=(-6.0, 6.0))  # nothing is clamped, so the log-odds add up in any order too
     frames = random_frames(7)
     a, b = fused(frames, f), fused([frames[i] for i in order], f)
-    for name in ("keys", "log_odds", "state", "hits"):
+    for name in ("keys", "log_odds", "state", "ballots", "votes"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
@@ -174,7 +179,7 @@ def test_no_frames_and_empty_frames() -> None:
     for frames in ([], [empty]):
         blocks = fused(frames, fusion())
         assert len(blocks.keys) == 0
-        assert [len(a) for a in blocks.occupied()] == [0, 0, 0, 0]
+        assert [len(a) for a in blocks.occupied()] == [0, 0]
         assert blocks.dense(np.zeros(3, int), (2, 2, 2)).tolist() == np.full((2, 2, 2), UNOBSERVED_STATE).tolist()
         assert [b.tolist() for b in blocks.bounds()] == [[0, 0, 0], [0, 0, 0]]
 
@@ -198,7 +203,7 @@ def test_an_origin_a_rounding_error_below_a_block_border() -> None:
     assert seen[(2, 0, -2)][1] == 0
     assert len(seen) <= 6
     ends = fused([(np.array([[1.2, 0.2, -1e-17]]), np.zeros(1, np.uint8), np.array([0.2, 0.2, -0.7]))], fusion())
-    assert ends.occupied()[3].tolist() == [1]  # the vote lies where the hit does
+    assert ends.votes.tolist() == [1]  # the vote lies where the hit does
 
 
 @pytest.mark.parametrize("far", [(500_000.0, 3_400_000.0, 300.0), (-2_000_000.0, 0.0, 0.0)])
@@ -221,7 +226,7 @@ def test_dense_boxes_overlap_the_map_in_part() -> None:
     wider[5:-4, 5:-4, 5:-4] = UNOBSERVED_STATE
     assert (wider == UNOBSERVED_STATE).all()
     np.testing.assert_array_equal(blocks.dense(low + 7, (3, 20, 4)), whole[7:10, 7:27, 7:11])
-    ijk, label, *_ = blocks.occupied()
+    ijk, label = blocks.occupied()
     np.testing.assert_array_equal(whole[tuple((ijk - low).T)], label)
     assert len(ijk) == (whole < FREE_STATE - 1).sum() + (whole == UNLABELLED).sum()
 

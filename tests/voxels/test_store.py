@@ -53,10 +53,12 @@ def test_blocks_come_back_exactly(blocks: BlockMap, tmp_path: Path) -> None:
     path = tmp_path / "submap.parquet"
     write_blocks(path, blocks, METADATA)
     found = read_blocks(path)
-    for name in ("keys", "log_odds", "state", "hits"):
+    for name in ("keys", "log_odds", "state", "ballots", "votes"):
         a, b = getattr(blocks, name), getattr(found, name)
         np.testing.assert_array_equal(a, b)
         assert a.dtype == b.dtype
+    assert not len(read_blocks(path, with_votes=False).ballots)
+    np.testing.assert_array_equal(read_blocks(path, with_votes=False).state, blocks.state)
     assert found.bounds()[0].tolist() == blocks.bounds()[0].tolist()
     assert read_metadata(path) == METADATA
 
@@ -120,12 +122,16 @@ def union(submaps: list[BlockMap]) -> dict[tuple[int, ...], tuple[int, int, int]
     odds: dict[tuple[int, ...], int] = defaultdict(int)
     votes: dict[tuple[int, ...], Counter[int]] = defaultdict(Counter)
     for blocks in submaps:
-        for key, log_odds, state, hits in zip(unpack(blocks.keys).tolist(), blocks.log_odds, blocks.state, blocks.hits, strict=True):
+        corners = unpack(blocks.keys).tolist()
+
+        def voxel_at(row: int, cell: int, corners: list[list[int]] = corners) -> tuple[int, ...]:
+            return tuple(k * 16 + i for k, i in zip(corners[row], (cell // 256, cell // 16 % 16, cell % 16), strict=True))
+
+        for row, log_odds in enumerate(blocks.log_odds):
             for cell in np.flatnonzero(log_odds != UNOBSERVED).tolist():
-                voxel = tuple(k * 16 + i for k, i in zip(key, (cell // 256, cell // 16 % 16, cell % 16), strict=True))
-                odds[voxel] += int(log_odds[cell])
-                if state[cell] != FREE_STATE:
-                    votes[voxel][int(state[cell])] += int(hits[cell])
+                odds[voxel_at(row, cell)] += int(log_odds[cell])
+        for ballot, count in zip(blocks.ballots.tolist(), blocks.votes.tolist(), strict=True):
+            votes[voxel_at(ballot // 2**20, ballot // 256 % 4096)][ballot % 256] += count
     out = {}
     for voxel in (v for v, total in odds.items() if total > 0):
         known = {c: n for c, n in votes[voxel].items() if c != 255}
