@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.geometry import inverse, rotation_angle
@@ -11,11 +12,37 @@ from semloc_logs.settings import Fusion
 UNPOSED_SPACING_NS = 400_000_000  # frames of a log without poses are taken this far apart
 
 
-def thin(points: NDArray[np.float32], cell: float) -> NDArray[np.int64]:
-    """Indices (m,) of the first point in each cell of ``cell`` metres, ascending."""
-    ijk = np.floor(points / cell).astype(np.int64)
-    key = (ijk[:, 0] << 42) + (ijk[:, 1] << 21) + ijk[:, 2]
-    return np.sort(np.unique(key, return_index=True)[1])
+def thin(points: NDArray[np.floating], cell: float) -> NDArray[np.int64]:
+    """Indices (m,) of the first of ``points`` (n, 3) in each cell of ``cell`` metres, ascending."""
+    return _first_in_cells(np.ascontiguousarray(points, np.float32), np.float32(cell))
+
+
+@njit(cache=True, nogil=True)
+def _first_in_cells(points: NDArray[np.float32], cell: np.float32) -> NDArray[np.int64]:
+    """A hash table of cells, open addressing: sorting the cells takes ten times as long."""
+    size = 1024
+    while size < 2 * len(points):
+        size *= 2
+    keys, filled = np.empty(size, np.int64), np.zeros(size, np.bool_)
+    kept, count, last = np.empty(len(points), np.int64), 0, np.int64(-1)
+    for i in range(len(points)):
+        x, y, z = (
+            np.int64(np.floor(points[i, 0] / cell)),
+            np.int64(np.floor(points[i, 1] / cell)),
+            np.int64(np.floor(points[i, 2] / cell)),
+        )
+        key = (x << 42) + (y << 21) + z
+        if count and key == last:
+            continue
+        last = key
+        h = ((key * 0x9E3779B97F4A7C1) >> 20) & (size - 1)
+        while filled[h] and keys[h] != key:
+            h = (h + 1) & (size - 1)
+        if not filled[h]:
+            filled[h], keys[h] = True, key
+            kept[count] = i
+            count += 1
+    return kept[:count]
 
 
 class KeyframeSelector:
