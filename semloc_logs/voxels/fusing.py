@@ -135,7 +135,8 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
                     keep = label != SKY
                     grounds.append(ground)
                     counts.append(int(keep.sum()))
-                    yield Keyframe(points[keep], label[keep])
+                    sigma = Path(scratch) / f"{i}-sigma.npy"
+                    yield Keyframe(points[keep], label[keep], np.load(sigma)[keep] if sigma.exists() else None)
 
             with replacing_folder(task.folder.keyframes) as folder:
                 for first in range(0, len(raws), PART):
@@ -196,6 +197,8 @@ def _collect(session: Session, task: FuseTask, scratch: Path, on_progress: Calla
         np.save(scratch / f"{len(raws)}.npy", points)
         if cloud.label is not None:
             np.save(scratch / f"{len(raws)}-label.npy", cloud.label[keep])
+        if cloud.sigma is not None:
+            np.save(scratch / f"{len(raws)}-sigma.npy", cloud.sigma[keep])
         raws.append(_Raw(cloud.header, cloud.session_T_base, cloud.origin))
         normals.add(cloud, points, 2 * cell)
         if len(raws) % 50 == 0:
@@ -271,11 +274,9 @@ def fuse_keyframes(
     fuser = Fuser(settings.fusion)
     for i in keyframes:
         frame = read_keyframe(folder.keyframes, i)
-        points, label = frame.points, frame.label
         if radius is not None:
-            near = np.linalg.norm(points - origins[i], axis=1) < radius
-            points, label = points[near], label[near]
-        fuser.add(apply(poses[i], points), label, apply(poses[i], origins[i][None])[0])
+            frame = frame.near(origins[i], radius)
+        fuser.add(apply(poses[i], frame.points), frame.label, apply(poses[i], origins[i][None])[0], frame.sigma)
     return fuser.finish()
 
 

@@ -43,10 +43,16 @@ def poses_of(table: pa.Table) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """Points (n, 3) in the base frame with classes (n,)."""
+    """Points (n, 3) in the base frame with classes (n,) and, where it is not small, the standard deviation of their range (n,), metres."""
 
     points: NDArray[np.float32]
     label: NDArray[np.uint8]
+    sigma: NDArray[np.float32] | None = None
+
+    def near(self, origin: NDArray[np.floating], radius: float) -> Keyframe:
+        """The points within ``radius`` metres of ``origin`` (3,)."""
+        kept = np.linalg.norm(self.points - origin, axis=1) < radius
+        return Keyframe(self.points[kept], self.label[kept], None if self.sigma is None else self.sigma[kept])
 
 
 def part_path(folder: Path, keyframe: int) -> Path:
@@ -58,13 +64,14 @@ def write_keyframes(path: Path, first: int, stamps_ns: Sequence[int], keyframes:
     """One part: keyframes ``first``, ``first`` + 1, ... each in a row group of its own. ``path`` lies in a folder that is renamed later."""
     schema = contracts.schema("keyframes").with_metadata({"semloc": _json(metadata)})
     with pq.ParquetWriter(
-        path, schema, compression="zstd", use_byte_stream_split=["x", "y", "z"], use_dictionary=["keyframe", "stamp_ns", "label"]
+        path, schema, compression="zstd", use_byte_stream_split=["x", "y", "z"], use_dictionary=["keyframe", "stamp_ns", "label", "sigma"]
     ) as writer:
         for k, (stamp, frame) in enumerate(zip(stamps_ns, keyframes, strict=True), start=first):
             n = len(frame.points)
             p = np.round(frame.points * 512) / 512  # 2 mm: below any sensor's noise, and packs well
             columns = {"keyframe": np.full(n, k, np.int32), "stamp_ns": np.full(n, stamp, np.int64), "label": frame.label}
             columns |= {c: p[:, i].astype(np.float32) for i, c in enumerate("xyz")}
+            columns["sigma"] = np.zeros(n, np.float32) if frame.sigma is None else frame.sigma.astype(np.float16).astype(np.float32)
             writer.write_table(contracts.table("keyframes", columns), row_group_size=max(n, 1))
 
 
@@ -78,11 +85,12 @@ def read_keyframe(folder: Path, keyframe: int) -> Keyframe:
     """WorkspaceError when the part is missing or damaged."""
     path = part_path(folder, keyframe)
     try:
-        table = pq.ParquetFile(path).read_row_group(keyframe % PART, columns=["x", "y", "z", "label"])
+        table = pq.ParquetFile(path).read_row_group(keyframe % PART, columns=["x", "y", "z", "label", "sigma"])
     except (OSError, pa.ArrowException) as problem:
         raise WorkspaceError(f"{path} cannot be read ({str(problem).splitlines()[0]}): fuse the session again with --overwrite.") from None
     points = np.stack([table[c].to_numpy() for c in "xyz"], 1)
-    return Keyframe(points, table["label"].to_numpy())
+    sigma = table["sigma"].to_numpy()
+    return Keyframe(points, table["label"].to_numpy(), sigma if sigma.any() else None)
 
 
 def blocks_path(folder: Path, submap: int) -> Path:

@@ -234,3 +234,18 @@ def test_dense_boxes_overlap_the_map_in_part() -> None:
 def test_unresolved_settings_are_refused() -> None:
     with pytest.raises(ValueError, match="resolved"):
         Fuser(Fusion()).add(np.zeros((1, 3)), np.zeros(1, np.uint8), np.zeros(3))
+
+
+def test_uncertain_ranges_count_less_and_leave_room_before_them() -> None:
+    """A point at 5 m known to 1 m, in voxels of 0.5 m: a quarter of a hit, and free up to 3 m only; one more certain wins."""
+    f = fusion(reach=10.0)
+    points, origin = np.array([[5.25, 0.25, 0.25]]), np.array([0.25, 0.25, 0.25])
+    fuser = Fuser(f)
+    fuser.add(points, np.array([2], np.uint8), origin, np.array([1.0], np.float32))
+    blocks = fuser.finish()
+    assert blocks.dense(np.array([0, 0, 0]), (11, 1, 1))[:, 0, 0].tolist() == [FREE_STATE] * 6 + [UNOBSERVED_STATE] * 4 + [2]
+    assert blocks.log_odds.max() == round(20 * f.hit / 4)
+    fuser.add(points + [0, 0, 0.1], np.array([8], np.uint8), origin)
+    blocks = fuser.finish()
+    assert blocks.log_odds.max() == round(20 * f.hit / 4) + 17
+    assert (blocks.dense(np.array([0, 0, 0]), (10, 1, 1)) == FREE_STATE).all()

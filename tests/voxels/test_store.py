@@ -86,6 +86,18 @@ def test_keyframes_come_back_to_the_grid_of_2_mm_each_in_its_row_group(tmp_path:
     assert read_metadata(path) == METADATA
 
 
+def test_the_uncertainty_of_ranges_comes_back_where_there_is_any(tmp_path: Path) -> None:
+    points, label = np.ones((3, 3), np.float32), np.zeros(3, np.uint8)
+    frames = [Keyframe(points, label, np.array([0.0, 0.25, 2.0], np.float32)), Keyframe(points, label)]
+    write_keyframes(part_path(tmp_path, 0), 0, [1, 2], frames, METADATA)
+    sigma = read_keyframe(tmp_path, 0).sigma
+    assert sigma is not None
+    assert sigma.tolist() == [0.0, 0.25, 2.0]
+    assert read_keyframe(tmp_path, 1).sigma is None
+    near = Keyframe(np.array([[1, 0, 0], [9, 0, 0]], np.float32), label[:2], sigma[:2]).near(np.array([2.0, 0, 0]), 3.0)
+    assert (near.points.tolist(), near.label.tolist()) == ([[1, 0, 0]], [0])
+
+
 def test_missing_and_damaged_keyframes_and_blocks_are_refused(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="overwrite"):
         read_keyframe(tmp_path, 0)
