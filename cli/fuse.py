@@ -14,6 +14,7 @@ from .options import (
     console_options,
     engine_options,
     json_option,
+    label_options,
     logs_argument,
     overwrite_option,
     pose_options,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 @click.option("--session", metavar="NAME", help="Name of the session; default: the first log's file stem or folder name.")
 @topic_option
 @pose_options
+@label_options
 @overwrite_option
 @json_option
 @engine_options

@@ -23,6 +23,8 @@ Function = Callable[..., Any]
 
 FLAGS = {  # options that are short for a setting
     "odometry": "fusion.odometry",
+    "seg_model": "labels.model",
+    "seg_spec": "labels.spec",
     "query_frames": "query.frames",
     "query_length": "query.length",
     "query_every": "query.every",
@@ -136,6 +138,8 @@ def _settings(options: Mapping[str, Any]) -> Settings:
 
     assignments = dict(options.get("assignments") or {})
     assignments |= {key: str(options[flag]) for flag, key in FLAGS.items() if options.get(flag) is not None}
+    if options.get("seg_model") is not None:
+        assignments.setdefault("labels.source", "onnx")
     return load(options.get("config"), assignments, os.environ)
 
 
@@ -155,6 +159,21 @@ def _yaml_value(value: object) -> str:
     import yaml
 
     return str(yaml.safe_dump(value, default_flow_style=True, width=1000)).removesuffix("...\n").strip()
+
+
+def label_options(function: Function) -> Function:
+    """--seg-model and --seg-spec."""
+    for decorate in (
+        click.option("--seg-spec", type=click.Path(path_type=Path), metavar="SPEC", help="YAML file: what the model takes and gives."),
+        click.option(
+            "--seg-model",
+            type=click.Path(path_type=Path),
+            metavar="MODEL",
+            help="ONNX model that labels points by the camera pictures.",
+        ),
+    ):
+        function = decorate(function)
+    return function
 
 
 def query_options(function: Function) -> Function:

@@ -14,6 +14,7 @@ from .options import (
     console_options,
     engine_options,
     json_option,
+    label_options,
     logs_argument,
     overwrite_option,
     pose_options,
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 )
 @topic_option
 @pose_options
+@label_options
 @query_options
 @overwrite_option
 @json_option

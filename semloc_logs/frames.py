@@ -109,7 +109,16 @@ class NavSatSample:
     altitude: float
 
 
-Frame = LidarFrame | ImageFrame | DepthFrame | Camera | PoseSample | TransformSample | ImuSample | NavSatSample
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelNames:
+    """What the ids of a label topic mean: the ``names`` of classes by id, or the name of a label ``space``."""
+
+    header: Header
+    space: str = ""
+    names: dict[int, str] = field(default_factory=dict)
+
+
+Frame = LidarFrame | ImageFrame | DepthFrame | Camera | PoseSample | TransformSample | ImuSample | NavSatSample | LabelNames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +127,8 @@ class PosedCloud:
 
     ``points`` (n, 3) float32 and ``origin`` (3,), the sensor's centre, in the base frame; ``label`` (n,) ids as recorded or None;
     ``session_T_base`` (4, 4) or None in a log without poses; ``sigma`` (n,) standard deviation of the measured range along the ray in
-    metres, None where it is small beside a voxel (LIDAR).
+    metres, None where it is small beside a voxel (LIDAR). ``extra`` names the ``label_topic`` of labels that come from pictures, and
+    says ``label_form`` = colours where they are packed colours (logs/depth.py) instead of ids.
     """
 
     header: Header

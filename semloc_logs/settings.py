@@ -62,7 +62,17 @@ class Labels(_Section):
     """Where the classes come from (paper 3.1); always recorded in session.json and in every table."""
 
     source: LabelSource = Field("auto", description="auto: labels of the log if it has any, else geometry; uniform: one class")
-    space: str | None = Field(None, description="label space of the log's ids (a file of schemas/label_spaces); default: guessed and noted")
+    space: str | None = Field(
+        None,
+        description="label space of the log's ids, shipped (schemas/label_spaces) or a YAML file; default: as the log says, else guessed",
+    )
+    model: Path | None = Field(None, description="ONNX model that labels the camera pictures, for source onnx")
+    spec: Path | None = Field(None, description="YAML file that says what the model takes and gives")
+    threads: int = Field(1, ge=1, le=64, description="threads of the model in each job")
+    erode: int = Field(2, ge=0, le=50, description="pixels beside the border of two labels in a picture that label nothing")
+    unseen: Literal["unlabelled", "geometry"] = Field(
+        "unlabelled", description="what points get that no picture shows, where labels come from pictures"
+    )
 
 
 class Descriptor(_Section):

@@ -23,6 +23,7 @@ from semloc_logs.closures.results import keyframe_at, read_closures, unique_clos
 from semloc_logs.engines import Engine, Serial
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError
 from semloc_logs.geometry import transform
+from semloc_logs.labels.model import fingerprint as label_fingerprint
 from semloc_logs.logs.annotate import (
     AnnotateReport,
     ClosureRecord,
@@ -87,6 +88,7 @@ def fuse(
     ``poses``: files of poses by session, instead of those of its logs.
     """
     report, tasks = Report(), []
+    label_files = label_fingerprint(settings.labels)
     for name, logs in sessions.items():
         for log in logs:
             recover(log)
@@ -94,7 +96,7 @@ def fuse(
         inputs = [content_fingerprint(log) for log in logs]
         trajectory = (poses or {}).get(name)
         inputs += [f"poses {trajectory.fingerprint()}"] if trajectory else []
-        fingerprint = _hash(settings.fingerprint("fusion", "labels"), repr(sorted(topics.items())), *inputs)
+        fingerprint = _hash(settings.fingerprint("fusion", "labels"), label_files, repr(sorted(topics.items())), *inputs)
         if not overwrite and _fingerprint(folder.session_json) == fingerprint:
             report.kept.append(name)
             report.skipped += read_json(folder.session_json)["skipped"]

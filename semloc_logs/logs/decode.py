@@ -18,6 +18,7 @@ from semloc_logs.frames import (
     Header,
     ImageFrame,
     ImuSample,
+    LabelNames,
     LidarFrame,
     NavSatSample,
     PoseSample,
@@ -50,7 +51,7 @@ class Decoder:
     def frames(self, message: Message) -> list[Frame]:
         """The frames in ``message``; none when its type is of no use here, or when it cannot be decoded."""
         convert = CONVERTERS.get(json_type(message.type) if message.encoding in ("protobuf", "json") else message.type)
-        if convert is None:
+        if convert is None or (convert is _text and not message.topic.endswith("/label_space")):  # any other text is of no use here
             return []
         found: list[Frame] = []  # keeps what a message gives before its damaged part
         try:
@@ -311,6 +312,17 @@ def _camera_calibration(m: Any, message: Message) -> Iterator[Frame]:
     yield from _camera(_foxglove_header(m, message, m.frame_id), m)
 
 
+# -- what labels mean
+
+
+def _label_info(m: Any, message: Message) -> Iterator[Frame]:
+    yield LabelNames(_header(m, message), names={int(c.class_id): str(c.class_name) for c in m.class_map})
+
+
+def _text(m: Any, message: Message) -> Iterator[Frame]:
+    yield LabelNames(Header(message.topic, message.log_time_ns, message.log_time_ns, ""), space=str(m.data).strip())
+
+
 CONVERTERS: dict[str, Convert] = {
     "sensor_msgs/msg/PointCloud2": _point_cloud2,
     "sensor_msgs/msg/Image": _image,
@@ -324,6 +336,8 @@ CONVERTERS: dict[str, Convert] = {
     "geometry_msgs/msg/TransformStamped": _transform_stamped,
     "tf2_msgs/msg/TFMessage": _tf,
     "tf/msg/tfMessage": _tf,
+    "vision_msgs/msg/LabelInfo": _label_info,
+    "std_msgs/msg/String": _text,
     "foxglove.PointCloud": _foxglove_cloud,
     "foxglove.RawImage": _foxglove_image,
     "foxglove.CompressedImage": _foxglove_compressed,

@@ -147,7 +147,9 @@ def _standard_types(generation: str) -> dict[str, Any]:
     if generation == "ros1":
         types |= get_typestore(Stores.ROS1_NOETIC).fielddefs  # has no tf2_msgs, which are laid out the same in both
         types["tf/msg/tfMessage"] = types["tf2_msgs/msg/TFMessage"]
-    return types
+    types |= get_types_from_msg("uint16 class_id\nstring class_name", "vision_msgs/msg/VisionClass")
+    label_info = "std_msgs/Header header\nVisionClass[] class_map\nfloat32 threshold"
+    return types | get_types_from_msg(label_info, "vision_msgs/msg/LabelInfo")
 
 
 def _protobuf_parser(definition: Definition) -> Parser:

@@ -77,12 +77,23 @@ def _normalised(pixels: F64, matrix: F64, distortion: F64, model: str, where: st
     return np.asarray(rays, float).reshape(-1, 2)
 
 
-def label_ids(frame: DepthFrame | ImageFrame) -> NDArray[np.uint32] | None:
-    """Ids (h, w) of a frame on a label topic, also where a 16-bit picture was decoded as if it were depth; None for colour pictures."""
+def label_ids(frame: DepthFrame | ImageFrame) -> NDArray[np.uint32]:
+    """Ids (h, w) of a frame on a label topic, also where a 16-bit picture was decoded as if it were depth.
+
+    Of a colour picture the colours: red in bits 16 to 23, green in 8 to 15, blue in 0 to 7.
+    """
     if isinstance(frame, DepthFrame):
         ids: NDArray[np.uint32] = np.rint(frame.depth * 1e3).astype(np.uint32)
         return ids
-    return frame.image.astype(np.uint32) if frame.image.ndim == 2 else None
+    wide = frame.image.astype(np.uint32)
+    if wide.ndim == 2:
+        return wide
+    return np.asarray(wide[..., 0] << 16 | wide[..., 1] << 8 | wide[..., 2], np.uint32)
+
+
+def is_coloured(frame: DepthFrame | ImageFrame) -> bool:
+    """Whether the labels of a frame on a label topic are colours."""
+    return isinstance(frame, ImageFrame) and frame.image.ndim == 3
 
 
 def _metres(frame: DepthFrame | ImageFrame) -> F32 | None:
@@ -104,6 +115,7 @@ class DepthClouds:
         self.cameras: dict[str, Camera] = {}  # by CameraInfo topic, the newest
         self.lost: dict[str, None] = {}
         self.notes: dict[str, None] = {}
+        self.coloured: set[str] = set()  # label topics whose labels are colours
         self._roles = roles
         self._stride = stride
         self._labels: dict[str, deque[DepthFrame | ImageFrame]] = {}
@@ -111,6 +123,8 @@ class DepthClouds:
 
     def take_label(self, frame: DepthFrame | ImageFrame) -> None:
         """Remembers a frame of a label topic."""
+        if is_coloured(frame):
+            self.coloured.add(frame.header.topic)
         self._labels.setdefault(frame.header.topic, deque(maxlen=_LABELS_KEPT)).append(frame)
 
     def has_all(self, frame: DepthFrame | ImageFrame) -> bool:
@@ -156,12 +170,13 @@ class DepthClouds:
         if abs(nearest.header.stamp_ns - frame.header.stamp_ns) > LABEL_TOLERANCE_NS:
             return None
         ids = label_ids(nearest)
-        if ids is not None and ids.shape == shape:
+        if ids.shape == shape:
             return ids
-        self.notes.setdefault(
-            f"{nearest.header.topic} is not used for labels: it is no picture of ids of the same size as {frame.header.topic}; "
-            f"--topic label_image=TOPIC names another."
-        )
+        if nearest.header.topic not in self._roles.info_of:  # else it is painted by its own calibration
+            self.notes.setdefault(
+                f"{nearest.header.topic} is not used for labels: it is no picture of the same size as {frame.header.topic}; "
+                f"--topic label_image=TOPIC names another."
+            )
         return None
 
 

@@ -10,7 +10,8 @@ from semloc_logs.errors import RoleError
 from semloc_logs.logs.log import Stream
 
 ROLES = (
-    "lidar", "depth", "image", "camera_info", "stereo_left", "stereo_right", "label_image", "pose", "tf", "tf_static", "imu", "gnss",
+    "lidar", "depth", "image", "camera_info", "stereo_left", "stereo_right", "label_image", "label_info", "pose", "tf",
+    "tf_static", "imu", "gnss",
 )  # fmt: skip
 _SINGLE = ("stereo_left", "stereo_right", "pose", "imu", "gnss")
 OWN_PREFIX = "/semloc/"  # results of an earlier run, never an input
@@ -24,7 +25,8 @@ _TRANSFORMS = {"tfmessage", "frametransform", "frametransforms"}
 _POSES = {"odometry": 0, "posewithcovariancestamped": 1, "posestamped": 2, "poseinframe": 2, "transformstamped": 3}
 _TYPES_OF_ROLE: dict[str, set[str]] = {
     "lidar": _CLOUDS, "depth": _IMAGES, "image": _IMAGES, "camera_info": _CAMERAS, "stereo_left": _IMAGES, "stereo_right": _IMAGES,
-    "label_image": _IMAGES, "pose": set(_POSES) | _TRANSFORMS, "tf": _TRANSFORMS, "tf_static": _TRANSFORMS, "imu": {"imu"},
+    "label_image": _IMAGES, "label_info": {"labelinfo", "string"}, "pose": set(_POSES) | _TRANSFORMS,
+    "tf": _TRANSFORMS, "tf_static": _TRANSFORMS, "imu": {"imu"},
     "gnss": {"navsatfix", "locationfix"},
 }  # fmt: skip
 
@@ -44,7 +46,8 @@ _LEFT_RIGHT = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"), ("imag
 
 @dataclass(frozen=True)
 class Roles:
-    """Topics by role. ``info_of`` names the CameraInfo topic of a picture's topic, ``label_of`` the label image of a depth topic.
+    """Topics by role. ``info_of`` names the CameraInfo topic of a picture's topic, ``label_of`` the label image of a depth topic,
+    ``names_of`` the topic that says what the labels of a label image or a LIDAR mean.
 
     ``problems`` are choices that nobody can make for the user; ``notes`` are choices that were made.
     """
@@ -56,6 +59,7 @@ class Roles:
     stereo_left: str | None = None
     stereo_right: str | None = None
     label_image: tuple[str, ...] = ()
+    label_info: tuple[str, ...] = ()
     pose: str | None = None
     tf: tuple[str, ...] = ()
     tf_static: tuple[str, ...] = ()
@@ -63,6 +67,7 @@ class Roles:
     gnss: str | None = None
     info_of: dict[str, str] = field(default_factory=dict)
     label_of: dict[str, str] = field(default_factory=dict)
+    names_of: dict[str, str] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -115,17 +120,19 @@ def guess_roles(streams: Sequence[Stream], overrides: Mapping[str, str] | None =
     image = pick("image", lambda: [t for t in colour if t not in (*stereo_left, *stereo_right)] or stereo_left)
     lidar = pick("lidar", lambda: _lidar_topics([t for t, kind in kinds.items() if kind in _CLOUDS], depth, notes))
     pose = pick("pose", lambda: _pose_topic(kinds, (*depth, *lidar, *image), problems, notes))
+    meanings = pick("label_info", lambda: sorted(t for t, kind in kinds.items() if _is_label_info(t, kind)))
     transforms = sorted(t for t, kind in kinds.items() if kind in _TRANSFORMS)
     imu = pick("imu", lambda: _preferred([t for t, kind in kinds.items() if kind == "imu"]))
     gnss = pick("gnss", lambda: sorted(t for t, kind in kinds.items() if kind in _TYPES_OF_ROLE["gnss"])[:1])
     return Roles(
-        lidar=lidar, depth=depth, image=image, camera_info=infos, label_image=labels,
+        lidar=lidar, depth=depth, image=image, camera_info=infos, label_image=labels, label_info=meanings,
         stereo_left=next(iter(stereo_left), None), stereo_right=next(iter(stereo_right), None),
         pose=next(iter(pose), None), imu=next(iter(imu), None), gnss=next(iter(gnss), None),
         tf=chosen.get("tf", tuple(t for t in transforms if not t.endswith("tf_static"))),
         tf_static=chosen.get("tf_static", tuple(t for t in transforms if t.endswith("tf_static"))),
-        info_of=_match((*depth, *image, *stereo_left, *stereo_right), infos, forced="camera_info" in chosen),
+        info_of=_match((*depth, *image, *labels, *stereo_left, *stereo_right), infos, forced="camera_info" in chosen),
         label_of=_match(depth, labels, forced="label_image" in chosen),
+        names_of=_match_meanings(labels, lidar, meanings, forced="label_info" in chosen),
         problems=tuple(problems), notes=tuple(notes),
     )  # fmt: skip
 
@@ -188,6 +195,16 @@ def _is_label(topic: str) -> bool:
     name = topic.lower()
     words = _LABEL.search(name)
     return words is not None and not _PAINTED.search(name[words.start() :]) and not _PAINTED.search(stem(name).rpartition("/")[2])
+
+
+def _is_label_info(topic: str, kind: str) -> bool:
+    return kind == "labelinfo" or (kind == "string" and topic.endswith("/label_space"))
+
+
+def _match_meanings(labels: Sequence[str], lidar: Sequence[str], meanings: Sequence[str], *, forced: bool) -> dict[str, str]:
+    """As :func:`_match`; where there are label images, a LIDAR has only what stands in its own namespace."""
+    of_lidar = _match(lidar, meanings, forced=forced and not labels)
+    return _match(labels, meanings, forced=forced) | {t: m for t, m in of_lidar.items() if not labels or _shared(t, m)}
 
 
 def _depth_topics(pictures: Sequence[str], labels: Sequence[str]) -> list[str]:

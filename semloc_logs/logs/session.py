@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError, RoleError
-from semloc_logs.frames import F64, Camera, DepthFrame, Frame, ImageFrame, ImuSample, LidarFrame, PosedCloud, PoseSample, TransformSample
+from semloc_logs.frames import (
+    F64,
+    Camera,
+    DepthFrame,
+    Frame,
+    ImageFrame,
+    ImuSample,
+    LabelNames,
+    LidarFrame,
+    PosedCloud,
+    PoseSample,
+    TransformSample,
+)
 from semloc_logs.logs.base_frame import BasePoses, PoseSource
-from semloc_logs.logs.depth import DepthClouds
+from semloc_logs.logs.depth import DepthClouds, label_ids
 from semloc_logs.logs.gravity import Accelerometer
 from semloc_logs.logs.log import Log, Stream
 from semloc_logs.logs.merge import merged_frames, merged_streams
@@ -114,8 +126,8 @@ class Session:
         self._waiting: deque[RangeFrame] = deque()
         self._waiting_bytes = 0
         self._sensors: dict[str, F64] = {}
-        self._image_end: int | None = None
-        self._wants_images = False
+        self._image_stamps: dict[str, deque[int]] = {}  # by topic that on_image wants, the newest last
+        self._meanings: dict[str, LabelNames] = {}
         self._deskewed = 0
         self._lost: list[str] = []
         self._notes: list[str] = list(self.roles.notes)
@@ -155,6 +167,11 @@ class Session:
         known = self._depth.cameras
         return {topic: known[info] for topic, info in self.roles.info_of.items() if info in known}
 
+    @property
+    def label_names(self) -> dict[str, LabelNames]:
+        """What the log says of the labels of each topic, as far as it does: the first message counts."""
+        return {topic: self._meanings[source] for topic, source in self.roles.names_of.items() if source in self._meanings}
+
     def trajectory(self) -> tuple[NDArray[np.int64], F64]:
         """Stamps (n,) and ``session_T_base`` (n, 4, 4) of all poses; complete once :meth:`clouds` is exhausted."""
         return self._where.track.stamps_ns.copy(), self._where.track.poses
@@ -162,6 +179,10 @@ class Session:
     def pose_at(self, stamp_ns: int) -> F64 | None:
         """``session_T_base`` (4, 4) at a time that the pass has reached; None where the poses have a gap."""
         return self._where.track.at(stamp_ns)
+
+    def base_T(self, frame_id: str, stamp_ns: int) -> F64 | None:
+        """``base_T_frame`` (4, 4) at a time that the pass has reached; None when nothing says where that frame is."""
+        return self._where.base_T(frame_id, stamp_ns)
 
     def base_T_sensors(self) -> dict[str, F64]:
         """``base_T_sensor`` (4, 4) by frame id of every sensor that gave a cloud, and of the cameras, at their last known time."""
@@ -224,19 +245,21 @@ class Session:
 
     # -- the pass over the logs ----------------------------------------------------------------------------------------------------
 
-    def clouds(self, on_image: Callable[[ImageFrame], None] | None = None) -> Iterator[PosedCloud]:
+    def clouds(self, on_image: Callable[[ImageFrame], None] | None = None, images: Collection[str] | None = None) -> Iterator[PosedCloud]:
         """All clouds in the order of their recording, points in the base frame.
 
         A frame waits until poses and transforms have passed its time, at most 64 at once; one that then has no pose is counted and left
         out, unless the log has no pose stream at all: then ``session_T_base`` is None. Colour pictures are decoded only for
-        ``on_image``, which gets each of them before the clouds up to its time.
+        ``on_image``, which gets each of them before the clouds up to its time: those of the topics ``images`` (pictures or label
+        images), by default of all pictures.
         """
         self._begin()
         roles = self.roles
         topics = {*roles.lidar, *roles.depth, *roles.label_of.values(), *roles.tf, *roles.tf_static}
-        topics |= {roles.info_of[t] for t in (*roles.depth, *roles.image) if t in roles.info_of}
-        topics |= {*roles.topics("pose"), *roles.topics("imu")} | (set(roles.image) if on_image else set())
-        self._wants_images = on_image is not None and bool(roles.image)
+        topics |= {roles.info_of[t] for t in (*roles.depth, *roles.image, *roles.label_image) if t in roles.info_of}
+        wanted = set(roles.image if images is None else images) if on_image else set()
+        topics |= {*roles.topics("pose"), *roles.topics("imu"), *roles.label_info} | wanted
+        self._image_stamps = {topic: deque(maxlen=4 * MAX_WAITING) for topic in sorted(wanted)}
         for frame in merged_frames(self.logs, topics):
             self._take(frame, on_image)
             yield from self._ready(is_end=False)
@@ -252,6 +275,8 @@ class Session:
             self._depth.cameras[topic] = frame
         elif isinstance(frame, ImuSample):
             self._accelerometer.add(frame)
+        elif isinstance(frame, LabelNames):
+            self._meanings.setdefault(topic, frame)
         elif isinstance(frame, RangeFrame):
             if topic in roles.lidar or topic in roles.depth:
                 self._tally.saw(topic, frame.header.stamp_ns)
@@ -265,11 +290,19 @@ class Session:
                 if self._where.source is not None:
                     self._where.source.take(frame)
                     self._where.pull()
-            elif topic in roles.label_of.values() and not isinstance(frame, LidarFrame):
-                self._depth.take_label(frame)
-            elif isinstance(frame, ImageFrame) and on_image is not None:
-                self._image_end = max(self._image_end or 0, frame.header.stamp_ns)
-                on_image(frame)
+            elif not isinstance(frame, LidarFrame):
+                self._take_picture(frame, on_image)
+
+    def _take_picture(self, frame: DepthFrame | ImageFrame, on_image: Callable[[ImageFrame], None] | None) -> None:
+        topic = frame.header.topic
+        if topic in self.roles.label_of.values():
+            self._depth.take_label(frame)
+        if on_image is None or topic not in self._image_stamps:
+            return
+        self._image_stamps[topic].append(frame.header.stamp_ns)
+        if isinstance(frame, DepthFrame):  # labels in 16 bits that were decoded as if they were depth
+            frame = ImageFrame(frame.header, np.minimum(label_ids(frame), 0xFFFF).astype(np.uint16), "mono16")
+        on_image(frame)
 
     def _ready(self, *, is_end: bool) -> Iterator[PosedCloud]:
         """Clouds of the frames that need not wait any longer, first come first served."""
@@ -299,8 +332,12 @@ class Session:
 
     def _has_all(self, frame: RangeFrame) -> bool:
         stamp_ns = frame.header.stamp_ns
-        if self._wants_images and (self._image_end is None or self._image_end < stamp_ns):
+        if any(self.roles.info_of.get(t) not in {None, *self._depth.cameras} for t in self._image_stamps):
             return False
+        for stamps in self._image_stamps.values():  # poses have to reach the first picture that is not earlier
+            following = next((s for s in stamps if s >= stamp_ns), None)
+            if following is None or not self._where.poses_have_passed(following):
+                return False
         if not isinstance(frame, LidarFrame) and not self._depth.has_all(frame):
             return False
         where = self._where
@@ -317,6 +354,7 @@ class Session:
         # before the poses have come so far, nobody knows whether the frame lies in a gap: the nearest pose serves at the end only
         is_known = base.pose_frame is not None and (is_end or self._where.poses_have_passed(header.stamp_ns))
         pose = self._where.track.at(header.stamp_ns) if is_known else None
+        extra: dict[str, str] = {}
         if base.pose_frame is not None and pose is None:
             return "no pose"
         if isinstance(frame, LidarFrame):
@@ -328,10 +366,13 @@ class Session:
             if isinstance(found, str):
                 return found
             points, label = in_base(base_T_sensor, found[0]), found[1]
+            label_topic = self.roles.label_of.get(header.topic)
+            if label is not None and label_topic is not None:
+                extra = {"label_topic": label_topic, "label_form": "colours" if label_topic in self._depth.coloured else "ids"}
         if not len(points):
             return "no points"
         self._sensors[header.frame_id] = base_T_sensor
-        return PosedCloud(header, points, base_T_sensor[:3, 3].astype(np.float32), pose, label)
+        return PosedCloud(header, points, base_T_sensor[:3, 3].astype(np.float32), pose, label, extra)
 
     def _conclude(self) -> None:
         track = self._where.track

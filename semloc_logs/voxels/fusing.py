@@ -16,9 +16,9 @@ from semloc_logs import contracts
 from semloc_logs.errors import LogError
 from semloc_logs.frames import PosedCloud
 from semloc_logs.geometry import apply, inverse, rotation_between
-from semloc_logs.labels.geometry import classify
+from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.shape import shape
-from semloc_logs.labels.space import SKY, UNLABELLED, guess_space, to_cityscapes
+from semloc_logs.labels.space import SKY
 from semloc_logs.logs.session import Session, open_session
 from semloc_logs.logs.trajectory_file import TrajectoryFile
 from semloc_logs.settings import STREET_VOXEL, Settings
@@ -106,19 +106,20 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
     )
     try:
         with tempfile.TemporaryDirectory(prefix="semloc-") as scratch:
-            raws, normals = _collect(session, task, Path(scratch), on_progress)
+            labeller = Labeller(settings.labels, session)
+            raws, normals = _collect(session, task, labeller, Path(scratch), on_progress)
             if not raws:
                 raise LogError(f"{session.name} gave no usable points: {'; '.join(session.problems) or 'its sensor streams are empty'}")
             posed = raws[0].pose is not None
             session_T_map, level = _level(session, raws, normals, posed)
             poses = np.array([inverse(session_T_map) @ r.pose if r.pose is not None else level(i) for i, r in enumerate(raws)])
-            source, space = _label_source(settings, Path(scratch), len(raws), session)
+            labeller.conclude()
             metadata = {
                 "schema_version": 1,
                 "voxel_size": fusion.voxel_size,
                 "session_T_map": session_T_map.tolist(),
                 "label_space": "cityscapes",
-                "label_source": source,
+                "label_source": labeller.source,
                 "version": semloc_logs.__version__,
             }
             grounds: list[float] = []
@@ -131,7 +132,7 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
                     ground = ground_height(
                         points_level - np.r_[poses[i][:2, 3], 0.0], float(apply(poses[i], raws[i].origin[None])[0, 2]), scale
                     )
-                    label = _labels(points_level, ids, source, space, scale)
+                    label = labeller.labels(i, points_level, ids, scale)
                     keep = label != SKY
                     grounds.append(ground)
                     counts.append(int(keep.sum()))
@@ -166,8 +167,12 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         ids = range(len(submaps))
         voxels = write_voxels(task.folder.voxels, (read_blocks(blocks_path(task.folder.blocks, i)) for i in ids), metadata, fusion.clamp)
         draw_map(task.folder.voxels, poses[:, :3, 3] if posed else np.zeros((0, 3)), fusion.voxel_size, task.folder.picture)
+        for note in labeller.notes:
+            on_progress(note)
         content = {
             **session.to_json(),
+            "problems": [*session.problems, *labeller.notes],
+            "labels": labeller.to_json(),
             "name": task.folder.name,
             "fingerprint": task.fingerprint,
             "settings": settings.model_dump(mode="json", include={"fusion", "labels"}),
@@ -184,19 +189,22 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         session.close()
 
 
-def _collect(session: Session, task: FuseTask, scratch: Path, on_progress: Callable[[str], None]) -> tuple[list[_Raw], _Normals]:
+def _collect(
+    session: Session, task: FuseTask, labeller: Labeller, scratch: Path, on_progress: Callable[[str], None]
+) -> tuple[list[_Raw], _Normals]:
     """The one pass over the log: keyframes' thinned points into ``scratch``, their poses and a sample of normals."""
     fusion = task.settings.fusion
     cell = fusion.keyframe_resolution or 0.1
     selector, normals, raws = KeyframeSelector(fusion), _Normals(), list[_Raw]()
-    for cloud in session.clouds():
+    for cloud in session.clouds(labeller.on_image, labeller.images):
         if not selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
             continue
         keep = thin(cloud.points, cell)
         points = cloud.points[keep]
         np.save(scratch / f"{len(raws)}.npy", points)
-        if cloud.label is not None:
-            np.save(scratch / f"{len(raws)}-label.npy", cloud.label[keep])
+        label = labeller.take(cloud, keep)
+        if label is not None:
+            np.save(scratch / f"{len(raws)}-label.npy", label)
         if cloud.sigma is not None:
             np.save(scratch / f"{len(raws)}-sigma.npy", cloud.sigma[keep])
         raws.append(_Raw(cloud.header, cloud.session_T_base, cloud.origin))
@@ -238,28 +246,6 @@ def _level(session: Session, raws: list[_Raw], normals: _Normals, posed: bool) -
         return out
 
     return np.eye(4), level
-
-
-def _label_source(settings: Settings, scratch: Path, count: int, session: Session) -> tuple[str, str]:
-    """Source ("log", "geometry" or "uniform") and the log's label space ("" without labels)."""
-    source = settings.labels.source
-    first = next((i for i in range(count) if (scratch / f"{i}-label.npy").exists()), None)
-    if source == "onnx":
-        raise LogError("labels.source=onnx is not available in this version: use auto, log, geometry or uniform.")
-    if source == "log" and first is None:
-        raise LogError(f"{session.name} has no labels (a 'label' field of the points or a label image): use --set labels.source=geometry.")
-    if source in ("geometry", "uniform") or first is None:
-        return ("uniform" if source == "uniform" else "geometry"), ""
-    return "log", settings.labels.space or guess_space(np.load(scratch / f"{first}-label.npy"))
-
-
-def _labels(points: F64, ids: NDArray[np.uint32] | None, source: str, space: str, scale: float) -> NDArray[np.uint8]:
-    """Classes (n,) of level points (n, 3)."""
-    if source == "log":
-        return to_cityscapes(ids, space) if ids is not None else np.full(len(points), UNLABELLED, np.uint8)
-    if source == "geometry":
-        return classify(points, shape(points), scale)
-    return np.full(len(points), UNLABELLED, np.uint8)
 
 
 def fuse_keyframes(

@@ -123,15 +123,27 @@ def test_each_pixel_gets_its_own_label() -> None:
     assert found[1].tolist() == ids[::2, ::2].ravel().tolist()
 
 
-def test_label_images_of_another_size_or_in_colour_are_left_out_with_a_note() -> None:
-    for shape in ((3, 4), (6, 8, 3)):
-        clouds = DepthClouds(ROLES)
-        clouds.cameras["/d/camera_info"] = camera()
-        clouds.take_label(label_frame(0, 1, shape))
-        found = clouds.points(depth_frame(), 0.0, 80.0)
-        assert not isinstance(found, str)
-        assert found[1] is None
-        assert "--topic label_image=TOPIC" in next(iter(clouds.notes))
+def test_label_images_of_another_size_are_left_out_with_a_note() -> None:
+    clouds = DepthClouds(ROLES)
+    clouds.cameras["/d/camera_info"] = camera()
+    clouds.take_label(label_frame(0, 1, (3, 4)))
+    found = clouds.points(depth_frame(), 0.0, 80.0)
+    assert not isinstance(found, str)
+    assert found[1] is None
+    assert "--topic label_image=TOPIC" in next(iter(clouds.notes))
+
+
+def test_colours_of_a_label_image_are_packed() -> None:
+    clouds = DepthClouds(ROLES)
+    clouds.cameras["/d/camera_info"] = camera()
+    colours = np.zeros((6, 8, 3), np.uint8)
+    colours[..., 0], colours[..., 1], colours[..., 2] = 128, 64, 32
+    clouds.take_label(ImageFrame(Header("/d/label", 0, 0, ""), colours, "rgb8"))
+    found = clouds.points(depth_frame(), 0.0, 80.0)
+    assert not isinstance(found, str)
+    assert found[1] is not None
+    assert set(found[1].tolist()) == {128 * 65536 + 64 * 256 + 32}
+    assert clouds.coloured == {"/d/label"}
 
 
 def test_reasons() -> None:

@@ -268,7 +268,7 @@ def test_depth_camera_with_labels_and_its_own_pose() -> None:
     assert [int(cloud.label[0]) for cloud in clouds if cloud.label is not None] == [0, 1, 2, 3]
     assert session.base_frame == "optical"
     np.testing.assert_allclose(clouds[0].points[0], [-2.0, -2.0, 2.0])
-    assert list(session.cameras) == ["/camera/depth/image"]
+    assert list(session.cameras) == ["/camera/depth/image", "/camera/label"]
 
 
 def test_depth_without_calibration_is_said() -> None:

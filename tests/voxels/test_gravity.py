@@ -106,12 +106,13 @@ def test_two_drives_through_a_basement_agree_on_up() -> None:
     for name in ("basement_a.mcap", "basement_b.bag"):
         scratch = Path(tempfile.mkdtemp())
         try:
+            from semloc_logs.labels.labeller import Labeller
             from semloc_logs.logs.session import open_session
 
             task = FuseTask((SHARED / "logs" / name,), SessionFolder(scratch), settings)
             session = open_session([*task.logs], {}, min_range=0.9, max_range=30.0)
             try:
-                raws, normals = _collect(session, task, scratch, lambda _: None)
+                raws, normals = _collect(session, task, Labeller(settings.labels, session), scratch, lambda _: None)
                 session_T_map, _ = _level(session, raws, normals, raws[0].pose is not None)
             finally:
                 session.close()

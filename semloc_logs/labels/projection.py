@@ -1,0 +1,93 @@
+"""Points in front of a camera -> pixels, by the distortion models of logs/depth.py."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.errors import LogError
+from semloc_logs.frames import F64, Camera
+
+_NEAREST = 0.1  # m along the optical axis: nearer points are not projected
+_STEEPEST = np.radians(85)
+
+
+class Projector:
+    """Projects points of a camera's optical frame (x right, y down, z forward) into its pictures of ``height`` x ``width`` pixels.
+
+    ``rectified``: the picture is undistorted, so R and P hold, not K and D. A picture that was scaled as a whole is allowed for.
+    LogError when the calibration cannot be used.
+    """
+
+    def __init__(self, camera: Camera, height: int, width: int, *, rectified: bool = False) -> None:
+        where = f"CameraInfo {camera.header.topic}"
+        matrix, self._distortion, self._rotation = camera.K.copy(), np.atleast_1d(np.asarray(camera.D, float)), np.eye(3)
+        if (rectified and camera.P[0, 0] > 0) or matrix[0, 0] <= 0:
+            matrix, self._distortion, self._rotation = camera.P[:, :3].copy(), np.zeros(0), camera.R
+        scale = np.array([width / (camera.width or width), height / (camera.height or height)])
+        if abs(scale[0] / scale[1] - 1) > 0.02:
+            raise LogError(
+                f"{where} is for {camera.width} x {camera.height} pixels but its picture has {width} x {height}: "
+                f"record the CameraInfo of the picture, or name it with --topic camera_info=TOPIC."
+            )
+        # pixel centres are whole numbers: the corner of the picture is at -0.5
+        matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
+        matrix[:2, :2] *= scale[:, None]
+        if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+            raise LogError(f"{where} has no focal length: the camera is not calibrated; name another with --topic camera_info=TOPIC.")
+        self.height, self.width, self.focal, self._matrix = height, width, float(matrix[0, 0]), matrix
+        name, count = camera.model.lower(), len(self._distortion)
+        self._fisheye = name in ("equidistant", "kannala_brandt", "fisheye") and count == 4
+        is_polynomial = name in ("plumb_bob", "rational_polynomial", "thin_prism", "") and count in (4, 5, 8, 12, 14)
+        if np.any(self._distortion) and not (self._fisheye or is_polynomial):
+            raise LogError(
+                f"{where} has the distortion model '{camera.model[:40]}' with {count} coefficients, which is not supported: "
+                f"record rectified pictures, or name another calibration with --topic camera_info=TOPIC."
+            )
+        self._widest = _widest(self._distortion, self._fisheye)
+
+    def pixels(self, points: NDArray[np.floating]) -> tuple[F64, NDArray[np.bool_]]:
+        """Pixel coordinates (n, 2) of ``points`` (n, 3) and which of them the camera can see: in front, and within its field of view.
+
+        Pixels of points that cannot be seen mean nothing; they are outside of the picture too where it ends.
+        """
+        p = np.asarray(points, float) @ self._rotation.T
+        front = p[:, 2] > _NEAREST
+        x, y = np.where(front[:, None], p[:, :2] / np.where(front, p[:, 2], 1.0)[:, None], 0.0).T
+        # a distortion polynomial turns back far outside of the picture and would fold the surroundings into it
+        front &= np.hypot(x, y) <= np.tan(self._widest)
+        x, y = np.where(front, x, 0.0), np.where(front, y, 0.0)
+        if not np.any(self._distortion) and not self._fisheye:
+            pixels = np.stack([x, y, np.ones_like(x)], axis=1) @ self._matrix[:2].T
+        else:
+            project = cv2.fisheye.projectPoints if self._fisheye else cv2.projectPoints
+            rays = np.stack([x, y, np.ones_like(x)], axis=1)[:, None]
+            pixels = np.zeros((0, 2))
+            if len(rays):
+                pixels = np.asarray(project(rays, np.zeros((1, 3)), np.zeros((1, 3)), self._matrix, self._distortion)[0], float)
+            pixels = pixels.reshape(-1, 2)
+        return pixels, front
+
+    def inside(self, pixels: F64) -> NDArray[np.bool_]:
+        """Which of ``pixels`` (n, 2) lie in the picture."""
+        bounds = np.array([self.width - 0.5, self.height - 0.5])
+        return np.asarray(((pixels >= -0.5) & (pixels < bounds)).all(1))
+
+
+def _widest(distortion: F64, fisheye: bool) -> float:
+    """Angle from the optical axis (rad) up to which the distorted radius grows."""
+    if not np.any(distortion):
+        return float(_STEEPEST)
+    angle = np.linspace(0, _STEEPEST, 2000)
+    if fisheye:
+        k = distortion
+        radius = angle * (1 + k[0] * angle**2 + k[1] * angle**4 + k[2] * angle**6 + k[3] * angle**8)
+    else:
+        k = np.zeros(14)
+        k[: len(distortion)] = distortion
+        r2 = np.tan(angle) ** 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            radius = np.sqrt(r2) * (1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3) / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
+    falling = np.flatnonzero(~(np.diff(radius) > 0))
+    return float(angle[falling[0]] if len(falling) else _STEEPEST)
