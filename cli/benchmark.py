@@ -8,61 +8,108 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .console import console
-from .options import Command, console_options, json_option, settings_options
+from .options import Command, console_options, json_option, pairs, settings_options
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Settings
+
+Rows = list[tuple[float, int, str]]
+
+
+def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ...]:
+    try:
+        lengths = tuple(int(part) for part in value.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{value!r} is not a list of whole numbers such as 1,4,16") from None
+    if min(lengths) < 1:
+        raise click.BadParameter("lengths begin at 1")
+    return lengths
 
 
 @click.command(cls=Command)
 @click.argument("name", metavar="NAME")
 @click.argument("logs", metavar="[LOG]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--truth", type=click.Path(path_type=Path), help="Truth file of the logs, for words.")
+@click.option(
+    "--peer",
+    "peers",
+    metavar="NAME=PYTHON",
+    multiple=True,
+    callback=pairs,
+    help="A mapper to run beside fusion and the Python that has it (benchmarks/README.md): octomap or kiss_slam; repeatable.",
+)
+@click.option("--lengths", default="1,4,16", callback=_lengths, help="Multiples of a drive of 250 m, for memory; default 1,4,16.")
 @json_option
 @settings_options
 @console_options
-def command(name: str, logs: tuple[Path, ...], truth: Path | None, as_json: bool, settings: Settings) -> int:
+def command(
+    name: str,
+    logs: tuple[Path, ...],
+    truth: Path | None,
+    peers: dict[str, str],
+    lengths: tuple[int, ...],
+    as_json: bool,
+    settings: Settings,
+) -> int:
     """Figures of speed and quality, measured here and now, beside what else does the same.
 
-    NAME is reading, fusion, encoder, search or annotate (on simulated data), pipeline (seconds, memory and profile of a run on the
-    LOGs), or words (recall of word matches between two LOGs whose truth is known, trained weights beside random ones). Close other
-    programs first: times are wall-clock.
+    NAME is reading, fusion, encoder, search or annotate (on simulated data; fusion takes sweeps of LOGs too), memory (peak of fusing
+    drives of several lengths), fuse (one session of the LOGs, beside reading and integrating alone), pipeline (seconds, memory and
+    profile of a run on the LOGs), or words (recall of word matches between two LOGs whose truth is known, trained weights beside random
+    ones). Close other programs first: times are wall-clock.
 
     \b
     Example:  semloc benchmark reading --json
+              semloc benchmark fusion --peer octomap=octomap/bin/python
               semloc benchmark pipeline monday.mcap tuesday.bag
               semloc benchmark words monday.mcap tuesday.bag --truth truth.json
     """
-    rows: list[tuple[float, int, str]] = []
-    figures: dict[str, dict[str, Any]]
     if name == "words" and (len(logs) != 2 or truth is None):
         raise click.UsageError("words needs two logs and --truth FILE.")
-    if name == "pipeline" and not logs:
-        raise click.UsageError("pipeline needs at least one log.")
+    if name in ("pipeline", "fuse") and not logs:
+        raise click.UsageError(f"{name} needs at least one log.")
     with console.progress():
-        if name == "pipeline":
-            from semloc_logs.profiling import profile_pipeline
-
-            figures, rows = profile_pipeline(logs, settings)
-        elif name == "words" and truth is not None:
-            from semloc_logs.profiling import word_recalls
-
-            figures = word_recalls(logs, truth, settings)
-        else:
-            from semloc_logs.evaluation.benchmarks import run_benchmark
-
-            figures = run_benchmark(name, settings)
+        figures, rows = _measure(name, logs, truth, peers, lengths, settings)
     if as_json:
         console.result_json(figures)
         return 0
-    peers = list(dict.fromkeys(p for row in figures.values() for p in row if p not in ("ours", "unit")))
-    drawn = [(figure, *(_number(row.get(column)) for column in ("ours", *peers)), str(row["unit"])) for figure, row in figures.items()]
-    console.table(name, ("figure", "ours#", *(f"{p}#" for p in peers), "unit"), drawn)
+    others = list(dict.fromkeys(p for row in figures.values() for p in row if p not in ("ours", "unit")))
+    drawn = [(figure, *(_number(row.get(column)) for column in ("ours", *others)), str(row["unit"])) for figure, row in figures.items()]
+    console.table(name, ("figure", "ours#", *(f"{p}#" for p in others), "unit"), drawn)
     if rows:
         console.table(
             "where the time goes", ("s#", "calls#", "function"), [(f"{own:.2f}", str(calls), where) for own, calls, where in rows]
         )
     return 0
+
+
+def _measure(
+    name: str, logs: tuple[Path, ...], truth: Path | None, peers: dict[str, str], lengths: tuple[int, ...], settings: Settings
+) -> tuple[dict[str, dict[str, Any]], Rows]:
+    """The figures of benchmark ``name`` and, where it profiles, the functions that took most time."""
+    if name == "pipeline":
+        from semloc_logs.profiling import profile_pipeline
+
+        return profile_pipeline(logs, settings)
+    if name == "fuse":
+        from semloc_logs.profiling import profile_fuse
+
+        return profile_fuse(logs, settings)
+    if name == "memory":
+        from semloc_logs.profiling import memory_curve
+
+        return memory_curve(lengths, settings), []
+    if name == "words" and truth is not None:
+        from semloc_logs.profiling import word_recalls
+
+        return word_recalls(logs, truth, settings), []
+    if name == "fusion":
+        from semloc_logs.evaluation.fusion_speed import fusion_speed
+
+        return fusion_speed(settings, logs, peers), []
+    from semloc_logs.evaluation.benchmarks import run_benchmark
+
+    return run_benchmark(name, settings), []
 
 
 def _number(value: float | str | None) -> str | None:

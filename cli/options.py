@@ -91,7 +91,8 @@ def console_options(function: Function) -> Function:
     return function
 
 
-def _pairs(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+def pairs(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    """Callback of options NAME=VALUE that may be repeated."""
     out = {}
     for value in values:
         key, equals, rest = value.partition("=")
@@ -106,7 +107,7 @@ topic_option = click.option(
     "topics",
     metavar="ROLE=TOPIC",
     multiple=True,
-    callback=_pairs,
+    callback=pairs,
     help="Topic that plays a role, such as lidar=/points; repeatable.",
 )
 
@@ -120,7 +121,7 @@ def settings_options(function: Function) -> Function:
         "assignments",
         metavar="KEY.PATH=VALUE",
         multiple=True,
-        callback=_pairs,
+        callback=pairs,
         help="One setting, such as fusion.voxel_size=0.3 (m); repeatable.",
     )
     @click.option("--dump-config", is_flag=True, help="Print all settings, explained, and exit.")

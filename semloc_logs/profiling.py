@@ -1,34 +1,60 @@
-"""Figures of whole logs: where the time of `semloc run` goes, and what the words are worth."""
+"""Figures of whole logs: where the time of `semloc run` and `semloc fuse` goes, how memory grows, and what the words are worth."""
 
 from __future__ import annotations
 
 import cProfile
 import pstats
 import resource
+import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 
 from semloc_logs.closures.queries import SessionMap, query_keyframes
 from semloc_logs.engines import make_engine
+from semloc_logs.errors import SemlocError
 from semloc_logs.evaluation.retrieval import word_recall
 from semloc_logs.evaluation.truth import read_truth
-from semloc_logs.geometry import inverse
+from semloc_logs.geometry import apply, inverse
+from semloc_logs.logs.session import open_session
 from semloc_logs.settings import Settings
 from semloc_logs.stages import fuse, run, session_name
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.tables import read_metadata
+from semloc_logs.voxels.grid import Fuser
+from semloc_logs.voxels.store import read_keyframe
 from semloc_logs.words.vocabulary import Vocabulary, load_vocabulary
 from semloc_logs.workspace import Workspace
 
 Figures = dict[str, dict[str, float | str]]
+Rows = list[tuple[float, int, str]]
+
+# parts of fusing: the functions whose time they are, and those within them whose time they are not
+_PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "fingerprint": (("annotate.py content_fingerprint",), ()),
+    "read": (("session.py clouds",), ()),
+    "thin": (("selection.py thin",), ()),
+    "direction of gravity": (("gravity.py find_up", "fusing.py add"), ("selection.py thin",)),
+    "labels": (("fusing.py _labels",), ()),
+    "height of the ground": (("gravity.py ground_height",), ()),
+    "keyframes written": (("store.py write_keyframes",), ("fusing.py labelled",)),
+    "keyframes read": (("store.py read_keyframe",), ()),
+    "integrate": (("grid.py add",), ()),
+    "finish of maps": (("grid.py finish",), ()),
+    "blocks written": (("store.py write_blocks",), ()),
+    "voxel merge": (("store.py write_voxels",), ("store.py read_blocks",)),
+    "blocks read": (("store.py read_blocks",), ()),
+    "picture": (("picture.py draw_map",), ()),
+}
 
 
-def profile_pipeline(logs: Sequence[Path], settings: Settings, functions: int = 12) -> tuple[Figures, list[tuple[float, int, str]]]:
+def profile_pipeline(logs: Sequence[Path], settings: Settings, functions: int = 12) -> tuple[Figures, Rows]:
     """Run the pipeline on ``logs`` in this process in a fresh workspace.
 
     Returns the figures (seconds of each stage, seconds a query, peak resident memory in MB) and, for the ``functions`` that took most
@@ -46,9 +72,144 @@ def profile_pipeline(logs: Sequence[Path], settings: Settings, functions: int = 
     figures["query"] = {"ours": report.seconds["close"] / max(queries, 1), "unit": "s a query"}
     figures["memory"] = {"ours": round(peak, 1), "unit": "MB peak"}
     figures["closures"] = {"ours": float(report.closures), "unit": ""}
-    stats = pstats.Stats(profiler).stats  # type: ignore[attr-defined]
-    rows = sorted(((own, calls, _place(where)) for where, (_, calls, own, _, _) in stats.items()), reverse=True)
-    return figures, rows[:functions]
+    return figures, _busiest(_stats(profiler), functions)
+
+
+def profile_fuse(logs: Sequence[Path], settings: Settings, rounds: int = 3, functions: int = 12) -> tuple[Figures, Rows]:
+    """`semloc fuse` of ``logs`` (one session) beside what it cannot do without: reading all clouds, and integrating all keyframes once.
+
+    ``rounds`` times in turn each, the median and the least count; ``ratio`` is whole / (reading + integrating). The parts come from one
+    more run under the profiler, which adds some percent; the rest of the returned functions are those that took most time themselves.
+    """
+    settings = settings.resolved()
+    fusion = settings.fusion
+    times: dict[str, list[float]] = {"whole": [], "reading": [], "integrating": []}
+
+    def whole(folder: Path, profiler: cProfile.Profile | None = None) -> Workspace:
+        work = Workspace(folder)
+        with profiler or nullcontext():
+            fuse({"session": logs}, work, settings, {}, make_engine("serial"), lambda _: None)
+        return work
+
+    def reading() -> int:
+        session = open_session([*logs], {}, min_range=fusion.min_range or 0.0, max_range=2.0 * (fusion.max_range or 50.0))
+        try:
+            return sum(1 for _ in session.clouds())
+        finally:
+            session.close()
+
+    clouds = reading()  # to warm up
+    for _ in range(rounds):
+        with tempfile.TemporaryDirectory(prefix="semloc-fuse-") as folder:
+            start = time.perf_counter()
+            work = whole(Path(folder))
+            times["whole"].append(time.perf_counter() - start)
+            start = time.perf_counter()
+            reading()
+            times["reading"].append(time.perf_counter() - start)
+            times["integrating"].append(_integrating(SessionMap(work.session("session")), settings))
+            keyframes = len(SessionMap(work.session("session")).map_T_base)
+    profiler = cProfile.Profile()
+    with tempfile.TemporaryDirectory(prefix="semloc-fuse-") as folder:
+        whole(Path(folder), profiler)
+    stats = _stats(profiler)
+    figures: Figures = {k: {"ours": float(np.median(v)), "least": min(v), "unit": "s"} for k, v in times.items()}
+    needed = np.array(times["reading"]) + np.array(times["integrating"])
+    ratio = np.array(times["whole"]) / needed
+    figures["ratio"] = {
+        "ours": float(np.median(ratio)),
+        "least": min(times["whole"]) / (min(times["reading"]) + min(times["integrating"])),
+        "unit": "whole / (reading + integrating)",
+    }
+    figures["clouds"] = {"ours": float(clouds), "unit": ""}
+    figures["keyframes"] = {"ours": float(keyframes), "unit": ""}
+    parts = _parts(stats)
+    figures |= {f"part: {part}": {"ours": seconds, "unit": "s, under the profiler"} for part, seconds in parts.items()}
+    return figures, _busiest(stats, functions)
+
+
+def _integrating(session: SessionMap, settings: Settings) -> float:
+    """Seconds of Fuser.add for every keyframe once, a new map every submap length of road."""
+    length, seconds = settings.fusion.submap_length or 100.0, 0.0
+    begun = np.floor(np.asarray(session.frames["distance"].to_numpy()) / length)
+    fuser = Fuser(settings.fusion)
+    for k, pose in enumerate(session.map_T_base):
+        if k and begun[k] != begun[k - 1]:
+            fuser = Fuser(settings.fusion)
+        frame = read_keyframe(session.folder.keyframes, k)
+        origin = np.array([session.frames[f"origin_{c}"][k].as_py() for c in "xyz"])
+        points = apply(pose, frame.points)
+        start = time.perf_counter()
+        fuser.add(points, frame.label, apply(pose, origin[None])[0])
+        seconds += time.perf_counter() - start
+    return seconds
+
+
+def _stats(profiler: cProfile.Profile) -> dict[tuple[str, int, str], tuple[int, int, float, float, object]]:
+    return pstats.Stats(profiler).stats  # type: ignore[attr-defined,no-any-return]
+
+
+def _busiest(stats: dict[tuple[str, int, str], tuple[int, int, float, float, object]], functions: int) -> Rows:
+    """Own seconds, calls and place of the functions that took most time themselves."""
+    return sorted(((own, calls, _place(where)) for where, (_, calls, own, _, _) in stats.items()), reverse=True)[:functions]
+
+
+def _parts(stats: dict[tuple[str, int, str], tuple[int, int, float, float, object]]) -> dict[str, float]:
+    """Seconds of the parts of fusing; ``rest`` is what no part names."""
+    total: dict[str, float] = {}
+    for (path, _, name), (_, _, _, cumulative, _) in stats.items():
+        key = f"{Path(path).name} {name}"
+        total[key] = total.get(key, 0.0) + cumulative
+    parts = {}
+    for part, (functions, without) in _PARTS.items():
+        if any(f in total for f in functions):
+            parts[part] = sum(total.get(f, 0.0) for f in functions) - sum(total.get(f, 0.0) for f in without)
+    parts["rest"] = total.get("stages.py fuse", 0.0) - sum(parts.values())
+    return parts
+
+
+def memory_curve(lengths: Sequence[int], settings: Settings) -> Figures:
+    """Peak resident memory of `semloc fuse`, in a process of its own, for a drive of 250 m and its multiples ``lengths``.
+
+    The road goes on (new places), or is driven there and back (the same places again). SemlocError when fusing fails.
+    """
+    from semloc_logs.simulation.long_drive import LAP_M, Lap
+
+    figures: Figures = {}
+    lap = Lap()
+    with tempfile.TemporaryDirectory(prefix="semloc-memory-") as folder:
+        (Path(folder) / "settings.yaml").write_text(settings.dump())
+        for onwards in (True, False):
+            for laps in lengths:
+                log = Path(folder) / "drive.mcap"
+                sweeps = lap.write(log, laps, onwards=onwards)
+                command = ["fuse", str(log), "-w", str(Path(folder) / "work"), "--config", str(Path(folder) / "settings.yaml"), "-q"]
+                start = time.perf_counter()
+                peak = peak_memory([*command, "--overwrite"])
+                figures[f"{laps}x, {'new places' if onwards else 'the same again'}"] = {
+                    "ours": round(peak, 1),
+                    "unit": f"MB peak, {laps * LAP_M:.0f} m",
+                    "sweeps": float(sweeps),
+                    "seconds": round(time.perf_counter() - start, 1),
+                }
+    return figures
+
+
+# a process inherits the peak of the one that forks it: a small one stands between
+_LAUNCH = """
+import resource, subprocess, sys
+code = subprocess.call([sys.executable, "-c", "from semloc_logs.cli.main import main; main()", *sys.argv[1:]])
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+sys.exit(code)
+"""
+
+
+def peak_memory(arguments: Sequence[str]) -> float:
+    """Peak resident memory (MB) of `semloc` with ``arguments``. SemlocError when it fails."""
+    done = subprocess.run([sys.executable, "-c", _LAUNCH, *arguments], capture_output=True, text=True, check=False)
+    if done.returncode not in (0, 3):
+        raise SemlocError(f"semloc {' '.join(arguments)} failed: {done.stderr.strip()}")
+    return int(done.stdout.split()[-1]) / (1024 if sys.platform.startswith("linux") else 1024**2)
 
 
 def _place(where: tuple[str, int, str]) -> str:

@@ -79,20 +79,10 @@ def reading(settings: Settings) -> Figures:
 
 
 def fusion(settings: Settings) -> Figures:
-    """Sweeps of a simulated street into the semantic map, free space carved."""
-    from semloc_logs.geometry import apply
-    from semloc_logs.simulation.training_scenes import training_session
-    from semloc_logs.voxels.grid import Fuser
+    """Sweeps and depth images into the semantic map, free space carved; see :mod:`semloc_logs.evaluation.fusion_speed`."""
+    from semloc_logs.evaluation.fusion_speed import fusion_speed
 
-    frames = [(apply(pose, p), label, apply(pose, o[None])[0]) for p, o, label, pose in training_session(4, 24)]
-
-    def fuse() -> None:
-        fuser = Fuser(settings.fusion)
-        for points, label, origin in frames:
-            fuser.add(points, label, origin)
-
-    points = float(np.mean([len(f[0]) for f in frames]))
-    return {"sweep": {"ours": 1e3 * _seconds(fuse, 3) / len(frames), "unit": f"ms a sweep of {points:.0f} points, labelled and carved"}}
+    return fusion_speed(settings)
 
 
 def encoder(settings: Settings) -> Figures:

@@ -1,0 +1,111 @@
+"""Mappers to compare with: each runs in a process of a Python environment of its own and is asked for one round after the other.
+
+A peer NAME is the script ``benchmarks/peers/NAME_runner.py`` of the source checkout. It gets a folder with ``points_K.npy`` ((n, 3)
+float32, sensor frame), ``poses.npy`` ((m, 4, 4)), voxel size and range; for every line on its stdin it integrates all scans into a
+new map and answers with a line of JSON, the fields of :class:`Round`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+import semloc_logs
+from semloc_logs.errors import SemlocError, SettingsError
+from semloc_logs.evaluation.scans import Scan
+
+_ANSWER_SECONDS = 600.0
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """All scans in one new map: milliseconds (and of processor time) of each, of what is due at the end; voxels of the map."""
+
+    ms: list[float]
+    cpu_ms: list[float]
+    finish_ms: float
+    free: int
+    occupied: int
+
+
+def runner(name: str) -> Path:
+    """The script of peer ``name``; SettingsError naming those there are."""
+    folder = Path(semloc_logs.__file__).resolve().parents[1] / "benchmarks" / "peers"
+    known = sorted(p.name.removesuffix("_runner.py") for p in folder.glob("*_runner.py"))
+    if name not in known:
+        there = f"there are {', '.join(known)}" if known else "their scripts are in benchmarks/peers of the source checkout"
+        raise SettingsError(f"There is no peer '{name}' to fuse with: {there}.")
+    return folder / f"{name}_runner.py"
+
+
+def write_scans(folder: Path, scans: Sequence[Scan]) -> None:
+    """The scans as files that a peer reads."""
+    for k, scan in enumerate(scans):
+        np.save(folder / f"points_{k}.npy", scan.points)
+    np.save(folder / "poses.npy", np.stack([s.map_T_sensor for s in scans]))
+
+
+class Peer:
+    """One peer at work on the scans of ``folder`` with so many ``threads``; a context manager."""
+
+    def __init__(self, name: str, python: str, folder: Path, voxel_size: float, max_range: float, threads: int) -> None:
+        self.name = name
+        environment = os.environ | dict.fromkeys(_THREADS, str(threads)) | {"OMP_WAIT_POLICY": "passive"}
+        environment.pop("PYTHONPATH", None)
+        command = [python, "-I", str(runner(name)), str(folder), repr(voxel_size), repr(max_range)]
+        self._errors = (folder / f"{name}-{threads}.err").open("w+")
+        try:
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True, env=environment
+            )
+        except OSError as problem:
+            self._errors.close()
+            raise SettingsError(f"Peer {name} cannot be started with {python} ({problem.strerror}): give --peer {name}=PYTHON.") from None
+
+    def __enter__(self) -> Peer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+        self._errors.close()
+
+    def round(self) -> Round:
+        """Everything once, into a new map. SemlocError when the peer fails or does not answer within ten minutes."""
+        watch = threading.Timer(_ANSWER_SECONDS, self._process.kill)
+        watch.start()
+        try:
+            ask, answer = self._process.stdin, self._process.stdout
+            if ask is not None and answer is not None:
+                ask.write("round\n")
+                ask.flush()
+                content = json.loads(answer.readline())
+                return Round(**{f.name: content[f.name] for f in fields(Round)})
+        except (OSError, ValueError, KeyError, TypeError):
+            pass
+        finally:
+            watch.cancel()
+        self._errors.seek(0)
+        said = self._errors.read().strip().splitlines()
+        raise SemlocError(f"Peer {self.name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md.")
+
+
+def open_peers(
+    stack: ExitStack, peers: Mapping[str, str], folder: Path, voxel_size: float, max_range: float, cores: int
+) -> dict[str, Peer]:
+    """Each of ``peers`` (name -> Python) with one thread as NAME and, where there are more cores, with two as NAME_2."""
+    out = {}
+    for name, python in peers.items():
+        for threads in (1, 2) if cores > 1 else (1,):
+            label = name if threads == 1 else f"{name}_{threads}"
+            out[label] = stack.enter_context(Peer(name, python, folder, voxel_size, max_range, threads))
+    return out
