@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,10 +13,44 @@ from numpy.typing import NDArray
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F32, F64, Camera, DepthFrame, ImageFrame
 from semloc_logs.logs.roles import Roles
+from semloc_logs.logs.stereo import DISPARITY_NOISE
 
 DENSE_PIXELS = 200_000  # a larger depth image is thinned to every second pixel of every second row
 LABEL_TOLERANCE_NS = 15_000_000  # a label image belongs to a depth image within half a period at 30 Hz
+# Noise along the optical axis of a structured-light camera, m: 0.0012 + 0.0019 (z - 0.4)^2, z in m (Nguyen, Izadi, Lovell, Modeling
+# Kinect Sensor Noise for Improved 3D Reconstruction and Tracking, 3DIMPVT 2012, equation 2, surfaces seen at 10 to 60 degrees)
+DEPTH_NOISE = 0.0019  # 1/m, the coefficient of the square
+_LEAST_DEPTH_NOISE = 0.0012  # m
+_NOISE_FREE_DEPTH = 0.4  # m
 _LABELS_KEPT = 80  # more than the depth images that may wait for their pose
+
+
+@dataclass(frozen=True, slots=True)
+class RangeNoise:
+    """How uncertain ranges from pictures are: ``depth`` (1/m), the growth of a depth image's standard deviation with the square of the
+    depth, and ``disparity`` (px), the standard deviation of a stereo pair's disparity where texture is plenty."""
+
+    depth: float = DEPTH_NOISE
+    disparity: float = DISPARITY_NOISE
+
+
+USUAL_NOISE = RangeNoise()
+
+
+class RangePoints(NamedTuple):
+    """``points`` (n, 3) in the optical frame (m), their ``label`` (n,) as recorded or None, and ``sigma`` (n,) of the range (m)."""
+
+    points: F32
+    label: NDArray[np.uint32] | None
+    sigma: F32
+
+
+def depth_sigma(points: F32, coefficient: float = DEPTH_NOISE) -> F32:
+    """Standard deviation (n,) of the range along the ray of points (n, 3) in the optical frame of a depth camera (m)."""
+    z = points[:, 2]
+    axial = np.float32(_LEAST_DEPTH_NOISE) + np.float32(coefficient) * np.square(np.maximum(z - np.float32(_NOISE_FREE_DEPTH), 0))
+    sigma: F32 = axial * np.sqrt(np.einsum("ij,ij->i", points, points)) / z
+    return sigma
 
 
 class Unprojector:
@@ -105,65 +141,29 @@ def _metres(frame: DepthFrame | ImageFrame) -> F32 | None:
     return None
 
 
-class DepthClouds:
-    """Depth images -> points with labels, by the calibrations and label images that came with them.
+class LabelImages:
+    """Label images as they come, for the pictures that they belong to by name and time. ``notes``: sentences about useless ones."""
 
-    ``lost`` and ``notes`` are sentences about calibrations and label images that cannot be used.
-    """
-
-    def __init__(self, roles: Roles, stride: int | None = None) -> None:
-        self.cameras: dict[str, Camera] = {}  # by CameraInfo topic, the newest
-        self.lost: dict[str, None] = {}
+    def __init__(self, roles: Roles) -> None:
         self.notes: dict[str, None] = {}
         self.coloured: set[str] = set()  # label topics whose labels are colours
         self._roles = roles
-        self._stride = stride
-        self._labels: dict[str, deque[DepthFrame | ImageFrame]] = {}
-        self._unprojectors: dict[str, tuple[Camera, tuple[int, ...], Unprojector | None]] = {}
+        self._frames: dict[str, deque[DepthFrame | ImageFrame]] = {}
 
-    def take_label(self, frame: DepthFrame | ImageFrame) -> None:
+    def take(self, frame: DepthFrame | ImageFrame) -> None:
         """Remembers a frame of a label topic."""
         if is_coloured(frame):
             self.coloured.add(frame.header.topic)
-        self._labels.setdefault(frame.header.topic, deque(maxlen=_LABELS_KEPT)).append(frame)
+        self._frames.setdefault(frame.header.topic, deque(maxlen=_LABELS_KEPT)).append(frame)
 
-    def has_all(self, frame: DepthFrame | ImageFrame) -> bool:
-        """Whether calibration and label image of a depth frame have come, as far as the log promises them."""
-        info, label = self._roles.info_of.get(frame.header.topic), self._roles.label_of.get(frame.header.topic)
-        if info is not None and info not in self.cameras:
-            return False
-        return label is None or (label in self._labels and self._labels[label][-1].header.stamp_ns >= frame.header.stamp_ns)
+    def has(self, frame: DepthFrame | ImageFrame) -> bool:
+        """Whether the label image of a picture has come, if the log promises one."""
+        label = self._roles.label_of.get(frame.header.topic)
+        return label is None or (label in self._frames and self._frames[label][-1].header.stamp_ns >= frame.header.stamp_ns)
 
-    def points(self, frame: DepthFrame | ImageFrame, min_range: float, max_range: float) -> tuple[F32, NDArray[np.uint32] | None] | str:
-        """Points (n, 3) in the optical frame and their labels (n,); or the reason why there are none."""
-        topic, depth = frame.header.topic, _metres(frame)
-        if depth is None:
-            return "no depth"
-        camera = self.cameras.get(self._roles.info_of.get(topic, ""))
-        if camera is None:
-            return "no calibration"
-        unprojector = self._unprojector(topic, camera, depth.shape)
-        if unprojector is None:
-            return "unusable calibration"
-        points, pixels = unprojector.points(depth, min_range, max_range)
-        label = self._label(frame, depth.shape)
-        return points, None if label is None else label.reshape(-1)[pixels]
-
-    def _unprojector(self, topic: str, camera: Camera, shape: tuple[int, ...]) -> Unprojector | None:
-        known = self._unprojectors.get(topic)
-        if known is not None and _same_calibration(known[0], camera) and known[1] == shape:
-            return known[2]
-        unprojector = None
-        try:
-            is_rectified = "rect" in topic
-            unprojector = Unprojector(camera, shape[0], shape[1], rectified=is_rectified, stride=self._stride)
-        except LogError as error:
-            self.lost.setdefault(str(error))
-        self._unprojectors[topic] = (camera, shape, unprojector)
-        return unprojector
-
-    def _label(self, frame: DepthFrame | ImageFrame, shape: tuple[int, ...]) -> NDArray[np.uint32] | None:
-        candidates = self._labels.get(self._roles.label_of.get(frame.header.topic, ""))
+    def of(self, frame: DepthFrame | ImageFrame, shape: tuple[int, ...]) -> NDArray[np.uint32] | None:
+        """Ids (h, w) of a picture of this shape; None without a label image at its time."""
+        candidates = self._frames.get(self._roles.label_of.get(frame.header.topic, ""))
         if not candidates:
             return None
         nearest = min(candidates, key=lambda c: abs(c.header.stamp_ns - frame.header.stamp_ns))
@@ -180,8 +180,56 @@ class DepthClouds:
         return None
 
 
-def _same_calibration(a: Camera, b: Camera) -> bool:
+class DepthClouds:
+    """Depth images -> points with labels, by the calibrations and ``labels`` that came with them.
+
+    ``lost``: sentences about calibrations that cannot be used.
+    """
+
+    def __init__(self, roles: Roles, stride: int | None = None, noise: RangeNoise = USUAL_NOISE) -> None:
+        self.cameras: dict[str, Camera] = {}  # by CameraInfo topic, the newest
+        self.labels = LabelImages(roles)
+        self.lost: dict[str, None] = {}
+        self._roles, self._stride, self._noise = roles, stride, noise
+        self._unprojectors: dict[str, tuple[Camera, tuple[int, ...], Unprojector | None]] = {}
+
+    def has_all(self, frame: DepthFrame | ImageFrame) -> bool:
+        """Whether calibration and label image of a depth frame have come, as far as the log promises them."""
+        info = self._roles.info_of.get(frame.header.topic)
+        return (info is None or info in self.cameras) and self.labels.has(frame)
+
+    def points(self, frame: DepthFrame | ImageFrame, min_range: float, max_range: float) -> RangePoints | str:
+        """Points in the optical frame; or the reason why there are none."""
+        topic, depth = frame.header.topic, _metres(frame)
+        if depth is None:
+            return "no depth"
+        camera = self.cameras.get(self._roles.info_of.get(topic, ""))
+        if camera is None:
+            return "no calibration"
+        unprojector = self._unprojector(topic, camera, depth.shape)
+        if unprojector is None:
+            return "unusable calibration"
+        points, pixels = unprojector.points(depth, min_range, max_range)
+        label = self.labels.of(frame, depth.shape)
+        return RangePoints(points, None if label is None else label.reshape(-1)[pixels], depth_sigma(points, self._noise.depth))
+
+    def _unprojector(self, topic: str, camera: Camera, shape: tuple[int, ...]) -> Unprojector | None:
+        known = self._unprojectors.get(topic)
+        if known is not None and same_calibration(known[0], camera) and known[1] == shape:
+            return known[2]
+        unprojector = None
+        try:
+            is_rectified = "rect" in topic
+            unprojector = Unprojector(camera, shape[0], shape[1], rectified=is_rectified, stride=self._stride)
+        except LogError as error:
+            self.lost.setdefault(str(error))
+        self._unprojectors[topic] = (camera, shape, unprojector)
+        return unprojector
+
+
+def same_calibration(a: Camera, b: Camera) -> bool:
+    """Whether two calibrations say the same."""
     return a is b or (
         (a.width, a.height, a.model) == (b.width, b.height, b.model)
-        and all(np.array_equal(x, y) for x, y in ((a.K, b.K), (a.D, b.D), (a.P, b.P)))
+        and all(np.array_equal(x, y) for x, y in ((a.K, b.K), (a.D, b.D), (a.R, b.R), (a.P, b.P)))
     )

@@ -18,7 +18,9 @@ from semloc_logs.logs.depth import Unprojector
 from semloc_logs.logs.log import Log, Message
 from semloc_logs.logs.open import open_log
 from semloc_logs.logs.problems import Problems
+from semloc_logs.logs.rectification import rectification
 from semloc_logs.logs.roles import guess_roles, no_sensor
+from semloc_logs.logs.stereo_clouds import is_rectified
 from semloc_logs.logs.tally import never_moves, no_poses, span, without_unused
 
 _TRIES = 5  # messages of a range sensor that are decoded in search of a good one
@@ -53,6 +55,8 @@ class _Inspection:
         self._undecodable = Problems()
         self._decoder = Decoder(self._undecodable)
         self._pass()
+        right = self.first.pop(self.roles.stereo_right or "", None)  # says nothing about the base frame
+        self.right = right if isinstance(right, ImageFrame) else None
         sensors = list(dict.fromkeys(frame.header.frame_id for frame in self.first.values()))
         self.where.settle(sensors, is_patient=False, must=True)
         self.where.finish()
@@ -60,7 +64,7 @@ class _Inspection:
     def _pass(self) -> None:
         roles = self.roles
         small = {*roles.tf, *roles.tf_static, *roles.camera_info, *roles.topics("pose")}
-        ranged = {*roles.lidar, *roles.depth}
+        ranged = {*roles.ranging, *roles.topics("stereo_right")}
         for message in self.log.messages():
             topic = message.topic
             self.counts[topic, message.type, message.encoding] += 1
@@ -128,14 +132,15 @@ class _Inspection:
         roles, told = self.roles, list(self.roles.problems)
         if not self.counts:
             return [f"{self.log.path.name} holds no messages."]
-        if not roles.lidar and not roles.depth:
-            told.append(no_sensor(roles, self.log.streams))
+        if not roles.ranging:
+            told.append(no_sensor(self.log.streams))
         if not len(self.where.track) and not roles.problems:
             told.append(no_poses(self.log.path.name))
         for topic, count in sorted(self.empty.items()):
             told.append(f"{topic}: no point with a position in the first {count} cloud{'s' if count > 1 else ''}.")
         for topic in roles.depth:
             told.extend(self._depth_obstacles(topic))
+        told.extend(self._stereo_obstacles())
         told.extend(self._pose_obstacles())
         return told
 
@@ -149,6 +154,30 @@ class _Inspection:
             except LogError as error:
                 return [str(error)]
         return []
+
+    def _stereo_obstacles(self) -> list[str]:
+        roles = self.roles
+        if roles.stereo_left is None or roles.stereo_right is None:
+            return []
+        pair = (roles.stereo_left, roles.stereo_right)
+        cameras = {topic: self.cameras.get(roles.info_of.get(topic, "")) for topic in pair}
+        told = [
+            f"{topic} has no CameraInfo: the pair cannot become points; record it, or name both with --topic camera_info=TOPIC,TOPIC."
+            for topic, camera in cameras.items()
+            if camera is None
+        ]
+        left, (left_camera, right_camera) = self.first.get(pair[0]), cameras.values()
+        if left_camera is None or right_camera is None or not isinstance(left, ImageFrame) or self.right is None:
+            return told
+        if left.image.shape[:2] != self.right.image.shape[:2]:
+            sizes = " and ".join(f"{i.shape[1]} x {i.shape[0]}" for i in (left.image, self.right.image))
+            return [f"{pair[0]}, {pair[1]} have pictures of {sizes} pixels: a stereo pair needs the same size."]
+        right_T_left = self.where.tree.lookup(self.right.header.frame_id, left.header.frame_id, left.header.stamp_ns)
+        try:
+            rectification(left_camera, right_camera, left.image.shape[:2], right_T_left, rectified=is_rectified(roles))
+        except LogError as error:
+            told.append(str(error))
+        return told
 
     def _pose_obstacles(self) -> list[str]:
         track, base = self.where.track, self.where.base

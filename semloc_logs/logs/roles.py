@@ -41,7 +41,10 @@ _DERIVED_CLOUD = {
 _NOT_A_POSE = re.compile(r"goal|target|setpoint|desired|reference|cmd|command|initial|waypoint|plan|object|marker|tag|clicked|landing")
 _REFERENCE_POSE = re.compile(r"truth|(^|[/_])gt([/_]|$)|wheel|controller|gps|gnss|imu|raw")
 _FILTERED_POSE = re.compile(r"filtered|fused|ekf|ukf")
-_LEFT_RIGHT = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"), ("image_0", "image_1"), ("camera_0", "camera_1"))
+_LEFT_RIGHT = (
+    ("left", "right"), ("cam0", "cam1"), ("cam_0", "cam_1"), ("infra1", "infra2"), ("image_00", "image_01"), ("image_02", "image_03"),
+    ("image_0", "image_1"), ("image_2", "image_3"), ("camera_0", "camera_1"), ("camera0", "camera1"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,12 @@ class Roles:
     names_of: dict[str, str] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @property
+    def ranging(self) -> tuple[str, ...]:
+        """The topics whose frames become clouds: LIDAR, depth and the left picture of a stereo pair."""
+        pair = self.stereo_left is not None and self.stereo_right is not None
+        return (*self.lidar, *self.depth, *(self.topics("stereo_left") if pair else ()))
 
     def topics(self, role: str) -> tuple[str, ...]:
         """The topics of a role, none or several."""
@@ -114,11 +123,16 @@ def guess_roles(streams: Sequence[Stream], overrides: Mapping[str, str] | None =
     labels = pick("label_image", lambda: [t for t in pictures if _is_label(t)])
     depth = pick("depth", lambda: _depth_topics(pictures, labels))
     colour = [t for t in pictures if t not in (*labels, *depth) and not _DEPTH.search(t.lower()) and not _LABEL.search(t.lower())]
-    left, right = _stereo(colour)
+    lidar = pick("lidar", lambda: _lidar_topics([t for t, kind in kinds.items() if kind in _CLOUDS], depth, notes))
+    is_asked = any(chosen.get(role) for role in ("stereo_left", "stereo_right"))
+    left, right = _stereo(colour, chosen) if is_asked or not (lidar or depth) else ([], [])
     stereo_left = pick("stereo_left", lambda: left)
     stereo_right = pick("stereo_right", lambda: right)
+    if bool(stereo_left) != bool(stereo_right) or (stereo_left and stereo_left == stereo_right):
+        if is_asked:
+            problems.append("A stereo pair takes two topics: name them with --topic stereo_left=TOPIC --topic stereo_right=TOPIC.")
+        stereo_left = stereo_right = ()
     image = pick("image", lambda: [t for t in colour if t not in (*stereo_left, *stereo_right)] or stereo_left)
-    lidar = pick("lidar", lambda: _lidar_topics([t for t, kind in kinds.items() if kind in _CLOUDS], depth, notes))
     pose = pick("pose", lambda: _pose_topic(kinds, (*depth, *lidar, *image), problems, notes))
     meanings = pick("label_info", lambda: sorted(t for t, kind in kinds.items() if _is_label_info(t, kind)))
     transforms = sorted(t for t, kind in kinds.items() if kind in _TRANSFORMS)
@@ -130,19 +144,20 @@ def guess_roles(streams: Sequence[Stream], overrides: Mapping[str, str] | None =
         pose=next(iter(pose), None), imu=next(iter(imu), None), gnss=next(iter(gnss), None),
         tf=chosen.get("tf", tuple(t for t in transforms if not t.endswith("tf_static"))),
         tf_static=chosen.get("tf_static", tuple(t for t in transforms if t.endswith("tf_static"))),
-        info_of=_match((*depth, *image, *labels, *stereo_left, *stereo_right), infos, forced="camera_info" in chosen),
-        label_of=_match(depth, labels, forced="label_image" in chosen),
+        info_of=_infos((*depth, *image, *labels), (*stereo_left, *stereo_right), infos, forced="camera_info" in chosen),
+        label_of=_match((*depth, *stereo_left), labels, forced="label_image" in chosen),
         names_of=_match_meanings(labels, lidar, meanings, forced="label_info" in chosen),
         problems=tuple(problems), notes=tuple(notes),
     )  # fmt: skip
 
 
-def no_sensor(roles: Roles, streams: Sequence[Stream]) -> str:
-    """Why a log without LIDAR and depth cannot be fused, and what to name."""
+def no_sensor(streams: Sequence[Stream]) -> str:
+    """Why a log without LIDAR, depth and stereo pair cannot be fused, and what to name."""
     listed = ", ".join(f"{s.topic} ({s.type or 'unknown type'})" for s in streams if s.count) or "none"
-    if roles.stereo_left is not None:
-        return f"The stereo pair {roles.stereo_left}, {roles.stereo_right} has no depth stream beside it; record depth or a LIDAR."
-    return f"There is no LIDAR and no depth stream; its topics are {listed}; name one with --topic lidar=TOPIC or --topic depth=TOPIC."
+    return (
+        f"There is no LIDAR and no depth stream, nor a stereo pair; its topics are {listed}; name one with --topic lidar=TOPIC, "
+        f"--topic depth=TOPIC, or --topic stereo_left=TOPIC --topic stereo_right=TOPIC."
+    )
 
 
 def _kind(message_type: str) -> str:
@@ -216,12 +231,16 @@ def _depth_topics(pictures: Sequence[str], labels: Sequence[str]) -> list[str]:
     return [min(group, key=lambda t: (("aligned" in t or "registered" in t) != bool(labels), t)) for _, group in sorted(groups.items())]
 
 
-def _stereo(colour: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The first pair of topics that differ only in left and right, rectified pictures last: their CameraInfo says less."""
+def _stereo(colour: Sequence[str], chosen: Mapping[str, tuple[str, ...]]) -> tuple[list[str], list[str]]:
+    """The first pair of topics that differ only in left and right, and has what the user named of it.
+
+    Raw pictures come before rectified ones, whose CameraInfo says less, and grey ones before the same in colour.
+    """
     for left_word, right_word in _LEFT_RIGHT:
-        for topic in sorted(colour, key=lambda t: ("rect" in t, t)):
+        for topic in sorted(colour, key=lambda t: ("rect" in t, "color" in t or "colour" in t, t)):
             partner = topic.replace(left_word, right_word)
-            if partner != topic and partner in colour:
+            is_wanted = all(t in chosen.get(role, (t,)) for role, t in (("stereo_left", topic), ("stereo_right", partner)))
+            if partner != topic and partner in colour and is_wanted:
                 return [topic], [partner]
     return [], []
 
@@ -267,6 +286,15 @@ def _pose_topic(kinds: Mapping[str, str], sensors: Sequence[str], problems: list
 
 def _preferred(imus: Sequence[str]) -> list[str]:
     return sorted(imus, key=lambda t: ("raw" in t.lower(), len(t), t))[:1]
+
+
+def _infos(pictures: Sequence[str], pair: Sequence[str], infos: Sequence[str], *, forced: bool) -> dict[str, str]:
+    """CameraInfo topic of each picture; the two cameras of a pair never share one, it is that of the nearer name."""
+    found = _match((*pictures, *pair), infos, forced=forced)
+    if len(pair) == 2 and pair[0] in found and found[pair[0]] == found.get(pair[1]):
+        left, right = ((_shared(t, found[t]), _shared_words(t, found[t])) for t in pair)
+        del found[pair[0] if right > left else pair[1]]
+    return found
 
 
 def _match(topics: Iterable[str], partners: Sequence[str], *, forced: bool) -> dict[str, str]:

@@ -24,12 +24,13 @@ from semloc_logs.frames import (
     TransformSample,
 )
 from semloc_logs.logs.base_frame import BasePoses, PoseSource
-from semloc_logs.logs.depth import DepthClouds, label_ids
+from semloc_logs.logs.depth import USUAL_NOISE, RangeNoise, label_ids
 from semloc_logs.logs.gravity import Accelerometer
 from semloc_logs.logs.log import Log, Stream
 from semloc_logs.logs.merge import merged_frames, merged_streams
 from semloc_logs.logs.odometry import LidarOdometry
 from semloc_logs.logs.open import open_log
+from semloc_logs.logs.picture_clouds import PictureClouds
 from semloc_logs.logs.roles import Roles, find_roles, no_sensor
 from semloc_logs.logs.sweeps import LONGEST_SWEEP_NS, in_base, sweep_in_base
 from semloc_logs.logs.tally import Tally, never_moves, no_poses, without_unused
@@ -49,12 +50,14 @@ def open_session(
     min_range: float = 0.5,
     max_range: float = 80.0,
     stride: int | None = None,
+    noise: RangeNoise = USUAL_NOISE,
     poses: TrajectoryFile | None = None,
     odometry: str = "none",
 ) -> Session:
     """Opens the logs of one session; ``topics`` overrules roles, points outside of the ranges (m, from the sensor) are dropped.
 
-    ``stride`` keeps every n-th pixel of every n-th row of depth images; None: 2 above 200,000 pixels. ``poses`` is a file of poses, and
+    ``stride`` keeps every n-th pixel of every n-th row of depth images, and shrinks stereo pictures n-fold; None: 2 above 200,000 pixels,
+    stereo pictures stay as they are up to half a million. ``noise``: how uncertain their ranges are. ``poses`` is a file of poses, and
     ``odometry`` "lidar" makes poses of the sweeps: either replaces what the log says. LogError for a log or file that cannot
     be read, RoleError when the streams leave open what to use, or have nothing to make clouds from.
     """
@@ -64,7 +67,7 @@ def open_session(
     try:
         logs.extend(open_log(Path(path)) for path in paths)
         logs.sort(key=lambda log: (log.start_ns is None, log.start_ns or 0))
-        return Session(logs, topics, min_range=min_range, max_range=max_range, stride=stride, poses=poses, odometry=odometry)
+        return Session(logs, topics, min_range=min_range, max_range=max_range, stride=stride, noise=noise, poses=poses, odometry=odometry)
     except BaseException:
         for log in logs:
             log.close()
@@ -82,6 +85,7 @@ class Session:
         min_range: float = 0.5,
         max_range: float = 80.0,
         stride: int | None = None,
+        noise: RangeNoise = USUAL_NOISE,
         poses: TrajectoryFile | None = None,
         odometry: str = "none",
     ) -> None:
@@ -93,9 +97,10 @@ class Session:
             self.roles: Roles = self._find_roles(topics or {})
         except RoleError as error:
             raise RoleError(f"{self.name}: {error}") from error
-        if not self.roles.lidar and not self.roles.depth:
-            raise RoleError(f"{self.name}: {no_sensor(self.roles, self.streams)}")
+        if not self.roles.ranging:
+            raise RoleError(f"{self.name}: {no_sensor(self.streams)}")
         self.min_range, self.max_range, self.stride = min_range, max_range, stride
+        self._noise = noise
         self._begin()
 
     def _find_roles(self, topics: Mapping[str, str]) -> Roles:
@@ -110,7 +115,7 @@ class Session:
 
     def _pose_source(self) -> PoseSource | None:
         """Where poses come from if not from a stream of the log."""
-        main = next(iter((*self.roles.lidar, *self.roles.depth)))
+        main = self.roles.ranging[0]
         if self._poses is not None:
             return FilePoses(self._poses, main, sum(s.count for s in self.streams if s.topic == main))
         if self._odometry:
@@ -120,7 +125,7 @@ class Session:
     def _begin(self) -> None:
         static_count = sum(s.count for s in self.streams if s.topic in self.roles.tf_static)
         self._where = BasePoses(self.roles, static_count, self._pose_source())
-        self._depth = DepthClouds(self.roles, self.stride)
+        self._pictures = PictureClouds(self.roles, self._where.tree.lookup, stride=self.stride, noise=self._noise)
         self._accelerometer = Accelerometer()
         self._tally = Tally()
         self._waiting: deque[RangeFrame] = deque()
@@ -149,7 +154,7 @@ class Session:
         """Sentences about data that could not be used."""
         unused = {s.topic for s in self.streams if self.roles.role_of(s.topic) is None}
         said = [self._told(log, p) for log in self.logs for p in without_unused(log.problems, unused)]
-        return list(dict.fromkeys([*said, *self._depth.lost, *self._lost]))
+        return list(dict.fromkeys([*said, *self._pictures.lost, *self._lost]))
 
     def _told(self, log: Log, problem: str) -> str:
         return f"{log.path.name}: {problem}" if len(self.logs) > 1 and not problem.startswith(log.path.name) else problem
@@ -159,12 +164,12 @@ class Session:
         """Everything worth saying: lost data first, then what was assumed."""
         assumed = self._where.base.notes if self._where.base else ()
         said = [self._told(log, p) for log in self.logs for p in log.problems]
-        return list(dict.fromkeys([*self.skipped, *said, *self._depth.notes, *assumed, *self._notes]))
+        return list(dict.fromkeys([*self.skipped, *said, *self._pictures.notes, *assumed, *self._notes]))
 
     @property
     def cameras(self) -> dict[str, Camera]:
         """The newest calibration of each picture topic that has one."""
-        known = self._depth.cameras
+        known = self._pictures.cameras
         return {topic: known[info] for topic, info in self.roles.info_of.items() if info in known}
 
     @property
@@ -187,7 +192,7 @@ class Session:
     def base_T_sensors(self) -> dict[str, F64]:
         """``base_T_sensor`` (4, 4) by frame id of every sensor that gave a cloud, and of the cameras, at their last known time."""
         found = dict(self._sensors)
-        for camera in self._depth.cameras.values():
+        for camera in self._pictures.cameras.values():
             pose = self._where.base_T(camera.header.frame_id, camera.header.stamp_ns)
             if pose is not None:
                 found.setdefault(camera.header.frame_id, pose)
@@ -230,7 +235,7 @@ class Session:
             "base_T_sensors": {frame: pose.tolist() for frame, pose in sorted(self.base_T_sensors().items())},
             "frames": {
                 topic: {"seen": tally.seen[topic], "used": tally.used[topic], "left_out": tally.left_out(topic)}
-                for topic in (*self.roles.lidar, *self.roles.depth)
+                for topic in self.roles.ranging
             },
             "sweeps_deskewed": self._deskewed,
             "poses": track.to_json(),
@@ -255,8 +260,8 @@ class Session:
         """
         self._begin()
         roles = self.roles
-        topics = {*roles.lidar, *roles.depth, *roles.label_of.values(), *roles.tf, *roles.tf_static}
-        topics |= {roles.info_of[t] for t in (*roles.depth, *roles.image, *roles.label_image) if t in roles.info_of}
+        topics = {*roles.ranging, *roles.topics("stereo_right"), *roles.label_of.values(), *roles.tf, *roles.tf_static}
+        topics |= {roles.info_of[t] for t in (*topics, *roles.image, *roles.label_image) if t in roles.info_of}
         wanted = set(roles.image if images is None else images) if on_image else set()
         topics |= {*roles.topics("pose"), *roles.topics("imu"), *roles.label_info} | wanted
         self._image_stamps = {topic: deque(maxlen=4 * MAX_WAITING) for topic in sorted(wanted)}
@@ -272,13 +277,13 @@ class Session:
         if isinstance(frame, TransformSample | PoseSample):
             self._where.take(frame)
         elif isinstance(frame, Camera):
-            self._depth.cameras[topic] = frame
+            self._pictures.cameras[topic] = frame
         elif isinstance(frame, ImuSample):
             self._accelerometer.add(frame)
         elif isinstance(frame, LabelNames):
             self._meanings.setdefault(topic, frame)
         elif isinstance(frame, RangeFrame):
-            if topic in roles.lidar or topic in roles.depth:
+            if topic in roles.ranging:
                 self._tally.saw(topic, frame.header.stamp_ns)
                 if isinstance(frame, LidarFrame):
                     self._tally.measured(frame)
@@ -290,13 +295,12 @@ class Session:
                 if self._where.source is not None:
                     self._where.source.take(frame)
                     self._where.pull()
-            elif not isinstance(frame, LidarFrame):
+            if not isinstance(frame, LidarFrame):
                 self._take_picture(frame, on_image)
 
     def _take_picture(self, frame: DepthFrame | ImageFrame, on_image: Callable[[ImageFrame], None] | None) -> None:
         topic = frame.header.topic
-        if topic in self.roles.label_of.values():
-            self._depth.take_label(frame)
+        self._pictures.take(frame)
         if on_image is None or topic not in self._image_stamps:
             return
         self._image_stamps[topic].append(frame.header.stamp_ns)
@@ -332,13 +336,13 @@ class Session:
 
     def _has_all(self, frame: RangeFrame) -> bool:
         stamp_ns = frame.header.stamp_ns
-        if any(self.roles.info_of.get(t) not in {None, *self._depth.cameras} for t in self._image_stamps):
+        if any(self.roles.info_of.get(t) not in {None, *self._pictures.cameras} for t in self._image_stamps):
             return False
         for stamps in self._image_stamps.values():  # poses have to reach the first picture that is not earlier
             following = next((s for s in stamps if s >= stamp_ns), None)
             if following is None or not self._where.poses_have_passed(following):
                 return False
-        if not isinstance(frame, LidarFrame) and not self._depth.has_all(frame):
+        if not isinstance(frame, LidarFrame) and not self._pictures.has_all(frame):
             return False
         where = self._where
         return where.poses_have_passed(stamp_ns + _sweep_ns(frame)) and where.transforms_have_passed(frame.header.frame_id, stamp_ns)
@@ -357,22 +361,23 @@ class Session:
         extra: dict[str, str] = {}
         if base.pose_frame is not None and pose is None:
             return "no pose"
+        sigma = None
         if isinstance(frame, LidarFrame):
             poses_at = None if pose is None else self._where.track.at_many
             points, label, is_deskewed = sweep_in_base(frame, base_T_sensor, poses_at, min_range=self.min_range, max_range=self.max_range)
             self._deskewed += is_deskewed
         else:
-            found = self._depth.points(frame, self.min_range, self.max_range)
+            found = self._pictures.points(frame, self.min_range, self.max_range)
             if isinstance(found, str):
                 return found
-            points, label = in_base(base_T_sensor, found[0]), found[1]
+            points, label, sigma = in_base(base_T_sensor, found.points), found.label, found.sigma
             label_topic = self.roles.label_of.get(header.topic)
             if label is not None and label_topic is not None:
-                extra = {"label_topic": label_topic, "label_form": "colours" if label_topic in self._depth.coloured else "ids"}
+                extra = {"label_topic": label_topic, "label_form": "colours" if label_topic in self._pictures.labels.coloured else "ids"}
         if not len(points):
             return "no points"
         self._sensors[header.frame_id] = base_T_sensor
-        return PosedCloud(header, points, base_T_sensor[:3, 3].astype(np.float32), pose, label, extra)
+        return PosedCloud(header, points, base_T_sensor[:3, 3].astype(np.float32), pose, label, extra, sigma)
 
     def _conclude(self) -> None:
         track = self._where.track

@@ -16,6 +16,12 @@ _WHY = {
     "no calibration": "no CameraInfo belongs to them: record it, or name it with --topic camera_info=TOPIC",
     "unusable calibration": "their CameraInfo cannot be used",
     "no depth": "they are colour or 8-bit pictures, not depth: choose another topic with --topic depth=TOPIC",
+    "no calibration of the right": "no CameraInfo belongs to the right camera: record it, or name both by --topic camera_info=TOPIC,TOPIC",
+    "no picture": "they are depth images, not pictures: choose another topic with --topic stereo_left=TOPIC",
+    "no partner": "the right camera has no picture within half a frame period of theirs",
+    "other size": "the picture of the right camera has another size",
+    "same picture": "the right camera has the very same picture: choose two cameras with --topic stereo_left=TOPIC stereo_right=TOPIC",
+    "unusable pair": "the calibrations of the pair cannot be used",
     "no points": "they have no points within the range limits",
     "empty": "they hold no points, or none whose position is a number",
 }

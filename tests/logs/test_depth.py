@@ -8,7 +8,7 @@ import pytest
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Camera, DepthFrame, Header, ImageFrame
-from semloc_logs.logs.depth import DepthClouds, Unprojector, label_ids
+from semloc_logs.logs.depth import DepthClouds, Unprojector, depth_sigma, label_ids
 from semloc_logs.logs.roles import Roles
 
 
@@ -86,6 +86,14 @@ def test_unusable_calibrations_are_said_so() -> None:
         Unprojector(camera(D=(0.1, 0.2), model="double_sphere"), 6, 8)
 
 
+def test_sigma_grows_with_the_square_of_depth() -> None:
+    # Nguyen et al. 2012: 1.2 mm at 0.4 m, 1.2 + 1.9 * 2.6^2 = 14.0 mm at 3 m; along a ray of slope 1 longer by the square root of 2
+    points = np.array([[0, 0, 0.4], [0, 0, 3.0], [3.0, 0, 3.0], [0, 0, 0.2]], np.float32)
+    expected = [0.0012, 0.0012 + 0.0019 * 2.6**2, (0.0012 + 0.0019 * 2.6**2) * 2**0.5, 0.0012]
+    np.testing.assert_allclose(depth_sigma(points), expected, rtol=1e-5)
+    assert depth_sigma(points, 0.0)[1] == pytest.approx(0.0012)
+
+
 ROLES = Roles(depth=("/d/depth",), label_image=("/d/label",), info_of={"/d/depth": "/d/camera_info"}, label_of={"/d/depth": "/d/label"})
 
 
@@ -102,7 +110,7 @@ def test_labels_come_from_the_nearest_label_image() -> None:
     clouds.cameras["/d/camera_info"] = camera()
     ms = 1_000_000
     for k in range(5):
-        clouds.take_label(label_frame(k * 100 * ms, k))
+        clouds.labels.take(label_frame(k * 100 * ms, k))
     found = clouds.points(depth_frame(204 * ms), 0.0, 80.0)
     assert not isinstance(found, str)
     assert found[1] is not None
@@ -116,7 +124,7 @@ def test_each_pixel_gets_its_own_label() -> None:
     clouds = DepthClouds(ROLES, stride=2)
     clouds.cameras["/d/camera_info"] = camera()
     ids = np.arange(48, dtype=np.uint8).reshape(6, 8)
-    clouds.take_label(ImageFrame(Header("/d/label", 0, 0, ""), ids, "mono8"))
+    clouds.labels.take(ImageFrame(Header("/d/label", 0, 0, ""), ids, "mono8"))
     found = clouds.points(depth_frame(), 0.0, 80.0)
     assert not isinstance(found, str)
     assert found[1] is not None
@@ -126,11 +134,11 @@ def test_each_pixel_gets_its_own_label() -> None:
 def test_label_images_of_another_size_are_left_out_with_a_note() -> None:
     clouds = DepthClouds(ROLES)
     clouds.cameras["/d/camera_info"] = camera()
-    clouds.take_label(label_frame(0, 1, (3, 4)))
+    clouds.labels.take(label_frame(0, 1, (3, 4)))
     found = clouds.points(depth_frame(), 0.0, 80.0)
     assert not isinstance(found, str)
     assert found[1] is None
-    assert "--topic label_image=TOPIC" in next(iter(clouds.notes))
+    assert "--topic label_image=TOPIC" in next(iter(clouds.labels.notes))
 
 
 def test_colours_of_a_label_image_are_packed() -> None:
@@ -138,12 +146,12 @@ def test_colours_of_a_label_image_are_packed() -> None:
     clouds.cameras["/d/camera_info"] = camera()
     colours = np.zeros((6, 8, 3), np.uint8)
     colours[..., 0], colours[..., 1], colours[..., 2] = 128, 64, 32
-    clouds.take_label(ImageFrame(Header("/d/label", 0, 0, ""), colours, "rgb8"))
+    clouds.labels.take(ImageFrame(Header("/d/label", 0, 0, ""), colours, "rgb8"))
     found = clouds.points(depth_frame(), 0.0, 80.0)
     assert not isinstance(found, str)
     assert found[1] is not None
     assert set(found[1].tolist()) == {128 * 65536 + 64 * 256 + 32}
-    assert clouds.coloured == {"/d/label"}
+    assert clouds.labels.coloured == {"/d/label"}
 
 
 def test_reasons() -> None:

@@ -90,6 +90,48 @@ def test_stereo_pairs() -> None:
     assert roles({"/left/image": IMAGE, "/other/image": IMAGE}).stereo_left is None
 
 
+def test_a_stereo_pair_beside_ranges_stays_two_images_unless_it_is_named() -> None:
+    pair = {"/left/image_raw": IMAGE, "/right/image_raw": IMAGE}
+    for ranges in ({"/points": CLOUD}, {"/depth/image": IMAGE}):
+        found = roles(pair | ranges)
+        assert (found.stereo_left, found.stereo_right) == (None, None)
+        assert found.image == ("/left/image_raw", "/right/image_raw")
+        assert found.ranging == tuple(ranges)
+        for named in ({"stereo_left": "/left/image_raw"}, {"stereo_right": "/right/image_raw"}):
+            asked = roles(pair | ranges, **named)
+            assert (asked.stereo_left, asked.stereo_right) == ("/left/image_raw", "/right/image_raw")
+            assert asked.ranging == (*ranges, "/left/image_raw")
+    assert roles(pair, stereo_left="none").ranging == ()
+
+
+def test_a_pair_takes_two_topics() -> None:
+    for named in ({"stereo_left": "/a"}, {"stereo_left": "/a", "stereo_right": "/a"}):
+        with pytest.raises(RoleError, match="A stereo pair takes two topics"):
+            roles({"/a": IMAGE, "/b": IMAGE}, **named)
+    found = roles({"/a": IMAGE, "/b": IMAGE}, stereo_left="/b", stereo_right="/a")
+    assert found.ranging == ("/b",)
+
+
+@pytest.mark.parametrize(
+    ("topics", "expected"),
+    [
+        (("/s/left/image_rect", "/s/right/image_rect", "/s/left/image_raw", "/s/right/image_raw"), "/s/left/image_raw"),
+        (("/c/infra1/image_rect_raw", "/c/infra2/image_rect_raw", "/c/color/image_raw"), "/c/infra1/image_rect_raw"),
+        (("/k/image_02/compressed", "/k/image_03/compressed"), "/k/image_02/compressed"),
+        (("/left/image_color", "/right/image_color", "/left/image_mono", "/right/image_mono"), "/left/image_mono"),
+        (("/front/image", "/rear/image"), None),
+    ],
+)
+def test_which_pair(topics: tuple[str, ...], expected: str | None) -> None:
+    assert roles(dict.fromkeys(topics, IMAGE)).stereo_left == expected
+
+
+def test_the_cameras_of_a_pair_never_share_a_calibration() -> None:
+    pair = {"/cam0/image_raw": IMAGE, "/cam1/image_raw": IMAGE}
+    assert roles(pair | {"/cam0/camera_info": INFO}).info_of == {"/cam0/image_raw": "/cam0/camera_info"}
+    assert roles(pair | {"/cam1/camera_info": INFO}).info_of == {"/cam1/image_raw": "/cam1/camera_info"}
+
+
 @pytest.mark.parametrize(
     ("topics", "expected"),
     [

@@ -1,0 +1,264 @@
+"""Partners by time, reasons for leaving pairs out, and a real pair of cameras in a room."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semloc_logs.frames import F64, Camera, Header, ImageFrame, PosedCloud
+from semloc_logs.geometry import apply, exp_se3
+from semloc_logs.logs.depth import LabelImages
+from semloc_logs.logs.inspect import inspect_log
+from semloc_logs.logs.rectification import Rectification, rectification
+from semloc_logs.logs.roles import Roles
+from semloc_logs.logs.session import open_session
+from semloc_logs.logs.stereo_clouds import StereoClouds, _grey
+
+MS = 1_000_000
+REAL = Path(__file__).resolve().parents[3] / "shared" / "logs" / "euroc_v101_stereo.bag"
+LEFT, RIGHT = "/left/image_rect", "/right/image_rect"
+ROLES = Roles(
+    image=(LEFT,), stereo_left=LEFT, stereo_right=RIGHT, camera_info=("/l", "/r"), info_of={LEFT: "/l", RIGHT: "/r"},
+    label_image=("/ids",), label_of={LEFT: "/ids"},
+)  # fmt: skip
+
+
+def info(topic: str, t: float = 0.0, width: int = 160) -> Camera:
+    K = np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
+    P = np.hstack([K, np.array([[t], [0.0], [0.0]])])
+    return Camera(Header(topic, 0, 0, topic), width, 120, K, np.zeros(5), np.eye(3), P, "plumb_bob")
+
+
+def picture(topic: str, stamp_ns: int, shift: int = 0, width: int = 160) -> ImageFrame:
+    grain = np.random.default_rng(0).integers(0, 255, (120, 400)).astype(np.uint8)
+    return ImageFrame(Header(topic, stamp_ns, stamp_ns, topic), grain[:, 50 + shift : 50 + shift + width], "mono8")
+
+
+def clouds(
+    roles: Roles = ROLES, right_T_left: F64 | None = None, cameras: Iterable[Camera] = (info("/l"), info("/r", -20.0))
+) -> StereoClouds:
+    return StereoClouds(roles, {c.header.topic: c for c in cameras}, LabelImages(roles), lambda right, left, stamp_ns: right_T_left)
+
+
+def test_partners_are_the_nearest_within_half_a_period() -> None:
+    stereo = clouds()
+    for k in range(4):
+        stereo.take_left(picture(LEFT, k * 40 * MS))
+        if k != 2:
+            stereo.take_right(picture(RIGHT, (k * 40 + 3) * MS, 10))
+    assert stereo.tolerance_ns == 20 * MS
+    reasons = [stereo.points(picture(LEFT, k * 40 * MS), 0.3, 20.0) for k in range(4)]
+    assert reasons[2] == "no partner"
+    for found in (reasons[0], reasons[1], reasons[3]):
+        assert not isinstance(found, str)
+        np.testing.assert_allclose(np.median(found.points[:, 2]), 2.0, atol=0.02)  # 100 px * 0.2 m / 10 px
+
+
+def test_a_pair_waits_for_all_that_belongs_to_it() -> None:
+    stereo = clouds(cameras=[info("/l")])
+    left = picture(LEFT, 10 * MS)
+    assert not stereo.has_all(left)
+    stereo.take_right(picture(RIGHT, 9 * MS, 10))
+    assert not stereo.has_all(left)  # a nearer one may still come
+    stereo.take_right(picture(RIGHT, 12 * MS, 10))
+    assert not stereo.has_all(left)
+    stereo = clouds()
+    stereo.take_right(picture(RIGHT, 12 * MS, 10))
+    assert not stereo.has_all(left)  # the label image
+    stereo._labels.take(ImageFrame(Header("/ids", 10 * MS, 0, ""), np.zeros((120, 160), np.uint8), "mono8"))
+    assert stereo.has_all(left)
+
+
+def test_labels_are_those_of_the_left_pixels() -> None:
+    stereo = clouds()
+    ids = np.arange(120 * 160, dtype=np.uint16).reshape(120, 160)
+    stereo._labels.take(ImageFrame(Header("/ids", 0, 0, ""), ids, "mono16"))
+    stereo.take_right(picture(RIGHT, 0, 10))
+    found = stereo.points(picture(LEFT, 0), 0.3, 20.0)
+    assert not isinstance(found, str)
+    assert found.label is not None
+    column = 100 * found.points[:, 0] / found.points[:, 2] + 80
+    np.testing.assert_allclose(found.label % 160, column, atol=1e-3)
+
+
+def test_memory_is_bounded_when_no_left_picture_comes() -> None:
+    stereo = clouds()
+    for k in range(500):
+        stereo.take_right(picture(RIGHT, k * MS))
+    assert len(stereo._rights) <= 80
+    assert stereo._bytes == sum(r.image.nbytes for r in stereo._rights)
+
+
+@pytest.mark.parametrize(
+    ("right", "cameras", "reason"),
+    [
+        (picture(RIGHT, 0, 10, width=120), [info("/l"), info("/r", -20.0)], "other size"),
+        (picture(RIGHT, 0, 10), [info("/r", -20.0)], "no calibration"),
+        (picture(RIGHT, 0, 10), [info("/l")], "no calibration of the right"),
+        (picture(RIGHT, 0, 0), [info("/l"), info("/r", -20.0)], "same picture"),
+        (picture(RIGHT, 0, 10), [info("/l"), info("/r")], "unusable pair"),
+        (picture(RIGHT, 0, 10), [info("/l"), info("/r", 20.0)], "unusable pair"),
+        (picture(RIGHT, 0, 10), [info("/l", width=99), info("/r", -20.0)], "unusable pair"),
+    ],
+)
+def test_why_a_pair_gives_nothing(right: ImageFrame, cameras: list[Camera], reason: str) -> None:
+    stereo = clouds(cameras=cameras)
+    stereo.take_right(right)
+    assert stereo.points(picture(LEFT, 0), 0.3, 20.0) == reason
+    assert len(stereo.lost) == (reason == "unusable pair")
+
+
+def test_transforms_serve_where_the_infos_say_nothing() -> None:
+    right_T_left = np.eye(4)
+    right_T_left[0, 3] = -0.2
+    for left, right in ((LEFT, RIGHT), ("/left/image_raw", "/right/image_raw")):
+        roles = replace(ROLES, stereo_left=left, stereo_right=right, info_of={left: "/l", right: "/r"})
+        stereo = clouds(roles, right_T_left, [info("/l"), info("/r")])
+        stereo.take_right(picture(right, 0, 10))
+        found = stereo.points(picture(left, 0), 0.3, 20.0)
+        assert not isinstance(found, str)
+        assert np.median(found.points[:, 2]) == pytest.approx(2.0, abs=0.02)
+
+
+def test_colour_and_sixteen_bits_become_the_same_grey() -> None:
+    grey = picture(LEFT, 0).image.astype(np.uint8)
+    deep = grey.astype(np.uint16)
+    for image in (np.stack([grey] * 3, axis=2), deep * np.uint16(16), deep * np.uint16(256)):
+        a, b = _grey(image, image)
+        np.testing.assert_array_equal(a, grey)
+        np.testing.assert_array_equal(b, grey)
+
+
+# -- a real pair ------------------------------------------------------------------------------------------------------------------------
+
+
+def planes(points: NDArray[np.floating], count: int, width: float = 0.05) -> list[tuple[F64, float, float]]:
+    """The largest planes one after the other, by RANSAC: unit normal, root mean square (m) and share of the points within ``width``."""
+    rng, found, rest = np.random.default_rng(0), [], np.asarray(points, float)
+    for _ in range(count):
+        some = rest[rng.permutation(len(rest))[:3000]]
+        best, most = (np.zeros(3), np.zeros(3)), 0
+        for _ in range(300):
+            a, b, c = some[rng.integers(len(some), size=3)]
+            normal = np.cross(b - a, c - a)
+            if np.linalg.norm(normal) > 1e-4:
+                normal /= np.linalg.norm(normal)
+                inliers = int((np.abs((some - a) @ normal) < width).sum())
+                best, most = ((normal, a), inliers) if inliers > most else (best, most)
+        normal, centre = best
+        for _ in range(3):
+            near = rest[np.abs((rest - centre) @ normal) < width]
+            centre = near.mean(axis=0)
+            normal = np.linalg.svd((near - centre).T @ (near - centre))[2][-1]
+        distance = (rest - centre) @ normal
+        inside = np.abs(distance) < width
+        found.append((normal, float(np.sqrt(np.mean(distance[inside] ** 2))), inside.sum() / len(points)))
+        rest = rest[~inside]
+    return found
+
+
+def in_world(cloud: PosedCloud) -> F64:
+    assert cloud.session_T_base is not None
+    return apply(cloud.session_T_base, cloud.points)
+
+
+def tilt(normal: F64) -> float:
+    """Degrees between a plane and the horizontal of a world whose z is up."""
+    return float(np.rad2deg(np.arccos(min(abs(normal[2]), 1.0))))
+
+
+def is_the_room(points: F64) -> bool:
+    """A level, flat floor at the height of the world's origin, and walls that stand: mattresses, some of which lean by 20 degrees."""
+    floor, *walls = planes(points, 3)
+    height = np.percentile(points[:, 2], 25)  # the floor is nearly half of what is seen
+    is_floor = tilt(floor[0]) < 2.0 and floor[1] < 0.018 and floor[2] > 0.4 and abs(height) < 0.03
+    return (
+        bool(is_floor)
+        and all(tilt(n) > 60 and rms < 0.03 for n, rms, _ in walls)
+        and float(sum(share for *_, share in (floor, *walls))) > 0.68
+    )
+
+
+@pytest.fixture(scope="module")
+def room() -> list[PosedCloud]:
+    if not REAL.is_file():
+        pytest.skip(f"{REAL} is missing")
+    session = open_session([REAL], max_range=10.0)
+    found = list(session.clouds())
+    assert session.skipped == []
+    session.close()
+    return found
+
+
+def test_the_floor_is_level_and_walls_are_planes_in_each_frame(room: list[PosedCloud]) -> None:
+    assert len(room) == 32
+    for cloud in room[::10]:
+        assert len(cloud.points) > 50_000
+        assert is_the_room(in_world(cloud))
+
+
+def test_all_frames_together_are_the_same_room(room: list[PosedCloud]) -> None:
+    points = np.vstack([in_world(cloud)[::8] for cloud in room])
+    assert is_the_room(points)
+    # the wall ahead, and the one to the left at a right angle to it as seen from above
+    ahead, left = points[points[:, 1] < 3.9], points[points[:, 1] > 4.75]
+    normals = [planes(part[part[:, 2] > 0.2], 1, 0.10)[0][0] for part in (ahead, left)]
+    yaws = [np.rad2deg(np.arctan2(n[1], n[0])) for n in normals]
+    assert abs((yaws[0] - yaws[1]) % 180 - 90) < 12
+
+
+def test_sigma_of_a_real_floor(room: list[PosedCloud]) -> None:
+    cloud = room[0]
+    points = in_world(cloud)
+    normal, _, _ = planes(points, 1)[0]
+    near = points[np.abs(points[:, 2]) < 0.3]
+    centre = np.median(near[np.abs(near @ normal - np.median(near @ normal)) < 0.05], axis=0)
+    assert cloud.sigma is not None
+    assert cloud.session_T_base is not None
+    rays = points - apply(cloud.session_T_base, cloud.origin[None])
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    off = (points - centre) @ normal / np.abs(rays @ normal)
+    floor = np.abs((points - centre) @ normal) < 0.08
+    normalised = off[floor] / cloud.sigma[floor]
+    assert 0.6 < 1.4826 * np.median(np.abs(normalised - np.median(normalised))) < 1.5
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.01, 0.0), (0.01, 0.0, 0.0), (0.0, 0.0, 0.03)])
+def test_the_room_would_not_be_there_with_a_wrong_rectification(monkeypatch: pytest.MonkeyPatch, turn: tuple[float, float, float]) -> None:
+    if not REAL.is_file():
+        pytest.skip(f"{REAL} is missing")
+
+    def wrong(left: Camera, right: Camera, shape: tuple[int, int], right_T_left: F64 | None, *, rectified: bool) -> Rectification:
+        assert right_T_left is not None
+        return rectification(left, right, shape, exp_se3(np.zeros(3), np.array(turn)) @ right_T_left, rectified=rectified)
+
+    monkeypatch.setattr("semloc_logs.logs.stereo_clouds.rectification", wrong)
+    session = open_session([REAL], max_range=10.0)
+    cloud = next(session.clouds(), None)
+    session.close()
+    assert cloud is None or len(cloud.points) < 20_000 or not is_the_room(in_world(cloud))
+
+
+def test_inspect_names_the_roles() -> None:
+    if not REAL.is_file():
+        pytest.skip(f"{REAL} is missing")
+    told = inspect_log(REAL)
+    assert told["problems"] == []
+    streams = told["streams"]
+    assert isinstance(streams, list)
+    roles = {s["topic"]: s["role"] for s in streams}
+    assert (roles["/cam0/image_raw"], roles["/cam1/image_raw"]) == ("stereo_left", "stereo_right")
+    [sentence] = [p for p in _listed(inspect_log(REAL, {"tf_static": "none"})["problems"]) if "Nothing says where the cameras" in p]
+    assert sentence.endswith(".")
+    swapped = _listed(inspect_log(REAL, {"stereo_left": "/cam1/image_raw", "stereo_right": "/cam0/image_raw"})["problems"])
+    assert any("sits right of the other: exchange them" in p for p in swapped)
+
+
+def _listed(value: object) -> list[str]:
+    assert isinstance(value, list)
+    return value
