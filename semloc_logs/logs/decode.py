@@ -56,8 +56,8 @@ class Decoder:
         found: list[Frame] = []  # keeps what a message gives before its damaged part
         try:
             _check_time(message.log_time_ns)
-            for frame in convert(self._parse(message), message):
-                found.append(self._times.checked(frame) if isinstance(frame, LidarFrame) else frame)
+            frames = convert(self._parse(message), message)
+            found.extend(self._times.checked(frame) if isinstance(frame, LidarFrame) else frame for frame in frames)
             return found
         except UndecodableError as error:
             reason = str(error)

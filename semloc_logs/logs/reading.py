@@ -50,6 +50,7 @@ class BaseLog(ABC):
         for message in self.messages(topics):
             yield from self._decoder.frames(message)
 
+    @abstractmethod
     def close(self) -> None:
         """Releases the files."""
 

@@ -75,11 +75,9 @@ class Tally:
         for (topic, reason), count in sorted(self._left_out.items()):
             spans = f"frames {span(*self._spans[topic])}, poses {span(*poses)}"
             told.append(f"{topic}: {count} of {self.seen[topic]} frames are left out: {_WHY[reason].format(spans=spans)}.")
-        for topic, count in sorted(self._lost_points.items()):
-            if count:
-                told.append(
-                    f"{topic}: {count} of {self._points[topic]} points are left out: they are not finite in clouds that call themselves dense."
-                )
+        for topic, count in sorted((+self._lost_points).items()):
+            of = f"{count} of {self._points[topic]} points"
+            told.append(f"{topic}: {of} are left out: they are not finite, although their clouds call themselves dense.")
         return told
 
 
