@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.frames import F32
 from semloc_logs.logs.definitions import UndecodableError
-from semloc_logs.logs.point_times import NO_SENSE, OTHER_CLOCK, offsets_ns, offsets_of_own_clock
+from semloc_logs.logs.point_times import NO_SENSE, OTHER_CLOCK, offsets_ns
 
 LABELS = ("label", "semantic", "class", "objtag")
 RINGS = ("ring", "line")
@@ -99,11 +99,8 @@ def _offsets(time: NDArray[np.generic] | None, stamp_ns: int) -> tuple[NDArray[n
     """Times relative to ``stamp_ns`` where they make sense, and a remark where they do not at once."""
     if time is None:
         return None, ""
-    offset = offsets_ns(time, stamp_ns)
-    if offset is not None:
-        return offset, ""
-    offset = offsets_of_own_clock(time)
-    return offset, NO_SENSE if offset is None else OTHER_CLOCK
+    offset, is_other_clock = offsets_ns(time, stamp_ns)
+    return offset, NO_SENSE if offset is None else OTHER_CLOCK if is_other_clock else ""
 
 
 def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> NDArray[np.void]:

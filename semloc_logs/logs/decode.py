@@ -24,11 +24,12 @@ from semloc_logs.frames import (
     PoseSample,
     TransformSample,
 )
-from semloc_logs.logs import images
+from semloc_logs.logs import images, livox
 from semloc_logs.logs.clouds import Field, Layout, decode_points
 from semloc_logs.logs.definitions import Parser, UndecodableError, binary, json_type, parser
+from semloc_logs.logs.livox import livox_parser
 from semloc_logs.logs.log import Definition, Message
-from semloc_logs.logs.point_times import PointTimes
+from semloc_logs.logs.point_times import SWEEP_NS, PointTimes
 from semloc_logs.logs.problems import Problems
 
 Convert = Callable[[Any, Message], Iterator[Frame]]
@@ -71,7 +72,8 @@ class Decoder:
         known = self._parsers.get(key)
         if known is None:
             try:
-                known = parser(message.encoding, message.type, message.definition)
+                make = livox_parser if message.type in livox.TYPES else parser
+                known = make(message.encoding, message.type, message.definition)
             except UndecodableError as error:
                 known = error
             self._parsers[key] = known
@@ -235,6 +237,32 @@ def _foxglove_cloud(m: Any, message: Message) -> Iterator[Frame]:
     yield LidarFrame(header, points, p.label, p.offset_ns, p.ring, remark=p.remark)
 
 
+def _livox(m: Any, message: Message) -> Iterator[Frame]:
+    header = Header(message.topic, _check_time(m.sec * 1_000_000_000 + m.nanosec), message.log_time_ns, m.frame_id)
+    offset = m.points["offset_time"].astype(np.int64)
+    start = m.timebase_ns - header.stamp_ns  # the base of the times is the stamp unless the sensor has a clock of its own
+    if abs(start) < SWEEP_NS:
+        offset += start
+    xyz = np.stack([m.points[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    finite = np.isfinite(xyz).all(axis=1)
+    kept = finite & xyz.any(axis=1)
+    yield LidarFrame(header, xyz[kept], None, offset[kept], m.points["line"][kept].astype(np.uint16), int((~finite).sum()))
+
+
+def _old_cloud(m: Any, message: Message) -> Iterator[Frame]:
+    """sensor_msgs/PointCloud: a list of points, and channels of float32 beside it."""
+    header = _header(m, message)
+    channels = {str(c.name).lower(): np.asarray(c.values, np.float32) for c in m.channels}
+    columns = {name: values for name, values in channels.items() if len(values) == len(m.points)}
+    fields = [Field(n, 4 * k, "f4") for k, n in enumerate(("x", "y", "z", *columns))]
+    rows = np.empty((len(m.points), len(fields)), "<f4")
+    rows[:, :3] = np.array([(p.x, p.y, p.z) for p in m.points], float).reshape(-1, 3)
+    for k, values in enumerate(columns.values()):
+        rows[:, 3 + k] = values
+    p = decode_points(rows.tobytes(), Layout(len(rows), 1, 4 * len(fields), 0), fields, header.stamp_ns)
+    yield LidarFrame(header, p.points, p.label, p.offset_ns, p.ring, remark=p.remark)
+
+
 # -- pictures
 
 
@@ -324,7 +352,9 @@ def _text(m: Any, message: Message) -> Iterator[Frame]:
 
 
 CONVERTERS: dict[str, Convert] = {
+    **dict.fromkeys(livox.TYPES, _livox),
     "sensor_msgs/msg/PointCloud2": _point_cloud2,
+    "sensor_msgs/msg/PointCloud": _old_cloud,
     "sensor_msgs/msg/Image": _image,
     "sensor_msgs/msg/CompressedImage": _compressed_image,
     "sensor_msgs/msg/CameraInfo": _camera_info,

@@ -43,7 +43,7 @@ def parser(encoding: str, type_: str, definition: Definition) -> Parser:
 def _ros_parser(encoding: str, type_: str, definition: Definition) -> Parser:
     store = get_typestore(Stores.EMPTY)
     try:
-        types = _ros_types(encoding, type_, definition)
+        types = ros_types(encoding, type_, definition)
         store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
         store.get_msgdef(type_)
     except UndecodableError:
@@ -61,7 +61,7 @@ def _ros_parser(encoding: str, type_: str, definition: Definition) -> Parser:
     return parse
 
 
-def _ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, Any]:
+def ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, Any]:
     """The definitions that ``type_`` needs: from the log where it has them, else the standard ones."""
     standard = _standard_types("ros1" if encoding == "ros1" else "ros2")
     text = definition.text.decode(errors="replace")

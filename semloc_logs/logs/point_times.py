@@ -23,41 +23,29 @@ NO_SENSE = "times"  # remarks of a LidarFrame, see semloc_logs.logs.tally
 OTHER_CLOCK = "clock"
 
 
-def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64] | None:
-    """Times of points relative to ``stamp_ns``, whatever their unit and origin; None when nothing makes sense of them.
+def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int64] | None, bool]:
+    """Times of points relative to ``stamp_ns``, whatever their unit and origin, and whether the origin is that of another clock.
 
-    The unit (s, ms, us, ns) and origin (the stamp, or the epoch) are those with which the points span more than 5 ms and
-    stay within a second of the stamp; failing that (a flash sensor) those that keep them within a second at all.
+    None when nothing makes sense of them. The unit (s, ms, us, ns) and origin (the stamp, or the epoch) are those with which the
+    points span more than 5 ms and stay within a second of the stamp; failing that the unit with which they span as much on a clock
+    of their own (such as seconds since power-on), whose first point is taken to be measured at the stamp; failing that (a flash
+    sensor) those that keep them within a second at all.
     """
     if time.size == 0:
-        return np.zeros(0, np.int64)
+        return np.zeros(0, np.int64), False
     low, high = time.min().item(), time.max().item()
     if not (np.isfinite(low) and np.isfinite(high)):
-        return None
-    fallback = None
-    for unit in _units(time):
-        for origin in (0, stamp_ns):
-            # in integers, because nanoseconds since 1970 do not fit a float64; the parts of a second are exact enough as float
-            first, last = _to_ns(low, unit) - origin, _to_ns(high, unit) - origin
-            if max(abs(first), abs(last)) < SWEEP_NS:
-                if last - first >= _LEAST_SPAN_NS:
-                    return _shift(time, unit, origin)
-                fallback = fallback or (unit, origin)
-    return None if fallback is None else _shift(time, *fallback)
-
-
-def offsets_of_own_clock(time: NDArray[np.generic]) -> NDArray[np.int64] | None:
-    """Times of a clock that is not the header's, such as seconds since power-on, relative to the first point; None without sense."""
-    if time.size == 0:
-        return None
-    low, high = time.min().item(), time.max().item()
-    if not (np.isfinite(low) and np.isfinite(high)):
-        return None
-    for unit in _units(time):
-        origin = _to_ns(low, unit)
-        if _LEAST_SPAN_NS <= _to_ns(high, unit) - origin < SWEEP_NS:
-            return _shift(time, unit, origin)
-    return None
+        return None, False
+    # in integers, because nanoseconds since 1970 do not fit a float64; the parts of a second are exact enough as float
+    ranges = [(unit, _to_ns(low, unit), _to_ns(high, unit)) for unit in _units(time)]
+    near = [(u, o) for u, first, last in ranges for o in (0, stamp_ns) if max(abs(first - o), abs(last - o)) < SWEEP_NS]
+    sweeps = {u: first for u, first, last in ranges if _LEAST_SPAN_NS <= last - first < 2 * SWEEP_NS}
+    for unit, origin in near:
+        if unit in sweeps:
+            return _shift(time, unit, origin), False
+    for unit, first in sweeps.items():
+        return _shift(time, unit, first), True
+    return (_shift(time, *near[0]), False) if near else (None, False)
 
 
 def _units(time: NDArray[np.generic]) -> tuple[int, ...]:

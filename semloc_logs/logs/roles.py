@@ -17,7 +17,11 @@ _SINGLE = ("stereo_left", "stereo_right", "pose", "imu", "gnss")
 OWN_PREFIX = "/semloc/"  # results of an earlier run, never an input
 
 # Message types by their last part: sensor_msgs/msg/PointCloud2, foxglove.PointCloud, tf/msg/tfMessage ...
-_CLOUDS = {"pointcloud2", "pointcloud"}
+_CLOUDS = {"pointcloud2", "pointcloud", "livox"}
+# what a driver records before it makes points of it, or packed by a codec
+_PACKETS = re.compile(
+    r"velodynescan|velodynepacket|packetmsg|pandarscan|udppacket|udpframe|rslidarscan|rslidarpacket|nebulapackets?|compressedpointcloud2?$"
+)
 _IMAGES = {"image", "compressedimage", "rawimage"}
 _CAMERAS = {"camerainfo", "cameracalibration"}
 _TRANSFORMS = {"tfmessage", "frametransform", "frametransforms"}
@@ -136,6 +140,7 @@ def guess_roles(streams: Sequence[Stream], overrides: Mapping[str, str] | None =
     pose = pick("pose", lambda: _pose_topic(kinds, (*depth, *lidar, *image), problems, notes))
     meanings = pick("label_info", lambda: sorted(t for t, kind in kinds.items() if _is_label_info(t, kind)))
     transforms = sorted(t for t, kind in kinds.items() if kind in _TRANSFORMS)
+    notes += _packets(streams)
     imu = pick("imu", lambda: _preferred([t for t, kind in kinds.items() if kind == "imu"]))
     gnss = pick("gnss", lambda: sorted(t for t, kind in kinds.items() if kind in _TYPES_OF_ROLE["gnss"])[:1])
     return Roles(
@@ -154,14 +159,27 @@ def guess_roles(streams: Sequence[Stream], overrides: Mapping[str, str] | None =
 def no_sensor(streams: Sequence[Stream]) -> str:
     """Why a log without LIDAR, depth and stereo pair cannot be fused, and what to name."""
     listed = ", ".join(f"{s.topic} ({s.type or 'unknown type'})" for s in streams if s.count) or "none"
+    if packets := _packets(streams):
+        return " ".join(packets)
     return (
         f"There is no LIDAR and no depth stream, nor a stereo pair; its topics are {listed}; name one with --topic lidar=TOPIC, "
         f"--topic depth=TOPIC, or --topic stereo_left=TOPIC --topic stereo_right=TOPIC."
     )
 
 
+def _packets(streams: Sequence[Stream]) -> list[str]:
+    """Sentences about LIDAR data that are recorded in a form that only its driver reads."""
+    return [
+        f"{s.topic} holds {s.type}, packets or packed points of a LIDAR that only its driver reads: "
+        f"run the driver on it and record the PointCloud2 that it publishes."
+        for s in streams
+        if s.count and _PACKETS.search(_kind(s.type))
+    ]
+
+
 def _kind(message_type: str) -> str:
-    return re.split(r"[/.]", message_type)[-1].lower()
+    last = re.split(r"[/.]", message_type)[-1].lower()
+    return "livox" if last == "custommsg" and message_type.startswith("livox") else last
 
 
 def _overrides(streams: Sequence[Stream], overrides: Mapping[str, str]) -> dict[str, tuple[str, ...]]:

@@ -24,6 +24,7 @@ from semloc_logs.frames import (
     TransformSample,
 )
 from semloc_logs.logs.base_frame import BasePoses, PoseSource
+from semloc_logs.logs.copies import Copies
 from semloc_logs.logs.depth import USUAL_NOISE, RangeNoise, label_ids
 from semloc_logs.logs.gravity import Accelerometer
 from semloc_logs.logs.log import Log, Stream
@@ -33,7 +34,7 @@ from semloc_logs.logs.open import open_log
 from semloc_logs.logs.picture_clouds import PictureClouds
 from semloc_logs.logs.roles import Roles, find_roles, no_sensor
 from semloc_logs.logs.sweeps import LONGEST_SWEEP_NS, in_base, sweep_in_base
-from semloc_logs.logs.tally import Tally, never_moves, no_poses, without_unused
+from semloc_logs.logs.tally import COPY, Tally, never_moves, no_poses, without_unused
 from semloc_logs.logs.trajectory_file import FilePoses, TrajectoryFile
 
 MAX_WAITING = 64  # frames that wait for their pose and transforms
@@ -128,6 +129,8 @@ class Session:
         self._pictures = PictureClouds(self.roles, self._where.tree.lookup, stride=self.stride, noise=self._noise)
         self._accelerometer = Accelerometer()
         self._tally = Tally()
+        # who names several LIDARs wants them all
+        self._copies = Copies() if len(self.roles.lidar) > 1 and not self._is_told else None
         self._waiting: deque[RangeFrame] = deque()
         self._waiting_bytes = 0
         self._sensors: dict[str, F64] = {}
@@ -363,6 +366,8 @@ class Session:
             return "no pose"
         sigma = None
         if isinstance(frame, LidarFrame):
+            if self._copies is not None and self._copies.is_copy(header.topic, header.stamp_ns, in_base(base_T_sensor, frame.points)):
+                return COPY
             poses_at = None if pose is None else self._where.track.at_many
             points, label, is_deskewed = sweep_in_base(frame, base_T_sensor, poses_at, min_range=self.min_range, max_range=self.max_range)
             self._deskewed += is_deskewed
@@ -383,6 +388,7 @@ class Session:
         track = self._where.track
         self._lost.extend(self._tally.sentences((track.start_ns, track.end_ns)))
         self._notes.extend(self._tally.remarks())
+        self._notes.extend([] if self._copies is None else self._copies.sentences())
         refused = [f"{n} {what}" for n, what in ((track.duplicates, "repeated"), (track.backwards, "back in time")) if n]
         if refused:
             self._notes.append(f"Poses that are {' and '.join(refused)} were left out.")

@@ -10,6 +10,7 @@ from semloc_logs.frames import LidarFrame
 from semloc_logs.logs.poses import PoseTrack
 
 _STANDSTILL_NS = 10_000_000_000  # a vehicle may well stand so long, but a log of nothing else is worth a sentence
+COPY = "copy"  # nothing is lost with the frames of a topic that repeats another's
 _WHY = {
     "no pose": "no pose is known at their time ({spans}): the pose stream has a gap there, or its clock differs from the sensor's",
     "no transform": "no transform leads from their frame to the base frame: record /tf_static, or leave the topic out with --topic",
@@ -73,6 +74,8 @@ class Tally:
         """One sentence for each topic and reason; ``poses``: the first and last stamp of the pose stream."""
         told = []
         for (topic, reason), count in sorted(self._left_out.items()):
+            if reason == COPY:
+                continue
             spans = f"frames {span(*self._spans[topic])}, poses {span(*poses)}"
             told.append(f"{topic}: {count} of {self.seen[topic]} frames are left out: {_WHY[reason].format(spans=spans)}.")
         for topic, count in sorted((+self._lost_points).items()):

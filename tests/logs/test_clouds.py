@@ -97,7 +97,7 @@ def test_positions_must_be_floating_point_fields_inside_the_point(fields: list[F
     ],
 )
 def test_units_and_origins_of_times(values: NDArray[np.generic], expected: list[int]) -> None:
-    found = offsets_ns(values, STAMP)
+    found, _ = offsets_ns(values, STAMP)
     assert found is not None
     assert found.dtype == np.int64
     np.testing.assert_allclose(found, expected, atol=20)
@@ -105,22 +105,22 @@ def test_units_and_origins_of_times(values: NDArray[np.generic], expected: list[
 
 def test_absolute_seconds_are_exact_to_their_precision() -> None:
     seconds = STAMP * 1e-9 + np.array([0.0, 0.02, 0.1])
-    found = offsets_ns(seconds, STAMP)
+    found, _ = offsets_ns(seconds, STAMP)
     assert found is not None
     np.testing.assert_allclose(found, [0, 20_000_000, 100_000_000], atol=500)  # a float64 of 1.7e9 s resolves 240 ns
 
 
 @pytest.mark.parametrize("values", [np.array([5.0, np.nan]), np.array([0.0, 1e300]), np.array([0, 2**63], np.uint64)])
 def test_times_without_sense_are_left_out(values: NDArray[np.generic]) -> None:
-    assert offsets_ns(values, STAMP) is None
+    assert offsets_ns(values, STAMP) == (None, False)
 
 
 @given(st.lists(st.integers(0, 999_999_999), min_size=2, max_size=20))
 def test_relative_and_absolute_nanoseconds_agree(offsets: list[int]) -> None:
     if max(offsets) - min(offsets) < 5_000_000:
         return
-    relative = offsets_ns(np.array(offsets, np.uint32), STAMP)
-    absolute = offsets_ns(np.array(offsets, np.uint64) + np.uint64(STAMP), STAMP)
+    relative, _ = offsets_ns(np.array(offsets, np.uint32), STAMP)
+    absolute, _ = offsets_ns(np.array(offsets, np.uint64) + np.uint64(STAMP), STAMP)
     assert relative is not None
     assert absolute is not None
     assert relative.tolist() == absolute.tolist() == offsets
