@@ -102,6 +102,7 @@ class Session:
             raise RoleError(f"{self.name}: {no_sensor(self.streams)}")
         self.min_range, self.max_range, self.stride = min_range, max_range, stride
         self._noise = noise
+        self._is_told = "lidar" in (topics or {})
         self._begin()
 
     def _find_roles(self, topics: Mapping[str, str]) -> Roles:
