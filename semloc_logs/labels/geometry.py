@@ -1,61 +1,99 @@
-"""Classes from geometry alone: ground, wall-like, vegetation-like, pole-like by local shape and height above the ground."""
+"""Classes from geometry alone: ground, wall-like, vegetation-like, pole-like, by local shape and height above the ground.
+
+What stands on the ground is cut into voxels of the map's size; the surroundings of each voxel decide (:func:`_class_of`), and then the
+majority of its neighbours. Vehicles and whatever else is neither stay unlabelled. All lengths are at street scale (0.30 m voxels) and
+follow ``scale``.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.labels.shape import Shape
+from semloc_logs.labels.columns import Voxels, VoxelShapes, objects, voxel_shapes, voxelise
 from semloc_logs.labels.space import BUILDING, POLE, ROAD, UNLABELLED, VEGETATION
+from semloc_logs.labels.surface import REACH, GroundSurface, ground_surface
 
-CELL = 0.30 * 4  # of the ground grid, at street scale (m)
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+I64 = NDArray[np.int64]
+
+VOXEL = 0.30  # (m)
+ON_GROUND, LEAST_ON_GROUND = 0.10, 0.04  # points lower than this are ground; a small scale does not make sensors better (m)
+TALL, LOW = 1.8, 2.3  # what reaches higher is no car; objects that may be vehicles are cut off here (m)
 
 
-def ground_surface(points: NDArray[np.floating], scale: float = 1.0) -> NDArray[np.float64]:
-    """Height (n,) of the ground below each of ``points`` (n, 3), whose z axis is up.
+def classify(points: NDArray[np.floating], origin: NDArray[np.floating], scale: float = 1.0, ground: GroundSurface | None = None) -> U8:
+    """Class (n,) of level ``points`` (n, 3), z up, of a sensor at ``origin`` (3,); 255 where the shape says nothing.
 
-    The lowest points of 1.2 m cells, a cell being lowered to what its surroundings reach at a slope of 20 %; ``scale`` is the
-    voxel size over 0.30 m.
+    ``scale`` is the voxel size over 0.30 m: a room is a street in miniature. ``ground`` saves finding the ground again. Points beyond
+    120 m of the sensor (at street scale) stay unlabelled.
     """
-    cell = CELL * scale
-    xy = np.floor(points[:, :2] / cell).astype(np.int64)
-    low = xy.min(0)
-    shape = xy.max(0) - low + 1
-    if shape.prod() > 4_000_000:  # a stray far point must not cost memory: coarser cells serve as well
-        return np.full(len(points), float(np.percentile(points[:, 2], 5)))
-    xy -= low
-    address = xy[:, 0] * shape[1] + xy[:, 1]
-    order = np.lexsort((points[:, 2], address))
-    sorted_address = address[order]
-    start = np.flatnonzero(np.r_[True, sorted_address[1:] != sorted_address[:-1]])
-    count = np.diff(np.r_[start, len(order)])
-    grid = np.full(int(shape.prod()), np.inf)
-    # the 2nd of few, the 5 % of many: one stray return below the street is no ground
-    grid[sorted_address[start]] = points[order[start + np.minimum(count // 20 + (count > 3), count - 1)], 2]
-    surface = np.pad(grid.reshape(tuple(shape)), 4, constant_values=np.inf)  # a margin, because roll wraps around
-    for step in (1, 2, 4):  # grey erosion by a cone of 20 % slope, in doubling steps
-        neighbours = [
-            np.roll(surface, (dx, dy), (0, 1)) + 0.2 * step * cell * np.hypot(np.sign(dx), np.sign(dy))
-            for dx in (-step, 0, step)
-            for dy in (-step, 0, step)
-        ]
-        surface = np.minimum.reduce(neighbours)
-    return np.asarray(surface[xy[:, 0] + 4, xy[:, 1] + 4], float)
-
-
-def classify(points: NDArray[np.floating], shape: Shape, scale: float = 1.0) -> NDArray[np.uint8]:
-    """Class (n,) of level ``points`` (n, 3) with their local ``shape``; 255 where the shape says nothing.
-
-    ``scale`` is the voxel size over 0.30 m: a room is a street in miniature.
-    """
-    if not len(points):
-        return np.zeros(0, np.uint8)
-    height = points[:, 2] - ground_surface(points, scale)
-    upright = np.abs(shape.normal[:, 2])
     label = np.full(len(points), UNLABELLED, np.uint8)
-    label[shape.scattered > 0.25] = VEGETATION
-    label[(shape.planar > 0.45) & (upright < 0.5)] = BUILDING
-    label[(shape.planar > 0.45) & (upright > 0.8) & (height > 2.0 * scale)] = BUILDING  # roofs and ceilings
-    label[(shape.linear > 0.6) & (np.abs(shape.direction[:, 2]) > 0.9) & (height > 0.3 * scale)] = POLE
-    label[(height < 0.35 * scale) & ((upright > 0.7) | (height < 0.15 * scale))] = ROAD
+    p, o = np.asarray(points, np.float64), np.asarray(origin, np.float64)
+    near = np.flatnonzero((np.abs(p - o) <= REACH * scale).all(1))
+    if not len(near):
+        return label
+    p = p[near]
+    height = p[:, 2] - (ground or ground_surface(p, o, scale)).height_at(p[:, :2])
+    low = height < max(ON_GROUND * scale, LEAST_ON_GROUND)
+    label[near[low]] = ROAD
+    standing = np.flatnonzero(~low)
+    if len(standing):
+        label[near[standing]] = _standing_classes(p[standing], height[standing], scale)
     return label
+
+
+def _standing_classes(points: F64, height: F64, scale: float) -> U8:
+    """Class (n,) of ``points`` (n, 3) that are not on the ground, at ``height`` (n,) above it."""
+    size = VOXEL * scale
+    voxels = voxelise(points, size)
+    mean = np.bincount(voxels.of_point, height) / np.bincount(voxels.of_point)
+    found = _class_of(voxels, voxel_shapes(points, voxels, size), mean, scale)
+    smooth = _majority(voxels.ijk, found, voxels.start, *voxels.shape)
+    return np.where((found == POLE) | (smooth == POLE), found, smooth)[voxels.of_point]
+
+
+def _class_of(voxels: Voxels, s: VoxelShapes, height: F64, scale: float) -> U8:
+    """Class (m,) of ``voxels`` at ``height`` (m,), each by its own surroundings."""
+    h = height / scale
+    top, extent = h + s.up / scale, (s.up + s.down) / scale + VOXEL
+    tall = top > TALL
+    length, width, highest = (a / scale for a in objects(voxels, (top < LOW) & (h < LOW), height, VOXEL * scale))
+    vehicle = (width > 0.9) & (width < 4.0) & (length < 6.5) & (highest > 0.9)
+    wall = ((s.wide_disorder < 0.06) | (s.wide_tilt < 0.12)) & (s.wide_disorder < 0.12)
+    out = np.full(len(h), UNLABELLED, np.uint8)
+    out[tall & ~wall & ~(vehicle & (highest < 2.1))] = VEGETATION
+    out[tall & wall] = BUILDING
+    out[~tall & ~vehicle & (s.tilt < 0.05) & (s.disorder < 0.02)] = BUILDING  # low walls and fences
+    out[~tall & ~vehicle & (s.wide_disorder > 0.06)] = VEGETATION
+    out[~tall & (s.wide_tilt > 0.6) & (h < 0.45) & (s.rough > 0.025 * scale)] = VEGETATION  # high grass, beds
+    out[(s.tilt > 0.8) & (s.disorder < 0.05) & (h > 2)] = BUILDING  # roofs and ceilings
+    thin = (s.thick < 0.12 * scale) & (s.long > 0.25 * scale) & (extent > 1.0)
+    out[thin & (s.crown < 4) & (s.beside < 8) & (top > 1.3)] = POLE
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _majority(ijk: I64, label: U8, start: I64, nx: int, ny: int) -> U8:
+    """The class (m,) that most of a voxel and its 26 neighbours have; its own counts twice and wins a tie."""
+    out = label.copy()
+    votes = np.zeros(256, np.int64)
+    for k in range(len(ijk)):
+        i, j, z = ijk[k]
+        votes[:] = 0
+        votes[label[k]] = 1
+        for u in range(max(i - 1, 0), min(i + 2, nx)):
+            for v in range(max(j - 1, 0), min(j + 2, ny)):
+                for q in range(start[u * ny + v], start[u * ny + v + 1]):
+                    if ijk[q, 2] > z + 1:
+                        break
+                    if ijk[q, 2] >= z - 1:
+                        votes[label[q]] += 1
+        best = label[k]
+        for c in range(256):
+            if votes[c] > votes[best]:
+                best = c
+        out[k] = best
+    return out

@@ -14,7 +14,6 @@ from semloc_logs.frames import ImageFrame, PosedCloud
 from semloc_logs.labels.geometry import classify
 from semloc_logs.labels.model import Segmenter
 from semloc_logs.labels.pictures import CAMERA_SHIFT, Pictures
-from semloc_logs.labels.shape import shape
 from semloc_logs.labels.space import (
     SKY,
     U8,
@@ -160,10 +159,11 @@ class Labeller:
         for name, topic in self._topics.items():
             topic.space, topic.said_by = self._space(name, topic)
 
-    def labels(self, keyframe: int, points: NDArray[np.floating], ids: U32 | None, scale: float) -> U8:
-        """Classes (n,) of the level ``points`` (n, 3) of a keyframe, from what :meth:`take` gave; ``scale``: the voxel size over 0.30 m."""
+    def labels(self, keyframe: int, points: NDArray[np.floating], origin: NDArray[np.floating], ids: U32 | None, scale: float) -> U8:
+        """Classes (n,) of the level ``points`` (n, 3) of a keyframe seen from ``origin`` (3,), from what :meth:`take` gave; ``scale``: the
+        voxel size over 0.30 m."""
         if self.source == "geometry":
-            return classify(points, shape(points), scale)
+            return classify(points, origin, scale)
         if self.source == "uniform" or ids is None:
             return np.full(len(points), UNLABELLED, np.uint8)
         topic, form = self._keyframes[keyframe]
@@ -176,7 +176,7 @@ class Labeller:
         out[out == SKY] = UNLABELLED  # what gave a return is no sky
         if self._settings.unseen == "geometry":
             unseen = ids == UNPAINTED
-            out[unseen] = classify(points, shape(points), scale)[unseen]
+            out[unseen] = classify(points, origin, scale)[unseen]
         return out
 
     def to_json(self) -> dict[str, Any]:

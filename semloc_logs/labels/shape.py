@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.labels.eigen import eigen
+
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,17 +34,43 @@ def shape(points: NDArray[np.floating], neighbours: int = 16, radius: float = np
         up = np.tile(np.array([0, 0, 1], np.float32), (n, 1))
         zero = np.zeros(n, np.float32)
         return Shape(up, up, zero, zero, zero + 1)
-    p = np.asarray(points, np.float64)
+    p = np.ascontiguousarray(points, np.float64)
     distance, index = cKDTree(p).query(p, k=min(neighbours, n), distance_upper_bound=radius, workers=1)
-    inside = np.isfinite(distance)
-    index[~inside] = 0
-    local = (p[index] - p[:, None]) * inside[..., None]
-    count = inside.sum(1)
-    centred = (local - (local.sum(1) / count[:, None])[:, None]) * inside[..., None]
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred, optimize=True) / count[:, None, None])
-    s = np.sqrt(np.maximum(values, 0)) + 1e-9
-    scattered = np.where(count < 4, 1.0, s[:, 0] / s[:, 2])
-    linear = np.where(count < 4, 0.0, (s[:, 2] - s[:, 1]) / s[:, 2])
-    planar = np.where(count < 4, 0.0, (s[:, 1] - s[:, 0]) / s[:, 2])
-    as32 = [np.asarray(a, np.float32) for a in (vectors[:, :, 0], vectors[:, :, 2], linear, planar, scattered)]
-    return Shape(*as32)
+    return Shape(*_shapes(p, np.where(np.isfinite(distance), index, -1)))
+
+
+@njit(cache=True, nogil=True)
+def _shapes(p: F64, index: NDArray[np.int64]) -> tuple[F32, F32, F32, F32, F32]:
+    """Shape of the neighbours ``index`` (n, k) of each point, -1 where there is none."""
+    n = len(index)
+    normal, direction = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+    linear, planar, scattered = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    mean, d, values, a, vectors = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(n):
+        mean[:] = 0.0
+        a[:] = 0.0
+        count = 0
+        for j in index[i]:
+            if j >= 0:
+                count += 1
+                for k in range(3):
+                    mean[k] += p[j, k] - p[i, k]
+        mean /= max(count, 1)
+        for j in index[i]:
+            if j >= 0:
+                for k in range(3):
+                    d[k] = p[j, k] - p[i, k] - mean[k]
+                for k in range(3):
+                    for m in range(3):
+                        a[k, m] += d[k] * d[m]
+        a /= max(count, 1)
+        eigen(a, values, vectors)
+        s0, s1, s2 = (np.sqrt(max(values[0], 0.0)) + 1e-9, np.sqrt(max(values[1], 0.0)) + 1e-9, np.sqrt(max(values[2], 0.0)) + 1e-9)
+        for k in range(3):
+            normal[i, k] = vectors[k, 0]
+            direction[i, k] = vectors[k, 2]
+        few = count < 4
+        linear[i] = 0.0 if few else (s2 - s1) / s2
+        planar[i] = 0.0 if few else (s1 - s0) / s2
+        scattered[i] = 1.0 if few else s0 / s2
+    return normal, direction, linear, planar, scattered

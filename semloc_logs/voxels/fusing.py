@@ -129,10 +129,9 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
                 for i in range(first, min(first + PART, len(raws))):
                     points, ids = _load_raw(Path(scratch), i)
                     points_level = apply(poses[i], points)
-                    ground = ground_height(
-                        points_level - np.r_[poses[i][:2, 3], 0.0], float(apply(poses[i], raws[i].origin[None])[0, 2]), scale
-                    )
-                    label = labeller.labels(i, points_level, ids, scale)
+                    origin = apply(poses[i], raws[i].origin[None])[0]
+                    ground = ground_height(points_level - np.r_[poses[i][:2, 3], 0.0], float(origin[2]), scale)
+                    label = labeller.labels(i, points_level, origin, ids, scale)
                     keep = label != SKY
                     grounds.append(ground)
                     counts.append(int(keep.sum()))
