@@ -92,21 +92,29 @@ class TransformSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSample:
-    """Specific force in m/s^2 and angular rate in rad/s, in the IMU frame."""
+    """Specific force in m/s^2 and angular rate in rad/s, in the IMU frame.
+
+    ``orientation`` is the quaternion xyzw of the IMU frame in east, north, up (REP 103, 105); None when the IMU does not report one.
+    """
 
     header: Header
     acceleration: F64
     angular_velocity: F64
+    orientation: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NavSatSample:
-    """WGS 84 latitude and longitude in degrees, ellipsoid height in metres."""
+    """WGS 84 latitude and longitude in degrees, ellipsoid height in metres.
+
+    ``covariance`` (3, 3) of east, north, up in m^2; None when the receiver does not know it.
+    """
 
     header: Header
     latitude_deg: float
     longitude_deg: float
     altitude: float
+    covariance: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

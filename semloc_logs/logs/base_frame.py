@@ -101,16 +101,17 @@ class BasePoses:
 
     Poses stay raw until :meth:`settle` has chosen the base frame. ``static_count``: static TF messages that are still to come, from
     the log's own statistics; once they are all there, nobody has to wait for more. ``source`` gives the poses instead of the log's
-    pose topic and TF.
+    pose topic and TF, ``fallback`` gives them when neither has any.
     """
 
-    def __init__(self, roles: Roles, static_count: int = 0, source: PoseSource | None = None) -> None:
+    def __init__(self, roles: Roles, static_count: int = 0, source: PoseSource | None = None, fallback: PoseSource | None = None) -> None:
         self.tree = TransformTree()
         self.track = PoseTrack()
         self.base: BaseFrame | None = None
         self.session_frame = ""
         self._roles = roles
         self.source = source
+        self._fallback = fallback
         self._has_topic = source is None and roles.pose is not None and roles.pose not in (*roles.tf, *roles.tf_static)
         self._child: str | None = None
         self._edge: Edge | None = None
@@ -155,15 +156,20 @@ class BasePoses:
             if not must and self._roles.tf and (edge is None or (is_patient and not edge[0].endswith("odom"))):
                 return False
             child = edge[1] if edge else None
+            if edge is None and self._fallback is not None:
+                child = self._fallback.child
         if not must and not self._is_settled(sensors, child):
             return False
+        if not self._has_topic and edge is None and self.source is None:
+            self.source = self._fallback
+        self._fallback = None
         self.base = self._choose(sensors, child)
         if edge is not None:
             self._edge, self.session_frame = edge, edge[0]
             track = self.tree.track(*edge)
             if track is not None:
                 self._raw.extend(zip(track.stamps_ns.tolist(), track.poses, strict=True))
-        self.pull()
+        self._pull()
         self._move()
         return True
 
@@ -182,7 +188,14 @@ class BasePoses:
             )
         return choose_base_frame(self.tree, sensors, child, source.name)
 
-    def pull(self) -> None:
+    def show(self, frame: Frame) -> None:
+        """A frame of the log that poses may be made of."""
+        source = self.source or self._fallback
+        if source is not None:
+            source.take(frame)
+            self._pull()
+
+    def _pull(self) -> None:
         """Takes what is new from the source of poses, if there is one."""
         if self.source is not None and self.base is not None:
             new = list(self.source.poses(self.base_T))
@@ -194,7 +207,7 @@ class BasePoses:
         """No more transforms will come: poses that wait for one are given up."""
         if self.source is not None:
             self.source.finish()
-            self.pull()
+            self._pull()
         self._move(is_end=True)
 
     def base_T(self, frame_id: str, stamp_ns: int) -> F64 | None:
@@ -224,7 +237,7 @@ class BasePoses:
         return next((edge for frame in frames if (edge := self.tree.pose_edge(frame)) is not None), None)
 
     def _is_settled(self, sensors: Sequence[str], child: str | None) -> bool:
-        if (child == "" and self.source is None) or not (self._roles.tf or self._roles.tf_static):
+        if (child == "" and self._has_topic) or not (self._roles.tf or self._roles.tf_static):
             return True
         if all(self.tree.connected(BASE_LINK, f) for f in (*sensors, *([child] if child else []))):
             return True

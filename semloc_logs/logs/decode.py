@@ -191,14 +191,32 @@ def _imu(m: Any, message: Message) -> Iterator[Frame]:
     acceleration, rate = _vector(m.linear_acceleration), _vector(m.angular_velocity)
     if not (np.isfinite(acceleration).all() and np.isfinite(rate).all()):
         raise UndecodableError("its measurements are not finite")
-    yield ImuSample(_header(m, message), acceleration, rate)
+    yield ImuSample(_header(m, message), acceleration, rate, _imu_orientation(m))
+
+
+def _imu_orientation(m: Any) -> F64 | None:
+    """The quaternion of an IMU that reports one: without, the first element of its covariance is -1, or it is no unit quaternion."""
+    q, covariance = getattr(m, "orientation", None), getattr(m, "orientation_covariance", None)
+    if q is None or (covariance is not None and len(covariance) and float(covariance[0]) == -1.0):
+        return None
+    orientation = np.array([q.x or 0.0, q.y or 0.0, q.z or 0.0, q.w or 0.0], float)
+    return orientation if abs(math.hypot(*orientation) - 1.0) < 0.1 else None
 
 
 def _nav_sat(header: Header, m: Any) -> Iterator[Frame]:
     latitude, longitude, altitude = float(m.latitude or 0.0), float(m.longitude or 0.0), float(m.altitude or 0.0)
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and math.isfinite(altitude)):
         raise UndecodableError("its latitude, longitude or altitude is no number on Earth")
-    yield NavSatSample(header, latitude, longitude, altitude)
+    yield NavSatSample(header, latitude, longitude, altitude, _fix_covariance(m))
+
+
+def _fix_covariance(m: Any) -> F64 | None:
+    """``position_covariance`` where its type is not "unknown" and it can be one."""
+    recorded = getattr(m, "position_covariance", None)
+    if not getattr(m, "position_covariance_type", 0) or recorded is None or len(recorded) != 9:
+        return None
+    covariance = np.array(recorded, float).reshape(3, 3)
+    return covariance if np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all() else None
 
 
 def _nav_sat_fix(m: Any, message: Message) -> Iterator[Frame]:

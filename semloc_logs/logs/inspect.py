@@ -11,11 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from semloc_logs.errors import LogError
-from semloc_logs.frames import Camera, DepthFrame, Frame, ImageFrame, ImuSample, LidarFrame, PoseSample, TransformSample
+from semloc_logs.frames import Camera, DepthFrame, Frame, ImageFrame, ImuSample, LidarFrame, NavSatSample, PoseSample, TransformSample
 from semloc_logs.logs.base_frame import BasePoses
 from semloc_logs.logs.decode import Decoder
 from semloc_logs.logs.depth import Unprojector
 from semloc_logs.logs.log import Log, Message
+from semloc_logs.logs.navsat import navsat_poses
 from semloc_logs.logs.open import open_log
 from semloc_logs.logs.problems import Problems
 from semloc_logs.logs.rectification import rectification
@@ -45,7 +46,9 @@ class _Inspection:
     def __init__(self, log: Log, topics: Mapping[str, str] | None) -> None:
         self.log = log
         self.roles = guess_roles(log.streams, topics)
-        self.where = BasePoses(self.roles)
+        navsat = navsat_poses(self.roles, log.streams)
+        self.where = BasePoses(self.roles, 0, navsat if self.roles.pose is not None else None, navsat)
+        self._makes_poses = navsat is not None
         self.cameras: dict[str, Camera] = {}
         self.first: dict[str, LidarFrame | DepthFrame | ImageFrame] = {}
         self.counts: Counter[tuple[str, str, str]] = Counter()
@@ -64,6 +67,8 @@ class _Inspection:
     def _pass(self) -> None:
         roles = self.roles
         small = {*roles.tf, *roles.tf_static, *roles.camera_info, *roles.topics("pose")}
+        if self._makes_poses:
+            small |= {*roles.topics("gnss"), *roles.topics("imu")}
         ranged = {*roles.ranging, *roles.topics("stereo_right")}
         for message in self.log.messages():
             topic = message.topic
@@ -84,8 +89,10 @@ class _Inspection:
             self.where.take(frame)
         elif isinstance(frame, Camera):
             self.cameras.setdefault(frame.header.topic, frame)
-        elif isinstance(frame, ImuSample):
-            self.imu_frame = frame.header.frame_id
+        elif isinstance(frame, ImuSample | NavSatSample):
+            if isinstance(frame, ImuSample):
+                self.imu_frame = frame.header.frame_id
+            self.where.show(frame)
         elif isinstance(frame, LidarFrame) and not len(frame.points):
             self.empty[frame.header.topic] += 1
         elif isinstance(frame, LidarFrame | DepthFrame | ImageFrame):
@@ -181,7 +188,9 @@ class _Inspection:
 
     def _pose_obstacles(self) -> list[str]:
         track, base = self.where.track, self.where.base
-        told = never_moves(self.roles.pose or "TF", track)
+        source = self.where.source
+        told = [*source.problems, *source.notes] if source else []
+        told += never_moves(source.name if source else self.roles.pose or "TF", track)
         if gaps := track.gaps():
             longest = max(gaps, key=lambda gap: gap[1] - gap[0])
             count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"

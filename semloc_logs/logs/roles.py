@@ -27,11 +27,11 @@ _CAMERAS = {"camerainfo", "cameracalibration"}
 _TRANSFORMS = {"tfmessage", "frametransform", "frametransforms"}
 # the more the message says, the better: an Odometry names its child frame, a PoseStamped does not
 _POSES = {"odometry": 0, "posewithcovariancestamped": 1, "posestamped": 2, "poseinframe": 2, "transformstamped": 3}
+_FIXES = {"navsatfix", "locationfix"}
 _TYPES_OF_ROLE: dict[str, set[str]] = {
     "lidar": _CLOUDS, "depth": _IMAGES, "image": _IMAGES, "camera_info": _CAMERAS, "stereo_left": _IMAGES, "stereo_right": _IMAGES,
-    "label_image": _IMAGES, "label_info": {"labelinfo", "string"}, "pose": set(_POSES) | _TRANSFORMS,
-    "tf": _TRANSFORMS, "tf_static": _TRANSFORMS, "imu": {"imu"},
-    "gnss": {"navsatfix", "locationfix"},
+    "label_image": _IMAGES, "label_info": {"labelinfo", "string"}, "pose": set(_POSES) | _TRANSFORMS | _FIXES,
+    "tf": _TRANSFORMS, "tf_static": _TRANSFORMS, "imu": {"imu"}, "gnss": _FIXES,
 }  # fmt: skip
 
 _TRANSPORTS = {"compressed", "compresseddepth", "theora", "ffmpeg", "zstd"}
@@ -142,7 +142,9 @@ def guess_roles(streams: Sequence[Stream], overrides: Mapping[str, str] | None =
     transforms = sorted(t for t, kind in kinds.items() if kind in _TRANSFORMS)
     notes += _packets(streams)
     imu = pick("imu", lambda: _preferred([t for t, kind in kinds.items() if kind == "imu"]))
-    gnss = pick("gnss", lambda: sorted(t for t, kind in kinds.items() if kind in _TYPES_OF_ROLE["gnss"])[:1])
+    gnss = pick("gnss", lambda: sorted(t for t, kind in kinds.items() if kind in _FIXES)[:1])
+    if any(kinds.get(topic) in _FIXES for topic in pose):  # --topic pose=/fix: poses are to be made of the fixes
+        gnss = pose
     return Roles(
         lidar=lidar, depth=depth, image=image, camera_info=infos, label_image=labels, label_info=meanings,
         stereo_left=next(iter(stereo_left), None), stereo_right=next(iter(stereo_right), None),

@@ -19,6 +19,7 @@ from semloc_logs.frames import (
     ImuSample,
     LabelNames,
     LidarFrame,
+    NavSatSample,
     PosedCloud,
     PoseSample,
     TransformSample,
@@ -29,6 +30,7 @@ from semloc_logs.logs.depth import USUAL_NOISE, RangeNoise, label_ids
 from semloc_logs.logs.gravity import Accelerometer
 from semloc_logs.logs.log import Log, Stream
 from semloc_logs.logs.merge import merged_frames, merged_streams
+from semloc_logs.logs.navsat import navsat_poses
 from semloc_logs.logs.odometry import LidarOdometry
 from semloc_logs.logs.open import open_log
 from semloc_logs.logs.picture_clouds import PictureClouds
@@ -126,7 +128,9 @@ class Session:
 
     def _begin(self) -> None:
         static_count = sum(s.count for s in self.streams if s.topic in self.roles.tf_static)
-        self._where = BasePoses(self.roles, static_count, self._pose_source())
+        navsat = navsat_poses(self.roles, self.streams)
+        named = navsat if self.roles.pose is not None else None  # as the pose topic, and not as what is left
+        self._where = BasePoses(self.roles, static_count, self._pose_source() or named, navsat)
         self._pictures = PictureClouds(self.roles, self._where.tree.lookup, stride=self.stride, noise=self._noise)
         self._accelerometer = Accelerometer()
         self._tally = Tally()
@@ -267,7 +271,7 @@ class Session:
         topics = {*roles.ranging, *roles.topics("stereo_right"), *roles.label_of.values(), *roles.tf, *roles.tf_static}
         topics |= {roles.info_of[t] for t in (*topics, *roles.image, *roles.label_image) if t in roles.info_of}
         wanted = set(roles.image if images is None else images) if on_image else set()
-        topics |= {*roles.topics("pose"), *roles.topics("imu"), *roles.label_info} | wanted
+        topics |= {*roles.topics("pose"), *roles.topics("imu"), *roles.topics("gnss"), *roles.label_info} | wanted
         self._image_stamps = {topic: deque(maxlen=4 * MAX_WAITING) for topic in sorted(wanted)}
         for frame in merged_frames(self.logs, topics):
             self._take(frame, on_image)
@@ -284,11 +288,15 @@ class Session:
             self._pictures.cameras[topic] = frame
         elif isinstance(frame, ImuSample):
             self._accelerometer.add(frame)
+            self._where.show(frame)
+        elif isinstance(frame, NavSatSample):
+            self._where.show(frame)
         elif isinstance(frame, LabelNames):
             self._meanings.setdefault(topic, frame)
         elif isinstance(frame, RangeFrame):
             if topic in roles.ranging:
                 self._tally.saw(topic, frame.header.stamp_ns)
+                self._where.show(frame)
                 if isinstance(frame, LidarFrame):
                     self._tally.measured(frame)
                     if not len(frame.points):
@@ -296,9 +304,6 @@ class Session:
                         return
                 self._waiting.append(frame)
                 self._waiting_bytes += _size(frame)
-                if self._where.source is not None:
-                    self._where.source.take(frame)
-                    self._where.pull()
             if not isinstance(frame, LidarFrame):
                 self._take_picture(frame, on_image)
 

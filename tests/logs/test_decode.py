@@ -221,16 +221,31 @@ def test_imu_and_nav_sat(ros: Ros) -> None:
     assert isinstance(frame, ImuSample)
     assert frame.acceleration.tolist() == [9, 2, 3]
     assert frame.angular_velocity.tolist() == [0.5, 2, 3]
+    assert frame.orientation is None  # a quaternion of zeros is none
+    parts["orientation"] = ros.pose((0, 0, 0), (0, 0, 0.6, 0.8)).orientation
+    [frame] = ros.frames(ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances))
+    assert isinstance(frame, ImuSample)
+    assert frame.orientation is not None
+    assert frame.orientation.tolist() == [0, 0, 0.6, 0.8]
+    covariances["orientation_covariance"] = np.r_[-1.0, np.zeros(8)]  # the IMU has no estimate of it
+    [frame] = ros.frames(ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances))
+    assert isinstance(frame, ImuSample)
+    assert frame.orientation is None
 
-    def fix(status: int, latitude: float) -> list[Any]:
+    def fix(status: int, latitude: float, kind: int = 0, variance: float = 0.0) -> list[Any]:
         s = ros.make("sensor_msgs/msg/NavSatStatus", status=status, service=1)
-        rest = {"position_covariance": np.zeros(9), "position_covariance_type": 0}
+        rest = {"position_covariance": np.diag([variance] * 3).ravel(), "position_covariance_type": kind}
         position = {"latitude": latitude, "longitude": 8.5, "altitude": 400.0}
         return ros.frames(ros.make("sensor_msgs/msg/NavSatFix", header=ros.header(), status=s, **position, **rest), "/fix")
 
     [frame] = fix(0, 47.25)
     assert isinstance(frame, NavSatSample)
     assert (frame.latitude_deg, frame.longitude_deg, frame.altitude) == (47.25, 8.5, 400.0)
+    assert frame.covariance is None
+    for variance, kind, known in ((4.0, 2, True), (4.0, 0, False), (-4.0, 2, False), (math.inf, 2, False)):
+        [frame] = fix(0, 47.25, kind, variance)
+        assert isinstance(frame, NavSatSample)
+        assert (None if frame.covariance is None else frame.covariance.tolist()) == (np.diag([4.0] * 3).tolist() if known else None)
     assert fix(-1, 47.25) == []
     assert ros.problems.sentences() == []  # a receiver without a fix is no problem of the log
     assert fix(0, math.nan) == []

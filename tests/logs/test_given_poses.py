@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, Frame, Header, LidarFrame, PoseSample, TransformSample
+from semloc_logs.frames import F64, Frame, Header, LidarFrame, NavSatSample, PoseSample, TransformSample
 from semloc_logs.geometry import inverse, yaw_transform
 from semloc_logs.logs import odometry
 from semloc_logs.logs.log import Message, Stream
@@ -27,6 +27,7 @@ MOUNT = yaw_transform(np.pi / 2, (1.0, 0.0, 2.0))  # base_T_lidar
 POINTS = np.array([[5.0, 0.0, 0.0], [0.0, 7.0, 0.0]], np.float32)
 TYPES: dict[type, str] = {
     LidarFrame: "sensor_msgs/msg/PointCloud2", TransformSample: "tf2_msgs/msg/TFMessage", PoseSample: "nav_msgs/msg/Odometry",
+    NavSatSample: "sensor_msgs/msg/NavSatFix",
 }  # fmt: skip
 
 
@@ -258,3 +259,30 @@ def test_kiss_icp_finds_a_known_motion_twice_the_same() -> None:
         assert made.problems == []
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_allclose(found[0][:, :3, 3], np.array(truth)[:, :3, 3], atol=0.05)
+
+
+# -- fixes
+
+
+def fix(k: int) -> Frame:
+    return NavSatSample(header("/fix", 0.1 * k, "base_link"), 48.0, 11.0 + 1e-5 * k, 500.0, None)
+
+
+def test_fixes_serve_where_there_is_nothing_else() -> None:
+    frames: list[Frame] = [STATIC, *sweeps(40), *[fix(k) for k in range(41)]]
+    session = Session([FakeLog(frames)])
+    clouds = list(session.clouds())
+    assert len(clouds) == 40
+    assert clouds[20].session_T_base is not None
+    # 1e-5 degrees are 0.746 m at 48 degrees north and 500 m
+    np.testing.assert_allclose(clouds[20].session_T_base, yaw_transform(0.0, (20 * 0.746, 0, 0)), atol=0.02)
+    assert (session.base_frame, session.session_frame) == ("base_link", "enu")
+    own: list[Frame] = [PoseSample(header("/odom", 0.1 * k, "odom"), "base_link", np.eye(4)) for k in range(41)]
+    tf: list[Frame] = [TransformSample(header("/tf", 0.1 * k, "odom"), "base_link", np.eye(4), static=False) for k in range(41)]
+    for better in (own, tf):
+        session = Session([FakeLog([*frames, *better])])
+        assert len(list(session.clouds())) == 40
+        assert session.session_frame == "odom"
+        session = Session([FakeLog([*frames, *better])], {"pose": "/fix"})
+        assert len(list(session.clouds())) == 40
+        assert session.session_frame == "enu"

@@ -163,6 +163,13 @@ def test_two_equal_poses_are_for_the_user_to_choose() -> None:
     assert roles(topics, pose="none").pose is None
 
 
+def test_fixes_named_as_the_pose() -> None:
+    topics = {"/odom": ODOM, "/fix": FIX, "/fix2": FIX}
+    assert (roles(topics).pose, roles(topics).gnss) == ("/odom", "/fix")
+    named = roles(topics, pose="/fix2")
+    assert (named.pose, named.gnss) == ("/fix2", "/fix2")
+
+
 def test_overrides_that_cannot_be() -> None:
     topics = {"/points": CLOUD, "/odom": ODOM}
     with pytest.raises(RoleError, match=r"no role 'laser'.*lidar, depth"):

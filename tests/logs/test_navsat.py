@@ -1,0 +1,235 @@
+"""Poses from fixes and an IMU: a vehicle on a circle whose truth in east, north, up is known."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from semloc_logs.frames import F64, Frame, Header, ImuSample, NavSatSample
+from semloc_logs.geometry import inverse, yaw_transform
+from semloc_logs.logs.inspect import inspect_log
+from semloc_logs.logs.navsat import LocalFrame, NavSatPoses, earth_centred
+
+S = 1_000_000_000
+EPOCH = 1_700_000_000 * S
+ODD = Path(__file__).resolve().parents[3] / "shared" / "odd_logs"
+A, B = 6378137.0, 6356752.314245  # m, WGS 84
+LATITUDE, LONGITUDE, HEIGHT = 48.0, 11.0, 500.0
+RADIUS, SPEED = 40.0, 5.0
+ANTENNA = yaw_transform(0.0, (-0.5, 0.3, 1.2))  # base_T_gps
+MOUNTED = np.eye(4)  # base_T_imu: its y axis points up, as on a Husky
+MOUNTED[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+
+
+# -- coordinates
+
+
+def test_earth_centred_at_known_places() -> None:
+    np.testing.assert_allclose(earth_centred(0, 0, 0), [A, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(earth_centred(0, 90, 10), [0, A + 10, 0], atol=1e-6)
+    np.testing.assert_allclose(earth_centred(90, 0, 0), [0, 0, B], atol=1e-5)
+    np.testing.assert_allclose(earth_centred(-90, 45, 100), [0, 0, -B - 100], atol=1e-5)
+
+
+def test_axes_point_east_north_and_up() -> None:
+    local = LocalFrame(LATITUDE, LONGITUDE, HEIGHT)
+    np.testing.assert_allclose(local.position(LATITUDE, LONGITUDE, HEIGHT), 0.0, atol=1e-9)
+    np.testing.assert_allclose(local.position(LATITUDE, LONGITUDE, HEIGHT + 7), [0, 0, 7], atol=1e-8)
+    east, north = local.position(LATITUDE, LONGITUDE + 1e-5, HEIGHT), local.position(LATITUDE + 1e-5, LONGITUDE, HEIGHT)
+    assert east[0] > 0.7
+    assert abs(east[1]) < 1e-5
+    assert north[1] > 1.1
+    assert abs(north[0]) < 1e-9
+
+
+def degrees_of(east: float, north: float) -> tuple[float, float]:
+    """Latitude and longitude of a place near the datum, by the radii of curvature at the datum: good to a millimetre within 100 m."""
+    eccentricity = 1.0 - (B / A) ** 2
+    w = 1.0 - eccentricity * np.sin(np.radians(LATITUDE)) ** 2
+    meridian, normal = A * (1.0 - eccentricity) / w**1.5, A / np.sqrt(w)
+    return (
+        LATITUDE + np.degrees(north / (meridian + HEIGHT)),
+        LONGITUDE + np.degrees(east / ((normal + HEIGHT) * np.cos(np.radians(LATITUDE)))),
+    )
+
+
+@given(st.floats(-100, 100), st.floats(-100, 100), st.floats(-20, 20))
+def test_agrees_with_the_radii_of_curvature(east: float, north: float, up: float) -> None:
+    latitude, longitude = degrees_of(east, north)
+    found = LocalFrame(LATITUDE, LONGITUDE, HEIGHT).position(latitude, longitude, HEIGHT + up)
+    np.testing.assert_allclose(found, [east, north, up], atol=5e-3)
+
+
+# -- a drive on a circle, heading along its tangent
+
+
+def truth(seconds: float) -> F64:
+    """``enu_T_base``; starts at the datum, to the east, and turns left."""
+    angle = SPEED * seconds / RADIUS
+    return yaw_transform(angle, (RADIUS * np.sin(angle), RADIUS * (1 - np.cos(angle)), 0.0))
+
+
+def header(topic: str, seconds: float, frame_id: str) -> Header:
+    stamp = EPOCH + round(seconds * S)
+    return Header(topic, stamp, stamp, frame_id)
+
+
+def fix(seconds: float, place: F64, sigma: float | None = 0.02) -> Frame:
+    latitude, longitude = degrees_of(place[0], place[1])
+    covariance = None if sigma is None else np.diag([sigma**2] * 3)
+    return NavSatSample(header("/fix", seconds, "gps"), latitude, longitude, HEIGHT + place[2], covariance)
+
+
+def antenna_at(seconds: float) -> F64:
+    """In the frame of the first fix, which has the antenna at its origin."""
+    return np.asarray((truth(seconds) @ ANTENNA)[:3, 3] - (truth(0) @ ANTENNA)[:3, 3])
+
+
+def imu(seconds: float, *, with_orientation: bool, offset: float = 0.0) -> Frame:
+    enu_R_base = truth(seconds)[:3, :3]
+    centripetal = enu_R_base[:, 1] * SPEED**2 / RADIUS
+    enu_R_imu = yaw_transform(offset)[:3, :3] @ enu_R_base @ MOUNTED[:3, :3]
+    force = (enu_R_base @ MOUNTED[:3, :3]).T @ (centripetal + np.array([0, 0, 9.80665]))
+    orientation = Rotation.from_matrix(enu_R_imu).as_quat() if with_orientation else None
+    return ImuSample(header("/imu", seconds, "imu"), force, np.zeros(3), orientation)
+
+
+def drive(source: NavSatPoses, frames: list[Frame], *, knows: tuple[str, ...] = ("gps", "imu")) -> dict[float, F64]:
+    """Poses by time, taken as they come."""
+    mounts = {"gps": ANTENNA, "imu": MOUNTED}
+    base_T: Callable[[str, int], F64 | None] = lambda frame, _: mounts[frame] if frame in knows else None  # noqa: E731
+    found = []
+    for frame in sorted(frames, key=lambda f: f.header.stamp_ns):
+        source.take(frame)
+        found += list(source.poses(base_T))
+    source.finish()
+    found += list(source.poses(base_T))
+    return {round((stamp - EPOCH) / S, 3): pose for stamp, pose in found}
+
+
+def fixes(until: float = 20.0, step: float = 0.2) -> list[Frame]:
+    return [fix(t, antenna_at(t)) for t in np.arange(0, until, step)]
+
+
+def samples(*, with_orientation: bool, until: float = 20.0, offset: float = 0.0) -> list[Frame]:
+    return [imu(t, with_orientation=with_orientation, offset=offset) for t in np.arange(-0.005, until, 0.01)]
+
+
+def check(found: dict[float, F64], *, position: float, angle: float) -> None:
+    start = (truth(0) @ ANTENNA)[:3, 3]
+    for seconds, pose in found.items():
+        wanted = truth(seconds)
+        wanted[:3, 3] -= start
+        off = inverse(wanted) @ pose
+        assert np.linalg.norm(off[:3, 3]) < position, seconds
+        assert np.degrees(np.linalg.norm(Rotation.from_matrix(off[:3, :3]).as_rotvec())) < angle, seconds
+
+
+def test_with_the_orientation_of_a_mounted_imu() -> None:
+    source = NavSatPoses("/fix", 100)
+    found = drive(source, [*fixes(), *samples(with_orientation=True)])
+    assert len(found) == 100
+    check(found, position=0.01, angle=0.1)
+    assert source.problems == []
+    assert source.notes == []
+    told = source.to_json()
+    assert (told["heading"], told["fixes"]) == ("imu", 100)
+
+
+def test_with_the_course_and_an_accelerometer() -> None:
+    source = NavSatPoses("/fix", 100)
+    found = drive(source, [*fixes(), *samples(with_orientation=False)])
+    assert len(found) == 100
+    # the parabola at both ends of the drive has fixes on one side only
+    check({t: p for t, p in found.items() if 1.5 < t < 18}, position=0.03, angle=1.0)
+    check(found, position=0.2, angle=6.0)
+    assert source.to_json()["heading"] == "course"
+
+
+def test_with_fixes_alone() -> None:
+    found = drive(NavSatPoses("/fix", 20), fixes(step=1.0), knows=("gps",))
+    assert len(found) == 20
+    check({t: p for t, p in found.items() if 1.5 < t < 18}, position=0.05, angle=2.0)
+
+
+def test_an_imu_of_unknown_mounting_is_not_believed() -> None:
+    source = NavSatPoses("/fix", 100)
+    check(
+        {t: p for t, p in drive(source, [*fixes(), *samples(with_orientation=True)], knows=()).items() if 1.5 < t < 18}, position=2, angle=1
+    )
+    assert any("from 'imu', the IMU's frame" in note for note in source.notes)
+    assert any("from 'gps', the antenna of /fix" in note for note in source.notes)
+
+
+def test_a_heading_that_is_not_relative_to_east_is_said() -> None:
+    source = NavSatPoses("/fix", 100)
+    drive(source, [*fixes(), *samples(with_orientation=True, offset=np.radians(90))])
+    (said,) = source.problems
+    assert re.search(r"off the course over ground by (89|9[0-2]) degrees.*--topic imu=none", said)
+
+
+def test_uncertain_and_missing_fixes_are_left_out() -> None:
+    frames = fixes()
+    frames[10] = fix(2.0, antenna_at(2.0) + np.array([30.0, 0, 0]), sigma=8.0)
+    frames[11] = fix(2.2, antenna_at(2.2), sigma=None)
+    source = NavSatPoses("/fix", 103)  # three messages said that there was no fix, so they gave no sample
+    found = drive(source, [*frames, *samples(with_orientation=True)])
+    assert len(found) == 99
+    assert 2.0 not in found
+    check(found, position=0.01, angle=0.1)
+    assert source.problems == [
+        "/fix: 3 of 103 messages say that there is no fix; they were left out.",
+        "/fix: 1 of 103 messages are less certain than 5 m or out of order; they were left out.",
+    ]
+
+
+def test_a_gap_stays_a_gap() -> None:
+    frames = [f for f in fixes() if not 5 * S < f.header.stamp_ns - EPOCH < 12 * S]
+    found = drive(NavSatPoses("/fix", len(frames)), [*frames, *samples(with_orientation=False)])
+    assert not [t for t in found if 5 < t < 11.9]
+    check({t: p for t, p in found.items() if 1.5 < t < 18}, position=0.2, angle=6.0)
+
+
+def test_who_never_moves_has_no_heading() -> None:
+    source = NavSatPoses("/fix", 50)
+    assert drive(source, [fix(0.2 * k, np.zeros(3)) for k in range(50)]) == {}
+    (said,) = source.problems
+    assert "never moves faster than 1 m/s" in said
+    assert "50 fixes give no pose" in said
+
+
+def test_who_stands_first_looks_where_he_then_goes() -> None:
+    standing = [fix(0.2 * k - 10, np.zeros(3)) for k in range(50)]
+    found = drive(NavSatPoses("/fix", 150), [*standing, *fixes()], knows=())
+    assert len(found) == 150
+    assert abs(np.degrees(np.arctan2(found[-9.0][1, 0], found[-9.0][0, 0]))) < 15
+
+
+def test_driving_backwards_is_not_turning() -> None:
+    there = [fix(0.2 * k, np.array([0.4 * k, 0, 0])) for k in range(50)]
+    back = [fix(10 + 0.2 * k, np.array([19.6 - 0.4 * k, 0, 0])) for k in range(50)]
+    found = drive(NavSatPoses("/fix", 100), [*there, *back], knows=())
+    assert all(abs(np.arctan2(p[1, 0], p[0, 0])) < 0.1 for p in found.values())
+
+
+@pytest.mark.skipif(not ODD.is_dir(), reason="the folder ../shared/odd_logs with recorded logs is missing")
+def test_the_fixes_of_a_husky_agree_with_its_odometry() -> None:
+    """Its length by fixes of a metre's noise is longer than by its wheels, but of the same size; fixes are used when named."""
+    log = ODD / "husky_imu_gnss_odometry.bag"
+    wheels, named = inspect_log(log), inspect_log(log, {"pose": "/fix"})
+    poses, fixed = wheels["poses"], named["poses"]
+    assert isinstance(poses, dict)
+    assert isinstance(fixed, dict)
+    assert poses["count"] == 3952
+    assert fixed["count"] == 989
+    assert 1.0 < fixed["length_m"] / poses["length_m"] < 1.4
+    assert named["session_frame"] == "enu"
+    fallback = inspect_log(log, {"pose": "none"})["poses"]
+    assert fallback == fixed
