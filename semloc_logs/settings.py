@@ -42,6 +42,10 @@ class Fusion(_Section):
     )
     submap_length: float | None = Field(None, gt=0, description="length of road in a submap (m); default 100 m at 0.30 m voxels")
     submap_overlap: float = Field(0.25, ge=0.0, lt=1.0, description="share of a submap that the next one repeats")
+    depth_noise: float = Field(
+        0.0019, ge=0, le=1, description="standard deviation of a depth image: 0.0012 m + this (1/m) times (z - 0.4 m)^2; structured light"
+    )
+    disparity_noise: float = Field(0.2, gt=0, le=10, description="standard deviation of a stereo pair's disparity (px)")
     hit: float = Field(0.85, ge=0.05, le=6, description="log-odds added to a voxel that a ray ends in")
     miss: float = Field(0.40, ge=0.05, le=6, description="log-odds taken from a voxel that a ray passes")
     odometry: Literal["none", "lidar"] = Field(

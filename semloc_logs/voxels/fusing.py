@@ -19,6 +19,7 @@ from semloc_logs.geometry import apply, inverse, rotation_between
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.shape import shape
 from semloc_logs.labels.space import SKY
+from semloc_logs.logs.depth import RangeNoise
 from semloc_logs.logs.session import Session, open_session
 from semloc_logs.logs.trajectory_file import TrajectoryFile
 from semloc_logs.settings import STREET_VOXEL, Settings
@@ -76,6 +77,8 @@ class _Normals:
 
     def add(self, cloud: PosedCloud, points: NDArray[np.float32], cell: float) -> None:
         if self.seen % self.every == 0:
+            if cloud.sigma is not None:  # the normal of points that lie nearer to each other than their noise means nothing
+                cell = max(cell, 2 * float(np.median(cloud.sigma)))
             some = points[thin(points, cell)][:12_000]
             s = shape(some, 12)
             weight = np.where((s.planar > 0.5) & (s.scattered < 0.15), s.planar, 0.0).astype(float)
@@ -101,6 +104,7 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         task.topics,
         min_range=fusion.min_range or 0.0,
         max_range=2.0 * (fusion.max_range or 50.0),
+        noise=RangeNoise(fusion.depth_noise, fusion.disparity_noise),
         poses=task.poses,
         odometry=fusion.odometry,
     )

@@ -18,6 +18,9 @@ from semloc_logs.logs.rectification import Rectification, rectification
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session import open_session
 from semloc_logs.logs.stereo_clouds import StereoClouds, _grey
+from semloc_logs.voxels.fusing import _Normals
+from semloc_logs.voxels.gravity import find_up
+from semloc_logs.voxels.selection import thin
 
 MS = 1_000_000
 REAL = Path(__file__).resolve().parents[3] / "shared" / "logs" / "euroc_v101_stereo.bag"
@@ -226,6 +229,16 @@ def test_sigma_of_a_real_floor(room: list[PosedCloud]) -> None:
     floor = np.abs((points - centre) @ normal) < 0.08
     normalised = off[floor] / cloud.sigma[floor]
     assert 0.6 < 1.4826 * np.median(np.abs(normalised - np.median(normalised))) < 1.5
+
+
+@pytest.mark.parametrize("voxel", [0.03, 0.05, 0.1, 0.3])
+def test_the_direction_of_gravity_is_found_at_every_voxel_size(room: list[PosedCloud], voxel: float) -> None:
+    """Leaning mattresses and noise of several voxels do not make the floor a slope."""
+    normals = _Normals()
+    for cloud in room[:3]:
+        normals.add(cloud, cloud.points[thin(cloud.points, voxel / 3)], 2 * voxel / 3)
+    up = find_up(np.concatenate([k[1] for k in normals.kept]), np.concatenate([k[2] for k in normals.kept]), np.array([0.0, 0.0, 1.0]))
+    assert tilt(up) < 1.5
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.01, 0.0), (0.01, 0.0, 0.0), (0.0, 0.0, 0.03)])
