@@ -26,7 +26,7 @@ from semloc_logs.settings import STREET_VOXEL, Settings
 from semloc_logs.tables import replacing_folder, write_json, write_table
 from semloc_logs.voxels.gravity import find_up, ground_height
 from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map
-from semloc_logs.voxels.picture import draw_map
+from semloc_logs.voxels.picture import Caption, draw_map
 from semloc_logs.voxels.selection import KeyframeSelector, road_distance, submap_ranges, thin
 from semloc_logs.voxels.store import (
     PART,
@@ -169,7 +169,8 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         submaps = _submaps(task, poses, origins, np.array(grounds), distance, posed, metadata, on_progress)
         ids = range(len(submaps))
         voxels = write_voxels(task.folder.voxels, (read_blocks(blocks_path(task.folder.blocks, i)) for i in ids), metadata, fusion.clamp)
-        draw_map(task.folder.voxels, poses[:, :3, 3] if posed else np.zeros((0, 3)), fusion.voxel_size, task.folder.picture)
+        caption = Caption(task.folder.name, source, fusion.voxel_size)
+        draw_map(task.folder.voxels, poses[:, :3, 3] if posed else np.zeros((0, 3)), caption, task.folder.picture)
         for note in labeller.notes:
             on_progress(note)
         content = {

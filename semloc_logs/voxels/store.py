@@ -22,7 +22,7 @@ from semloc_logs.voxels.keys import pack, unpack
 
 PART = 64  # keyframes in a file; a row group each
 TILE = 256  # voxels along the edge of a tile of the session map
-VOXEL_ROWS = 65_536  # in Morton order a row group is a compact box, so a bounding box skips most of them
+VOXEL_ROWS = 16_384  # of a row group: in Morton order a compact box, so that readers of a bounding box skip most by their statistics
 POSE = ("t_x", "t_y", "t_z", "q_x", "q_y", "q_z", "q_w")
 
 

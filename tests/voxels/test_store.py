@@ -14,7 +14,7 @@ from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Settings
 from semloc_logs.tables import read_metadata
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED, BlockMap, Fuser, empty_map
-from semloc_logs.voxels.keys import morton, unpack
+from semloc_logs.voxels.keys import morton, pack, unpack
 from semloc_logs.voxels.store import (
     PART,
     TILE,
@@ -192,6 +192,37 @@ def test_the_session_map_in_duckdb_and_polars(tmp_path: Path) -> None:
     assert frame.schema["ix"] == pl.Int32
     assert frame.schema["label"] == pl.UInt8
     assert frame["occupancy"].mean() == pytest.approx(mean, rel=1e-6)
+
+
+def plain(width: int) -> BlockMap:
+    """A level floor of ``width`` x ``width`` voxels, one voxel thick."""
+    n = width // 16
+    blocks = np.stack(np.meshgrid(np.arange(n), np.arange(n), [0], indexing="ij"), -1).reshape(-1, 3)
+    state = np.full((len(blocks), 16, 16, 16), FREE_STATE, np.uint8)
+    state[:, :, :, 0] = 0
+    state = state.reshape(len(blocks), -1)
+    ballots = np.flatnonzero(state.ravel() == 0) * 256
+    return BlockMap(pack(blocks), np.where(state == 0, 20, -8).astype(np.int8), state, ballots, np.ones(len(ballots), np.int64))
+
+
+def test_a_bounding_box_reads_few_row_groups(tmp_path: Path) -> None:
+    """By the statistics alone: other files and other row groups are not read; DuckDB and Arrow find the same rows."""
+    assert write_voxels(tmp_path / "voxels", [plain(512)], METADATA, CLAMP) == 512 * 512
+    import pyarrow.dataset as ds
+
+    data = ds.dataset(tmp_path / "voxels", partitioning="hive")
+    box = (ds.field("ix") >= 100) & (ds.field("ix") < 167) & (ds.field("iy") >= 300) & (ds.field("iy") < 367)
+    every = [g for f in data.get_fragments() for g in f.split_by_row_group()]
+    read = [g for f in data.get_fragments(box) for g in f.split_by_row_group(box)]
+    assert len(every) == 4 * 256 * 256 // 16384
+    assert len(read) <= 2  # each is a square of 128 x 128 voxels; the box lies in x over one border of them
+    assert max(g.row_groups[0].num_rows for g in every) <= 16384
+    found = data.to_table(filter=box)
+    query = f"SELECT * FROM '{tmp_path}/voxels/**/*.parquet' WHERE ix BETWEEN 100 AND 166 AND iy BETWEEN 300 AND 366"
+    rows = duckdb.connect().execute(query).fetchall()
+    assert len(rows) == found.num_rows == 67 * 67
+    assert {r[:2] for r in rows} == set(zip(found["ix"].to_pylist(), found["iy"].to_pylist(), strict=True))
+    assert {d.name for d in (tmp_path / "voxels").iterdir()} == {f"tile={x}_{y}" for x in (0, 1) for y in (0, 1)}
 
 
 @pytest.mark.parametrize("submaps", [[], [empty_map()], "free only"])
