@@ -169,7 +169,7 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         submaps = _submaps(task, poses, origins, np.array(grounds), distance, posed, metadata, on_progress)
         ids = range(len(submaps))
         voxels = write_voxels(task.folder.voxels, (read_blocks(blocks_path(task.folder.blocks, i)) for i in ids), metadata, fusion.clamp)
-        caption = Caption(task.folder.name, source, fusion.voxel_size)
+        caption = Caption(task.folder.name, labeller.source, fusion.voxel_size)
         draw_map(task.folder.voxels, poses[:, :3, 3] if posed else np.zeros((0, 3)), caption, task.folder.picture)
         for note in labeller.notes:
             on_progress(note)

@@ -22,7 +22,7 @@ class Sheet:
 
     def __init__(self, picture: U8) -> None:
         height, width = picture.shape[:2]
-        self._scale = max(1.0, max(height, width) / 1400)
+        self._scale: float = max(1.0, max(height, width) / 1400)
         self._pad = self._px(24)
         left = max(0, self._px(NARROWEST) - width) // 2 + self._pad
         self._left = left

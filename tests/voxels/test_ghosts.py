@@ -58,7 +58,9 @@ def fused(cars: list[float | None]) -> BlockMap:
 def on_track(ijk: NDArray[np.int32]) -> NDArray[np.bool_]:
     """Voxels (n, 3) above the road where cars were, in the part of their way that has the wall behind it."""
     centre = (ijk + 0.5) * 0.3
-    return (centre[:, 0] > CAR_X - 0.5) & (centre[:, 0] < CAR_X + CAR_SIZE[0] + 0.5) & (np.abs(centre[:, 1]) < 6) & (centre[:, 2] > 0.3)
+    return np.asarray(
+        (centre[:, 0] > CAR_X - 0.5) & (centre[:, 0] < CAR_X + CAR_SIZE[0] + 0.5) & (np.abs(centre[:, 1]) < 6) & (centre[:, 2] > 0.3)
+    )
 
 
 def wall(ijk: NDArray[np.int32]) -> set[tuple[int, ...]]:
