@@ -40,8 +40,8 @@ _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "fingerprint": (("annotate.py content_fingerprint",), ()),
     "read": (("session.py clouds",), ()),
     "thin": (("selection.py thin",), ()),
-    "direction of gravity": (("gravity.py find_up", "fusing.py add"), ("selection.py thin",)),
-    "labels": (("fusing.py _labels",), ()),
+    "direction of gravity": (("gravity.py find_up", "fusing.py add"), ()),
+    "labels": (("labeller.py labels", "labeller.py take"), ()),
     "height of the ground": (("gravity.py ground_height",), ()),
     "keyframes written": (("store.py write_keyframes",), ("fusing.py labelled",)),
     "keyframes read": (("store.py read_keyframe",), ()),
@@ -78,12 +78,13 @@ def profile_pipeline(logs: Sequence[Path], settings: Settings, functions: int = 
 def profile_fuse(logs: Sequence[Path], settings: Settings, rounds: int = 3, functions: int = 12) -> tuple[Figures, Rows]:
     """`semloc fuse` of ``logs`` (one session) beside what it cannot do without: reading all clouds, and integrating all keyframes once.
 
-    ``rounds`` times in turn each, the median and the least count; ``ratio`` is whole / (reading + integrating). The parts come from one
-    more run under the profiler, which adds some percent; the rest of the returned functions are those that took most time themselves.
+    ``rounds`` times in turn each: wall-clock seconds, median and least, and processor seconds, median. ``ratio`` is whole / (reading +
+    integrating). The parts come from one more run under the profiler, which adds some percent, as do the returned ``functions``, those
+    that took most time themselves.
     """
     settings = settings.resolved()
     fusion = settings.fusion
-    times: dict[str, list[float]] = {"whole": [], "reading": [], "integrating": []}
+    times: dict[str, list[tuple[float, float]]] = {"whole": [], "reading": [], "integrating": []}
 
     def whole(folder: Path, profiler: cProfile.Profile | None = None) -> Workspace:
         work = Workspace(folder)
@@ -101,26 +102,29 @@ def profile_fuse(logs: Sequence[Path], settings: Settings, rounds: int = 3, func
     clouds = reading()  # to warm up
     for _ in range(rounds):
         with tempfile.TemporaryDirectory(prefix="semloc-fuse-") as folder:
-            start = time.perf_counter()
+            start = _clocks()
             work = whole(Path(folder))
-            times["whole"].append(time.perf_counter() - start)
-            start = time.perf_counter()
+            times["whole"].append(_since(start))
+            start = _clocks()
             reading()
-            times["reading"].append(time.perf_counter() - start)
+            times["reading"].append(_since(start))
             times["integrating"].append(_integrating(SessionMap(work.session("session")), settings))
             keyframes = len(SessionMap(work.session("session")).map_T_base)
     profiler = cProfile.Profile()
     with tempfile.TemporaryDirectory(prefix="semloc-fuse-") as folder:
         whole(Path(folder), profiler)
     stats = _stats(profiler)
-    figures: Figures = {k: {"ours": float(np.median(v)), "least": min(v), "unit": "s"} for k, v in times.items()}
-    needed = np.array(times["reading"]) + np.array(times["integrating"])
-    ratio = np.array(times["whole"]) / needed
-    figures["ratio"] = {
-        "ours": float(np.median(ratio)),
-        "least": min(times["whole"]) / (min(times["reading"]) + min(times["integrating"])),
-        "unit": "whole / (reading + integrating)",
+    value = {
+        name: {
+            "ours": float(np.median([wall for wall, _ in taken])),
+            "least": min(wall for wall, _ in taken),
+            "cpu": float(np.median([processor for _, processor in taken])),
+        }
+        for name, taken in times.items()
     }
+    figures: Figures = {name: {**seconds, "unit": "s"} for name, seconds in value.items()}
+    ratio = {kind: value["whole"][kind] / (value["reading"][kind] + value["integrating"][kind]) for kind in value["whole"]}
+    figures["ratio"] = {**ratio, "unit": "whole / (reading + integrating)"}
     figures["clouds"] = {"ours": float(clouds), "unit": ""}
     figures["keyframes"] = {"ours": float(keyframes), "unit": ""}
     parts = _parts(stats)
@@ -128,9 +132,19 @@ def profile_fuse(logs: Sequence[Path], settings: Settings, rounds: int = 3, func
     return figures, _busiest(stats, functions)
 
 
-def _integrating(session: SessionMap, settings: Settings) -> float:
-    """Seconds of Fuser.add for every keyframe once, a new map every submap length of road."""
-    length, seconds = settings.fusion.submap_length or 100.0, 0.0
+def _clocks() -> tuple[float, float]:
+    return time.perf_counter(), time.process_time()
+
+
+def _since(start: tuple[float, float]) -> tuple[float, float]:
+    """Seconds of the wall clock and of the processor."""
+    wall, processor = _clocks()
+    return wall - start[0], processor - start[1]
+
+
+def _integrating(session: SessionMap, settings: Settings) -> tuple[float, float]:
+    """Seconds (wall clock, processor) of Fuser.add for every keyframe once, a new map every submap length of road."""
+    length, taken = settings.fusion.submap_length or 100.0, np.zeros(2)
     begun = np.floor(np.asarray(session.frames["distance"].to_numpy()) / length)
     fuser = Fuser(settings.fusion)
     for k, pose in enumerate(session.map_T_base):
@@ -139,10 +153,10 @@ def _integrating(session: SessionMap, settings: Settings) -> float:
         frame = read_keyframe(session.folder.keyframes, k)
         origin = np.array([session.frames[f"origin_{c}"][k].as_py() for c in "xyz"])
         points = apply(pose, frame.points)
-        start = time.perf_counter()
-        fuser.add(points, frame.label, apply(pose, origin[None])[0])
-        seconds += time.perf_counter() - start
-    return seconds
+        start = _clocks()
+        fuser.add(points, frame.label, apply(pose, origin[None])[0], frame.sigma)
+        taken += _since(start)
+    return float(taken[0]), float(taken[1])
 
 
 def _stats(profiler: cProfile.Profile) -> dict[tuple[str, int, str], tuple[int, int, float, float, object]]:
