@@ -21,6 +21,8 @@ from semloc_logs.geometry import rotation_angle, rotation_between
 PINHOLE = ("plumb_bob", "rational_polynomial", "thin_prism", "")
 FISHEYE = ("equidistant", "kannala_brandt", "fisheye")
 _SHORTEST_BASELINE = 1e-3  # m; below, the two frames are one
+SMALLEST = 32  # px, sides of a picture
+_LARGEST_NUMBER = 1e6  # in K (px), D and P
 _WIDEST_ANGLE = np.deg2rad(40.0)  # between the optical axes, or the baseline and the rows: more is no stereo pair
 _WIDER = 0.6  # of the focal length, at least: rectified pictures see more than the middle, at the cost of resolution there
 _SAME = 0.02  # focal lengths of rectified pictures differ by no more than this share
@@ -53,12 +55,15 @@ def rectification(left: Camera, right: Camera, shape: tuple[int, int], right_T_l
     ``right_T_left`` (4, 4) between the optical frames, None where nothing says it. LogError where the calibrations do not allow it.
     """
     names = f"{left.header.topic}, {right.header.topic}"
+    if min(shape) < SMALLEST:
+        raise LogError(f"The pictures of {names} have {shape[1]} x {shape[0]} pixels: too few to be matched.")
     for camera in (left, right):
         if camera.width and camera.height and (camera.height, camera.width) != shape:
             raise LogError(
                 f"CameraInfo {camera.header.topic} is for {camera.width} x {camera.height} pixels but the picture has "
                 f"{shape[1]} x {shape[0]}: record the CameraInfo of the picture, or name it with --topic camera_info=TOPIC."
             )
+    _check_numbers(left, right, names)
     if right_T_left is not None and np.linalg.norm(right_T_left[:3, 3]) < _SHORTEST_BASELINE:
         right_T_left = None  # the frame ids of both pictures are the same, as stereo_image_proc wants them
     if rectified:
@@ -87,6 +92,15 @@ def bouguet_rotations(right_T_left: F64) -> tuple[F64, F64]:
     axis = -(half.inv().as_matrix() @ right_T_left[:3, 3])
     rect_R_half = rotation_between(axis, np.array([1.0, 0.0, 0.0]))
     return rect_R_half @ half.as_matrix(), rect_R_half @ half.inv().as_matrix()
+
+
+def _check_numbers(left: Camera, right: Camera, names: str) -> None:
+    """OpenCV computes with anything; what follows from numbers that no lens has would be garbage, or a crash."""
+    for camera in (left, right):
+        numbers = np.concatenate([camera.K.ravel(), camera.P.ravel(), np.ravel(camera.D)])
+        is_rotation = np.allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-2) and np.linalg.det(camera.R) > 0
+        if not is_rotation or not np.isfinite(numbers).all() or np.abs(numbers).max() > _LARGEST_NUMBER:
+            raise LogError(f"The calibrations of {names} make no sense; name others with --topic camera_info=TOPIC,TOPIC.")
 
 
 def _check_angles(right_T_left: F64, names: str) -> None:

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.errors import LogError
 from semloc_logs.frames import F32
-from semloc_logs.logs.rectification import Rectification
+from semloc_logs.logs.rectification import SMALLEST, Rectification
 
 DISPARITY_NOISE = 0.2  # px of the matched pictures, where texture is plenty: interpolation, pixel locking, calibration
 LARGEST_SHARE = 0.15  # of the range; beyond that sigma, 1 / disparity is no longer linear enough to speak of one
@@ -49,7 +50,7 @@ class StereoMatcher:
     ``min_range`` and ``max_range`` (m, along the ray) bound the disparities that are searched. ``stride`` n shrinks the pictures n-fold
     before they are matched; None: they are matched as they are up to half a million pixels and shrunk until they have so few, and above
     200,000 pixels every second pixel of every second row becomes a point. ``noise``: standard deviation of a disparity where texture is
-    plenty (px of the matched pictures).
+    plenty (px of the matched pictures). LogError where nothing within the ranges could be seen by both.
     """
 
     def __init__(
@@ -59,12 +60,17 @@ class StereoMatcher:
         self._min_range, self._max_range = min_range, max_range
         height, width = how.pixels.shape
         shrink = stride or math.ceil(math.sqrt(height * width / MOST_PIXELS))
-        self.shrink = max(1, min(shrink, height // 16, width // 16))
+        self.shrink = max(1, min(shrink, height // SMALLEST, width // SMALLEST))
         self.width, self.height = width // self.shrink, height // self.shrink
         self.step = 2 if stride is None and self.width * self.height > DENSE_PIXELS else 1
         self._scale = width / self.width  # recorded pixels in a matched one; more than shrink by less than one pixel in all
         self._fb, self._offset = how.focal * how.baseline / self._scale, how.offset / self._scale
         self.least, self.count = self._disparities()
+        if abs(self.least) + self.count >= self.width:
+            raise LogError(
+                f"The calibrations of the stereo pair put all within {max_range:g} m at disparities of {self.least} pixels and more, "
+                f"too many for pictures {self.width} pixels wide; name others with --topic camera_info=TOPIC,TOPIC."
+            )
         self._matcher = _matcher(self.least, self.count)
         self._back_least = math.floor(self.least / 2)
         self._back_matcher = _matcher(self._back_least, max(16, 16 * math.ceil((self.count + 2) / 32)))

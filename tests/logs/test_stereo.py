@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -269,3 +271,33 @@ def test_what_is_no_stereo_pair_is_said_in_a_sentence() -> None:
     refused(None, "are not those of one rectified pair", rectified=True, right=other)
     far_off = np.array([[210.0, 0, 1e5], [0, 210, 120], [0, 0, 1]])
     refused(ahead, "Nothing of the pictures is left", right=camera("plumb_bob", 1, K=far_off))
+    refused(ahead, "calibrations of .* make no sense", right=camera("plumb_bob", 1, K=far_off * 100))
+    refused(ahead, "calibrations of .* make no sense", right=camera("plumb_bob", 1, R=np.diag([1.0, 1.0, -1.0])))
+    with pytest.raises(LogError, match="320 x 20 pixels: too few"):
+        rectification(replace(camera(), height=20), replace(camera(), height=20), (20, WIDTH), ahead, rectified=False)
+    with pytest.raises(LogError, match="disparities of 399 pixels and more, too many for pictures 320 pixels wide"):
+        StereoMatcher(_unturned(240, 320, 1000.0, 4.0), min_range=0.3, max_range=10.0)
+
+
+def test_numbers_at_random_give_a_sentence_or_points() -> None:
+    """OpenCV crashes on some of what a damaged calibration may hold."""
+    rng = np.random.default_rng(5)
+    outcomes = set()
+    for _ in range(150):
+        width, height = (int(n) for n in rng.choice([1, 31, 32, 50, 130], 2, p=[0.1, 0.1, 0.2, 0.3, 0.3]))
+        infos = []
+        for side in (0, 1):
+            K = np.array([[40.0, 0, width / 2], [0, 40, height / 2], [0, 0, 1]]) + (rng.random() < 0.3) * rng.normal(size=(3, 3)) * 30
+            D = rng.normal(size=int(rng.choice([0, 4, 5, 8, 14]))) * 10.0 ** rng.choice([-2, 0, 3])
+            P = np.hstack([K, np.array([[-8.0 * side], [0.0], [0.0]])]) * 10.0 ** rng.choice([0, 0, 0, 9])
+            model = str(rng.choice(list(MODELS)))
+            infos.append(Camera(Header(f"/{side}", 0, 0, ""), 0, 0, K, D, np.eye(3), P, model))
+        transform = exp_se3(np.array([-0.2, 0, 0]) + rng.normal(size=3) * 0.05, rng.normal(size=3) * rng.choice([0, 0.1]))
+        try:
+            how = rectification(infos[0], infos[1], (height, width), transform, rectified=bool(rng.integers(2)))
+            pictures = rng.integers(0, 255, (2, height, width)).astype(np.uint8)
+            StereoMatcher(how, min_range=0.0, max_range=10.0).points(pictures[0], pictures[1])
+            outcomes.add("points")
+        except LogError:
+            outcomes.add("sentence")
+    assert outcomes == {"points", "sentence"}

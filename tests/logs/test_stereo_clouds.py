@@ -18,6 +18,7 @@ from semloc_logs.logs.rectification import Rectification, rectification
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session import open_session
 from semloc_logs.logs.stereo_clouds import StereoClouds, _grey
+from semloc_logs.logs.tally import Tally
 from semloc_logs.voxels.fusing import _Normals
 from semloc_logs.voxels.gravity import find_up
 from semloc_logs.voxels.selection import thin
@@ -114,6 +115,11 @@ def test_why_a_pair_gives_nothing(right: ImageFrame, cameras: list[Camera], reas
     stereo.take_right(right)
     assert stereo.points(picture(LEFT, 0), 0.3, 20.0) == reason
     assert len(stereo.lost) == (reason == "unusable pair")
+    tally = Tally()
+    tally.saw(LEFT, 0)
+    tally.leave_out(LEFT, reason)
+    [sentence] = tally.sentences((None, None))
+    assert sentence.startswith(f"{LEFT}: 1 of 1 frames are left out: ")
 
 
 def test_transforms_serve_where_the_infos_say_nothing() -> None:
