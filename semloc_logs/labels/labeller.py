@@ -13,9 +13,11 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import ImageFrame, PosedCloud
 from semloc_logs.labels.geometry import classify
 from semloc_logs.labels.model import Segmenter
+from semloc_logs.labels.painting import DOUBTFUL
 from semloc_logs.labels.pictures import CAMERA_SHIFT, Pictures
 from semloc_logs.labels.space import (
     SKY,
+    THINGS,
     U8,
     U32,
     UNLABELLED,
@@ -133,7 +135,7 @@ class Labeller:
             form = "painted" if ids is not None else ""
             if ids is not None and self.source != "onnx":
                 for number, name in enumerate(self.images):
-                    own = ids[(ids >> CAMERA_SHIFT == number) & (ids != UNPAINTED)] & _LOW
+                    own = ids[_of_camera(ids, number)] & np.uint32(_LOW)
                     self._topics.setdefault(name, _Topic()).see(own, self._topics.setdefault(name, _Topic()).is_coloured)
         self._keyframes.append((topic, form))
         return ids
@@ -171,9 +173,15 @@ class Labeller:
             return self._train_ids(topic, ids)
         out = np.full(len(ids), UNLABELLED, np.uint8)
         for number, name in enumerate(self.images):
-            own = (ids >> CAMERA_SHIFT == number) & (ids != UNPAINTED)
-            out[own] = (ids[own] & _LOW).astype(np.uint8) if self.source == "onnx" else self._train_ids(name, ids[own] & _LOW)
+            own = _of_camera(ids, number)
+            out[own] = (
+                (ids[own] & np.uint32(_LOW)).astype(np.uint8)
+                if self.source == "onnx"
+                else self._train_ids(name, ids[own] & np.uint32(_LOW))
+            )
         out[out == SKY] = UNLABELLED  # what gave a return is no sky
+        # a car's class on what is seen through its windows; a road has no windows, and is always behind a nearer piece of itself
+        out[(ids & DOUBTFUL > 0) & np.isin(out, THINGS)] = UNLABELLED
         if self._settings.unseen == "geometry":
             unseen = ids == UNPAINTED
             out[unseen] = classify(points, origin, scale)[unseen]
@@ -225,6 +233,11 @@ class Labeller:
         for colour, count in strange.items():
             topic.strange[colour] = topic.strange.get(colour, 0) + count
         return out
+
+
+def _of_camera(ids: U32, number: int) -> NDArray[np.bool_]:
+    cameras = (ids & np.uint32(0xFFFFFFFF ^ DOUBTFUL)) >> np.uint32(CAMERA_SHIFT)
+    return np.asarray((cameras == number) & (ids != UNPAINTED))
 
 
 def _some(names: Any, most: int = 8) -> str:

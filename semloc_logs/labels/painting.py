@@ -4,6 +4,9 @@ A LIDAR beside a camera looks past the edges of near things at what is hidden fr
 gaps between the points of a near thing, a plain depth test lets the hidden points take the near thing's class. So the surfaces that the
 LIDAR saw are drawn into a depth image without gaps: in columns of equal azimuth, as seen from the LIDAR, each point is joined with the
 next one above it that continues the same surface, and this strip is as wide as a column. A point is hidden where a strip is much nearer.
+
+A LIDAR also looks through the windows of cars, and gets nothing back from black paint: there is no surface where the picture has one. A
+point that lies behind a near surface of the very label that it would get, and beside it by less than a thing's size, is marked DOUBTFUL.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from numpy.typing import NDArray
 from semloc_logs.frames import F32, F64
 from semloc_logs.labels.projection import Projector
 from semloc_logs.labels.space import UNPAINTED
+from semloc_logs.logs.sweeps import in_base
 
 COLUMN = np.radians(0.4)  # the azimuth step of spinning LIDARs is 0.1 to 0.4 degrees
 MOST_GAP = np.radians(2.5)  # between rings: 2 degrees with 16 of them
@@ -25,51 +29,51 @@ _LOOK_AHEAD = 12  # points of a column that are tried as the continuation of a s
 _CELL = np.radians(0.16)  # of the depth image
 _NEARER = 0.25  # what hides a point is nearer by so much (m),
 _NEARER_SHARE = 0.04  # and by this share of the distance
+DOUBTFUL = 1 << 31  # set in a label that may be that of something nearer
+_THING = 0.8  # m, half the size of what has windows
+_REACH = (np.radians(6.0), np.radians(3.0), np.radians(1.5))  # around a point, for near surfaces of which _THING is as large as that
+_BEHIND = 3.0  # m, so that the side of a truck is not behind its own rear
+_MOST_LABELS = 40  # of a picture that are looked at: more are noise
 
 U32 = NDArray[np.uint32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scan:
-    """All points of a cloud as one sensor saw them: ``points`` (n, 3) in the base frame, in order of column, then of elevation.
+class Viewpoint:
+    """Where points were measured from: ``origin`` (3,) of the sensor in their frame, and ``axis`` (3,), a unit vector, about which
+    its azimuth is counted."""
 
-    ``distance`` (n,) from the sensor in metres, ``column`` (n,) and ``elevation`` (n,) in radians about the sensor's axis.
-    """
+    origin: NDArray[np.floating]
+    axis: NDArray[np.floating]
 
-    points: F32
-    distance: F32
-    column: NDArray[np.int32]
-    elevation: F32
-
-
-def scan(points: F32, origin: NDArray[np.floating], axis: NDArray[np.floating]) -> Scan:
-    """``points`` (n, 3) as seen from ``origin`` (3,), by azimuth and elevation about the unit vector ``axis`` (3,)."""
-    rays = points - np.asarray(origin, np.float32)
-    side = np.cross(axis, (1.0, 0.0, 0.0) if abs(axis[0]) < 0.9 else (0.0, 1.0, 0.0))
-    side /= np.linalg.norm(side)
-    frame = np.stack([side, np.cross(axis, side), axis]).astype(np.float32)
-    x, y, z = np.einsum("ij,nj->in", frame, rays)
-    flat = np.hypot(x, y)
-    elevation = np.arctan2(z, flat)
-    column = np.floor(np.arctan2(y, x) / COLUMN).astype(np.int32)
-    order = np.lexsort((elevation, column))
-    return Scan(points[order], np.hypot(flat, z)[order], column[order], elevation[order])
+    def columns(self, points: F32) -> tuple[NDArray[np.int32], F32, F32]:
+        """Column of equal azimuth, elevation (rad) and distance (m) of ``points`` (n, 3), each (n,)."""
+        rays = points - np.asarray(self.origin, np.float32)
+        side = np.cross(self.axis, (1.0, 0.0, 0.0) if abs(self.axis[0]) < 0.9 else (0.0, 1.0, 0.0))
+        side /= np.linalg.norm(side)
+        x, y, z = np.einsum("ij,nj->in", np.stack([side, np.cross(self.axis, side), self.axis]).astype(np.float32), rays)
+        flat = np.hypot(x, y)
+        return np.floor(np.arctan2(y, x) / COLUMN).astype(np.int32), np.arctan2(z, flat), np.hypot(flat, z)
 
 
-def nearest_depth(seen: Scan, camera_T_base: F64, projector: Projector) -> tuple[F32, float]:
+def nearest_depth(points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, projector: Projector) -> tuple[F32, float]:
     """Depth (m along the optical axis) of the nearest surface in each cell of the picture, infinite where there is none, and the edge
-    of a cell in pixels."""
+    of a cell in pixels.
+
+    ``camera`` and ``pixels`` are where all the ``points`` (n, 3) of a cloud lie in the camera's frame and in its picture.
+    """
     cell = max(1.0, float(round(projector.focal * _CELL)))
     shape = int(np.ceil(projector.height / cell)), int(np.ceil(projector.width / cell))
     depth = np.full(shape, np.inf, np.float32)
-    camera = seen.points @ camera_T_base[:3, :3].T.astype(np.float32) + camera_T_base[:3, 3].astype(np.float32)
-    pixels, front = projector.pixels(camera)
-    margin = 0.1 * max(projector.width, projector.height)
-    size = np.array([projector.width, projector.height])
-    near = front & ((pixels > -margin) & (pixels < size + margin)).all(1)
-    cells = (pixels[near] + 0.5) / cell
-    half = projector.focal / cell * (COLUMN / 2) * seen.distance[near] / camera[near, 2]
-    _draw(depth, cells, camera[near, 2].astype(float), seen.distance[near], seen.column[near], seen.elevation[near], half)
+    near = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    column, elevation, distance = viewpoint.columns(points[near])
+    order = np.lexsort((elevation, column))
+    near, column, elevation, distance = near[order], column[order], elevation[order], distance[order]
+    z = camera[near, 2].astype(float)
+    # off the axis a picture is stretched by the square of the ray's length over its depth
+    stretch = np.linalg.norm(camera[near], axis=1) / z
+    half = np.maximum(projector.focal / cell * (COLUMN / 2) * distance / z * stretch, 0.5)
+    _draw(depth, (pixels[near] + 0.5) / cell, z, distance, column, elevation, half)
     return depth, cell
 
 
@@ -114,25 +118,52 @@ def _row(depth, row, centre, half, z):  # type: ignore[no-untyped-def]
             depth[row, column] = z
 
 
-def paint(points: F32, seen: Scan, labels: U32, camera_T_base: F64, projector: Projector) -> tuple[U32, NDArray[np.bool_]]:
-    """Labels (n,) of ``points`` (n, 3) in the base frame from the picture ``labels`` (h, w), and which points are in the picture at all.
+def paint(
+    points: F32, wanted: NDArray[np.integer], viewpoint: Viewpoint, labels: U32, camera_T_base: F64, projector: Projector
+) -> tuple[U32, NDArray[np.bool_]]:
+    """Labels (m,) of ``points[wanted]`` in the base frame from the picture ``labels`` (h, w), and which points are in the picture at all.
 
-    UNPAINTED where the picture does not show the point: outside of it, or hidden by the surfaces of ``seen``, the whole cloud.
+    ``points`` (n, 3) are all that the sensor at ``viewpoint`` measured: they hide each other. UNPAINTED where the picture does not show
+    the point: outside of it, or hidden. DOUBTFUL is added to labels that may be those of something nearer.
     """
-    out = np.full(len(points), UNPAINTED, np.uint32)
-    camera = points @ camera_T_base[:3, :3].T.astype(np.float32) + camera_T_base[:3, 3].astype(np.float32)
+    out = np.full(len(wanted), UNPAINTED, np.uint32)
+    camera = in_base(camera_T_base, points)
     pixels, front = projector.pixels(camera)
-    inside = front & projector.inside(pixels)
-    if not inside.any():
-        return out, inside
-    depth, cell = nearest_depth(seen, camera_T_base, projector)
+    pixels[~(front & projector.near(pixels, 0.1))] = np.nan
+    depth, cell = nearest_depth(points, camera, pixels, viewpoint, projector)
+    camera, pixels = camera[wanted], pixels[wanted]
+    inside = projector.inside(pixels)
     column, row = np.floor((pixels[inside] + 0.5) / cell).astype(int).T
     z = camera[inside, 2]
     visible = depth[row, column] * (1 + _NEARER_SHARE) + _NEARER >= z
     at = np.flatnonzero(inside)[visible]
     u, v = np.rint(pixels[at]).astype(int).T
     out[at] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
+    known = at[out[at] != UNPAINTED]
+    column, row = np.floor((pixels[known] + 0.5) / cell).astype(int).T
+    doubtful = _behind_its_own(depth, cell, labels, out[known], row, column, camera[known, 2], projector.focal)
+    out[known[doubtful]] |= np.uint32(DOUBTFUL)
     return out, inside
+
+
+def _behind_its_own(
+    depth: F32, cell: float, labels: U32, own: U32, row: NDArray[np.intp], column: NDArray[np.intp], z: F32, focal: float
+) -> NDArray[np.bool_]:
+    """Which points (n,) with the labels ``own`` at cells (``row``, ``column``) have a much nearer surface of the same label beside them."""
+    out = np.zeros(len(own), bool)
+    half = int(cell) // 2
+    coarse = labels[half :: int(cell), half :: int(cell)]
+    coarse = np.pad(coarse, [(0, max(0, n - m)) for n, m in zip(depth.shape, coarse.shape, strict=True)], "edge")
+    values, counts = np.unique(own, return_counts=True)
+    for label in values[np.argsort(-counts, kind="stable")][:_MOST_LABELS]:
+        mine = np.flatnonzero(own == label)
+        surface = np.where(coarse[: depth.shape[0], : depth.shape[1]] == label, depth, np.float32(np.inf))
+        for reach in _REACH:
+            near = np.where(surface < _THING / np.tan(reach), surface, np.float32(1e9))
+            size = 2 * int(focal * reach / cell) + 1
+            around = cv2.erode(near, np.ones((size, size), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=1e9)
+            out[mine] |= np.asarray(around)[row[mine], column[mine]] * 1.1 + _BEHIND < z[mine]
+    return out
 
 
 def without_borders(labels: U32, width: int) -> U32:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Camera, ImageFrame, PosedCloud
 from semloc_logs.geometry import inverse
-from semloc_logs.labels.painting import U32, paint, scan, without_borders
+from semloc_logs.labels.painting import U32, Viewpoint, paint, without_borders
 from semloc_logs.labels.projection import Projector
 from semloc_logs.labels.space import UNPAINTED
 from semloc_logs.logs.session import Session
@@ -38,11 +38,13 @@ class _Camera:
 class Pictures:
     """Paints the pictures of ``topics`` onto clouds; ``label_of`` makes the labels (h, w) of a picture, at most 24 bits or UNPAINTED.
 
+    The number of the camera stands above them, and DOUBTFUL above that (labels/painting.py).
+
     ``erode``: pixels next to where two labels meet that do not count. ``notes`` are sentences about pictures that cannot be used.
     """
 
     def __init__(self, session: Session, topics: tuple[str, ...], label_of: Callable[[ImageFrame], U32], erode: int) -> None:
-        self.topics = topics[:255]
+        self.topics = topics[:127]
         self.notes: dict[str, None] = {}
         self.seen = self.painted = self.inside = 0  # points
         self._session, self._label_of, self._erode = session, label_of, erode
@@ -59,24 +61,23 @@ class Pictures:
 
     def labels(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> U32 | None:
         """Labels of ``cloud.points[keep]`` with the camera's number above them, UNPAINTED where no camera sees; None without a picture."""
-        out, inside, seen = np.full(len(keep), UNPAINTED, np.uint32), np.zeros(len(keep), bool), None
+        out, inside, viewpoint = np.full(len(keep), UNPAINTED, np.uint32), np.zeros(len(keep), bool), None
         for topic, camera in self._cameras.items():
             self._forget(camera, cloud.header.stamp_ns)
             found = self._picture(topic, camera, cloud)
             if found is None:
                 continue
             picture, camera_T_base, projector = found
-            if seen is None:
-                seen = scan(cloud.points, cloud.origin, self._axis(cloud))
+            viewpoint = viewpoint or Viewpoint(cloud.origin, self._axis(cloud))
             if camera.newest is None or camera.newest[0] != picture.header.stamp_ns:
                 camera.newest = picture.header.stamp_ns, without_borders(self._label_of(picture), self._erode)
                 camera.pictures += 1
             open_ = np.flatnonzero(out == UNPAINTED)
-            got, got_inside = paint(cloud.points[keep[open_]], seen, camera.newest[1], camera_T_base, projector)
+            got, got_inside = paint(cloud.points, keep[open_], viewpoint, camera.newest[1], camera_T_base, projector)
             out[open_] = np.where(got == UNPAINTED, np.uint32(UNPAINTED), got | np.uint32(camera.number << CAMERA_SHIFT))
             inside[open_] |= got_inside
             camera.points += int((got != UNPAINTED).sum())
-        if seen is None:
+        if viewpoint is None:
             return None
         self.seen += len(out)
         self.inside += int(inside.sum())

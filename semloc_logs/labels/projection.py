@@ -11,6 +11,7 @@ from semloc_logs.frames import F64, Camera
 
 _NEAREST = 0.1  # m along the optical axis: nearer points are not projected
 _STEEPEST = np.radians(85)
+_MARGIN = 1.25  # points so much further from the middle than the picture's corner still are projected
 
 
 class Projector:
@@ -45,49 +46,55 @@ class Projector:
                 f"{where} has the distortion model '{camera.model[:40]}' with {count} coefficients, which is not supported: "
                 f"record rectified pictures, or name another calibration with --topic camera_info=TOPIC."
             )
-        self._widest = _widest(self._distortion, self._fisheye)
+        corners = np.array([[u, v] for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)]) - matrix[:2, 2]
+        corner = float(np.hypot(corners[:, 0] / matrix[0, 0], corners[:, 1] / matrix[1, 1]).max())
+        self._widest = _widest(self._distortion, self._fisheye, _MARGIN * corner)
 
     def pixels(self, points: NDArray[np.floating]) -> tuple[F64, NDArray[np.bool_]]:
-        """Pixel coordinates (n, 2) of ``points`` (n, 3) and which of them the camera can see: in front, and within its field of view.
+        """Pixel coordinates (n, 2) of ``points`` (n, 3) and which of them are in front of the camera and near its field of view.
 
-        Pixels of points that cannot be seen mean nothing; they are outside of the picture too where it ends.
+        The others have no pixel coordinates (NaN).
         """
-        p = np.asarray(points, float) @ self._rotation.T
-        front = p[:, 2] > _NEAREST
-        x, y = np.where(front[:, None], p[:, :2] / np.where(front, p[:, 2], 1.0)[:, None], 0.0).T
+        p = points if np.array_equal(self._rotation, np.eye(3)) else points @ self._rotation.T
+        out, front = np.full((len(p), 2), np.nan), p[:, 2] > _NEAREST
         # a distortion polynomial turns back far outside of the picture and would fold the surroundings into it
-        front &= np.hypot(x, y) <= np.tan(self._widest)
-        x, y = np.where(front, x, 0.0), np.where(front, y, 0.0)
+        steepest = np.tan(self._widest)
+        front &= np.square(p[:, 0]) + np.square(p[:, 1]) <= np.square(p[:, 2] * steepest)
+        at = np.flatnonzero(front)
+        if not len(at):
+            return out, front
+        rays = np.asarray(p[at], float)
+        rays /= rays[:, 2:]
         if not np.any(self._distortion) and not self._fisheye:
-            pixels = np.stack([x, y, np.ones_like(x)], axis=1) @ self._matrix[:2].T
+            m = self._matrix
+            out[at, 0] = m[0, 0] * rays[:, 0] + m[0, 1] * rays[:, 1] + m[0, 2]
+            out[at, 1] = m[1, 1] * rays[:, 1] + m[1, 2]
         else:
             project = cv2.fisheye.projectPoints if self._fisheye else cv2.projectPoints
-            rays = np.stack([x, y, np.ones_like(x)], axis=1)[:, None]
-            pixels = np.zeros((0, 2))
-            if len(rays):
-                pixels = np.asarray(project(rays, np.zeros((1, 3)), np.zeros((1, 3)), self._matrix, self._distortion)[0], float)
-            pixels = pixels.reshape(-1, 2)
-        return pixels, front
+            found = project(rays[:, None], np.zeros((1, 3)), np.zeros((1, 3)), self._matrix, self._distortion)[0]
+            out[at] = np.asarray(found, float).reshape(-1, 2)
+        return out, front
 
     def inside(self, pixels: F64) -> NDArray[np.bool_]:
         """Which of ``pixels`` (n, 2) lie in the picture."""
-        bounds = np.array([self.width - 0.5, self.height - 0.5])
-        return np.asarray(((pixels >= -0.5) & (pixels < bounds)).all(1))
+        return self.near(pixels, 0.0)
+
+    def near(self, pixels: F64, margin: float) -> NDArray[np.bool_]:
+        """Which of ``pixels`` (n, 2) lie in the picture or beside it within this share of its size."""
+        u, v, x, y = pixels[:, 0], pixels[:, 1], margin * self.width, margin * self.height
+        return np.asarray((u >= -0.5 - x) & (u < self.width - 0.5 + x) & (v >= -0.5 - y) & (v < self.height - 0.5 + y))
 
 
-def _widest(distortion: F64, fisheye: bool) -> float:
-    """Angle from the optical axis (rad) up to which the distorted radius grows."""
-    if not np.any(distortion):
-        return float(_STEEPEST)
+def _widest(distortion: F64, fisheye: bool, corner: float) -> float:
+    """Angle from the optical axis (rad) up to which the distorted radius grows, and does not exceed ``corner`` (at focal length 1)."""
     angle = np.linspace(0, _STEEPEST, 2000)
+    k = np.zeros(14)
+    k[: len(distortion)] = distortion
     if fisheye:
-        k = distortion
         radius = angle * (1 + k[0] * angle**2 + k[1] * angle**4 + k[2] * angle**6 + k[3] * angle**8)
     else:
-        k = np.zeros(14)
-        k[: len(distortion)] = distortion
         r2 = np.tan(angle) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             radius = np.sqrt(r2) * (1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3) / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
-    falling = np.flatnonzero(~(np.diff(radius) > 0))
-    return float(angle[falling[0]] if len(falling) else _STEEPEST)
+    beyond = np.flatnonzero(~(np.diff(radius) > 0) | (radius[:-1] > corner))
+    return float(angle[beyond[0]] if len(beyond) else _STEEPEST)

@@ -21,6 +21,7 @@ UNPAINTED = 0xFFFFFFFF  # instead of an id: nothing was seen there
 SKY = 10
 ROAD, SIDEWALK, BUILDING, POLE, VEGETATION, TERRAIN = 0, 1, 2, 5, 8, 9
 GROUND = (ROAD, SIDEWALK, TERRAIN)
+THINGS = (POLE, 6, 7, *range(11, 19))  # poles, traffic lights and signs, people, vehicles: not larger than some metres
 _MOST_BYTES = 1 << 20  # of a label space's file
 _HIGHEST_ID = 0xFFFF
 
