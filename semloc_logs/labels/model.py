@@ -127,7 +127,7 @@ class Segmenter:
                     return np.where((ids < 0) | (ids >= classes), classes, ids).astype(np.intp)
                 raise SettingsError(f"Model {self._path} gives the class {strange}, but {self._space.name} ends at {classes - 1}.")
             return ids
-        if image.ndim != 3:
+        if image.ndim != 3 or (image.shape[0] == 1 and classes > 1):
             raise SettingsError(f"Model {self._path} gives {given} values, not classes x rows x columns: output.kind may be 'ids'.")
         axis = 0 if spec.layout == "CHW" else 2
         if image.shape[axis] != classes:

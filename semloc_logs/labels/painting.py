@@ -25,7 +25,9 @@ from semloc_logs.logs.sweeps import in_base
 
 COLUMN = np.radians(0.4)  # the azimuth step of spinning LIDARs is 0.1 to 0.4 degrees
 MOST_GAP = np.radians(2.5)  # between rings: 2 degrees with 16 of them
-_LOOK_AHEAD = 12  # points of a column that are tried as the continuation of a surface
+_ENDS, _STEPS = -1, -2
+_LEAST_GAP = np.radians(0.08)
+_LOOK_AHEAD = 16  # points of a column that are tried as the continuation of a surface
 _CELL = np.radians(0.16)  # of the depth image
 _NEARER = 0.25  # what hides a point is nearer by so much (m),
 _NEARER_SHARE = 0.04  # and by this share of the distance
@@ -81,39 +83,66 @@ def nearest_depth(points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, p
 def _draw(depth, cells, z, distance, column, elevation, half):  # type: ignore[no-untyped-def]
     n = len(z)
     for i in range(n):
-        _row(depth, int(np.floor(cells[i, 1])), cells[i, 0], half[i], z[i])
-        for j in range(i + 1, min(i + 1 + _LOOK_AHEAD, n)):
-            gap = elevation[j] - elevation[i]
-            if column[j] != column[i] or gap > MOST_GAP:
-                break
-            # a surface that is seen at less than 20 degrees falls apart into its points
-            if abs(distance[j] - distance[i]) > 0.1 + 2.75 * gap * min(distance[i], distance[j]):
-                continue
-            _strip(depth, cells[i], cells[j], z[i], z[j], half[i], half[j])
+        _line(depth, 1, int(np.floor(cells[i, 1])), cells[i, 0], half[i], z[i])
+        above = _continues(distance, column, elevation, i, 1)
+        below = _continues(distance, column, elevation, i, -1)
+        if above >= 0:
+            _strip(depth, cells[i], cells[above], z[i], z[above], half[i], half[above])
+        # a surface that ends before something far may reach as far as just before the next ring
+        if above == _ENDS and below >= 0:
+            _strip(depth, cells[i], 2 * cells[i] - cells[below], z[i], z[i], half[i], half[i])
+        if below == _ENDS and above >= 0:
+            _strip(depth, cells[i], 2 * cells[i] - cells[above], z[i], z[i], half[i], half[i])
+
+
+@njit(cache=True, nogil=True)
+def _continues(distance, column, elevation, i, step):  # type: ignore[no-untyped-def]
+    """The next point of another ring, upwards or downwards, that is on the same surface as point ``i``; _ENDS where the next ring sees
+    something much farther or nothing, and _STEPS where it sees something else."""
+    ends = _ENDS
+    for k in range(1, _LOOK_AHEAD + 1):
+        j = i + step * k
+        if j < 0 or j >= len(column) or column[j] != column[i]:
             break
+        gap = abs(elevation[j] - elevation[i])
+        if gap > MOST_GAP:
+            break
+        if gap < _LEAST_GAP:
+            continue
+        # a surface that is seen at less than 20 degrees falls apart into its points
+        if abs(distance[j] - distance[i]) < 0.1 + 2.75 * gap * min(distance[i], distance[j]):
+            return j
+        if distance[j] < 1.1 * distance[i] + 2.0:
+            ends = _STEPS
+    return ends
 
 
 @njit(cache=True, nogil=True)
 def _strip(depth, a, b, z_a, z_b, half_a, half_b):  # type: ignore[no-untyped-def]
-    """Joins two points: in each row of cells the farthest depth that the line has there, which is linear in 1 / z."""
-    first, last = int(np.floor(min(a[1], b[1]))), int(np.floor(max(a[1], b[1])))
+    """Joins two points: in each row of cells the farthest depth that the line has there, which is linear in 1 / z; in each column where
+    the line lies rather than stands."""
+    main = 1 if abs(b[1] - a[1]) >= abs(b[0] - a[0]) else 0
+    first, last = int(np.floor(min(a[main], b[main]))), int(np.floor(max(a[main], b[main])))
     if last == first:
         return
-    for row in range(max(first, 0), min(last, depth.shape[0] - 1) + 1):
-        middle = min(max((row + 0.5 - a[1]) / (b[1] - a[1]), 0.0), 1.0)
+    for line in range(max(first, 0), min(last, depth.shape[1 - main] - 1) + 1):
+        middle = min(max((line + 0.5 - a[main]) / (b[main] - a[main]), 0.0), 1.0)
         farthest = 0.0
-        for edge in (float(row), row + 1.0):
-            t = min(max((edge - a[1]) / (b[1] - a[1]), 0.0), 1.0)
+        for edge in (float(line), line + 1.0):
+            t = min(max((edge - a[main]) / (b[main] - a[main]), 0.0), 1.0)
             farthest = max(farthest, 1.0 / ((1 - t) / z_a + t / z_b))
-        _row(depth, row, a[0] + middle * (b[0] - a[0]), half_a + middle * (half_b - half_a), farthest)
+        centre = a[1 - main] + middle * (b[1 - main] - a[1 - main])
+        _line(depth, main, line, centre, half_a + middle * (half_b - half_a), farthest)
 
 
 @njit(cache=True, nogil=True)
-def _row(depth, row, centre, half, z):  # type: ignore[no-untyped-def]
-    if row < 0 or row >= depth.shape[0]:
+def _line(depth, main, line, centre, half, z):  # type: ignore[no-untyped-def]
+    """Cells of one row (``main`` 1) or column (0) around ``centre`` are no farther than ``z``."""
+    if line < 0 or line >= depth.shape[1 - main]:
         return
     first, last = int(np.floor(centre - half)), int(np.floor(centre + half))
-    for column in range(max(first, 0), min(last, depth.shape[1] - 1) + 1):
+    for across in range(max(first, 0), min(last, depth.shape[main] - 1) + 1):
+        row, column = (line, across) if main == 1 else (across, line)
         if z < depth[row, column]:
             depth[row, column] = z
 

@@ -1,11 +1,30 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import DTypeLike
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.labels.space import BUILDING, GROUND, POLE, SKY, UNLABELLED, VEGETATION, cityscapes, guess_space, spaces, to_cityscapes
+from semloc_logs.labels.space import (
+    BUILDING,
+    GROUND,
+    POLE,
+    SKY,
+    UNLABELLED,
+    UNPAINTED,
+    VEGETATION,
+    cityscapes,
+    guess_palette,
+    guess_space,
+    plain,
+    read_space,
+    space_of_names,
+    spaces,
+    to_cityscapes,
+    trains_by_name,
+)
 
 INTEGERS = [np.uint8, np.int16, np.uint32, np.int64]
 
@@ -64,3 +83,112 @@ def test_guessing_the_space(kind: DTypeLike) -> None:
         assert guess_space(np.array([10 + (1 << 16), 13], kind)) == "semantickitti"  # an instance in the upper half
     if np.iinfo(kind).max >= 255:
         assert guess_space(np.array([2, 255], kind)) == "cityscapes"
+
+
+@pytest.mark.parametrize("name", spaces())
+def test_every_shipped_space_is_sound(name: str) -> None:
+    space, own = read_space(name), cityscapes()
+    assert space.name == name
+    assert len(set(space.names.values())) == len(space.names) > 10
+    assert set(space.targets) == set(space.names)
+    assert set(space.targets.values()) <= {*range(19), UNLABELLED}
+    assert {i for i, t in space.targets.items() if t < 19 and own.dynamic[t]} <= space.dynamic
+    by_colour: dict[tuple[int, int, int], set[int]] = {}
+    for i, colour in space.colours.items():
+        by_colour.setdefault(colour, set()).add(space.targets[i])
+    assert all(len(targets) == 1 for targets in by_colour.values()), {c: t for c, t in by_colour.items() if len(t) > 1}
+    train_ids, strange = space.train_ids_of_colours(np.array([c[0] << 16 | c[1] << 8 | c[2] for c in space.colours.values()], np.uint32))
+    assert train_ids.tolist() == [space.targets[i] for i in space.colours]
+    assert not strange
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "known"),
+    [
+        ("cityscapes", 19, {0: ("road", 0), 13: ("car", 13), 18: ("bicycle", 18)}),
+        ("cityscapes_ids", 34, {0: ("unlabeled", 255), 7: ("road", 0), 23: ("sky", 10), 26: ("car", 13), 33: ("bicycle", 18)}),
+        ("kitti360", 45, {7: ("road", 0), 34: ("garage", 2), 37: ("smallpole", 5), 44: ("unknown object", 255)}),
+        ("semantickitti", 34, {10: ("car", 13), 40: ("road", 0), 81: ("traffic-sign", 7), 252: ("moving-car", 13)}),
+        ("mapillary", 66, {13: ("road", 0), 27: ("sky", 10), 45: ("pole", 5), 55: ("car", 13), 65: ("unlabeled", 255)}),
+        ("ade20k", 150, {0: ("wall", 3), 2: ("sky", 10), 6: ("road", 0), 20: ("car", 13), 127: ("bicycle", 18), 149: ("flag", 255)}),
+        ("nuscenes_lidarseg", 32, {17: ("vehicle.car", 13), 24: ("flat.driveable_surface", 0), 30: ("static.vegetation", 8)}),
+        ("nuscenes_challenge", 17, {4: ("car", 13), 11: ("driveable_surface", 0), 16: ("vegetation", 8)}),
+    ],
+)
+def test_well_known_classes(name: str, count: int, known: dict[int, tuple[str, int]]) -> None:
+    space = read_space(name)
+    assert len(space.names) == count
+    assert {i: (space.names[i], space.targets[i]) for i in known} == known
+
+
+def test_colours_that_the_palette_does_not_have_are_counted() -> None:
+    road, car, strange = (128 << 16 | 64 << 8 | 128), 142, 0x010203
+    found, unknown = read_space("cityscapes").train_ids_of_colours(np.array([[road, car, strange], [strange, 0, UNPAINTED]], np.uint32))
+    assert found.tolist() == [[0, 13, 255], [255, 255, 255]]
+    assert unknown == {strange: 2}
+
+
+def test_guessing_palettes_and_full_ids() -> None:
+    assert guess_palette({128 << 16 | 64 << 8 | 128: 5, 0: 100}) == "cityscapes"
+    assert guess_palette({0: 7}) is None
+    assert guess_palette({0x010203: 5}) is None
+    semantickitti = {c[0] << 16 | c[1] << 8 | c[2]: 1 for c in read_space("semantickitti").colours.values()}
+    assert guess_palette(semantickitti) == "semantickitti"
+    assert guess_space(np.array([7, 8, 11, 21, 22, 23, 26])) == "cityscapes_ids"
+    assert guess_space(np.array([0, 10, 30, 31])) == "semantickitti"
+
+
+def test_a_space_of_the_user(tmp_path: Path) -> None:
+    file = tmp_path / "ours.yaml"
+    file.write_text(
+        "classes:\n  1: {name: asphalt}\n  2: {name: truss, to: pole, colour: [1, 2, 3]}\n  3: gizmo\n  7: {name: deer, to: null, dynamic: true}\n"
+    )
+    space = read_space(str(file))
+    assert space.train_ids(np.array([0, 1, 2, 3, 7, 99])).tolist() == [255, 0, 5, 255, 255, 255]
+    assert space.colours == {2: (1, 2, 3)}
+    assert space.dynamic == {7}
+    assert space.unknown == ("gizmo",)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("classes: {1: {name: a, to: rod}}", "maps 1 to 'rod'"),
+        ("classes: {1: {name: a, to: 19}}", "maps 1 to '19'"),
+        ("classes: {1: {name: a, to: true}}", "maps 1 to 'True'"),
+        ("classes: {70000: {name: a}}", "the id 70000"),
+        ("classes: {-1: {name: a}}", "the id -1"),
+        ("classes: {1: {name: a, colour: [1, 2]}}", "gives 1 the colour"),
+        ("classes: {1: {name: a, colour: [1, 2, 256]}}", "gives 1 the colour"),
+        ("classes: [a, b]", "no 'classes'"),
+        ("classes: {a: {name: b}}", "no 'classes'"),
+        ("5", "no 'classes'"),
+        ("{", "cannot be read as YAML"),
+        ("[" * 5000, "cannot be read as YAML"),
+    ],
+)
+def test_a_space_that_makes_no_sense_is_refused(tmp_path: Path, text: str, match: str) -> None:
+    file = tmp_path / "odd.yaml"
+    file.write_text(text)
+    with pytest.raises(SettingsError, match=match):
+        read_space(str(file))
+    with pytest.raises(SettingsError, match="cannot be read"):
+        read_space(str(tmp_path / "none.yaml"))
+
+
+def test_classes_by_name() -> None:
+    names = [
+        "Road",
+        "traffic_light",
+        "Lane Marking - General",
+        "construction--flat--road",
+        "vehicle.car",
+        "BACKGROUND",
+        "unlabeled",
+        "frob",
+        "",
+    ]
+    space = space_of_names(dict(enumerate(names)), "/label_info")
+    assert [space.targets[i] for i in range(len(names))] == [0, 6, 0, 0, 13, 255, 255, 255, 255]
+    assert space.unknown == ("frob",)
+    assert {trains_by_name()[plain(n)] for n in cityscapes().names} == set(range(19))

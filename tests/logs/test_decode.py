@@ -15,9 +15,9 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from semloc_logs.frames import Camera, DepthFrame, ImageFrame, ImuSample, LidarFrame, NavSatSample, PoseSample, TransformSample
+from semloc_logs.frames import Camera, DepthFrame, ImageFrame, ImuSample, LabelNames, LidarFrame, NavSatSample, PoseSample, TransformSample
 from semloc_logs.logs.decode import Decoder
 from semloc_logs.logs.log import Definition, Message
 from semloc_logs.logs.problems import Problems
@@ -420,3 +420,28 @@ def test_impossible_times_are_named() -> None:
     frames, problems = json_frames("foxglove.LocationFix", {"timestamp": {"sec": 1 << 60, "nsec": 0}, "latitude": 1, "longitude": 2})
     assert frames == []
     assert "is impossible" in problems.sentences()[0]
+
+
+def test_what_labels_mean() -> None:
+    """A LabelInfo without a definition in the log, and the name of a label space."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("uint16 class_id\nstring class_name", "vision_msgs/msg/VisionClass"))
+    store.register(get_types_from_msg("std_msgs/Header header\nVisionClass[] class_map\nfloat32 threshold", "vision_msgs/msg/LabelInfo"))
+    types: Any = store.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=3, nanosec=4)
+    classes = [types["vision_msgs/msg/VisionClass"](class_id=i, class_name=n) for i, n in ((0, "road"), (7, "tree"))]
+    message = types["vision_msgs/msg/LabelInfo"](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="cam"), class_map=classes, threshold=0.5
+    )
+    problems = Problems()
+    data = bytes(store.serialize_cdr(message, "vision_msgs/msg/LabelInfo"))
+    (found,) = Decoder(problems).frames(Message("/label_info", "vision_msgs/msg/LabelInfo", "cdr", 1, data, NOTHING))
+    assert isinstance(found, LabelNames)
+    assert found.names == {0: "road", 7: "tree"}
+    assert found.header.stamp_ns == 3_000_000_004
+    text = bytes(store.serialize_cdr(types["std_msgs/msg/String"](data="semantickitti"), "std_msgs/msg/String"))
+    (found,) = Decoder(problems).frames(Message("/lidar/label_space", "std_msgs/msg/String", "cdr", 9, text, NOTHING))
+    assert isinstance(found, LabelNames)
+    assert found.space == "semantickitti"
+    assert Decoder(problems).frames(Message("/chatter", "std_msgs/msg/String", "cdr", 9, text, NOTHING)) == []
+    assert problems.sentences() == []
