@@ -24,10 +24,12 @@ Net = Callable[[NDArray[Any]], NDArray[Any]]  # a batch of one picture -> the ou
 
 def fingerprint(settings: Labels) -> str:
     """Hashes of the files that ``settings`` name: model, spec, label spaces; "" without any. SettingsError if one is missing."""
-    paths = [p for p in (settings.model, settings.spec) if p is not None] if settings.source == "onnx" else []
-    if settings.spec is not None and paths:
-        named = read_spec(settings.spec).space or ""
-        paths += [p for p in (settings.spec.parent / named, Path(named)) if named.endswith((".yaml", ".yml")) and p.is_file()]
+    paths = []
+    if settings.source == "onnx":
+        model, spec = _named(settings)
+        paths = [model, spec]
+        named = read_spec(spec).space or ""
+        paths += [p for p in (spec.parent / named, Path(named)) if named.endswith((".yaml", ".yml")) and p.is_file()]
     if settings.space is not None and settings.space.endswith((".yaml", ".yml")):
         read_space(settings.space)
         paths.append(Path(settings.space))
@@ -40,6 +42,12 @@ def _digest(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()[:16]
     except OSError as error:
         raise SettingsError(f"The file {path} cannot be read ({error.strerror or error}): name another.") from None
+
+
+def _named(settings: Labels) -> tuple[Path, Path]:
+    if settings.model is None or settings.spec is None:
+        raise SettingsError("labels.source=onnx needs a model and its spec: give --seg-model MODEL.onnx --seg-spec SPEC.yaml.")
+    return settings.model, settings.spec
 
 
 class Segmenter:
@@ -56,13 +64,12 @@ class Segmenter:
     @classmethod
     def open(cls, settings: Labels) -> Segmenter:
         """The model that ``labels.model`` and ``labels.spec`` name. SettingsError when one of them is missing or cannot be used."""
-        if settings.model is None or settings.spec is None:
-            raise SettingsError("labels.source=onnx needs a model and its spec: give --seg-model MODEL.onnx --seg-spec SPEC.yaml.")
-        spec = read_spec(settings.spec)
-        if not settings.model.is_file():
-            raise SettingsError(f"There is no model {settings.model}: --seg-model takes an ONNX file.")
-        net, runtime = _load(settings.model, spec, settings.threads)
-        return cls(net, runtime, spec, settings.spec, settings.model)
+        model_path, spec_path = _named(settings)
+        spec = read_spec(spec_path)
+        if not model_path.is_file():
+            raise SettingsError(f"There is no model {model_path}: --seg-model takes an ONNX file.")
+        net, runtime = _load(model_path, spec, settings.threads)
+        return cls(net, runtime, spec, spec_path, model_path)
 
     def to_json(self) -> dict[str, Any]:
         """For session.json."""

@@ -23,8 +23,15 @@ from semloc_logs.settings import Labels
 
 MS = 1_000_000
 ROAD, BUILDING, POLE, CAR = 0, 2, 5, 13
-TYPES = {LidarFrame: "sensor_msgs/msg/PointCloud2", ImageFrame: "sensor_msgs/msg/Image", Camera: "sensor_msgs/msg/CameraInfo",
-         TransformSample: "tf2_msgs/msg/TFMessage", LabelNames: "vision_msgs/msg/LabelInfo", PoseSample: "nav_msgs/msg/Odometry"}  # fmt: skip
+TYPES = {
+    LidarFrame: "sensor_msgs/msg/PointCloud2",
+    ImageFrame: "sensor_msgs/msg/Image",
+    Camera: "sensor_msgs/msg/CameraInfo",
+    TransformSample: "tf2_msgs/msg/TFMessage",
+    LabelNames: "vision_msgs/msg/LabelInfo",
+    PoseSample: "nav_msgs/msg/Odometry",
+}
+ORIGIN = np.zeros(3)
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 POINTS = np.array([[10.0, 2, 0], [10.0, -2, 0], [-10.0, 0, 0]], np.float32)  # left, right, behind
 
@@ -83,7 +90,7 @@ def classes(frames: Sequence[Frame], **settings: Any) -> tuple[list[list[int]], 
     taken = [(labeller.take(c, np.arange(len(c.points))), c.points) for c in session.clouds(labeller.on_image, labeller.images)]
     labeller.conclude()
     json.dumps(labeller.to_json())
-    return [labeller.labels(i, points, ids, 1.0).tolist() for i, (ids, points) in enumerate(taken)], labeller
+    return [labeller.labels(i, points, ORIGIN, ids, 1.0).tolist() for i, (ids, points) in enumerate(taken)], labeller
 
 
 def test_the_log_says_what_its_ids_mean() -> None:
@@ -124,7 +131,7 @@ def test_labels_that_are_all_zero_are_none() -> None:
 
 
 def test_label_images_are_painted_onto_the_lidar() -> None:
-    frames = [static(), camera(), halves(0, 5, 2), sweep(0), halves(100, 13, 13), sweep(100)]
+    frames: list[Frame] = [static(), camera(), halves(0, 5, 2), sweep(0), halves(100, 13, 13), sweep(100)]
     found, labeller = classes(frames)
     assert found == [[POLE, BUILDING, 255], [CAR, CAR, 255]]
     content = labeller.to_json()
@@ -151,17 +158,18 @@ def test_with_poses_the_motion_between_picture_and_cloud_is_taken_out() -> None:
     """The vehicle turns by 90 degrees a second; 200 ms later what was on the left lies straight ahead, 18 degrees further right."""
     poses = [PoseSample(header("/odom", ms, "odom"), "base_link", yaw_transform(np.radians(0.09 * ms))) for ms in range(0, 420, 10)]
     points = np.array([[10.0, 0.7, 0], [10.0, -0.7, 0]], np.float32)
-    frames = [static(), camera(), *poses, halves(0, 5, 2), halves(400, 5, 2), sweep(150, points=points)]
+    frames: list[Frame] = [static(), camera(), *poses, halves(0, 5, 2), halves(400, 5, 2), sweep(150, points=points)]
     found, _ = classes(frames)
     assert found == [[POLE, POLE]]  # at 13.5 degrees to the left in the first picture
     still = [PoseSample(header("/odom", ms, "odom"), "base_link", np.eye(4)) for ms in range(0, 420, 10)]
-    found, _ = classes([static(), camera(), *still, halves(0, 5, 2), halves(400, 5, 2), sweep(150, points=points)])
+    stood: list[Frame] = [static(), camera(), *still, halves(0, 5, 2), halves(400, 5, 2), sweep(150, points=points)]
+    found, _ = classes(stood)
     assert found == [[POLE, BUILDING]]
 
 
 def test_two_cameras() -> None:
     back = yaw_transform(np.pi) @ OPTICAL
-    frames = [static(), static("rear", back), camera(), camera("/rear/camera_info", "rear"), sweep(0)]
+    frames: list[Frame] = [static(), static("rear", back), camera(), camera("/rear/camera_info", "rear"), sweep(0)]
     frames += [halves(0, 5, 2), halves(0, 13, 13, "/rear/labels", "rear")]
     found, labeller = classes(frames)
     assert found == [[POLE, BUILDING, CAR]]
@@ -227,7 +235,7 @@ def test_a_real_drive_without_poses(shared: Path, tmp_path: Path) -> None:
     finally:
         session.close()
     labeller.conclude()
-    found = labeller.labels(0, cloud.points, ids, 1.0)
+    found = labeller.labels(0, cloud.points, ORIGIN, ids, 1.0)
     behind = cloud.points[:, 0] < 0
     assert (found[behind] == 255).all()
     assert set(np.unique(found)) == {BUILDING, CAR, 255}

@@ -142,7 +142,7 @@ def test_what_does_not_fit_is_said(tmp_path: Path, model: dict[str, Any], spec: 
 
 
 def test_files_that_are_missing_or_no_model(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="--seg-model MODEL.onnx --seg-spec"):
+    with pytest.raises(SettingsError, match="needs a model and its spec"):
         Segmenter.open(Labels(source="onnx"))
     opened(tmp_path)
     spec = tmp_path / "spec.yaml"

@@ -49,7 +49,7 @@ def test_a_distortion_that_turns_back_does_not_fold_the_surroundings_into_the_pi
     points = 10 * np.stack([np.sin(angle), np.zeros(100), np.cos(angle)], axis=1)
     projector = Projector(calibration, 480, 640)
     inside = projector.inside(projector.pixels(points)[0])
-    folded = cv2.projectPoints(points, np.zeros(3), np.zeros(3), calibration.K, calibration.D)[0][:, 0]
+    folded = np.asarray(cv2.projectPoints(points, np.zeros(3), np.zeros(3), calibration.K, calibration.D)[0], float)[:, 0]
     assert projector.inside(folded)[-25:].any()  # the polynomial alone does fold
     assert not inside[angle > np.radians(50)].any()
     assert inside[angle < np.radians(25)].all()
