@@ -245,7 +245,7 @@ def test_uncertain_ranges_count_less_and_leave_room_before_them() -> None:
     blocks = fuser.finish()
     assert blocks.dense(np.array([0, 0, 0]), (11, 1, 1))[:, 0, 0].tolist() == [FREE_STATE] * 6 + [UNOBSERVED_STATE] * 4 + [2]
     assert blocks.log_odds.max() == round(20 * f.hit / 4)
-    fuser.add(points + [0, 0, 0.1], np.array([8], np.uint8), origin)
+    fuser.add(points + np.array([0, 0, 0.1]), np.array([8], np.uint8), origin)
     blocks = fuser.finish()
     assert blocks.log_odds.max() == round(20 * f.hit / 4) + 17
     assert (blocks.dense(np.array([0, 0, 0]), (10, 1, 1)) == FREE_STATE).all()
