@@ -39,20 +39,27 @@ def addresses(blocks: tuple[int, int, int]) -> tuple[I64, I64, I64]:
 
 
 @njit(cache=True, nogil=True)
-def extent(points: F32, start: F64, per_metre: float, limit: float) -> tuple[F64, F64]:
-    """Lowest and highest coordinate (3,) in voxels that rays from ``start`` (3,) to finite ``points`` (n, 3) in metres reach; rays
-    longer than ``limit`` voxels are cut there. The start is within."""
+def to_rays(points: F32, pose: F64, start: F64, per_metre: float, limit: float) -> tuple[F64, F64, F64, F64]:
+    """Rays in voxels: (n, 3) from ``start`` (3,) to ``points`` (n, 3) metres that ``pose`` (4, 4) takes into the map, cut at ``limit``;
+    their full lengths (n,), nan where a point is not finite; lowest and highest coordinate (3,) that they reach, the start included."""
+    rays, length = np.empty((len(points), 3)), np.empty(len(points))
     low, high = start.copy(), start.copy()
     for i in range(len(points)):
-        dx, dy, dz = points[i, 0] * per_metre - start[0], points[i, 1] * per_metre - start[1], points[i, 2] * per_metre - start[2]
-        squared = dx * dx + dy * dy + dz * dz
-        if not np.isfinite(squared):
+        px, py, pz = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        dx = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) * per_metre - start[0]
+        dy = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) * per_metre - start[1]
+        dz = (pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]) * per_metre - start[2]
+        far = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if not np.isfinite(far):
+            length[i] = np.nan
             continue
-        scale = limit / np.sqrt(squared) if squared > limit * limit else 1.0
-        x, y, z = start[0] + dx * scale, start[1] + dy * scale, start[2] + dz * scale
-        low[0], low[1], low[2] = min(low[0], x), min(low[1], y), min(low[2], z)
-        high[0], high[1], high[2] = max(high[0], x), max(high[1], y), max(high[2], z)
-    return low, high
+        if far > limit:
+            scale = limit / far
+            dx, dy, dz = dx * scale, dy * scale, dz * scale
+        rays[i, 0], rays[i, 1], rays[i, 2], length[i] = dx, dy, dz, far
+        low[0], low[1], low[2] = min(low[0], start[0] + dx), min(low[1], start[1] + dy), min(low[2], start[2] + dz)
+        high[0], high[1], high[2] = max(high[0], start[0] + dx), max(high[1], start[1] + dy), max(high[2], start[2] + dz)
+    return rays, length, low, high
 
 
 @njit(cache=True, nogil=True)
@@ -70,24 +77,23 @@ def mark_ends(
     marks: U8,
     touched: U8,
     tables: tuple[I64, I64, I64],
-    points: F32,
+    rays: F64,
+    length: F64,
     label: U8,
     sigma: F32,
     start: F64,
-    low: I64,
-    per_metre: float,
     limit: float,
     voxel_votes: NDArray[np.uint32],
 ) -> tuple[I64, F64]:
-    """Mark the end voxels of all rays; returns 2 * address + is_hit (m,) and the rays' ends to carve to (m, 3) in voxels from ``low``.
+    """Mark the end voxels of all rays; returns 2 * address + is_hit (m,) and the ends to carve to (m, 3), one of each end voxel.
 
-    ``points`` (n, 3) in metres, ``label`` (n,), ``sigma`` (n,) in metres or (0,): a range of standard deviation sigma hits with the
-    weight min(1, voxel / 2 sigma), the share of its density that the end voxel holds at most, and carves up to 2 sigma before its
-    end. ``start`` (3,) in voxels from ``low`` (3,), ``limit`` in voxels: longer rays carve and do not hit. ``voxel_votes`` (n, 20)
-    zeros: gets the weights of each class in sixteenths, a row a ray.
+    ``rays`` (n, 3) and ``length`` (n,) as :func:`to_rays` gives them, from ``start`` (3,) in the grid, all in voxels; those longer than
+    ``limit`` do not hit. ``label`` (n,); ``sigma`` (n,) in voxels or (0,): a range of standard deviation sigma hits with the weight
+    min(1, 1 / 2 sigma), the share of its density that the end voxel holds at most, and carves up to 2 sigma before its end.
+    ``voxel_votes`` (n, 20) zeros: gets the weights of each class in sixteenths, a row a ray.
     """
     ax, ay, az = tables
-    n = len(points)
+    n = len(rays)
     size = 1024
     while size < 2 * n:
         size *= 2
@@ -96,21 +102,15 @@ def mark_ends(
     ends = np.empty((n, 3))
     count, last, row = 0, -1, -1
     for i in range(n):
-        dx = points[i, 0] * per_metre - low[0] - start[0]
-        dy = points[i, 1] * per_metre - low[1] - start[1]
-        dz = points[i, 2] * per_metre - low[2] - start[2]
-        squared = dx * dx + dy * dy + dz * dz
-        if not np.isfinite(squared):
+        if np.isnan(length[i]):
             continue
-        is_hit = squared <= limit * limit
+        dx, dy, dz = rays[i, 0], rays[i, 1], rays[i, 2]
+        is_hit = length[i] <= limit
         weight, carved = FULL_WEIGHT, 1.0
-        if not is_hit:
-            scale = limit / np.sqrt(squared)
-            dx, dy, dz = dx * scale, dy * scale, dz * scale
-        elif len(sigma) and sigma[i] > 0:
-            spread = 2 * sigma[i] * per_metre
-            weight = max(1, min(FULL_WEIGHT, int(FULL_WEIGHT / spread)) if spread > 1 else FULL_WEIGHT)
-            carved = max(0.0, 1.0 - spread / max(np.sqrt(squared), 1e-9)) if spread > 1 else 1.0
+        if is_hit and len(sigma) and sigma[i] > 0.5:
+            spread = 2 * sigma[i]
+            weight = max(1, int(FULL_WEIGHT / spread))
+            carved = max(0.0, 1.0 - spread / max(length[i], 1e-9))
         x, y, z = start[0] + dx, start[1] + dy, start[2] + dz
         address = ax[int(x)] + ay[int(y)] + az[int(z)]
         # one ray for a hit and one for a pass that end in the same voxel: they differ in what they carve

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.settings import Fusion
-from semloc_logs.voxels.carve import BITS, CLASSES, add_votes, addresses, carve, extent, flush, mark_ends, rehash
+from semloc_logs.voxels.carve import BITS, CLASSES, add_votes, addresses, carve, flush, mark_ends, rehash, to_rays
 from semloc_logs.voxels.keys import BLOCK, pack, unpack
 
 UNLABELLED = 255  # occupied, class unknown
@@ -85,20 +85,28 @@ class Fuser:
     _votes: int = 0
     _marks: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
 
-    def add(self, points: NDArray[np.floating], label: U8, origin: NDArray[np.floating], sigma: NDArray[np.floating] | None = None) -> None:
-        """Integrate ``points`` (n, 3) in the map frame seen from ``origin`` (3,), with classes ``label`` (n,) (255 unknown).
+    def add(
+        self,
+        points: NDArray[np.floating],
+        label: U8,
+        origin: NDArray[np.floating],
+        sigma: NDArray[np.floating] | None = None,
+        map_T_points: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Integrate ``points`` (n, 3) with classes ``label`` (n,) (255 unknown), seen from ``origin`` (3,); both are in the map frame
+        unless ``map_T_points`` (4, 4) takes them there.
 
         Points beyond the maximum range carve and do not hit; points that are not finite are left out. ``sigma`` (n,) is the standard
         deviation of the range in metres: uncertain points count less.
         """
         if self.fusion.max_range is None:
             raise ValueError("fusion settings must be resolved")
-        points = np.ascontiguousarray(points)
         per_metre, limit = 1.0 / self.fusion.voxel_size, self.fusion.max_range / self.fusion.voxel_size
-        start = np.asarray(origin, float) * per_metre
+        pose = np.eye(4) if map_T_points is None else np.ascontiguousarray(map_T_points, np.float64)
+        start = (pose[:3, :3] @ np.asarray(origin, float) + pose[:3, 3]) * per_metre
         if not np.isfinite(start).all():
             return
-        lowest, highest = extent(points, start, per_metre, limit)
+        rays, length, lowest, highest = to_rays(np.ascontiguousarray(points), pose, start, per_metre, limit)
         # a thousandth of a voxel to spare, as positions from the corner are rounded once more
         low = np.floor((lowest - 1e-3) / BLOCK).astype(np.int64) * BLOCK
         blocks: tuple[int, int, int] = tuple((np.floor((highest + 1e-3 - low) / BLOCK).astype(np.int64) + 1).tolist())
@@ -107,9 +115,9 @@ class Fuser:
             self._marks = np.zeros(count << BITS, np.uint8)
         tables, touched = addresses(blocks), np.zeros(count, np.uint8)
         votes = np.zeros((len(points), CLASSES), np.uint32)
-        spread = np.zeros(0, np.float32) if sigma is None else np.asarray(sigma, np.float32)
-        ends, rays = mark_ends(self._marks, touched, tables, points, label, spread, start - low, low, per_metre, limit, votes)
-        carve(self._marks, touched, tables, start - low, rays)
+        spread = np.zeros(0, np.float32) if sigma is None else np.asarray(sigma * per_metre, np.float32)
+        ends, carved = mark_ends(self._marks, touched, tables, rays, length, label, spread, start - low, limit, votes)
+        carve(self._marks, touched, tables, start - low, carved)
         found = np.flatnonzero(touched)
         slots = self._slots_of(np.stack(np.unravel_index(found, blocks), 1) + low // BLOCK)
         f = self.fusion

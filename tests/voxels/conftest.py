@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.voxels.carve import CLASSES, addresses, carve, mark_ends
+from semloc_logs.voxels.carve import CLASSES, addresses, carve, mark_ends, to_rays
 from semloc_logs.voxels.keys import BLOCK
 
 Walk = Callable[..., NDArray[np.uint8]]
@@ -24,14 +24,16 @@ def walk_rays(
     room = np.zeros(count + 2 * guard, np.uint8)
     marks, touched = room[guard : guard + count], np.zeros(count >> 12, np.uint8)
     tables = addresses(blocks)
-    corner, nothing = np.zeros(3, np.int64), np.zeros(0, np.float32)
+    nothing = np.zeros(0, np.float32)
     for end, is_hit in zip(ends, hit, strict=True):
         # a limit of almost the length makes it a ray that ends at its end and does not hit
-        length = float(np.linalg.norm(end - origin))
-        limit = 1e9 if is_hit else length * (1 - 1e-15)
-        votes = np.zeros((1, CLASSES), np.uint32)
-        _, rays = mark_ends(marks, touched, tables, end[None], np.zeros(1, np.uint8), nothing, origin, corner, 1.0, limit, votes)
-        carve(marks, touched, tables, origin, rays)
+        limit = 1e9 if is_hit else float(np.linalg.norm(end - origin)) * (1 - 1e-15)
+        votes, label = np.zeros((1, CLASSES), np.uint32), np.zeros(1, np.uint8)
+        rays, length, low, high = to_rays(end[None], np.eye(4), origin, 1.0, limit)
+        assert (low <= np.minimum(origin, origin + rays[0])).all()
+        assert (high >= np.maximum(origin, origin + rays[0])).all()
+        _, carved = mark_ends(marks, touched, tables, rays, length, label, nothing, origin, limit, votes)
+        carve(marks, touched, tables, origin, carved)
     assert not room[:guard].any()
     assert not room[guard + count :].any()
     dense = marks.reshape(*blocks, BLOCK, BLOCK, BLOCK).transpose(0, 3, 1, 4, 2, 5).reshape(np.array(blocks) * BLOCK)

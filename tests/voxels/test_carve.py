@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.voxels.carve import CLASSES, add_votes, addresses, flush, mark_ends, rehash
+from semloc_logs.voxels.carve import CLASSES, add_votes, addresses, flush, mark_ends, rehash, to_rays
 
 EDGE = 16
 FREE, HIT = 1, 2
@@ -131,9 +131,9 @@ def test_addresses_are_block_by_block() -> None:
 )
 def test_an_uncertain_range_hits_less_and_carves_less(sigma: float, weight: int, carved_to: float) -> None:
     marks, touched, votes = np.zeros(4096, np.uint8), np.zeros(1, np.uint8), np.zeros((1, CLASSES), np.uint32)
-    start, corner = np.full(3, 0.5), np.zeros(3, np.int64)
-    point, label, spread = np.array([[10.5, 0.5, 0.5]]), np.array([8], np.uint8), np.array([sigma], np.float32)
-    ends, rays = mark_ends(marks, touched, addresses((1, 1, 1)), point, label, spread, start, corner, 1.0, 50.0, votes)
+    start, label, spread = np.full(3, 0.5), np.array([8], np.uint8), np.array([sigma], np.float32)
+    ray, length, _, _ = to_rays(np.array([[10.5, 0.5, 0.5]]), np.eye(4), start, 1.0, 50.0)
+    ends, rays = mark_ends(marks, touched, addresses((1, 1, 1)), ray, length, label, spread, start, 50.0, votes)
     assert ends.tolist() == [2 * 2560 + 1]  # voxel (10, 0, 0), a hit
     assert marks[2560] == weight << 1
     assert votes[0, 8] == weight

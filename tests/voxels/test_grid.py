@@ -249,3 +249,13 @@ def test_uncertain_ranges_count_less_and_leave_room_before_them() -> None:
     blocks = fuser.finish()
     assert blocks.log_odds.max() == round(20 * f.hit / 4) + 17
     assert (blocks.dense(np.array([0, 0, 0]), (10, 1, 1)) == FREE_STATE).all()
+
+
+def test_a_pose_takes_the_points_into_the_map() -> None:
+    points, label, origin = random_frames(3, count=1)[0]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [7.125, -3.5, 0.25]
+    moved, there = Fuser(fusion()), points @ pose[:3, :3].T + pose[:3, 3]
+    moved.add(points, label, origin, map_T_points=pose)
+    at = pose[:3, :3] @ origin + pose[:3, 3]
+    assert as_dictionary(moved.finish()) == as_dictionary(fused([(there, label, at)], fusion()))
