@@ -1,0 +1,64 @@
+"""Work ahead of its use: an iterator that runs in a thread of its own, a few items before they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from queue import Empty, Full, Queue
+from threading import Event, Thread
+from typing import TypeVar
+
+T = TypeVar("T")
+_END = object()
+
+
+def ahead(items: Iterable[T], depth: int = 2) -> Iterator[T]:
+    """``items`` in their order, made in another thread while the caller works on the earlier ones; at most ``depth`` wait.
+
+    Reading, decompressing and the compiled loops leave the interpreter free, so two cores are used. What ``items`` raises is raised
+    here; an iterator that is left early stops the other thread before it returns.
+    """
+    queue: Queue[object] = Queue(depth)
+    left = Event()
+    failure: list[BaseException] = []
+
+    def put(item: object) -> None:
+        while not left.is_set():
+            try:
+                queue.put(item, timeout=0.1)
+                return
+            except Full:
+                continue
+
+    def work() -> None:
+        try:
+            iterator = iter(items)
+            try:
+                for item in iterator:
+                    put(item)
+                    if left.is_set():
+                        return
+            finally:
+                close = getattr(iterator, "close", None)
+                if close is not None:
+                    close()
+        except BaseException as problem:  # whatever it is, the caller has to see it
+            failure.append(problem)
+        finally:
+            put(_END)
+
+    thread = Thread(target=work, name="semloc-ahead", daemon=True)
+    thread.start()
+    try:
+        while True:
+            try:
+                item = queue.get(timeout=1.0)
+            except Empty:
+                continue  # lets Ctrl-C through while the other thread is slow
+            if item is _END:
+                break
+            yield item  # type: ignore[misc]
+    finally:
+        left.set()
+        thread.join()
+    if failure:
+        raise failure[0]

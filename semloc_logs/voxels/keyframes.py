@@ -1,0 +1,103 @@
+"""The pass over a log: which clouds become keyframes, thinned and kept on disk until gravity and the meaning of labels are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.frames import Header
+from semloc_logs.labels.labeller import Labeller
+from semloc_logs.labels.shape import shape
+from semloc_logs.logs.session import Session
+from semloc_logs.settings import Fusion
+from semloc_logs.voxels.ahead import ahead
+from semloc_logs.voxels.selection import KeyframeSelector, thin
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+MOST_NORMALS = 40  # keyframes whose normals say where up is
+
+
+@dataclass(slots=True, eq=False)
+class Collected:
+    """Keyframe by keyframe: ``header``, ``session_T_base`` (4, 4) or None, ``origin`` (3,) of the sensor in the base frame; their points,
+    and of some of them ``normals``: (keyframe, unit vectors (m, 3) in the session frame, or the base frame without poses, weights)."""
+
+    scratch: Path
+    headers: list[Header] = field(default_factory=list)
+    poses: list[F64 | None] = field(default_factory=list)
+    origins: list[F32] = field(default_factory=list)
+    normals: list[tuple[int, F64, F64]] = field(default_factory=list)
+    _every: int = 1  # keyframes with normals are this far apart
+
+    def __len__(self) -> int:
+        return len(self.headers)
+
+    def load(self, keyframe: int) -> tuple[F32, NDArray[np.uint32] | None, F32 | None]:
+        """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of their range, where there are any."""
+        return _load(self.scratch, keyframe, ""), _load(self.scratch, keyframe, "-label"), _load(self.scratch, keyframe, "-sigma")
+
+    def add(self, raw: _Raw, cell: float) -> None:
+        """The next keyframe; its points are in the scratch folder already."""
+        number = len(self)
+        self.headers.append(raw.header)
+        self.poses.append(raw.session_T_base)
+        self.origins.append(raw.origin)
+        if number % self._every == 0:
+            some = raw.points[thin(raw.points, cell)][:12_000]
+            s = shape(some, 12)
+            weight = np.where((s.planar > 0.5) & (s.scattered < 0.15), s.planar, 0.0).astype(float)
+            keep = weight > 0
+            normals = s.normal[keep].astype(float)
+            turned = normals if raw.session_T_base is None else normals @ raw.session_T_base[:3, :3].T
+            self.normals.append((number, turned, weight[keep]))
+            if len(self.normals) > MOST_NORMALS:
+                self._every *= 2
+                self.normals = [k for k in self.normals if k[0] % self._every == 0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Raw:
+    header: Header
+    session_T_base: F64 | None
+    origin: F32
+    points: F32
+
+
+def collect(session: Session, labeller: Labeller, fusion: Fusion, scratch: Path, on_progress: Callable[[str], None]) -> Collected:
+    """Read the log once: thinned points of its keyframes go to files of ``scratch``, what is small stays in memory."""
+    cell = fusion.keyframe_resolution or 0.1
+    collected = Collected(scratch)
+    for raw in ahead(_keyframes(session, labeller, KeyframeSelector(fusion), cell, scratch)):
+        collected.add(raw, 2 * cell)
+        if len(collected) % 50 == 0:
+            on_progress(f"read {len(collected)} keyframes")
+    return collected
+
+
+def _keyframes(session: Session, labeller: Labeller, selector: KeyframeSelector, cell: float, scratch: Path) -> Iterator[_Raw]:
+    number = 0
+    for cloud in session.clouds(labeller.on_image, labeller.images):
+        if not selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
+            continue
+        keep = thin(cloud.points, cell)
+        points = cloud.points[keep]
+        _save(scratch, number, "", points)
+        _save(scratch, number, "-label", labeller.take(cloud, keep))
+        _save(scratch, number, "-sigma", None if cloud.sigma is None else cloud.sigma[keep])
+        yield _Raw(cloud.header, cloud.session_T_base, cloud.origin, points)
+        number += 1
+
+
+def _save(scratch: Path, keyframe: int, what: str, values: NDArray[np.generic] | None) -> None:
+    if values is not None:
+        np.save(scratch / f"{keyframe}{what}.npy", values, allow_pickle=False)
+
+
+def _load(scratch: Path, keyframe: int, what: str) -> NDArray[np.generic] | None:
+    path = scratch / f"{keyframe}{what}.npy"
+    return np.load(path, allow_pickle=False) if path.exists() else None
