@@ -20,7 +20,7 @@ from semloc_logs.settings import Settings, load
 from semloc_logs.subvolumes.own_sessions import session_frames, stretch_tasks
 from semloc_logs.subvolumes.pairs import read_shard, write_shard
 from semloc_logs.tables import write_json, write_table
-from semloc_logs.voxels.store import Keyframe, part_path, pose_columns, write_keyframes
+from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import SessionFolder
 
 METADATA = {"schema_version": 1}
@@ -123,11 +123,7 @@ def _session(folder: SessionFolder, n: int, posed: bool = True) -> list[np.ndarr
     }
     write_table(folder.frames, contracts.table("frames", frames), METADATA)
     folder.keyframes.mkdir()
-    for first in range(0, n, 64):
-        part = range(first, min(first + 64, n))
-        write_keyframes(
-            part_path(folder.keyframes, first), first, [stamps[k] for k in part], (Keyframe(clouds[k], label) for k in part), METADATA
-        )
+    list(keep_keyframes(folder.keyframes, stamps, (Keyframe(cloud, label) for cloud in clouds), METADATA))
     write_json(folder.session_json, {"posed": posed})
     return clouds
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,36 +16,25 @@ from numpy.typing import NDArray
 import semloc_logs
 from semloc_logs import contracts
 from semloc_logs.errors import LogError
-from semloc_logs.frames import PosedCloud
-from semloc_logs.geometry import apply, inverse, rotation_between
+from semloc_logs.geometry import apply
 from semloc_logs.labels.labeller import Labeller
-from semloc_logs.labels.shape import shape
 from semloc_logs.labels.space import SKY
 from semloc_logs.logs.depth import RangeNoise
-from semloc_logs.logs.session import Session, open_session
+from semloc_logs.logs.session import open_session
 from semloc_logs.logs.trajectory_file import TrajectoryFile
-from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.settings import STREET_VOXEL, Fusion, Settings
 from semloc_logs.tables import replacing_folder, write_json, write_table
-from semloc_logs.voxels.gravity import find_up, ground_height
+from semloc_logs.voxels.ahead import ahead
+from semloc_logs.voxels.gravity import ground_height
 from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map
+from semloc_logs.voxels.keyframes import Collected, collect
+from semloc_logs.voxels.levelling import level
 from semloc_logs.voxels.picture import Caption, draw_map
-from semloc_logs.voxels.selection import KeyframeSelector, road_distance, submap_ranges, thin
-from semloc_logs.voxels.store import (
-    PART,
-    Keyframe,
-    blocks_path,
-    part_path,
-    pose_columns,
-    read_blocks,
-    read_keyframe,
-    write_blocks,
-    write_keyframes,
-    write_voxels,
-)
+from semloc_logs.voxels.selection import road_distance, submap_ranges
+from semloc_logs.voxels.store import Keyframe, blocks_path, keep_keyframes, pose_columns, read_keyframe, write_blocks, write_voxels
 from semloc_logs.workspace import SessionFolder
 
 F64 = NDArray[np.float64]
-UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,47 +49,12 @@ class FuseTask:
     poses: TrajectoryFile | None = None
 
 
-@dataclass(slots=True, eq=False)
-class _Raw:
-    """A keyframe before labels: what is known during the pass."""
-
-    header: Any
-    pose: F64 | None  # session_T_base
-    origin: NDArray[np.float32]
-
-
-@dataclass(slots=True, eq=False)
-class _Normals:
-    """Normals of a bounded number of keyframes, evenly spread over the log, for the direction of gravity."""
-
-    every: int = 1
-    seen: int = 0
-    kept: list[tuple[int, F64, F64]] = field(default_factory=list)
-
-    def add(self, cloud: PosedCloud, points: NDArray[np.float32], cell: float) -> None:
-        if self.seen % self.every == 0:
-            if cloud.sigma is not None:  # the normal of points that lie nearer to each other than their noise means nothing
-                cell = max(cell, 2 * float(np.median(cloud.sigma)))
-            some = points[thin(points, cell)][:12_000]
-            s = shape(some, 12)
-            weight = np.where((s.planar > 0.5) & (s.scattered < 0.15), s.planar, 0.0).astype(float)
-            turned = s.normal.astype(float) if cloud.session_T_base is None else s.normal @ cloud.session_T_base[:3, :3].T
-            keep = weight > 0
-            self.kept.append((self.seen, turned[keep], weight[keep]))
-            if len(self.kept) > 60:
-                self.every *= 2
-                self.kept = [k for k in self.kept if k[0] % self.every == 0]
-        self.seen += 1
-
-
 def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """Write keyframes/, blocks/, voxels/, frames.parquet, trajectory.parquet, map.png and, last, session.json; returns the latter.
 
     Raises LogError when the log has nothing to fuse, RoleError when its streams leave open what to use.
     """
-    settings = task.settings
-    fusion = settings.fusion
-    scale = fusion.voxel_size / STREET_VOXEL
+    fusion = task.settings.fusion
     session = open_session(
         [*task.logs],
         task.topics,
@@ -109,15 +65,13 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         odometry=fusion.odometry,
     )
     try:
-        with tempfile.TemporaryDirectory(prefix="semloc-") as scratch:
-            labeller = Labeller(settings.labels, session)
-            raws, normals = _collect(session, task, labeller, Path(scratch), on_progress)
-            if not raws:
+        with _scratch(task.folder) as scratch:
+            labeller = Labeller(task.settings.labels, session)
+            collected = collect(session, labeller, fusion, scratch, on_progress)
+            if not len(collected):
                 raise LogError(f"{session.name} gave no usable points: {'; '.join(session.problems) or 'its sensor streams are empty'}")
-            posed = raws[0].pose is not None
-            session_T_map, level = _level(session, raws, normals, posed)
-            poses = np.array([inverse(session_T_map) @ r.pose if r.pose is not None else level(i) for i, r in enumerate(raws)])
             labeller.conclude()
+            session_T_map, poses = level(session, collected)
             metadata = {
                 "schema_version": 1,
                 "voxel_size": fusion.voxel_size,
@@ -126,51 +80,11 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
                 "label_source": labeller.source,
                 "version": semloc_logs.__version__,
             }
-            grounds: list[float] = []
-            counts: list[int] = []
-
-            def labelled(first: int) -> Iterator[Keyframe]:
-                for i in range(first, min(first + PART, len(raws))):
-                    points, ids = _load_raw(Path(scratch), i)
-                    points_level = apply(poses[i], points)
-                    origin = apply(poses[i], raws[i].origin[None])[0]
-                    ground = ground_height(points_level - np.r_[poses[i][:2, 3], 0.0], float(origin[2]), scale)
-                    label = labeller.labels(i, points_level, origin, ids, scale)
-                    keep = label != SKY
-                    grounds.append(ground)
-                    counts.append(int(keep.sum()))
-                    sigma = Path(scratch) / f"{i}-sigma.npy"
-                    yield Keyframe(points[keep], label[keep], np.load(sigma)[keep] if sigma.exists() else None)
-
-            with replacing_folder(task.folder.keyframes) as folder:
-                for first in range(0, len(raws), PART):
-                    stamps = [r.header.stamp_ns for r in raws[first : first + PART]]
-                    write_keyframes(part_path(folder, first), first, stamps, labelled(first), metadata)
-                    on_progress(f"labelled {min(first + PART, len(raws))} of {len(raws)} keyframes")
-        distance = road_distance(poses) if posed else np.zeros(len(poses))
-        frames = {
-            "keyframe": np.arange(len(raws)),
-            "stamp_ns": [r.header.stamp_ns for r in raws],
-            "log_time_ns": [r.header.log_time_ns for r in raws],
-            "topic": [r.header.topic for r in raws],
-            "posed": [posed] * len(raws),
-            "distance": distance,
-            "ground_z": grounds,
-            "points": counts,
-            **{f"origin_{c}": np.array([r.origin[k] for r in raws], np.float32) for k, c in enumerate("xyz")},
-            **pose_columns(poses),
-        }
-        write_table(task.folder.frames, contracts.table("frames", frames), metadata, ("keyframe",))
+            fused = _Fused(task, collected, labeller, poses, metadata, on_progress)
+            content = fused.write()
         stamps_ns, track = session.trajectory()
-        write_table(
-            task.folder.trajectory, contracts.table("trajectory", {"stamp_ns": stamps_ns, **pose_columns(track)}), metadata, ("stamp_ns",)
-        )
-        origins = np.array([r.origin for r in raws])
-        submaps = _submaps(task, poses, origins, np.array(grounds), distance, posed, metadata, on_progress)
-        ids = range(len(submaps))
-        voxels = write_voxels(task.folder.voxels, (read_blocks(blocks_path(task.folder.blocks, i)) for i in ids), metadata, fusion.clamp)
-        caption = Caption(task.folder.name, labeller.source, fusion.voxel_size)
-        draw_map(task.folder.voxels, poses[:, :3, 3] if posed else np.zeros((0, 3)), caption, task.folder.picture)
+        trajectory = contracts.table("trajectory", {"stamp_ns": stamps_ns, **pose_columns(track)})
+        write_table(task.folder.trajectory, trajectory, metadata, ("stamp_ns",))
         for note in labeller.notes:
             on_progress(note)
         content = {
@@ -179,12 +93,9 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
             "labels": labeller.to_json(),
             "name": task.folder.name,
             "fingerprint": task.fingerprint,
-            "settings": settings.model_dump(mode="json", include={"fusion", "labels"}),
+            "settings": task.settings.model_dump(mode="json", include={"fusion", "labels"}),
             **metadata,
-            "posed": posed,
-            "keyframes": len(raws),
-            "submaps": submaps,
-            "voxels": voxels,
+            **content,
             "skipped": session.skipped,
         }
         write_json(task.folder.session_json, content)
@@ -193,63 +104,103 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
         session.close()
 
 
-def _collect(
-    session: Session, task: FuseTask, labeller: Labeller, scratch: Path, on_progress: Callable[[str], None]
-) -> tuple[list[_Raw], _Normals]:
-    """The one pass over the log: keyframes' thinned points into ``scratch``, their poses and a sample of normals."""
-    fusion = task.settings.fusion
-    cell = fusion.keyframe_resolution or 0.1
-    selector, normals, raws = KeyframeSelector(fusion), _Normals(), list[_Raw]()
-    for cloud in session.clouds(labeller.on_image, labeller.images):
-        if not selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
-            continue
-        keep = thin(cloud.points, cell)
-        points = cloud.points[keep]
-        np.save(scratch / f"{len(raws)}.npy", points)
-        label = labeller.take(cloud, keep)
-        if label is not None:
-            np.save(scratch / f"{len(raws)}-label.npy", label)
-        if cloud.sigma is not None:
-            np.save(scratch / f"{len(raws)}-sigma.npy", cloud.sigma[keep])
-        raws.append(_Raw(cloud.header, cloud.session_T_base, cloud.origin))
-        normals.add(cloud, points, 2 * cell)
-        if len(raws) % 50 == 0:
-            on_progress(f"read {len(raws)} keyframes")
-    return raws, normals
+@contextmanager
+def _scratch(folder: SessionFolder) -> Iterator[Path]:
+    """A folder for the keyframes of the pass, beside the results: temporary folders of the system may be memory."""
+    folder.path.mkdir(parents=True, exist_ok=True)
+    for stale in folder.path.glob(".scratch.*"):  # of a run that was killed
+        shutil.rmtree(stale, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=".scratch.", dir=folder.path) as name:
+        yield Path(name)
 
 
-def _load_raw(scratch: Path, i: int) -> tuple[NDArray[np.float32], NDArray[np.uint32] | None]:
-    label = scratch / f"{i}-label.npy"
-    return np.load(scratch / f"{i}.npy"), np.load(label) if label.exists() else None
+@dataclass(slots=True, eq=False)
+class _Fused:
+    """The second half: labelled keyframes, submaps, the session map, as a chain of iterators that holds a few keyframes and the
+    submaps that are being driven through."""
+
+    task: FuseTask
+    collected: Collected
+    labeller: Labeller
+    poses: F64  # map_T_base (n, 4, 4)
+    metadata: dict[str, Any]
+    on_progress: Callable[[str], None]
+    grounds: list[float] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
+    submaps: list[dict[str, Any]] = field(default_factory=list)
+
+    def write(self) -> dict[str, Any]:
+        """Write every table but the trajectory, and the picture; returns what session.json says of them."""
+        folder, fusion, n = self.task.folder, self.task.settings.fusion, len(self.collected)
+        posed = self.collected.poses[0] is not None
+        distance = road_distance(self.poses) if posed else np.zeros(n)
+        # without poses there is no map: the keyframes only ask
+        ranges = submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else []
+        stamps = [h.stamp_ns for h in self.collected.headers]
+        with replacing_folder(folder.keyframes) as keyframes, replacing_folder(folder.blocks) as blocks:
+            kept = ahead(keep_keyframes(keyframes, stamps, self._labelled(), self.metadata))
+            voxels = write_voxels(folder.voxels, self._kept_submaps(blocks, kept, ranges), self.metadata, fusion.clamp)
+            if not ranges:
+                write_blocks(blocks_path(blocks, 0), empty_map(), self.metadata)
+        frames = {
+            "keyframe": np.arange(n),
+            "stamp_ns": stamps,
+            "log_time_ns": [h.log_time_ns for h in self.collected.headers],
+            "topic": [h.topic for h in self.collected.headers],
+            "posed": [posed] * n,
+            "distance": distance,
+            "ground_z": self.grounds,
+            "points": self.counts,
+            **{f"origin_{c}": np.array([o[k] for o in self.collected.origins], np.float32) for k, c in enumerate("xyz")},
+            **pose_columns(self.poses),
+        }
+        write_table(folder.frames, contracts.table("frames", frames), self.metadata, ("keyframe",))
+        caption = Caption(folder.name, self.labeller.source, fusion.voxel_size)
+        draw_map(folder.voxels, self.poses[:, :3, 3] if posed else np.zeros((0, 3)), caption, folder.picture)
+        return {"posed": posed, "keyframes": n, "submaps": self.submaps, "voxels": voxels}
+
+    def _labelled(self) -> Iterator[Keyframe]:
+        """All keyframes with their classes, without sky."""
+        scale = self.task.settings.fusion.voxel_size / STREET_VOXEL
+        for i, pose in enumerate(self.poses):
+            points, ids, sigma = self.collected.load(i)
+            level_points, origin = apply(pose, points), apply(pose, self.collected.origins[i][None])[0]
+            self.grounds.append(ground_height(level_points - np.r_[pose[:2, 3], 0.0], float(origin[2]), scale))
+            label = self.labeller.labels(i, level_points, origin, ids, scale)
+            keep = label != SKY
+            self.counts.append(int(keep.sum()))
+            yield Keyframe(points[keep], label[keep], None if sigma is None else sigma[keep])
+            if (i + 1) % 50 == 0 or i + 1 == len(self.poses):
+                self.on_progress(f"labelled {i + 1} of {len(self.poses)} keyframes")
+
+    def _kept_submaps(self, folder: Path, keyframes: Iterable[Keyframe], ranges: list[tuple[int, int]]) -> Iterator[BlockMap]:
+        """Every submap, once it is written to ``folder``."""
+        for i, blocks in enumerate(fuse_ranges(keyframes, ranges, self.poses, self.collected.origins, self.task.settings.fusion)):
+            write_blocks(blocks_path(folder, i), blocks, {**self.metadata, "submap": i})
+            first, last = ranges[i]
+            ground = float(np.median(self.grounds[first:last]))
+            self.submaps.append({"id": i, "first": first, "last": last - 1, "ground_z": ground, "blocks": len(blocks.keys)})
+            self.on_progress(f"fused submap {i + 1} of {len(ranges)}")
+            yield blocks
 
 
-def _level(session: Session, raws: list[_Raw], normals: _Normals, posed: bool) -> tuple[F64, Callable[[int], F64]]:
-    """``session_T_map`` (4, 4), level and with its origin at the first keyframe, because poses may be in UTM and voxels, words and
-    surfaces want small numbers; and for a log without poses the level pose of each keyframe by its number."""
-    optical = session.base_frame.endswith("_optical") or session.base_frame in {c.header.frame_id for c in session.cameras.values()}
-    up_in_base = np.array([0.0, -1.0, 0.0]) if optical else UP
-    if posed:
-        prior = session.imu_up_in_session()
-        if prior is None:
-            rotations = np.array([r.pose[:3, :3] for r in raws if r.pose is not None])
-            # a vehicle's frames follow REP 103, and so does its odometry; a camera's world may be any of its frames
-            prior = (rotations @ up_in_base).mean(0) if optical else UP
-        kept = normals.kept
-        up = find_up(np.concatenate([k[1] for k in kept]), np.concatenate([k[2] for k in kept]), prior)
-        session_T_map = np.eye(4)
-        session_T_map[:3, :3] = rotation_between(UP, up)
-        if raws[0].pose is not None:
-            session_T_map[:3, 3] = raws[0].pose[:3, 3]
-        return session_T_map, lambda _: np.eye(4)
-    found = {k[0]: find_up(k[1], k[2], up_in_base) for k in normals.kept}
-    keys = np.array(sorted(found))
+def fuse_ranges(
+    keyframes: Iterable[Keyframe], ranges: list[tuple[int, int]], poses: F64, origins: Sequence[NDArray[np.floating]], fusion: Fusion
+) -> Iterator[BlockMap]:
+    """The map of each of ``ranges`` [first, last) of ``keyframes``, which come one by one; both bounds never decrease.
 
-    def level(i: int) -> F64:
-        out = np.eye(4)
-        out[:3, :3] = rotation_between(found[int(keys[np.argmin(np.abs(keys - i))])], UP)
-        return out
-
-    return np.eye(4), level
+    Only the ranges that hold the current keyframe are in memory: the others are not begun, or done.
+    """
+    active: dict[int, Fuser] = {}
+    begun = 0
+    for i, keyframe in enumerate(keyframes):
+        while begun < len(ranges) and ranges[begun][0] <= i:
+            active[begun] = Fuser(fusion)
+            begun += 1
+        for fuser in active.values():
+            fuser.add(keyframe.points, keyframe.label, origins[i], keyframe.sigma, poses[i])
+        for number in [n for n in active if ranges[n][1] == i + 1]:
+            yield active.pop(number).finish()
 
 
 def fuse_keyframes(
@@ -266,33 +217,5 @@ def fuse_keyframes(
         frame = read_keyframe(folder.keyframes, i)
         if radius is not None:
             frame = frame.near(origins[i], radius)
-        fuser.add(apply(poses[i], frame.points), frame.label, apply(poses[i], origins[i][None])[0], frame.sigma)
+        fuser.add(frame.points, frame.label, origins[i], frame.sigma, poses[i])
     return fuser.finish()
-
-
-def _submaps(
-    task: FuseTask,
-    poses: F64,
-    origins: NDArray[np.floating],
-    grounds: F64,
-    distance: F64,
-    posed: bool,
-    metadata: dict[str, Any],
-    on_progress: Callable[[str], None],
-) -> list[dict[str, Any]]:
-    """Fuse and write every submap; returns what session.json says of them."""
-    fusion = task.settings.fusion
-    # without poses there is no map: the keyframes only ask
-    ranges = submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else []
-    out = []
-    with replacing_folder(task.folder.blocks) as folder:
-        for i, (first, last) in enumerate(ranges):
-            blocks = fuse_keyframes(task.folder, range(first, last), poses, origins, task.settings)
-            write_blocks(blocks_path(folder, i), blocks, {**metadata, "submap": i})
-            out.append(
-                {"id": i, "first": first, "last": last - 1, "ground_z": float(np.median(grounds[first:last])), "blocks": len(blocks.keys)}
-            )
-            on_progress(f"fused submap {i + 1} of {len(ranges)}")
-        if not ranges:
-            write_blocks(blocks_path(folder, 0), empty_map(), metadata)
-    return out

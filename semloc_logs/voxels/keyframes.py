@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,8 @@ class Collected:
 
     def load(self, keyframe: int) -> tuple[F32, NDArray[np.uint32] | None, F32 | None]:
         """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of their range, where there are any."""
-        return _load(self.scratch, keyframe, ""), _load(self.scratch, keyframe, "-label"), _load(self.scratch, keyframe, "-sigma")
+        points, label, sigma = (self.scratch / f"{keyframe}{what}.npy" for what in ("", "-label", "-sigma"))
+        return _load(points), _load(label) if label.exists() else None, _load(sigma) if sigma.exists() else None
 
     def add(self, raw: _Raw, cell: float) -> None:
         """The next keyframe; its points are in the scratch folder already."""
@@ -48,6 +50,8 @@ class Collected:
         self.poses.append(raw.session_T_base)
         self.origins.append(raw.origin)
         if number % self._every == 0:
+            if raw.sigma is not None:  # the normal of points that lie nearer to each other than their noise means nothing
+                cell = max(cell, 2 * float(np.median(raw.sigma)))
             some = raw.points[thin(raw.points, cell)][:12_000]
             s = shape(some, 12)
             weight = np.where((s.planar > 0.5) & (s.scattered < 0.15), s.planar, 0.0).astype(float)
@@ -66,6 +70,7 @@ class _Raw:
     session_T_base: F64 | None
     origin: F32
     points: F32
+    sigma: F32 | None
 
 
 def collect(session: Session, labeller: Labeller, fusion: Fusion, scratch: Path, on_progress: Callable[[str], None]) -> Collected:
@@ -88,8 +93,9 @@ def _keyframes(session: Session, labeller: Labeller, selector: KeyframeSelector,
         points = cloud.points[keep]
         _save(scratch, number, "", points)
         _save(scratch, number, "-label", labeller.take(cloud, keep))
-        _save(scratch, number, "-sigma", None if cloud.sigma is None else cloud.sigma[keep])
-        yield _Raw(cloud.header, cloud.session_T_base, cloud.origin, points)
+        sigma = None if cloud.sigma is None else cloud.sigma[keep]
+        _save(scratch, number, "-sigma", sigma)
+        yield _Raw(cloud.header, cloud.session_T_base, cloud.origin, points, sigma)
         number += 1
 
 
@@ -98,6 +104,6 @@ def _save(scratch: Path, keyframe: int, what: str, values: NDArray[np.generic] |
         np.save(scratch / f"{keyframe}{what}.npy", values, allow_pickle=False)
 
 
-def _load(scratch: Path, keyframe: int, what: str) -> NDArray[np.generic] | None:
-    path = scratch / f"{keyframe}{what}.npy"
-    return np.load(path, allow_pickle=False) if path.exists() else None
+def _load(path: Path) -> NDArray[Any]:
+    values: NDArray[Any] = np.load(path, allow_pickle=False)
+    return values

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,19 +60,34 @@ def part_path(folder: Path, keyframe: int) -> Path:
     return folder / f"part-{keyframe // PART:05d}.parquet"
 
 
-def write_keyframes(path: Path, first: int, stamps_ns: Sequence[int], keyframes: Iterable[Keyframe], metadata: dict[str, Any]) -> None:
-    """One part: keyframes ``first``, ``first`` + 1, ... each in a row group of its own. ``path`` lies in a folder that is renamed later."""
+def keep_keyframes(folder: Path, stamps_ns: Sequence[int], keyframes: Iterable[Keyframe], metadata: dict[str, Any]) -> Iterator[Keyframe]:
+    """Write keyframes to parts in ``folder``, each in a row group of its own, and pass them on as they will be read back.
+
+    ``folder`` is renamed later; it is complete when the iterator is exhausted.
+    """
     schema = contracts.schema("keyframes").with_metadata({"semloc": _json(metadata)})
-    with pq.ParquetWriter(
-        path, schema, compression="zstd", use_byte_stream_split=["x", "y", "z"], use_dictionary=["keyframe", "stamp_ns", "label", "sigma"]
-    ) as writer:
-        for k, (stamp, frame) in enumerate(zip(stamps_ns, keyframes, strict=True), start=first):
-            n = len(frame.points)
-            p = np.round(frame.points * 512) / 512  # 2 mm: below any sensor's noise, and packs well
-            columns = {"keyframe": np.full(n, k, np.int32), "stamp_ns": np.full(n, stamp, np.int64), "label": frame.label}
-            columns |= {c: p[:, i].astype(np.float32) for i, c in enumerate("xyz")}
-            columns["sigma"] = np.zeros(n, np.float32) if frame.sigma is None else frame.sigma.astype(np.float16).astype(np.float32)
-            writer.write_table(contracts.table("keyframes", columns), row_group_size=max(n, 1))
+    coming = iter(keyframes)
+    for first in range(0, len(stamps_ns), PART):
+        with pq.ParquetWriter(
+            part_path(folder, first),
+            schema,
+            compression="zstd",
+            use_byte_stream_split=["x", "y", "z"],
+            use_dictionary=["keyframe", "stamp_ns", "label", "sigma"],
+        ) as writer:
+            for k, frame in zip(range(first, min(first + PART, len(stamps_ns))), coming, strict=False):
+                n = len(frame.points)
+                points = (np.round(frame.points * 512) / 512).astype(np.float32)  # 2 mm: below any sensor's noise, and packs well
+                sigma = None if frame.sigma is None else frame.sigma.astype(np.float16).astype(np.float32)
+                columns = {
+                    "keyframe": np.full(n, k, np.int32),
+                    "stamp_ns": np.full(n, stamps_ns[k], np.int64),
+                    **{c: points[:, i] for i, c in enumerate("xyz")},
+                    "label": frame.label,
+                    "sigma": np.zeros(n, np.float32) if sigma is None else sigma,
+                }
+                writer.write_table(contracts.table("keyframes", columns), row_group_size=max(n, 1))
+                yield Keyframe(points, frame.label, sigma)
 
 
 def _json(metadata: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from semloc_logs.geometry import apply, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.tables import write_json, write_table
 from semloc_logs.voxels.selection import road_distance
-from semloc_logs.voxels.store import PART, Keyframe, part_path, pose_columns, write_keyframes
+from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import SessionFolder
 
 
@@ -35,9 +35,7 @@ def session(folder: Path, poses: NDArray[np.float64], clouds: list[NDArray[np.fl
     }
     write_table(folder / "frames.parquet", contracts.table("frames", frames), {})
     (folder / "keyframes").mkdir()
-    for first in range(0, n, PART):
-        some = [Keyframe(c, np.full(len(c), 2, np.uint8)) for c in clouds[first : first + PART]]
-        write_keyframes(part_path(folder / "keyframes", first), first, list(range(first, first + len(some))), some, {})
+    list(keep_keyframes(folder / "keyframes", range(n), [Keyframe(c, np.full(len(c), 2, np.uint8)) for c in clouds], {}))
     write_json(folder / "session.json", {"posed": posed, "label_source": "log", "submaps": []})
     return SessionMap(SessionFolder(folder))
 

@@ -19,7 +19,7 @@ from semloc_logs.exports.clouds import SessionPoints
 from semloc_logs.geometry import apply, yaw_transform
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.tables import write_json, write_table
-from semloc_logs.voxels.store import Keyframe, part_path, pose_columns, write_keyframes
+from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import Workspace
 
 METADATA = {"schema_version": 1}
@@ -59,7 +59,7 @@ def make(work: Workspace, session_T_map: NDArray[np.float64], posed: bool = True
         Keyframe(np.array([[1, 2, 3]], np.float32), np.array([8], np.uint8)),
     ]
     folder.keyframes.mkdir()
-    write_keyframes(part_path(folder.keyframes, 0), 0, [1, 2], clouds, METADATA)
+    list(keep_keyframes(folder.keyframes, [1, 2], clouds, METADATA))
     write_json(folder.session_json, {"posed": posed, "session_T_map": session_T_map.tolist(), "voxel_size": VOXEL})
     return np.concatenate(every), np.concatenate(labels)
 

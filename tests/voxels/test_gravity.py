@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.settings import load
-from semloc_logs.voxels.fusing import FuseTask, _collect, _level
 from semloc_logs.voxels.gravity import find_up, ground_height
-from semloc_logs.workspace import SessionFolder
+from semloc_logs.voxels.keyframes import collect
+from semloc_logs.voxels.levelling import level
 
 F64 = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
@@ -109,16 +109,15 @@ def test_two_drives_through_a_basement_agree_on_up() -> None:
             from semloc_logs.labels.labeller import Labeller
             from semloc_logs.logs.session import open_session
 
-            task = FuseTask((SHARED / "logs" / name,), SessionFolder(scratch), settings)
-            session = open_session([*task.logs], {}, min_range=0.9, max_range=30.0)
+            session = open_session([SHARED / "logs" / name], {}, min_range=0.9, max_range=30.0)
             try:
-                raws, normals = _collect(session, task, Labeller(settings.labels, session), scratch, lambda _: None)
-                session_T_map, _ = _level(session, raws, normals, raws[0].pose is not None)
+                collected = collect(session, Labeller(settings.labels, session), settings.fusion, scratch, lambda _: None)
+                session_T_map, _ = level(session, collected)
             finally:
                 session.close()
         finally:
             shutil.rmtree(scratch)
-        assert len(raws) > 3
+        assert len(collected) > 3
         common = np.array(truth[name]["T_common_session"])
         ups[name] = common[:3, :3] @ session_T_map[:3, 2]
     assert degrees_between(*ups.values()) < 0.5, ups

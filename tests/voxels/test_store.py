@@ -19,13 +19,13 @@ from semloc_logs.voxels.store import (
     PART,
     TILE,
     Keyframe,
+    keep_keyframes,
     part_path,
     pose_columns,
     poses_of,
     read_blocks,
     read_keyframe,
     write_blocks,
-    write_keyframes,
     write_voxels,
 )
 
@@ -67,29 +67,36 @@ def test_keyframes_come_back_to_the_grid_of_2_mm_each_in_its_row_group(tmp_path:
     rng = np.random.default_rng(0)
     sizes = [5, 0, 7, 1]  # a keyframe without points keeps its place
     frames = [Keyframe(rng.uniform(-80, 80, (n, 3)).astype(np.float32), rng.integers(0, 19, n).astype(np.uint8)) for n in sizes]
-    first = 3 * PART
-    path = part_path(tmp_path, first)
-    write_keyframes(path, first, [10**18 + i for i in range(4)], frames, METADATA)
+    passed = list(keep_keyframes(tmp_path, [10**18 + i for i in range(4)], frames, METADATA))
+    path = part_path(tmp_path, 0)
     assert pq.ParquetFile(path).num_row_groups == 4
-    for i, frame in enumerate(frames):
-        found = read_keyframe(tmp_path, first + i)
+    for i, (frame, kept) in enumerate(zip(frames, passed, strict=True)):
+        found = read_keyframe(tmp_path, i)
         np.testing.assert_array_equal(found.label, frame.label)
         assert found.points.shape == frame.points.shape
         np.testing.assert_allclose(found.points, frame.points, atol=1 / 1024 + 1e-6)
+        np.testing.assert_array_equal(found.points, kept.points)  # what is passed on is what is read back
         again = tmp_path / "again"
         again.mkdir(exist_ok=True)
-        write_keyframes(part_path(again, 0), 0, [0], [found], METADATA)
+        list(keep_keyframes(again, [0], [found], METADATA))
         np.testing.assert_array_equal(read_keyframe(again, 0).points, found.points)  # what lies on the grid is kept exactly
     table = pq.read_table(path)
-    assert table["keyframe"].to_pylist() == [first] * 5 + [first + 2] * 7 + [first + 3]
+    assert table["keyframe"].to_pylist() == [0] * 5 + [2] * 7 + [3]
     assert table["stamp_ns"].to_pylist()[-1] == 10**18 + 3
     assert read_metadata(path) == METADATA
+
+
+def test_keyframes_are_in_parts_of_64(tmp_path: Path) -> None:
+    one = Keyframe(np.ones((1, 3), np.float32), np.zeros(1, np.uint8))
+    assert len(list(keep_keyframes(tmp_path, range(2 * PART + 1), (one for _ in range(2 * PART + 1)), METADATA))) == 2 * PART + 1
+    assert [pq.ParquetFile(p).num_row_groups for p in sorted(tmp_path.iterdir())] == [PART, PART, 1]
+    assert pq.read_table(part_path(tmp_path, 2 * PART))["keyframe"].to_pylist() == [2 * PART]
 
 
 def test_the_uncertainty_of_ranges_comes_back_where_there_is_any(tmp_path: Path) -> None:
     points, label = np.ones((3, 3), np.float32), np.zeros(3, np.uint8)
     frames = [Keyframe(points, label, np.array([0.0, 0.25, 2.0], np.float32)), Keyframe(points, label)]
-    write_keyframes(part_path(tmp_path, 0), 0, [1, 2], frames, METADATA)
+    list(keep_keyframes(tmp_path, [1, 2], frames, METADATA))
     sigma = read_keyframe(tmp_path, 0).sigma
     assert sigma is not None
     assert sigma.tolist() == [0.0, 0.25, 2.0]
@@ -101,7 +108,7 @@ def test_the_uncertainty_of_ranges_comes_back_where_there_is_any(tmp_path: Path)
 def test_missing_and_damaged_keyframes_and_blocks_are_refused(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="overwrite"):
         read_keyframe(tmp_path, 0)
-    write_keyframes(part_path(tmp_path, 0), 0, [1], [Keyframe(np.ones((4, 3), np.float32), np.zeros(4, np.uint8))], METADATA)
+    list(keep_keyframes(tmp_path, [1], [Keyframe(np.ones((4, 3), np.float32), np.zeros(4, np.uint8))], METADATA))
     with pytest.raises(WorkspaceError, match="overwrite"):
         read_keyframe(tmp_path, 1)  # beyond the last
     content = part_path(tmp_path, 0).read_bytes()

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from semloc_logs.voxels.ahead import ahead
+
+
+def test_items_come_in_their_order() -> None:
+    assert list(ahead(range(100), depth=3)) == list(range(100))
+    assert list(ahead([])) == []
+
+
+def test_at_most_the_depth_and_one_are_made_ahead() -> None:
+    made = []
+
+    def items() -> Iterator[int]:
+        for i in range(10):
+            made.append(i)
+            yield i
+
+    coming = ahead(items(), depth=2)
+    assert next(coming) == 0
+    time.sleep(0.3)
+    assert made == [0, 1, 2, 3]  # one taken, two waiting, one in hand
+    assert list(coming) == list(range(1, 10))
+
+
+def test_what_is_raised_there_is_raised_here_after_the_items_before_it() -> None:
+    def items() -> Iterator[int]:
+        yield 1
+        raise KeyError("lost")
+
+    coming = ahead(items())
+    assert next(coming) == 1
+    with pytest.raises(KeyError, match="lost"):
+        next(coming)
+
+
+def test_leaving_early_closes_the_source_and_ends_the_thread() -> None:
+    closed = threading.Event()
+
+    def items() -> Iterator[int]:
+        try:
+            yield from range(10**9)
+        finally:
+            closed.set()
+
+    coming = ahead(items())
+    next(coming)
+    coming.close()  # type: ignore[attr-defined]
+    assert closed.is_set()
+    assert not [t for t in threading.enumerate() if t.name == "semloc-ahead"]
