@@ -43,7 +43,7 @@ class Collected:
         points, label, sigma = (self.scratch / f"{keyframe}{what}.npy" for what in ("", "-label", "-sigma"))
         return _load(points), _load(label) if label.exists() else None, _load(sigma) if sigma.exists() else None
 
-    def add(self, raw: _Raw, cell: float) -> None:
+    def add(self, raw: RawKeyframe, cell: float) -> None:
         """The next keyframe; its points are in the scratch folder already."""
         number = len(self)
         self.headers.append(raw.header)
@@ -65,7 +65,9 @@ class Collected:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Raw:
+class RawKeyframe:
+    """A thinned cloud before its classes are known; the fields are those of a PosedCloud."""
+
     header: Header
     session_T_base: F64 | None
     origin: F32
@@ -84,7 +86,7 @@ def collect(session: Session, labeller: Labeller, fusion: Fusion, scratch: Path,
     return collected
 
 
-def _keyframes(session: Session, labeller: Labeller, selector: KeyframeSelector, cell: float, scratch: Path) -> Iterator[_Raw]:
+def _keyframes(session: Session, labeller: Labeller, selector: KeyframeSelector, cell: float, scratch: Path) -> Iterator[RawKeyframe]:
     number = 0
     for cloud in session.clouds(labeller.on_image, labeller.images):
         if not selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
@@ -95,7 +97,7 @@ def _keyframes(session: Session, labeller: Labeller, selector: KeyframeSelector,
         _save(scratch, number, "-label", labeller.take(cloud, keep))
         sigma = None if cloud.sigma is None else cloud.sigma[keep]
         _save(scratch, number, "-sigma", sigma)
-        yield _Raw(cloud.header, cloud.session_T_base, cloud.origin, points, sigma)
+        yield RawKeyframe(cloud.header, cloud.session_T_base, cloud.origin, points, sigma)
         number += 1
 
 

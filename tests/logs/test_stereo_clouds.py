@@ -19,8 +19,8 @@ from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session import open_session
 from semloc_logs.logs.stereo_clouds import StereoClouds, _grey
 from semloc_logs.logs.tally import Tally
-from semloc_logs.voxels.fusing import _Normals
 from semloc_logs.voxels.gravity import find_up
+from semloc_logs.voxels.keyframes import Collected, RawKeyframe
 from semloc_logs.voxels.selection import thin
 
 MS = 1_000_000
@@ -240,10 +240,13 @@ def test_sigma_of_a_real_floor(room: list[PosedCloud]) -> None:
 @pytest.mark.parametrize("voxel", [0.03, 0.05, 0.1, 0.3])
 def test_the_direction_of_gravity_is_found_at_every_voxel_size(room: list[PosedCloud], voxel: float) -> None:
     """Leaning mattresses and noise of several voxels do not make the floor a slope."""
-    normals = _Normals()
+    collected = Collected(Path())
     for cloud in room[:3]:
-        normals.add(cloud, cloud.points[thin(cloud.points, voxel / 3)], 2 * voxel / 3)
-    up = find_up(np.concatenate([k[1] for k in normals.kept]), np.concatenate([k[2] for k in normals.kept]), np.array([0.0, 0.0, 1.0]))
+        keep = thin(cloud.points, voxel / 3)
+        sigma = None if cloud.sigma is None else cloud.sigma[keep]
+        collected.add(RawKeyframe(cloud.header, cloud.session_T_base, cloud.origin, cloud.points[keep], sigma), 2 * voxel / 3)
+    _, normals, weights = zip(*collected.normals, strict=True)
+    up = find_up(np.concatenate(normals), np.concatenate(weights), np.array([0.0, 0.0, 1.0]))
     assert tilt(up) < 1.5
 
 
