@@ -13,6 +13,8 @@ PERIODS_PER_GAP = 3.0  # a stream slower than max_gap / 3 may skip two poses bef
 LONGEST_GAP = 5.0  # s; nothing that drives is interpolated over more than this, however slow its stream
 _FARTHEST = 1e8  # m; positions in Earth-centred frames are below 1e7
 _FIRST_NS, _LAST_NS = -(1 << 60), 1 << 62  # the years 1933 to 2116: sums and differences still fit 64 bits
+_AHEAD_NS = 10_000_000_000  # clocks that are adjusted while recording jump less
+_GLITCH = 3  # poses that a glitch of the clock may stamp in a row
 _PERIOD_WINDOW = 256  # poses that the period is estimated from: the newest ones
 
 
@@ -26,7 +28,7 @@ class PoseTrack:
 
     ``max_gap`` (s) is the longest hole that is interpolated, or three median periods of a slow stream. With ``keep_seconds`` only the
     newest stretch is remembered (at least that long), so memory is bounded. ``duplicates``, ``backwards`` and ``invalid`` count what
-    was refused: equal stamps, stamps before the newest one, and matrices that are no rigid transforms.
+    was refused: equal stamps, stamps before the newest one, and matrices that are no rigid transforms; ``ahead`` what was taken back.
     """
 
     def __init__(self, max_gap: float = 1.0, keep_seconds: float | None = None) -> None:
@@ -34,6 +36,7 @@ class PoseTrack:
         self.duplicates = 0
         self.backwards = 0
         self.invalid = 0
+        self.ahead = 0
         self._keep_ns = None if keep_seconds is None else round(keep_seconds * 1e9)
         self._stamps = np.empty(16, np.int64)
         self._rows = np.empty((16, 3, 4))
@@ -50,6 +53,8 @@ class PoseTrack:
     def append(self, stamp_ns: int, pose: F64) -> bool:
         """Appends a pose (4, 4); False when it was refused and counted."""
         if self._n and is_time(stamp_ns) and stamp_ns <= self._stamps[self._n - 1]:
+            self._drop_ahead(stamp_ns)
+        if self._n and is_time(stamp_ns) and stamp_ns <= self._stamps[self._n - 1]:
             if stamp_ns == self._stamps[self._n - 1]:
                 self.duplicates += 1
             else:
@@ -65,6 +70,19 @@ class PoseTrack:
         self._rows[self._n] = pose[:3]
         self._n += 1
         return True
+
+    def _drop_ahead(self, stamp_ns: int) -> None:
+        """Takes back the newest poses, a few at most, when they lie so far ahead of ``stamp_ns`` that a glitch of the clock stamped them.
+
+        One pose from the next century would otherwise make all that follow it too old.
+        """
+        for count in range(1, min(_GLITCH, self._n) + 1):
+            is_ahead = self._stamps[self._n - count] - stamp_ns > _AHEAD_NS
+            if is_ahead and (count == self._n or self._stamps[self._n - count - 1] < stamp_ns):
+                self._n -= count
+                self.ahead += count
+                self._limit = None
+                return
 
     def _make_room(self) -> None:
         first = 0
@@ -148,7 +166,7 @@ class PoseTrack:
         gaps = [[before, after] for before, after in self.gaps()]
         return {
             "count": self._n, "start_ns": self.start_ns, "end_ns": self.end_ns, "gaps": gaps, "length_m": round(self.length(), 3),
-            "duplicates": self.duplicates, "backwards": self.backwards, "invalid": self.invalid,
+            "duplicates": self.duplicates, "backwards": self.backwards, "invalid": self.invalid, "ahead": self.ahead,
         }  # fmt: skip
 
     def _matrices(self, first: int, last: int) -> F64:

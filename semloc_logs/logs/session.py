@@ -398,6 +398,8 @@ class Session:
         refused = [f"{n} {what}" for n, what in ((track.duplicates, "repeated"), (track.backwards, "back in time")) if n]
         if refused:
             self._notes.append(f"Poses that are {' and '.join(refused)} were left out.")
+        if track.ahead:
+            self._lost.append(f"{track.ahead} of the poses lie more than 10 s ahead of those that follow and were left out.")
         if track.invalid:
             self._lost.append(f"{track.invalid} poses are no rigid transforms and were left out.")
         source = self._where.source

@@ -149,3 +149,13 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], asked: list[int]) -
             w = (inside - stamps[k - 1]) / (stamps[k] - stamps[k - 1])
             np.testing.assert_allclose(found[:3, 3], (1 - w) * positions[k - 1] + w * positions[k], atol=1e-9)
             np.testing.assert_allclose(found[:3, :3], Slerp([0, 1], rotations[k - 1 : k + 1])(w).as_matrix(), atol=1e-7)
+
+
+def test_a_glitch_of_the_clock_is_taken_back() -> None:
+    track = PoseTrack()
+    for second in (1, 2, 3, 4000, 4001, 4, 5):
+        track.append(second * 1_000_000_000, np.eye(4))
+    assert (track.stamps_ns // 1_000_000_000).tolist() == [1, 2, 3, 4, 5]
+    assert (track.ahead, track.backwards) == (2, 0)
+    track.append(1_500_000_000, np.eye(4))  # a clock that is set back is none
+    assert (len(track), track.backwards) == (5, 1)
