@@ -42,12 +42,10 @@ def parser(encoding: str, type_: str, definition: Definition) -> Parser:
 
 def _ros_parser(encoding: str, type_: str, definition: Definition) -> Parser:
     store = get_typestore(Stores.EMPTY)
+    types = ros_types(encoding, type_, definition)
     try:
-        types = ros_types(encoding, type_, definition)
         store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
         store.get_msgdef(type_)
-    except UndecodableError:
-        raise
     except Exception as error:  # the text is hostile, and the parser of another project answers with any exception
         raise UndecodableError(f"its definition in the log cannot be parsed ({_short(error)})") from error
     deserialize = store.deserialize_cdr if encoding == "cdr" else store.deserialize_ros1
@@ -62,7 +60,16 @@ def _ros_parser(encoding: str, type_: str, definition: Definition) -> Parser:
 
 
 def ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, Any]:
-    """The definitions that ``type_`` needs: from the log where it has them, else the standard ones."""
+    """The definitions that ``type_`` needs: from the log where it has them, else the standard ones. UndecodableError without."""
+    try:
+        return _ros_types(encoding, type_, definition)
+    except UndecodableError:
+        raise
+    except Exception as error:  # as above: the text is hostile
+        raise UndecodableError(f"its definition in the log cannot be parsed ({_short(error)})") from error
+
+
+def _ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, Any]:
     standard = _standard_types("ros1" if encoding == "ros1" else "ros2")
     text = definition.text.decode(errors="replace")
     if len(text) > _MAX_TEXT:

@@ -37,7 +37,7 @@ def livox_parser(encoding: str, type_: str, definition: Definition) -> Parser:
     if definition.text.strip():
         types = ros_types(encoding, type_, definition)
         fields = [n for n, _ in types[type_][1]]
-        point = [(n, d[1][0]) for n, d in types[type_.replace("CustomMsg", "CustomPoint")][1] if d[0] == Nodetype.BASE]
+        point = [(n, d[1][0]) for n, d in types.get(type_.replace("CustomMsg", "CustomPoint"), ("", ()))[1] if d[0] == Nodetype.BASE]
         known = [(n, _NAMES[kind]) for n, kind in _POINT]
         if fields != ["header", "timebase", "point_num", "lidar_id", "rsvd", "points"] or point != known:
             raise UndecodableError("its definition in the log is not that of the Livox drivers")

@@ -1,0 +1,148 @@
+"""Fuzzes the message decoders and the containers: python benchmarks/fuzz.py [--seed N] [--minutes M] [--only decoders|layouts|logs].
+
+Valid messages of every type that can be decoded, in cdr, ros1, protobuf and json, and small valid logs are damaged; the same seed gives the
+same inputs. What comes out must be frames or a LogError, within 2 s. Anything else, and any warning of numpy, is kept in a folder with
+the command that repeats it; exit code 1 when there is such a finding.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from fuzz_inputs import damage, layout, logs, messages  # noqa: E402
+
+from semloc_logs.errors import LogError  # noqa: E402
+from semloc_logs.logs.decode import Decoder  # noqa: E402
+from semloc_logs.logs.log import Message  # noqa: E402
+from semloc_logs.logs.open import open_log  # noqa: E402
+from semloc_logs.logs.problems import Problems  # noqa: E402
+
+LIMIT_S = 2.0
+MEMORY = 2 << 30
+
+
+class TooSlowError(BaseException):
+    """Not an Exception: nothing under test may swallow it."""
+
+
+def _alarm(_: int, __: FrameType | None) -> None:
+    raise TooSlowError
+
+
+_decoders: dict[int, tuple[Decoder, Problems]] = {}  # by definition: to parse those takes longer than to decode
+
+
+def decode(message: Message, *, is_known: bool = False) -> None:
+    """The frames of one message; ``is_known``: its definition is undamaged."""
+    problems = Problems()
+    decoder = Decoder(problems)
+    if is_known:
+        decoder, problems = _decoders.setdefault(id(message.definition), (decoder, problems))
+        problems.forget_skipped("decoding", None)
+    decoder.frames(message)
+    told = problems.sentences()
+    if any("MemoryError" in sentence for sentence in told):
+        raise AssertionError(f"memory was asked for: {told}")
+
+
+def read(files: dict[str, bytes]) -> None:
+    """The frames of one log, and what is said of it."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, content in files.items():
+            Path(folder, name).write_bytes(content)
+        path = Path(folder) if "metadata.yaml" in files else Path(folder, next(iter(files)))
+        try:
+            log = open_log(path)
+        except LogError:
+            return
+        try:
+            for _ in log.frames():
+                pass
+            if not all(isinstance(sentence, str) for sentence in log.problems):
+                raise AssertionError("a problem is no sentence")
+        except LogError:
+            pass
+        finally:
+            log.close()
+
+
+def one(seed: int, only: str | None) -> tuple[str, Callable[[], None], Any]:
+    """What the input of ``seed`` is called, what tries it, and the input itself."""
+    rng = random.Random(seed)
+    kind = only or rng.choices(["decoders", "layouts", "logs"], [50, 30, 1])[0]
+    if kind == "decoders":
+        name, message = rng.choice(messages())
+        message = message._replace(data=damage(rng, bytes(message.data)))
+        is_known = rng.random() > 0.05
+        if not is_known:
+            definition = message.definition
+            text = damage(rng, definition.text) if definition.text else b""
+            message = message._replace(definition=type(definition)(definition.name, definition.encoding, text))
+        return name, lambda: decode(message, is_known=is_known), message
+    if kind == "layouts":
+        message = layout(rng)
+        return f"layout {message.encoding}", lambda: decode(message, is_known=True), message
+    name, files = rng.choice(logs())
+    files = {part: damage(rng, content) if rng.random() < 0.8 else content for part, content in files.items()}
+    return name, lambda: read(files), files
+
+
+def main() -> int:
+    """Runs for the time asked for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seed", type=int, default=0, help="the first input; each further one has the next number")
+    parser.add_argument("--minutes", type=float, default=1.0)
+    parser.add_argument("--count", type=int, default=None, help="inputs instead of minutes")
+    parser.add_argument("--only", choices=["decoders", "layouts", "logs"])
+    parser.add_argument("--keep", type=Path, default=Path("fuzz-findings"), help="folder for findings")
+    options = parser.parse_args()
+    warnings.simplefilter("error")
+    messages(), logs()  # before memory is limited
+    signal.signal(signal.SIGALRM, _alarm)
+    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
+    end = time.monotonic() + 60 * options.minutes
+    found: Counter[str] = Counter()
+    slowest, seed = (0.0, ""), options.seed
+    while (seed < options.seed + options.count) if options.count is not None else (time.monotonic() < end):
+        name, attempt, content = one(seed, options.only)
+        signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+        start = time.monotonic()
+        try:
+            attempt()
+        except (Exception, TooSlowError) as error:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            key = f"{name}: {type(error).__name__} at {Path(place.filename).name}:{place.lineno}"
+            found[key] += 1
+            if found[key] == 1:
+                options.keep.mkdir(exist_ok=True)
+                text = "".join(traceback.format_exception(error)) + f"\n--seed {seed} --count 1 --only {options.only}\n{content!r}\n"
+                (options.keep / f"{seed}.txt").write_text(text)
+                print(f"seed {seed}: {key}: {str(error)[:200]}", flush=True)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        slowest = max(slowest, (time.monotonic() - start, f"{name} seed {seed}"))
+        seed += 1
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"{seed - options.seed} inputs, {sum(found.values())} findings of {len(found)} kinds; slowest {slowest[0]:.2f} s ({slowest[1]}); ", end="")
+    print(f"peak memory {peak:.0f} MiB")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
