@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help install demo test lint format wheel clean
+.PHONY: help install demo test fuzz lint format wheel clean
 
 help:
 	@echo "make install   a virtual environment in $(VENV) with semloc and the tools of development"
 	@echo "make demo      two simulated drives, their loop closures, and an annotated log, in demo/"
 	@echo "make test      all tests"
+	@echo "make fuzz      damaged messages and logs for MINUTES (1) from SEED (0) on"
 	@echo "make lint      ruff and mypy"
 	@echo "make format    ruff format"
 	@echo "make wheel     the wheel, in dist/"
@@ -28,6 +29,9 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest
+
+fuzz: install
+	$(BIN)/python -P benchmarks/fuzz.py --minutes $(or $(MINUTES),1) --seed $(or $(SEED),0)
 
 lint: install
 	$(BIN)/ruff check

@@ -79,7 +79,12 @@ def _ros_messages(store: Any) -> Iterator[tuple[str, Any]]:
             data = np.arange(96, dtype=np.uint8)
             yield "/points", _ros(store, name, height=2, width=3, fields=fields, point_step=16, row_step=48, data=data)
         elif name.endswith("/Image"):
-            for topic, encoding, size in (("/image", "rgb8", 3), ("/depth", "16UC1", 2), ("/depth", "32FC1", 4), ("/bayer", "bayer_rggb8", 1)):
+            for topic, encoding, size in (
+                ("/image", "rgb8", 3),
+                ("/depth", "16UC1", 2),
+                ("/depth", "32FC1", 4),
+                ("/bayer", "bayer_rggb8", 1),
+            ):
                 data = np.arange(16 * size, dtype=np.uint8)
                 yield topic, _ros(store, name, height=4, width=4, step=4 * size, encoding=encoding, data=data)
         elif name.endswith("/CompressedImage"):
@@ -156,15 +161,15 @@ def messages() -> list[tuple[str, Message]]:
             name = m.__msgtype__
             data = bytes(store.serialize_cdr(m, name) if encoding == "cdr" else store.serialize_ros1(m, name))
             text = store.generate_msgdef(name, ros_version=2 if encoding == "cdr" else 1)[0].encode()
-            for definition in (Definition("", "", b""), Definition(name, language, text)):
-                found.append((f"{encoding} {name}", Message(topic, name, encoding, 1, data, definition)))
+            definitions = (_NOTHING, Definition(name, language, text))
+            found += [(f"{encoding} {name}", Message(topic, name, encoding, 1, data, d)) for d in definitions]
     for m in _foxglove():
         m.timestamp.FromNanoseconds(5) if "timestamp" in m.DESCRIPTOR.fields_by_name else None
         name = m.DESCRIPTOR.full_name
         definition = Definition(name, "protobuf", _file_set(m.DESCRIPTOR.file))
         found.append((f"protobuf {name}", Message("/t", name, "protobuf", 1, m.SerializeToString(), definition)))
         text = json.dumps(_as_json(m)).encode()
-        found.append((f"json {name}", Message("/t", name, "json", 1, text, Definition("", "", b""))))
+        found.append((f"json {name}", Message("/t", name, "json", 1, text, _NOTHING)))
     return found
 
 
@@ -206,8 +211,24 @@ def logs() -> list[tuple[str, dict[str, bytes]]]:
 
 
 _NOTHING = Definition("", "", b"")
-_WORDS = [b"\xff", b"\0", b"\xff" * 4, b"\0" * 4, b"\0\0\0\x7f", b"\xff\xff\xff\x7f", b"\xff" * 8, b"\0\0\0\x80", b"\1\0\0\0", b"A", b'"', b"}", b"-1"]
-_WORDS += [struct.pack("<d", v) for v in (float("nan"), float("inf"), -1e308, 1e-308)] + [struct.pack("<f", v) for v in (float("nan"), 1e38)]
+_WORDS = [
+    b"\xff",
+    b"\0",
+    b"\xff" * 4,
+    b"\0" * 4,
+    b"\0\0\0\x7f",
+    b"\xff\xff\xff\x7f",
+    b"\xff" * 8,
+    b"\0\0\0\x80",
+    b"\1\0\0\0",
+    b"A",
+    b'"',
+    b"}",
+    b"-1",
+]
+_WORDS += [struct.pack("<d", v) for v in (float("nan"), float("inf"), -1e308, 1e-308)] + [
+    struct.pack("<f", v) for v in (float("nan"), 1e38)
+]
 
 
 def damage(rng: random.Random, content: bytes) -> bytes:
@@ -241,12 +262,19 @@ def layout(rng: random.Random) -> Message:
     field = store.types["sensor_msgs/msg/PointField"]
     numbers = [0, 1, 3, 4, 8, 12, 16, 17, 24, 48, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1]
     fields = [
-        field(name=n, offset=rng.choice(numbers[:10] if rng.random() < 0.9 else numbers), datatype=rng.randrange(10), count=rng.choice(numbers))
+        field(
+            name=n,
+            offset=rng.choice(numbers[:10] if rng.random() < 0.9 else numbers),
+            datatype=rng.randrange(10),
+            count=rng.choice(numbers),
+        )
         for n in rng.sample(names, rng.randint(0, len(names)))
     ]
     if rng.random() < 0.7:
         kinds = [rng.choice((7, 8)) for _ in range(3)]
-        fields[:0] = [field(name=n, offset=rng.choice((0, 4, 8, 9, 12, 16)), datatype=k, count=1) for n, k in zip("xyz", kinds, strict=True)]
+        fields[:0] = [
+            field(name=n, offset=rng.choice((0, 4, 8, 9, 12, 16)), datatype=k, count=1) for n, k in zip("xyz", kinds, strict=True)
+        ]
     step, width, height = rng.choice(numbers), rng.choice(numbers[:9] if rng.random() < 0.8 else numbers), rng.choice(numbers[:5])
     row = rng.choice([step * width % 2**32, *numbers])
     size = rng.choice([step * width * height, row * height, *numbers[:11]])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import struct
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from functools import cache
@@ -174,3 +176,30 @@ def decoder_of(name: str) -> Decoder:
 def test_json_of_any_shape(value: Any, name: str, type_: str) -> None:
     data = json.dumps({name: value}).encode()
     Decoder(Problems()).frames(Message("/t", f"foxglove.{type_}", "json", 1, data, NOTHING))
+
+
+def test_some_seeds_of_the_fuzzer(repository: Path, tmp_path: Path) -> None:
+    """Every message type in every encoding, and layouts of clouds; `make fuzz` runs longer."""
+    command = [sys.executable, "-P", str(repository / "benchmarks" / "fuzz.py"), "--seed", "5000000", "--count", "400"]
+    done = subprocess.run([*command, "--keep", str(tmp_path / "found")], capture_output=True, text=True, timeout=55)
+    assert done.returncode == 0, done.stdout
+    assert "400 inputs, 0 findings" in done.stdout
+
+
+@pytest.mark.parametrize("type_", ["livox_ros_driver/msg/CustomMsg", "sensor_msgs/msg/PointCloud2"])
+def test_definitions_that_cannot_be_parsed_are_named(type_: str) -> None:
+    problems = Problems()
+    broken = Definition(type_, "ros2msg", b"uint8[ x\n==\nMSG: y\n")
+    assert Decoder(problems).frames(Message("/t", type_, "cdr", 1, b"\0\1\0\0", broken)) == []
+    assert "definition in the log" in problems.sentences()[0]
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+def test_lists_of_elements_without_content_are_refused(encoding: str) -> None:
+    """Four bytes would claim as many objects as memory holds."""
+    problems = Problems()
+    text = b"E[] transforms\n" + b"=" * 80 + b"\nMSG: tf2_msgs/E\n"
+    definition = Definition("", "ros1msg" if encoding == "ros1" else "ros2msg", text)
+    data = (b"" if encoding == "ros1" else b"\0\1\0\0") + struct.pack("<I", 2**31)
+    assert Decoder(problems).frames(Message("/tf", "tf2_msgs/msg/TFMessage", encoding, 1, data, definition)) == []
+    assert "have no content" in problems.sentences()[0]
