@@ -139,11 +139,8 @@ def main() -> int:
         slowest = max(slowest, (time.process_time() - start, f"{name} seed {seed}"))
         seed += 1
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(
-        f"{seed - options.seed} inputs, {sum(found.values())} findings of {len(found)} kinds; slowest {slowest[0]:.2f} s of processor ({slowest[1]}); ",
-        end="",
-    )
-    print(f"peak memory {peak:.0f} MiB")
+    print(f"{seed - options.seed} inputs, {sum(found.values())} findings of {len(found)} kinds")
+    print(f"slowest {slowest[0]:.2f} s of processor ({slowest[1]}); peak memory {peak:.0f} MiB")
     return 1 if found else 0
 
 
