@@ -81,6 +81,7 @@ def mark_ends(
     length: F64,
     label: U8,
     sigma: F32,
+    level: NDArray[np.bool_],
     start: F64,
     limit: float,
     voxel_votes: NDArray[np.uint32],
@@ -89,7 +90,8 @@ def mark_ends(
 
     ``rays`` (n, 3) and ``length`` (n,) as :func:`to_rays` gives them, from ``start`` (3,) in the grid, all in voxels; those longer than
     ``limit`` do not hit. ``label`` (n,); ``sigma`` (n,) in voxels or (0,): a range of standard deviation sigma hits with the weight
-    min(1, 1 / 2 sigma), the share of its density that the end voxel holds at most, and carves up to 2 sigma before its end.
+    min(1, 1 / 2 sigma), the share of its density that the end voxel holds at most, and carves up to 2 sigma before its end. ``level``
+    (256,) says of which classes the surfaces are level: rays that end there carve down to a voxel above them.
     ``voxel_votes`` (n, 20) zeros: gets the weights of each class in sixteenths, a row a ray.
     """
     ax, ay, az = tables
@@ -111,6 +113,9 @@ def mark_ends(
             spread = 2 * sigma[i]
             weight = max(1, int(FULL_WEIGHT / spread))
             carved = max(0.0, 1.0 - spread / max(length[i], 1e-9))
+        if is_hit and level[label[i]]:
+            # a ray that grazes the ground runs within its voxels for metres: it says nothing about them
+            carved = max(0.0, min(carved, 1.0 - 1.0 / max(abs(dz), 1.0)))
         x, y, z = start[0] + dx, start[1] + dy, start[2] + dz
         address = ax[int(x)] + ay[int(y)] + az[int(z)]
         # one ray for a hit and one for a pass that end in the same voxel: they differ in what they carve

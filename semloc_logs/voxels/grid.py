@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.labels.space import GROUND, UNLABELLED
 from semloc_logs.settings import Fusion
 from semloc_logs.voxels.carve import BITS, CLASSES, add_votes, addresses, carve, flush, mark_ends, rehash, to_rays
 from semloc_logs.voxels.keys import BLOCK, pack, unpack
 
-UNLABELLED = 255  # occupied, class unknown
 FREE_STATE, UNOBSERVED_STATE = 254, 253
 UNOBSERVED = -128  # in log-odds
+LEVEL = np.isin(np.arange(256), GROUND)  # classes whose surfaces are level
 SCALE = 20  # int8 log-odds are in units of 1/20
 
 U8 = NDArray[np.uint8]
@@ -116,7 +117,7 @@ class Fuser:
         tables, touched = addresses(blocks), np.zeros(count, np.uint8)
         votes = np.zeros((len(points), CLASSES), np.uint32)
         spread = np.zeros(0, np.float32) if sigma is None else np.asarray(sigma * per_metre, np.float32)
-        ends, carved = mark_ends(self._marks, touched, tables, rays, length, label, spread, start - low, limit, votes)
+        ends, carved = mark_ends(self._marks, touched, tables, rays, length, label, spread, LEVEL, start - low, limit, votes)
         carve(self._marks, touched, tables, start - low, carved)
         found = np.flatnonzero(touched)
         slots = self._slots_of(np.stack(np.unravel_index(found, blocks), 1) + low // BLOCK)

@@ -32,7 +32,7 @@ def walk_rays(
         rays, length, low, high = to_rays(end[None], np.eye(4), origin, 1.0, limit)
         assert (low <= np.minimum(origin, origin + rays[0])).all()
         assert (high >= np.maximum(origin, origin + rays[0])).all()
-        _, carved = mark_ends(marks, touched, tables, rays, length, label, nothing, origin, limit, votes)
+        _, carved = mark_ends(marks, touched, tables, rays, length, label, nothing, np.zeros(256, bool), origin, limit, votes)
         carve(marks, touched, tables, origin, carved)
     assert not room[:guard].any()
     assert not room[guard + count :].any()

@@ -13,6 +13,7 @@ from semloc_logs.voxels.carve import CLASSES, add_votes, addresses, flush, mark_
 
 EDGE = 16
 FREE, HIT = 1, 2
+NOT_LEVEL = np.zeros(256, bool)
 F64 = NDArray[np.float64]
 Walk = Callable[..., NDArray[np.uint8]]
 
@@ -133,7 +134,7 @@ def test_an_uncertain_range_hits_less_and_carves_less(sigma: float, weight: int,
     marks, touched, votes = np.zeros(4096, np.uint8), np.zeros(1, np.uint8), np.zeros((1, CLASSES), np.uint32)
     start, label, spread = np.full(3, 0.5), np.array([8], np.uint8), np.array([sigma], np.float32)
     ray, length, _, _ = to_rays(np.array([[10.5, 0.5, 0.5]]), np.eye(4), start, 1.0, 50.0)
-    ends, rays = mark_ends(marks, touched, addresses((1, 1, 1)), ray, length, label, spread, start, 50.0, votes)
+    ends, rays = mark_ends(marks, touched, addresses((1, 1, 1)), ray, length, label, spread, NOT_LEVEL, start, 50.0, votes)
     assert ends.tolist() == [2 * 2560 + 1]  # voxel (10, 0, 0), a hit
     assert marks[2560] == weight << 1
     assert votes[0, 8] == weight
