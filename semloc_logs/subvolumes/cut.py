@@ -10,7 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.voxels.grid import FREE_STATE, UNLABELLED, UNOBSERVED_STATE
+from semloc_logs.labels.space import UNLABELLED
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 SIZE, MARGIN = 32, 8
 WIDE = SIZE + 2 * MARGIN

@@ -14,7 +14,8 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from semloc_logs.voxels.grid import UNLABELLED, UNOBSERVED, BlockMap, winners
+from semloc_logs.labels.space import UNLABELLED
+from semloc_logs.voxels.grid import UNOBSERVED, BlockMap, winners
 from semloc_logs.voxels.keys import BLOCK, morton, unpack
 
 CELLS = BLOCK**3

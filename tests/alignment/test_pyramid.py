@@ -10,8 +10,8 @@ from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.pyramid import ANY_BIT, FREE_BIT, build_pyramid, class_bits, look_up, pose_matrix, search, tau, yaw_between
 from semloc_logs.alignment.verify import Query, Target, same_place, search_hypotheses, structure_mask, structure_scores
 from semloc_logs.geometry import apply, exp_se3, inverse, yaw_transform
-from semloc_logs.labels.space import cityscapes
-from semloc_logs.voxels.grid import FREE_STATE, UNLABELLED, UNOBSERVED_STATE, BlockMap, empty_map
+from semloc_logs.labels.space import UNLABELLED, cityscapes
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, empty_map
 from semloc_logs.voxels.keys import BLOCK, pack
 
 V = 0.5

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.settings import Fusion, Settings
-from semloc_logs.voxels.grid import FREE_STATE, UNLABELLED, UNOBSERVED_STATE, BlockMap, Fuser
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
 from semloc_logs.voxels.keys import BLOCK
 
 Cell = tuple[int, ...]
