@@ -29,6 +29,10 @@ class SessionFolder:
         return self.path / "frames.parquet"
 
     @property
+    def ground(self) -> Path:
+        return self.path / "ground.parquet"
+
+    @property
     def keyframes(self) -> Path:
         return self.path / "keyframes"
 

@@ -29,6 +29,7 @@ from semloc_logs.labels.space import (
     space_of_names,
     spaces,
 )
+from semloc_logs.labels.surface import GroundSurface
 from semloc_logs.logs.depth import label_ids
 from semloc_logs.logs.session import Session
 from semloc_logs.settings import Labels
@@ -161,11 +162,21 @@ class Labeller:
         for name, topic in self._topics.items():
             topic.space, topic.said_by = self._space(name, topic)
 
-    def labels(self, keyframe: int, points: NDArray[np.floating], origin: NDArray[np.floating], ids: U32 | None, scale: float) -> U8:
-        """Classes (n,) of the level ``points`` (n, 3) of a keyframe seen from ``origin`` (3,), from what :meth:`take` gave; ``scale``: the
-        voxel size over 0.30 m."""
+    def labels(
+        self,
+        keyframe: int,
+        points: NDArray[np.floating],
+        origin: NDArray[np.floating],
+        ids: U32 | None,
+        scale: float,
+        ground: GroundSurface | None = None,
+    ) -> U8:
+        """Classes (n,) of the level ``points`` (n, 3) of a keyframe seen from ``origin`` (3,), from what :meth:`take` gave.
+
+        ``scale`` is the voxel size over 0.30 m; ``ground`` saves finding the ground below the points again.
+        """
         if self.source == "geometry":
-            return classify(points, origin, scale)
+            return classify(points, origin, scale, ground)
         if self.source == "uniform" or ids is None:
             return np.full(len(points), UNLABELLED, np.uint8)
         topic, form = self._keyframes[keyframe]
@@ -184,7 +195,7 @@ class Labeller:
         out[(ids & DOUBTFUL > 0) & np.isin(out, THINGS)] = UNLABELLED
         if self._settings.unseen == "geometry":
             unseen = ids == UNPAINTED
-            out[unseen] = classify(points, origin, scale)[unseen]
+            out[unseen] = classify(points, origin, scale, ground)[unseen]
         return out
 
     def to_json(self) -> dict[str, Any]:

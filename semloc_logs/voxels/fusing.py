@@ -19,6 +19,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.geometry import apply
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.space import SKY
+from semloc_logs.labels.surface import ground_surface
 from semloc_logs.logs.depth import RangeNoise
 from semloc_logs.logs.session import open_session
 from semloc_logs.logs.trajectory_file import TrajectoryFile
@@ -27,6 +28,7 @@ from semloc_logs.tables import replacing_folder, write_json, write_table
 from semloc_logs.voxels.ahead import ahead
 from semloc_logs.voxels.gravity import ground_height
 from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map
+from semloc_logs.voxels.ground import GroundMapper, write_ground
 from semloc_logs.voxels.keyframes import Collected, collect
 from semloc_logs.voxels.levelling import level
 from semloc_logs.voxels.picture import Caption, draw_map
@@ -50,7 +52,7 @@ class FuseTask:
 
 
 def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Write keyframes/, blocks/, voxels/, frames.parquet, trajectory.parquet, map.png and, last, session.json; returns the latter.
+    """Write every table, map.png and, last, session.json; returns the latter.
 
     Raises LogError when the log has nothing to fuse, RoleError when its streams leave open what to use.
     """
@@ -138,7 +140,8 @@ class _Fused:
         ranges = submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else []
         stamps = [h.stamp_ns for h in self.collected.headers]
         with replacing_folder(folder.keyframes) as keyframes, replacing_folder(folder.blocks) as blocks:
-            kept = ahead(keep_keyframes(keyframes, stamps, self._labelled(), self.metadata))
+            ground = GroundMapper(fusion.voxel_size / STREET_VOXEL)
+            kept = ahead(keep_keyframes(keyframes, stamps, self._labelled(ground), self.metadata))
             voxels = write_voxels(folder.voxels, self._kept_submaps(blocks, kept, ranges), self.metadata, fusion.clamp)
             if not ranges:
                 write_blocks(blocks_path(blocks, 0), empty_map(), self.metadata)
@@ -155,18 +158,22 @@ class _Fused:
             **pose_columns(self.poses),
         }
         write_table(folder.frames, contracts.table("frames", frames), self.metadata, ("keyframe",))
+        write_ground(folder.ground, ground.finish(), self.metadata)
         caption = Caption(folder.name, self.labeller.source, fusion.voxel_size)
         draw_map(folder.voxels, self.poses[:, :3, 3] if posed else np.zeros((0, 3)), caption, folder.picture)
         return {"posed": posed, "keyframes": n, "submaps": self.submaps, "voxels": voxels}
 
-    def _labelled(self) -> Iterator[Keyframe]:
-        """All keyframes with their classes, without sky."""
+    def _labelled(self, ground: GroundMapper) -> Iterator[Keyframe]:
+        """All keyframes with their classes, without sky; ``ground`` learns what they see of it."""
         scale = self.task.settings.fusion.voxel_size / STREET_VOXEL
         for i, pose in enumerate(self.poses):
             points, ids, sigma = self.collected.load(i)
             level_points, origin = apply(pose, points), apply(pose, self.collected.origins[i][None])[0]
             self.grounds.append(ground_height(level_points - np.r_[pose[:2, 3], 0.0], float(origin[2]), scale))
-            label = self.labeller.labels(i, level_points, origin, ids, scale)
+            surface = ground_surface(level_points, origin, scale)
+            if self.collected.poses[i] is not None:
+                ground.add(surface, origin)
+            label = self.labeller.labels(i, level_points, origin, ids, scale, surface)
             keep = label != SKY
             self.counts.append(int(keep.sum()))
             yield Keyframe(points[keep], label[keep], None if sigma is None else sigma[keep])

@@ -5,7 +5,31 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.labels.shape import shape
+from semloc_logs.voxels.selection import thin
+
 F64 = NDArray[np.float64]
+MOST_POINTS = 12_000  # of a keyframe that normals are taken from
+FINENESS = 25.0  # so many cells lie one behind the other within the median range, where the points are as dense as that
+
+
+def surface_normals(points: NDArray[np.float32], origin: NDArray[np.floating], cell: float, noise: float = 0.0) -> tuple[F64, F64]:
+    """Unit normals (m, 3) of flat places among ``points`` (n, 3) and their weights (m,).
+
+    The points are thinned to cells of ``cell`` metres, to smaller ones in a room that is small for its voxels, and to larger ones where
+    there are too many or where ``noise``, the standard deviation of their ranges (m), would turn the normals.
+    """
+    if not len(points):
+        return np.zeros((0, 3)), np.zeros(0)
+    cell = max(min(cell, float(np.median(np.linalg.norm(points - origin, axis=1))) / FINENESS), 2 * noise, 1e-3)
+    some = points[thin(points, cell)]
+    while len(some) > MOST_POINTS:
+        cell *= max(1.05, float(np.sqrt(len(some) / MOST_POINTS)))
+        some = some[thin(some, cell)]
+    s = shape(some, 12)
+    weight = np.where((s.planar > 0.5) & (s.scattered < 0.15), s.planar, 0.0).astype(float)
+    keep = weight > 0
+    return s.normal[keep].astype(float), weight[keep]
 
 
 def find_up(normals: NDArray[np.floating], weights: NDArray[np.floating], prior: F64, within: float = 0.7) -> F64:

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from semloc_logs.frames import Header
 from semloc_logs.labels.labeller import Labeller
-from semloc_logs.labels.shape import shape
 from semloc_logs.logs.session import Session
 from semloc_logs.settings import Fusion
 from semloc_logs.voxels.ahead import ahead
+from semloc_logs.voxels.gravity import surface_normals
 from semloc_logs.voxels.selection import KeyframeSelector, thin
 
 F32 = NDArray[np.float32]
@@ -50,15 +50,10 @@ class Collected:
         self.poses.append(raw.session_T_base)
         self.origins.append(raw.origin)
         if number % self._every == 0:
-            if raw.sigma is not None:  # the normal of points that lie nearer to each other than their noise means nothing
-                cell = max(cell, 2 * float(np.median(raw.sigma)))
-            some = raw.points[thin(raw.points, cell)][:12_000]
-            s = shape(some, 12)
-            weight = np.where((s.planar > 0.5) & (s.scattered < 0.15), s.planar, 0.0).astype(float)
-            keep = weight > 0
-            normals = s.normal[keep].astype(float)
+            noise = 0.0 if raw.sigma is None else float(np.median(raw.sigma))
+            normals, weights = surface_normals(raw.points, raw.origin, cell, noise)
             turned = normals if raw.session_T_base is None else normals @ raw.session_T_base[:3, :3].T
-            self.normals.append((number, turned, weight[keep]))
+            self.normals.append((number, turned, weights))
             if len(self.normals) > MOST_NORMALS:
                 self._every *= 2
                 self.normals = [k for k in self.normals if k[0] % self._every == 0]

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semloc_logs.errors import SemlocError
+from semloc_logs.labels.surface import ground_surface
+from semloc_logs.voxels.ground import GroundMap, GroundMapper, read_ground, write_ground
+
+F64 = NDArray[np.float64]
+
+
+def hill(xy: F64) -> F64:
+    return np.asarray(2.0 * np.sin(xy[:, 0] / 15) + 0.05 * xy[:, 1])
+
+
+def sweep(rng: np.random.Generator, at: tuple[float, float], scale: float = 1.0) -> tuple[F64, F64]:
+    """Ground within 20 m, a bridge 5 m above it, a hole of 3 m where nothing is seen."""
+    r, a = 20 * np.sqrt(rng.random(9000)), rng.uniform(0, 2 * np.pi, 9000)
+    xy = np.c_[r * np.cos(a), r * np.sin(a)] + at
+    xy = xy[np.hypot(*(xy - [4.0, 4.0]).T) > 3]
+    deck = rng.uniform((-30, 8), (60, 11), (3000, 2))
+    points = np.concatenate([np.c_[xy, hill(xy) + rng.normal(0, 0.01, len(xy))], np.c_[deck, hill(deck) + 5]])
+    eye = np.array([*at, hill(np.array([at]))[0] + 1.8])
+    return points * scale, eye * scale
+
+
+@pytest.mark.parametrize("scale", [1.0, 1 / 6])
+def test_a_hill_driven_over(scale: float) -> None:
+    rng = np.random.default_rng(0)
+    mapper = GroundMapper(scale)
+    for x in range(0, 31, 6):
+        points, eye = sweep(rng, (float(x), 0.0), scale)
+        mapper.add(ground_surface(points, eye, scale), eye)
+    ground = mapper.finish()
+    xy = rng.uniform((-15, -15), (45, 15), (500, 2))
+    xy = xy[np.hypot(*(xy - [4.0, 4.0]).T) > 3.5]
+    off = ground.ground_at(xy * scale) / scale - hill(xy)
+    assert np.abs(off).max() < 0.25  # a cell of 1 m at slopes up to 14 %
+    assert np.median(np.abs(off)) < 0.05
+    assert np.abs(ground.ground_at(np.array([[4.0, 4.0]]) * scale) / scale - hill(np.array([[4.0, 4.0]]))) < 0.2  # filled in
+    assert np.isnan(ground.ground_at(np.array([[300.0, 0.0], [np.nan, 0.0]]) * scale)).all()
+
+
+def test_of_two_levels_the_one_that_is_seen_more() -> None:
+    xy = np.random.default_rng(1).uniform(-10, 10, (4000, 2))
+    mapper = GroundMapper(1.0)
+    for z in (0.02, 0.02, -0.02, 6.0):  # across the border of two levels, and on a deck
+        points = np.c_[xy, np.full(len(xy), z)]
+        mapper.add(ground_surface(points, np.array([0, 0, z + 1.8])), np.array([0, 0, z + 1.8]))
+    ground = mapper.finish()
+    assert ground.ground_at(np.zeros((1, 2)))[0] == pytest.approx(0.02 / 3, abs=0.005)
+    assert ground.frames.max() == 3
+
+
+def test_the_order_of_keyframes_does_not_matter() -> None:
+    rng = np.random.default_rng(2)
+    sweeps = [sweep(rng, (float(x), 0.0)) for x in (0, 7, 14)]
+    found = []
+    for order in ((0, 1, 2), (2, 0, 1)):
+        mapper = GroundMapper(1.0)
+        for k in order:
+            points, eye = sweeps[k]
+            mapper.add(ground_surface(points, eye), eye)
+        found.append(mapper.finish())
+    assert (found[0].ij == found[1].ij).all()
+    np.testing.assert_allclose(found[0].z, found[1].z, atol=1e-12)
+
+
+def test_written_and_read_again(tmp_path: Path) -> None:
+    ground = GroundMap(0.5, np.array([[-3, 2], [4, 5]], np.int32), np.array([1.25, -2.5]), np.array([1, 7], np.int32))
+    write_ground(tmp_path / "ground.parquet", ground, {"schema_version": 1})
+    again = read_ground(tmp_path / "ground.parquet")
+    assert (again.cell, again.ij.tolist(), again.z.tolist(), again.frames.tolist()) == (0.5, [[-3, 2], [4, 5]], [1.25, -2.5], [1, 7])
+    assert again.ground_at(np.array([[-1.25, 1.25]]))[0] == pytest.approx(1.25, abs=0.01)
+    with pytest.raises(SemlocError):
+        read_ground(tmp_path / "missing.parquet")
+
+
+def test_nothing_seen() -> None:
+    ground = GroundMapper(1.0).finish()
+    assert np.isnan(ground.ground_at(np.zeros((3, 2)))).all()
+    mapper = GroundMapper(1.0)
+    mapper.add(ground_surface(np.zeros((0, 3)), np.zeros(3)), np.zeros(3))
+    assert len(mapper.finish().z) == 0
