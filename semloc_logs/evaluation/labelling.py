@@ -22,7 +22,8 @@ from semloc_logs.labels.geometry import classify
 from semloc_logs.labels.space import UNLABELLED, cityscapes
 from semloc_logs.settings import STREET_VOXEL, Settings
 from semloc_logs.voxels.fusing import FuseTask, fuse_session
-from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
+from semloc_logs.voxels.grid import BlockMap, Fuser
+from semloc_logs.voxels.keys import pack
 from semloc_logs.voxels.store import read_keyframe
 from semloc_logs.workspace import Workspace
 
@@ -61,9 +62,10 @@ def intersection_over_union(counts: I64) -> NDArray[np.float64]:
 
 
 def _compare_maps(truth: BlockMap, found: BlockMap) -> I64:
-    """Confusion of the occupied voxels; both maps are of the same points."""
-    occupied = (truth.state != FREE_STATE) & (truth.state != UNOBSERVED_STATE)
-    return confusion(truth.state[occupied], found.state[occupied])
+    """Confusion of the voxels that are occupied in both maps, which classes decide a little: what is ground is carved less."""
+    (ours, our_class, *_), (theirs, their_class, *_) = found.occupied(), truth.occupied()
+    _, at, true_at = np.intersect1d(pack(ours), pack(theirs), assume_unique=True, return_indices=True)
+    return confusion(their_class[true_at], our_class[at])
 
 
 def measure_labels(logs: Sequence[Path], settings: Settings) -> Figures:
