@@ -76,13 +76,12 @@ def fusion_speed(settings: Settings, logs: Sequence[Path] = (), peers: Mapping[s
 def measure(case: Case, settings: Settings, peers: Mapping[str, str]) -> Figures:
     """Rounds of all, in turn: times of a scan, of what is due at the end, and the content of the map."""
     fusion = _fusion(settings, case)
-    points = [apply(s.map_T_sensor, s.points) for s in case.scans]
     with tempfile.TemporaryDirectory(prefix="semloc-fusion-") as folder, ExitStack() as stack:
         write_scans(Path(folder), case.scans)
         others = open_peers(stack, peers, Path(folder), case.voxel_size, case.max_range, os.cpu_count() or 1)
         rounds: dict[str, list[Round]] = {name: [] for name in ("ours", *others)}
         for _ in range(case.rounds + 1):  # the first one warms up
-            rounds["ours"].append(our_round(case.scans, points, fusion))
+            rounds["ours"].append(our_round(case.scans, fusion))
             for name, peer in others.items():
                 rounds[name].append(peer.round())
     rows: dict[str, dict[str, float]] = {}
@@ -110,12 +109,12 @@ def measure(case: Case, settings: Settings, peers: Mapping[str, str]) -> Figures
     return {f"{case.name}_{key}": {**rows[f"{case.name}_{key}"], "unit": unit} for key, unit in units.items()}
 
 
-def our_round(scans: Sequence[Scan], points: Sequence[NDArray[np.float64]], fusion: Fusion) -> Round:
-    """Our fusion of ``points`` (n, 3) in the map frame with the labels of ``scans``."""
-    fuser, ms, cpu = Fuser(fusion), [], []
-    for scan, placed in zip(scans, points, strict=True):
+def our_round(scans: Sequence[Scan], fusion: Fusion) -> Round:
+    """Our fusion of ``scans`` with their labels."""
+    fuser, here, ms, cpu = Fuser(fusion), np.zeros(3), [], []
+    for scan in scans:
         start, start_cpu = time.perf_counter(), time.process_time()
-        fuser.add(placed, scan.label, scan.map_T_sensor[:3, 3])
+        fuser.add(scan.points, scan.label, here, None, scan.map_T_sensor)
         ms.append(1e3 * (time.perf_counter() - start))
         cpu.append(1e3 * (time.process_time() - start_cpu))
     start = time.perf_counter()
@@ -139,7 +138,7 @@ def _limits(case: Case, settings: Settings, bandwidth: float, clock: float) -> F
     points = apply(scan.map_T_sensor, scan.points)
     steps, free, occupied = walk_all(points, scan.map_T_sensor[:3, 3], case.voxel_size, case.max_range)
     fuser = Fuser(_fusion(settings, case))
-    fuser.add(points, scan.label, scan.map_T_sensor[:3, 3])
+    fuser.add(scan.points, scan.label, np.zeros(3), None, scan.map_T_sensor)
     ours = _content(fuser.finish())
     own = "" if case.name == "sweep" else f"{case.name}_"
     touched = len(points) * 16 + sum(ours) * 2
