@@ -10,10 +10,11 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, LidarFrame
-from semloc_logs.geometry import inverse, rotation_angle
+from semloc_logs.geometry import apply, inverse, rotation_angle
 from semloc_logs.logs.poses import is_time
 from semloc_logs.logs.sweeps import LONGEST_SWEEP_NS
 from semloc_logs.logs.tally import span
@@ -25,13 +26,16 @@ MAX_TURN = 10.0  # rad/s
 _FEWEST = 100  # points of a sweep that can be registered
 _VOXELS_PER_RANGE = 100.0  # KISS-ICP's own choice: the map's voxels are a hundredth of the range
 _LONGEST_RANGE = 100.0  # m; its default
+# A sweep lies on the one before it: in a hall 0.67 to 0.9 of its points, on a street 0.76 and more, 0.25 to 0.45 once track is lost
+LEAST_OVERLAP = 0.6  # of the median overlap so far
+_MOST_COMPARED = 20_000  # points of the sweep before
 
 
 class LidarOdometry:
     """Poses of the LIDAR on ``topic`` from its sweeps. LogError when KISS-ICP is not installed.
 
-    ``max_range`` and ``min_range`` (m): points that are used. After a jump that no vehicle can make there are no more poses, and
-    ``problems`` says so.
+    ``max_range`` and ``min_range`` (m): points that are used. After a jump that no vehicle can make, or once a sweep does not lie on the
+    one before any more, there are no more poses, and ``problems`` says so. Slow drift goes unnoticed.
     """
 
     name = "LIDAR odometry"
@@ -43,7 +47,10 @@ class LidarOdometry:
         self.problems: list[str] = []
         self.notes: list[str] = []
         self.is_over = False
-        self._engine, self._version = _kiss_icp(min_range, min(max_range, _LONGEST_RANGE))
+        self._voxel = min(max_range, _LONGEST_RANGE) / _VOXELS_PER_RANGE
+        self._engine, self._version = _kiss_icp(min_range, min(max_range, _LONGEST_RANGE), self._voxel)
+        self._before: cKDTree | None = None  # the sweep before
+        self._overlaps: list[float] = []
         self._start: F64 | None = None  # base_T_sensor of the first sweep
         self._new: list[tuple[int, F64]] = []
         self._last: tuple[int, F64] | None = None
@@ -62,9 +69,9 @@ class LidarOdometry:
         if len(frame.points) < _FEWEST or is_late or not is_time(stamp_ns):
             self._poor += 1
             return
-        self._engine.register_frame(frame.points.astype(np.float64), offsets)
+        whole, some = self._engine.register_frame(frame.points.astype(np.float64), offsets)
         pose = np.array(self._engine.last_pose, float)
-        if self._last is not None and self._is_jump(stamp_ns, pose):
+        if self._last is not None and (self._is_jump(stamp_ns, pose) or self._is_apart(pose, np.asarray(some))):
             self.is_over = True
             self.problems.append(
                 f"LIDAR odometry lost track at {span(stamp_ns, stamp_ns).split(' to ')[0]}: frames after that are left out; "
@@ -77,6 +84,7 @@ class LidarOdometry:
             self._new.insert(0, (2 * first_ns - stamp_ns, first @ inverse(pose) @ first))
         self._new.append((stamp_ns, pose))
         self._last = (stamp_ns, pose)
+        self._before = cKDTree(np.asarray(whole)[:: 1 + len(whole) // _MOST_COMPARED])
         self._count += 1
 
     def poses(self, base_T: Callable[[str, int], F64 | None]) -> Iterator[tuple[int, F64]]:
@@ -112,6 +120,16 @@ class LidarOdometry:
             return True
         return before is not None and bool(np.linalg.norm(speed - before) > MAX_SPEED_CHANGE + _MAX_ACCELERATION * seconds)
 
+    def _is_apart(self, pose: F64, points: F64) -> bool:
+        """Whether ``points`` (n, 3) of the newest sweep at ``pose`` lie on fewer of the sweep before than sweeps have done so far."""
+        if self._last is None or self._before is None or not len(points):
+            return False
+        near, _ = self._before.query(apply(inverse(self._last[1]) @ pose, points), distance_upper_bound=self._voxel / 2)
+        overlap = float(np.isfinite(near).mean())
+        usual = float(np.median(self._overlaps)) if self._overlaps else overlap
+        self._overlaps.append(overlap)
+        return overlap < LEAST_OVERLAP * usual
+
 
 def _pose_time(frame: LidarFrame) -> tuple[int, F64]:
     """When KISS-ICP's pose is, and point times from 0 to 1: it moves the points of a sweep to the time of the last one."""
@@ -124,7 +142,7 @@ def _pose_time(frame: LidarFrame) -> tuple[int, F64]:
     return frame.header.stamp_ns + last, (offset_ns - first) / (last - first)
 
 
-def _kiss_icp(min_range: float, max_range: float) -> tuple[Any, str]:
+def _kiss_icp(min_range: float, max_range: float, voxel_size: float) -> tuple[Any, str]:
     """An odometry and the version of the library. One thread, because more of them sum in another order each time."""
     try:
         version = str(import_module("kiss_icp").__version__)
@@ -139,7 +157,7 @@ def _kiss_icp(min_range: float, max_range: float) -> tuple[Any, str]:
     settings = parser.KISSConfig(
         data=config.DataConfig(max_range=max_range, min_range=min_range, deskew=True),
         registration=config.RegistrationConfig(max_num_threads=1),
-        mapping=config.MappingConfig(voxel_size=max_range / _VOXELS_PER_RANGE),
+        mapping=config.MappingConfig(voxel_size=voxel_size),
         adaptive_threshold=config.AdaptiveThresholdConfig(),
     )
     return module.KissICP(config=settings), version

@@ -143,9 +143,10 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> Any:
     """An odometry that gives the sensor poses that the test puts into ``steps``."""
     made = SimpleNamespace(steps=[], calls=[], last_pose=np.eye(4))
 
-    def register_frame(points: F64, offsets: F64) -> None:
+    def register_frame(points: F64, offsets: F64) -> tuple[F64, F64]:
         made.calls.append((points, offsets))
         made.last_pose = made.steps[len(made.calls) - 1]
+        return points, points
 
     made.register_frame = register_frame
     monkeypatch.setattr(odometry, "_kiss_icp", lambda *_: (made, "1.3.0"))
@@ -193,6 +194,15 @@ def test_a_jump_ends_the_poses_and_is_said(engine: Any) -> None:
     assert len(clouds) == 7  # the nearest pose serves a tenth of a second
     assert any("LIDAR odometry lost track at 2023-11-14T22:13:20.600Z" in said for said in session.skipped)
     assert any("13 of 20 frames are left out: no pose" in said for said in session.skipped)
+
+
+def test_a_sweep_that_does_not_lie_on_the_one_before_ends_the_poses(engine: Any) -> None:
+    engine.steps = along(0.0, 0.1, 0.2, 0.7, 1.2)  # within what a vehicle can do, but the points stay where they are
+    made = LidarOdometry("/points", min_range=0.5, max_range=80.0)
+    for frame in sweeps(5, many=60):
+        made.take(frame)
+    assert len(engine.calls) == 4
+    assert "lost track at 2023-11-14T22:13:20.300Z" in made.problems[0]
 
 
 @pytest.mark.parametrize("pose", [yaw_transform(1.5), np.full((4, 4), np.nan), yaw_transform(0.0, (30.0, 0, 0))])
