@@ -37,6 +37,7 @@ class PoseTrack:
         self.backwards = 0
         self.invalid = 0
         self.ahead = 0
+        self.moves = False  # whether any position differs from the first
         self._keep_ns = None if keep_seconds is None else round(keep_seconds * 1e9)
         self._stamps = np.empty(16, np.int64)
         self._rows = np.empty((16, 3, 4))
@@ -69,6 +70,7 @@ class PoseTrack:
         self._stamps[self._n] = stamp_ns
         self._rows[self._n] = pose[:3]
         self._n += 1
+        self.moves = self.moves or bool((pose[:3, 3] != self._rows[0, :, 3]).any())
         return True
 
     def _drop_ahead(self, stamp_ns: int) -> None:

@@ -35,8 +35,10 @@ from semloc_logs.logs.odometry import LidarOdometry
 from semloc_logs.logs.open import open_log
 from semloc_logs.logs.picture_clouds import PictureClouds
 from semloc_logs.logs.roles import Roles, find_roles, no_sensor
+from semloc_logs.logs.stamps import StampOrder
+from semloc_logs.logs.standstill import Standstill
 from semloc_logs.logs.sweeps import LONGEST_SWEEP_NS, in_base, sweep_in_base
-from semloc_logs.logs.tally import COPY, Tally, never_moves, no_poses, without_unused
+from semloc_logs.logs.tally import COPY, Tally, never_moves, no_poses, refused, smeared, without_unused
 from semloc_logs.logs.trajectory_file import FilePoses, TrajectoryFile
 
 MAX_WAITING = 64  # frames that wait for their pose and transforms
@@ -134,6 +136,8 @@ class Session:
         self._pictures = PictureClouds(self.roles, self._where.tree.lookup, stride=self.stride, noise=self._noise)
         self._accelerometer = Accelerometer()
         self._tally = Tally()
+        self._standstill = Standstill()
+        self._order: dict[str, StampOrder] = {}
         # who names several LIDARs wants them all
         self._copies = Copies() if len(self.roles.lidar) > 1 and not self._is_told else None
         self._waiting: deque[RangeFrame] = deque()
@@ -302,6 +306,9 @@ class Session:
                     if not len(frame.points):
                         self._tally.leave_out(topic, "empty")
                         return
+                if not self._order.setdefault(topic, StampOrder()).accepts(frame.header.stamp_ns):
+                    self._tally.leave_out(topic, "back in time")
+                    return
                 self._waiting.append(frame)
                 self._waiting_bytes += _size(frame)
             if not isinstance(frame, LidarFrame):
@@ -388,6 +395,8 @@ class Session:
         if not len(points):
             return "no points"
         self._sensors[header.frame_id] = base_T_sensor
+        if pose is not None and header.topic == self.roles.ranging[0] and not self._where.track.moves:
+            self._standstill.add(points, pose)
         return PosedCloud(header, points, base_T_sensor[:3, 3].astype(np.float32), pose, label, extra, sigma)
 
     def _conclude(self) -> None:
@@ -395,18 +404,19 @@ class Session:
         self._lost.extend(self._tally.sentences((track.start_ns, track.end_ns)))
         self._notes.extend(self._tally.remarks())
         self._notes.extend([] if self._copies is None else self._copies.sentences())
-        refused = [f"{n} {what}" for n, what in ((track.duplicates, "repeated"), (track.backwards, "back in time")) if n]
-        if refused:
-            self._notes.append(f"Poses that are {' and '.join(refused)} were left out.")
-        if track.ahead:
-            self._lost.append(f"{track.ahead} of the poses lie more than 10 s ahead of those that follow and were left out.")
         if track.invalid:
             self._lost.append(f"{track.invalid} poses are no rigid transforms and were left out.")
         source = self._where.source
         if source is not None:
             self._lost.extend(source.problems)
             self._notes.extend(source.notes)
-        self._notes.extend(never_moves(source.name if source else self.roles.pose or "TF", track))
+        name = source.name if source else self.roles.pose or "TF"
+        # every publisher of TF may repeat what others said: nothing is lost by that
+        (self._notes if name == "TF" and not track.backwards + track.ahead else self._lost).extend(refused(name, track))
+        if self._standstill.shift and not track.moves:
+            self._lost.append(smeared(name, self._standstill.shift))
+        else:
+            self._notes.extend(never_moves(name, track))
         if self._where.base is not None and self._where.base.pose_frame is None:
             self._notes.append(no_poses(self.name))
 

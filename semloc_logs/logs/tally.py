@@ -24,6 +24,7 @@ _WHY = {
     "same picture": "the right camera has the very same picture: choose two cameras with --topic stereo_left=TOPIC stereo_right=TOPIC",
     "unusable pair": "the calibrations of the pair cannot be used",
     "no points": "they have no points within the range limits",
+    "back in time": "their stamps fall back behind those of earlier frames: the clock was set back; cut the log there",
     "empty": "they hold no points, or none whose position is a number",
 }
 _REMARKS = {
@@ -89,6 +90,21 @@ def no_poses(name: str) -> str:
     return (
         f"{name} has no pose stream: its frames can be searched one by one, but no map is built; "
         f"for a map use --odometry lidar, give a trajectory with --poses FILE, or name a topic with --topic pose=TOPIC."
+    )
+
+
+def refused(topic: str, track: PoseTrack) -> list[str]:
+    """A sentence about poses whose stamps make no sense. Empty when all is well."""
+    kinds = ((track.duplicates, "repeated"), (track.backwards, "back in time"), (track.ahead, "far ahead in time"))
+    counts = [f"{count} {what}" for count, what in kinds if count]
+    return [f"{topic}: poses that are {' and '.join(counts)} were left out."] if counts else []
+
+
+def smeared(topic: str, shift: float) -> str:
+    """What follows from poses that stand still while the surroundings move by ``shift`` metres or more."""
+    return (
+        f"{topic} gives the same position all the time, but the surroundings move by {shift:.1f} m or more: its poses, and what is mapped "
+        f"with them, are wrong; use --odometry lidar, give poses with --poses FILE, or name a topic with --topic pose=TOPIC."
     )
 
 

@@ -1,0 +1,55 @@
+"""The order of stamps: outliers, clocks that are set back, and poses that do not move."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semloc_logs.geometry import yaw_transform
+from semloc_logs.logs.poses import PoseTrack
+from semloc_logs.logs.stamps import StampOrder
+from semloc_logs.logs.standstill import Standstill
+
+S = 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("seconds", "refused"),
+    [
+        ([0, 1, 2, 3], []),
+        ([0, 1, 1, 2], []),
+        ([0, 1.0, 0.5, 2], []),  # overtaken
+        ([0, 1, 2, 3600, 3, 4], []),  # one leaps; it has no pose, so it is left out by that
+        ([0, 1, 2, 100, 101, 102], []),  # a pause
+        ([0, 1, 50, 100, 150], []),  # a slow stream
+        ([100, 101, 102, 50, 51, 103], [50, 51]),
+        ([3600, 0, 1, 2], []),  # the first one leaps
+        ([0, 1, 2, 3600, 3601, 3, 4], [3, 4]),
+        ([0, 1, 3600, 7200, 2, 3], []),
+    ],
+)
+def test_what_goes_back_is_refused(seconds: list[float], refused: list[float]) -> None:
+    order = StampOrder()
+    assert [s for s in seconds if not order.accepts(round(s * S))] == refused
+
+
+def test_whether_a_track_moves() -> None:
+    made = PoseTrack()
+    assert not made.moves
+    for k in range(5):
+        made.append(k * S, yaw_transform(0.1 * k, (1.0, 2.0, 3.0)))
+    assert not made.moves
+    made.append(9 * S, yaw_transform(0.0, (1.0, 2.0, 3.01)))
+    assert made.moves
+
+
+@pytest.mark.parametrize(("speed", "moves"), [(0.0, False), (0.2, True)])
+def test_surroundings_that_move_while_the_poses_stand(speed: float, moves: bool) -> None:
+    rng = np.random.default_rng(2)
+    watch = Standstill()
+    for k in range(20):
+        street = np.c_[rng.uniform(-20, 20, 5000), rng.choice([-6.0, 6.0], 5000), rng.uniform(0, 4, 5000)]
+        street = np.r_[street, np.c_[np.full(5000, 25.0), rng.uniform(-6, 6, 5000), rng.uniform(0, 4, 5000)]]
+        street += rng.normal(0, 0.02, street.shape)
+        watch.add((street - [speed * k, 0, 0]).astype(np.float32), yaw_transform(0.0, (7.0, 0, 0)))
+    assert (watch.shift > 0) == moves
