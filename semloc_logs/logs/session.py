@@ -138,6 +138,7 @@ class Session:
         self._tally = Tally()
         self._standstill = Standstill()
         self._order: dict[str, StampOrder] = {}
+        self._set_back: set[int] = set()  # ids of waiting frames
         # who names several LIDARs wants them all
         self._copies = Copies() if len(self.roles.lidar) > 1 and not self._is_told else None
         self._waiting: deque[RangeFrame] = deque()
@@ -307,8 +308,7 @@ class Session:
                         self._tally.leave_out(topic, "empty")
                         return
                 if not self._order.setdefault(topic, StampOrder()).accepts(frame.header.stamp_ns):
-                    self._tally.leave_out(topic, "back in time")
-                    return
+                    self._set_back.add(id(frame))
                 self._waiting.append(frame)
                 self._waiting_bytes += _size(frame)
             if not isinstance(frame, LidarFrame):
@@ -339,6 +339,10 @@ class Session:
             frame = self._waiting.popleft()
             self._waiting_bytes -= _size(frame)
             cloud = self._cloud(frame, is_end=is_end)
+            if id(frame) in self._set_back:
+                self._set_back.remove(id(frame))
+                # the pose at its time is that of an earlier frame
+                cloud = cloud if isinstance(cloud, str) or cloud.session_T_base is None else "back in time"
             if isinstance(cloud, str):
                 self._tally.leave_out(frame.header.topic, cloud)
             else:

@@ -128,8 +128,7 @@ def test_poses_that_make_no_sense_are_3_and_a_sentence(tmp_path: Path, poses: li
     done, session = fuse(drive(tmp_path / "a.mcap", poses))
     assert done.exit_code == 3, done.stderr
     warnings = [line for line in done.stderr.splitlines() if line.startswith("Warning: ")]
-    assert len(warnings) == 1
-    assert says in warnings[0]
+    assert sum(says in line for line in warnings) == 1
     assert any(says in sentence for sentence in session["skipped"])
 
 
