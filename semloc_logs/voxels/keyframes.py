@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import Header
+from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.session import Session
 from semloc_logs.settings import Fusion
@@ -20,87 +20,69 @@ from semloc_logs.voxels.selection import KeyframeSelector, thin
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-MOST_NORMALS = 40  # keyframes whose normals say where up is
+U32 = NDArray[np.uint32]
+MOST_NORMALS = 20  # keyframes whose normals say where up is
 
 
 @dataclass(slots=True, eq=False)
 class Collected:
-    """Keyframe by keyframe: ``header``, ``session_T_base`` (4, 4) or None, ``origin`` (3,) of the sensor in the base frame; their points,
-    and of some of them ``normals``: (keyframe, unit vectors (m, 3) in the session frame, or the base frame without poses, weights)."""
+    """Keyframe by keyframe: ``headers``, ``poses`` session_T_base (4, 4) or None, and ``origins`` (3,) of the sensor in the base frame;
+    their points, thinned to one a ``cell`` (m), are in files of the folder ``scratch``."""
 
     scratch: Path
+    cell: float
     headers: list[Header] = field(default_factory=list)
     poses: list[F64 | None] = field(default_factory=list)
     origins: list[F32] = field(default_factory=list)
-    normals: list[tuple[int, F64, F64]] = field(default_factory=list)
-    _every: int = 1  # keyframes with normals are this far apart
 
     def __len__(self) -> int:
         return len(self.headers)
 
-    def load(self, keyframe: int) -> tuple[F32, NDArray[np.uint32] | None, F32 | None]:
-        """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of their range, where there are any."""
-        points, label, sigma = (self.scratch / f"{keyframe}{what}.npy" for what in ("", "-label", "-sigma"))
-        return _load(points), _load(label) if label.exists() else None, _load(sigma) if sigma.exists() else None
-
-    def add(self, raw: RawKeyframe, cell: float) -> None:
-        """The next keyframe; its points are in the scratch folder already."""
+    def add(self, cloud: PosedCloud, kept: NDArray[np.int64], label: U32 | None = None) -> None:
+        """A keyframe: the points ``kept`` (m,) of ``cloud``, and their labels (m,) as recorded, if any."""
         number = len(self)
-        self.headers.append(raw.header)
-        self.poses.append(raw.session_T_base)
-        self.origins.append(raw.origin)
-        if number % self._every == 0:
-            noise = 0.0 if raw.sigma is None else float(np.median(raw.sigma))
-            normals, weights = surface_normals(raw.points, raw.origin, cell, noise)
-            turned = normals if raw.session_T_base is None else normals @ raw.session_T_base[:3, :3].T
-            self.normals.append((number, turned, weights))
-            if len(self.normals) > MOST_NORMALS:
-                self._every *= 2
-                self.normals = [k for k in self.normals if k[0] % self._every == 0]
+        self._save(number, "points", cloud.points[kept])
+        self._save(number, "label", label)
+        self._save(number, "sigma", None if cloud.sigma is None else cloud.sigma[kept])
+        self.headers.append(cloud.header)
+        self.poses.append(cloud.session_T_base)
+        self.origins.append(cloud.origin)
 
+    def load(self, keyframe: int) -> tuple[F32, U32 | None, F32 | None]:
+        """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of their range, where there are any."""
+        points = self._load(keyframe, "points")
+        return np.zeros((0, 3), np.float32) if points is None else points, self._load(keyframe, "label"), self._load(keyframe, "sigma")
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RawKeyframe:
-    """A thinned cloud before its classes are known; the fields are those of a PosedCloud."""
+    def normals(self, most: int = MOST_NORMALS) -> list[tuple[int, F64, F64]]:
+        """Of ``most`` keyframes, evenly spread: number, unit normals (m, 3) of surfaces in the session frame, or in the base frame
+        without poses, and their weights (m,)."""
+        out = []
+        for i in np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64)).tolist():
+            points, _, sigma = self.load(i)
+            noise = 0.0 if sigma is None else float(np.median(sigma))
+            normals, weights = surface_normals(points, self.origins[i], 2 * self.cell, noise)
+            pose = self.poses[i]
+            out.append((i, normals if pose is None else normals @ pose[:3, :3].T, weights))
+        return out
 
-    header: Header
-    session_T_base: F64 | None
-    origin: F32
-    points: F32
-    sigma: F32 | None
+    def _save(self, keyframe: int, what: str, values: NDArray[Any] | None) -> None:
+        if values is not None:
+            np.save(self.scratch / f"{keyframe}-{what}.npy", values, allow_pickle=False)
+
+    def _load(self, keyframe: int, what: str) -> NDArray[Any] | None:
+        path = self.scratch / f"{keyframe}-{what}.npy"
+        return np.load(path, allow_pickle=False) if path.exists() else None
 
 
 def collect(session: Session, labeller: Labeller, fusion: Fusion, scratch: Path, on_progress: Callable[[str], None]) -> Collected:
     """Read the log once: thinned points of its keyframes go to files of ``scratch``, what is small stays in memory."""
-    cell = fusion.keyframe_resolution or 0.1
-    collected = Collected(scratch)
-    for raw in ahead(_keyframes(session, labeller, KeyframeSelector(fusion), cell, scratch)):
-        collected.add(raw, 2 * cell)
-        if len(collected) % 50 == 0:
-            on_progress(f"read {len(collected)} keyframes")
+    collected, selector = Collected(scratch, fusion.keyframe_resolution or 0.1), KeyframeSelector(fusion)
+    clouds = session.clouds(labeller.on_image, labeller.images)
+    # pictures come through the labeller in the same pass: they must not overtake the clouds that they are painted on
+    for cloud in ahead(clouds) if labeller.on_image is None else clouds:
+        if selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
+            kept = thin(cloud.points, collected.cell)
+            collected.add(cloud, kept, labeller.take(cloud, kept))
+            if len(collected) % 50 == 0:
+                on_progress(f"read {len(collected)} keyframes")
     return collected
-
-
-def _keyframes(session: Session, labeller: Labeller, selector: KeyframeSelector, cell: float, scratch: Path) -> Iterator[RawKeyframe]:
-    number = 0
-    for cloud in session.clouds(labeller.on_image, labeller.images):
-        if not selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
-            continue
-        keep = thin(cloud.points, cell)
-        points = cloud.points[keep]
-        _save(scratch, number, "", points)
-        _save(scratch, number, "-label", labeller.take(cloud, keep))
-        sigma = None if cloud.sigma is None else cloud.sigma[keep]
-        _save(scratch, number, "-sigma", sigma)
-        yield RawKeyframe(cloud.header, cloud.session_T_base, cloud.origin, points, sigma)
-        number += 1
-
-
-def _save(scratch: Path, keyframe: int, what: str, values: NDArray[np.generic] | None) -> None:
-    if values is not None:
-        np.save(scratch / f"{keyframe}{what}.npy", values, allow_pickle=False)
-
-
-def _load(path: Path) -> NDArray[Any]:
-    values: NDArray[Any] = np.load(path, allow_pickle=False)
-    return values

@@ -29,7 +29,7 @@ def level(session: Session, collected: Collected) -> tuple[F64, F64]:
     if prior is None:
         # a vehicle's frames follow REP 103, and so does its odometry; a camera's world may be any of its frames
         prior = (np.array([p[:3, :3] for p in known]) @ up_in_base).mean(0) if optical else UP
-    normals = collected.normals
+    normals = collected.normals()
     session_T_map = np.eye(4)
     session_T_map[:3, :3] = rotation_between(
         UP, find_up(np.concatenate([k[1] for k in normals]), np.concatenate([k[2] for k in normals]), prior)
@@ -40,7 +40,7 @@ def level(session: Session, collected: Collected) -> tuple[F64, F64]:
 
 def _each_level(collected: Collected, up_in_base: F64) -> F64:
     """Level poses (n, 4, 4) of keyframes without poses, by the nearest keyframe whose direction of gravity was found."""
-    found = {number: find_up(normals, weights, up_in_base) for number, normals, weights in collected.normals}
+    found = {number: find_up(normals, weights, up_in_base) for number, normals, weights in collected.normals()}
     keys = np.array(sorted(found))
     poses = np.tile(np.eye(4), (len(collected), 1, 1))
     for i in range(len(collected)):

@@ -20,7 +20,7 @@ from semloc_logs.logs.session import open_session
 from semloc_logs.logs.stereo_clouds import StereoClouds, _grey
 from semloc_logs.logs.tally import Tally
 from semloc_logs.voxels.gravity import find_up
-from semloc_logs.voxels.keyframes import Collected, RawKeyframe
+from semloc_logs.voxels.keyframes import Collected
 from semloc_logs.voxels.selection import thin
 
 MS = 1_000_000
@@ -238,14 +238,12 @@ def test_sigma_of_a_real_floor(room: list[PosedCloud]) -> None:
 
 
 @pytest.mark.parametrize("voxel", [0.03, 0.05, 0.1, 0.3])
-def test_the_direction_of_gravity_is_found_at_every_voxel_size(room: list[PosedCloud], voxel: float) -> None:
+def test_the_direction_of_gravity_is_found_at_every_voxel_size(room: list[PosedCloud], voxel: float, tmp_path: Path) -> None:
     """Leaning mattresses and noise of several voxels do not make the floor a slope."""
-    collected = Collected(Path())
+    collected = Collected(tmp_path, voxel / 3)
     for cloud in room[:3]:
-        keep = thin(cloud.points, voxel / 3)
-        sigma = None if cloud.sigma is None else cloud.sigma[keep]
-        collected.add(RawKeyframe(cloud.header, cloud.session_T_base, cloud.origin, cloud.points[keep], sigma), 2 * voxel / 3)
-    _, normals, weights = zip(*collected.normals, strict=True)
+        collected.add(cloud, thin(cloud.points, voxel / 3))
+    _, normals, weights = zip(*collected.normals(), strict=True)
     up = find_up(np.concatenate(normals), np.concatenate(weights), np.array([0.0, 0.0, 1.0]))
     assert tilt(up) < 1.5
 
