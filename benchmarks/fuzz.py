@@ -117,7 +117,8 @@ def main() -> int:
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
     end = time.monotonic() + 60 * options.minutes
     found: Counter[str] = Counter()
-    slowest, seed = (0.0, ""), options.seed
+    slowest, largest, seed = (0.0, ""), (0.0, ""), options.seed
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     while (seed < options.seed + options.count) if options.count is not None else (time.monotonic() < end):
         name, limit_s, attempt, content = one(seed, options.only)
         signal.setitimer(signal.ITIMER_PROF, limit_s)
@@ -136,11 +137,16 @@ def main() -> int:
                 print(f"seed {seed}: {key}: {str(error)[:200]}", flush=True)
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
+        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - peak
+        if grown > 1:
+            peak += grown
+            largest = max(largest, (grown, f"{name} seed {seed}"))
         slowest = max(slowest, (time.process_time() - start, f"{name} seed {seed}"))
         seed += 1
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"{seed - options.seed} inputs, {sum(found.values())} findings of {len(found)} kinds")
-    print(f"slowest {slowest[0]:.2f} s of processor ({slowest[1]}); peak memory {peak:.0f} MiB")
+    print(
+        f"slowest {slowest[0]:.2f} s of processor ({slowest[1]}); peak memory {peak:.0f} MiB, most by {largest[0]:.0f} MiB ({largest[1]})"
+    )
     return 1 if found else 0
 
 

@@ -263,7 +263,7 @@ def _livox(m: Any, message: Message) -> Iterator[Frame]:
         offset += start
     xyz = np.stack([m.points[axis] for axis in "xyz"], axis=1).astype(np.float32)
     finite = np.isfinite(xyz).all(axis=1)
-    kept = finite & xyz.any(axis=1)
+    kept = finite & ((xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0))
     yield LidarFrame(header, xyz[kept], None, offset[kept], m.points["line"][kept].astype(np.uint16), int((~finite).sum()))
 
 

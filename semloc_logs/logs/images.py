@@ -138,6 +138,7 @@ def _check_claim(data: bytes) -> None:
     if data.startswith(b"\x89PNG\r\n\x1a\n"):
         if len(data) < 33 or data[12:16] != b"IHDR" or data[25] not in _PNG_CHANNELS:
             raise UndecodableError("its PNG picture is damaged")
+        _check_chunks(data)
         width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
         values = width * height * _PNG_CHANNELS[colour]
         stored = height * (width * (1 if colour == 3 else _PNG_CHANNELS[colour]) * depth // 8)
@@ -149,6 +150,18 @@ def _check_claim(data: bytes) -> None:
         raise UndecodableError("its picture is neither JPEG nor PNG")
     if too_many or width * height > _MAX_PIXELS:
         raise UndecodableError(f"its {len(data)} bytes claim {width} x {height} pixels")
+
+
+def _check_chunks(data: bytes) -> None:
+    """UndecodableError when a chunk of a PNG claims more bytes than there are: the decoder would make room for them."""
+    position = 8
+    while position + 12 <= len(data):
+        length = int.from_bytes(data[position : position + 4], "big")
+        position += 12 + length
+        if position > len(data):
+            raise UndecodableError("its PNG picture is cut off or damaged")
+        if data[position - length - 8 : position - length - 4] == b"IEND":
+            return
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:

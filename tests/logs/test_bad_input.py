@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from semloc_logs.cli.main import program
 from semloc_logs.errors import LogError
 from semloc_logs.geometry import yaw_transform
-from semloc_logs.logs.images import decode_compressed
+from semloc_logs.logs.definitions import UndecodableError
+from semloc_logs.logs.images import decode_compressed, decode_compressed_depth
 from semloc_logs.logs.inspect import inspect_log
 from semloc_logs.logs.session import Session, open_session
 
@@ -297,6 +298,7 @@ BOMBS = {
     "png": ("png", png_head(100_000, 100_000)),
     "png of many bits": ("png", png_head(8000, 8000, 16, 6, bytes(40_000_000))),
     "png 2^31": ("png", png_head(2**31 - 1, 2**31 - 1, 16, 6)),
+    "png chunk": ("png", png_head(8, 8).replace(struct.pack(">I", len(zlib.compress(b""))) + b"IDAT", b"\x41\0\0\0IDAT")),
     "jpeg": ("jpeg", jpeg_head(65_000, 65_000)),
     "rvl": ("16UC1; compressedDepth rvl", struct.pack("<iffIII", 0, 0, 0, 60_000, 60_000, 0)),
     "rvl of zeros": ("16UC1; compressedDepth rvl", struct.pack("<iffIIII", 0, 0, 0, 4096, 8192, 0xFFFFFFF7, 0)),
@@ -336,9 +338,17 @@ print(json.dumps([len(clouds), session.skipped, resource.getrusage(resource.RUSA
     assert not any("MemoryError" in s for s in skipped), skipped
     assert grown_kib < 100 << 10
     told = " ".join(skipped)
-    assert "/colour/image/compressed: 4 messages skipped" in told
+    assert "/colour/image/compressed: 5 messages skipped" in told
     assert "/cam/depth/image/compressedDepth: 3 messages skipped" in told
     assert "/points: 3 messages skipped" in told
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_bombs_are_refused_for_their_claim(name: str) -> None:
+    """Before the decoder of pictures sees them: it would ask for the memory, and say only that it failed."""
+    format_, data = BOMBS[name]
+    with pytest.raises(UndecodableError, match="claim|cut off"):
+        decode_compressed_depth(data, format_) if "Depth" in format_ else decode_compressed(data)
 
 
 def test_pictures_that_shrink_well_are_read() -> None:

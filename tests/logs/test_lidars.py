@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -221,6 +222,17 @@ def test_livox_claims_and_strange_definitions(encoding: str) -> None:
     strange = Definition("", definition.encoding, definition.text.replace(b"float32 x", b"float64 x"))
     assert Decoder(problems).frames(Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", encoding, 1, data, strange)) == []
     assert "not that of the Livox drivers" in problems.sentences()[0] or "need" in problems.sentences()[0]
+
+
+def test_livox_points_of_signalling_nan_are_dropped_without_a_warning() -> None:
+    data, definition = livox_message(PACKAGES[0], "ros1")
+    at = data.index(struct.pack("<fff", 2.0, 2.0, -1.0))
+    damaged = data[:at] + struct.pack("<I", 0x7F800001) + data[at + 4 :]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        [frame] = Decoder(Problems()).frames(Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", "ros1", 1, damaged, definition))
+    assert isinstance(frame, LidarFrame)
+    assert (len(frame.points), frame.lost) == (4, 1)
 
 
 def test_livox_is_a_lidar() -> None:
