@@ -347,7 +347,7 @@ print(json.dumps([len(clouds), session.skipped, resource.getrusage(resource.RUSA
 def test_bombs_are_refused_for_their_claim(name: str) -> None:
     """Before the decoder of pictures sees them: it would ask for the memory, and say only that it failed."""
     format_, data = BOMBS[name]
-    with pytest.raises(UndecodableError, match="claim|cut off"):
+    with pytest.raises(UndecodableError, match=r"claim|cut off"):
         decode_compressed_depth(data, format_) if "Depth" in format_ else decode_compressed(data)
 
 
