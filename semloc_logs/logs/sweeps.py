@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs import geometry
@@ -25,8 +26,8 @@ def sweep_in_base(
     times, the sweep stays as it was measured. Points nearer than ``min_range`` or beyond ``max_range`` (m, from the sensor) are dropped.
     """
     with np.errstate(over="ignore"):  # damaged floats may be 1e38
-        distance = np.linalg.norm(frame.points, axis=1)
-    kept = (distance >= min_range) & (distance <= max_range)
+        squared = np.einsum("ni,ni->n", frame.points, frame.points)
+    kept = (squared >= min_range**2) & (squared <= max_range**2)
     points = frame.points[kept]
     label = None if frame.label is None else frame.label[kept]
     if frame.offset_ns is not None and poses_at is not None and len(points):
@@ -38,10 +39,19 @@ def sweep_in_base(
 
 def in_base(base_T_sensor: F64, points: F32) -> F32:
     """Points (n, 3) of a sensor in the base frame, in single precision: a hundred metres to 0.01 mm."""
-    matrix = base_T_sensor.astype(np.float32)
-    # not a matrix product: BLAS would wake its threads for three columns, which costs more than the work on a busy machine
-    moved: F32 = np.einsum("ij,nj->ni", matrix[:3, :3], points) + matrix[:3, 3]
-    return moved
+    return _move(np.ascontiguousarray(points, np.float32), np.zeros(len(points), np.int64), base_T_sensor[None])
+
+
+@njit(cache=True, nogil=True)
+def _move(points: F32, index: NDArray[np.int64], poses: F64) -> F32:
+    """Points (n, 3), each moved by its pose ``poses[index]`` (m, 4, 4): a loop, because gathered poses are five times the points' bytes."""
+    out = np.empty_like(points)
+    for i in range(len(points)):
+        m = poses[index[i]]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        for k in range(3):
+            out[i, k] = m[k, 0] * x + m[k, 1] * y + m[k, 2] * z + m[k, 3]
+    return out
 
 
 def deskew(points: F32, offset_ns: NDArray[np.int64], stamp_ns: int, base_T_sensor: F64, poses_at: PosesAt) -> F32 | None:
@@ -56,7 +66,5 @@ def deskew(points: F32, offset_ns: NDArray[np.int64], stamp_ns: int, base_T_sens
     poses, known = poses_at(stamps)
     if not known.all():
         return None
-    base_T_moving = (geometry.inverse(poses[-1]) @ poses[:-1] @ base_T_sensor).astype(np.float32)
-    motion = base_T_moving[bins]
-    moved: F32 = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3]
-    return moved
+    base_T_moving = geometry.inverse(poses[-1]) @ poses[:-1] @ base_T_sensor
+    return _move(np.ascontiguousarray(points, np.float32), bins, base_T_moving)
