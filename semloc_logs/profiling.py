@@ -43,7 +43,7 @@ _PARTS: dict[str, tuple[tuple[str, ...], str]] = {
     "thin": (("selection.py thin",), ""),
     "scratch files": (("keyframes.py _save", "keyframes.py load"), ""),
     "direction of gravity": (("keyframes.py add", "levelling.py level"), ""),
-    "height of the ground": (("gravity.py ground_height",), ""),
+    "ground": (("gravity.py ground_height", "surface.py ground_surface", "ground.py add", "ground.py finish"), ""),
     "labels": (("labeller.py labels", "labeller.py take"), ""),
     "keyframes written": (("store.py keep_keyframes",), "fusing.py _labelled"),
     "integrate": (("grid.py add",), ""),
