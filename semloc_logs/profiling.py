@@ -182,7 +182,7 @@ def _parts(stats: dict[tuple[str, int, str], tuple[int, int, float, float, objec
     for part, (functions, without) in _PARTS.items():
         if any(f in total for f in functions):
             parts[part] = sum(total.get(f, 0.0) for f in functions) - total.get(without, 0.0)
-    parts["rest"] = total.get("stages.py fuse", 0.0) - sum(parts.values())
+    parts["rest"] = max(0.0, total.get("stages.py fuse", 0.0) - sum(parts.values()))  # thinning for gravity counts twice
     return parts
 
 
