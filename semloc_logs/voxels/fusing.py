@@ -170,8 +170,9 @@ class _Fused:
             points, ids, sigma = self.collected.load(i)
             level_points, origin = apply(pose, points), apply(pose, self.collected.origins[i][None])[0]
             self.grounds.append(ground_height(level_points - np.r_[pose[:2, 3], 0.0], float(origin[2]), scale))
-            surface = ground_surface(level_points, origin, scale)
-            if self.collected.poses[i] is not None:
+            is_mapped = self.collected.poses[i] is not None and ground.wants(origin)
+            surface = ground_surface(level_points, origin, scale) if is_mapped or self.labeller.source == "geometry" else None
+            if is_mapped and surface is not None:
                 ground.add(surface, origin)
             label = self.labeller.labels(i, level_points, origin, ids, scale, surface)
             keep = label != SKY

@@ -21,6 +21,7 @@ F64 = NDArray[np.float64]
 SEEN_WITHIN = 40.0  # of the sensor; farther off few rays reach the ground (m at street scale)
 NEAR = 10.0  # a cell at this distance counts half of one at the sensor's feet (m at street scale)
 LEVEL = 1.0  # heights of a cell that differ by more are two levels, a bridge and the road below it (m at street scale)
+APART = 2.0  # keyframes nearer to each other than this see the same ground (m at street scale)
 NEIGHBOURS = 4
 FAR = 30.0  # nothing is said of places farther than this from any seen ground (m at street scale)
 _COMPACT = 400_000  # rows
@@ -71,13 +72,20 @@ class GroundMap:
 
 @dataclass(slots=True, eq=False)
 class GroundMapper:
-    """Collects the ground of keyframes; ``scale`` is the voxel size over 0.30 m. The result does not depend on the order of keyframes."""
+    """Collects the ground of keyframes; ``scale`` is the voxel size over 0.30 m. The order in which they are added does not
+    matter."""
 
     scale: float
     _rows: list[_Rows] = field(default_factory=list)
+    _last: F64 | None = None
+
+    def wants(self, origin: NDArray[np.floating]) -> bool:
+        """Whether a keyframe seen from ``origin`` (3,) is far enough from the last one that was added to tell anything new."""
+        return self._last is None or float(np.linalg.norm(np.asarray(origin, float) - self._last)) >= APART * self.scale
 
     def add(self, surface: GroundSurface, origin: NDArray[np.floating]) -> None:
         """The ground below a keyframe, in the map frame, seen from ``origin`` (3,)."""
+        self._last = np.array(origin, float)
         cell = CELL * self.scale
         centres = surface.centres()[surface.gap == 0]
         distance = np.hypot(*(centres - np.asarray(origin, float)[:2]).T)

@@ -86,3 +86,12 @@ def test_nothing_seen() -> None:
     mapper = GroundMapper(1.0)
     mapper.add(ground_surface(np.zeros((0, 3)), np.zeros(3)), np.zeros(3))
     assert len(mapper.finish().z) == 0
+
+
+def test_keyframes_that_tell_nothing_new_are_not_wanted() -> None:
+    mapper = GroundMapper(0.5)  # of voxels of 0.15 m: everything is half as far
+    assert mapper.wants(np.zeros(3))
+    points = np.random.default_rng(0).uniform([-10, -10, -1], [10, 10, -1], (500, 3))
+    mapper.add(ground_surface(points, np.zeros(3), 0.5), np.zeros(3))
+    assert not mapper.wants(np.array([0.9, 0, 0]))
+    assert mapper.wants(np.array([1.1, 0, 0]))
