@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import (
-    Command,
-    EngineChoice,
-    console_options,
-    engine_options,
-    json_option,
-    overwrite_option,
-    query_options,
-    settings_options,
-    work_option,
-)
+from .options import Command, EngineChoice, query_options, stage_options, work_option
 from .results import finish, report_json, show_closures
 
 if TYPE_CHECKING:
@@ -31,11 +21,7 @@ if TYPE_CHECKING:
 @click.option("--target", "targets", metavar="SESSION", multiple=True, help="Session that is asked; repeatable; default: all.")
 @click.option("--no-self", is_flag=True, help="Do not look for revisits within a session.")
 @query_options
-@overwrite_option
-@json_option
-@engine_options
-@settings_options
-@console_options
+@stage_options
 def command(
     work: Path,
     queries: tuple[str, ...],

@@ -9,7 +9,7 @@ import click
 
 from .console import console
 from .evaluate import show_evaluation
-from .options import Command, EngineChoice, console_options, engine_options, json_option, overwrite_option, settings_options
+from .options import Command, EngineChoice, stage_options
 from .results import finish, report_json, session_logs
 
 if TYPE_CHECKING:
@@ -22,11 +22,7 @@ QUERY_EVERY = 20.0  # m; a demonstration need not ask every two metres
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder of the logs and the workspace."
 )
-@overwrite_option
-@json_option
-@engine_options
-@settings_options
-@console_options
+@stage_options
 def command(output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, settings: Settings) -> int:
     """Everything once: two drives round a simulated block on two days, their maps, closures, the truth, and an annotated log to look at.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import Command, EngineChoice, console_options, engine_options, json_option, overwrite_option, settings_options, work_option
+from .options import Command, EngineChoice, stage_options, work_option
 from .results import finish, report_json, show_report
 
 if TYPE_CHECKING:
@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 @click.command(cls=Command)
 @click.argument("sessions", metavar="[SESSION...]", nargs=-1)
 @work_option
-@overwrite_option
-@json_option
-@engine_options
-@settings_options
-@console_options
+@stage_options
 def command(sessions: tuple[str, ...], work: Path, overwrite: bool, as_json: bool, engine: EngineChoice, settings: Settings) -> int:
     """Maps -> semantic words: every occupied subvolume of the sessions' submaps (all sessions by default) becomes a word and a 64-bit code.
 

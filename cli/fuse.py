@@ -8,21 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import (
-    Command,
-    EngineChoice,
-    console_options,
-    engine_options,
-    json_option,
-    label_options,
-    logs_argument,
-    overwrite_option,
-    pose_options,
-    settings_options,
-    topic_option,
-    trajectories,
-    work_option,
-)
+from .options import Command, EngineChoice, PoseChoice, logs_argument, reading_options, stage_options, work_option
 from .results import checked_name, finish, report_json, show_report
 
 if TYPE_CHECKING:
@@ -33,22 +19,14 @@ if TYPE_CHECKING:
 @logs_argument
 @work_option
 @click.option("--session", metavar="NAME", help="Name of the session; default: the first log's file stem or folder name.")
-@topic_option
-@pose_options
-@label_options
-@overwrite_option
-@json_option
-@engine_options
-@settings_options
-@console_options
+@reading_options
+@stage_options
 def command(
     logs: tuple[Path, ...],
     work: Path,
     session: str | None,
     topics: dict[str, str],
-    pose_files: tuple[str, ...],
-    pose_times: tuple[str, ...],
-    pose_frame: str,
+    poses: PoseChoice,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -65,9 +43,9 @@ def command(
     from semloc_logs.workspace import Workspace
 
     name = checked_name(session or session_name(logs[0]))
-    poses = trajectories([name], pose_files, pose_times, pose_frame)
+    given = poses.by_session([name])
     with console.progress(), engine.open(1) as opened:
-        report = fuse({name: logs}, Workspace(work), settings, topics, opened, console.note, overwrite, poses)
+        report = fuse({name: logs}, Workspace(work), settings, topics, opened, console.note, overwrite, given)
     if as_json:
         console.result_json(report_json(report, work))
     else:

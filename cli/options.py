@@ -188,42 +188,24 @@ def query_options(function: Function) -> Function:
     return function
 
 
-def pose_options(function: Function) -> Function:
-    """Poses from elsewhere than a stream of the log; the command gets ``pose_files``, ``pose_times`` and ``pose_frame``."""
-    for decorate in (
-        click.option("--pose-frame", metavar="FRAME", default="", help="Frame that the poses of --poses are of; default: the base frame."),
-        click.option(
-            "--pose-times", "pose_times", metavar="[SESSION=]FILE", multiple=True, help="Times of KITTI poses, one in seconds a line."
-        ),
-        click.option(
-            "--poses",
-            "pose_files",
-            metavar="[SESSION=]FILE",
-            multiple=True,
-            help="Trajectory (TUM or KITTI) instead of the log's own poses; SESSION= for each of several logs.",
-        ),
-        click.option(
-            "--odometry",
-            type=click.Choice(["none", "lidar"]),
-            help="lidar: poses from LIDAR odometry instead of the log's own (needs the extra 'odometry').",
-        ),
-    ):
-        function = decorate(function)
-    return function
+@dataclass(frozen=True, slots=True)
+class PoseChoice:
+    """What --poses, --pose-times and --pose-frame said."""
 
+    files: tuple[str, ...]
+    times: tuple[str, ...]
+    frame: str
 
-def trajectories(
-    sessions: Iterable[str], pose_files: Iterable[str], pose_times: Iterable[str], pose_frame: str
-) -> dict[str, TrajectoryFile]:
-    """Files of poses by session; UsageError when it is not clear which session a file belongs to."""
-    from semloc_logs.logs.trajectory_file import TrajectoryFile
+    def by_session(self, sessions: Iterable[str]) -> dict[str, TrajectoryFile]:
+        """Files of poses; UsageError when it is not clear which session a file belongs to."""
+        from semloc_logs.logs.trajectory_file import TrajectoryFile
 
-    names = list(sessions)
-    files, times = _by_session("--poses", names, pose_files), _by_session("--pose-times", names, pose_times)
-    without = [name for name in times if name not in files]
-    if without or (pose_frame and not files):
-        raise click.UsageError(f"{'--pose-times' if without else '--pose-frame'} says something about --poses FILE: give that, too.")
-    return {name: TrajectoryFile(file, times.get(name), pose_frame) for name, file in files.items()}
+        names = list(sessions)
+        files, times = _by_session("--poses", names, self.files), _by_session("--pose-times", names, self.times)
+        without = [name for name in times if name not in files]
+        if without or (self.frame and not files):
+            raise click.UsageError(f"{'--pose-times' if without else '--pose-frame'} says something about --poses FILE: give that, too.")
+        return {name: TrajectoryFile(file, times.get(name), self.frame) for name, file in files.items()}
 
 
 def _by_session(option: str, names: list[str], values: Iterable[str]) -> dict[str, Path]:
@@ -238,6 +220,35 @@ def _by_session(option: str, names: list[str], values: Iterable[str]) -> dict[st
             raise click.UsageError(f"{option} is given twice for session '{name}'.")
         out[name] = Path(rest)
     return out
+
+
+def pose_options(function: Function) -> Function:
+    """Poses from elsewhere than a stream of the log; the command gets ``poses``, a PoseChoice, and the setting of --odometry."""
+
+    @click.option(
+        "--odometry",
+        type=click.Choice(["none", "lidar"]),
+        help="lidar: poses from LIDAR odometry instead of the log's own (needs the extra 'odometry').",
+    )
+    @click.option(
+        "--poses",
+        "pose_files",
+        metavar="[SESSION=]FILE",
+        multiple=True,
+        help="Trajectory (TUM or KITTI) instead of the log's own poses; SESSION= for each of several logs.",
+    )
+    @click.option("--pose-times", metavar="[SESSION=]FILE", multiple=True, help="Times of KITTI poses, one in seconds a line.")
+    @click.option("--pose-frame", metavar="FRAME", default="", help="Frame that the poses of --poses are of; default: the base frame.")
+    @functools.wraps(function)
+    def with_poses(*args: Any, pose_files: tuple[str, ...], pose_times: tuple[str, ...], pose_frame: str, **options: Any) -> Any:
+        return function(*args, poses=PoseChoice(pose_files, pose_times, pose_frame), **options)
+
+    return with_poses
+
+
+def reading_options(function: Function) -> Function:
+    """What is read of the logs, and how: topics, poses and labels."""
+    return topic_option(pose_options(label_options(function)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,3 +289,10 @@ def engine_options(function: Function) -> Function:
         return function(*args, engine=EngineChoice(engine_name, jobs), **options)
 
     return with_engine
+
+
+def stage_options(function: Function) -> Function:
+    """What every stage over a workspace is asked: --overwrite, --json, the engine, settings and the console."""
+    for decorate in (console_options, settings_options, engine_options, json_option, overwrite_option):
+        function = decorate(function)
+    return function

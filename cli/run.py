@@ -8,22 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import (
-    Command,
-    EngineChoice,
-    console_options,
-    engine_options,
-    json_option,
-    label_options,
-    logs_argument,
-    overwrite_option,
-    pose_options,
-    query_options,
-    settings_options,
-    topic_option,
-    trajectories,
-    work_option,
-)
+from .options import Command, EngineChoice, PoseChoice, logs_argument, query_options, reading_options, stage_options, work_option
 from .results import finish, report_json, session_logs, show_closures
 
 if TYPE_CHECKING:
@@ -41,23 +26,15 @@ if TYPE_CHECKING:
     show_default=True,
     help="Also write the closures as channels: to WORK/annotated (copy, sidecar) or into the logs.",
 )
-@topic_option
-@pose_options
-@label_options
+@reading_options
 @query_options
-@overwrite_option
-@json_option
-@engine_options
-@settings_options
-@console_options
+@stage_options
 def command(
     logs: tuple[Path, ...],
     work: Path,
     annotation: str,
     topics: dict[str, str],
-    pose_files: tuple[str, ...],
-    pose_times: tuple[str, ...],
-    pose_frame: str,
+    poses: PoseChoice,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -72,13 +49,13 @@ def command(
     Example:  semloc run monday.mcap tuesday.bag -w work --annotate copy
     """
     sessions = session_logs(logs)
-    poses = trajectories(sessions, pose_files, pose_times, pose_frame)
+    given = poses.by_session(sessions)
     from semloc_logs.stages import run
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(sessions)) as opened:
-        report = run(sessions, workspace, settings, topics, opened, console.note, annotation, overwrite, poses)
+        report = run(sessions, workspace, settings, topics, opened, console.note, annotation, overwrite, given)
     if as_json:
         console.result_json(report_json(report, work))
     else:

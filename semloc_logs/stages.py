@@ -27,6 +27,7 @@ from semloc_logs.labels.model import fingerprint as label_fingerprint
 from semloc_logs.logs.annotate import (
     AnnotateReport,
     ClosureRecord,
+    Results,
     annotate_copy,
     annotate_in_place,
     annotate_sidecar,
@@ -276,13 +277,13 @@ def annotate(
     times = dict(zip(mine.stamps_ns.tolist(), mine.frames["log_time_ns"].to_pylist(), strict=True))
     notes = {"version": semloc_logs.__version__, "settings": settings.fingerprint("fusion", "labels", "descriptor", "query", "closures")}
     notes["fusion.voxel_size"] = str(settings.fusion.voxel_size)
-    frame = str(mine.json.get("session_frame") or "") or None
+    results = Results(records, name, notes, times, frame_id=str(mine.json.get("session_frame") or "") or None)
     if mode == "in-place":
-        return annotate_in_place(log, records, name, notes, log_times=times, frame_id=frame)
+        return annotate_in_place(log, results)
     if output is None:
         raise WorkspaceError("Annotating needs an output file.")
     write = annotate_sidecar if mode == "sidecar" else annotate_copy
-    return write(log, output, records, name, notes, log_times=times, frame_id=frame, overwrite=overwrite)
+    return write(log, output, results, overwrite=overwrite)
 
 
 def _record(work: Workspace, mine: SessionMap, name: str, row: dict[str, Any]) -> ClosureRecord:

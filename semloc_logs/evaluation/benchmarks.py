@@ -7,17 +7,20 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings
+
+if TYPE_CHECKING:
+    from semloc_logs.logs.annotate import ClosureRecord
 
 Figures = dict[str, dict[str, float | str]]
 REPEATS = 5
@@ -155,7 +158,7 @@ def annotate(settings: Settings) -> Figures:
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
-    from semloc_logs.logs.annotate import ClosureRecord, annotate_in_place
+    from semloc_logs.logs.annotate import ClosureRecord
 
     with tempfile.TemporaryDirectory(prefix="semloc-") as folder:
         log = _drive(Path(folder))
@@ -180,13 +183,15 @@ def annotate(settings: Settings) -> Figures:
                 writer.finish()  # type: ignore[no-untyped-call]
 
         size = log.stat().st_size / 1e6
-        taken = [_annotated(log, records[: 100 - i], annotate_in_place) for i in range(REPEATS)]
+        taken = [_annotated(log, records[: 100 - i]) for i in range(REPEATS)]
         return {"in_place": {"ours": float(np.median(taken)), "unit": f"s for a log of {size:.0f} MB", "mcap-python": _seconds(rewrite, 2)}}
 
 
-def _annotated(log: Path, records: Any, write: Callable[..., Any]) -> float:
+def _annotated(log: Path, records: Sequence[ClosureRecord]) -> float:
+    from semloc_logs.logs.annotate import Results, annotate_in_place
+
     start = time.perf_counter()
-    write(log, records, "session_0", {}, log_times={r.query_stamp_ns: r.query_stamp_ns for r in records})
+    annotate_in_place(log, Results(records, "session_0", {}, {r.query_stamp_ns: r.query_stamp_ns for r in records}))
     return time.perf_counter() - start
 
 

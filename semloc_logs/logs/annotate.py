@@ -31,7 +31,16 @@ from semloc_logs.logs.channels import ClosureRecord, Encoding, LogFacts, channel
 from semloc_logs.logs.rosbag_copy import QOS_KEY, bag_facts, opened, write_copy
 from semloc_logs.logs.splice import SIDE_SUFFIX, copy_start, locked, recover, recover_locked, replace_end, sync_folder
 
-__all__ = ["AnnotateReport", "ClosureRecord", "annotate_copy", "annotate_in_place", "annotate_sidecar", "content_fingerprint", "recover"]
+__all__ = [
+    "AnnotateReport",
+    "ClosureRecord",
+    "Results",
+    "annotate_copy",
+    "annotate_in_place",
+    "annotate_sidecar",
+    "content_fingerprint",
+    "recover",
+]
 
 LIBRARY = f"semloc_logs {__version__}"
 _ENCODINGS: dict[str, Encoding] = {"cdr": "ros2", "ros1": "ros1", "protobuf": "protobuf", "json": "json"}
@@ -54,14 +63,18 @@ class AnnotateReport:
 
 
 @dataclass(frozen=True, slots=True)
-class _Results:
-    """What is to be written, whatever the log."""
+class Results:
+    """What is to be written, whatever the log: the ``closures`` in which ``session`` takes part, and the ``settings`` behind them.
+
+    ``log_times`` maps the stamp (ns) of an end in this log to the receive time (ns) of the frame there; ``frame_id`` is the frame of the
+    log's pose stream, for the markers; None: semloc/SESSION.
+    """
 
     closures: Sequence[ClosureRecord]
     session: str
     settings: Mapping[str, str]
     log_times: Mapping[int, int]
-    frame_id: str | None
+    frame_id: str | None = None
 
     def end(self, path: Path, ending: Ending, facts: LogFacts) -> tuple[bytes, AnnotateReport]:
         """The bytes of the file from ``ending.offset`` on."""
@@ -82,24 +95,12 @@ class _Results:
         return data, AnnotateReport(path, run, facts.encoding, count, len(messages), len(data), ending.replaces)
 
 
-def annotate_copy(
-    log: Path,
-    output: Path,
-    closures: Sequence[ClosureRecord],
-    session: str,
-    settings: Mapping[str, str],
-    *,
-    log_times: Mapping[int, int],
-    frame_id: str | None = None,
-    overwrite: bool = False,
-) -> AnnotateReport:
-    """Write ``output`` (MCAP): all of ``log``, and the closures in which ``session`` takes part.
+def annotate_copy(log: Path, output: Path, results: Results, *, overwrite: bool = False) -> AnnotateReport:
+    """Write ``output`` (MCAP): all of ``log``, and the results.
 
-    An MCAP log is copied undecoded; a .bag, a .db3 or a bag folder is converted, message by message. ``log_times`` maps the stamp of an end
-    in this log to the receive time of the frame there; ``frame_id`` is the frame of the log's pose stream, for the markers.
+    An MCAP log is copied undecoded; a .bag, a .db3 or a bag folder is converted, message by message.
     Raises ``LogError``, and leaves nothing behind, when the log is damaged or ``output`` exists and ``overwrite`` is not set.
     """
-    results = _Results(closures, session, settings, log_times, frame_id)
     _refuse(log, output, overwrite)
     recover(log)
     if not _is_mcap(log):
@@ -118,16 +119,8 @@ def annotate_copy(
         return report
 
 
-def annotate_in_place(
-    log: Path,
-    closures: Sequence[ClosureRecord],
-    session: str,
-    settings: Mapping[str, str],
-    *,
-    log_times: Mapping[int, int],
-    frame_id: str | None = None,
-) -> AnnotateReport:
-    """Write the closures into ``log`` itself, an MCAP file; only its end is written. Arguments and errors as for :func:`annotate_copy`.
+def annotate_in_place(log: Path, results: Results) -> AnnotateReport:
+    """Write the results into ``log`` itself, an MCAP file; only its end is written. Errors as for :func:`annotate_copy`.
 
     An interruption at any point leaves a log that is whole, or that :func:`recover` makes whole.
     """
@@ -135,7 +128,6 @@ def annotate_in_place(
         raise LogError(f"{log} does not exist; give the path of a log.")
     if not _is_mcap(log):
         raise LogError(f"{log} is no MCAP file, so it cannot take our channels; use `-o OUT.mcap` or `--sidecar OUT.mcap`.")
-    results = _Results(closures, session, settings, log_times, frame_id)
     with locked(log) as fd:
         recover_locked(log, fd)
         with os.fdopen(os.dup(fd), "rb") as file:
@@ -145,19 +137,8 @@ def annotate_in_place(
         return report
 
 
-def annotate_sidecar(
-    log: Path,
-    output: Path,
-    closures: Sequence[ClosureRecord],
-    session: str,
-    settings: Mapping[str, str],
-    *,
-    log_times: Mapping[int, int],
-    frame_id: str | None = None,
-    overwrite: bool = False,
-) -> AnnotateReport:
-    """Write ``output``, an MCAP file of the log's profile and encoding with the results only. Arguments as for :func:`annotate_copy`."""
-    results = _Results(closures, session, settings, log_times, frame_id)
+def annotate_sidecar(log: Path, output: Path, results: Results, *, overwrite: bool = False) -> AnnotateReport:
+    """Write ``output``, an MCAP file of the log's profile and encoding with the results only. Errors as for :func:`annotate_copy`."""
     _refuse(log, output, overwrite)
     recover(log)
     if _is_mcap(log):

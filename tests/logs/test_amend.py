@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from semloc_logs.errors import LogError
 from semloc_logs.logs import splice
 from semloc_logs.logs.amend import read_ending
-from semloc_logs.logs.annotate import ClosureRecord, annotate_copy, annotate_in_place, content_fingerprint, recover
+from semloc_logs.logs.annotate import ClosureRecord, Results, annotate_copy, annotate_in_place, content_fingerprint, recover
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 CONFORMANCE = SHARED / "odd_logs" / "mcap_conformance"
@@ -130,19 +130,19 @@ def test_every_shape_copy_in_place_and_again(tmp_path: Path, shape: str, count: 
     log, copy, place = (tmp_path / n for n in ("log.mcap", "copy.mcap", "place.mcap"))
     write_log(log, count, **SHAPES[shape])
     shutil.copyfile(log, place)
-    report = annotate_copy(log, copy, closures(), "a", {"k": "v"}, log_times=NO_TIMES)
+    report = annotate_copy(log, copy, Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES))
     check_annotated(log, copy)
     assert (report.closures, report.messages, report.replaced) == (2, 5, False)
     assert copy.stat().st_size - read_ending(log.open("rb"), log).offset == report.bytes_written
     fingerprint = content_fingerprint(place)
-    annotate_in_place(place, closures(), "a", {"k": "v"}, log_times=NO_TIMES)
+    annotate_in_place(place, Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES))
     assert place.read_bytes() == copy.read_bytes()
-    annotate_in_place(place, closures()[:1], "a", {"k": "other"}, log_times=NO_TIMES)
+    annotate_in_place(place, Results(closures()[:1], "a", {"k": "other"}, log_times=NO_TIMES))
     assert sum(is_ours(r) for r in linear(place)) == 4
-    assert annotate_in_place(place, closures(), "a", {"k": "v"}, log_times=NO_TIMES).replaced
+    assert annotate_in_place(place, Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES)).replaced
     assert place.read_bytes() == copy.read_bytes()
     assert content_fingerprint(place) == content_fingerprint(log) == fingerprint
-    annotate_copy(place, tmp_path / "second.mcap", closures(), "a", {"k": "v"}, log_times=NO_TIMES)
+    annotate_copy(place, tmp_path / "second.mcap", Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES))
     assert (tmp_path / "second.mcap").read_bytes() == copy.read_bytes()
 
 
@@ -151,11 +151,11 @@ def test_conformance_files(tmp_path: Path) -> None:
         pytest.skip("no shared/odd_logs/mcap_conformance beside the checkout")
     for log in sorted(CONFORMANCE.glob("*.mcap"))[::5]:
         copy, place = tmp_path / "copy.mcap", tmp_path / "place.mcap"
-        annotate_copy(log, copy, closures(), "a", {}, log_times=NO_TIMES, overwrite=True)
+        annotate_copy(log, copy, Results(closures(), "a", {}, log_times=NO_TIMES), overwrite=True)
         check_annotated(log, copy)
         shutil.copyfile(log, place)
         for _ in range(2):
-            annotate_in_place(place, closures(), "a", {}, log_times=NO_TIMES)
+            annotate_in_place(place, Results(closures(), "a", {}, log_times=NO_TIMES))
             assert place.read_bytes() == copy.read_bytes(), log.name
 
 
@@ -166,7 +166,7 @@ def test_results_larger_than_a_chunk_are_split(tmp_path: Path) -> None:
         ClosureRecord("a", f"target{k}", k, k, 0, 0, 0, 0, 0, 0, 1, tuple(np.eye(6).ravel()), 0.5, 0.9, 1, 1, None, np.zeros(3))
         for k in range(1500)
     ]
-    annotate_copy(log, copy, many, "a", {}, log_times={k: 10**9 + k for k in range(1500)})
+    annotate_copy(log, copy, Results(many, "a", {}, log_times={k: 10**9 + k for k in range(1500)}))
     with copy.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -180,8 +180,8 @@ def test_no_closures_replace_earlier_ones(tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     write_log(log)
     before = linear(log)
-    annotate_in_place(log, closures(), "a", {}, log_times=NO_TIMES)
-    annotate_in_place(log, [], "a", {}, log_times=NO_TIMES)
+    annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
+    annotate_in_place(log, Results([], "a", {}, log_times=NO_TIMES))
     after = linear(log)
     assert after[:-1] == before
     assert after[-1][:1] == ("d",)
@@ -191,7 +191,7 @@ def test_records_behind_ours_are_not_lost(tmp_path: Path) -> None:
     """Another tool that adds an attachment behind our results: neither is it cut off nor are results written twice."""
     log = tmp_path / "log.mcap"
     write_log(log)
-    annotate_in_place(log, closures(), "a", {}, log_times=NO_TIMES)
+    annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
     data = log.read_bytes()
     summary_start = struct.unpack("<Q", data[-28:-20])[0]
     added = b"\x09" + struct.pack("<QQQI1sIQI", 8 + 8 + 5 + 4 + 8 + 4, 0, 0, 1, b"x", 0, 0, 0)
@@ -200,7 +200,7 @@ def test_records_behind_ours_are_not_lost(tmp_path: Path) -> None:
     log.write_bytes(data[: summary_start - 13] + added + end + footer + data[-8:])
     changed = log.read_bytes()
     with pytest.raises(LogError, match="cannot be replaced"):
-        annotate_in_place(log, closures(), "a", {}, log_times=NO_TIMES)
+        annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
     assert log.read_bytes() == changed
 
 
@@ -211,9 +211,9 @@ def test_cut_off_logs_are_refused_and_nothing_is_written(tmp_path: Path, keep: i
     log.write_bytes(log.read_bytes()[:keep])
     before = log.read_bytes()
     with pytest.raises(LogError, match=r"mcap recover|not an MCAP"):
-        annotate_copy(log, tmp_path / "out.mcap", closures(), "a", {}, log_times=NO_TIMES)
+        annotate_copy(log, tmp_path / "out.mcap", Results(closures(), "a", {}, log_times=NO_TIMES))
     with pytest.raises(LogError):
-        annotate_in_place(log, closures(), "a", {}, log_times=NO_TIMES)
+        annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
     assert [p.name for p in tmp_path.iterdir()] == ["log.mcap"]
     assert log.read_bytes() == before
     assert content_fingerprint(log)
@@ -226,7 +226,7 @@ def test_a_damaged_chunk_is_refused_when_it_has_to_be_read(tmp_path: Path) -> No
     data[data.index(b'"v": 7')] ^= 1
     log.write_bytes(data)
     with pytest.raises(LogError, match="checksum"):
-        annotate_copy(log, tmp_path / "out.mcap", closures(), "a", {}, log_times=NO_TIMES)
+        annotate_copy(log, tmp_path / "out.mcap", Results(closures(), "a", {}, log_times=NO_TIMES))
 
 
 @given(data=st.data())
@@ -287,10 +287,10 @@ def test_interruption_at_every_step_of_writing_in_place(tmp_path: Path, monkeypa
     log, done = tmp_path / "log.mcap", tmp_path / "done.mcap"
     write_log(log, chunk_size=100)
     if fewer:  # the file becomes shorter
-        annotate_in_place(log, closures(), "a", {"k": "old"}, log_times=NO_TIMES)
+        annotate_in_place(log, Results(closures(), "a", {"k": "old"}, log_times=NO_TIMES))
     wanted = closures()[: 1 if fewer else 3]
     before = log.read_bytes()
-    annotate_copy(log, done, wanted, "a", {}, log_times=NO_TIMES)
+    annotate_copy(log, done, Results(wanted, "a", {}, log_times=NO_TIMES))
     after = done.read_bytes()
     assert (len(after) < len(before)) == fewer
     outcomes = []
@@ -299,7 +299,7 @@ def test_interruption_at_every_step_of_writing_in_place(tmp_path: Path, monkeypa
         with monkeypatch.context() as patch:
             patch.setattr(splice, "os", Dying(steps, grain=997))
             try:
-                annotate_in_place(log, wanted, "a", {}, log_times=NO_TIMES)
+                annotate_in_place(log, Results(wanted, "a", {}, log_times=NO_TIMES))
                 finished = True
             except Crash:
                 finished = False
@@ -331,7 +331,7 @@ def test_interruption_of_the_repair_itself(tmp_path: Path, monkeypatch: pytest.M
                 return True
         return False
 
-    assert interrupted(lambda: annotate_in_place(log, closures(), "a", {}, log_times=NO_TIMES), 12)
+    assert interrupted(lambda: annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES)), 12)
     torn, side = log.read_bytes(), (tmp_path / "log.mcap.semloc-tail").read_bytes()
     assert torn != before
     for steps in range(100):
@@ -365,7 +365,7 @@ def test_full_disk_while_writing_leaves_the_log_as_it_was(tmp_path: Path, monkey
         with monkeypatch.context() as patch:
             patch.setattr(splice, "os", Full(write, 1))
             with pytest.raises(LogError, match=r"unchanged.*No space left"):
-                annotate_in_place(log, closures(), "a", {}, log_times=NO_TIMES)
+                annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
         assert log.read_bytes() == before
         assert [p.name for p in tmp_path.iterdir()] == ["log.mcap"]
 
@@ -376,7 +376,7 @@ def test_a_saved_tail_of_another_file_is_not_put_back(tmp_path: Path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(splice, "os", Dying(12, grain=997))
         with pytest.raises(Crash):
-            annotate_in_place(log, closures(), "a", {}, log_times=NO_TIMES)
+            annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
     write_log(log, count=21)
     other = log.read_bytes()
     with pytest.raises(LogError, match="delete that file"):
@@ -388,7 +388,7 @@ def test_two_writers(tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     write_log(log)
     with splice.locked(log), pytest.raises(LogError, match="another process"):
-        annotate_in_place(log, closures(), "a", {}, log_times=NO_TIMES)
+        annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
 
 
 def test_chunk_that_claims_to_be_huge(tmp_path: Path) -> None:
@@ -400,4 +400,4 @@ def test_chunk_that_claims_to_be_huge(tmp_path: Path) -> None:
     data[start + 25 : start + 33] = (1 << 62).to_bytes(8, "little")
     log.write_bytes(data)
     with pytest.raises(LogError, match="announced"):
-        annotate_copy(log, tmp_path / "out.mcap", closures(), "a", {}, log_times=NO_TIMES)
+        annotate_copy(log, tmp_path / "out.mcap", Results(closures(), "a", {}, log_times=NO_TIMES))

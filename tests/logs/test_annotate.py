@@ -22,6 +22,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.annotate import (
     AnnotateReport,
     ClosureRecord,
+    Results,
     annotate_copy,
     annotate_in_place,
     annotate_sidecar,
@@ -91,8 +92,8 @@ def test_bags_get_a_converted_copy_or_a_sidecar(tmp_path: Path, kind: str) -> No
     log, reader = logs(tmp_path)[kind]
     before = content_fingerprint(log)
     copy, side = tmp_path / "copy.mcap", tmp_path / "side.mcap"
-    report = annotate_copy(log, copy, [closure()], "a", {}, log_times={3: 102})
-    annotate_sidecar(log, side, [closure()], "a", {}, log_times={3: 102})
+    report = annotate_copy(log, copy, Results([closure()], "a", {}, log_times={3: 102}))
+    annotate_sidecar(log, side, Results([closure()], "a", {}, log_times={3: 102}))
     ours = mcap_messages(side)
     assert [m[:2] for m in ours] == [("/semloc/loop_closures", 102), ("/semloc/markers", 102), ("/semloc/pose", 102)]
     assert mcap_messages(copy) == sorted(bag_messages(reader) + ours)
@@ -107,8 +108,8 @@ def test_bags_get_a_converted_copy_or_a_sidecar(tmp_path: Path, kind: str) -> No
                 read = [any_reader.deserialize(raw, c.msgtype) for c, _, raw in any_reader.messages()]
             assert len(read) == count
     with pytest.raises(LogError, match="sidecar"):
-        annotate_in_place(log, [closure()], "a", {}, log_times={})
-    again = annotate_in_place(copy, [closure()], "a", {}, log_times={3: 102})  # the copy is an MCAP log like any other
+        annotate_in_place(log, Results([closure()], "a", {}, log_times={}))
+    again = annotate_in_place(copy, Results([closure()], "a", {}, log_times={3: 102}))  # the copy is an MCAP log like any other
     assert again.replaced
 
 
@@ -123,8 +124,8 @@ def test_qos_of_the_log_is_kept(tmp_path: Path) -> None:
         connection = writer.add_connection("/one", TEXT, typestore=store, offered_qos_profiles=[qos])
         writer.write(connection, 1, store.serialize_cdr(store.types[TEXT](data="x"), TEXT))
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
-    annotate_copy(folder, first, [closure()], "a", {}, log_times={})
-    annotate_copy(first, second, [closure()], "a", {}, log_times={})
+    annotate_copy(folder, first, Results([closure()], "a", {}, log_times={}))
+    annotate_copy(first, second, Results([closure()], "a", {}, log_times={}))
     assert first.read_bytes() == second.read_bytes()
     with Reader2(second) as reader:
         found = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}  # type: ignore[union-attr]
@@ -141,7 +142,7 @@ def test_markers_are_defined_as_in_the_log(tmp_path: Path) -> None:
         writer.write(connection, 1, store.serialize_cdr(store.types[kind](markers=[]), kind))
     log, out = tmp_path / "bag" / "bag.mcap", tmp_path / "out.mcap"
     for source in (log, tmp_path / "bag"):
-        annotate_copy(source, out, [closure()], "a", {}, log_times={}, overwrite=True)
+        annotate_copy(source, out, Results([closure()], "a", {}, log_times={}), overwrite=True)
         with AnyReader([out]) as reader:
             definitions = {c.msgdef.data for c in reader.connections if c.msgtype == kind}
             assert len(definitions) == 1
@@ -155,11 +156,11 @@ def test_output_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
     out.write_bytes(b"precious")
     for annotate in (annotate_copy, annotate_sidecar):
         with pytest.raises(LogError, match="exists already"):
-            annotate(log, out, [closure()], "a", {}, log_times={})
+            annotate(log, out, Results([closure()], "a", {}, log_times={}))
         assert out.read_bytes() == b"precious"
         with pytest.raises(LogError, match="is the log itself"):
-            annotate(log, log, [closure()], "a", {}, log_times={}, overwrite=True)
-        assert isinstance(annotate(log, out, [closure()], "a", {}, log_times={}, overwrite=True), AnnotateReport)
+            annotate(log, log, Results([closure()], "a", {}, log_times={}), overwrite=True)
+        assert isinstance(annotate(log, out, Results([closure()], "a", {}, log_times={}), overwrite=True), AnnotateReport)
         out.write_bytes(b"precious")
 
 
@@ -171,9 +172,9 @@ def test_missing_and_foreign_files(tmp_path: Path) -> None:
     for log in (text, tmp_path / "empty", tmp_path / "empty.db3", tmp_path / "nothing.mcap", tmp_path / "nothing.bag"):
         for annotate in (annotate_copy, annotate_sidecar):
             with pytest.raises(LogError):
-                annotate(log, out, [closure()], "a", {}, log_times={})
+                annotate(log, out, Results([closure()], "a", {}, log_times={}))
         with pytest.raises(LogError):
-            annotate_in_place(log, [closure()], "a", {}, log_times={})
+            annotate_in_place(log, Results([closure()], "a", {}, log_times={}))
         assert not recover(log)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "empty.db3", "text.bag"]
 
@@ -182,14 +183,14 @@ def test_a_bag_cut_off_in_the_middle_leaves_nothing(tmp_path: Path) -> None:
     log = bag1(tmp_path / "log.bag")
     log.write_bytes(log.read_bytes()[:-200])
     with pytest.raises(LogError, match="reindex"):
-        annotate_copy(log, tmp_path / "out.mcap", [closure()], "a", {}, log_times={})
+        annotate_copy(log, tmp_path / "out.mcap", Results([closure()], "a", {}, log_times={}))
     assert [p.name for p in tmp_path.iterdir()] == ["log.bag"]
 
 
 def test_a_log_that_is_cut_off_still_gets_a_sidecar(tmp_path: Path) -> None:
-    log = annotate_copy(bag2(tmp_path / "bag"), tmp_path / "log.mcap", [], "a", {}, log_times={}).path
+    log = annotate_copy(bag2(tmp_path / "bag"), tmp_path / "log.mcap", Results([], "a", {}, log_times={})).path
     log.write_bytes(log.read_bytes()[:-40])
-    report = annotate_sidecar(log, tmp_path / "side.mcap", [closure()], "a", {}, log_times={})
+    report = annotate_sidecar(log, tmp_path / "side.mcap", Results([closure()], "a", {}, log_times={}))
     assert (report.encoding, report.closures) == ("ros2", 1)
     with AnyReader([tmp_path / "side.mcap"]) as reader:
         assert reader.message_count == 3
@@ -215,13 +216,13 @@ def test_the_encoding_is_that_of_the_log(tmp_path: Path, profile: str, encodings
         for k, encoding in enumerate(encodings):
             writer.add_message(writer.register_channel(f"/{k}", encoding, 0), 1, b"", 1)
         writer.finish()  # type: ignore[no-untyped-call]
-    assert annotate_copy(log, tmp_path / "out.mcap", [closure()], "a", {}, log_times={}).encoding == expected
+    assert annotate_copy(log, tmp_path / "out.mcap", Results([closure()], "a", {}, log_times={})).encoding == expected
 
 
 def test_metadata_record(tmp_path: Path) -> None:
-    log = annotate_copy(bag2(tmp_path / "bag"), tmp_path / "log.mcap", [], "a", {}, log_times={}).path
+    log = annotate_copy(bag2(tmp_path / "bag"), tmp_path / "log.mcap", Results([], "a", {}, log_times={})).path
     size = log.stat().st_size
-    report = annotate_in_place(log, [closure()], "a", {"fusion.voxel_size": "0.1"}, log_times={})
+    report = annotate_in_place(log, Results([closure()], "a", {"fusion.voxel_size": "0.1"}, log_times={}))
     with log.open("rb") as file:
         (metadata,) = make_reader(file).iter_metadata()
     assert metadata.name == f"semloc/{report.run_id}"
@@ -254,7 +255,7 @@ def test_real_ros2_logs(tmp_path: Path, name: str) -> None:
     from mcap_ros2.decoder import DecoderFactory
 
     out = tmp_path / "out.mcap"
-    annotate_copy(log, out, [closure(), closure("b", "a")], "a", {}, log_times={}, frame_id="odom")
+    annotate_copy(log, out, Results([closure(), closure("b", "a")], "a", {}, log_times={}, frame_id="odom"))
     with Reader2(log) as original:
         expected = original.message_count
     with AnyReader([out]) as reader:
