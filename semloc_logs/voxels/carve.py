@@ -10,10 +10,14 @@ A mark is a byte: bit 0 says that a ray passed, the bits above hold the weight o
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.labels.space import GROUND
+from semloc_logs.settings import Fusion
 from semloc_logs.voxels.keys import BLOCK
 
 BITS = 12  # of an address within a block
@@ -24,6 +28,66 @@ U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+
+
+LEVEL = np.isin(np.arange(256), GROUND)  # classes whose surfaces are level
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marks:
+    """What the rays of one frame say, until the next frame is carved: ``grid`` of marks, in runs of 4096 bytes; ``runs`` (m,) of it hold
+    any, those of the blocks ``blocks`` (m, 3); ``ends`` (n,) 2 * address + is_hit of the end voxels and their ``votes`` (n, 20)."""
+
+    grid: U8
+    runs: I64
+    blocks: I64
+    ends: I64
+    votes: NDArray[np.uint32]
+
+
+class Carver:
+    """Carves one frame after the other; its grid is as large as the largest frame so far."""
+
+    def __init__(self, fusion: Fusion) -> None:
+        if fusion.max_range is None:
+            raise ValueError("fusion settings must be resolved")
+        self._per_metre, self._limit = 1.0 / fusion.voxel_size, fusion.max_range / fusion.voxel_size
+        self._grid, self._used = np.zeros(0, np.uint8), np.zeros(0, np.int64)
+
+    def marks(
+        self,
+        points: NDArray[np.floating],
+        label: U8,
+        origin: NDArray[np.floating],
+        sigma: NDArray[np.floating] | None = None,
+        map_T_points: NDArray[np.float64] | None = None,
+    ) -> Marks:
+        """Carve ``points`` (n, 3) with classes ``label`` (n,) (255 unknown), seen from ``origin`` (3,); both are in the map frame unless
+        ``map_T_points`` (4, 4) takes them there.
+
+        Points beyond the maximum range carve and do not hit; points that are not finite are left out. ``sigma`` (n,) is the standard
+        deviation of the range in metres: uncertain points count less.
+        """
+        self._grid.reshape(-1, 1 << BITS)[self._used] = 0
+        pose = np.eye(4) if map_T_points is None else np.ascontiguousarray(map_T_points, np.float64)
+        start = (pose[:3, :3] @ np.asarray(origin, float) + pose[:3, 3]) * self._per_metre
+        if not np.isfinite(start).all():
+            points, label, sigma, start = points[:0], label[:0], None, np.zeros(3)
+        rays, length, lowest, highest = to_rays(np.ascontiguousarray(points), pose, start, self._per_metre, self._limit)
+        # a thousandth of a voxel to spare, as positions from the corner are rounded once more
+        low = np.floor((lowest - 1e-3) / BLOCK).astype(np.int64) * BLOCK
+        blocks: tuple[int, int, int] = tuple((np.floor((highest + 1e-3 - low) / BLOCK).astype(np.int64) + 1).tolist())
+        count = blocks[0] * blocks[1] * blocks[2]
+        if count << BITS > len(self._grid):
+            self._grid = np.zeros(count << BITS, np.uint8)
+        tables, touched = addresses(blocks), np.zeros(count, np.uint8)
+        votes = np.zeros((len(points), CLASSES), np.uint32)
+        spread = np.zeros(0, np.float32) if sigma is None else np.asarray(sigma * self._per_metre, np.float32)
+        ends, carved = mark_ends(self._grid, touched, tables, rays, length, label, spread, LEVEL, start - low, self._limit, votes)
+        carve(self._grid, touched, tables, start - low, carved)
+        self._used = np.flatnonzero(touched)
+        found = np.stack(np.unravel_index(self._used, blocks), 1) + low // BLOCK
+        return Marks(self._grid, self._used, found, ends, votes[: len(ends)])
 
 
 def addresses(blocks: tuple[int, int, int]) -> tuple[I64, I64, I64]:
@@ -179,25 +243,24 @@ def carve(marks: U8, touched: U8, tables: tuple[I64, I64, I64], start: F64, ends
 
 
 @njit(cache=True, nogil=True)
-def flush(marks: U8, blocks: I64, slots: I64, log_odds: NDArray[np.int8], hit: int, miss: int, low: int, high: int) -> None:
-    """Add the marks of ``blocks`` (m,) to rows ``slots`` (m,) of ``log_odds`` (slots, 4096) int8 in units of 1/20, clamped to
-    [low, high]; -128 is unobserved. A hit adds its weight's share of ``hit``, at least 1. The marks are cleared."""
+def flush(marks: U8, runs: I64, slots: I64, log_odds: NDArray[np.int8], hit: int, miss: int, low: int, high: int) -> None:
+    """Add the marks of ``runs`` (m,) of 4096 bytes to rows ``slots`` (m,) of ``log_odds`` (slots, 4096) int8 in units of 1/20, clamped to
+    [low, high]; -128 is unobserved. A hit adds its weight's share of ``hit``, at least 1."""
     gain = np.empty(256, np.int64)
     for mark in range(256):
         gain[mark] = max(1, (hit * (mark >> 1) + FULL_WEIGHT // 2) // FULL_WEIGHT) if mark > 1 else -miss
-    for b in range(len(blocks)):
+    for b in range(len(runs)):
         row = log_odds[slots[b]]
-        run = marks[blocks[b] << BITS : (blocks[b] + 1) << BITS]
+        run = marks[runs[b] << BITS : (runs[b] + 1) << BITS]
         for n in range(len(run)):
             mark = run[n]
             if mark:
                 old = int(row[n])
                 row[n] = min(max((0 if old == -128 else old) + gain[mark], low), high)
-                run[n] = 0
 
 
 @njit(cache=True, nogil=True)
-def add_votes(keys: I64, counts: NDArray[np.uint32], used: int, ends: I64, voxel_votes: NDArray[np.uint32], slot_of_block: I64) -> int:
+def add_votes(keys: I64, counts: NDArray[np.uint32], used: int, ends: I64, voxel_votes: NDArray[np.uint32], slot_of_run: I64) -> int:
     """Add a frame's votes to a hash table of ``keys`` ((slot * 4096 + cell) * 32 + class, -1 empty) and ``counts``; returns how
     many places are used. The table must be large enough. A class gets at least one vote where it has any weight."""
     mask = len(keys) - 1
@@ -205,7 +268,7 @@ def add_votes(keys: I64, counts: NDArray[np.uint32], used: int, ends: I64, voxel
         if not ends[r] & 1:
             continue
         address = ends[r] >> 1
-        voxel = (slot_of_block[address >> BITS] << BITS) + (address & ((1 << BITS) - 1))
+        voxel = (slot_of_run[address >> BITS] << BITS) + (address & ((1 << BITS) - 1))
         for label in range(CLASSES):
             weight = voxel_votes[r, label]
             if weight == 0:

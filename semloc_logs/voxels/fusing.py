@@ -26,6 +26,7 @@ from semloc_logs.logs.trajectory_file import TrajectoryFile
 from semloc_logs.settings import STREET_VOXEL, Fusion, Settings
 from semloc_logs.tables import replacing_folder, write_json, write_table
 from semloc_logs.voxels.ahead import ahead
+from semloc_logs.voxels.carve import Carver
 from semloc_logs.voxels.gravity import ground_height
 from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map
 from semloc_logs.voxels.ground import GroundMapper, write_ground
@@ -169,7 +170,7 @@ class _Fused:
         for i, pose in enumerate(self.poses):
             points, ids, sigma = self.collected.load(i)
             level_points, origin = apply(pose, points), apply(pose, self.collected.origins[i][None])[0]
-            self.grounds.append(ground_height(level_points - np.r_[pose[:2, 3], 0.0], float(origin[2]), scale))
+            self.grounds.append(ground_height(level_points, origin, scale))
             is_mapped = self.collected.poses[i] is not None and ground.wants(origin)
             surface = ground_surface(level_points, origin, scale) if is_mapped or self.labeller.source == "geometry" else None
             if is_mapped and surface is not None:
@@ -199,14 +200,16 @@ def fuse_ranges(
 
     Only the ranges that hold the current keyframe are in memory: the others are not begun, or done.
     """
-    active: dict[int, Fuser] = {}
+    carver, active = Carver(fusion), dict[int, Fuser]()
     begun = 0
     for i, keyframe in enumerate(keyframes):
         while begun < len(ranges) and ranges[begun][0] <= i:
             active[begun] = Fuser(fusion)
             begun += 1
-        for fuser in active.values():
-            fuser.add(keyframe.points, keyframe.label, origins[i], keyframe.sigma, poses[i])
+        if active:
+            marks = carver.marks(keyframe.points, keyframe.label, origins[i], keyframe.sigma, poses[i])
+            for fuser in active.values():
+                fuser.take(marks)
         for number in [n for n in active if ranges[n][1] == i + 1]:
             yield active.pop(number).finish()
 

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.labels.space import GROUND, UNLABELLED
+from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.settings import Fusion
-from semloc_logs.voxels.carve import BITS, CLASSES, add_votes, addresses, carve, flush, mark_ends, rehash, to_rays
+from semloc_logs.voxels.carve import BITS, CLASSES, Carver, Marks, add_votes, flush, rehash
 from semloc_logs.voxels.keys import BLOCK, pack, unpack
 
 FREE_STATE, UNOBSERVED_STATE = 254, 253
 UNOBSERVED = -128  # in log-odds
-LEVEL = np.isin(np.arange(256), GROUND)  # classes whose surfaces are level
 SCALE = 20  # int8 log-odds are in units of 1/20
 
 U8 = NDArray[np.uint8]
@@ -84,7 +83,7 @@ class Fuser:
     _vote_keys: I64 = field(default_factory=lambda: np.full(1 << 15, -1, np.int64))
     _vote_counts: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(1 << 15, np.uint32))
     _votes: int = 0
-    _marks: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
+    _carver: Carver | None = None
 
     def add(
         self,
@@ -94,39 +93,19 @@ class Fuser:
         sigma: NDArray[np.floating] | None = None,
         map_T_points: NDArray[np.float64] | None = None,
     ) -> None:
-        """Integrate ``points`` (n, 3) with classes ``label`` (n,) (255 unknown), seen from ``origin`` (3,); both are in the map frame
-        unless ``map_T_points`` (4, 4) takes them there.
+        """Integrate a frame; the arguments are those of :meth:`Carver.marks`."""
+        self._carver = self._carver or Carver(self.fusion)
+        self.take(self._carver.marks(points, label, origin, sigma, map_T_points))
 
-        Points beyond the maximum range carve and do not hit; points that are not finite are left out. ``sigma`` (n,) is the standard
-        deviation of the range in metres: uncertain points count less.
-        """
-        if self.fusion.max_range is None:
-            raise ValueError("fusion settings must be resolved")
-        per_metre, limit = 1.0 / self.fusion.voxel_size, self.fusion.max_range / self.fusion.voxel_size
-        pose = np.eye(4) if map_T_points is None else np.ascontiguousarray(map_T_points, np.float64)
-        start = (pose[:3, :3] @ np.asarray(origin, float) + pose[:3, 3]) * per_metre
-        if not np.isfinite(start).all():
-            return
-        rays, length, lowest, highest = to_rays(np.ascontiguousarray(points), pose, start, per_metre, limit)
-        # a thousandth of a voxel to spare, as positions from the corner are rounded once more
-        low = np.floor((lowest - 1e-3) / BLOCK).astype(np.int64) * BLOCK
-        blocks: tuple[int, int, int] = tuple((np.floor((highest + 1e-3 - low) / BLOCK).astype(np.int64) + 1).tolist())
-        count = blocks[0] * blocks[1] * blocks[2]
-        if count << BITS > len(self._marks):
-            self._marks = np.zeros(count << BITS, np.uint8)
-        tables, touched = addresses(blocks), np.zeros(count, np.uint8)
-        votes = np.zeros((len(points), CLASSES), np.uint32)
-        spread = np.zeros(0, np.float32) if sigma is None else np.asarray(sigma * per_metre, np.float32)
-        ends, carved = mark_ends(self._marks, touched, tables, rays, length, label, spread, LEVEL, start - low, limit, votes)
-        carve(self._marks, touched, tables, start - low, carved)
-        found = np.flatnonzero(touched)
-        slots = self._slots_of(np.stack(np.unravel_index(found, blocks), 1) + low // BLOCK)
+    def take(self, marks: Marks) -> None:
+        """Integrate a frame that is carved already: maps that overlap share the work."""
+        slots = self._slots_of(marks.blocks)
         f = self.fusion
-        flush(self._marks, found, slots, self._log_odds, *(round(SCALE * a) for a in (f.hit, f.miss, f.clamp[0], f.clamp[1])))
-        slot_of_block = np.zeros(count, np.int64)
-        slot_of_block[found] = slots
-        self._reserve_votes(int(np.count_nonzero(votes[: len(ends)])))
-        self._votes = add_votes(self._vote_keys, self._vote_counts, self._votes, ends, votes, slot_of_block)
+        flush(marks.grid, marks.runs, slots, self._log_odds, *(round(SCALE * a) for a in (f.hit, f.miss, f.clamp[0], f.clamp[1])))
+        slot_of_run = np.zeros(len(marks.grid) >> BITS, np.int64)
+        slot_of_run[marks.runs] = slots
+        self._reserve_votes(int(np.count_nonzero(marks.votes)))
+        self._votes = add_votes(self._vote_keys, self._vote_counts, self._votes, marks.ends, marks.votes, slot_of_run)
 
     def _slots_of(self, block: NDArray[np.integer]) -> I64:
         """Rows of ``_log_odds`` of blocks (m, 3), made where they are new."""

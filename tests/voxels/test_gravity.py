@@ -90,11 +90,12 @@ def test_ground_height(scale: float) -> None:
     below = np.c_[rng.uniform(-20, 20, (40, 2)), rng.uniform(-4, -2, 40)]
     far = np.c_[rng.uniform(30, 40, (9000, 2)), np.full(9000, -3.0)]  # down the hill
     points = scale * np.concatenate([ground, house, below, far])
-    assert ground_height(points, 0.0, scale) == pytest.approx(-1.73 * scale, abs=0.02 * scale)
-    assert ground_height(points + np.array([0, 0, 7.0]), 7.0, scale) == pytest.approx(7 - 1.73 * scale, abs=0.02 * scale)
-    assert ground_height(np.zeros((0, 3)), 2.0, scale) == pytest.approx(2 - 1.7 * scale)
+    assert ground_height(points, np.zeros(3), scale) == pytest.approx(-1.73 * scale, abs=0.02 * scale)
+    there = np.array([40.0, -3.0, 7.0])
+    assert ground_height(points + there, there, scale) == pytest.approx(7 - 1.73 * scale, abs=0.02 * scale)
+    assert ground_height(np.zeros((0, 3)), np.array([0, 0, 2.0]), scale) == pytest.approx(2 - 1.7 * scale)
     few = scale * np.c_[np.zeros((50, 2)), np.linspace(-2, 0, 50)]
-    assert ground_height(few, 0.0, scale) == pytest.approx(np.percentile(few[:, 2], 2))
+    assert ground_height(few, np.zeros(3), scale) == pytest.approx(np.percentile(few[:, 2], 2))
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="no folder shared beside the checkout")

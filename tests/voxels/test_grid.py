@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.settings import Fusion, Settings
+from semloc_logs.voxels.carve import Carver
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
 from semloc_logs.voxels.keys import BLOCK
 
@@ -282,3 +283,15 @@ def test_rays_that_graze_the_ground_do_not_carve_it() -> None:
 
     assert lost(0) == 0.0
     assert lost(2) > 0.1  # nothing says that a building's surface is level
+
+
+def test_maps_that_share_a_carved_frame_are_those_that_carve_it_themselves() -> None:
+    frames, f = random_frames(5, count=4), fusion()
+    carver, shared, late = Carver(f), Fuser(f), Fuser(f)
+    for i, frame in enumerate(frames):
+        marks = carver.marks(*frame)
+        shared.take(marks)
+        if i >= 2:
+            late.take(marks)
+    assert as_dictionary(shared.finish()) == as_dictionary(fused(frames, f))
+    assert as_dictionary(late.finish()) == as_dictionary(fused(frames[2:], f))
