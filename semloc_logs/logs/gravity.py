@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F64, ImuSample
+from semloc_logs.logs.base_frame import BasePoses
 from semloc_logs.logs.poses import is_time
 
 MAX_SAMPLES = 16_384  # beyond, every second sample is forgotten and only every 2nd (4th, ...) taken: the whole log at bounded memory
@@ -52,6 +53,31 @@ class Accelerometer:
             rotations, known = rotations_at(np.array(self._stamps, np.int64))
             forces = np.einsum("nij,nj->ni", rotations[known], forces[known])
         return _robust_direction(forces)
+
+
+def up_in_base(accelerometer: Accelerometer, where: BasePoses) -> F64 | None:
+    """Unit vector (3,) that points up in the base frame: the robust mean of the accelerometer; None without a usable IMU."""
+    base_T_imu, up = _base_T_imu(accelerometer, where), accelerometer.up()
+    return None if base_T_imu is None or up is None else base_T_imu[:3, :3] @ up
+
+
+def up_in_session(accelerometer: Accelerometer, where: BasePoses) -> F64 | None:
+    """As :func:`up_in_base`, in the session frame: every sample is turned by the pose at its time, so the base may tilt."""
+    base_T_imu = _base_T_imu(accelerometer, where)
+    if base_T_imu is None or not len(where.track):
+        return None
+    base_R_imu = base_T_imu[:3, :3]
+
+    def rotations_at(stamps_ns: NDArray[np.int64]) -> tuple[F64, NDArray[np.bool_]]:
+        poses, known = where.track.at_many(stamps_ns)
+        return poses[:, :3, :3] @ base_R_imu, known
+
+    return accelerometer.up(rotations_at)
+
+
+def _base_T_imu(accelerometer: Accelerometer, where: BasePoses) -> F64 | None:
+    frame_id = accelerometer.frame_id
+    return None if frame_id is None else where.base_T(frame_id, where.track.end_ns or 0)
 
 
 def _robust_direction(forces: F64) -> F64 | None:

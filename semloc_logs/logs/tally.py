@@ -11,6 +11,7 @@ from semloc_logs.logs.poses import PoseTrack
 
 _STANDSTILL_NS = 10_000_000_000  # a vehicle may well stand so long, but a log of nothing else is worth a sentence
 COPY = "copy"  # nothing is lost with the frames of a topic that repeats another's
+BACK_IN_TIME = "back in time"
 _WHY = {
     "no pose": "no pose is known at their time ({spans}): the pose stream has a gap there, or its clock differs from the sensor's",
     "no transform": "no transform leads from their frame to the base frame: record /tf_static, or leave the topic out with --topic",
@@ -24,7 +25,7 @@ _WHY = {
     "same picture": "the right camera has the very same picture: choose two cameras with --topic stereo_left=TOPIC stereo_right=TOPIC",
     "unusable pair": "the calibrations of the pair cannot be used",
     "no points": "they have no points within the range limits",
-    "back in time": "their stamps fall back behind those of earlier frames: the clock was set back; cut the log there",
+    BACK_IN_TIME: "their stamps fall back behind those of earlier frames: the clock was set back; cut the log there",
     "empty": "they hold no points, or none whose position is a number",
 }
 _REMARKS = {

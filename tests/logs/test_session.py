@@ -13,7 +13,8 @@ from semloc_logs.errors import LogError, RoleError
 from semloc_logs.frames import Camera, DepthFrame, Frame, Header, ImageFrame, ImuSample, LidarFrame, PoseSample, TransformSample
 from semloc_logs.geometry import Array, rotation_angle, yaw_transform
 from semloc_logs.logs.log import Message, Stream
-from semloc_logs.logs.session import MAX_WAITING, Session, open_session
+from semloc_logs.logs.session import Session, open_session
+from semloc_logs.logs.waiting import MAX_WAITING
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
@@ -119,7 +120,7 @@ def test_frames_wait_for_late_poses_in_bounded_memory() -> None:
         seen += 1
         assert cloud.session_T_base is not None
         assert cloud.session_T_base[0, 3] == pytest.approx((cloud.header.stamp_ns - EPOCH) / S, abs=1e-6)
-        most = max(most, len(session._waiting))
+        most = max(most, len(session._pass.waiting))
     assert seen == 400
     assert most <= 30
 
@@ -130,7 +131,7 @@ def test_a_gap_in_the_poses_costs_its_frames_and_a_sentence() -> None:
     session = Session([FakeLog(frames)])
     clouds = list(session.clouds())
     assert len(clouds) == 201  # the frames at both edges of the gap have a pose of their own
-    assert session._waiting_bytes == 0
+    assert session._pass.waiting.nbytes == 0
     assert len(session.skipped) == 1
     assert "/points: 99 of 300 frames are left out: no pose" in session.skipped[0]
 
