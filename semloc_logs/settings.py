@@ -20,6 +20,7 @@ from semloc_logs.errors import SettingsError
 
 STREET_VOXEL = 0.30
 MOST_VOXELS = 1000
+_MOST_BYTES = 1 << 20  # of a YAML file
 LabelSource = Literal["auto", "log", "onnx", "geometry", "uniform"]
 
 
@@ -194,6 +195,33 @@ class Settings(BaseSettings):
         return str(yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False))
 
 
+class _Loader(yaml.SafeLoader):
+    """Without aliases: a few lines of aliases of aliases stand for more than any memory holds."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.composer.ComposerError(None, None, "aliases are not supported", None)
+        return super().compose_node(parent, index)
+
+
+def _from_yaml(text: str) -> Any:
+    """ValueError for what is no YAML; the values of tags and dates raise many other types."""
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as problem:
+        raise ValueError(" ".join(str(problem).split())[:200].rstrip(".")) from None
+
+
+def read_yaml(path: Path, what: str) -> Any:
+    """The content of the YAML file ``path``. SettingsError, which calls it ``what``, when it cannot be read or is larger than 1 MiB."""
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise SettingsError(f"{what} {path} is larger than a megabyte: name another file.")
+        return _from_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as problem:
+        raise SettingsError(f"{what} {path} cannot be read as YAML: {problem}.") from None
+
+
 def load(file: Path | None = None, assignments: Mapping[str, str] | None = None, environment: Mapping[str, str] | None = None) -> Settings:
     """Settings from defaults < ``file`` (YAML) < ``environment`` < ``assignments`` (``key.path`` -> YAML value).
 
@@ -201,10 +229,7 @@ def load(file: Path | None = None, assignments: Mapping[str, str] | None = None,
     """
     merged: dict[str, Any] = {}
     if file is not None:
-        try:
-            content = yaml.safe_load(file.read_text())
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as problem:
-            raise SettingsError(f"Settings file {file} cannot be read as YAML: {problem}".replace("\n", " ")) from None
+        content = read_yaml(file, "Settings file")
         if content is not None and not isinstance(content, dict):
             raise SettingsError(f"Settings file {file} does not hold a mapping of sections such as 'fusion:'.")
         merged = {str(k): {} if v is None else v for k, v in (content or {}).items()}  # a section may be empty
@@ -231,6 +256,6 @@ def _assign(tree: dict[str, Any], key: str, value: str) -> None:
             raise SettingsError(f"Unknown setting '{key}': '{part}' is not a section.")
         tree = child
     try:
-        tree[last] = yaml.safe_load(value)
-    except yaml.YAMLError:
+        tree[last] = _from_yaml(value)
+    except ValueError:
         raise SettingsError(f"Setting '{key}' has a value that is not YAML: {value!r}.") from None

@@ -101,6 +101,8 @@ def test_every_section_refuses_unknown_keys() -> None:
         ("query.every", "0"),
         ("closures.min_probability", "1.5"),
         ("closures.min_probability", "[1"),
+        ("closures.min_probability", "2001-99-99"),
+        ("closures.min_probability", "!!int ''"),
     ],
 )
 def test_impossible_values_are_refused_by_name(key: str, value: str) -> None:
@@ -108,7 +110,7 @@ def test_impossible_values_are_refused_by_name(key: str, value: str) -> None:
         load(assignments={key: value})
 
 
-@pytest.mark.parametrize("content", [b"fusion: [", b"\xff\xfe\x00", b"- a\n- b\n", b"just text"])
+@pytest.mark.parametrize("content", [b"fusion: [", b"\xff\xfe\x00", b"- a\n- b\n", b"just text", b"fusion: 2001-99-99", b"[" * 5000])
 def test_files_that_are_no_settings_are_refused_by_name(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "odd.yaml"
     path.write_bytes(content)

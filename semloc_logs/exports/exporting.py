@@ -79,7 +79,7 @@ def tum(session: SessionMap) -> bytes:
     table = read_table(session.folder.trajectory)
     t, q = translation_quaternion(poses_of(table))
     lines = [
-        f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{x:.9g}" for x in (*position, *quaternion))
+        f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{x:.12g}" for x in (*position, *quaternion))
         for stamp, position, quaternion in zip(table["stamp_ns"].to_pylist(), t, q, strict=True)
     ]
     return "".join(f"{line}\n" for line in lines).encode()
@@ -88,4 +88,4 @@ def tum(session: SessionMap) -> bytes:
 def kitti(session: SessionMap) -> bytes:
     """Twelve numbers a line: the upper 3 x 4 of ``session_T_base`` of each pose of the trajectory, row-major."""
     poses = poses_of(read_table(session.folder.trajectory))
-    return "".join(" ".join(f"{x:.9g}" for x in pose[:3].ravel()) + "\n" for pose in poses).encode()
+    return "".join(" ".join(f"{x:.12g}" for x in pose[:3].ravel()) + "\n" for pose in poses).encode()

@@ -58,7 +58,7 @@ class Segmenter:
         self._space = spec.label_space(spec_path)
         ignored = spec.ignored(self._space)
         ids = np.arange(max(self._space.targets, default=0) + 1)
-        self._table = self._space.train_ids(ids)
+        self._table = np.append(self._space.train_ids(ids), np.uint8(UNLABELLED))  # the last for what a model itself leaves out
         self._table[sorted(ignored)] = UNLABELLED
 
     @classmethod
@@ -123,17 +123,16 @@ class Segmenter:
         """Class ids (rows, columns) of what the model gave. SettingsError when it is not of the form that the spec says."""
         spec, given = self._spec.output, " x ".join(map(str, output.shape))
         image = output.reshape([n for n in output.shape if n != 1] or [1]) if output.ndim > 3 or spec.kind == "ids" else output
-        classes = len(self._table)
+        classes = len(self._table) - 1
         if spec.kind == "ids":
             if image.ndim != 2:
                 raise SettingsError(f"Model {self._path} gives {given} values, which is no picture of ids: output.kind may be 'logits'.")
             ids: NDArray[np.intp] = np.rint(image).astype(np.intp)
-            strange = int(ids.max(initial=0)) if ids.max(initial=0) >= classes else int(ids.min(initial=0))
-            if strange < 0 or strange >= classes:
-                if strange in (-1, UNLABELLED):
-                    return np.where((ids < 0) | (ids >= classes), classes, ids).astype(np.intp)
-                raise SettingsError(f"Model {self._path} gives the class {strange}, but {self._space.name} ends at {classes - 1}.")
-            return ids
+            left_out = (ids == -1) | ((ids == UNLABELLED) & (classes <= UNLABELLED))
+            strange = ids[((ids < 0) | (ids >= classes)) & ~left_out]
+            if len(strange):
+                raise SettingsError(f"Model {self._path} gives the class {strange[0]}, but {self._space.name} ends at {classes - 1}.")
+            return np.where(left_out, classes, ids)
         if image.ndim != 3 or (image.shape[0] == 1 and classes > 1):
             raise SettingsError(f"Model {self._path} gives {given} values, not classes x rows x columns: output.kind may be 'ids'.")
         axis = 0 if spec.layout == "CHW" else 2

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.schemas import names, read_text
+from semloc_logs.settings import read_yaml
 
 UNLABELLED = 255
 UNPAINTED = 0xFFFFFFFF  # instead of an id: nothing was seen there
@@ -22,7 +23,6 @@ SKY = 10
 ROAD, SIDEWALK, BUILDING, POLE, VEGETATION, TERRAIN = 0, 1, 2, 5, 8, 9
 GROUND = (ROAD, SIDEWALK, TERRAIN)
 THINGS = (POLE, 6, 7, *range(11, 19))  # poles, traffic lights and signs, people, vehicles: not larger than some metres
-_MOST_BYTES = 1 << 20  # of a label space's file
 _HIGHEST_ID = 0xFFFF
 
 U8 = NDArray[np.uint8]
@@ -107,13 +107,7 @@ def read_space(name: str) -> LabelSpace:
     path = Path(name)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise SettingsError(f"Unknown label space '{name}': there are {', '.join(spaces())}; or name a YAML file.")
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise SettingsError(f"Label space {path} is larger than a megabyte: it is no list of classes.")
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as problem:
-        raise SettingsError(f"Label space {path} cannot be read as YAML: {str(problem)[:200]}.".replace("\n", " ")) from None
-    return _parse(content, str(path), trains_by_name())
+    return _parse(read_yaml(path, "Label space"), str(path), trains_by_name())
 
 
 @cache
@@ -129,6 +123,8 @@ def _parse(content: Any, where: str, by_name: Mapping[str, int]) -> LabelSpace:
         rows = {int(i): row if isinstance(row, dict) else {"name": row} for i, row in classes.items()}
     except (TypeError, KeyError, ValueError, AttributeError, OverflowError):
         raise SettingsError(f"Label space {where} has no 'classes' of the form 'ID: {{name: NAME, to: CITYSCAPES_CLASS}}'.") from None
+    if not 0 <= mask <= 0xFFFFFFFF:
+        raise SettingsError(f"Label space {where} has the mask {mask:#x}: it has to be within 32 bits.")
     found, targets, colours, unknown = dict[int, str](), dict[int, int](), dict[int, tuple[int, int, int]](), list[str]()
     for i, row in rows.items():
         if not 0 <= i <= _HIGHEST_ID:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.labels.space import LabelSpace, plain, read_space, space_of_names
-
-_MOST_BYTES = 1 << 20
+from semloc_logs.settings import read_yaml
 
 
 class _Part(BaseModel):
@@ -90,12 +88,7 @@ class Spec(_Part):
 
 def read_spec(path: Path) -> Spec:
     """The spec file ``path``. SettingsError that names the key when it is unknown or its value impossible."""
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise SettingsError(f"Spec {path} is larger than a megabyte: it is no description of a model.")
-        content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as problem:
-        raise SettingsError(f"Spec {path} cannot be read as YAML: {str(problem)[:200]}.".replace("\n", " ")) from None
+    content = read_yaml(path, "Spec")
     try:
         return Spec.model_validate(content)
     except ValidationError as problem:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from semloc_logs.voxels.gravity import ground_height
 from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map
 from semloc_logs.voxels.ground import GroundMapper, write_ground
 from semloc_logs.voxels.keyframes import Collected, collect
-from semloc_logs.voxels.levelling import level
+from semloc_logs.voxels.levelling import check_reach, level
 from semloc_logs.voxels.picture import Caption, draw_map
 from semloc_logs.voxels.selection import road_distance, submap_ranges
 from semloc_logs.voxels.store import Keyframe, blocks_path, keep_keyframes, pose_columns, read_keyframe, write_blocks, write_voxels
@@ -73,6 +73,7 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
             collected = collect(session, labeller, fusion, scratch, on_progress)
             if not len(collected):
                 raise LogError(f"{session.name} gave no usable points: {'; '.join(session.problems) or 'its sensor streams are empty'}")
+            check_reach(session, collected, fusion.voxel_size)
             labeller.conclude()
             session_T_map, poses = level(session, collected)
             metadata = {
@@ -140,9 +141,13 @@ class _Fused:
         # without poses there is no map: the keyframes only ask
         ranges = submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else []
         stamps = [h.stamp_ns for h in self.collected.headers]
-        with replacing_folder(folder.keyframes) as keyframes, replacing_folder(folder.blocks) as blocks:
-            ground = GroundMapper(fusion.voxel_size / STREET_VOXEL)
-            kept = ahead(keep_keyframes(keyframes, stamps, self._labelled(ground), self.metadata))
+        ground = GroundMapper(fusion.voxel_size / STREET_VOXEL)
+        with (
+            replacing_folder(folder.keyframes) as keyframes,
+            replacing_folder(folder.blocks) as blocks,
+            # whatever happens, the other thread ends before its folder is renamed or removed
+            closing(ahead(keep_keyframes(keyframes, stamps, self._labelled(ground), self.metadata))) as kept,
+        ):
             voxels = write_voxels(folder.voxels, self._kept_submaps(blocks, kept, ranges), self.metadata, fusion.clamp)
             if not ranges:
                 write_blocks(blocks_path(blocks, 0), empty_map(), self.metadata)
@@ -178,9 +183,9 @@ class _Fused:
             label = self.labeller.labels(i, level_points, origin, ids, scale, surface)
             keep = label != SKY
             self.counts.append(int(keep.sum()))
-            yield Keyframe(points[keep], label[keep], None if sigma is None else sigma[keep])
             if (i + 1) % 50 == 0 or i + 1 == len(self.poses):
                 self.on_progress(f"labelled {i + 1} of {len(self.poses)} keyframes")
+            yield Keyframe(points[keep], label[keep], None if sigma is None else sigma[keep])
 
     def _kept_submaps(self, folder: Path, keyframes: Iterable[Keyframe], ranges: list[tuple[int, int]]) -> Iterator[BlockMap]:
         """Every submap, once it is written to ``folder``."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -79,10 +80,11 @@ def collect(session: Session, labeller: Labeller, fusion: Fusion, scratch: Path,
     collected, selector = Collected(scratch, fusion.keyframe_resolution or 0.1), KeyframeSelector(fusion)
     clouds = session.clouds(labeller.on_image, labeller.images)
     # pictures come through the labeller in the same pass: they must not overtake the clouds that they are painted on
-    for cloud in ahead(clouds) if labeller.on_image is None else clouds:
-        if selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
-            kept = thin(cloud.points, collected.cell)
-            collected.add(cloud, kept, labeller.take(cloud, kept))
-            if len(collected) % 50 == 0:
-                on_progress(f"read {len(collected)} keyframes")
+    with closing(ahead(clouds) if labeller.on_image is None else (cloud for cloud in clouds)) as coming:
+        for cloud in coming:
+            if selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
+                kept = thin(cloud.points, collected.cell)
+                collected.add(cloud, kept, labeller.take(cloud, kept))
+                if len(collected) % 50 == 0:
+                    on_progress(f"read {len(collected)} keyframes")
     return collected

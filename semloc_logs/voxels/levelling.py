@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.errors import LogError
 from semloc_logs.geometry import inverse, rotation_between
 from semloc_logs.logs.session import Session
+from semloc_logs.logs.tally import span
 from semloc_logs.voxels.gravity import find_up
 from semloc_logs.voxels.keyframes import Collected
 
 F64 = NDArray[np.float64]
+REACH = 3_000_000  # voxels; of the tables that are indexed by place the coarse one of the ground ends first (voxels/keys.py)
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -36,6 +39,22 @@ def level(session: Session, collected: Collected) -> tuple[F64, F64]:
     )
     session_T_map[:3, 3] = known[0][:3, 3]
     return session_T_map, inverse(session_T_map) @ np.array(known)
+
+
+def check_reach(session: Session, collected: Collected, voxel_size: float) -> None:
+    """LogError where the poses leave the space that voxels have numbers for, 3 million of them in each direction."""
+    reach, first = REACH * voxel_size, None
+    for header, pose in zip(collected.headers, collected.poses, strict=True):
+        if pose is None:
+            continue
+        first = pose[:3, 3] if first is None else first
+        away = float(np.abs(pose[:3, 3] - first).max())
+        if away > reach:
+            when = span(header.stamp_ns, header.stamp_ns).split(" to ")[0]
+            raise LogError(
+                f"{session.name}: the poses have come {away / 1e3:.0f} km from the first at {when}, "
+                f"but a map of {voxel_size:g} m voxels reaches {reach / 1e3:.0f} km: cut the log there, or give poses with --poses FILE."
+            )
 
 
 def _each_level(collected: Collected, up_in_base: F64) -> F64:

@@ -83,7 +83,19 @@ def submap_ranges(distance: NDArray[np.float64], length: float, overlap: float) 
     if not len(distance):
         return []
     total, step = float(distance[-1]), length * (1.0 - overlap)
-    starts = [0.0] if total <= length else [*np.arange(0.0, total - length, step), total - length]
     slack = 1e-9 * max(total, 1.0)  # (total - length) + length may round to less than total
-    ranges = [(int(np.searchsorted(distance, s - slack)), int(np.searchsorted(distance, s + length + slack, side="right"))) for s in starts]
-    return [r for r in dict.fromkeys(ranges) if r[0] < r[1]]
+
+    def held(start: float) -> tuple[int, int]:
+        ends = start - slack, start + length + slack
+        return int(np.searchsorted(distance, ends[0])), int(np.searchsorted(distance, ends[1], side="right"))
+
+    ranges, k = dict[tuple[int, int], None](), 0
+    while k * step < total - length:
+        first, last = held(k * step)
+        if first < last:
+            ranges[first, last] = None
+        # stretches up to where a keyframe leaves or comes are the same, or hold none: where poses jump these are very many
+        leaves, comes = distance[first] / step, (distance[last] - length) / step if last < len(distance) else np.inf
+        k = max(k + 1, int(min(leaves, comes)) - 1)
+    ranges[held(max(total - length, 0.0))] = None
+    return list(ranges)

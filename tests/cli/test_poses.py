@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.cli.main import program
+from semloc_logs.settings import load
+from semloc_logs.voxels.fusing import FuseTask, fuse_session
+from semloc_logs.workspace import SessionFolder
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
@@ -130,6 +134,31 @@ def test_poses_that_make_no_sense_are_3_and_a_sentence(tmp_path: Path, poses: li
     warnings = [line for line in done.stderr.splitlines() if line.startswith("Warning: ")]
     assert sum(says in line for line in warnings) == 1
     assert any(says in sentence for sentence in session["skipped"])
+
+
+def test_a_failure_half_way_leaves_no_thread_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = SessionFolder(tmp_path / "a")
+    settings = load(assignments={"labels.source": "uniform", "fusion.keyframe_distance": "0.05", "fusion.submap_length": "0.2"}).resolved()
+
+    def fails(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("semloc_logs.voxels.fusing.write_blocks", fails)
+    with pytest.raises(OSError, match="no space") as problem:  # which holds all that it passed through
+        fuse_session(FuseTask((drive(tmp_path / "a.mcap", GOOD),), folder, settings))
+    assert problem.value
+    assert not [t for t in threading.enumerate() if t.name == "semloc-ahead"]
+    assert list(folder.path.iterdir()) == []
+
+
+def test_poses_beyond_what_a_map_reaches_are_1_and_a_sentence(tmp_path: Path) -> None:
+    # odometry at zero until the satellites are found, then in UTM: the northing is more than voxels have numbers for
+    done, session = fuse(drive(tmp_path / "a.mcap", [(t, x + (5.3e6 if t > 0.45 else 0.0)) for t, x in GOOD]))
+    assert done.exit_code == 1
+    assert "the poses have come 5300 km from the first at 2023-11-14T22:13:20.500Z, but a map of 0.3 m voxels reaches 900 km" in done.stderr
+    assert not session
+    done, _ = fuse(drive(tmp_path / "b.mcap", [(t, x + 5.3e6) for t, x in GOOD]))
+    assert done.exit_code == 0, done.stderr
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,14 @@ def test_kitti_has_three_by_four_matrices(work: Workspace, tmp_path: Path) -> No
     np.testing.assert_allclose(np.loadtxt(path)[1], [1, 0, 0, 103, 0, 1, 0, 0, 0, 0, 1, 0])
 
 
+@pytest.mark.parametrize("form", ["tum", "kitti"])
+def test_poses_in_utm_keep_their_millimetres(form: str, work: Workspace, tmp_path: Path) -> None:
+    _session(work, "utm", np.array([yaw_transform(0.0, (691_234.567, 5_334_567.891, 0.0))]))
+    (path,) = export(work, ["utm"], form, tmp_path)
+    assert "691334.567 " in path.read_text()
+    assert "5334567.891 " in path.read_text()
+
+
 def test_ply_has_voxel_centres_in_the_session_frame(work: Workspace, tmp_path: Path) -> None:
     paths = export(work, [], "ply", tmp_path)
     assert [p.name for p in paths] == ["a.ply", "b.ply"]

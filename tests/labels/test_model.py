@@ -22,8 +22,10 @@ ROAD, VEGETATION, CAR = 0, 8, 13
 Pixels = NDArray[np.uint8]
 
 
-def save_model(path: Path, rows: int = 8, columns: int = 16, nhwc: bool = False, ids: bool = False, classes: int = 3) -> Path:
-    """Class k of three is the channel that is brightest; more classes never win."""
+def save_model(
+    path: Path, rows: int = 8, columns: int = 16, nhwc: bool = False, ids: bool = False, classes: int = 3, times: int = 1, plus: int = 0
+) -> Path:
+    """Class k of three is the channel that is brightest; more classes never win. Ids are k ``times`` this ``plus`` that."""
     weights = np.zeros((classes, 3, 1, 1), np.float32)
     weights[:3, :, 0, 0] = np.eye(3)
     bias = np.where(np.arange(classes) < 3, 0, -100).astype(np.float32)
@@ -32,13 +34,15 @@ def save_model(path: Path, rows: int = 8, columns: int = 16, nhwc: bool = False,
     nodes.append(helper.make_node("Conv", ["t" if nhwc else "x", "w", "b"], ["c" if ids or nhwc else "y"]))
     out = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, classes, rows, columns])
     if ids:
-        nodes.append(helper.make_node("ArgMax", ["c"], ["y"], axis=1, keepdims=0))
+        nodes.append(helper.make_node("ArgMax", ["c"], ["k"], axis=1, keepdims=0))
+        nodes += [helper.make_node("Mul", ["k", "times"], ["m"]), helper.make_node("Add", ["m", "plus"], ["y"])]
         out = helper.make_tensor_value_info("y", TensorProto.INT64, [1, rows, columns])
     elif nhwc:
         nodes.append(helper.make_node("Transpose", ["c"], ["y"], perm=[0, 2, 3, 1]))
         out = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, rows, columns, classes])
     x = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)
-    stored = [numpy_helper.from_array(weights, "w"), numpy_helper.from_array(bias, "b")]
+    numbers = [numpy_helper.from_array(np.array(n, np.int64), name) for n, name in ((times, "times"), (plus, "plus"))]
+    stored = [*(numbers if ids else []), numpy_helper.from_array(weights, "w"), numpy_helper.from_array(bias, "b")]
     model = helper.make_model(helper.make_graph(nodes, "by colour", [x], [out], stored), opset_imports=[helper.make_opsetid("", 13)])
     model.ir_version = 8
     onnx.save(model, str(path))
@@ -76,6 +80,17 @@ def test_layouts_and_ids(tmp_path: Path, nhwc: bool, ids: bool) -> None:
     spec_in = {"size": [8, 16], "layout": "NHWC" if nhwc else "NCHW"}
     spec_out = {"kind": "ids"} if ids else {"layout": "HWC" if nhwc else "CHW"}
     assert opened(tmp_path, model, input=spec_in, output=spec_out).train_ids(stripes())[0, ::5].tolist() == [ROAD, VEGETATION, CAR, CAR]
+
+
+def test_ids_that_models_give_to_nothing_are_unlabelled(tmp_path: Path) -> None:
+    less = opened(tmp_path, {"ids": True, "plus": -1}, output={"kind": "ids"})
+    assert less.train_ids(stripes())[0, ::5].tolist() == [255, ROAD, VEGETATION, VEGETATION]
+    image = stripes()
+    image[:, 10:] = image[:, 9:10]  # no third class, which would be 510
+    many = opened(tmp_path, {"ids": True, "times": 255}, output={"kind": "ids"})
+    assert many.train_ids(image)[0, ::5].tolist() == [ROAD, 255, 255, 255]
+    with pytest.raises(SettingsError, match="gives the class 510"):
+        many.train_ids(stripes())
 
 
 def test_colour_order_mean_and_scale(tmp_path: Path) -> None:

@@ -164,6 +164,13 @@ def test_a_space_of_the_user(tmp_path: Path) -> None:
         ("5", "no 'classes'"),
         ("{", "cannot be read as YAML"),
         ("[" * 5000, "cannot be read as YAML"),
+        ("classes: {1: 2001-99-99}", "cannot be read as YAML"),
+        ("classes: !!timestamp soon", "cannot be read as YAML"),
+        (f"classes: {{{'9' * 5000}: a}}", "cannot be read as YAML"),
+        ("a: &a [x, x]\nclasses: {1: {name: *a}}", "aliases are not supported"),
+        ("classes: {1: a}\nmask: 100000000000000000000", "has the mask"),
+        ("classes: {1: a}\nmask: -1", "has the mask"),
+        ("#" * (1 << 20) + "#", "larger than a megabyte"),
     ],
 )
 def test_a_space_that_makes_no_sense_is_refused(tmp_path: Path, text: str, match: str) -> None:

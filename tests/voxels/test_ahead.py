@@ -51,6 +51,6 @@ def test_leaving_early_closes_the_source_and_ends_the_thread() -> None:
 
     coming = ahead(items())
     next(coming)
-    coming.close()  # type: ignore[attr-defined]
+    coming.close()
     assert closed.is_set()
     assert not [t for t in threading.enumerate() if t.name == "semloc-ahead"]

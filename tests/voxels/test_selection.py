@@ -49,6 +49,22 @@ def test_a_jump_in_the_road_leaves_no_empty_submaps() -> None:
     assert all(distance[last - 1] - distance[first] < 100 for first, last in ranges)
 
 
+@given(steps, st.floats(0.5, 120), st.sampled_from([0.0, 0.3, 0.5, 0.9]))
+@settings(deadline=None)
+def test_submaps_are_those_of_every_stretch_looked_at(step: list[float], length: float, overlap: float) -> None:
+    distance = np.cumsum(step) - step[0]
+    total = float(distance[-1])
+    starts = [0.0] if total <= length else [*np.arange(0.0, total - length, length * (1 - overlap)), total - length]
+    slack = 1e-9 * max(total, 1.0)
+    held = [(int((distance < s - slack).sum()), int((distance <= s + length + slack).sum())) for s in starts]
+    assert submap_ranges(distance, length, overlap) == [r for r in dict.fromkeys(held) if r[0] < r[1]]
+
+
+def test_a_road_of_many_submap_lengths_without_keyframes_takes_no_time() -> None:
+    assert submap_ranges(np.array([0.0, 1e12, 2e12]), 100.0, 0.25) == [(0, 1), (1, 2), (2, 3)]
+    assert submap_ranges(np.array([0.0, 50.0, 2e7]), 100.0, 0.9999999)[:2] == [(0, 2), (1, 2)]
+
+
 def test_road_distance() -> None:
     poses = np.array([yaw_transform(1.0, (x, y, 0.0)) for x, y in ((0, 0), (3, 4), (3, 4), (3, 0))])
     assert road_distance(poses).tolist() == [0, 5, 5, 9]
