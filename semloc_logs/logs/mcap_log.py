@@ -20,7 +20,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.names import ros2_type
 from semloc_logs.logs.problems import Problems
-from semloc_logs.logs.reading import BaseLog, decompress, encoding_of, in_log_time_order, read_exactly
+from semloc_logs.logs.reading import BaseLog, closed_on_error, decompress, encoding_of, in_log_time_order, open_file, read_exactly
 
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
@@ -52,19 +52,10 @@ class McapLog(BaseLog):
         self._channels: dict[int, Channel] = {}
         self._kinds: dict[int, tuple[str, str, str, Definition]] = {}
         self._parts: list[Part] = []
-        try:
-            self._file = path.open("rb")
-        except OSError as error:
-            raise LogError(f"{path} cannot be opened: {error.strerror}.") from error
-        try:
+        self._file = open_file(path)
+        with closed_on_error(self._file, path):
             self._size = self._file.seek(0, 2)
             self._open()
-        except LogError as error:
-            self._file.close()
-            raise LogError(f"{path} cannot be read: {error}.") from error
-        except OSError as error:
-            self._file.close()
-            raise LogError(f"{path} cannot be read: {error}.") from error
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` (None: of all) in log-time order; a damaged chunk is skipped and named in ``problems``."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import bz2
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from heapq import heappop, heappush, heapreplace
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
 import lz4.frame
 import zstandard
@@ -53,6 +54,24 @@ class BaseLog(ABC):
     @abstractmethod
     def close(self) -> None:
         """Releases the files."""
+
+
+def open_file(path: Path) -> BinaryIO:
+    """``path`` for reading; LogError when that is not possible."""
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise LogError(f"{path} cannot be opened: {error.strerror}.") from error
+
+
+@contextmanager
+def closed_on_error(file: BinaryIO, path: Path) -> Iterator[None]:
+    """Closes ``file`` when it turns out to be no log, and says so as a LogError that names ``path``."""
+    try:
+        yield
+    except (LogError, OSError) as error:
+        file.close()
+        raise LogError(f"{path} cannot be read: {error}.") from error
 
 
 class SizedFile(Protocol):

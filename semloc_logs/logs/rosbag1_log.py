@@ -12,7 +12,7 @@ from typing import NamedTuple
 from semloc_logs.errors import LogError
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.names import ros2_type
-from semloc_logs.logs.reading import BaseLog, decompress, in_log_time_order, read_exactly
+from semloc_logs.logs.reading import BaseLog, closed_on_error, decompress, in_log_time_order, open_file, read_exactly
 
 MAGIC = b"#ROSBAG V2.0\n"
 _U32 = struct.Struct("<I")
@@ -40,16 +40,10 @@ class Rosbag1Log(BaseLog):
         self.encoding = "ros1"
         self._connections: dict[int, tuple[str, str, Definition]] = {}
         self._parts: list[Part] = []
-        try:
-            self._file = path.open("rb")
-        except OSError as error:
-            raise LogError(f"{path} cannot be opened: {error.strerror}.") from error
-        try:
+        self._file = open_file(path)
+        with closed_on_error(self._file, path):
             self._size = self._file.seek(0, 2)
             self._open()
-        except (LogError, OSError) as error:
-            self._file.close()
-            raise LogError(f"{path} cannot be read: {error}.") from error
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` (None: of all) in log-time order; a damaged chunk is skipped and named in ``problems``."""
