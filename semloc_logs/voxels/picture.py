@@ -25,6 +25,7 @@ TRACK, START = (214, 39, 40), (20, 120, 50)
 GEOMETRY_NAMES = {0: "ground", 2: "wall-like", 5: "pole-like", 8: "vegetation-like"}  # what labels from geometry can tell
 NOTHING = np.iinfo(np.int32).min
 STRAY = 0.001  # this share of the voxels may lie beyond each edge of the picture
+STRIP = 128  # rows of pixels that are shaded at once
 HEADROOM = 2  # voxels above the sensor that are drawn indoors
 
 F64 = NDArray[np.float64]
@@ -77,26 +78,34 @@ class Canvas:
 
     def classes(self) -> list[int]:
         """Class ids that show, the most frequent first."""
-        counts = Counter(self.label[self.seen].tolist())
-        return sorted(counts, key=lambda c: (-counts[c], c))
+        counts = np.bincount(self.label[self.seen], minlength=256)
+        return sorted(np.flatnonzero(counts).tolist(), key=lambda c: (-counts[c], c))
 
     def image(self) -> U8:
-        """RGB (height, width, 3): white where nothing was observed, lighter the higher, lit from the upper left."""
-        out, seen = np.full((*self.top.shape, 3), 255, np.uint8), self.seen
-        if not seen.any():
+        """RGB (height, width, 3): white where nothing was observed, lighter the higher, lit from the upper left. Strip by strip, because
+        a large map has ten million pixels."""
+        out = np.full((*self.top.shape, 3), 255, np.uint8)
+        z = self.top[self.seen]
+        if not len(z):
             return out
-        z = self.top.astype(float)
-        bottom, top = np.percentile(z[seen], [2, 98])
-        share = np.clip((z - bottom) / max(top - bottom, 1.0), 0, 1)
-        is_ground = np.isin(self.label, GROUND)
-        bright = np.where(is_ground, 0.92 + 0.12 * share, 0.75 + 0.45 * share)
-        slope = np.zeros_like(z)
-        for axis in (0, 1):
-            other = np.roll(z, 1, axis)
-            slope += np.where(seen & np.roll(seen, 1, axis), np.clip(z - other, -3, 3), 0)
-        bright += 0.03 * slope
-        out[seen] = np.clip(colour_table()[self.label[seen]] * bright[seen][:, None], 0, 250)
+        heights = np.cumsum(np.bincount(z - z.min()))
+        bottom, top = (int(np.searchsorted(heights, share * len(z))) + int(z.min()) for share in (0.02, 0.98))
+        for row in range(0, len(out), STRIP):
+            strip = slice(row, row + STRIP)
+            above = np.vstack([self.top[row - 1] if row else self.top[:1] * 0 + NOTHING, self.top[strip]])
+            out[strip] = _shaded(above.astype(np.float32), self.label[strip], bottom, top)
         return out
+
+
+def _shaded(z: NDArray[np.float32], label: U8, bottom: float, top: float) -> U8:
+    """RGB (n, width, 3) of pixels of height ``z`` (n + 1, width), the row above them first, and class ``label`` (n, width)."""
+    seen = z > NOTHING
+    share = np.clip((z[1:] - bottom) / max(top - bottom, 1.0), 0, 1)
+    bright = np.where(np.isin(label, GROUND), 0.92 + 0.12 * share, 0.75 + 0.45 * share)
+    bright += 0.03 * np.where(seen[1:] & seen[:-1], np.clip(z[1:] - z[:-1], -3, 3), 0)
+    bright[:, 1:] += 0.03 * np.where(seen[1:, 1:] & seen[1:, :-1], np.clip(z[1:, 1:] - z[1:, :-1], -3, 3), 0)
+    shaded = np.clip(colour_table()[label] * bright[:, :, None], 0, 250).astype(np.uint8)
+    return np.where(seen[1:, :, None], shaded, np.uint8(255))
 
 
 @dataclass(frozen=True, slots=True)
