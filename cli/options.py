@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -138,7 +139,11 @@ def _settings(options: Mapping[str, Any]) -> Settings:
     from semloc_logs.settings import load
 
     assignments = dict(options.get("assignments") or {})
-    assignments |= {key: str(options[flag]) for flag, key in FLAGS.items() if options.get(flag) is not None}
+    given = {key: options[flag] for flag, key in FLAGS.items() if options.get(flag) is not None}
+    # the values of --set are YAML, in which a path may mean something else
+    assignments |= {
+        key: json.dumps(str(value), ensure_ascii=False) if isinstance(value, Path) else str(value) for key, value in given.items()
+    }
     if options.get("seg_model") is not None:
         assignments.setdefault("labels.source", "onnx")
     return load(options.get("config"), assignments, os.environ)

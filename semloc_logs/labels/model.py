@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.labels.space import U8, U32, UNLABELLED, UNPAINTED, read_space
+from semloc_logs.labels.space import U8, U32, UNLABELLED, UNPAINTED, is_file_name, read_space
 from semloc_logs.labels.spec import Spec, read_spec
 from semloc_logs.settings import Labels
 
@@ -29,8 +29,8 @@ def fingerprint(settings: Labels) -> str:
         model, spec = _named(settings)
         paths = [model, spec]
         named = read_spec(spec).space or ""
-        paths += [p for p in (spec.parent / named, Path(named)) if named.endswith((".yaml", ".yml")) and p.is_file()]
-    if settings.space is not None and settings.space.endswith((".yaml", ".yml")):
+        paths += [p for p in (spec.parent / named, Path(named)) if is_file_name(named) and p.is_file()]
+    if settings.space is not None and is_file_name(settings.space):
         read_space(settings.space)
         paths.append(Path(settings.space))
     return " ".join(_digest(path) for path in paths)

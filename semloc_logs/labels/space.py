@@ -100,14 +100,18 @@ def spaces() -> list[str]:
     return list(names("label_spaces", ".yaml"))
 
 
+def is_file_name(name: str) -> bool:
+    """Whether ``name`` is that of a YAML file, not of a shipped space."""
+    return Path(name).suffix.lower() in (".yaml", ".yml")
+
+
 def read_space(name: str) -> LabelSpace:
     """The shipped space ``name``, or that of the YAML file ``name``. SettingsError for an unknown name and for a file that is none."""
     if name in spaces():
         return _shipped(name)
-    path = Path(name)
-    if path.suffix.lower() not in (".yaml", ".yml"):
+    if not is_file_name(name):
         raise SettingsError(f"Unknown label space '{name}': there are {', '.join(spaces())}; or name a YAML file.")
-    return _parse(read_yaml(path, "Label space"), str(path), trains_by_name())
+    return _parse(read_yaml(Path(name), "Label space"), name, trains_by_name())
 
 
 @cache
@@ -180,9 +184,15 @@ def trains_by_name() -> Mapping[str, int]:
 
 
 def space_of_names(classes: Mapping[int, str], name: str) -> LabelSpace:
-    """The space of a list of class names; of a path such as ``construction--flat--road`` the last part that is known counts."""
+    """The space of a list of class names; of a path such as ``construction--flat--road`` the last part that is known counts.
+
+    Ids below 0 or above 65535, which only a damaged log gives, have no meaning and are among the unknown.
+    """
     targets, unknown = dict[int, int](), list[str]()
     for i, given in classes.items():
+        if not 0 <= i <= _HIGHEST_ID:
+            unknown.append(given)
+            continue
         parts = [given, *reversed(re.split(r"--|[./:]", given))]
         target = next((t for p in parts if (t := trains_by_name().get(plain(p))) is not None), None)
         targets[i] = UNLABELLED if target is None else target

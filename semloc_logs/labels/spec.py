@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.labels.space import LabelSpace, plain, read_space, space_of_names
+from semloc_logs.labels.space import LabelSpace, is_file_name, plain, read_space, space_of_names
 from semloc_logs.settings import read_yaml
 
 
@@ -73,7 +73,7 @@ class Spec(_Part):
             return space_of_names(dict(enumerate(self.classes)), str(where))
         name = self.space or ""
         beside = where.parent / name
-        return read_space(str(beside) if name.endswith((".yaml", ".yml")) and beside.exists() else name)
+        return read_space(str(beside) if is_file_name(name) and beside.exists() else name)
 
     def ignored(self, space: LabelSpace) -> set[int]:
         """Ids that become unlabelled. SettingsError for a class that is not there."""

@@ -42,13 +42,13 @@ def level(session: Session, collected: Collected) -> tuple[F64, F64]:
 
 
 def check_reach(session: Session, collected: Collected, voxel_size: float) -> None:
-    """LogError where the poses leave the space that voxels have numbers for, 3 million of them in each direction."""
+    """LogError where the poses leave the space that voxels have numbers for, 3 million of them from the first keyframe."""
     reach, first = REACH * voxel_size, None
     for header, pose in zip(collected.headers, collected.poses, strict=True):
         if pose is None:
             continue
         first = pose[:3, 3] if first is None else first
-        away = float(np.abs(pose[:3, 3] - first).max())
+        away = float(np.linalg.norm(pose[:3, 3] - first))
         if away > reach:
             when = span(header.stamp_ns, header.stamp_ns).split(" to ")[0]
             raise LogError(

@@ -83,6 +83,13 @@ def test_settings_come_from_defaults_then_file_then_environment_then_flags(tmp_p
     assert all_of_it["query"]["length"] == 11
 
 
+@pytest.mark.parametrize("name", ["model #2.onnx", "a: b.onnx", "[1].onnx", "12", "größe 😀.onnx", "it's \\ so.onnx"])
+def test_a_path_is_taken_as_it_is(name: str) -> None:
+    content = yaml.safe_load(semloc("run", "--dump-config", "--seg-model", name).stdout)
+    assert content["labels"]["model"] == name
+    assert content["labels"]["source"] == "onnx"
+
+
 def test_what_dump_config_prints_is_read_back(tmp_path: Path) -> None:
     first = semloc("run", "--dump-config", "--set", "closures.min_probability=0.5", "--set", "fusion.clamp=[-1, 2]").stdout
     (tmp_path / "s.yaml").write_text(first)

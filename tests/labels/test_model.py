@@ -188,5 +188,11 @@ def test_the_fingerprint_follows_the_files(tmp_path: Path) -> None:
     save_model(tmp_path / "model.onnx", classes=4)
     assert fingerprint(settings) != before
     assert fingerprint(Labels()) == ""
+    for name in ("mine.yaml", "MINE.YML"):
+        space = tmp_path / name
+        space.write_text("classes: {0: {name: road}}")
+        before = fingerprint(Labels(space=str(space)))
+        space.write_text("classes: {0: {name: pole}}")
+        assert fingerprint(Labels(space=str(space))) != before
     with pytest.raises(SettingsError, match="cannot be read"):
         fingerprint(settings.model_copy(update={"model": tmp_path / "none.onnx"}))

@@ -198,3 +198,10 @@ def test_classes_by_name() -> None:
     assert [space.targets[i] for i in range(len(names))] == [0, 6, 0, 0, 13, 255, 255, 255, 255]
     assert space.unknown == ("frob",)
     assert {trains_by_name()[plain(n)] for n in cityscapes().names} == set(range(19))
+
+
+def test_names_of_ids_that_no_label_can_have_are_left_out() -> None:
+    space = space_of_names({-1: "road", 3: "car", 1 << 40: "pole"}, "/label_info")
+    assert space.targets == {3: 13}
+    assert space.unknown == ("road", "pole")
+    assert space.train_ids(np.array([0, 3, 4, 1 << 31])).tolist() == [255, 13, 255, 255]
