@@ -215,9 +215,11 @@ def _from_yaml(text: str) -> Any:
 def read_yaml(path: Path, what: str) -> Any:
     """The content of the YAML file ``path``. SettingsError, which calls it ``what``, when it cannot be read or is larger than 1 MiB."""
     try:
-        if path.stat().st_size > _MOST_BYTES:
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
             raise SettingsError(f"{what} {path} is larger than a megabyte: name another file.")
-        return _from_yaml(path.read_text(encoding="utf-8"))
+        return _from_yaml(content.decode())
     except (OSError, ValueError) as problem:
         raise SettingsError(f"{what} {path} cannot be read as YAML: {problem}.") from None
 

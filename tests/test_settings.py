@@ -120,6 +120,11 @@ def test_files_that_are_no_settings_are_refused_by_name(content: bytes, tmp_path
         load(tmp_path / "missing.yaml")
 
 
+def test_files_without_end_are_refused() -> None:
+    with pytest.raises(SettingsError, match="larger than a megabyte"):
+        load(Path("/dev/zero"))
+
+
 @pytest.mark.parametrize("text", ["", "# nothing\n", "fusion:\nquery:\n"])
 def test_empty_files_and_sections_are_the_defaults(text: str, tmp_path: Path) -> None:
     path = tmp_path / "empty.yaml"

@@ -123,6 +123,8 @@ class Segmenter:
         """Class ids (rows, columns) of what the model gave. SettingsError when it is not of the form that the spec says."""
         spec, given = self._spec.output, " x ".join(map(str, output.shape))
         image = output.reshape([n for n in output.shape if n != 1] or [1]) if output.ndim > 3 or spec.kind == "ids" else output
+        if not output.size or output.dtype.kind not in "biuf":
+            raise SettingsError(f"Model {self._path} gives {given} values of type {output.dtype}: output.name may be that of another.")
         classes = len(self._table) - 1
         if spec.kind == "ids":
             if image.ndim != 2:

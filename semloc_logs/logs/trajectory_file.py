@@ -39,6 +39,8 @@ class TrajectoryFile:
         """sha256 over the content of the files and the frame; LogError when one cannot be read."""
         digest = hashlib.sha256(self.frame.encode())
         for path in (self.path, *([self.times] if self.times else [])):
+            if path.exists() and not path.is_file():
+                raise LogError(f"{path} is no regular file: give the path of a file of poses.")  # a pipe can be read only once
             try:
                 with path.open("rb") as file:
                     digest.update(hashlib.file_digest(file, "sha256").digest())

@@ -16,6 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 from semloc_logs.errors import SettingsError
 from semloc_logs.labels.model import Segmenter, fingerprint
 from semloc_logs.labels.space import UNPAINTED
+from semloc_logs.labels.spec import read_spec
 from semloc_logs.settings import Labels
 
 ROAD, VEGETATION, CAR = 0, 8, 13
@@ -91,6 +92,16 @@ def test_ids_that_models_give_to_nothing_are_unlabelled(tmp_path: Path) -> None:
     assert many.train_ids(image)[0, ::5].tolist() == [ROAD, 255, 255, 255]
     with pytest.raises(SettingsError, match="gives the class 510"):
         many.train_ids(stripes())
+
+
+@pytest.mark.parametrize("output", [np.zeros((1, 3, 0, 16), np.float32), np.full((1, 8, 16), "road"), np.full((3, 8, 16), None)])
+@pytest.mark.parametrize("kind", ["ids", "logits"])
+def test_outputs_that_are_no_pictures_are_refused(tmp_path: Path, output: NDArray[Any], kind: str) -> None:
+    opened(tmp_path, output={"kind": kind})
+    file = tmp_path / "spec.yaml"
+    segmenter = Segmenter(lambda _: output, "none", read_spec(file), file, tmp_path / "model.onnx")
+    with pytest.raises(SettingsError, match="values of type"):
+        segmenter.train_ids(stripes())
 
 
 def test_colour_order_mean_and_scale(tmp_path: Path) -> None:

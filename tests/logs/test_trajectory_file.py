@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from decimal import Decimal
 from pathlib import Path
 
@@ -158,3 +159,10 @@ def test_times_from_zero_count_from_the_first_frame(tmp_path: Path) -> None:
     assert given_by(source) == [7_000_000_000, 7_500_000_000]
     assert source.is_over
     assert given_by(source) == []
+
+
+def test_a_pipe_is_refused_because_it_cannot_be_read_twice(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.tum")
+    for path in (tmp_path / "pipe.tum", Path("/dev/zero"), tmp_path):
+        with pytest.raises(LogError, match="is no regular file"):
+            TrajectoryFile(path).fingerprint()
