@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.session import Session
@@ -50,9 +51,14 @@ class Collected:
         self.origins.append(cloud.origin)
 
     def load(self, keyframe: int) -> tuple[F32, U32 | None, F32 | None]:
-        """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of their range, where there are any."""
+        """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of their range, where there are any.
+
+        WorkspaceError when somebody removed them, as a second ``fuse`` of the same session would.
+        """
         points = self._load(keyframe, "points")
-        return np.zeros((0, 3), np.float32) if points is None else points, self._load(keyframe, "label"), self._load(keyframe, "sigma")
+        if points is None:
+            raise WorkspaceError(f"{self.scratch} was removed meanwhile: fuse a session in one process at a time.")
+        return points, self._load(keyframe, "label"), self._load(keyframe, "sigma")
 
     def normals(self, most: int = MOST_NORMALS) -> list[tuple[int, F64, F64]]:
         """Of ``most`` keyframes, evenly spread: number, unit normals (m, 3) of surfaces in the session frame, or in the base frame
