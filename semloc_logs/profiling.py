@@ -46,7 +46,7 @@ _PARTS: dict[str, tuple[tuple[str, ...], str]] = {
     "ground": (("gravity.py ground_height", "surface.py ground_surface", "ground.py add", "ground.py finish"), ""),
     "labels": (("labeller.py labels", "labeller.py take"), ""),
     "keyframes written": (("store.py keep_keyframes",), "fusing.py _labelled"),
-    "integrate": (("grid.py add",), ""),
+    "integrate": (("grid.py take", "carve.py marks"), ()),
     "finish of maps": (("grid.py finish",), ""),
     "blocks written": (("store.py write_blocks",), ""),
     "voxel merge": (("store.py write_voxels",), "fusing.py _kept_submaps"),

@@ -148,7 +148,8 @@ class _Fused:
             # whatever happens, the other thread ends before its folder is renamed or removed
             closing(ahead(keep_keyframes(keyframes, stamps, self._labelled(ground), self.metadata))) as kept,
         ):
-            voxels = write_voxels(folder.voxels, self._kept_submaps(blocks, kept, ranges), self.metadata, fusion.clamp)
+            submaps = ahead(self._kept_submaps(blocks, kept, ranges), depth=1)
+            voxels = write_voxels(folder.voxels, submaps, self.metadata, fusion.clamp)
             if not ranges:
                 write_blocks(blocks_path(blocks, 0), empty_map(), self.metadata)
         frames = {
