@@ -145,10 +145,10 @@ class _Fused:
         with (
             replacing_folder(folder.keyframes) as keyframes,
             replacing_folder(folder.blocks) as blocks,
-            # whatever happens, the other thread ends before its folder is renamed or removed
+            # whatever happens, the other threads end before their folders are renamed or removed
             closing(ahead(keep_keyframes(keyframes, stamps, self._labelled(ground), self.metadata))) as kept,
+            closing(ahead(self._kept_submaps(blocks, kept, ranges), depth=1)) as submaps,
         ):
-            submaps = ahead(self._kept_submaps(blocks, kept, ranges), depth=1)
             voxels = write_voxels(folder.voxels, submaps, self.metadata, fusion.clamp)
             if not ranges:
                 write_blocks(blocks_path(blocks, 0), empty_map(), self.metadata)
