@@ -109,7 +109,8 @@ def fuse(
         name = task.folder.name
         if isinstance(outcome, SemlocError):
             report.failed.append(str(outcome))
-            note(f"{name}: {outcome}")
+            if len(tasks) > 1:  # the only one is raised below, and need not be said twice
+                note(f"{name}: {outcome}")
         else:
             report.done.append(name)
             report.skipped += outcome["skipped"]
