@@ -12,6 +12,7 @@ from semloc_logs.voxels.selection import thin
 F64 = NDArray[np.float64]
 MOST_POINTS = 12_000  # of a keyframe that normals are taken from
 FINENESS = 25.0  # so many cells lie one behind the other within the median range, where the points are as dense as that
+PLUMB = 5.0  # a wall's word against a floor's: houses are built plumb, streets follow the land
 
 
 def surface_normals(points: NDArray[np.float32], origin: NDArray[np.floating], cell: float, noise: float = 0.0) -> tuple[F64, F64]:
@@ -55,7 +56,7 @@ def find_up(normals: NDArray[np.floating], weights: NDArray[np.floating], prior:
         sine = np.sin(np.radians(degrees))
         dot = n @ up
         floor, wall = np.abs(dot) > np.cos(np.radians(degrees)), np.abs(dot) < sine
-        a = (n[floor] * w[floor, None]).T @ n[floor] - 0.5 * (n[wall] * w[wall, None]).T @ n[wall]
+        a = (n[floor] * w[floor, None]).T @ n[floor] - PLUMB * (n[wall] * w[wall, None]).T @ n[wall]
         vector = np.linalg.eigh(a)[1][:, -1]
         up = vector if vector @ prior > 0 else -vector
     return np.asarray(up)
