@@ -120,9 +120,8 @@ class Database:
             radius = 1.2 * (self.settings.query.radius or 24.0)
             clouds = []
             for i in np.sort(ids[np.argsort(away, kind="stable")[:SURFACE_KEYFRAMES]]):
-                points = read_keyframe(session.folder.keyframes, int(i)).points
-                near = np.linalg.norm(points - session.origins[i], axis=1) < radius
-                clouds.append(apply(session.map_T_base[i], points[near]))
+                frame = read_keyframe(session.folder.keyframes, int(i)).near(session.origins[i], radius)
+                clouds.append(apply(session.map_T_base[i], frame.points))
             return surface_of(thin_points(np.concatenate(clouds), self.settings.fusion.voxel_size / 2.5))
 
         found: Surface = self._surfaces.get((place.session, keyframe, submap["id"]), make)

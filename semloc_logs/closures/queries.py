@@ -15,7 +15,7 @@ from semloc_logs.geometry import apply, inverse, rotation_angle
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describing import KNOWS_CLASSES
 from semloc_logs.tables import read_json, read_table
-from semloc_logs.voxels.fusing import fuse_keyframes
+from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import poses_of, read_keyframe
 from semloc_logs.workspace import SessionFolder
 
@@ -116,11 +116,10 @@ def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple
     query_T_map[:3, 3] = -session.map_T_base[keyframe][:3, 3]
     poses = query_T_map @ session.map_T_base
     radius = settings.query.radius or 24.0
-    blocks = fuse_keyframes(session.folder, members, poses, session.origins, settings, radius)
-    clouds = []
+    fuser, clouds = Fuser(settings.fusion), []
     for i in members:
-        points = read_keyframe(session.folder.keyframes, i).points
-        near = np.linalg.norm(points - session.origins[i], axis=1) < radius
-        clouds.append(apply(poses[i], points[near]))
+        frame = read_keyframe(session.folder.keyframes, i).near(session.origins[i], radius)
+        fuser.add(frame.points, frame.label, session.origins[i], frame.sigma, poses[i])
+        clouds.append(apply(poses[i], frame.points))
     v = settings.fusion.voxel_size
-    return Query(blocks, thin_points(np.concatenate(clouds), v / 2), v), poses[keyframe]
+    return Query(fuser.finish(), thin_points(np.concatenate(clouds), v / 2), v), poses[keyframe]

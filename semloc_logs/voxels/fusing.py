@@ -34,7 +34,7 @@ from semloc_logs.voxels.keyframes import Collected, collect
 from semloc_logs.voxels.levelling import check_reach, level
 from semloc_logs.voxels.picture import Caption, draw_map
 from semloc_logs.voxels.selection import road_distance, submap_ranges
-from semloc_logs.voxels.store import Keyframe, blocks_path, keep_keyframes, pose_columns, read_keyframe, write_blocks, write_voxels
+from semloc_logs.voxels.store import Keyframe, blocks_path, keep_keyframes, pose_columns, write_blocks, write_voxels
 from semloc_logs.workspace import SessionFolder
 
 F64 = NDArray[np.float64]
@@ -218,21 +218,3 @@ def fuse_ranges(
                 fuser.take(marks)
         for number in [n for n in active if ranges[n][1] == i + 1]:
             yield active.pop(number).finish()
-
-
-def fuse_keyframes(
-    folder: SessionFolder,
-    keyframes: range | list[int],
-    poses: F64,
-    origins: NDArray[np.floating],
-    settings: Settings,
-    radius: float | None = None,
-) -> BlockMap:
-    """The map of some keyframes at ``poses`` (n, 4, 4) map_T_base by keyframe; points beyond ``radius`` of the sensor are left out."""
-    fuser = Fuser(settings.fusion)
-    for i in keyframes:
-        frame = read_keyframe(folder.keyframes, i)
-        if radius is not None:
-            frame = frame.near(origins[i], radius)
-        fuser.add(frame.points, frame.label, origins[i], frame.sigma, poses[i])
-    return fuser.finish()
