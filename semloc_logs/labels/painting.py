@@ -80,7 +80,15 @@ def nearest_depth(points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, p
 
 
 @njit(cache=True, nogil=True)
-def _draw(depth, cells, z, distance, column, elevation, half):  # type: ignore[no-untyped-def]
+def _draw(
+    depth: NDArray[np.floating],
+    cells: F64,
+    z: F64,
+    distance: NDArray[np.floating],
+    column: NDArray[np.integer],
+    elevation: NDArray[np.floating],
+    half: F64,
+) -> None:
     n = len(z)
     for i in range(n):
         _line(depth, 1, int(np.floor(cells[i, 1])), cells[i, 0], half[i], z[i])
@@ -96,7 +104,7 @@ def _draw(depth, cells, z, distance, column, elevation, half):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def _continues(distance, column, elevation, i, step):  # type: ignore[no-untyped-def]
+def _continues(distance: NDArray[np.floating], column: NDArray[np.integer], elevation: NDArray[np.floating], i: int, step: int) -> int:
     """The next point of another ring, upwards or downwards, that is on the same surface as point ``i``; _ENDS where the next ring sees
     something much farther or nothing, and _STEPS where it sees something else."""
     ends = _ENDS
@@ -118,7 +126,7 @@ def _continues(distance, column, elevation, i, step):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True)
-def _strip(depth, a, b, z_a, z_b, half_a, half_b):  # type: ignore[no-untyped-def]
+def _strip(depth: NDArray[np.floating], a: F64, b: F64, z_a: float, z_b: float, half_a: float, half_b: float) -> None:
     """Joins two points: in each row of cells the farthest depth that the line has there, which is linear in 1 / z; in each column where
     the line lies rather than stands."""
     main = 1 if abs(b[1] - a[1]) >= abs(b[0] - a[0]) else 0
@@ -136,7 +144,7 @@ def _strip(depth, a, b, z_a, z_b, half_a, half_b):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True)
-def _line(depth, main, line, centre, half, z):  # type: ignore[no-untyped-def]
+def _line(depth: NDArray[np.floating], main: int, line: int, centre: float, half: float, z: float) -> None:
     """Cells of one row (``main`` 1) or column (0) around ``centre`` are no farther than ``z``."""
     if line < 0 or line >= depth.shape[1 - main]:
         return

@@ -260,10 +260,19 @@ def flush(marks: U8, runs: I64, slots: I64, log_odds: NDArray[np.int8], hit: int
 
 
 @njit(cache=True, nogil=True)
+def _place(keys: I64, key: int) -> int:
+    """Where ``key`` is in an open hash table of :func:`add_votes`, or the empty place for it."""
+    mask = len(keys) - 1
+    h = ((key * 0x9E3779B97F4A7C1) >> 20) & mask
+    while keys[h] >= 0 and keys[h] != key:
+        h = (h + 1) & mask
+    return h
+
+
+@njit(cache=True, nogil=True)
 def add_votes(keys: I64, counts: NDArray[np.uint32], used: int, ends: I64, voxel_votes: NDArray[np.uint32], slot_of_run: I64) -> int:
     """Add a frame's votes to a hash table of ``keys`` ((slot * 4096 + cell) * 32 + class, -1 empty) and ``counts``; returns how
     many places are used. The table must be large enough. A class gets at least one vote where it has any weight."""
-    mask = len(keys) - 1
     for r in range(len(ends)):
         if not ends[r] & 1:
             continue
@@ -274,9 +283,7 @@ def add_votes(keys: I64, counts: NDArray[np.uint32], used: int, ends: I64, voxel
             if weight == 0:
                 continue
             key = voxel * 32 + label
-            h = ((key * 0x9E3779B97F4A7C1) >> 20) & mask
-            while keys[h] >= 0 and keys[h] != key:
-                h = (h + 1) & mask
+            h = _place(keys, key)
             if keys[h] < 0:
                 keys[h] = key
                 used += 1
@@ -287,10 +294,7 @@ def add_votes(keys: I64, counts: NDArray[np.uint32], used: int, ends: I64, voxel
 @njit(cache=True, nogil=True)
 def rehash(keys: I64, counts: NDArray[np.uint32], new_keys: I64, new_counts: NDArray[np.uint32]) -> None:
     """Move a table of :func:`add_votes` into a larger, empty one."""
-    mask = len(new_keys) - 1
     for i in range(len(keys)):
         if keys[i] >= 0:
-            h = ((keys[i] * 0x9E3779B97F4A7C1) >> 20) & mask
-            while new_keys[h] >= 0:
-                h = (h + 1) & mask
+            h = _place(new_keys, keys[i])
             new_keys[h], new_counts[h] = keys[i], counts[i]
