@@ -24,8 +24,8 @@ from foxglove_schemas_protobuf import (
     PoseInFrame_pb2,
     RawImage_pb2,
 )
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
@@ -119,21 +119,6 @@ def _foxglove() -> Iterator[Any]:
     yield LocationFix_pb2.LocationFix(latitude=47, longitude=8, altitude=400, frame_id="g")
 
 
-def _file_set(file: Any) -> bytes:
-    found: dict[str, Any] = {}
-
-    def visit(one: Any) -> None:
-        for dependency in one.dependencies:
-            visit(dependency)
-        found.setdefault(one.name, one)
-
-    visit(file)
-    out = FileDescriptorSet()
-    for one in found.values():
-        one.CopyToProto(out.file.add())
-    return bytes(out.SerializeToString())
-
-
 def _as_json(message: Any) -> Any:
     """As Foxglove writes JSON: bytes in base64, times as sec and nsec, enumerations as numbers."""
     if message.DESCRIPTOR.full_name == "google.protobuf.Timestamp":
@@ -166,7 +151,7 @@ def messages() -> list[tuple[str, Message]]:
     for m in _foxglove():
         m.timestamp.FromNanoseconds(5) if "timestamp" in m.DESCRIPTOR.fields_by_name else None
         name = m.DESCRIPTOR.full_name
-        definition = Definition(name, "protobuf", _file_set(m.DESCRIPTOR.file))
+        definition = Definition(name, "protobuf", build_file_descriptor_set(m).SerializeToString())
         found.append((f"protobuf {name}", Message("/t", name, "protobuf", 1, m.SerializeToString(), definition)))
         text = json.dumps(_as_json(m)).encode()
         found.append((f"json {name}", Message("/t", name, "json", 1, text, _NOTHING)))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import Writer
+from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
@@ -133,7 +133,9 @@ class Recorder:
             for log_time, topic, m in self.events:
                 if topic not in channels:
                     if self.kind == "protobuf":
-                        schema = writer.register_schema(m.DESCRIPTOR.full_name, "protobuf", _file_set(m.DESCRIPTOR.file))
+                        schema = writer.register_schema(
+                            m.DESCRIPTOR.full_name, "protobuf", build_file_descriptor_set(m).SerializeToString()
+                        )
                         channels[topic] = writer.register_channel(topic, "protobuf", schema)
                     else:
                         text = self.store.generate_msgdef(m.__msgtype__, ros_version=2)[0].encode()
@@ -168,22 +170,6 @@ def _ros1_bytes(m: Any, store: Any) -> bytes:
         edges = b"".join(bytes(store.serialize_ros1(e, e.__msgtype__)) for e in m.transforms)
         return len(m.transforms).to_bytes(4, "little") + edges
     return bytes(store.serialize_ros1(m, m.__msgtype__))
-
-
-def _file_set(file: Any) -> bytes:
-    """The FileDescriptorSet of a file and all that it imports."""
-    found: dict[str, Any] = {}
-
-    def visit(one: Any) -> None:
-        for dependency in one.dependencies:
-            visit(dependency)
-        found.setdefault(one.name, one)
-
-    visit(file)
-    out = FileDescriptorSet()
-    for one in found.values():
-        one.CopyToProto(out.file.add())
-    return bytes(out.SerializeToString())
 
 
 @pytest.fixture
