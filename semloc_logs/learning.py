@@ -16,11 +16,12 @@ from semloc_logs.engines import Engine
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings, Training
 from semloc_logs.simulation.training_data import make_shard, scene_tasks
+from semloc_logs.subvolumes.completion import completion_scores
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.own_sessions import cut_stretch, stretch_tasks
 from semloc_logs.subvolumes.pairs import read_shard
 from semloc_logs.subvolumes.sampling import shard_descriptors
-from semloc_logs.subvolumes.training import Progress, completion_scores, save_weights, train
+from semloc_logs.subvolumes.training import Progress, save_weights, train
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import SessionFolder
 

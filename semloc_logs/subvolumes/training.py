@@ -24,6 +24,7 @@ from torch.nn import functional as F
 
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import Training
+from semloc_logs.subvolumes.completion import targets
 from semloc_logs.subvolumes.cut import CLASSES, code_table
 from semloc_logs.subvolumes.network import Completion, descriptors
 from semloc_logs.subvolumes.pairs import occupied, read_shard
@@ -77,13 +78,6 @@ def _seen(part: U8) -> NDArray[np.bool_]:
     return np.ascontiguousarray(np.array(counts).transpose(2, 0, 1).reshape(-1) >= MIN_OCCUPIED)
 
 
-def _targets(complete: U8, table: U8, classes: int) -> tuple[Tensor, Tensor]:
-    """Class indices of the complete subvolumes and which voxels count: unobserved ones and occupied ones of unknown class do not."""
-    codes = table[complete]
-    known = codes <= classes
-    return torch.from_numpy(np.where(known, codes, 0).astype(np.int64)), torch.from_numpy(known)
-
-
 def train(
     variant: str,
     shards: Sequence[Path],
@@ -115,7 +109,7 @@ def train(
             group["lr"] = RATE * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
         seen = torch.from_numpy(_seen(part))
         noise = torch.from_numpy(np.random.default_rng((training.seed, 2, step)).standard_normal((len(part), 256), np.float32))
-        target, known = _targets(whole, table, classes)
+        target, known = targets(whole, table, classes)
         with torch.autocast("cpu", dtype=torch.bfloat16):
             logits, mu, log_variance = model(torch.from_numpy(table[part]), noise)
             with torch.no_grad():  # the complete view is the goal; a gradient through it too would cost a third more
@@ -184,48 +178,3 @@ def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
     tensors = {k: v.to(torch.bfloat16).contiguous() for k, v in model.state_dict().items() if v.is_floating_point()}
     with replacing_file(path) as temporary:
         save_file(tensors, temporary, metadata={**card, "variant": model.encoder.variant})
-
-
-@torch.inference_mode()
-def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, float]:
-    """How well the subvolumes of a held-out shard are completed, beside the trivial answers, and found again.
-
-    ``accuracy``: share of the complete map's observed voxels with the right label (the paper's figure); ``iou``: mean over the
-    classes that occur; ``unobserved_accuracy``: over voxels that the input did not observe; ``all_free``, ``copy_input``: accuracy
-    of the two trivial answers; ``recall5``: share of incomplete subvolumes with their partner among the five nearest.
-    """
-    model.eval()
-    variant = model.encoder.variant
-    table, classes = code_table(variant), CLASSES[variant]
-    confusion = np.zeros((classes + 1, classes + 1), np.int64)
-    right = seen = free = copied = hidden = hidden_right = 0
-    ours, theirs = [], []
-    for i in range(0, len(pairs[0]), 32):
-        part, whole, other = (a[i : i + 32] for a in pairs)
-        logits, mu, _ = model(torch.from_numpy(table[part]), None)
-        ours.append(descriptors(mu[:, :, 1:2, 1:2]))
-        theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 1:2, 1:2]))
-        said = logits[:, : classes + 1].argmax(1).numpy()
-        target, known = (t.numpy() for t in _targets(whole, table, classes))
-        given = table[part[:, 16:-16, 16:-16]]
-        seen += int(known.sum())
-        right += int((known & (said == target)).sum())
-        free += int((known & (target == classes)).sum())
-        copied += int((known & (given == target)).sum())
-        unseen = known & (given == classes + 1)
-        hidden += int(unseen.sum())
-        hidden_right += int((unseen & (said == target)).sum())
-        np.add.at(confusion, (target[known], said[known]), 1)
-    inter = np.diag(confusion)[:classes]
-    union = confusion.sum(0)[:classes] + confusion.sum(1)[:classes] - inter
-    occurs = confusion.sum(1)[:classes] > 0
-    rank = torch.cdist(torch.cat(ours), torch.cat(theirs))
-    recall = (rank < rank.diag()[:, None]).sum(1).lt(5).float().mean()
-    return {
-        "accuracy": right / max(seen, 1),
-        "all_free": free / max(seen, 1),
-        "copy_input": copied / max(seen, 1),
-        "unobserved_accuracy": hidden_right / max(hidden, 1),
-        "iou": float((inter[occurs] / union[occurs]).mean()) if occurs.any() else 0.0,
-        "recall5": float(recall),
-    }

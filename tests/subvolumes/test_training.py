@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import Settings, Training
 from semloc_logs.subvolumes import training
+from semloc_logs.subvolumes.completion import completion_scores, targets
 from semloc_logs.subvolumes.cut import SIZE, code_table
 from semloc_logs.subvolumes.pairs import BROAD, SceneFrame, cut_pairs, occupied, read_shard, write_shard
-from semloc_logs.subvolumes.training import Progress, _batches, _seen, _targets, completion_scores, train
+from semloc_logs.subvolumes.training import Progress, _batches, _seen, train
 
 U8 = NDArray[np.uint8]
 Pair = tuple[U8, U8, U8]
@@ -103,7 +104,7 @@ def test_which_subvolumes_are_described_and_which_voxels_count() -> None:
     seen = _seen(part).reshape(2, 3, 3)
     assert not seen[0].any()
     assert np.argwhere(seen[1]).tolist() == [[0, 0]]
-    target, known = _targets(np.array([0, 18, 254, 253, 255], np.uint8), code_table("semantic"), 19)
+    target, known = targets(np.array([0, 18, 254, 253, 255], np.uint8), code_table("semantic"), 19)
     assert known.tolist() == [True, True, True, False, False]
     assert target[known].tolist() == [0, 18, 19]
 

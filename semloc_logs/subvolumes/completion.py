@@ -1,0 +1,65 @@
+"""How well the network completes subvolumes: what counts, and the scores on a held-out shard (paper 3.2 and 4.3)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semloc_logs.subvolumes.cut import CLASSES, code_table
+from semloc_logs.subvolumes.network import Completion, descriptors
+
+U8 = NDArray[np.uint8]
+
+
+def targets(complete: U8, table: U8, classes: int) -> tuple[Tensor, Tensor]:
+    """Class indices of the complete subvolumes and which voxels count: unobserved ones and occupied ones of unknown class do not."""
+    codes = table[complete]
+    known = codes <= classes
+    return torch.from_numpy(np.where(known, codes, 0).astype(np.int64)), torch.from_numpy(known)
+
+
+@torch.inference_mode()
+def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, float]:
+    """How well the subvolumes of a held-out shard are completed, beside the trivial answers, and found again.
+
+    ``accuracy``: share of the complete map's observed voxels with the right label (the paper's figure); ``iou``: mean over the
+    classes that occur; ``unobserved_accuracy``: over voxels that the input did not observe; ``all_free``, ``copy_input``: accuracy
+    of the two trivial answers; ``recall5``: share of incomplete subvolumes with their partner among the five nearest.
+    """
+    model.eval()
+    variant = model.encoder.variant
+    table, classes = code_table(variant), CLASSES[variant]
+    confusion = np.zeros((classes + 1, classes + 1), np.int64)
+    right = seen = free = copied = hidden = hidden_right = 0
+    ours, theirs = [], []
+    for i in range(0, len(pairs[0]), 32):
+        part, whole, other = (a[i : i + 32] for a in pairs)
+        logits, mu, _ = model(torch.from_numpy(table[part]), None)
+        ours.append(descriptors(mu[:, :, 1:2, 1:2]))
+        theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 1:2, 1:2]))
+        said = logits[:, : classes + 1].argmax(1).numpy()
+        target, known = (t.numpy() for t in targets(whole, table, classes))
+        given = table[part[:, 16:-16, 16:-16]]
+        seen += int(known.sum())
+        right += int((known & (said == target)).sum())
+        free += int((known & (target == classes)).sum())
+        copied += int((known & (given == target)).sum())
+        unseen = known & (given == classes + 1)
+        hidden += int(unseen.sum())
+        hidden_right += int((unseen & (said == target)).sum())
+        np.add.at(confusion, (target[known], said[known]), 1)
+    inter = np.diag(confusion)[:classes]
+    union = confusion.sum(0)[:classes] + confusion.sum(1)[:classes] - inter
+    occurs = confusion.sum(1)[:classes] > 0
+    rank = torch.cdist(torch.cat(ours), torch.cat(theirs))
+    recall = (rank < rank.diag()[:, None]).sum(1).lt(5).float().mean()
+    return {
+        "accuracy": right / max(seen, 1),
+        "all_free": free / max(seen, 1),
+        "copy_input": copied / max(seen, 1),
+        "unobserved_accuracy": hidden_right / max(hidden, 1),
+        "iou": float((inter[occurs] / union[occurs]).mean()) if occurs.any() else 0.0,
+        "recall5": float(recall),
+    }
