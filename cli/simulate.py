@@ -18,6 +18,9 @@ from .options import Command, console_options, json_option, overwrite_option, pa
 @click.option("--rate", type=float, default=2.0, show_default=True, help="Sweeps a second (Hz).")
 @click.option("--format", "format_", default="mcap", show_default=True, help="Form of the logs: mcap or bag.")
 @click.option("--label-noise", type=float, default=0.0, show_default=True, help="Share of wrong labels, 0 to 1.")
+@click.option("--season", default="summer", show_default=True, help="Season of each drive, in turn: summer,autumn,winter,snow.")
+@click.option("--roadworks", type=float, default=0.0, show_default=True, help="Roadworks a kilometre, from the second drive on.")
+@click.option("--rebuilt", type=float, default=0.0, show_default=True, help="Share of houses gone or new, from the second drive on.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Number of the town.")
 @overwrite_option
 @json_option
@@ -30,6 +33,9 @@ def command(
     rate: float,
     format_: str,
     label_noise: float,
+    season: str,
+    roadworks: float,
+    rebuilt: float,
     seed: int,
     overwrite: bool,
     as_json: bool,
@@ -51,6 +57,9 @@ def command(
             rate_hz=rate,
             format=format_,
             label_noise=label_noise,
+            seasons=[name.strip() for name in season.split(",")],
+            roadworks=roadworks,
+            rebuilt=rebuilt,
             overwrite=overwrite,
         )
     logs = sorted(str(p) for p in output.glob(f"session_*.{format_}"))

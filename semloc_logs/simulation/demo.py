@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path
 from semloc_logs.simulation.sessions import Sensor, Session, write_sessions
 from semloc_logs.simulation.trajectory import smooth_line
@@ -19,8 +20,8 @@ def simulate_demo(directory: Path | str, seed: int = 0) -> list[Path]:
     other = [(road, not forwards) for road, forwards in around[::-1]]
     half = [*other[:2], *around[-2:], around[0]]
     sessions = [
-        Session("monday.mcap", smooth_line(lane_path(network, monday)), 0),
-        Session("tuesday.bag", smooth_line(lane_path(network, half)), 1),
+        Session("monday.mcap", smooth_line(lane_path(network, monday)), Condition(0)),
+        Session("tuesday.bag", smooth_line(lane_path(network, half)), Condition(1)),
     ]
     truth = write_sessions(directory, network, sessions, seed=seed, sensor=Sensor("hdl32", rate_hz=1.6, columns=1100), overwrite=True)
     folder = Path(directory)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from semloc_logs.errors import SemlocError, SettingsError
+from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drive import simulate_drive
 from semloc_logs.simulation.lidar import MODELS
 from semloc_logs.simulation.log import FORMATS, write_session, write_truth
@@ -27,11 +28,11 @@ _DAY_NS = 86_400_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Session:
-    """A session to simulate: file name, driven lane line (n, 2) and the number of its conditions."""
+    """A session to simulate: file name, driven lane line (n, 2) and its conditions."""
 
     file: str
     line: F64
-    condition: int
+    condition: Condition
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +55,16 @@ def simulate_sessions(
     rate_hz: float = 2.0,
     format: str = "mcap",
     label_noise: float = 0.0,
+    seasons: Sequence[str] = ("summer",),
+    roadworks: float = 0.0,
+    rebuilt: float = 0.0,
     overwrite: bool = False,
 ) -> Path:
     """Drive ``sessions`` times about ``length_m`` metres through one random town, each time by another route; the path of truth.json.
 
-    Between sessions parked cars, people and a few trees change. ``sensor`` is a name in ``lidar.MODELS``, ``format`` ``mcap`` or ``bag``.
+    Between sessions parked cars, people and a few trees change. ``seasons`` are those of the sessions, over and over again; from the second
+    session on there are ``roadworks`` (sites a kilometre) and a share of ``rebuilt`` houses. ``sensor`` is a name in ``lidar.MODELS``,
+    ``format`` ``mcap`` or ``bag``.
     SettingsError for impossible values, SemlocError when the files are there already and ``overwrite`` is false.
     """
     if sessions < 1:
@@ -67,14 +73,22 @@ def simulate_sessions(
         raise SettingsError(f"a simulated session cannot be {length_m} m long: give between 50 and 100000 m")
     if format not in FORMATS:
         raise SettingsError(f"logs cannot be simulated as {format!r}: choose one of {', '.join(FORMATS)}")
+    conditions = drawn_conditions(sessions, seasons, roadworks, rebuilt)
     side = max(2, math.ceil(math.sqrt(length_m / _BLOCK / 2.5)))
     network = grid_network(np.random.default_rng([seed, 61]), side, side + int(side < 3), _BLOCK)
     planned = []
     for k in range(sessions):
         route = random_route(np.random.default_rng([seed, 62, k]), network, length_m + 30)
         line = smooth_line(lane_path(network, route))
-        planned.append(Session(f"session_{k}{FORMATS[format]}", line[: int(length_m / 0.5)], k))
+        planned.append(Session(f"session_{k}{FORMATS[format]}", line[: int(length_m / 0.5)], conditions[k]))
     return write_sessions(directory, network, planned, seed=seed, sensor=Sensor(sensor, rate_hz, None, label_noise), overwrite=overwrite)
+
+
+def drawn_conditions(sessions: int, seasons: Sequence[str], roadworks: float, rebuilt: float) -> list[Condition]:
+    """The conditions of ``sessions`` sessions: seasons in turn, works and rebuilt houses from the second one on."""
+    if not seasons:
+        raise SettingsError("simulated sessions need a season: give at least one")
+    return [Condition(k, seasons[k % len(seasons)], roadworks if k else 0.0, rebuilt if k else 0.0) for k in range(sessions)]
 
 
 def write_sessions(
@@ -107,9 +121,10 @@ def write_sessions(
 
 
 def _write(folder: Path, network: RoadNetwork, session: Session, seed: int, sensor: Sensor) -> None:
-    rng = np.random.default_rng([seed, 63, session.condition])
+    number = session.condition.number
+    rng = np.random.default_rng([seed, 63, number])
     ground = street_ground(network, seed)
-    start_ns = _START_NS + session.condition * _DAY_NS
+    start_ns = _START_NS + number * _DAY_NS
     trajectory = drive(session.line, ground.slope_height, rng, start_ns=start_ns, speed=float(rng.uniform(6, 8)))
     traffic = random_traffic(rng, ground, [session.line], 0.4)
     frames = simulate_drive(
@@ -117,7 +132,7 @@ def _write(folder: Path, network: RoadNetwork, session: Session, seed: int, sens
         trajectory,
         MODELS[sensor.name],
         rate_hz=sensor.rate_hz,
-        seed=seed + session.condition,
+        seed=seed + number,
         columns=sensor.columns,
         traffic=traffic,
         label_noise=sensor.label_noise,

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semloc_logs.simulation import objects
 from semloc_logs.simulation.buildings import building
+from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.ground import Ground
 from semloc_logs.simulation.network import Road, RoadNetwork, path_network
 from semloc_logs.simulation.objects import Parts
-from semloc_logs.simulation.world import F64, MeshBuilder, World, place
+from semloc_logs.simulation.world import F64, Mesh, MeshBuilder, World, place
 
 Rng = np.random.Generator
 
@@ -95,10 +97,10 @@ class _Side:
 class _Street:
     """Puts things on the ground; ``moving`` collects what differs between sessions."""
 
-    def __init__(self, ground: Ground, seed: int, condition: int) -> None:
-        self.ground, self.seed = ground, seed
+    def __init__(self, ground: Ground, seed: int, condition: Condition) -> None:
+        self.ground, self.seed, self.condition = ground, seed, condition
         self.rng = np.random.default_rng([seed, 11])
-        self.change = np.random.default_rng([seed, 12, condition])
+        self.change = np.random.default_rng([seed, 12, condition.number])
         self.static = MeshBuilder(ground.height)
         self.moving = MeshBuilder(ground.height)
 
@@ -114,7 +116,11 @@ class _Street:
 
     def put_tree(self, x: float, y: float, size: float, kind: str | None = None) -> None:
         """A tree, that is missing in three sessions of a hundred."""
+        kind = kind or str(self.rng.choice(["round", "round", "round", "column", "cone", "spreading"]))
         parts, yaw = objects.tree(self.rng, size, kind), self.rng.uniform(0, 6.3)
+        leaves = 1.0 if kind == "cone" else {"autumn": 0.4, "winter": 0.03, "snow": 0.03}.get(self.condition.season, 1.0)
+        if leaves < 1:
+            parts = [(Mesh(m.vertices, _thinned(m.triangles, leaves)), label) for m, label in parts]
         if self.change.random() >= 0.03:
             self.put(parts, x, y, yaw)
 
@@ -259,16 +265,25 @@ class _Street:
                 self.put_tree(x, y, rng.uniform(0.4, 1.2))
 
 
+def _thinned(triangles: NDArray[np.int64], share: float, trunk: int = 32) -> NDArray[np.int64]:
+    """The trunk of a tree and a share of its leaves, the same ones whatever else is drawn."""
+    keep = np.arange(len(triangles)) * share % 1.0 < share
+    keep[:trunk] = True
+    return triangles[keep]
+
+
 def street_ground(network: RoadNetwork, seed: int) -> Ground:
     """The ground alone of the world that :func:`build_street` makes of the same network and seed; trajectories take heights from it."""
     return Ground(network, np.random.default_rng([seed, 10]))
 
 
-def build_street(path: F64 | RoadNetwork, seed: int, condition: int = 0) -> World:
+def build_street(path: F64 | RoadNetwork, seed: int, condition: Condition | int = 0) -> World:
     """A street world along a driven path (n, 2 or 3) in metres or a road network.
 
-    The same seed and condition give the same bytes; another condition changes parked cars, people, bins and a few trees.
+    The same seed and condition give the same bytes; the condition's number changes parked cars, people, bins and a few trees, and is
+    enough where nothing else differs.
     """
+    condition = condition if isinstance(condition, Condition) else Condition(condition)
     network = path if isinstance(path, RoadNetwork) else path_network(np.random.default_rng([seed, 9]), path)
     ground = street_ground(network, seed)
     street = _Street(ground, seed, condition)

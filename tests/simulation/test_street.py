@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
+from semloc_logs.errors import SettingsError
+from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.hall import build_hall, hall_walk
 from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route
 from semloc_logs.simulation.street import build_street, street_ground
 from semloc_logs.simulation.traffic import random_traffic
 from semloc_logs.simulation.trajectory import drifting_odometry, drive, poses_along, smooth_line
-from semloc_logs.simulation.world import ROAD, SIDEWALK, TERRAIN, Scene, World
+from semloc_logs.simulation.world import ROAD, SIDEWALK, TERRAIN, VEGETATION, Scene, World
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +49,23 @@ def test_a_condition_changes_some_of_it(network: RoadNetwork, world: World) -> N
     common = len(first & second)
     assert common < len(first)
     assert common > 0.8 * max(len(first), len(second))
+
+
+def test_a_season_changes_the_trees_and_nothing_else(network: RoadNetwork, world: World) -> None:
+    summer = faces(world)
+    for season, least in (("autumn", 0.3), ("winter", 0.0)):
+        other = faces(build_street(network, 4, Condition(0, season)))
+        assert {face[-1] for face in summer ^ other} == {VEGETATION}
+        assert other < summer
+        assert least < sum(f[-1] == VEGETATION for f in other) / sum(f[-1] == VEGETATION for f in summer) < 0.95
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"season": "spring"}, {"daytime": "night"}, {"roadworks": -1.0}, {"roadworks": float("nan")}, {"rebuilt": 1.5}]
+)
+def test_conditions_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(SettingsError):
+        Condition(**wrong)
 
 
 def test_labels_are_train_ids_and_triangles_are_in_range(world: World) -> None:
