@@ -13,7 +13,7 @@ from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.ground import Ground
 from semloc_logs.simulation.network import Road, RoadNetwork, path_network
 from semloc_logs.simulation.objects import Parts
-from semloc_logs.simulation.world import F64, Mesh, MeshBuilder, World, place
+from semloc_logs.simulation.world import F64, Mesh, MeshBuilder, World, join_worlds, place
 
 Rng = np.random.Generator
 
@@ -294,9 +294,4 @@ def build_street(path: F64 | RoadNetwork, seed: int, condition: Condition | int 
     street.backlands()
     mesh, labels = ground.mesh()
     street.static.add(mesh, labels, ground="none")
-    static, moving = street.static.build(), street.moving.build()
-    return World(
-        np.concatenate([static.vertices, moving.vertices]),
-        np.concatenate([static.triangles, moving.triangles + np.int32(len(static.vertices))]),
-        np.concatenate([static.labels, moving.labels]),
-    )
+    return join_worlds(street.static.build(), street.moving.build())

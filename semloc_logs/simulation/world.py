@@ -6,7 +6,7 @@ A mesh is a pair (vertices (n, 3) float64 in metres, triangles (m, 3) int64). La
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,11 +31,15 @@ class Mesh(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """``vertices`` (n, 3) float32 in metres, ``triangles`` (m, 3) int32, ``labels`` (m,) uint8 Cityscapes train ids (255 = none)."""
+    """``vertices`` (n, 3) float32 in metres, ``triangles`` (m, 3) int32, ``labels`` (m,) uint8 Cityscapes train ids (255 = none).
+
+    ``objects`` (m,) int32 numbers, from 0 in the order of the triangles, say which triangles are of one piece; empty: nobody knows.
+    """
 
     vertices: NDArray[np.float32]
     triangles: NDArray[np.int32]
     labels: NDArray[np.uint8]
+    objects: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
 
 class Scene:
@@ -49,7 +53,7 @@ class Scene:
             raise SemlocError("simulating a lidar needs the package embreex, which is not installed: run `pip install embreex`") from error
         if not len(world.triangles):
             raise SemlocError("the world to simulate has no triangles, so there is nothing to scan: give it at least a ground")
-        self.labels = world.labels
+        self.world, self.labels = world, world.labels
         self._scene: Any = EmbreeScene()
         self._mesh: Any = TriangleMesh(self._scene, world.vertices[world.triangles])
 
@@ -96,7 +100,19 @@ class MeshBuilder:
             np.concatenate(self._vertices).astype(np.float32),
             np.concatenate(self._triangles).astype(np.int32),
             np.concatenate(self._labels).astype(np.uint8),
+            np.repeat(np.arange(len(self._labels), dtype=np.int32), [len(part) for part in self._labels]),
         )
+
+
+def join_worlds(first: World, second: World) -> World:
+    """One world of two."""
+    pieces = int(first.objects.max(initial=-1)) + 1
+    return World(
+        np.concatenate([first.vertices, second.vertices]),
+        np.concatenate([first.triangles, second.triangles + np.int32(len(first.vertices))]),
+        np.concatenate([first.labels, second.labels]),
+        np.concatenate([first.objects, second.objects + np.int32(pieces)]),
+    )
 
 
 def place(mesh: Mesh, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Mesh:

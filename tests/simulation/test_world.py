@@ -9,7 +9,20 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.errors import SemlocError
-from semloc_logs.simulation.world import Mesh, MeshBuilder, Scene, World, box, cylinder, ellipsoid, extrude, gabled_roof, place, ribbon
+from semloc_logs.simulation.world import (
+    Mesh,
+    MeshBuilder,
+    Scene,
+    World,
+    box,
+    cylinder,
+    ellipsoid,
+    extrude,
+    gabled_roof,
+    join_worlds,
+    place,
+    ribbon,
+)
 
 F64 = NDArray[np.float64]
 
@@ -95,3 +108,14 @@ def test_without_embreex_the_error_says_so(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     with pytest.raises(SemlocError, match="embreex"):
         Scene(World(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32), np.zeros(1, np.uint8)))
+
+
+def test_pieces_keep_their_numbers_apart_when_worlds_are_joined() -> None:
+    builder = MeshBuilder(lambda x, y: np.zeros_like(x))
+    builder.add(box(1, 1, 1), 2)
+    builder.add(box(1, 1, 1, x=5), 13)
+    one = builder.build()
+    both = join_worlds(one, one)
+    assert np.array_equal(both.objects, np.repeat([0, 1, 2, 3], 12))
+    assert np.array_equal(both.vertices[both.triangles[24:]], one.vertices[one.triangles])
+    assert np.array_equal(both.labels, np.tile(one.labels, 2))
