@@ -14,7 +14,7 @@ from .options import Command, console_options, json_option, overwrite_option, pa
 @path_option("-o", "--output", required=True, help="Folder of the logs and of truth.json.")
 @click.option("--sessions", type=int, default=2, show_default=True, help="Number of drives through the same town.")
 @click.option("--length", type=float, default=500.0, show_default=True, help="Length of a drive (m).")
-@click.option("--sensor", default="hdl32", show_default=True, help="Simulated lidar: hdl64, hdl32, vlp32 or vlp16.")
+@click.option("--sensor", default="hdl32", show_default=True, help="Simulated lidar: hdl64, hdl32, vlp32, vlp16, rosette or raster.")
 @click.option("--rate", type=float, default=2.0, show_default=True, help="Sweeps a second (Hz).")
 @click.option("--format", "format_", default="mcap", show_default=True, help="Form of the logs: mcap or bag.")
 @click.option("--label-noise", type=float, default=0.0, show_default=True, help="Share of wrong labels, 0 to 1.")

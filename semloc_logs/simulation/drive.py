@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,18 +50,25 @@ def simulate_drive(
     columns: int | None = None,
     traffic: Traffic | None = None,
     label_noise: float = 0.0,
+    wet: float = 0.0,
 ) -> Iterator[DriveFrame]:
-    """Sweeps at ``rate_hz`` along a trajectory, one at a time; ``label_noise`` is the share of wrong labels, fixed to places."""
+    """Sweeps at ``rate_hz`` along a trajectory, one at a time; ``label_noise`` is the share of wrong labels.
+
+    About half of these errors are fixed to places, the others belong to one sweep. ``wet`` in [0, 1] is how wet the road is.
+    """
     scene, base_T_lidar, rng = Scene(world), mounting(model), np.random.default_rng([seed, 41])
     stamps = trajectory.stamps_ns
     first = int(stamps[0])
-    for stamp in range(first, int(stamps[-1]) - TURN_NS + 1, round(1e9 / rate_hz)):
+    for number, stamp in enumerate(range(first, int(stamps[-1]) - TURN_NS + 1, round(1e9 / rate_hz))):
         start, end = interpolate(stamps, trajectory.world_T_base, np.array([stamp, stamp + TURN_NS]))
-        moving = traffic.scene((stamp - first) * 1e-9, start) if traffic else None
+        moment = (stamp - first) * 1e-9
+        moving = traffic.scene(moment, start) if traffic else None
         lidar = start @ base_T_lidar
-        turn = full_sweep(scene, lidar, rng, model, columns=columns, traffic=moving, world_T_end=end @ base_T_lidar)
+        turn = full_sweep(
+            scene, lidar, rng, model, columns=columns, traffic=moving, world_T_end=end @ base_T_lidar, moment=moment + 0.37 * seed, wet=wet
+        )
         if label_noise > 0:
-            wrong = corrupt_labels(apply(lidar, turn.points), turn.labels, seed, label_noise)
-            turn = Sweep(turn.points, wrong, turn.ring, turn.turn)
+            where = apply(lidar, turn.points)
+            turn = replace(turn, labels=corrupt_labels(where, turn.labels, seed, label_noise, frame=number, beyond=turn.beyond))
         odom = interpolate(stamps, trajectory.odom_T_base, np.array([stamp]))[0]
         yield DriveFrame(stamp, start, odom, base_T_lidar, turn)

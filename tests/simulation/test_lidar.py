@@ -11,7 +11,7 @@ from semloc_logs.geometry import apply, interpolate, yaw_transform
 from semloc_logs.simulation.lidar import CONFUSIONS, MODELS, beam_directions, corrupt_labels, full_sweep, sweep
 from semloc_logs.simulation.world import CAR, POLE, SIDEWALK, WALL, MeshBuilder, Scene, box
 
-QUIET = replace(MODELS["hdl32"], noise=0.0)
+QUIET = replace(MODELS["hdl32"], noise=0.0, beam_bias=0.0, pointing_deg=0.0, divergence=0.0)
 
 
 def room() -> Scene:
