@@ -12,8 +12,12 @@ from .options import Command, console_options, json_option, overwrite_option, pa
 
 @click.command(cls=Command)
 @path_option("-o", "--output", required=True, help="Folder of the logs and of truth.json.")
-@click.option("--sessions", type=int, default=2, show_default=True, help="Number of drives through the same town.")
+@click.option("--sessions", type=int, help="Number of drives through the same town.  [default: 2, along a trajectory 1]")
 @click.option("--length", type=float, default=500.0, show_default=True, help="Length of a drive (m).")
+@path_option("--trajectory", help="TUM or KITTI file: lay the streets along this drive, and drive it.")
+@click.option("--from", "from_", type=float, default=0.0, show_default=True, help="Where to begin along the trajectory (m).")
+@click.option("--to", type=float, default=float("inf"), help="Where to end along the trajectory (m).  [default: its end]")
+@click.option("--there-and-back", is_flag=True, help="Drive the trajectory the other way in every other session.")
 @click.option("--sensor", default="hdl32", show_default=True, help="Simulated lidar: hdl64, hdl32, vlp32, vlp16, rosette or raster.")
 @click.option("--rate", type=float, default=2.0, show_default=True, help="Sweeps a second (Hz).")
 @click.option("--format", "format_", default="mcap", show_default=True, help="Form of the logs: mcap or bag.")
@@ -27,8 +31,12 @@ from .options import Command, console_options, json_option, overwrite_option, pa
 @console_options
 def command(
     output: Path,
-    sessions: int,
+    sessions: int | None,
     length: float,
+    trajectory: Path | None,
+    from_: float,
+    to: float,
+    there_and_back: bool,
     sensor: str,
     rate: float,
     format_: str,
@@ -51,8 +59,11 @@ def command(
         truth = simulate_sessions(
             output,
             seed=seed,
-            sessions=sessions,
+            sessions=sessions if sessions is not None else 1 if trajectory else 2,
             length_m=length,
+            trajectory=trajectory,
+            part_m=(from_, to),
+            there_and_back=there_and_back,
             sensor=sensor,
             rate_hz=rate,
             format=format_,

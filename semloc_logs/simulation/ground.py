@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from semloc_logs.simulation.network import RoadNetwork
+from semloc_logs.simulation.relief import Relief
 from semloc_logs.simulation.world import F64, ROAD, SIDEWALK, TERRAIN, Mesh
 
 CELL = 0.5  # m; kerbs are exact to half of it
 MARGIN = 48.0  # m of ground beside a road
 KERB = 0.12  # m
+CLEAR = 1.4  # m to either side of a driven line
 
 
 @dataclass(slots=True, eq=False)
@@ -28,27 +30,32 @@ class Ground:
     beside: NDArray[np.float32] = field(init=False)  # metres from the edge of the carriageway, negative on it
     free: NDArray[np.bool_] = field(init=False)
     paved: NDArray[np.bool_] = field(init=False)  # terrain that is stone or asphalt: drives, yards, squares
+    clear: NDArray[np.bool_] = field(init=False)  # lanes that are driven: nothing may stand there
     _waves: F64 = field(init=False)
     _bank: tuple[float, float] = field(init=False)
+    _relief: Relief | None = field(init=False)
 
     def __post_init__(self) -> None:
-        everything = np.concatenate([r.path for r in self.network.roads])
+        lines = [r.path for r in self.network.roads]
+        everything = np.concatenate([*lines, *([self.network.survey[:, :2]] if self.network.survey is not None else [])])
         self.corner = everything.min(0) - MARGIN
         shape = np.ceil((everything.max(0) + MARGIN - self.corner) / CELL).astype(int)
-        x, y = np.meshgrid(*(self.corner[k] + CELL * (np.arange(shape[k]) + 0.5) for k in (0, 1)), indexing="ij")
-        centres = np.column_stack([x.ravel(), y.ravel()])
-        beside = np.full(len(centres), np.inf, np.float32)
-        walk = np.full(len(centres), np.inf, np.float32)
+        beside = np.full(shape, np.inf, np.float32)
+        walk = np.full(shape, np.inf, np.float32)
+        self.clear = np.zeros(shape, np.bool_)
         for road in self.network.roads:
-            low, high = road.path.min(0) - MARGIN - 8, road.path.max(0) + MARGIN + 8
-            near = np.flatnonzero(((centres > low) & (centres < high)).all(1))
-            distance = cKDTree(road.path).query(centres[near], distance_upper_bound=MARGIN + 8)[0].astype(np.float32)
-            beside[near] = np.minimum(beside[near], distance - road.half_width)
-            walk[near] = np.minimum(walk[near], distance - road.half_width - road.sidewalk)
-        field_ = _rounded_corners(beside.reshape(shape))
-        self.beside = field_
-        kind = np.where(field_ < 0, ROAD, np.where(walk.reshape(shape) < 0, SIDEWALK, TERRAIN))
-        self.kind = np.where(field_ > MARGIN, 255, kind).astype(np.uint8)
+            window, distance = self._near(road.path, shape)
+            beside[window] = np.minimum(beside[window], distance - road.half_width)
+            walk[window] = np.minimum(walk[window], distance - road.half_width - road.sidewalk)
+            self.clear[window] |= np.abs(distance - road.lane) < CLEAR
+        if self.network.survey is not None:
+            for line in np.array_split(self.network.survey[:, :2], max(1, len(self.network.survey) // 200)):
+                window, distance = self._near(line, shape)
+                beside[window] = np.minimum(beside[window], distance - CLEAR - 0.4)
+                self.clear[window] |= distance < CLEAR
+        self.beside = _rounded_corners(beside)
+        kind = np.where(self.beside < 0, ROAD, np.where(walk < 0, SIDEWALK, TERRAIN))
+        self.kind = np.where(self.beside > MARGIN, 255, kind).astype(np.uint8)
         self.free = self.kind == TERRAIN
         self.paved = np.zeros_like(self.free)
         wavelength = self.rng.uniform([25, 60, 90, 150], [60, 120, 200, 400])
@@ -57,9 +64,20 @@ class Ground:
         k = 2 * np.pi / wavelength
         self._waves = np.stack([k * np.cos(angle), k * np.sin(angle), phase, slope / k])
         self._bank = (float(self.rng.uniform(4, 14)), float(self.rng.choice([0.0, 0.0, 0.06, 0.15, -0.06])))
+        self._relief = None if self.network.survey is None else Relief(self.network.survey, self.corner, everything.max(0) + MARGIN)
+
+    def _near(self, line: F64, shape: NDArray[np.int64]) -> tuple[tuple[slice, slice], NDArray[np.float32]]:
+        """The part of the raster around a plan line, and the distances of its cells from the line (infinite beyond the margin)."""
+        low = np.clip(((line.min(0) - MARGIN - 8 - self.corner) / CELL).astype(int), 0, shape)
+        high = np.clip(((line.max(0) + MARGIN + 8 - self.corner) / CELL).astype(int), 0, shape)
+        x, y = np.meshgrid(*(self.corner[k] + CELL * (np.arange(low[k], high[k]) + 0.5) for k in (0, 1)), indexing="ij")
+        distance = cKDTree(line).query(np.column_stack([x.ravel(), y.ravel()]), distance_upper_bound=MARGIN + 8)[0]
+        return np.s_[low[0] : high[0], low[1] : high[1]], distance.astype(np.float32).reshape(x.shape)
 
     def slope_height(self, x: F64, y: F64) -> F64:
         """Height of the carriageway's surface in metres at plan positions (n,)."""
+        if self._relief is not None:
+            return self._relief(x, y)
         kx, ky, phase, size = self._waves
         return np.asarray((np.sin(np.multiply.outer(x, kx) + np.multiply.outer(y, ky) + phase) * size).sum(-1))
 
@@ -83,6 +101,15 @@ class Ground:
     def allowed(self, points: F64) -> bool:
         """Whether all plan points (n, 2) are free ground."""
         return bool(self.free[self.cell(points[:, 0], points[:, 1])].all())
+
+    def on_road(self, x: float, y: float) -> bool:
+        """Whether a plan position is carriageway or at its very edge."""
+        return bool(self.beside[self.cell(np.array([x]), np.array([y]))][0] < 0.15)
+
+    def passable(self, parts: list[tuple[Mesh, int]], headroom: float = 2.6) -> bool:
+        """Whether lanes stay clear below ``headroom`` metres when a thing, z counted from the ground, stands where it is."""
+        low = np.concatenate([mesh.vertices[mesh.vertices[:, 2] < headroom, :2] for mesh, _ in parts])
+        return not self.clear[self.cell(low[:, 0], low[:, 1])].any()
 
     def pave(self, points: F64) -> None:
         """Make plan points (n, 2) stone or asphalt where they are not road."""

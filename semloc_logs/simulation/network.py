@@ -32,17 +32,19 @@ class Road:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoadNetwork:
-    """Crossings (k, 2) and the roads between them."""
+    """Crossings (k, 2) and the roads between them; ``survey`` are points (n, 3) of lanes that are driven, and how high they are."""
 
     crossings: F64
     roads: tuple[Road, ...]
+    survey: F64 | None = None
 
     def neighbours(self, crossing: int) -> list[tuple[int, int]]:
         """(road, other crossing) of every road at a crossing."""
         return [(k, r.b if r.a == crossing else r.a) for k, r in enumerate(self.roads) if crossing in (r.a, r.b)]
 
 
-def _road(rng: Rng, a: int, b: int, path: F64, narrow: float) -> Road:
+def drawn_road(rng: Rng, a: int, b: int, path: F64, narrow: float) -> Road:
+    """A road along a centre line (n, 2), its widths drawn; ``narrow`` multiplies that of the carriageway."""
     parking = bool(rng.random() < 0.55)
     half = rng.uniform(2.3, 3.7) * narrow + (2.0 if parking else 0.0)
     sidewalk = 0.0 if rng.random() < 0.12 else rng.uniform(1.2, 3.8)
@@ -68,7 +70,7 @@ def grid_network(rng: Rng, columns: int, rows: int, block: float) -> RoadNetwork
         else:
             kept.append((a, b))
     narrow = rng.uniform(0.85, 1.3)
-    roads = tuple(_road(rng, a, b, _bend(rng, crossings[a], crossings[b]), narrow) for a, b in kept)
+    roads = tuple(drawn_road(rng, a, b, _bend(rng, crossings[a], crossings[b]), narrow) for a, b in kept)
     return RoadNetwork(crossings, roads)
 
 
@@ -98,7 +100,7 @@ def path_network(rng: Rng, path: F64) -> RoadNetwork:
             if first == start:
                 crossings.append(piece[0])
             crossings.append(piece[-1])
-            roads.append(_road(rng, len(crossings) - 2, len(crossings) - 1, piece, narrow))
+            roads.append(drawn_road(rng, len(crossings) - 2, len(crossings) - 1, piece, narrow))
     return RoadNetwork(np.array(crossings), tuple(roads))
 
 
@@ -117,6 +119,11 @@ def random_route(rng: Rng, network: RoadNetwork, length: float) -> list[tuple[in
     return route
 
 
+def left_of(direction: F64) -> F64:
+    """Plan directions (n, 2) turned to the left by a right angle."""
+    return np.column_stack([-direction[:, 1], direction[:, 0]])
+
+
 def lane_path(network: RoadNetwork, route: list[tuple[int, bool]]) -> F64:
     """The line (n, 2) that a car drives along a route, on the right, about every metre, corners cut not rounded."""
     pieces = []
@@ -125,7 +132,7 @@ def lane_path(network: RoadNetwork, route: list[tuple[int, bool]]) -> F64:
         centre = road.path if forwards else road.path[::-1]
         tangent = np.gradient(centre, axis=0)
         tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
-        lane = centre + road.lane * np.column_stack([tangent[:, 1], -tangent[:, 0]])
+        lane = centre - road.lane * left_of(tangent)
         trim = min(int(road.half_width + 2), len(lane) // 3)
         pieces.append(lane[trim : len(lane) - trim])
     return np.concatenate(pieces)

@@ -16,13 +16,16 @@ from semloc_logs.simulation.drive import simulate_drive
 from semloc_logs.simulation.lidar import MODELS
 from semloc_logs.simulation.log import FORMATS, write_session, write_truth
 from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, random_route
+from semloc_logs.simulation.objects import resample
 from semloc_logs.simulation.street import build_street, street_ground
+from semloc_logs.simulation.survey import drive_network, opposite_lane, read_drive
 from semloc_logs.simulation.traffic import random_traffic
 from semloc_logs.simulation.trajectory import drive, smooth_line
 from semloc_logs.simulation.world import F64
 
 _BLOCK = 85.0  # m between crossings
 _START_NS = 1_760_000_000_000_000_000
+_SHORTEST_M = 50
 _DAY_NS = 86_400_000_000_000
 
 
@@ -54,6 +57,9 @@ def simulate_sessions(
     sensor: str = "hdl32",
     rate_hz: float = 2.0,
     format: str = "mcap",
+    trajectory: Path | None = None,
+    part_m: tuple[float, float] = (0.0, math.inf),
+    there_and_back: bool = False,
     label_noise: float = 0.0,
     seasons: Sequence[str] = ("summer",),
     roadworks: float = 0.0,
@@ -62,6 +68,9 @@ def simulate_sessions(
 ) -> Path:
     """Drive ``sessions`` times about ``length_m`` metres through one random town, each time by another route; the path of truth.json.
 
+    With a ``trajectory`` (a TUM or KITTI file) the streets lie along a recorded drive and every session drives the part of it between two
+    lengths in metres, every other one, if ``there_and_back``, the other way in the other lane.
+
     Between sessions parked cars, people and a few trees change. ``seasons`` are those of the sessions, over and over again; from the second
     session on there are ``roadworks`` (sites a kilometre) and a share of ``rebuilt`` houses. ``sensor`` is a name in ``lidar.MODELS``,
     ``format`` ``mcap`` or ``bag``.
@@ -69,19 +78,41 @@ def simulate_sessions(
     """
     if sessions < 1:
         raise SettingsError(f"{sessions} sessions cannot be simulated: give at least 1")
-    if not (math.isfinite(length_m) and 50 <= length_m <= 100_000):
+    if trajectory is None and not (math.isfinite(length_m) and 50 <= length_m <= 100_000):
         raise SettingsError(f"a simulated session cannot be {length_m} m long: give between 50 and 100000 m")
     if format not in FORMATS:
         raise SettingsError(f"logs cannot be simulated as {format!r}: choose one of {', '.join(FORMATS)}")
     conditions = drawn_conditions(sessions, seasons, roadworks, rebuilt)
+    if trajectory is None:
+        network, lines = _town(seed, sessions, length_m)
+    else:
+        network, lines = _recorded(seed, sessions, trajectory, part_m, there_and_back)
+    planned = [Session(f"session_{k}{FORMATS[format]}", line, conditions[k]) for k, line in enumerate(lines)]
+    return write_sessions(directory, network, planned, seed=seed, sensor=Sensor(sensor, rate_hz, None, label_noise), overwrite=overwrite)
+
+
+def _town(seed: int, sessions: int, length_m: float) -> tuple[RoadNetwork, list[F64]]:
+    """A grid of streets, and another route through it for every session."""
     side = max(2, math.ceil(math.sqrt(length_m / _BLOCK / 2.5)))
     network = grid_network(np.random.default_rng([seed, 61]), side, side + int(side < 3), _BLOCK)
-    planned = []
-    for k in range(sessions):
-        route = random_route(np.random.default_rng([seed, 62, k]), network, length_m + 30)
-        line = smooth_line(lane_path(network, route))
-        planned.append(Session(f"session_{k}{FORMATS[format]}", line[: int(length_m / 0.5)], conditions[k]))
-    return write_sessions(directory, network, planned, seed=seed, sensor=Sensor(sensor, rate_hz, None, label_noise), overwrite=overwrite)
+    routes = [random_route(np.random.default_rng([seed, 62, k]), network, length_m + 30) for k in range(sessions)]
+    return network, [smooth_line(lane_path(network, route))[: int(length_m / 0.5)] for route in routes]
+
+
+def _recorded(seed: int, sessions: int, path: Path, part_m: tuple[float, float], there_and_back: bool) -> tuple[RoadNetwork, list[F64]]:
+    """Streets along a recorded drive, and a part of it for every session, every other one perhaps backwards in the other lane."""
+    drive_ = read_drive(path)
+    network = drive_network(np.random.default_rng([seed, 64]), drive_)
+    plan = resample(drive_[:, :2], 0.5)
+    if not 0 <= part_m[0] < part_m[1]:
+        raise SettingsError(f"a drive cannot go from {part_m[0]} m to {part_m[1]} m: give two lengths along {path}, the first one smaller")
+    first, last = (int(np.clip(m / 0.5, 0, len(plan))) for m in part_m)
+    if last - first < 2 * _SHORTEST_M:
+        raise SettingsError(
+            f"{path} is {len(plan) / 2:.0f} m long: give a part of at least {_SHORTEST_M} m, not {part_m[0]} to {part_m[1]} m"
+        )
+    other = opposite_lane(plan)[first:last][::-1]
+    return network, [other if there_and_back and k % 2 else plan[first:last] for k in range(sessions)]
 
 
 def drawn_conditions(sessions: int, seasons: Sequence[str], roadworks: float, rebuilt: float) -> list[Condition]:

@@ -104,15 +104,19 @@ class _Street:
         self.static = MeshBuilder(ground.height)
         self.moving = MeshBuilder(ground.height)
 
-    def put(self, parts: Parts, x: float, y: float, yaw: float, *, moving: bool = False, ground: str = "rigid") -> None:
-        builder = self.moving if moving else self.static
-        z = float(self.ground.height(np.array([x]), np.array([y]))[0]) if ground == "rigid" else 0.0
-        for mesh, label in parts:
-            builder.add(place(mesh, x, y, z, yaw), label, ground="none" if ground == "rigid" else ground)
+    def put(self, parts: Parts, x: float, y: float, yaw: float, *, moving: bool = False, aside: bool = False) -> None:
+        """Set a thing up at a place, unless it would stand in a lane or, if it has to keep ``aside``, on a carriageway."""
+        placed = [(place(mesh, x, y, 0.0, yaw), label) for mesh, label in parts]
+        if (aside and self.ground.on_road(x, y)) or not self.ground.passable(placed):
+            return
+        lift = np.array([0.0, 0.0, float(self.ground.height(np.array([x]), np.array([y]))[0])])
+        for mesh, label in placed:
+            (self.moving if moving else self.static).add(Mesh(mesh.vertices + lift, mesh.triangles), label, ground="none")
 
     def put_line(self, parts: Parts) -> None:
-        for mesh, label in parts:
-            self.static.add(mesh, label, ground="drape")
+        if self.ground.passable(parts):
+            for mesh, label in parts:
+                self.static.add(mesh, label, ground="drape")
 
     def put_tree(self, x: float, y: float, size: float, kind: str | None = None) -> None:
         """A tree, that is missing in three sessions of a hundred."""
@@ -122,7 +126,7 @@ class _Street:
         if leaves < 1:
             parts = [(Mesh(m.vertices, _thinned(m.triangles, leaves)), label) for m, label in parts]
         if self.change.random() >= 0.03:
-            self.put(parts, x, y, yaw)
+            self.put(parts, x, y, yaw, aside=True)
 
     def side(self, side: _Side, style: _Style) -> None:
         """Everything along one side of a road."""
@@ -227,7 +231,7 @@ class _Street:
         kerb = 0.5
         for u in np.arange(edge + rng.uniform(0, 15), side.length - edge, style.lamp_pitch):
             x, y, yaw = side.at(u, kerb)
-            self.put(objects.pole(rng, "lamp"), x, y, yaw)
+            self.put(objects.pole(rng, "lamp"), x, y, yaw, aside=True)
         if walk > 2.0 or rng.random() < 0.4:
             for u in np.arange(edge + 3 + rng.uniform(0, style.tree_pitch), side.length - edge, style.tree_pitch):
                 x, y, _ = side.at(u + rng.normal(), 0.9 if walk > 2 else walk + 1.0)
@@ -235,17 +239,17 @@ class _Street:
         for kind, rate in (("sign", 25.0), ("mast", 140.0), ("bollard", 80.0)):
             for u in rng.uniform(edge - 3, max(edge, side.length - edge + 3), rng.poisson(side.length / rate)):
                 x, y, yaw = side.at(float(u), kerb)
-                self.put(objects.pole(rng, kind), x, y, yaw)
+                self.put(objects.pole(rng, kind), x, y, yaw, aside=True)
         if rng.random() < 0.35:
             x, y, yaw = side.at(side.length - edge + 2.5 if side.sign > 0 else edge - 2.5, kerb)
-            self.put(objects.pole(rng, "signals"), x, y, yaw)
+            self.put(objects.pole(rng, "signals"), x, y, yaw, aside=True)
         for _ in range(rng.poisson(side.length / 30)):
             x, y, yaw = side.at(rng.uniform(edge, max(edge + 1, side.length - edge)), max(kerb, walk - 0.5))
-            self.put(objects.street_clutter(self.change), x, y, yaw + np.pi, moving=True)
+            self.put(objects.street_clutter(self.change), x, y, yaw + np.pi, moving=True, aside=True)
         for _ in range(self.change.poisson(side.length / 45)):
             x, y, _ = side.at(self.change.uniform(0, side.length), self.change.uniform(0.4, max(0.6, walk)))
             make = objects.person if self.change.random() < 0.7 else objects.two_wheeler
-            self.put(make(self.change), x, y, self.change.uniform(0, 6.3), moving=True)
+            self.put(make(self.change), x, y, self.change.uniform(0, 6.3), moving=True, aside=True)
 
     def backlands(self) -> None:
         """Trees, sheds and houses in what is left behind the plots."""
