@@ -1,0 +1,160 @@
+"""Are descriptors found again? The share of query subvolumes whose true place is among the nearest descriptors of a database.
+
+What is asked: :mod:`semloc_logs.evaluation.held_out`. Whatever describes a place can be measured: the network, trained or not, or a
+descriptor of a peer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from semloc_logs.evaluation.held_out import DATABASE_OF, HeldOut, Place
+from semloc_logs.geometry import apply
+from semloc_logs.settings import Settings
+from semloc_logs.subvolumes.cut import MARGIN, SIZE
+from semloc_logs.subvolumes.describe import Described, describe_map
+from semloc_logs.subvolumes.network import LATENT
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Describe = Callable[[Place, bool], Described]  # a place and whether it is a query -> centres (voxels of its frame) and descriptors
+
+NEAREST = 5
+RADIUS = 1.5  # m at 0.30 m voxels
+LAYER = 8  # voxels between the layers of a map
+WORDS = 12  # query words of one query map at most: neighbours are alike
+BESIDE = 3.0  # m: what lies so near to a query's true place is never cut from the database
+BLOCK = 256  # queries that are compared at once
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Words:
+    """Descriptors (n, d), and where in the common frame they are of, (n, 3) metres."""
+
+    centre: F64
+    descriptor: F32
+
+    def __getitem__(self, rows: I64) -> Words:
+        return Words(self.centre[rows], self.descriptor[rows])
+
+
+class NoEncoder(nn.Module):
+    """Describes everything alike: which subvolumes are described does not depend on the network."""
+
+    variant = "geometric"
+    latent = LATENT
+
+    def forward(self, codes: Tensor) -> Tensor:
+        """Ones (b, 256, i, j) for codes (b, x, y, 32)."""
+        return torch.ones(len(codes), self.latent, *((n - 2 * MARGIN - SIZE) // 8 + 1 for n in codes.shape[1:3]))
+
+
+def network_describes(encoder: nn.Module, settings: Settings) -> Describe:
+    """Describes places by the network, as ``semloc describe`` and ``semloc close`` do. ``settings`` are resolved."""
+    d, v = settings.descriptor, settings.fusion.voxel_size
+
+    def describe(place: Place, is_query: bool) -> Described:
+        road = None if is_query else place.track[:, :2]
+        stride = d.query_stride if is_query else d.stride
+        return describe_map(
+            place.state,
+            place.low,
+            place.ground_z,
+            v,
+            encoder,  # type: ignore[arg-type]
+            stride,
+            d.min_occupied,
+            road,
+            np.inf if is_query else d.reach or np.inf,
+        )
+
+    return describe
+
+
+def count_subvolumes(settings: Settings) -> Callable[[Place], int]:
+    """How many descriptors a place of a database has, whatever the network."""
+    describe = network_describes(NoEncoder().eval(), settings)
+    return lambda place: len(describe(place, False).centre)
+
+
+def retrieval_recall(world: HeldOut, encoder: nn.Module) -> dict[str, float]:
+    """Recall at 5 of each scenario, in [0, 1], of a network that maps codes to mu as :class:`~semloc_logs.subvolumes.network.Encoder` does.
+
+    See :func:`recalls`.
+    """
+    return recalls(world, network_describes(encoder.eval(), world.settings))
+
+
+def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:
+    """Recall of each scenario by whatever describes places.
+
+    The share of query words whose true place is among the 5 nearest (L2) of exactly ``world.database`` database words: one of those is
+    within the larger of 1.5 m (at 0.30 m voxels) and half a cell's diagonal of it. Query words without any such database word do not count.
+    """
+    v = world.settings.fusion.voxel_size
+    found: dict[str, list[Words]] = {kind: [] for kind in DATABASE_OF.values()}
+    asked: dict[str, list[Words]] = {name: [] for name in DATABASE_OF}
+    rng = np.random.default_rng(0)
+    for street in world.streets():
+        for kind, place in street.database.items():
+            found[kind].append(_words(place, describe(place, False), v))
+        # the camera looking ahead asks twice
+        described = {id(place): describe(place, True) for places in street.queries.values() for place in places}
+        for name, places in street.queries.items():
+            for place in places:
+                words = _words(place, described[id(place)], v)
+                asked[name].append(words[rng.permutation(len(words.centre))[:WORDS]])
+    databases = {kind: _joined(parts) for kind, parts in found.items()}
+    radius = true_radius(world.settings)
+    return {name: _recall(_joined(parts), databases[DATABASE_OF[name]], world, radius) for name, parts in asked.items()}
+
+
+def true_radius(settings: Settings) -> float:
+    """Metres within which a database word is the true one: the larger of 1.5 m (at 0.30 m voxels) and half a cell's diagonal."""
+    v, stride = settings.fusion.voxel_size, settings.descriptor.stride
+    return v * max(RADIUS / 0.30, 0.5 * float(np.linalg.norm([stride, stride, LAYER])))
+
+
+def _words(place: Place, described: Described, voxel_size: float) -> Words:
+    return Words(apply(place.common_T_map, described.centre.astype(np.float64) * voxel_size), described.descriptor)
+
+
+def _joined(parts: list[Words]) -> Words:
+    parts = [p for p in parts if len(p.centre)] or parts[:1]
+    return Words(np.concatenate([p.centre for p in parts]), np.concatenate([p.descriptor for p in parts]))
+
+
+def _recall(asked: Words, database: Words, world: HeldOut, radius: float) -> float:
+    """Of as many query words as are wanted, on as large a database as is wanted; drawn at random, always the same."""
+    rng = np.random.default_rng(1)
+    away = cKDTree(database.centre).query(asked.centre)[0] if len(database.centre) and len(asked.centre) else np.zeros(0)
+    possible = rng.permutation(np.flatnonzero(away < radius))[: world.queries]
+    asked = asked[np.sort(possible)]
+    if not len(asked.centre):
+        return 0.0
+    beside = cKDTree(asked.centre).query(database.centre)[0] < BESIDE * radius / RADIUS
+    others = rng.permutation(np.flatnonzero(~beside))[: max(0, world.database - int(beside.sum()))]
+    database = database[np.sort(np.r_[np.flatnonzero(beside), others])]
+    return float(found_again(asked, database, radius).mean())
+
+
+def found_again(asked: Words, database: Words, radius: float, nearest: int = NEAREST) -> NDArray[np.bool_]:
+    """Which words (m,) have one of their ``nearest`` descriptors (L2) within ``radius`` metres of where they truly are."""
+    out = np.zeros(len(asked.centre), bool)
+    length = np.einsum("nd,nd->n", database.descriptor, database.descriptor)
+    k = min(nearest, len(length))
+    for i in range(0, len(out), BLOCK):
+        rows = slice(i, i + BLOCK)
+        distance = length - 2 * asked.descriptor[rows] @ database.descriptor.T
+        best = np.argpartition(distance, k - 1, axis=1)[:, :k]
+        away = np.linalg.norm(database.centre[best] - asked.centre[rows, None], axis=2)
+        out[rows] = (away < radius).any(1)
+    return out

@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semloc_logs.errors import SettingsError, WorkspaceError
+from semloc_logs.evaluation import held_out as module
+from semloc_logs.evaluation.held_out import DATABASE_OF, Extent, HeldOut, Place, Street, held_out, read_street, write_street
+from semloc_logs.evaluation.recall import NoEncoder, Words, count_subvolumes, found_again, recalls, retrieval_recall, true_radius
+from semloc_logs.geometry import apply
+from semloc_logs.settings import Settings
+from semloc_logs.simulation.network import RoadNetwork
+from semloc_logs.subvolumes.describe import Described, random_encoder
+
+SETTINGS = Settings().resolved()
+V = SETTINGS.fusion.voxel_size
+
+
+def test_found_again_as_the_slow_reference_says() -> None:
+    rng = np.random.default_rng(0)
+    database = Words(rng.uniform(0, 20, (700, 3)), rng.normal(size=(700, 4)).astype(np.float32))
+    asked = Words(rng.uniform(0, 20, (300, 3)), rng.normal(size=(300, 4)).astype(np.float32))
+    found = found_again(asked, database, 6.0)
+    for i in range(300):
+        distance = [float(np.linalg.norm(asked.descriptor[i].astype(float) - d)) for d in database.descriptor]
+        best = sorted(range(700), key=distance.__getitem__)[:5]
+        assert found[i] == any(np.linalg.norm(asked.centre[i] - database.centre[j]) < 6.0 for j in best)
+    assert 0.05 < found.mean() < 0.95
+
+
+def test_the_radius_is_at_least_half_a_cell() -> None:
+    assert true_radius(SETTINGS) == pytest.approx(1.5)
+    wide = SETTINGS.model_copy(update={"descriptor": SETTINGS.descriptor.model_copy(update={"stride": 8})})
+    assert true_radius(wide) == pytest.approx(0.3 * np.sqrt(8**2 * 3) / 2)
+
+
+def place(rng: np.random.Generator, x: float) -> Place:
+    """Nothing but its position counts here."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return Place(np.full((4, 4, 4), 253, np.uint8), np.zeros(3, np.int64), 0.0, rng.normal(size=(3, 3)), pose)
+
+
+class Fake(HeldOut):
+    """Streets without content, 200 m apart, at 0, 200, ..."""
+
+    def streets(self):  # type: ignore[no-untyped-def]
+        rng = np.random.default_rng(5)
+        for k in range(6):
+            queries = {name: [place(rng, 200.0 * k)] for name in DATABASE_OF if name != "sensor"}
+            yield Street({kind: place(rng, 200.0 * k) for kind in ("camera", "lidar")}, {**queries, "sensor": queries["0"]})
+
+
+def lattice(at: Place, is_query: bool) -> np.ndarray:
+    """Centres in voxels: the database every 4, queries every 8 and a little beside."""
+    x, y = np.meshgrid(*(np.arange(0, 200, 8 if is_query else 4),) * 2)
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 16)]) + (0.7 if is_query else 0.0)
+
+
+def test_a_descriptor_that_knows_its_place_is_always_right_and_a_constant_one_never() -> None:
+    world = Fake((), SETTINGS, 4000, 50)
+    seen: list[int] = []
+
+    def knows(at: Place, is_query: bool) -> Described:
+        centre = lattice(at, is_query)
+        seen.append(len(centre))
+        return Described(centre.astype(np.float32), apply(at.common_T_map, centre * V).astype(np.float32))
+
+    assert recalls(world, knows) == dict.fromkeys(DATABASE_OF, 1.0)
+    assert sum(seen) > 4000
+
+    def constant(at: Place, is_query: bool) -> Described:
+        centre = lattice(at, is_query)
+        return Described(centre.astype(np.float32), np.ones((len(centre), 3), np.float32))
+
+    assert max(recalls(world, constant).values()) < 0.1
+
+
+def test_a_chance_descriptor_finds_five_of_all() -> None:
+    """Each of 5 draws of 4000 is one of the about 5 within 1.5 m of the true place."""
+    world = Fake((), SETTINGS, 4000, 10**6)
+    rng = np.random.default_rng(0)
+
+    def chance(at: Place, is_query: bool) -> Described:
+        centre = lattice(at, is_query)
+        return Described(centre.astype(np.float32), rng.normal(size=(len(centre), 8)).astype(np.float32))
+
+    found = recalls(world, chance)
+    assert max(found.values()) < 0.15
+
+
+def test_the_database_is_cut_to_size_but_keeps_what_is_asked_for() -> None:
+    """With no more room than the true places take, every answer is a true one or a neighbour."""
+
+    def knows(at: Place, is_query: bool) -> Described:
+        centre = lattice(at, is_query)
+        return Described(centre.astype(np.float32), apply(at.common_T_map, centre * V).astype(np.float32))
+
+    assert recalls(Fake((), SETTINGS, 1, 5), knows) == dict.fromkeys(DATABASE_OF, 1.0)
+
+
+def test_a_small_held_out_town(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SPACING", 6.0)
+    monkeypatch.setattr(module, "COLUMNS", 240)
+    extent = Extent(side=2, block=36.0, queries=1)
+    count = count_subvolumes(SETTINGS)
+    world = held_out(tmp_path, SETTINGS, count, 300, 40, extent)
+    made = {p: p.stat().st_mtime_ns for p in world.paths}
+    street = next(world.streets())
+    assert set(street.queries) == set(DATABASE_OF)
+    assert [len(q) for q in street.queries.values()] == [2] * 5
+    for name in ("0", "180", "season"):
+        asked = street.queries[name][0]
+        true = asked.common_T_map
+        # what is left of the heading is at most half a step of 20 degrees
+        assert abs(np.degrees(np.arctan2(true[1, 0], true[0, 0]))) <= 10
+        occupied = np.argwhere(asked.state < 20) + asked.low + 0.5
+        level = occupied[:, 2] * V
+        assert np.percentile(level, 5) < 1.0  # the ground is at zero
+        assert np.abs(occupied[:, :2] * V).max() < 25
+        # the same surfaces are in the map, at the pose that the query claims: most of its voxels have one within two of its own
+        there = street.database["camera" if name != "season" else "lidar"]
+        cells = apply(true, occupied * V) @ np.eye(3) / V - there.low
+        inside = ((cells >= 2) & (cells < np.array(there.state.shape) - 2)).all(1)
+        i = np.floor(cells[inside]).astype(int)
+        near = [there.state[tuple((i + step).T)] < 20 for step in np.indices((3, 3, 3)).reshape(3, -1).T - 1]
+        assert np.any(near, axis=0).mean() > 0.6
+    found = retrieval_recall(world, random_encoder("semantic"))
+    assert set(found) == set(DATABASE_OF)
+    assert all(0 <= v <= 1 for v in found.values())
+    again = held_out(tmp_path, SETTINGS, count, 300, 40, extent)
+    assert {p: p.stat().st_mtime_ns for p in again.paths} == made  # not simulated twice
+    monkeypatch.setattr(module, "_network", lambda town, extent: RoadNetwork(np.zeros((0, 2)), ()))
+    with pytest.raises(SettingsError, match="cannot be had"):
+        held_out(tmp_path, SETTINGS, count, 300, 40, extent)
+    _comes_back(street, tmp_path / "again.parquet")
+
+
+def _comes_back(street: Street, path: Path) -> None:
+    write_street(path, street, {})
+    found = read_street(path)
+    for a, b in zip([*street.database.values(), *street.queries["90"]], [*found.database.values(), *found.queries["90"]], strict=True):
+        for name in ("state", "low", "track", "common_T_map"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        assert a.ground_z == b.ground_z
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(WorkspaceError):
+        read_street(path)
+
+
+def test_everything_alike_has_one_descriptor_for_each_subvolume() -> None:
+    import torch
+
+    assert NoEncoder()(torch.zeros((2, 64, 56, 32), dtype=torch.uint8)).shape == (2, 256, 3, 2)
