@@ -16,12 +16,15 @@ if TYPE_CHECKING:
 
 
 @click.command(cls=Command)
-@click.option("--variant", type=click.Choice(["semantic", "geometric"]), required=True, help="Network whose descriptors are clustered.")
-@path_option("-o", "--output", required=True, help="File of the vocabulary (.safetensors).")
+@click.option(
+    "--variant", type=click.Choice(["semantic", "geometric", "both"]), required=True, help="Network whose descriptors are clustered."
+)
+@path_option("-o", "--output", required=True, help="File of the vocabulary (.safetensors); of both: folder of the two files.")
 @path_option("-w", "--work", help="Use the fused sessions of this workspace instead of simulated scenes.")
+@path_option("--shards", help="Use the packed pairs (.parquet) of this folder instead.")
 @path_option("--checkpoint", help="Folder of packed pairs, such as that of 'semloc train'; default: beside the output.")
 @click.option("--scenes", type=int, metavar="N", help="Simulated scenes; default: training.scenes.")
-@click.option("--pairs", type=click.IntRange(1), default=150, show_default=True, help="Pairs of each scene, nine descriptors each.")
+@click.option("--pairs", type=click.IntRange(1), help="Pairs of each scene, nine descriptors each; default: all.")
 @json_option
 @engine_options
 @settings_options
@@ -30,8 +33,9 @@ def command(
     variant: str,
     output: Path,
     work: Path | None,
+    shards: Path | None,
     checkpoint: Path | None,
-    pairs: int,
+    pairs: int | None,
     as_json: bool,
     engine: EngineChoice,
     settings: Settings,
@@ -39,22 +43,37 @@ def command(
     """Learn the words: descriptors of subvolumes are clustered, and each cluster gets thresholds for 64-bit codes.
 
     A vocabulary belongs to the weights that it was made with (--set descriptor.weights=FILE; the shipped ones by default). Use it
-    with --set descriptor.vocabulary=FILE.
+    with --set descriptor.vocabulary=FILE. Half a million descriptors (60 scenes) give 2^16 words; fewer are possible.
 
     \b
     Example:  semloc vocabulary --variant semantic -o words.safetensors -w work
+              semloc vocabulary --variant both -o semloc_logs/words/vocabularies --shards weights/checkpoint/simulated-0123456789
     """
     from semloc_logs.engines.engine import cores
-    from semloc_logs.learning import learn_vocabulary, use_threads
+    from semloc_logs.learning import given_shards, learn_vocabulary, use_threads
 
+    if variant == "both" and settings.descriptor.weights is not None:
+        raise click.UsageError("descriptor.weights are those of one variant: name it with --variant.")
+    if shards is not None and work is not None:
+        raise click.UsageError("--shards and --work are alternatives.")
     with console.progress():
-        with engine.open(settings.training.scenes) as opened:
-            shards = packed_shards(checkpoint or output.parent / "checkpoint", work, settings, opened)
+        if shards is not None:
+            packed = given_shards(shards)
+        else:
+            with engine.open(settings.training.scenes) as opened:
+                packed = packed_shards(checkpoint or output.parent / "checkpoint", work, settings, opened)
+        files = {v: output / f"{v}.safetensors" for v in ("semantic", "geometric")} if variant == "both" else {variant: output}
         use_threads(engine.jobs or cores())
-        console.note("Describing and clustering")
-        count = learn_vocabulary(variant, shards, settings, output, pairs)
+        made = {}
+        for name, file in files.items():
+            made[name] = {
+                "vocabulary": str(file),
+                "descriptors": learn_vocabulary(name, packed, settings, file, pairs, console.note),
+                "shards": len(packed),
+            }
     if as_json:
-        console.result_json({"vocabulary": str(output), "descriptors": count, "shards": len(shards)})
+        console.result_json(made if variant == "both" else made[variant])
     else:
-        console.result(f"{output}: from {count} descriptors of {len(shards)} scenes")
+        for said in made.values():
+            console.result(f"{said['vocabulary']}: from {said['descriptors']} descriptors of {said['shards']} scenes")
     return 0

@@ -55,6 +55,14 @@ def session_shards(folder: Path, sessions: Sequence[SessionFolder], settings: Se
     return out
 
 
+def given_shards(folder: Path) -> list[Path]:
+    """The shards (.parquet) of a folder of packed pairs. Raises SettingsError when there is none."""
+    shards = sorted(folder.glob("*.parquet"))
+    if not shards:
+        raise SettingsError(f"{folder}: no shards of packed pairs (.parquet); 'semloc train' leaves them below its checkpoint folder.")
+    return shards
+
+
 def _shard_folder(folder: Path, kind: str, settings: Settings) -> Path:
     """Shards of other settings lie in another folder."""
     t = settings.training
@@ -95,9 +103,18 @@ def learn_descriptor(
     return scores
 
 
-def learn_vocabulary(variant: str, shards: Sequence[Path], settings: Settings, output: Path, pairs_per_shard: int) -> int:
-    """A vocabulary from the descriptors of the shards' complete views; the number of descriptors."""
-    descriptors = shard_descriptors(shards, load_encoder(variant, settings.descriptor.weights), pairs_per_shard)
+def learn_vocabulary(
+    variant: str, shards: Sequence[Path], settings: Settings, output: Path, pairs_per_shard: int | None = None, note: Note = lambda _: None
+) -> int:
+    """A vocabulary from the descriptors of the shards' complete views; the number of descriptors.
+
+    2^16 words need half a million descriptors or more to lie well; with fewer there are words of few descriptors or of none.
+    """
+    threads = torch.get_num_threads()
+    encoder = load_encoder(variant, settings.descriptor.weights)
+    use_threads(threads)  # loading left one
+    descriptors = shard_descriptors(shards, encoder, pairs_per_shard, note)
+    note(f"{variant}: clustering {len(descriptors)} descriptors")
     vocabulary = train_vocabulary(descriptors, seed=settings.training.seed)
     save_vocabulary(output, vocabulary, _card(settings, shards, variant=variant, descriptors=len(descriptors)))
     return len(descriptors)

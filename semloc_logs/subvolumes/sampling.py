@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +15,21 @@ from semloc_logs.subvolumes.pairs import read_shard
 
 
 @torch.inference_mode()
-def shard_descriptors(shards: Sequence[Path], encoder: Encoder, pairs_per_shard: int = 150) -> NDArray[np.float32]:
-    """Unit descriptors (n, 256), nine of each of the first pairs' complete view."""
+def shard_descriptors(
+    shards: Sequence[Path], encoder: Encoder, pairs_per_shard: int | None = None, note: Callable[[str], None] | None = None
+) -> NDArray[np.float16]:
+    """Unit descriptors (n, N), nine of the complete view of each of the first pairs (of all without ``pairs_per_shard``).
+
+    One shard is in memory at a time; what is kept has half precision, which is finer than what a vocabulary rounds to.
+    """
     table = code_table(encoder.variant)
     out = []
-    for path in shards:
+    for done, path in enumerate(shards, 1):
         views = read_shard(path)[2][:pairs_per_shard]
         for i in range(0, len(views), 16):
             with torch.autocast("cpu", dtype=torch.bfloat16):
                 mu = encoder(torch.from_numpy(table[views[i : i + 16]]))
-            out.append(descriptors(mu).numpy())
-    return np.concatenate(out) if out else np.zeros((0, 256), np.float32)
+            out.append(descriptors(mu).half().numpy())
+        if note is not None:
+            note(f"{encoder.variant}: descriptors of {done} of {len(shards)} shards")
+    return np.concatenate(out) if out else np.zeros((0, 256), np.float16)

@@ -1,10 +1,14 @@
 """The semantic vocabulary (paper 3.4): hierarchical k-means over descriptors with a 64-bit Hamming embedding (Jegou et al. 2008).
 
 The first level has up to 256 cells in the space of the descriptors, the second up to 256 children of each in the 64 projected
-dimensions that the codes are made of. Thresholds of the code are the medians of each cell, so within a cell half of all bits are set.
+dimensions that the codes are made of: 2^16 words in 4.3 MB, as the children are stored in steps of 2^-8, one byte a dimension.
 
-Descriptors and directions are of unit length and rounded to multiples of 2^-11: their products are multiples of 2^-22 whose partial sums
-stay below 2, which float32 holds exactly. So words do not depend on the order in which a BLAS with so many threads adds.
+Thresholds of the code are the medians of each *cell*, so within a cell half of all bits are set. Jegou et al. have them for every word;
+here a word has a handful of descriptors to take a median of, and thresholds at the words' centroids find no more true neighbours than
+thresholds of cells do (benchmarks/README.md, Words), while every word of a cell would need codes of its own of the query.
+
+Descriptors, directions and centroids are multiples of 2^-11 (children of 2^-8), so that words do not depend on the order in which a
+BLAS with so many threads adds: see :mod:`semloc_logs.words.kmeans`.
 """
 
 from __future__ import annotations
@@ -15,21 +19,25 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.tables import replacing_file
+from semloc_logs.words.kmeans import BLOCK, grid, kmeans, nearest_centroids
 
 BITS = 64
+CHILD_STEP = 2.0**-8  # of the children's coordinates, which int8 holds up to 127 / 256: three times their spread and more
+PER_CELL = 256  # descriptors for each cell that the cells are found from
 F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vocabulary:
-    """``cells`` (c, 256) unit centroids, ``projection`` (64, 256), ``thresholds`` (c, 64), ``children`` (c, k, 64) centroids;
-    multiples of 2^-11, all but the thresholds."""
+    """``cells`` (c, N) unit centroids and ``projection`` (64, N), multiples of 2^-11, ``thresholds`` (c, 64), ``children`` (c, k, 64)
+    centroids, multiples of 2^-8; N is the dimension of the descriptors, 64 or more."""
 
     cells: F32
     projection: F32
@@ -37,93 +45,118 @@ class Vocabulary:
     children: F32
 
     def nearest_cells(self, descriptors: F32, probes: int) -> NDArray[np.int32]:
-        """The ``probes`` nearest cells (n, probes) of descriptors (n, 256), nearest first."""
-        similarity = _grid(descriptors) @ self.cells.T
-        probes = min(probes, len(self.cells))
-        part = np.argpartition(-similarity, probes - 1, axis=1)[:, :probes]
-        order = np.argsort(-np.take_along_axis(similarity, part, 1), axis=1, kind="stable")
-        return np.take_along_axis(part, order, 1).astype(np.int32)
+        """The ``probes`` nearest cells (n, probes) of descriptors (n, N), nearest first, of equals the first."""
+        out = np.zeros((len(descriptors), min(probes, len(self.cells))), np.int32)
+        for i in range(0, len(descriptors), BLOCK):
+            _largest(grid(descriptors[i : i + BLOCK]) @ self.cells.T, out[i : i + BLOCK])
+        return out
+
+    def projected(self, descriptors: F32) -> F32:
+        """Descriptors (n, N) in the dimensions of the code (n, 64)."""
+        return np.asarray(grid(descriptors) @ self.projection.T)
 
     def codes(self, descriptors: F32, cell: NDArray[np.integer]) -> NDArray[np.uint64]:
-        """64-bit codes of descriptors (n, 256) under the thresholds of ``cell`` (n,) or (n, p), in its shape; bit b is projection b."""
-        projected = (_grid(descriptors) @ self.projection.T).reshape(len(descriptors), *[1] * (cell.ndim - 1), BITS)
+        """64-bit codes of descriptors (n, N) under the thresholds of ``cell`` (n,) or (n, p), in its shape; bit b is projection b."""
+        projected = self.projected(descriptors).reshape(len(descriptors), *[1] * (cell.ndim - 1), BITS)
         bits = np.packbits(projected > self.thresholds[cell], axis=-1, bitorder="little")
         return np.ascontiguousarray(bits).view("<u8").astype(np.uint64).reshape(cell.shape)
 
     def words(self, descriptors: F32) -> tuple[NDArray[np.uint16], NDArray[np.uint64]]:
-        """Word (cell * 256 + child) and code of each descriptor (n, 256)."""
+        """Word (cell * 256 + child) and code of each descriptor (n, N)."""
         if not len(descriptors):
             return np.zeros(0, np.uint16), np.zeros(0, np.uint64)
         cell = self.nearest_cells(descriptors, 1)[:, 0]
-        projected = _grid(_grid(descriptors) @ self.projection.T)
+        order, starts = _by_cell(cell, len(self.cells))
+        projected = grid(self.projected(descriptors))
         child = np.zeros(len(cell), np.int64)
-        for c in np.unique(cell):
-            mine = cell == c
-            k = self.children[c]
-            child[mine] = np.argmin((k**2).sum(1) - 2 * projected[mine] @ k.T, axis=1)
+        for c in np.flatnonzero(np.diff(starts)):
+            mine = order[starts[c] : starts[c + 1]]
+            child[mine] = nearest_centroids(projected[mine], self.children[c])[0]
         return (cell.astype(np.int64) * 256 + child).astype(np.uint16), self.codes(descriptors, cell)
 
 
-def _grid(a: NDArray[np.floating]) -> F32:
-    return (np.round(np.asarray(a, np.float32) * 2048) / 2048).astype(np.float32)
+@njit(cache=True, nogil=True)
+def _largest(similarity: F32, out: NDArray[np.int32]) -> None:
+    """Columns of the largest values of each row of ``similarity`` (n, c), largest first, into ``out`` (n, k)."""
+    k = out.shape[1]
+    best = np.empty(k, np.float32)
+    for i in range(len(similarity)):
+        best[:] = -np.inf
+        for c in range(similarity.shape[1]):
+            s = similarity[i, c]
+            if s > best[k - 1]:
+                j = k - 1
+                while j > 0 and best[j - 1] < s:
+                    best[j] = best[j - 1]
+                    out[i, j] = out[i, j - 1]
+                    j -= 1
+                best[j] = s
+                out[i, j] = c
 
 
-def _kmeans(data: F32, k: int, rng: np.random.Generator, rounds: int = 15) -> F32:
-    """Lloyd's algorithm from distinct random points; an empty cluster takes the point farthest from its centroid."""
-    centroids, square = data[rng.choice(len(data), k, replace=False)].copy(), (data**2).sum(1)
-    for _ in range(rounds):
-        distance = square[:, None] - 2 * data @ centroids.T + (centroids**2).sum(1)
-        nearest = distance.argmin(1)
-        count = np.bincount(nearest, minlength=k)
-        sums = np.zeros_like(centroids)
-        np.add.at(sums, nearest, data)
-        full = count > 0
-        centroids[full] = sums[full] / count[full, None]
-        if not full.all():
-            worst = np.argsort(-distance[np.arange(len(data)), nearest])
-            centroids[~full] = data[worst[: int((~full).sum())]]
-    return centroids
+def _by_cell(cell: NDArray[np.integer], cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows in the order of their cells, and where each cell starts (cells + 1,)."""
+    order = np.argsort(cell, kind="stable")
+    return order, np.searchsorted(cell[order], np.arange(cells + 1))
 
 
-def train_vocabulary(descriptors: F32, cells: int = 256, children: int = 16, seed: int = 0) -> Vocabulary:
-    """A vocabulary of ``cells`` x ``children`` words from unit descriptors (n, 256); fewer where there are not enough.
+def _directions(descriptors: F32, cells: F32, rng: np.random.Generator) -> F32:
+    """Principal directions (64, N) of what is left within the cells, rotated at random so that every bit says equally much."""
+    rest = (descriptors - cells[nearest_centroids(descriptors, cells)[0]]).astype(np.float64)
+    directions = np.linalg.eigh(rest.T @ rest)[1][:, ::-1][:, :BITS]
+    # an eigenvector's sign is the library's choice: the largest component is made positive
+    directions = directions * np.sign(directions[np.abs(directions).argmax(0), np.arange(BITS)])
+    q, r = np.linalg.qr(rng.standard_normal((BITS, BITS)))
+    return grid((directions @ (q * np.sign(np.diag(r)))).T)
 
-    Raises SettingsError below 256 descriptors.
+
+def train_vocabulary(descriptors: NDArray[np.floating], cells: int = 256, children: int = 256, seed: int = 0) -> Vocabulary:
+    """A vocabulary of ``cells`` x ``children`` words from unit descriptors (n, N).
+
+    There are at least 64 descriptors to a cell, so fewer than 16,384 give fewer cells; a cell with fewer descriptors than ``children``
+    has as many words as descriptors, and its last rows repeat the first, which no descriptor is given then. Raises SettingsError below
+    256 descriptors and 64 dimensions.
     """
     n = len(descriptors)
-    if n < 256:
-        raise SettingsError(f"A vocabulary needs at least 256 descriptors, not {n}: describe more sessions.")
+    if n < 256 or descriptors.shape[1] < BITS:
+        raise SettingsError(
+            f"A vocabulary needs at least 256 descriptors of {BITS} dimensions, not {n} of {descriptors.shape[1]}: describe more sessions."
+        )
     rng = np.random.default_rng(seed)
     cells = int(min(cells, max(8, n // 64)))
-    centroids = _kmeans(descriptors, cells, rng)
-    centroids = _grid(centroids / np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), 1e-9))
-    cell = (descriptors @ centroids.T).argmax(1)
-    # principal directions of what is left within the cells, rotated at random so that every bit says equally much
-    rest = descriptors - centroids[cell]
-    directions = np.linalg.eigh(rest.T @ rest)[1][:, ::-1][:, :BITS]
-    rotation = np.linalg.qr(rng.standard_normal((BITS, BITS)))[0]
-    projection = _grid((directions @ rotation).T)
-    projected = descriptors @ projection.T
-    overall = np.median(projected, axis=0)
-    thresholds = np.tile(overall, (cells, 1)).astype(np.float32)
+    some = grid(descriptors[np.sort(rng.choice(n, min(n, PER_CELL * cells), replace=False))])
+    centroids = kmeans(some, cells, rng, 15)
+    centroids = grid(centroids / np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), 1e-9))
+    projection = _directions(some, centroids, rng)
+    cell, projected = np.zeros(n, np.int32), np.zeros((n, BITS), np.float32)
+    for i in range(0, n, BLOCK):
+        block = grid(descriptors[i : i + BLOCK])
+        projected[i : i + BLOCK] = block @ projection.T
+        _largest(block @ centroids.T, cell[i : i + BLOCK, None])
+    order, starts = _by_cell(cell, cells)
+    thresholds = np.tile(np.median(projected, axis=0), (cells, 1)).astype(np.float32)
     kids = np.zeros((cells, children, BITS), np.float32)
     for c in range(cells):
-        mine = projected[cell == c]
+        mine = projected[order[starts[c] : starts[c + 1]]]
         if len(mine) >= 8:
             thresholds[c] = np.median(mine, axis=0)
-        if len(mine) >= children:
-            kids[c] = _kmeans(mine, children, rng, 8)
-        elif len(mine):
-            kids[c] = mine[rng.choice(len(mine), children)]
-    return Vocabulary(centroids, projection, thresholds, _grid(kids))
+        if len(mine):
+            k = min(children, len(mine))
+            kids[c, :k] = kmeans(mine, k, rng, 8)
+            kids[c, k:] = kids[c, 0]
+    return Vocabulary(centroids, projection, thresholds, _bytes(kids).astype(np.float32) * np.float32(CHILD_STEP))
+
+
+def _bytes(children: F32) -> NDArray[np.int8]:
+    return np.clip(np.round(children / CHILD_STEP), -127, 127).astype(np.int8)
 
 
 def save_vocabulary(path: Path, vocabulary: Vocabulary, card: dict[str, str]) -> None:
-    """Half precision safetensors; ``card`` says what it was trained on."""
+    """Safetensors of half precision, the children in bytes; ``card`` says what it was trained on."""
     # safetensors writes the memory as it lies, whatever the strides say: a transposed array would come back scrambled
-    arrays = {k: np.ascontiguousarray(getattr(vocabulary, k), np.float16) for k in ("cells", "projection", "thresholds", "children")}
+    arrays = {k: np.ascontiguousarray(getattr(vocabulary, k), np.float16) for k in ("cells", "projection", "thresholds")}
     with replacing_file(path) as temporary:
-        save_file(arrays, temporary, metadata=card)
+        save_file(arrays | {"children": _bytes(vocabulary.children)}, temporary, metadata=card)
 
 
 @lru_cache(maxsize=8)
@@ -135,11 +168,16 @@ def load_vocabulary(variant: str, path: Path | None = None) -> Vocabulary:
         else:
             with as_file(files("semloc_logs.words") / "vocabularies" / f"{variant}.safetensors") as shipped:
                 arrays = load_file(shipped)
-        cells, projection, thresholds, children = (arrays[k].astype(np.float32) for k in ("cells", "projection", "thresholds", "children"))
-        c, k = len(cells), children.shape[1]
+        if arrays["children"].dtype == np.float16:  # files before there were 2^16 words
+            arrays["children"] = _bytes(arrays["children"].astype(np.float32))
+        cells, projection, thresholds, children = (arrays[k] for k in ("cells", "projection", "thresholds", "children"))
+        c, k, n = len(cells), children.shape[1], projection.shape[1]
         shapes = (cells.shape, projection.shape, thresholds.shape, children.shape)
-        if shapes != ((c, 256), (BITS, 256), (c, BITS), (c, k, BITS)) or not (0 < c <= 256 and 0 < k <= 256):
-            raise ValueError(f"shapes {shapes}")
-        return Vocabulary(_grid(cells), _grid(projection), thresholds, _grid(children))
+        if shapes != ((c, n), (BITS, n), (c, BITS), (c, k, BITS)) or not (0 < c <= 256 and 0 < k <= 256) or children.dtype != np.int8:
+            raise ValueError(f"shapes {shapes}, children {children.dtype}")
+        if not all(np.isfinite(a).all() for a in (cells, projection, thresholds)):
+            raise ValueError("values that are no numbers")
+        step = np.float32(CHILD_STEP)
+        return Vocabulary(grid(cells), grid(projection), thresholds.astype(np.float32), children.astype(np.float32) * step)
     except (OSError, SafetensorError, KeyError, IndexError, ValueError) as problem:
         raise SettingsError(f"{path or 'The shipped vocabulary'}: no vocabulary of the {variant} variant ({problem}).") from None

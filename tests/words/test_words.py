@@ -10,11 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.words.index import Index
-from semloc_logs.words.vocabulary import BITS, Vocabulary, _kmeans, load_vocabulary, save_vocabulary, train_vocabulary
+from semloc_logs.words.kmeans import grid, kmeans, nearest_centroids
+from semloc_logs.words.vocabulary import BITS, Vocabulary, load_vocabulary, save_vocabulary, train_vocabulary
 
 F32 = NDArray[np.float32]
 TOLERANCE = 2.0**-9  # of a similarity: descriptors are rounded to 2^-11
@@ -42,9 +43,9 @@ def test_the_shape_and_scale_of_a_vocabulary(vocabulary: Vocabulary) -> None:
     ]
     np.testing.assert_allclose(np.linalg.norm(vocabulary.cells, axis=1), 1, atol=0.01)
     np.testing.assert_allclose(vocabulary.projection @ vocabulary.projection.T, np.eye(BITS), atol=0.02)
-    for k in ("cells", "projection", "children"):
+    for k, steps in (("cells", 2048), ("projection", 2048), ("children", 256)):
         a = getattr(vocabulary, k)
-        assert (a * 2048 == np.round(a * 2048)).all()
+        assert (a * steps == np.round(a * steps)).all()
 
 
 def test_cells_are_the_nearest_ones(vocabulary: Vocabulary) -> None:
@@ -177,25 +178,49 @@ def test_searches_with_nothing_to_find() -> None:
 
 def test_kmeans_finds_clusters_that_lie_apart() -> None:
     rng = np.random.default_rng(0)
-    centres = np.array([[0.0, 0], [10, 0], [0, 10], [10, 10], [20, 20]])
-    data = np.concatenate([c + 0.1 * rng.standard_normal((40, 2)) for c in centres]).astype(np.float32)
-    found = _kmeans(data, 5, np.random.default_rng(3))
-    assert sum(((data - found[np.argmin(((data[:, None] - found) ** 2).sum(2), 1)]) ** 2).sum(1)) < 0.25 * sum(
-        ((data - data.mean(0)) ** 2).sum(1)
-    )
+    centres = np.array([[0.0, 0], [0.5, 0], [0, 0.5], [0.5, 0.5], [0.7, 0.7]])
+    data = np.concatenate([c + 0.005 * rng.standard_normal((40, 2)) for c in centres]).astype(np.float32)
+    found = kmeans(data, 5, np.random.default_rng(3), 15)
+    assert (((data[:, None] - found) ** 2).sum(2).min(1)).sum() < 0.25 * ((data - data.mean(0)) ** 2).sum()
     assert np.isfinite(found).all()
 
 
-def test_an_empty_cluster_takes_the_point_farthest_from_its_centroid() -> None:
-    class Picks:
-        """A generator that starts two of three centroids in one place."""
+class Picks:
+    """A generator that starts two of three centroids in one place."""
 
-        def choice(self, n: int, k: int, replace: bool) -> NDArray[np.int64]:
-            return np.array([0, 1, 2])
+    def choice(self, n: int, k: int, replace: bool) -> NDArray[np.int64]:
+        return np.array([0, 1, 2])
 
-    data = np.array([[0, 0], [0, 0], [5, 0], [5, 0.1], [5, 4], [-0.1, 0]], np.float32)
-    found = _kmeans(data, 3, Picks(), rounds=15)  # type: ignore[arg-type]
-    assert [5.0, 4.0] in found.tolist()
+
+def test_an_empty_centroid_takes_the_point_farthest_from_its_own() -> None:
+    data = np.array([[0, 0], [0, 0], [0.5, 0], [0.5, 0.0625], [0.5, 0.5], [-0.0625, 0]], np.float32)
+    assert [0.5, 0.5] in kmeans(data, 3, Picks(), rounds=15).tolist()  # type: ignore[arg-type]
+
+
+@given(st.integers(0, 10_000), st.integers(1, 7), st.integers(1, 4), st.integers(1, 6))
+@settings(max_examples=30, deadline=None)
+def test_kmeans_is_lloyds_algorithm(seed: int, k: int, dimensions: int, rounds: int) -> None:
+    """Beside points one by one; the sums of rounded points are exact in any order."""
+    rng = np.random.default_rng(seed)
+    points = grid(rng.uniform(-0.4, 0.4, (40, dimensions)).astype(np.float32))
+    centroids = points[np.sort(np.random.default_rng(seed).choice(40, k, replace=False))].astype(float)
+    for _ in range(rounds):
+        nearest = [min(range(k), key=lambda c: (float(((p - centroids[c]) ** 2).sum()), c)) for p in points.astype(float)]
+        distance = [float(((p - centroids[c]) ** 2).sum()) for p, c in zip(points.astype(float), nearest, strict=True)]
+        farthest = sorted(range(40), key=lambda i: (-distance[i], i))
+        moved = np.array(
+            [grid(points[np.array(nearest) == c].astype(float).mean(0)) if c in nearest else points[farthest.pop(0)] for c in range(k)]
+        )
+        centroids = moved.astype(float)
+    np.testing.assert_array_equal(kmeans(points, k, np.random.default_rng(seed), rounds), centroids)
+
+
+def test_the_nearest_of_equal_centroids_is_the_first() -> None:
+    nearest, distance = nearest_centroids(
+        np.array([[0.5, 0], [0, 0.25]], np.float32), np.array([[0, 0], [0.5, 0], [0.5, 0], [0, 0]], np.float32)
+    )
+    assert nearest.tolist() == [1, 0]
+    assert distance.tolist() == [0, 0.0625]
 
 
 def test_training_is_repeatable_and_small_data_give_fewer_words() -> None:
@@ -205,6 +230,49 @@ def test_training_is_repeatable_and_small_data_give_fewer_words() -> None:
     assert len(train_vocabulary(unit(0, 512), cells=256, children=2).cells) == 8
     with pytest.raises(SettingsError, match="256 descriptors"):
         train_vocabulary(unit(0, 255))
+    with pytest.raises(SettingsError, match="64 dimensions"):
+        train_vocabulary(unit(0, 400)[:, :63])
+
+
+def test_descriptors_may_have_64_dimensions_and_half_precision() -> None:
+    d = unit(0, 700)[:, :64]
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    v = train_vocabulary(grid(d).astype(np.float16), cells=10, children=4)
+    assert (v.cells.shape, v.projection.shape) == ((10, 64), (64, 64))
+    np.testing.assert_allclose(v.projected(d), grid(d) @ v.projection.T, atol=1e-6)
+    word, code = v.words(d)
+    m = Index(v, word, code, np.zeros(700, np.int64)).search(d[:50], 1, 1, np.array([True]))
+    assert (code[m.entry] == code[:50]).all()
+    again = train_vocabulary(d, cells=10, children=4)  # multiples of 2^-11 below 1 have no more digits than half precision holds
+    for k in ("cells", "projection", "thresholds", "children"):
+        np.testing.assert_array_equal(getattr(v, k), getattr(again, k))
+
+
+def test_a_cell_of_few_descriptors_has_as_many_words() -> None:
+    d = unit(0, 600)
+    v = train_vocabulary(d, cells=9, children=256)
+    words = v.words(d)[0]
+    own = v.nearest_cells(d, 1)[:, 0]
+    for cell in range(9):
+        mine, kids = np.flatnonzero(own == cell), v.children[cell]
+        assert len(np.unique(kids, axis=0)) <= min(256, len(mine)) <= len(kids)
+        assert (words[mine] % 256 < max(1, len(mine))).all()
+        # each descriptor has a word of its own, but for the rounding of the children
+        if len(mine):
+            miss = np.linalg.norm(v.projected(d[mine]) - kids[words[mine] % 256], axis=1)
+            assert miss.max() < 0.5 * 2**-8 * 8 + 1e-3
+
+
+def test_children_of_more_words_lie_nearer() -> None:
+    d = unit(0, 3000)
+    own = np.arange(3000)
+
+    def miss(children: int) -> float:
+        v = train_vocabulary(d, cells=4, children=children)
+        word = v.words(d)[0]
+        return float(np.mean(np.linalg.norm(v.projected(d) - v.children[word // 256, word % 256], axis=1)[own]))
+
+    assert miss(64) < miss(8) < miss(1)
 
 
 def test_vocabularies_come_back_and_code_the_same(vocabulary: Vocabulary, tmp_path: Path) -> None:
@@ -213,6 +281,7 @@ def test_vocabularies_come_back_and_code_the_same(vocabulary: Vocabulary, tmp_pa
     found = load_vocabulary("geometric", path)
     for k in ("cells", "projection", "children"):
         np.testing.assert_array_equal(getattr(found, k), getattr(vocabulary, k))
+    assert load_file(path)["children"].dtype == np.int8
     np.testing.assert_allclose(found.thresholds, vocabulary.thresholds, atol=1e-3)
     d = unit(5, 200)
     word, code = found.words(d)
@@ -225,13 +294,26 @@ def test_vocabularies_come_back_and_code_the_same(vocabulary: Vocabulary, tmp_pa
     assert again.read_bytes() == path.read_bytes()
 
 
+def test_children_of_half_precision_are_rounded_to_bytes(vocabulary: Vocabulary, tmp_path: Path) -> None:
+    """As vocabularies of fewer words had them."""
+    halves = {k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds")}
+    children = np.array([[[0.1] * 64, [0.9] * 64]] * 10, np.float16)
+    save_file(halves | {"children": children}, tmp_path / "old.safetensors")
+    found = load_vocabulary("geometric", tmp_path / "old.safetensors").children
+    assert found[:, 0].tolist() == [[26 / 256] * 64] * 10
+    assert found[:, 1].tolist() == [[127 / 256] * 64] * 10  # the end of the range
+
+
 def test_files_that_hold_no_vocabulary_are_refused_by_name(vocabulary: Vocabulary, tmp_path: Path) -> None:
-    arrays = {k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds", "children")}
-    odd = {"missing": None, "bytes": b"x" * 50, "empty": b""}
+    arrays = {k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds")}
+    arrays["children"] = (vocabulary.children * 256).astype(np.int8)
+    odd: dict[str, bytes | None] = {"missing": None, "bytes": b"x" * 50, "empty": b""}
     odd_arrays = {
         "fewer": {k: v for k, v in arrays.items() if k != "children"},
         "narrow": arrays | {"cells": arrays["cells"][:, :128].copy()},
         "unequal": arrays | {"thresholds": arrays["thresholds"][:5].copy()},
+        "wide": arrays | {"children": arrays["children"].astype(np.float32)},
+        "infinite": arrays | {"thresholds": np.full_like(arrays["thresholds"], np.inf)},
         "flat": arrays | {"children": arrays["children"].reshape(-1)},
         "many": {k: v if k == "projection" else np.concatenate([v] * 26) for k, v in arrays.items()},  # 260 cells do not fit a byte
     }
@@ -252,13 +334,16 @@ rng = np.random.default_rng(0)
 unit = lambda n: (lambda v: (v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32))(rng.standard_normal((n, 256)))
 grid = lambda a: (np.round(a * 2048) / 2048).astype(np.float32)
 thresholds = rng.uniform(-0.1, 0.1, (200, 64)).astype(np.float32)
-v = Vocabulary(grid(unit(200)), grid(unit(64)), thresholds, grid(rng.uniform(-0.1, 0.1, (200, 5, 64))))
+v = Vocabulary(grid(unit(200)), grid(unit(64)), thresholds, np.round(rng.uniform(-25, 25, (200, 5, 64))).astype(np.float32) / 256)
 d = unit(3000)
 digest = hashlib.sha256()
 for a in (*v.words(d), v.nearest_cells(d, 8), (grid(d) @ v.cells.T)):
     digest.update(np.ascontiguousarray(a).tobytes())
 one = np.concatenate([v.words(d[i : i + 7])[1] for i in range(0, 3000, 7)])
 assert (one == v.words(d)[1]).all()
+trained = train_vocabulary(unit(2000), cells=20, children=20)
+for a in (trained.cells, trained.projection, trained.thresholds, trained.children):
+    digest.update(a.tobytes())
 print(digest.hexdigest())
 """
 
