@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semloc_logs.simulation.objects import Parts, awning
+from semloc_logs.simulation.shapes import Parts
 from semloc_logs.simulation.world import BUILDING, F64, Mesh, box, cylinder, extrude, gabled_roof, merge, place, quads
 
 Rng = np.random.Generator
@@ -123,3 +123,9 @@ def _windows(rng: Rng, width: float, height: float, line: float) -> Mesh:
     shutters[:, :, 1] = line - 0.1
     shutters[:, 2:, 2] += 1.3
     return quads(np.concatenate([corners, shutters]))
+
+
+def awning(width: float, depth: float, height: float) -> Mesh:
+    """A slanting sheet hanging from a wall at y = 0 towards +y."""
+    w = width / 2
+    return quads(np.array([[[-w, 0, height + 0.5], [w, 0, height + 0.5], [w, depth, height], [-w, depth, height]]]))
