@@ -20,21 +20,22 @@ def fence(rng: Rng, path: F64, kind: str | None = None) -> Parts:
     a, b = posts[:-1], posts[1:]
     if kind == "board":
         gap = rng.uniform(0.0, 0.1)
-        for z in np.arange(0.05, height - 0.1, 0.3):
-            meshes.append(upright_quads(a, b, z, min(z + 0.3 - gap, height)))
+        meshes += [upright_quads(a, b, float(z), min(float(z) + 0.3 - gap, height)) for z in np.arange(0.05, height - 0.1, 0.3)]
         return [(joined(*meshes), FENCE)]
     if kind == "gabions":
         return [(ribbon(posts, np.array([[-0.25, -0.2], [0.25, -0.2], [0.25, height], [-0.25, height]])), WALL)]
-    levels = {"rails": np.linspace(0.35, height, 3), "mesh": np.arange(0.08, height, 0.2), "lattice": np.array([0.1, height])}.get(
-        kind, np.array([0.2, height - 0.12])
-    )
+    levels: F64 = {
+        "rails": np.linspace(0.35, height, 3, dtype=np.float64),
+        "mesh": np.arange(0.08, height, 0.2),
+        "lattice": np.array([0.1, height]),
+    }.get(kind, np.array([0.2, height - 0.12]))
     thin = 0.008 if kind == "mesh" else 0.045
-    meshes += [upright_quads(a, b, z - thin, z + thin) for z in levels]
+    meshes += [upright_quads(a, b, float(z) - thin, float(z) + thin) for z in levels]
     if kind in ("picket", "bars", "mesh"):
         step, width = {"picket": (0.19, 0.1), "bars": (0.14, 0.03), "mesh": (0.25, 0.012)}[kind]
         fine = resample(path, step)
         along = np.diff(fine, axis=0) * min(1.0, width / step)
-        meshes.append(upright_quads(fine[:-1], fine[:-1] + along, 0.05, height * (1 + 0.03 * (np.arange(len(along)) % 2))))
+        meshes.append(upright_quads(fine[:-1], fine[:-1] + along, 0.05, height + 0.03 * np.arange(len(along), dtype=np.float64) % 0.06))
     if kind == "lattice":
         fine = resample(path, 0.3)
         bottom = np.column_stack([fine, np.full(len(fine), 0.1)])

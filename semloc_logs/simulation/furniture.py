@@ -39,7 +39,9 @@ def person(rng: Rng) -> Parts:
     extra = rng.random()
     if extra < 0.06:
         rows = [[0.7, 0.45, 0.35, 0.75, 0, 0.5], [0.5, 0.04, 0.04, 0.3, 0, 0.95], [0.3, 0.4, 0.35, 0.95, 0, 0.8]]
-        parts.append((joined(boxes(np.array(rows)), wheels([(x, s * 0.2) for x in (0.5, 1.0) for s in (-1, 1)], 0.12, 0.05, 6)), UNLABELLED))
+        parts.append(
+            (joined(boxes(np.array(rows)), wheels([(x, s * 0.2) for x in (0.5, 1.0) for s in (-1, 1)], 0.12, 0.05, 6)), UNLABELLED)
+        )
     elif extra < 0.2:
         parts[0] = (joined(parts[0][0], box(0.18, 0.3, 0.42, -0.2, 0, 0.55 * height)), PERSON)
     return parts
@@ -67,7 +69,14 @@ def _bollard(rng: Rng) -> Parts:
     height, kind = float(rng.uniform(0.6, 1.1)), rng.integers(3)
     if kind == 0:
         return [(joined(cylinder(0.06, height, 6), cylinder(0.09, 0.1, 6, z=height - 0.08)), POLE)]
-    return [(cylinder(0.08, height, 6) if kind == 1 else joined(cylinder(0.16, 0.6 * height, 8, 0.13), ellipsoid((0.14, 0.14, 0.1), 0.6 * height)), POLE)]
+    return [
+        (
+            cylinder(0.08, height, 6)
+            if kind == 1
+            else joined(cylinder(0.16, 0.6 * height, 8, 0.13), ellipsoid((0.14, 0.14, 0.1), 0.6 * height)),
+            POLE,
+        )
+    ]
 
 
 def _lamp(rng: Rng) -> Parts:
@@ -92,7 +101,9 @@ def _double(rng: Rng) -> Parts:
 def _park(rng: Rng) -> Parts:
     height = float(rng.uniform(3.0, 4.5))
     globe = ellipsoid((0.22, 0.22, 0.25), height + 0.2, 5, 8) if rng.random() < 0.5 else cylinder(0.14, 0.45, 6, 0.24, z=height)
-    return [(joined(cylinder(0.06, height + 0.1, 7), cylinder(0.14, 0.5, 7, 0.08), globe, cylinder(0.3, 0.08, 8, 0.05, z=height + 0.44)), POLE)]
+    return [
+        (joined(cylinder(0.06, height + 0.1, 7), cylinder(0.14, 0.5, 7, 0.08), globe, cylinder(0.3, 0.08, 8, 0.05, z=height + 0.44)), POLE)
+    ]
 
 
 def _mast(rng: Rng) -> Parts:
@@ -132,7 +143,10 @@ def _sign(rng: Rng, kind: str) -> Parts:
     if rng.random() < 0.15:
         plates.append(place(_plate(rng, height + 0.1, kind), 0, 0, 0, np.pi / 2))
     turn = rng.normal() * 0.15
-    return [(cylinder(0.035, float(max(p.vertices[:, 2].max() for p in plates)), 6), POLE), (place(joined(*plates), 0, 0, 0, turn), TRAFFIC_SIGN)]
+    return [
+        (cylinder(0.035, float(max(p.vertices[:, 2].max() for p in plates)), 6), POLE),
+        (place(joined(*plates), 0, 0, 0, turn), TRAFFIC_SIGN),
+    ]
 
 
 def _gantry(rng: Rng) -> Parts:
@@ -171,7 +185,22 @@ def shelter(rng: Rng) -> Parts:
     return [(boxes(np.array(rows)), BUILDING), (boxes(np.array(bench)), UNLABELLED), (sign, POLE), (plate, TRAFFIC_SIGN)]
 
 
-CLUTTER = ("bin", "cabinet", "bench", "skip", "letters", "hydrant", "column", "poster", "planter", "basket", "meter", "phone", "rack", "bins")
+CLUTTER = (
+    "bin",
+    "cabinet",
+    "bench",
+    "skip",
+    "letters",
+    "hydrant",
+    "column",
+    "poster",
+    "planter",
+    "basket",
+    "meter",
+    "phone",
+    "rack",
+    "bins",
+)
 
 
 def street_clutter(rng: Rng, kind: str | None = None) -> Parts:

@@ -16,7 +16,9 @@ def bush(rng: Rng, *, bare: bool = False) -> Parts:
     evergreen = own.random() < 0.35
     stems = int(own.integers(6, 15))
     angle, out = own.uniform(0, 2 * np.pi, stems), radius * np.sqrt(own.uniform(0.05, 1.0, stems))
-    ends = np.column_stack([out * np.cos(angle), out * np.sin(angle), height * own.uniform(0.5, 1.0, stems) * (1 - 0.35 * (out / radius) ** 2)])
+    ends = np.column_stack(
+        [out * np.cos(angle), out * np.sin(angle), height * own.uniform(0.5, 1.0, stems) * (1 - 0.35 * (out / radius) ** 2)]
+    )
     ends[:, :2] *= own.uniform(0.8, 1.3, 2)
     foot = ends * [0.25, 0.25, 0.0] - [0, 0, 0.15]
     wood = tubes(foot, ends, 0.02, 0.01, 3)

@@ -48,9 +48,11 @@ __all__ = [
 def parked_vehicle(rng: Rng) -> Parts:
     """What stands on a parking place: mostly cars, now and then a van, a camper, a trailer, a motorcycle or a lorry."""
     kind = rng.random()
-    for share, make in ((0.82, car), (0.93, van), (0.95, camper), (0.965, trailer), (0.98, truck)):
+    for share, make in ((0.83, car), (0.94, van), (0.955, camper), (0.97, trailer)):
         if kind < share:
             return make(rng)
+    if kind < 0.98:
+        return truck(rng, articulated=0.0)
     return two_wheeler(rng, motor=True)
 
 

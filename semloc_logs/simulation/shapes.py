@@ -59,11 +59,11 @@ def loft(sections: F64) -> Mesh:
 
 def body(x: F64, top: F64, width: F64 | float, low: float, belt: float, tumblehome: float) -> Mesh:
     """A vehicle's hull along +x: at stations ``x`` (s,) it is ``top`` (s,) high and ``width`` wide; drawn in above ``belt``."""
-    half = np.broadcast_to(np.asarray(width, np.float64) / 2, x.shape)
+    half = np.zeros_like(x) + np.asarray(width, np.float64) / 2
     middle = np.minimum(belt, top - 0.02)
     narrow = np.maximum(half - tumblehome * (top - middle), 0.25 * half)
-    columns = [(-half, low), (-half, middle), (-narrow, top), (narrow, top), (half, middle), (half, low)]
-    return loft(np.stack([np.column_stack([x, y, np.broadcast_to(z, x.shape)]) for y, z in columns], axis=1))
+    columns: list[tuple[F64, F64 | float]] = [(-half, low), (-half, middle), (-narrow, top), (narrow, top), (half, middle), (half, low)]
+    return loft(np.stack([np.column_stack([x, y, np.zeros_like(x) + z]) for y, z in columns], axis=1))
 
 
 def wheels(places: list[tuple[float, float]], radius: float, width: float = 0.22, sides: int = 10) -> Mesh:

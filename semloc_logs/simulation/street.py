@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.simulation import objects
 from semloc_logs.simulation.buildings import building
@@ -13,7 +14,7 @@ from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.ground import Ground
 from semloc_logs.simulation.network import Road, RoadNetwork, path_network
 from semloc_logs.simulation.objects import Parts
-from semloc_logs.simulation.world import F64, Mesh, MeshBuilder, World, join_worlds, place
+from semloc_logs.simulation.world import F64, MeshBuilder, World, join_worlds, place
 
 Rng = np.random.Generator
 
@@ -118,13 +119,16 @@ class _Street:
             for mesh, label in parts:
                 self.static.add(mesh, label, ground="drape")
 
+    @property
+    def bare(self) -> bool:
+        """Whether deciduous plants have lost their leaves."""
+        return self.condition.season in ("winter", "snow")
+
     def put_tree(self, x: float, y: float, size: float, kind: str | None = None) -> None:
         """A tree, that is missing in three sessions of a hundred."""
-        kind = kind or str(self.rng.choice(["round", "round", "round", "column", "cone", "spreading"]))
-        parts, yaw = objects.tree(self.rng, size, kind), self.rng.uniform(0, 6.3)
-        leaves = 1.0 if kind == "cone" else {"autumn": 0.4, "winter": 0.03, "snow": 0.03}.get(self.condition.season, 1.0)
-        if leaves < 1:
-            parts = [(Mesh(m.vertices, _thinned(m.triangles, leaves)), label) for m, label in parts]
+        season = self.condition.season
+        parts = objects.tree(self.rng, size, kind, bare=self.bare, leafy=0.4 if season == "autumn" else 1.0)
+        yaw = self.rng.uniform(0, 6.3)
         if self.change.random() >= 0.03:
             self.put(parts, x, y, yaw, aside=True)
 
@@ -183,7 +187,9 @@ class _Street:
             return
         opening = rng.uniform(2.5, 4.0)
         start = rng.uniform(u0, max(u0 + 0.1, u1 - opening))
-        make = [objects.hedge, objects.fence, objects.garden_wall][int(rng.integers(3)) if style.frontage == "any" else 1]
+        hedge = partial(objects.hedge, bare=self.bare)
+        makers: list[Callable[[Rng, F64], Parts]] = [hedge, objects.fence, objects.garden_wall]
+        make = makers[int(rng.integers(3)) if style.frontage == "any" else 1]
         state = int(rng.integers(2**31))
         for a, b in ((u0, start), (start + opening, u1)):
             line = side.line(a + 0.4, b - 0.4, walk + 0.6)
@@ -195,7 +201,7 @@ class _Street:
         if rng.random() < 0.4 and style.gap > 1:
             line = np.array([side.at(u0, v)[:2] for v in np.linspace(walk + 1, walk + style.setback + 8, 8)])
             if self.ground.allowed(line):
-                self.put_line(objects.fence(rng, line) if rng.random() < 0.5 else objects.hedge(rng, line))
+                self.put_line(objects.fence(rng, line) if rng.random() < 0.5 else hedge(rng, line))
 
     def garden(self, side: _Side, style: _Style, u: float, width: float, walk: float, behind: float, house: bool) -> None:
         rng = self.rng
@@ -207,8 +213,10 @@ class _Street:
                 continue
             if rng.random() < 0.4:
                 self.put_tree(x, y, rng.uniform(0.3, 1.1))
+            elif rng.random() < 0.8:
+                self.put(objects.bush(rng, bare=self.bare), x, y, rng.uniform(0, 6.3))
             else:
-                self.put(objects.bush(rng), x, y, rng.uniform(0, 6.3))
+                self.put(objects.tufts(rng), x, y, 0.0)
             self.ground.take(np.array([[x, y]]))
 
     def parked(self, side: _Side, u: float, v: float, share: float, *, across: bool = False) -> None:
@@ -216,11 +224,9 @@ class _Street:
         x, y, yaw = side.at(u, v)
         if self.change.random() > share:
             return
-        kind = self.change.random()
-        make = objects.car if kind < 0.85 else objects.van if kind < 0.97 else objects.truck
         turn = (np.pi / 2 if across else 0.0) + (np.pi if self.change.random() < 0.2 else 0.0) + self.change.normal() * 0.04
         shift = self.change.normal(size=2) * [0.3, 0.15]
-        self.put(make(self.change), x + shift[0], y + shift[1], yaw + turn, moving=True)
+        self.put(objects.parked_vehicle(self.change), x + shift[0], y + shift[1], yaw + turn, moving=True)
 
     def kerbside(self, side: _Side, style: _Style, edge: float, walk: float) -> None:
         """Lamps, signs, street trees, bins, parked cars and people between the carriageway and the plots."""
@@ -229,14 +235,23 @@ class _Street:
             for u in np.arange(edge + 6, side.length - edge - 6, 6.2):
                 self.parked(side, u + rng.normal() * 0.3, -1.05, style.parked)
         kerb = 0.5
+        lamp, state = str(rng.choice(["lamp", "lamp", "double", "park"])), int(rng.integers(2**31))
         for u in np.arange(edge + rng.uniform(0, 15), side.length - edge, style.lamp_pitch):
             x, y, yaw = side.at(u, kerb)
-            self.put(objects.pole(rng, "lamp"), x, y, yaw, aside=True)
+            self.put(objects.pole(np.random.default_rng(state), lamp), x, y, yaw, aside=True)
         if walk > 2.0 or rng.random() < 0.4:
             for u in np.arange(edge + 3 + rng.uniform(0, style.tree_pitch), side.length - edge, style.tree_pitch):
                 x, y, _ = side.at(u + rng.normal(), 0.9 if walk > 2 else walk + 1.0)
                 self.put_tree(x, y, style.tree_size * rng.uniform(0.7, 1.2))
-        for kind, rate in (("sign", 25.0), ("mast", 140.0), ("bollard", 80.0)):
+        for kind, rate in (
+            ("sign", 30.0),
+            ("parking", 90.0),
+            ("street", 90.0),
+            ("mast", 140.0),
+            ("bollard", 80.0),
+            ("gantry", 900.0),
+            ("flag", 400.0),
+        ):
             for u in rng.uniform(edge - 3, max(edge, side.length - edge + 3), rng.poisson(side.length / rate)):
                 x, y, yaw = side.at(float(u), kerb)
                 self.put(objects.pole(rng, kind), x, y, yaw, aside=True)
@@ -246,10 +261,35 @@ class _Street:
         for _ in range(rng.poisson(side.length / 30)):
             x, y, yaw = side.at(rng.uniform(edge, max(edge + 1, side.length - edge)), max(kerb, walk - 0.5))
             self.put(objects.street_clutter(self.change), x, y, yaw + np.pi, moving=True, aside=True)
-        for _ in range(self.change.poisson(side.length / 45)):
-            x, y, _ = side.at(self.change.uniform(0, side.length), self.change.uniform(0.4, max(0.6, walk)))
-            make = objects.person if self.change.random() < 0.7 else objects.two_wheeler
-            self.put(make(self.change), x, y, self.change.uniform(0, 6.3), moving=True, aside=True)
+        for make, pitch in ((objects.bicycle_stand, 120.0), (objects.shelter, 250.0)):
+            for u in rng.uniform(edge, max(edge + 1, side.length - edge - 8), rng.poisson(side.length / pitch if walk > 2.0 else 0.0)):
+                x, y, yaw = side.at(float(u), walk - 1.1)
+                self.put(make(rng), x, y, yaw, aside=True)
+        for _ in range(self.change.poisson(side.length / 40)):
+            x, y, yaw = side.at(self.change.uniform(0, side.length), self.change.uniform(0.4, max(0.6, walk)))
+            passer = objects.person if self.change.random() < 0.7 else objects.two_wheeler
+            self.put(passer(self.change), x, y, self.change.uniform(0, 6.3), moving=True, aside=True)
+        for _ in range(self.change.poisson(side.length / 150)):
+            x, y, yaw = side.at(self.change.uniform(edge, max(edge + 1, side.length - edge)), 0.4 if side.road.parking else -0.4)
+            self.put(objects.rider(self.change), x, y, yaw, moving=True, aside=True)
+
+    def railway(self) -> None:
+        """Wagons on a siding, in one town of three, where there is room for it."""
+        rng, ground = self.rng, self.ground
+        i, j = np.nonzero(ground.free & (ground.beside > 8))
+        if rng.random() > 0.35 or not len(i):
+            return
+        for k in rng.integers(0, len(i), 60):
+            x, y = ground.corner + 0.5 * (np.array([i[k], j[k]]) + 0.5)
+            yaw, count = rng.uniform(0, np.pi), int(rng.integers(1, 4))
+            gx, gy = np.meshgrid(np.arange(-13.0, 26.0 * count - 13, 0.5), np.arange(-2.5, 2.6, 0.5))
+            along = np.array([np.cos(yaw), np.sin(yaw)])
+            cells = gx.reshape(-1, 1) * along + gy.reshape(-1, 1) * np.array([-along[1], along[0]]) + [x, y]
+            if ground.allowed(cells):
+                ground.take(cells)
+                for n in range(count):
+                    self.put(objects.railway_wagon(rng), x + 26.0 * n * along[0], y + 26.0 * n * along[1], yaw, aside=True)
+                return
 
     def backlands(self) -> None:
         """Trees, sheds and houses in what is left behind the plots."""
@@ -267,13 +307,6 @@ class _Street:
                 ground.take(cells)
             elif ground.allowed(np.array([[x, y]])):
                 self.put_tree(x, y, rng.uniform(0.4, 1.2))
-
-
-def _thinned(triangles: NDArray[np.int64], share: float, trunk: int = 32) -> NDArray[np.int64]:
-    """The trunk of a tree and a share of its leaves, the same ones whatever else is drawn."""
-    keep = np.arange(len(triangles)) * share % 1.0 < share
-    keep[:trunk] = True
-    return triangles[keep]
 
 
 def street_ground(network: RoadNetwork, seed: int) -> Ground:
@@ -295,6 +328,7 @@ def build_street(path: F64 | RoadNetwork, seed: int, condition: Condition | int 
     for road in network.roads:
         for sign in (1, -1):
             street.side(_Side(road, sign), _style(street.rng, np.random.default_rng(town)))
+    street.railway()
     street.backlands()
     mesh, labels = ground.mesh()
     street.static.add(mesh, labels, ground="none")

@@ -31,7 +31,9 @@ class Traffic:
             at = (start + speed * seconds) % length
             pose = poses_along(line, np.array([at]), self.ground.slope_height, np.random.default_rng(0), shake=0.0)[0]
             offset = (base_T_world @ pose)[:3, 3]
-            if np.hypot(offset[0], 3 * offset[1]) < KEEP_OFF:
+            # long vehicles keep off by what they are longer than a car
+            longer = max(0.0, max(float(mesh.vertices[:, 0].max()) for mesh, _ in parts) - 2.5)
+            if np.hypot(max(0.0, abs(offset[0]) - longer), 3 * offset[1]) < KEEP_OFF:
                 continue
             for mesh, label in parts:
                 builder.add(Mesh(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], mesh.triangles), label, ground="none")
@@ -44,8 +46,8 @@ def random_traffic(rng: np.random.Generator, ground: Ground, lines: list[F64], d
     vehicles = []
     for line in lines:
         length = 0.5 * (len(line) - 1)
-        for _ in range(rng.poisson(density * length / 100)):
-            kind = rng.random()
-            make = objects.car if kind < 0.8 else objects.van if kind < 0.92 else objects.truck
-            vehicles.append((make(rng), line, float(rng.uniform(0, length)), float(rng.uniform(4, 11))))
+        vehicles += [
+            (objects.moving_vehicle(rng), line, float(rng.uniform(0, length)), float(rng.uniform(4, 11)))
+            for _ in range(rng.poisson(density * length / 100))
+        ]
     return Traffic(ground, tuple(vehicles))

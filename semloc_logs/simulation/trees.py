@@ -55,8 +55,11 @@ _NAMES = list(SPECIES)
 _SHARES = np.array([s.share for s in SPECIES.values()]) / sum(s.share for s in SPECIES.values())
 
 
-def tree(rng: Rng, size: float = 1.0, kind: str | None = None, *, bare: bool = False) -> Parts:
-    """A tree of one of ``SPECIES``, at random by default; ``size`` 1 is full-grown. With ``bare`` deciduous trees have lost their leaves."""
+def tree(rng: Rng, size: float = 1.0, kind: str | None = None, *, bare: bool = False, leafy: float = 1.0) -> Parts:
+    """A tree of one of ``SPECIES``, at random by default; ``size`` 1 is full-grown.
+
+    With ``bare`` deciduous trees have twigs and no leaves; otherwise ``leafy`` is the share of their leaves that they still have.
+    """
     own = np.random.default_rng(int(rng.integers(2**62)))
     drawn = str(own.choice(_NAMES, p=_SHARES))
     name = kind or drawn
@@ -73,6 +76,8 @@ def tree(rng: Rng, size: float = 1.0, kind: str | None = None, *, bare: bool = F
         crown = twigs(np.random.default_rng(seed), ends, 0.3 + 0.06 * radius, hanging=name == "weeping")
     else:
         crown = _foliage(np.random.default_rng(seed), species, ends, height - clear, radius, hanging=name == "weeping")
+        if not species.evergreen and leafy < 1:
+            crown = Mesh(crown.vertices, crown.triangles[: int(leafy * len(crown.triangles))])
     return [(joined(wood, crown), VEGETATION)]
 
 
@@ -109,13 +114,17 @@ def _wood(rng: Rng, species: Species, height: float, clear: float, radius: float
         starts.append(line)
     limbs = int(np.clip(rng.integers(6, 11) + count, 6, 14))
     begin, tip = _limbs(rng, species, starts, limbs, clear, crown, radius)
-    bend = 0.55 * begin + 0.45 * tip - np.array([0, 0, 1.0]) * (0.08 * np.linalg.norm(tip - begin, axis=1))[:, None] * np.sign(species.rise - 0.8)
+    bend = (
+        0.55 * begin
+        + 0.45 * tip
+        - np.array([0, 0, 1.0]) * (0.08 * np.linalg.norm(tip - begin, axis=1))[:, None] * np.sign(species.rise - 0.8)
+    )
     meshes.append(tubes(begin, bend, 0.42 * thick, 0.28 * thick, 5))
     meshes.append(tubes(bend, tip, 0.28 * thick, 0.1 * thick, 4))
     t = np.linspace(0.35, 1.0, 5)[:, None, None]
     along = np.concatenate([(bend + (tip - bend) * t).reshape(-1, 3), *(s[4:] for s in starts)])
-    number = int(np.clip(10 + 5.0 * radius * np.sqrt(crown), 16, 70))
-    ends = _inside(rng, species.shape, number, clear, crown, radius) + [*(starts[0][3, :2] * 0.7), 0]
+    number = int(np.clip(10 + 4.0 * radius * np.sqrt(crown), 14, 50))
+    ends = _inside(rng, species.shape, number, clear, crown, radius) + 0.7 * starts[0][3] * [1, 1, 0]
     gap = ends[:, None] - along[None]
     cost = np.linalg.norm(gap, axis=2) + 0.8 * np.maximum(-gap[:, :, 2], 0)
     meshes.append(tubes(along[cost.argmin(1)], ends, 0.1 * thick + 0.008, 0.012, 3))
@@ -127,7 +136,12 @@ def _limbs(rng: Rng, species: Species, lines: list[F64], count: int, clear: floa
     up = np.sort(rng.uniform(0.0, 0.75, count) ** 1.3)
     stem = rng.integers(0, len(lines), count)
     z = clear + up * crown * 0.8
-    base = np.array([[np.interp(h, lines[s][:, 2], lines[s][:, 0]), np.interp(h, lines[s][:, 2], lines[s][:, 1]), h] for s, h in zip(stem, z, strict=True)])
+    base = np.array(
+        [
+            [np.interp(h, lines[s][:, 2], lines[s][:, 0]), np.interp(h, lines[s][:, 2], lines[s][:, 1]), h]
+            for s, h in zip(stem, z, strict=True)
+        ]
+    )
     angle = 2.4 * np.arange(count) + rng.uniform(-0.5, 0.5, count) + rng.uniform(0, 6.3)
     high = np.clip(up * 0.8 + rng.uniform(0.12, 0.3, count) * species.rise, 0.1, 0.93)
     out = radius * _envelope(species.shape, high) * rng.uniform(0.6, 0.85, count)
@@ -153,8 +167,8 @@ def leaves(rng: Rng, centre: F64, size: float | F64) -> Mesh:
 
 def _foliage(rng: Rng, species: Species, ends: F64, crown: float, radius: float, *, hanging: bool) -> Mesh:
     area = np.pi / 4 * crown * 2 * radius
-    count = int(np.clip(species.cover * rng.uniform(0.75, 1.3) * 2 * area / (LEAF_AREA * 0.64 * species.leaf**2 * 4), 120, 2200))
-    size = species.leaf * max(1.0, np.sqrt(area / 60))
+    count = int(np.clip(species.cover * rng.uniform(0.75, 1.3) * 2 * area / (LEAF_AREA * 0.64 * species.leaf**2 * 4), 100, 1100))
+    size = species.leaf * 1.1 * max(1.0, np.sqrt(area / 40))
     pick = rng.integers(0, len(ends), count)
     wide = 0.28 + 0.13 * radius
     centre = ends[pick] + rng.normal(size=(count, 3)) * [wide, wide, 0.8 * wide]
@@ -192,10 +206,10 @@ def _conifer(rng: Rng, height: float, clear: float, radius: float, leaf: float) 
     trunk = np.array([[0, 0, -0.4], [0, 0, 0.6 * height], [0, 0, height]])
     thick = 0.013 * height + 0.03
     wood = tubes(trunk[:-1], trunk[1:], np.array([1.3, 0.6]) * thick, np.array([0.6, 0.1]) * thick, 6)
-    needles = int(np.clip(34 * radius * height, 150, 1700))
+    needles = int(np.clip(26 * radius * height, 150, 1000))
     pick = rng.integers(0, count, needles)
     centre = start[pick] + (end - start)[pick] * np.sqrt(rng.uniform(0.08, 1, needles))[:, None]
-    corners = centre[:, None] + rng.uniform(-1, 1, (needles, 3, 3)) * [leaf, leaf, 0.45 * leaf]
+    corners = centre[:, None] + rng.uniform(-1, 1, (needles, 3, 3)) * [1.2 * leaf, 1.2 * leaf, 0.5 * leaf]
     corners[..., 2] = np.maximum(corners[..., 2], 0.05)
     return joined(wood, tubes(start, end, 0.02, 0.01, 3), triangles_of(corners))
 

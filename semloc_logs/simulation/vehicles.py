@@ -120,9 +120,9 @@ def trailer(rng: Rng) -> Parts:
     return [(joined(hull, bar, wheels([(0.0, s * 0.8) for s in (-1, 1)], 0.3)), UNLABELLED)]
 
 
-def truck(rng: Rng) -> Parts:
-    """A rigid lorry or, one time in three, an articulated one: with a box, a tarpaulin, a tank, a tipper or a load on a flat bed."""
-    if rng.random() < 0.33:
+def truck(rng: Rng, articulated: float = 0.33) -> Parts:
+    """A rigid lorry or, with that probability, an articulated one: with a box, a tarpaulin, a tank, a tipper or a load on a flat bed."""
+    if rng.random() < articulated:
         return [(_articulated(rng), TRUCK)]
     length, height = float(rng.uniform(5.6, 10.0)), float(rng.uniform(2.6, 3.6))
     bed = length - 2.3
@@ -201,7 +201,9 @@ def tram(rng: Rng) -> Parts:
         meshes.append(body(x, top, width, 0.3, 1.4, 0.05))
         meshes.append(boxes(np.array([[2.2, 2.0, 0.45, (a + b) / 2, 0, 0.0], [1.8, 1.4, 0.3, (a + b) / 2, 0, height]])))
     gaps = [[0.8, width - 0.4, height - 0.6, -length / 2 + k * piece, 0, 0.4] for k in range(1, sections)]
-    arm = np.array([[0.0, 0, height + 0.2], [0.9, 0, height + 0.8], [0.0, 0, height + 1.5], [0.0, -0.8, height + 1.5], [0.0, 0.8, height + 1.5]])
+    arm = np.array(
+        [[0.0, 0, height + 0.2], [0.9, 0, height + 0.8], [0.0, 0, height + 1.5], [0.0, -0.8, height + 1.5], [0.0, 0.8, height + 1.5]]
+    )
     pantograph = tubes(arm[[0, 1, 3]], arm[[1, 2, 4]], 0.05, 0.05, 4)
     return [(joined(*meshes, boxes(np.array(gaps)), pantograph), TRAIN)]
 
@@ -241,13 +243,15 @@ def _machine(rng: Rng, motor: bool) -> tuple[Mesh, int, float]:
         radius, base = float(rng.uniform(0.24, 0.32)), float(rng.uniform(1.25, 1.5))
         x = np.array([-0.75 * base, -0.4 * base, 0.05 * base, 0.25 * base, 0.42 * base])
         hull = body(x, np.array([0.85, 0.8, 0.78, 1.0, 0.85]), np.array([0.2, 0.34, 0.3, 0.36, 0.25]), 0.35, 0.7, 0.1)
-        bars = boxes(np.array([[0.06, 0.72, 0.06, 0.28 * base, 0, 1.02], [0.35, 0.25, 0.3, -0.72 * base, 0, 0.85]][: 2 if rng.random() < 0.4 else 1]))
+        bars = boxes(
+            np.array([[0.06, 0.72, 0.06, 0.28 * base, 0, 1.02], [0.35, 0.25, 0.3, -0.72 * base, 0, 0.85]][: 2 if rng.random() < 0.4 else 1])
+        )
         fork = tubes(np.array([[0.5 * base, 0, radius]]), np.array([[0.3 * base, 0, 1.0]]), 0.06, 0.06, 4)
         return joined(hull, bars, fork, wheels([(-base / 2, 0.0), (base / 2, 0.0)], radius, 0.14)), MOTORCYCLE, 0.8
     radius, base = float(rng.uniform(0.31, 0.36)), float(rng.uniform(0.98, 1.12))
     rear, front, crank = [-base / 2, 0, radius], [base / 2, 0, radius], [-0.1, 0, 0.3]
-    saddle, head, bars = [-0.28, 0, 0.92], [base / 2 - 0.2, 0, 0.85], [base / 2 - 0.22, 0, 1.03]
-    pairs = np.array([[rear, crank], [rear, saddle], [crank, saddle], [crank, head], [[-0.25, 0, 0.8], head], [front, bars]], np.float64)
+    saddle, head, grip = [-0.28, 0, 0.92], [base / 2 - 0.2, 0, 0.85], [base / 2 - 0.22, 0, 1.03]
+    pairs = np.array([[rear, crank], [rear, saddle], [crank, saddle], [crank, head], [[-0.25, 0, 0.8], head], [front, grip]], np.float64)
     rows = [[0.26, 0.16, 0.07, -0.28, 0, 0.92], [0.05, 0.58, 0.05, base / 2 - 0.24, 0, 1.01]]
     if rng.random() < 0.4:
         rows.append([0.35, 0.3, 0.25, base / 2 - 0.05, 0, 0.85] if rng.random() < 0.5 else [0.4, 0.14, 0.04, -0.55, 0, 0.74])
@@ -263,7 +267,9 @@ def bicycle_stand(rng: Rng) -> Parts:
         if rng.random() < 0.75:
             mesh, label, _ = _machine(rng, motor=False)
             parts.append((place(mesh, k * pitch, rng.normal() * 0.08, 0, np.pi / 2 + rng.normal() * 0.05), label))
-        hoop = np.array([[k * pitch + 0.15, -0.35, 0], [k * pitch + 0.15, -0.35, 0.8], [k * pitch + 0.15, 0.35, 0.8], [k * pitch + 0.15, 0.35, 0]])
+        hoop = np.array(
+            [[k * pitch + 0.15, -0.35, 0], [k * pitch + 0.15, -0.35, 0.8], [k * pitch + 0.15, 0.35, 0.8], [k * pitch + 0.15, 0.35, 0]]
+        )
         parts.append((tubes(hoop[:-1], hoop[1:], 0.025, 0.025, 4), UNLABELLED))
     return parts
 
@@ -281,7 +287,11 @@ def _sitting(rng: Rng, saddle: float) -> Mesh:
     lines: list[tuple[F64, F64, float]] = []
     for s, pedal in ((-1, 0.0), (1, 0.2)):
         knee, foot = np.array([0.12, 0.12 * s, saddle - 0.15 + pedal]), np.array([-0.05, 0.12 * s, 0.15 + pedal])
-        lines += [(hip + [0, 0.1 * s, 0], knee, 0.08), (knee, foot, 0.06), (shoulder + [0, 0.2 * s, -0.05], np.array([0.28, 0.25 * s, 1.05]), 0.05)]
+        lines += [
+            (np.add(hip, [0, 0.1 * s, 0]), knee, 0.08),
+            (knee, foot, 0.06),
+            (np.add(shoulder, [0, 0.2 * s, -0.05]), np.array([0.28, 0.25 * s, 1.05]), 0.05),
+        ]
     start, end, radius = (np.array([line[k] for line in lines]) for k in range(3))
     torso = cylinder(0.17, float(np.linalg.norm(shoulder - hip)), 8, 0.2)
     sheared = torso.vertices * [0.8, 1.1, 1.0]

@@ -56,7 +56,7 @@ def test_a_season_changes_the_trees_and_nothing_else(network: RoadNetwork, world
     for season, least in (("autumn", 0.3), ("winter", 0.0)):
         other = faces(build_street(network, 4, Condition(0, season)))
         assert {face[-1] for face in summer ^ other} == {VEGETATION}
-        assert other < summer
+        assert (other < summer) == (season == "autumn")  # in winter there are twigs
         assert least < sum(f[-1] == VEGETATION for f in other) / sum(f[-1] == VEGETATION for f in summer) < 0.95
 
 
