@@ -14,7 +14,7 @@ from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.ground import Ground
 from semloc_logs.simulation.network import Road, RoadNetwork, path_network
 from semloc_logs.simulation.objects import Parts
-from semloc_logs.simulation.world import F64, MeshBuilder, World, join_worlds, place
+from semloc_logs.simulation.world import F64, Mesh, MeshBuilder, World, join_worlds, place
 
 Rng = np.random.Generator
 
@@ -271,7 +271,7 @@ class _Street:
             self.put(passer(self.change), x, y, self.change.uniform(0, 6.3), moving=True, aside=True)
         for _ in range(self.change.poisson(side.length / 150)):
             x, y, yaw = side.at(self.change.uniform(edge, max(edge + 1, side.length - edge)), 0.4 if side.road.parking else -0.4)
-            self.put(objects.rider(self.change), x, y, yaw, moving=True, aside=True)
+            self.put(objects.rider(self.change), x, y, yaw, moving=True)
 
     def railway(self) -> None:
         """Wagons on a siding, in one town of three, where there is room for it."""
