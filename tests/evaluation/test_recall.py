@@ -123,10 +123,11 @@ def test_a_small_held_out_town(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert np.abs(occupied[:, :2] * V).max() < 25
         # the same surfaces are in the map where the query claims to be, and not where it does not
         there = street.database["camera" if name != "season" else "lidar"]
+        upright = occupied if name == "180" else occupied[level > 1.0]  # looking back it sees far beyond the short street
         mapped = cKDTree((np.argwhere(there.state < 20) + there.low + 0.5) * V)
-        away, elsewhere = (np.median(mapped.query(apply(pose, occupied * V))[0]) for pose in (true, true @ yaw_transform(0.6, (3, 3, 0))))
-        assert away < 0.6
-        assert away < 0.7 * elsewhere
+        away, elsewhere = (np.median(mapped.query(apply(pose, upright * V))[0]) for pose in (true, true @ yaw_transform(0.6, (3, 3, 0))))
+        assert away < 0.5
+        assert away < 0.6 * elsewhere
     found = retrieval_recall(world, random_encoder("semantic"))
     assert set(found) == set(DATABASE_OF)
     assert all(0 <= v <= 1 for v in found.values())
