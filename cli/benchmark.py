@@ -56,7 +56,8 @@ def command(
     NAME is reading, fusion, encoder, search or annotate (on simulated data; fusion takes sweeps of LOGs too), memory (peak of fusing
     drives of several lengths), fuse (one session of the LOGs, beside reading and integrating alone), pipeline (seconds, memory and
     profile of a run on the LOGs), words (recall of word matches between two LOGs whose truth is known, trained weights beside random
-    ones), or labels (classes from geometry against the labels recorded in the LOGs). Close other programs first: times are wall-clock.
+    ones), labels (classes from geometry against the labels recorded in the LOGs), or realism (simulated sweeps beside the labelled ones of
+    the LOGs). Close other programs first: times are wall-clock.
 
     \b
     Example:  semloc benchmark reading --json
@@ -64,10 +65,11 @@ def command(
               semloc benchmark pipeline monday.mcap tuesday.bag
               semloc benchmark words monday.mcap tuesday.bag --truth truth.json
               semloc benchmark labels labelled.mcap
+              semloc benchmark realism labelled.mcap
     """
     if name == "words" and (len(logs) != 2 or truth is None):
         raise click.UsageError("words needs two logs and --truth FILE.")
-    if name in ("pipeline", "fuse", "labels") and not logs:
+    if name in ("pipeline", "fuse", "labels", "realism") and not logs:
         raise click.UsageError(f"{name} needs at least one log.")
     with console.progress():
         figures, rows = _measure(name, logs, truth, peers, lengths, settings)
@@ -108,6 +110,10 @@ def _measure(
         from semloc_logs.evaluation.labelling import measure_labels
 
         return measure_labels(logs, settings), []
+    if name == "realism":
+        from semloc_logs.evaluation.realism import measure_realism
+
+        return measure_realism(logs, settings), []
     if name == "fusion":
         from semloc_logs.evaluation.fusion_speed import fusion_speed
 

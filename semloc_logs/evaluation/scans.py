@@ -49,6 +49,29 @@ def street_sweeps(count: int = 12, points: int = SWEEP_POINTS, seed: int = 1) ->
     return out
 
 
+def town_sweeps(seed: int, count: int = 3) -> list[Scan]:
+    """Whole sweeps of a simulated sensor of 64 beams, ``count`` of them 35 m apart, through the town of a seed with its traffic."""
+    from semloc_logs.simulation.lidar import MODELS, full_sweep
+    from semloc_logs.simulation.network import grid_network, lane_path, random_route
+    from semloc_logs.simulation.street import build_street, street_ground
+    from semloc_logs.simulation.traffic import random_traffic
+    from semloc_logs.simulation.trajectory import poses_along, smooth_line
+
+    rng = np.random.default_rng([seed, 43])
+    network = grid_network(rng, 2, 3, 85.0)
+    line = smooth_line(lane_path(network, random_route(rng, network, 60.0 + 35.0 * count)))
+    ground = street_ground(network, seed)
+    poses = poses_along(line, 20.0 + 35.0 * np.arange(count, dtype=np.float64), ground.slope_height, rng)
+    scene, model, traffic = Scene(build_street(network, seed)), MODELS["hdl64"], random_traffic(rng, ground, [line], 0.4)
+    out = []
+    for k, pose in enumerate(poses):
+        moving = traffic.scene(5.0 * k, pose)
+        pose[:3, 3] += pose[:3, 2] * model.height
+        turn = full_sweep(scene, pose, rng, model, traffic=moving)
+        out.append(Scan(turn.points, turn.labels, pose))
+    return out
+
+
 def depth_images(count: int = 6, shape: tuple[int, int] = DEPTH_SHAPE, seed: int = 1) -> list[Scan]:
     """Depth images (height, width) of a camera that turns in a furnished room of 7 x 5 x 2.7 m, a point for every pixel.
 
@@ -99,10 +122,10 @@ def _room() -> Scene:
     return Scene(room.build())
 
 
-def log_sweeps(log: Path, count: int = 12) -> list[Scan]:
+def log_sweeps(log: Path, count: int = 12, *, repeat: bool = True) -> list[Scan]:
     """The first ``count`` clouds of a log with their recorded labels, if any.
 
-    A log of fewer clouds is seen again from poses each 1.2 m further on, so that no scan meets a map of itself only.
+    With ``repeat`` a log of fewer clouds is seen again from poses each 1.2 m further on, so that no scan meets a map of itself only.
     LogError when there is no cloud.
     """
     from semloc_logs.labels.space import guess_space, to_cityscapes
@@ -125,6 +148,8 @@ def log_sweeps(log: Path, count: int = 12) -> list[Scan]:
         session.close()
     if not seen:
         raise LogError(f"{log} has no cloud to measure fusion with: name a log of a lidar or a depth camera.")
+    if not repeat:
+        return seen
     home = seen[0].map_T_sensor[:3, 3].copy()
     out = []
     for k in range(count):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.simulation.world import BUILDING, CAR, F64, ROAD, SIDEWALK
+from semloc_logs.simulation.world import BUILDING, CAR, F64, ROAD, SIDEWALK, VEGETATION
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -17,9 +17,10 @@ I64 = NDArray[np.int64]
 # share of the light of 905 nm that comes back from a surface of each class that faces the sensor
 _REFLECTANCE = np.full(256, 0.3)
 _REFLECTANCE[:19] = 0.18, 0.3, 0.35, 0.35, 0.3, 0.3, 0.3, 0.9, 0.45, 0.35, 0.3, 0.35, 0.35, 0.3, 0.35, 0.35, 0.35, 0.2, 0.2
-_FAINTEST = 2.5e-6  # of reflectance * cosine / range^2 (1/m^2), for two echoes of three: asphalt at 50 m from a height of 1.8 m
+_FAINTEST = 1.2e-6  # of reflectance * cosine / range^2 (1/m^2), for two echoes of three: asphalt at 64 m from a height of 1.8 m
+_LEAVES = 0.3  # the least cosine: a beam that meets leaves meets many
 _LOST = 0.002  # of all measurements, for no reason that one could see
-_PULSE = 1.2  # m: echoes nearer to each other than that are one
+_PULSE = 1.5  # m: echoes nearer to each other than that are one
 
 
 def hash_cells(cells: I64, seed: int = 0) -> I64:
@@ -55,9 +56,12 @@ def is_pane(world_points: F64, labels: U8) -> NDArray[np.bool_]:
     return pane
 
 
-def is_heard(rng: np.random.Generator, distance: NDArray[np.floating], cosine: F64, reflected: F64) -> NDArray[np.bool_]:
+def is_heard(
+    rng: np.random.Generator, distance: NDArray[np.floating], cosine: F64, reflected: F64, labels: U8 | None = None
+) -> NDArray[np.bool_]:
     """Which echoes (n,) are strong enough: strength falls with the square of the range and with the cosine of incidence."""
-    strength = reflected * np.clip(cosine, 0.01, 1.0) / np.maximum(distance, 3.0) ** 2
+    least = 0.01 if labels is None else np.where(labels == VEGETATION, _LEAVES, 0.01)
+    strength = reflected * np.clip(cosine, least, 1.0) / np.maximum(distance, 3.0) ** 2
     return np.asarray(rng.random(len(distance)) < (1.0 - _LOST) * (1.0 - np.exp(-1.1 * strength / _FAINTEST)))
 
 

@@ -75,7 +75,7 @@ def full_sweep(
     ray, normal, seen = rays[hit], normal[hit], labels[hit]
     cosine = np.abs(np.einsum("ij,ij->i", normal, ray)) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
     end = origin[hit] + ray * measured[hit, None]
-    kept = is_heard(rng, measured[hit], cosine, reflectance(end, seen, wet))
+    kept = is_heard(rng, measured[hit], cosine, reflectance(end, seen, wet), seen)
     hit, cosine = hit[kept], cosine[kept]
     noise = rng.normal(size=len(hit)) * model.noise * (1 + 0.5 * (1 - cosine))
     bias = np.random.default_rng(zlib.crc32(model.name.encode())).normal(size=beams) * model.beam_bias

@@ -68,8 +68,8 @@ def test_mixed_ranges_lie_between() -> None:
     clean, mixed = (ahead(Scene(builder.build()), divergence=d) for d in (0.0, 0.003))
     assert ((clean[:, 0] > 11.45) & (clean[:, 0] < 11.95)).sum() == 0  # apart from the sides of the bar
     between = (mixed[:, 0] > 11.25) & (mixed[:, 0] < 11.95)
-    # two edges x 64 beams; 0.994 of the beams at an edge are cut, 1.2 / (1.2 + 0.8) of these mix, 0.875 of these within the band
-    assert between.sum() == pytest.approx(2 * 64 * 0.994 * 0.6 * 0.875, rel=0.2)
+    # two edges x 64 beams; 0.994 of the beams at an edge are cut, 1.5 / (1.5 + 0.8) of these mix, 0.875 of these within the band
+    assert between.sum() == pytest.approx(2 * 64 * 0.994 * 0.652 * 0.875, rel=0.2)
     assert mixed[:, 0].min() > 11.19
     assert mixed[:, 0].max() < 12.01
 
@@ -78,7 +78,7 @@ def test_far_steps_rarely_mix_and_nothing_mixes_with_the_sky() -> None:
     grid = np.full((4000, 1), 5.0, np.float32)
     grid[1::2] = 65.0
     mixed = mixed_ranges(np.random.default_rng(0), grid, 0.003, 0.003)
-    assert ((mixed > 5.01) & (mixed < 64.99)).mean() == pytest.approx(1.2 / 61.2 * 2 * 0.5, rel=0.3)
+    assert ((mixed > 5.01) & (mixed < 64.99)).mean() == pytest.approx(1.5 / 61.5 * 2 * 0.5, rel=0.3)
     grid[1::2] = np.inf
     np.testing.assert_array_equal(mixed_ranges(np.random.default_rng(0), grid, 0.003, 0.003), grid)
 
@@ -91,10 +91,10 @@ def test_echoes_fade_with_range_and_incidence() -> None:
         return float(is_heard(rng, np.full(n, distance), np.full(n, cosine), np.full(n, reflected)).mean())
 
     assert heard(20.0, 1.0, 0.3) > 0.99
-    # asphalt from 1.73 m at 50 m: 0.18 * 1.73 / 50 / 50^2 = 2.49e-6, 1 - exp(-1.1)
-    assert heard(50.0, 1.73 / 50, 0.18) == pytest.approx(0.667, abs=0.02)
-    assert heard(70.0, 1.73 / 70, 0.18) < 0.4
-    assert heard(50.0, 1.73 / 50, 0.018) == pytest.approx(0.104, abs=0.02)  # wet
+    # asphalt from 1.73 m at 50 m: 0.18 * 1.73 / 50 / 50^2 = 2.49e-6, 1 - exp(-1.1 * 2.49 / 1.2)
+    assert heard(50.0, 1.73 / 50, 0.18) == pytest.approx(0.898, abs=0.02)
+    assert heard(90.0, 1.73 / 90, 0.18) < 0.4
+    assert heard(50.0, 1.73 / 50, 0.018) == pytest.approx(0.204, abs=0.02)  # wet
 
 
 def test_cars_lose_a_tenth_of_their_echoes_and_houses_a_hundredth() -> None:
