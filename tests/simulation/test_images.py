@@ -1,0 +1,114 @@
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semloc_logs.simulation.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
+from semloc_logs.simulation.conditions import Condition
+from semloc_logs.simulation.images import Painter
+from semloc_logs.simulation.noise import octaves
+from semloc_logs.simulation.street import build_street
+from semloc_logs.simulation.surfaces import road_plan, surfaces
+from semloc_logs.simulation.world import BUILDING, ROAD, MeshBuilder, Scene, World, box
+
+U8 = NDArray[np.uint8]
+STEREO = CAMERAS["stereo"]
+PATH = np.column_stack([np.arange(0.0, 160.0), np.zeros(160)])
+
+
+@pytest.fixture(scope="module")
+def street() -> World:
+    return build_street(PATH, 4)
+
+
+@pytest.fixture(scope="module")
+def painter(street: World) -> Painter:
+    return Painter(Scene(street))
+
+
+def pose(x: float) -> NDArray[np.float64]:
+    world_T_base = np.eye(4)
+    world_T_base[:2, 3] = x, -1.5
+    return world_T_base @ base_T_camera(STEREO)
+
+
+def inliers(a: U8, b: U8) -> int:
+    sift, grey = cv2.SIFT.create(), [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in (a, b)]
+    (ka, da), (kb, db) = (sift.detectAndCompute(g, None) for g in grey)
+    good = [m for m, n in cv2.BFMatcher().knnMatch(da, db, k=2) if m.distance < 0.8 * n.distance]
+    pa, pb = np.array([ka[m.queryIdx].pt for m in good]), np.array([kb[m.trainIdx].pt for m in good])
+    return int(cv2.findFundamentalMat(pa, pb, cv2.FM_RANSAC, 1.5, 0.999)[1].sum())
+
+
+def test_neighbouring_pictures_match_and_others_do_not(painter: Painter) -> None:
+    """More than 100 inliers from 1.5 m away, fewer than 30 from another place."""
+    rng = np.random.default_rng(0)
+    here, near, elsewhere = (painter.picture(pose(x), rng, STEREO) for x in (30.0, 31.5, 110.0))
+    assert here.shape == (360, 640, 3)
+    assert here.dtype == np.uint8
+    assert inliers(here, near) > 100
+    assert inliers(here, elsewhere) < 30
+
+
+def test_depth_comes_back_from_a_pair(painter: Painter) -> None:
+    rng, left = np.random.default_rng(1), pose(60.0)
+    right = left.copy()
+    right[:3, 3] += STEREO.baseline * left[:3, 0]
+    hits = first_hits(painter.scene, left, pixel_rays(STEREO))
+    pair = [painter.picture(left, rng, STEREO, hits=hits), painter.picture(right, rng, STEREO)]
+    matcher = cv2.StereoSGBM.create(0, 112, 5, 200, 800, 1, 31, 10, 100, 2, mode=cv2.STEREO_SGBM_MODE_HH)
+    disparity = matcher.compute(*(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in pair)) / 16
+    found = (disparity > 1) & np.isfinite(hits.depth)
+    error = disparity[found] - STEREO.focal * STEREO.baseline / hits.depth[found]
+    assert found.sum() > 0.5 * np.isfinite(hits.depth).sum()
+    assert abs(np.median(error)) < 0.2
+    assert (np.abs(error) < 1).mean() > 0.7
+
+
+def test_surfaces_keep_their_colours_between_sessions(street: World) -> None:
+    other = build_street(PATH, 4, Condition(1))
+    a, b = surfaces(street), surfaces(other)
+    houses_a, houses_b = (set(s.seed[s.piece[w.labels == BUILDING]].tolist()) for s, w in ((a, street), (b, other)))
+    assert houses_a == houses_b
+    assert len(houses_a) > 5
+
+
+def test_light_and_season_change_the_picture(street: World) -> None:
+    def mean(condition: Condition, label: int) -> NDArray[np.float64]:
+        painter = Painter(Scene(street), condition)
+        hits = first_hits(painter.scene, pose(30.0), pixel_rays(STEREO))
+        picture = painter.picture(pose(30.0), np.random.default_rng(0), STEREO, hits=hits)
+        return np.asarray(picture[hits.labels == label].mean(0), np.float64)
+
+    summer, snow = (mean(Condition(season=season, daytime="overcast"), 9) for season in ("summer", "snow"))
+    assert snow.mean() > summer.mean() + 30  # lawns
+    evening = mean(Condition(daytime="evening"), 255)
+    noon = mean(Condition(), 255)
+    assert evening[0] - evening[2] > noon[0] - noon[2] + 20  # redder sky
+
+
+def test_a_box_casts_a_shadow() -> None:
+    builder = MeshBuilder(lambda x, y: np.zeros_like(x))
+    builder.add(box(60, 60, 0.5, z=-0.5), ROAD, ground="none")
+    builder.add(box(40, 1, 10, x=20, y=-6), BUILDING, ground="none")  # the sun of noon stands behind it
+    painter = Painter(Scene(builder.build()))
+    camera = base_T_camera(STEREO)
+    picture = painter.picture(camera, np.random.default_rng(0), STEREO).mean(2)
+    dark, bright = picture[330, 560:600].mean(), picture[330, 40:80].mean()  # the shadow is 10 / tan(0.9) = 7.9 m long
+    assert dark < 0.7 * bright
+
+
+def test_noise_fades_with_the_size_of_the_pixel() -> None:
+    points = np.random.default_rng(0).uniform(-50, 50, (2000, 3)).astype(np.float32)
+    near, far = (octaves(points, np.full(2000, f, np.float32), 1.0, 4, 0.8, 1.0, 3) for f in (0.001, 3.0))
+    assert 0.2 < near.std() < 1.5
+    assert abs(near.mean()) < 0.1
+    assert not far.any()
+
+
+def test_the_plan_knows_kerb_and_middle(street: World) -> None:
+    plan = road_plan(street)
+    column, row = ((np.array([80.0, 0.0]) - plan.corner) / plan.cell).astype(int)
+    half = plan.half_width[row, column]
+    assert 2.0 < half < 6.0
+    assert abs(plan.beside[row, column] - half) < 0.5
