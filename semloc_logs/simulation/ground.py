@@ -16,6 +16,7 @@ from semloc_logs.simulation.world import F64, ROAD, SIDEWALK, TERRAIN, Mesh
 CELL = 0.5  # m; kerbs are exact to half of it
 MARGIN = 48.0  # m of ground beside a road
 KERB = 0.12  # m
+_DEPTH = 0.5  # m of what is dug up
 CLEAR = 1.4  # m to either side of a driven line
 
 
@@ -30,6 +31,9 @@ class Ground:
     beside: NDArray[np.float32] = field(init=False)  # metres from the edge of the carriageway, negative on it
     free: NDArray[np.bool_] = field(init=False)
     paved: NDArray[np.bool_] = field(init=False)  # terrain that is stone or asphalt: drives, yards, squares
+    dug: NDArray[np.bool_] = field(init=False)  # dug up by roadworks
+    closed: NDArray[np.bool_] = field(init=False)  # sites of roadworks
+    covered: NDArray[np.bool_] = field(init=False)  # under bridges
     clear: NDArray[np.bool_] = field(init=False)  # lanes that are driven: nothing may stand there
     _waves: F64 = field(init=False)
     _bank: tuple[float, float] = field(init=False)
@@ -57,7 +61,7 @@ class Ground:
         kind = np.where(self.beside < 0, ROAD, np.where(walk < 0, SIDEWALK, TERRAIN))
         self.kind = np.where(self.beside > MARGIN, 255, kind).astype(np.uint8)
         self.free = self.kind == TERRAIN
-        self.paved = np.zeros_like(self.free)
+        self.paved, self.dug, self.closed, self.covered = (np.zeros_like(self.free) for _ in range(4))
         wavelength = self.rng.uniform([25, 60, 90, 150], [60, 120, 200, 400])
         slope = self.rng.uniform(0, [0.006, 0.012, 0.02, 0.03])
         angle, phase = self.rng.uniform(0, 2 * np.pi, (2, 4))
@@ -98,13 +102,32 @@ class Ground:
         rise = bank * np.clip(beside - start, 0, 12.0) * (1 + 0.5 * np.sin(0.03 * x + 0.05 * y))
         return np.where(kind == ROAD, 0.0, KERB + np.where(kind == TERRAIN, rough + rise, 0.0))
 
+    def _snow(self, x: F64, y: F64, kind: NDArray[np.uint8], beside: NDArray[np.float32], deep: float) -> F64:
+        """How thick the snow lies: as good as cleared off the road, heaped up along the kerb."""
+        drift = 1 + 0.25 * np.sin(0.9 * x - 0.6 * y) + 0.15 * np.sin(1.7 * y + 0.4 * x)
+        bank = 0.45 * np.clip(0.5 + np.sin(0.21 * x + 0.17 * y), 0, 1) * np.clip(1 - np.abs(beside - 0.5) / 0.7, 0, 1)
+        return np.where(kind == ROAD, 0.02, deep * drift + bank)
+
     def allowed(self, points: F64) -> bool:
         """Whether all plan points (n, 2) are free ground."""
         return bool(self.free[self.cell(points[:, 0], points[:, 1])].all())
 
     def on_road(self, x: float, y: float) -> bool:
-        """Whether a plan position is carriageway or at its very edge."""
-        return bool(self.beside[self.cell(np.array([x]), np.array([y]))][0] < 0.15)
+        """Whether a plan position is carriageway, at its very edge, or under a bridge."""
+        cell = self.cell(np.array([x]), np.array([y]))
+        return bool(self.beside[cell][0] < 0.15 or self.covered[cell][0])
+
+    def cover(self, points: F64) -> None:
+        """Mark plan points (n, 2) as lying under a bridge, where nothing grows."""
+        self.covered[self.cell(points[:, 0], points[:, 1])] = True
+
+    def is_closed(self, x: float, y: float) -> bool:
+        """Whether a plan position is in a site of roadworks."""
+        return bool(self.closed[self.cell(np.array([x]), np.array([y]))][0])
+
+    def close(self, points: F64) -> None:
+        """Close plan points (n, 2) for roadworks."""
+        self.closed[self.cell(points[:, 0], points[:, 1])] = True
 
     def passable(self, parts: list[tuple[Mesh, int]], headroom: float = 2.6) -> bool:
         """Whether lanes stay clear below ``headroom`` metres when a thing, z counted from the ground, stands where it is."""
@@ -119,11 +142,17 @@ class Ground:
         """Mark plan points (n, 2) as built upon."""
         self.free[self.cell(points[:, 0], points[:, 1])] = False
 
-    def mesh(self) -> tuple[Mesh, NDArray[np.uint8]]:
-        """The ground with its kerbs, heights absolute, and the label of each triangle."""
+    def dig(self, points: F64) -> None:
+        """Dig the ground up at plan points (n, 2), lanes left out."""
+        cell = self.cell(points[:, 0], points[:, 1])
+        self.dug[cell] = ~self.clear[cell]
+
+    def mesh(self, snow: float = 0.0) -> tuple[Mesh, NDArray[np.uint8]]:
+        """The ground with its kerbs, heights absolute, and the label of each triangle; ``snow`` metres deep where nobody drives."""
         i, j = np.nonzero(self.kind != 255)
-        kind = self.kind[i, j]
+        kind, dug = self.kind[i, j], self.dug[i, j]
         label = np.where(self.paved[i, j] & (kind == TERRAIN), SIDEWALK, kind)
+        label = np.where(dug, TERRAIN, label)
         slope = [np.asarray(np.gradient(self.beside, CELL, axis=k), np.float32) for k in (0, 1)]
         corners = np.zeros((len(i), 4, 3))
         for k, (di, dj) in enumerate(((0, 0), (1, 0), (1, 1), (0, 1))):
@@ -132,14 +161,16 @@ class Ground:
             # corners next to the kerb move onto it, so that it runs smooth across the raster
             near = np.where(np.abs(at) < 0.6 * CELL, at, 0.0)
             x, y = (c - near * _at_corners(g, i + di, j + dj) for c, g in zip((x, y), slope, strict=True))
-            corners[:, k] = np.column_stack([x, y, self.slope_height(x, y) + self._step(x, y, kind, at)])
+            up = self._step(x, y, kind, at) - _DEPTH * dug + (self._snow(x, y, kind, at, snow) if snow else 0.0)
+            corners[:, k] = np.column_stack([x, y, self.slope_height(x, y) + up])
         start = 4 * np.arange(len(i), dtype=np.int64)[:, None]
         triangles = [start + np.array([0, 1, 2]), start + np.array([0, 2, 3])]
         labels = [label, label]
         number = np.full(self.kind.shape, -1, np.int64)
         number[i, j] = np.arange(len(i))
         for (a, b), (c, d), here, there in (((1, 2), (0, 3), np.s_[:-1, :], np.s_[1:, :]), ((3, 2), (0, 1), np.s_[:, :-1], np.s_[:, 1:])):
-            step = ((self.kind[here] == ROAD) != (self.kind[there] == ROAD)) & (number[here] >= 0) & (number[there] >= 0)
+            step = ((self.kind[here] == ROAD) != (self.kind[there] == ROAD)) | (self.dug[here] != self.dug[there])
+            step &= (number[here] >= 0) & (number[there] >= 0)
             p, q = 4 * number[here][step], 4 * number[there][step]
             triangles += [np.column_stack([p + a, p + b, q + d]), np.column_stack([p + a, q + d, q + c])]
             labels += [np.full(len(p), SIDEWALK, np.uint8)] * 2

@@ -15,7 +15,10 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Road:
-    """A road between crossings ``a`` and ``b``: centre line (n, 2) about every metre, half the carriageway, pavement, parking lanes."""
+    """A road between crossings ``a`` and ``b``: centre line (n, 2) about every metre, half the carriageway, pavement, parking lanes.
+
+    Roads of one ``look`` have the same houses and trees on both sides.
+    """
 
     a: int
     b: int
@@ -23,6 +26,7 @@ class Road:
     half_width: float
     sidewalk: float
     parking: bool
+    look: int | None = None
 
     @property
     def lane(self) -> float:

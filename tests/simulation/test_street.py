@@ -15,7 +15,7 @@ from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path,
 from semloc_logs.simulation.street import build_street, street_ground
 from semloc_logs.simulation.traffic import random_traffic
 from semloc_logs.simulation.trajectory import drifting_odometry, drive, poses_along, smooth_line
-from semloc_logs.simulation.world import ROAD, SIDEWALK, TERRAIN, VEGETATION, Scene, World
+from semloc_logs.simulation.world import BUILDING, FENCE, POLE, ROAD, SIDEWALK, TERRAIN, TRAFFIC_SIGN, VEGETATION, Scene, World
 
 
 @pytest.fixture(scope="module")
@@ -192,3 +192,73 @@ def test_halls_are_closed_and_walked_inside() -> None:
         distance, _, _ = Scene(world).cast(origins.astype(np.float32), directions.astype(np.float32))
         assert np.isinf(distance).mean() < 0.01
         assert distance[np.isfinite(distance)].max() < 80
+
+
+def test_snow_lies_where_nobody_drives(network: RoadNetwork) -> None:
+    summer, snow = build_street(network, 4), build_street(network, 4, Condition(0, "snow"))
+    route = random_route(np.random.default_rng(0), network, 150)
+    line = smooth_line(lane_path(network, route))
+    poses = poses_along(line, np.arange(3.0, 140.0), street_ground(network, 4).slope_height, np.random.default_rng(0), shake=0.0)
+    road = poses[:, :3, 3] + [0, 0, 0.5]
+    down = np.tile(np.array([0, 0, -1], np.float32), (len(road), 1))
+    distance, triangle, _ = Scene(snow).cast(road.astype(np.float32), down)
+    assert (snow.labels[triangle] == ROAD).all()
+    assert np.abs(distance - 0.48).max() < 0.03
+    ground = street_ground(network, 4)
+    cells = np.argwhere((ground.kind == TERRAIN) & (ground.beside > 3))[::200]
+    above = np.column_stack([ground.corner + 0.5 * (cells + 0.5), np.full(len(cells), 100.0)]).astype(np.float32)
+    rays = np.tile(np.array([0, 0, -1], np.float32), (len(above), 1))
+    before, after = (Scene(world).cast(above, rays) for world in (summer, snow))
+    same = (summer.labels[before[1]] == TERRAIN) & (snow.labels[after[1]] == TERRAIN)
+    rise = (before[0] - after[0])[same]
+    assert same.sum() > 50
+    assert 0.05 < rise.min() < rise.max() < 0.5
+    roofs = (summer.labels[before[1]] == BUILDING) & (snow.labels[after[1]] == BUILDING)
+    assert 0.09 < np.median((before[0] - after[0])[roofs]) < 0.31
+
+
+def test_houses_and_trunks_are_the_same_in_every_season(network: RoadNetwork) -> None:
+    houses = [
+        {face for face in faces(build_street(network, 4, Condition(0, season))) if face[-1] in (BUILDING, POLE, TRAFFIC_SIGN)}
+        for season in ("summer", "autumn", "winter", "snow")
+    ]
+    assert houses[0] == houses[1] == houses[2]
+    assert houses[0] < houses[3]
+
+
+def test_roadworks_close_a_side_and_leave_the_lane_open() -> None:
+    network = grid_network(np.random.default_rng(6), 2, 2, 70.0)
+    before, after = build_street(network, 6), build_street(network, 6, Condition(0, roadworks=40.0))
+    added = faces(after) - faces(before)
+    assert {FENCE, TERRAIN, 255} <= {face[-1] for face in added}
+    assert {f for f in faces(before) - faces(after) if f[-1] in (BUILDING, POLE, VEGETATION)} == set()
+    line = smooth_line(lane_path(network, random_route(np.random.default_rng(0), network, 300)))
+    poses = poses_along(line, np.arange(3.0, 280.0, 0.5), street_ground(network, 6).slope_height, np.random.default_rng(0), shake=0.0)
+    down = np.tile(np.array([0, 0, -1], np.float32), (len(poses), 1))
+    distance, triangle, _ = Scene(after).cast((poses[:, :3, 3] + [0, 0, 0.25]).astype(np.float32), down)
+    assert (after.labels[triangle] == ROAD).all()
+    assert np.abs(distance - 0.25).max() < 0.03
+
+
+def test_rebuilt_houses_are_other_houses_and_nothing_else_changes(network: RoadNetwork, world: World) -> None:
+    rebuilt = build_street(network, 4, Condition(0, rebuilt=0.4))
+    first, second = faces(world), faces(rebuilt)
+    assert {face[-1] for face in first - second} == {BUILDING}
+    assert {face[-1] for face in second - first} <= {BUILDING, FENCE}
+    kept = {f for f in first & second if f[-1] == BUILDING}
+    assert 0.3 < len(kept) / sum(f[-1] == BUILDING for f in first) < 0.95
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_stands_in_the_lanes(seed: int) -> None:
+    network = grid_network(np.random.default_rng(seed), 2, 2, 60.0)
+    scene = Scene(build_street(network, seed, Condition(1, roadworks=20.0, rebuilt=0.2)))
+    ground = street_ground(network, seed)
+    for route in ([(k, forwards)] for k in range(len(network.roads)) for forwards in (True, False)):
+        line = smooth_line(lane_path(network, route))
+        poses = poses_along(line, np.arange(2.0, 0.5 * len(line) - 3, 0.6), ground.slope_height, np.random.default_rng(0), shake=0.0)
+        for height in (0.3, 0.9, 1.6):
+            for side in (-1.1, 1.1):
+                origins = poses[:, :3, 3] + height * poses[:, :3, 2]
+                distance, _, _ = scene.cast(origins.astype(np.float32), (side * poses[:, :3, 1]).astype(np.float32))
+                assert (distance > 1).all()
