@@ -55,11 +55,14 @@ class Vocabulary:
         """Descriptors (n, N) in the dimensions of the code (n, 64)."""
         return np.asarray(grid(descriptors) @ self.projection.T)
 
+    def margins(self, descriptors: F32, cell: NDArray[np.integer]) -> F32:
+        """How far the projections of descriptors (n, N) lie above the thresholds of ``cell`` (n,) or (n, p): (n, 64) or (n, p, 64)."""
+        projected = self.projected(descriptors).reshape(len(descriptors), *[1] * (cell.ndim - 1), BITS)
+        return np.asarray(projected - self.thresholds[cell])
+
     def codes(self, descriptors: F32, cell: NDArray[np.integer]) -> NDArray[np.uint64]:
         """64-bit codes of descriptors (n, N) under the thresholds of ``cell`` (n,) or (n, p), in its shape; bit b is projection b."""
-        projected = self.projected(descriptors).reshape(len(descriptors), *[1] * (cell.ndim - 1), BITS)
-        bits = np.packbits(projected > self.thresholds[cell], axis=-1, bitorder="little")
-        return np.ascontiguousarray(bits).view("<u8").astype(np.uint64).reshape(cell.shape)
+        return codes_of(self.margins(descriptors, cell))
 
     def words(self, descriptors: F32) -> tuple[NDArray[np.uint16], NDArray[np.uint64]]:
         """Word (cell * 256 + child) and code of each descriptor (n, N)."""
@@ -73,6 +76,12 @@ class Vocabulary:
             mine = order[starts[c] : starts[c + 1]]
             child[mine] = nearest_centroids(projected[mine], self.children[c])[0]
         return (cell.astype(np.int64) * 256 + child).astype(np.uint16), self.codes(descriptors, cell)
+
+
+def codes_of(margins: F32) -> NDArray[np.uint64]:
+    """Codes (...) of ``margins`` (..., 64): bit b is whether margin b is above 0."""
+    bits = np.packbits(margins > 0, axis=-1, bitorder="little")
+    return np.ascontiguousarray(bits).view("<u8").astype(np.uint64)[..., 0]
 
 
 @njit(cache=True, nogil=True)

@@ -4,16 +4,18 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.words.index import Index
+from semloc_logs.words.index import SHORTLIST, Index, lowest_bit, popcount
 from semloc_logs.words.kmeans import grid, kmeans, nearest_centroids
 from semloc_logs.words.vocabulary import BITS, Vocabulary, load_vocabulary, save_vocabulary, train_vocabulary
 
@@ -105,47 +107,83 @@ def slow_search(
     v: Vocabulary,
     word: NDArray[np.uint16],
     code: NDArray[np.uint64],
-    group: NDArray[np.int64],
     d: F32,
+    cells: NDArray[np.int32],
     k: int,
-    probes: int,
     allowed: NDArray[np.bool_],
-) -> list[list[int]]:
-    """Distances of the k nearest allowed entries in the probed cells, of each query."""
-    cells = v.nearest_cells(d, probes)
-    out = []
-    for q in range(len(d)):
-        found = []
-        for cell in cells[q]:
-            own = int(v.codes(d[q : q + 1], cell[None])[0])
-            mine = np.flatnonzero((word // 256 == cell) & allowed[group])
-            found += [(own ^ int(code[e])).bit_count() for e in mine]
-        out.append(sorted(found)[:k])
-    return out
+) -> list[tuple[float, int, int]]:
+    """Asymmetric and Hamming distances and rows of the k nearest ``allowed`` (n,) entries in the ``cells`` of one descriptor."""
+    found = []
+    for e in np.flatnonzero(np.isin(word // 256, cells) & allowed):
+        margin = v.projected(d[None])[0].astype(float) - v.thresholds[word[e] // 256]
+        differs = [(int(code[e]) >> b & 1) != (margin[b] > 0) for b in range(BITS)]
+        found.append((float(np.abs(margin[differs]).sum()), sum(differs), int(e)))
+    size = max(SHORTLIST, k)
+    farthest = sorted(f[1] for f in found)[min(size, len(found)) - 1] if found else 0
+    return sorted(f for f in found if f[1] <= farthest)[:k]
 
 
-@given(st.integers(0, 1000), st.integers(1, 9), st.integers(1, 12), st.lists(st.booleans(), min_size=5, max_size=5))
+@given(st.integers(0, 1000), st.integers(1, 40), st.integers(1, 12), st.lists(st.booleans(), min_size=5, max_size=5))
 @settings(max_examples=15, deadline=None)
 def test_the_nearest_words_are_those_of_brute_force(seed: int, k: int, probes: int, allow: list[bool]) -> None:
     v = TRAINED
-    d, q = unit(seed, 200), unit(seed + 1, 8)
+    d, q = unit(seed, 300), unit(seed + 1, 8)
     word, code = v.words(d)
-    group = np.random.default_rng(seed).integers(0, 5, 200)
+    group = np.random.default_rng(seed).integers(0, 5, 300)
     allowed = np.array(allow)
-    index = Index(v, word, code, group)
-    m = index.search(q, k, probes, allowed)
-    expected = slow_search(v, word, code, group, q, k, probes, allowed)
+    m = Index(v, word, code, group).search(q, k, probes, allowed)
     cells = v.nearest_cells(q, probes)
     for i in range(len(q)):
+        expected = slow_search(v, word, code, q[i], cells[i], k, allowed[group])
+        row = {e: (asymmetric, hamming) for asymmetric, hamming, e in slow_search(v, word, code, q[i], cells[i], 300, allowed[group])}
         mine = m.query == i
-        assert m.distance[mine].tolist() == expected[i]
-        entries = m.entry[mine]
-        assert len(set(entries.tolist())) == len(entries)
-        assert allowed[group[entries]].all()
-        for e, distance in zip(entries, m.distance[mine], strict=True):
-            cell = word[e] // 256
-            assert cell in cells[i]
-            assert (int(code[e]) ^ int(v.codes(q[i : i + 1], np.array([cell]))[0])).bit_count() == distance
+        entries = m.entry[mine].tolist()
+        assert len(set(entries)) == len(entries) == len(expected)
+        assert m.distance[mine].tolist() == [row[e][1] for e in entries]
+        np.testing.assert_allclose([row[e][0] for e in entries], [f[0] for f in expected], rtol=1e-6, atol=1e-7)
+
+
+def _count(x: NDArray[np.uint64]) -> list[tuple[int, int]]:
+    return [(popcount(v), lowest_bit(v)) for v in x]
+
+
+_counted: Any = njit(_count)
+
+
+@given(st.lists(st.integers(1, 2**64 - 1), min_size=1, max_size=20))
+@settings(max_examples=30, deadline=None)
+def test_bits_are_counted(values: list[int]) -> None:
+    assert _counted(np.array(values, np.uint64)) == [(v.bit_count(), (v & -v).bit_length() - 1) for v in values]
+
+
+def test_what_is_found_does_not_depend_on_the_other_queries() -> None:
+    """The bound that a query begins with is the one before's: far and near queries in either order, and alone, find the same."""
+    near = unit(3, 400)
+    far = unit(77, 30, centres=3, spread=3.0)
+    word, code = TRAINED.words(near)
+    index = Index(TRAINED, word, code, np.zeros(400, np.int64))
+    mixed = np.stack([near[:30], far], 1).reshape(60, 256)
+
+    def found(q: F32) -> list[tuple[int, int, int]]:
+        m = index.search(q, 5, 3, np.array([True]))
+        return list(zip(m.query.tolist(), m.entry.tolist(), m.distance.tolist(), strict=True))
+
+    together = found(mixed)
+    assert sorted((59 - q, e, d) for q, e, d in found(mixed[::-1])) == sorted(together)
+    assert [(q + i, e, d) for i in range(60) for q, e, d in found(mixed[i : i + 1])] == together
+
+
+def test_a_bit_that_is_sure_outweighs_two_that_are_not() -> None:
+    """One cell, thresholds 0: the query's projections are 0.5, -0.01, -0.01 and nothing else."""
+    projection = np.eye(64, dtype=np.float32)
+    cell = np.full((1, 64), 0.125, np.float32)
+    v = Vocabulary(cell, projection, np.zeros((1, 64), np.float32), np.zeros((1, 1, 64), np.float32))
+    query = np.zeros((1, 64), np.float32)
+    query[0, :3] = 0.5, -0.01, -0.01
+    code = np.array([0b000, 0b111, 0b001], np.uint64)
+    m = Index(v, np.zeros(3, np.uint16), code, np.zeros(3, np.int64)).search(query, 3, 1, np.array([True]))
+    assert m.entry.tolist() == [2, 1, 0]
+    assert m.distance.tolist() == [0, 2, 1]
 
 
 TRAINED = train_vocabulary(unit(0, 600), cells=9, children=3)
