@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .console import console
-from .options import Command, console_options, json_option, pairs, settings_options
+from .options import Command, console_options, json_option, pairs, path_option, settings_options
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Settings
@@ -36,9 +36,20 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
     metavar="NAME=PYTHON",
     multiple=True,
     callback=pairs,
-    help="A mapper to run beside fusion and the Python that has it (benchmarks/README.md): octomap or kiss_slam; repeatable.",
+    help="What to compare with and the Python that has it (benchmarks/README.md): octomap or kiss_slam for fusion, fpfh for retrieval.",
 )
 @click.option("--lengths", default="1,4,16", callback=_lengths, help="Multiples of a drive of 250 m, for memory; default 1,4,16.")
+@click.option(
+    "--variant",
+    type=click.Choice(["semantic", "geometric", "both"]),
+    default="semantic",
+    show_default=True,
+    help="Network with classes, without, or both, for retrieval and completion.",
+)
+@path_option("--weights", help="Weights instead of the shipped ones, for retrieval and completion.")
+@click.option("--database", type=click.IntRange(1), default=100_000, show_default=True, metavar="N", help="Descriptors, for retrieval.")
+@click.option("--queries", type=click.IntRange(1), default=2000, show_default=True, metavar="N", help="Words that ask, for retrieval.")
+@path_option("--work", help="Folder that keeps the simulated streets, for retrieval and completion.")
 @json_option
 @settings_options
 @console_options
@@ -48,6 +59,11 @@ def command(
     truth: Path | None,
     peers: dict[str, str],
     lengths: tuple[int, ...],
+    variant: str,
+    weights: Path | None,
+    database: int,
+    queries: int,
+    work: Path | None,
     as_json: bool,
     settings: Settings,
 ) -> int:
@@ -56,8 +72,9 @@ def command(
     NAME is reading, fusion, encoder, search or annotate (on simulated data; fusion takes sweeps of LOGs too), memory (peak of fusing
     drives of several lengths), fuse (one session of the LOGs, beside reading and integrating alone), pipeline (seconds, memory and
     profile of a run on the LOGs), words (recall of word matches between two LOGs whose truth is known, trained weights beside random
-    ones), labels (classes from geometry against the labels recorded in the LOGs), or realism (simulated sweeps beside the labelled ones of
-    the LOGs). Close other programs first: times are wall-clock.
+    ones), labels (classes from geometry against the labels recorded in the LOGs), realism (simulated sweeps beside the labelled ones of
+    the LOGs), or retrieval (recall of descriptors on held-out simulated streets and, with --truth, of the first LOG's in the second
+    one's). Close other programs first: times are wall-clock.
 
     \b
     Example:  semloc benchmark reading --json
@@ -66,19 +83,31 @@ def command(
               semloc benchmark words monday.mcap tuesday.bag --truth truth.json
               semloc benchmark labels labelled.mcap
               semloc benchmark realism labelled.mcap
+              semloc benchmark retrieval --work streets --peer fpfh=open3d/bin/python
     """
     if name == "words" and (len(logs) != 2 or truth is None):
         raise click.UsageError("words needs two logs and --truth FILE.")
+    if name == "retrieval" and ((truth is None) != (not logs) or len(logs) not in (0, 2)):
+        raise click.UsageError("retrieval takes two logs and --truth FILE, or neither.")
     if name in ("pipeline", "fuse", "labels", "realism") and not logs:
         raise click.UsageError(f"{name} needs at least one log.")
     with console.progress():
-        figures, rows = _measure(name, logs, truth, peers, lengths, settings)
+        if name == "retrieval":
+            from semloc_logs.evaluation.retrieval_benchmark import RetrievalChoice, retrieval_benchmark
+            from semloc_logs.profiling import real_streets
+
+            variants = ("semantic", "geometric") if variant == "both" else (variant,)
+            real = real_streets(logs, truth, settings) if truth is not None else None
+            rows: Rows = []
+            figures = retrieval_benchmark(RetrievalChoice(variants, weights, database, queries, work), peers, settings, real, console.note)
+        else:
+            figures, rows = _measure(name, logs, truth, peers, lengths, settings)
     if as_json:
         console.result_json(figures)
         return 0
-    others = list(dict.fromkeys(p for row in figures.values() for p in row if p not in ("ours", "unit")))
-    drawn = [(figure, *(_number(row.get(column)) for column in ("ours", *others)), str(row["unit"])) for figure, row in figures.items()]
-    console.table(name, ("figure", "ours#", *(f"{p}#" for p in others), "unit"), drawn)
+    columns = sorted(dict.fromkeys(p for row in figures.values() for p in row if p != "unit"), key=lambda p: p != "ours")
+    drawn = [(figure, *(_number(row.get(column)) for column in columns), str(row["unit"])) for figure, row in figures.items()]
+    console.table(name, ("figure", *(f"{p}#" for p in columns), "unit"), drawn)
     if rows:
         console.table(
             "where the time goes", ("s#", "calls#", "function"), [(f"{own:.2f}", str(calls), where) for own, calls, where in rows]

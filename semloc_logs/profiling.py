@@ -16,12 +16,12 @@ from unittest.mock import patch
 
 import numpy as np
 
-from semloc_logs.closures.queries import SessionMap, query_keyframes
+from semloc_logs.closures.queries import SessionMap
 from semloc_logs.engines import make_engine
 from semloc_logs.errors import SemlocError
-from semloc_logs.evaluation.retrieval import word_recall
+from semloc_logs.evaluation.places import Street
+from semloc_logs.evaluation.retrieval import real_street, true_queries, word_recall
 from semloc_logs.evaluation.truth import read_truth
-from semloc_logs.geometry import inverse
 from semloc_logs.logs.session import open_session
 from semloc_logs.settings import Settings
 from semloc_logs.stages import fuse, run, session_name
@@ -249,15 +249,7 @@ def word_recalls(logs: Sequence[Path], truth: Path, settings: Settings) -> Figur
         maps = {name: SessionMap(work.session(name)) for name in sessions}
         target, query = maps.values()
         tracks = read_truth(truth, maps)
-        common = {name: tracks[name].at(m.stamps_ns)[0] for name, m in maps.items()}
-        pairs = []
-        for k in query_keyframes(query, settings):
-            here = common[query.folder.name][k]
-            away = np.linalg.norm(common[target.folder.name][:, :3, 3] - here[:3, 3], axis=1)
-            near = int(np.argmin(away))
-            if away[near] < 10.0:
-                targetmap_T_common = target.map_T_base[near] @ inverse(common[target.folder.name][near])
-                pairs.append((k, targetmap_T_common @ here @ inverse(query.map_T_base[k])))
+        pairs = true_queries(query, target, tracks, settings)
         figures: Figures = {}
         for variant in ("semantic", "geometric"):
             trained = load_encoder(variant, settings.descriptor.weights), load_vocabulary(variant, settings.descriptor.vocabulary)
@@ -271,3 +263,21 @@ def word_recalls(logs: Sequence[Path], truth: Path, settings: Settings) -> Figur
                 row: dict[str, float | str] = {who: float(np.mean([getattr(r, how) for r in rs])) for who, rs in found.items() if rs}
                 figures[f"{variant}, {'by descriptor' if how == 'exact' else 'by word and code'}"] = row | {"unit": "recall at 5"}
         return figures
+
+
+def real_streets(logs: Sequence[Path], truth: Path, settings: Settings) -> dict[str, Street]:
+    """For `semloc benchmark retrieval`: what the first log's queries and the second one's map are, with the log's labels and with those
+    from geometry, by the names of :data:`semloc_logs.evaluation.retrieval_benchmark.REAL`."""
+    settings = settings.resolved()
+    out: dict[str, Street] = {}
+    for source, names in (("auto", ("real_log", "real_geometric")), ("geometry", ("real_geometry_labels",))):
+        labelled = settings.model_copy(update={"labels": settings.labels.model_copy(update={"source": source})})
+        with tempfile.TemporaryDirectory(prefix="semloc-real-") as folder:
+            work = Workspace(Path(folder))
+            sessions = {session_name(log): [log] for log in logs}
+            fuse(sessions, work, labelled, {}, make_engine("serial"), lambda _: None)
+            maps = {name: SessionMap(work.session(name)) for name in sessions}
+            query, target = maps.values()
+            tracks = read_truth(truth, maps)
+            out |= {name: real_street(query, target, tracks, name, labelled) for name in names}
+    return out

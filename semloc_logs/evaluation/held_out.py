@@ -8,6 +8,7 @@ the true one, of a frame of unknown heading, so that what is left is anything up
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
+from semloc_logs import simulation
 from semloc_logs.errors import SettingsError, WorkspaceError
+from semloc_logs.evaluation.places import Place, Street, asked_place, map_place, read_street, write_street
 from semloc_logs.geometry import apply, inverse, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.camera import CAMERAS, camera_points
@@ -30,19 +32,18 @@ from semloc_logs.simulation.street import build_street, street_ground
 from semloc_logs.simulation.traffic import Traffic, random_traffic
 from semloc_logs.simulation.trajectory import poses_along, smooth_line
 from semloc_logs.simulation.world import Scene
-from semloc_logs.subvolumes.cut import turn
-from semloc_logs.tables import read_metadata, read_table, write_table
+from semloc_logs.tables import read_metadata
 from semloc_logs.voxels.grid import BlockMap, Fuser
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
-I64 = NDArray[np.int64]
 Cloud = tuple[F32, F32, U8, F32 | None]  # points and sensor (base frame, m), labels, standard deviation of the range
 
 TOWNS = 9001  # seed of the first town: those of training count from 0
 APART = 10_000.0  # m between the towns in the common frame
-DATABASE_OF = {"0": "camera", "90": "camera", "180": "camera", "season": "lidar", "sensor": "lidar"}
+SENSORS = ("camera", "lidar")
+SCENARIOS = {"0": "camera", "90": "camera", "180": "camera", "season": "lidar"}  # and the sensor that asks
 SPACING, QUERY_SPACING = 1.5, 1.0  # m between frames
 FRAMES = (1, 5)  # of queries
 LIDAR, COLUMNS = MODELS["hdl64"], 900
@@ -50,37 +51,20 @@ SUMMER, LATER, SNOW = Condition(0), Condition(1), Condition(2, "snow")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
-    """A map: voxel states ``state`` (x, y, z) whose corner is voxel ``low`` (3,) of its frame, height of the ground there (m), the
-    sensor's places ``track`` (n, 3) in it (m), and its frame in the common one, ``common_T_map`` (4, 4)."""
-
-    state: U8
-    low: I64
-    ground_z: float
-    track: F64
-    common_T_map: F64
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Street:
-    """The maps of one street by sensor, and the queries of each scenario."""
-
-    database: dict[str, Place]
-    queries: dict[str, list[Place]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
-    """Held-out streets in a folder: as many as give ``database`` descriptors of each sensor; ``queries`` words of each scenario."""
+    """Held-out streets in a folder, as many as give ``database`` descriptors of each sensor, and others in memory; ``queries`` words of
+    each scenario."""
 
     paths: tuple[Path, ...]
     settings: Settings  # resolved
     database: int
     queries: int
+    others: tuple[Street, ...] = ()
 
     def streets(self) -> Iterator[Street]:
         """One street after the other."""
-        return map(read_street, self.paths)
+        yield from map(read_street, self.paths)
+        yield from self.others
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +87,12 @@ def held_out(
 ) -> HeldOut:
     """As many streets as give ``database`` descriptors of each sensor by ``count``, simulated where ``folder`` lacks them.
 
-    SettingsError when so many cannot be had.
+    Another version of the simulation has files of its own. SettingsError when so many cannot be had.
     """
+    folder = folder / _version()
     note = {"schema_version": 1, "fusion": settings.fingerprint("fusion"), "headings": settings.closures.headings, "extent": repr(extent)}
     paths: list[Path] = []
-    counts = dict.fromkeys(sorted(set(DATABASE_OF.values())), 0)
+    counts = dict.fromkeys(SENSORS, 0)
     for town in range(8):
         roads = len(_network(town, extent).roads)
         for road in np.random.default_rng([TOWNS + town, 91]).permutation(roads):
@@ -116,7 +101,7 @@ def held_out(
             path = folder / f"street-{town}-{road:03d}.parquet"
             if not _is_made(path, note):
                 street = simulate_street(town, int(road), settings, extent)
-                held = {kind: count(place) for kind, place in street.database.items()}
+                held = {kind: count(place) for kind, place in street.database}
                 write_street(path, street, {**note, "count": held})
             for kind, held in read_metadata(path)["count"].items():
                 counts[kind] += held
@@ -125,6 +110,12 @@ def held_out(
     if min(counts.values()) < database:
         raise SettingsError(f"{database} held-out descriptors cannot be had: {min(counts.values())} at most.")
     return HeldOut(tuple(paths), settings, database, queries)
+
+
+def _version() -> str:
+    """Of the simulation: a hash of its modules."""
+    package = Path(simulation.__file__).parent
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(package.glob("*.py")))).hexdigest()[:12]
 
 
 def _is_made(path: Path, note: dict[str, Any]) -> bool:
@@ -203,21 +194,22 @@ def simulate_street(town: int, road: int, settings: Settings, extent: Extent = E
 
     first = drive(SUMMER, 0.0)
     poses = first.poses(np.arange(0.0, first.length, SPACING))
-    database = {
-        "camera": _mapped(settings, [first.camera(p, 0.0) for p in poses], poses, common),
-        "lidar": _mapped(settings, [first.lidar(p) for p in poses], poses, common),
-    }
-    queries: dict[str, list[Place]] = {name: [] for name in DATABASE_OF if name != "sensor"}
-    for name, found in queries.items():
+    database = [
+        ("camera", _mapped(settings, [first.camera(p, 0.0) for p in poses], poses, common)),
+        ("lidar", _mapped(settings, [first.lidar(p) for p in poses], poses, common)),
+    ]
+    queries: dict[str, list[Place]] = {}
+    for name, sensor in SCENARIOS.items():
         again = drive(SNOW if name == "season" else LATER, float(rng.choice([-1, 1]) * rng.uniform(0.4, 1.2)))
+        found = queries.setdefault(name, [])
         for frames in FRAMES:
             for _ in range(extent.queries):
                 middle = rng.uniform(0.2, 0.8) * again.length
                 poses = again.poses(middle + QUERY_SPACING * (np.arange(frames, dtype=np.float64) - frames // 2))
-                yaw = np.radians(float(name)) * rng.choice([-1, 1]) if name != "season" else 0.0
-                clouds = [again.lidar(p) if name == "season" else again.camera(p, yaw) for p in poses]
+                yaw = np.radians(float(name)) * rng.choice([-1, 1]) if sensor == "camera" else 0.0
+                clouds = [again.camera(p, yaw) if sensor == "camera" else again.lidar(p) for p in poses]
                 found.append(_asked(settings, clouds, poses, common, float(rng.uniform(0, 2 * np.pi))))
-    return Street(database, {**queries, "sensor": queries["0"]})
+    return Street(database, queries)
 
 
 def _fuse(settings: Settings, clouds: list[Cloud], poses: F64, radius: float = np.inf) -> tuple[BlockMap, F64]:
@@ -232,65 +224,11 @@ def _fuse(settings: Settings, clouds: list[Cloud], poses: F64, radius: float = n
 
 def _mapped(settings: Settings, clouds: list[Cloud], poses: F64, common_T_map: F64) -> Place:
     blocks, track = _fuse(settings, clouds, poses)
-    low, high = blocks.bounds()
-    state = blocks.dense(low, tuple((high - low).tolist()))
-    return Place(state, low.astype(np.int64), float(np.median(poses[:, 2, 3])), track, common_T_map)
+    return map_place(blocks, track, float(np.median(poses[:, 2, 3])), common_T_map)
 
 
 def _asked(settings: Settings, clouds: list[Cloud], poses: F64, common_T_map: F64, heading: float) -> Place:
-    """A query of a frame whose ``heading`` in the map is turned back by the nearest of the search's headings; origin in the middle."""
-    v, radius = settings.fusion.voxel_size, settings.query.radius or 24.0
+    """A query in a frame of some ``heading`` in the map, its origin in the middle of the drive."""
     map_T_query = yaw_transform(heading, tuple(poses[len(poses) // 2][:3, 3]))
-    blocks, track = _fuse(settings, clouds, inverse(map_T_query) @ poses, radius)
-    step = 2 * np.pi / settings.closures.headings
-    yaw = step * round(heading / step)
-    low, high = blocks.bounds()
-    half = -(-int(radius / v + 16) // 8) * 8
-    state = blocks.dense(low, tuple((high - low).tolist()))
-    box = np.empty((2 * half, 2 * half, int(high[2] - low[2])), np.uint8)
-    turn(state, low.astype(np.int64), -yaw, np.array([0.0, 0.0, (low[2] + high[2]) / 2]), box)
-    turned = yaw_transform(yaw)
-    corner = np.array([-half, -half, low[2]], np.int64)
-    return Place(box, corner, 0.0, apply(turned, track), common_T_map @ map_T_query @ inverse(turned))
-
-
-# -- files
-
-
-def write_street(path: Path, street: Street, metadata: dict[str, Any]) -> None:
-    """A Parquet file with a row for each map."""
-    rows = [("database", kind, place) for kind, place in street.database.items()]
-    rows += [("query", name, place) for name, places in street.queries.items() if name != "sensor" for place in places]
-    columns = {
-        "part": pa.array([r[0] for r in rows]),
-        "kind": pa.array([r[1] for r in rows]),
-        "shape": pa.array([list(r[2].state.shape) for r in rows], pa.list_(pa.int64())),
-        "low": pa.array([r[2].low.tolist() for r in rows], pa.list_(pa.int64())),
-        "ground_z": pa.array([r[2].ground_z for r in rows]),
-        "track": pa.array([r[2].track.ravel().tolist() for r in rows], pa.list_(pa.float64())),
-        "common_T_map": pa.array([r[2].common_T_map.ravel().tolist() for r in rows], pa.list_(pa.float64())),
-        "state": pa.array([r[2].state.tobytes() for r in rows], pa.large_binary()),
-    }
-    write_table(path, pa.table(columns), metadata)
-
-
-def read_street(path: Path) -> Street:
-    """What :func:`write_street` wrote; WorkspaceError when it is missing or damaged."""
-    database: dict[str, Place] = {}
-    queries: dict[str, list[Place]] = {}
-    try:
-        for row in read_table(path).to_pylist():
-            place = Place(
-                np.frombuffer(row["state"], np.uint8).reshape(row["shape"]),
-                np.array(row["low"], np.int64),
-                float(row["ground_z"]),
-                np.array(row["track"], np.float64).reshape(-1, 3),
-                np.array(row["common_T_map"], np.float64).reshape(4, 4),
-            )
-            if row["part"] == "database":
-                database[row["kind"]] = place
-            else:
-                queries.setdefault(row["kind"], []).append(place)
-        return Street(database, {**queries, "sensor": queries["0"]})
-    except (KeyError, ValueError, TypeError):
-        raise WorkspaceError(f"{path} is no street of the retrieval benchmark: remove it, and it is simulated again.") from None
+    blocks, track = _fuse(settings, clouds, inverse(map_T_query) @ poses, settings.query.radius or 24.0)
+    return asked_place(blocks, track, 0.0, common_T_map @ map_T_query, settings)

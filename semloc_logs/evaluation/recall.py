@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from semloc_logs.evaluation.held_out import DATABASE_OF, HeldOut, Place
+from semloc_logs.evaluation.held_out import HeldOut
+from semloc_logs.evaluation.places import Place
 from semloc_logs.geometry import apply
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import MARGIN, SIZE
@@ -27,6 +28,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Describe = Callable[[Place, bool], Described]  # a place and whether it is a query -> centres (voxels of its frame) and descriptors
 
+DATABASES = {"0": ("camera",), "90": ("camera",), "180": ("camera",), "season": ("lidar",), "sensor": ("lidar",)}  # of each scenario
 NEAREST = 5
 RADIUS = 1.5  # m at 0.30 m voxels
 LAYER = 8  # voxels between the layers of a map
@@ -98,23 +100,28 @@ def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:
 
     The share of query words whose true place is among the 5 nearest (L2) of exactly ``world.database`` database words: one of those is
     within the larger of 1.5 m (at 0.30 m voxels) and half a cell's diagonal of it. Query words without any such database word do not count.
+    Scenarios other than the five have a database of their own name, filled up with that of the LIDAR.
     """
     v = world.settings.fusion.voxel_size
-    found: dict[str, list[Words]] = {kind: [] for kind in DATABASE_OF.values()}
-    asked: dict[str, list[Words]] = {name: [] for name in DATABASE_OF}
+    found: dict[str, list[Words]] = {}
+    asked: dict[str, list[Words]] = {}
     rng = np.random.default_rng(0)
     for street in world.streets():
-        for kind, place in street.database.items():
-            found[kind].append(_words(place, describe(place, False), v))
-        # the camera looking ahead asks twice
-        described = {id(place): describe(place, True) for places in street.queries.values() for place in places}
+        for kind, place in street.database:
+            found.setdefault(kind, []).append(_words(place, describe(place, False), v))
         for name, places in street.queries.items():
             for place in places:
-                words = _words(place, described[id(place)], v)
-                asked[name].append(words[rng.permutation(len(words.centre))[:WORDS]])
+                words = _words(place, describe(place, True), v)
+                asked.setdefault(name, []).append(words[rng.permutation(len(words.centre))[:WORDS]])
+    if "0" in asked:  # the camera that looks ahead asks the LIDAR's map too
+        asked["sensor"] = asked["0"]
     databases = {kind: _joined(parts) for kind, parts in found.items()}
     radius = true_radius(world.settings)
-    return {name: _recall(_joined(parts), databases[DATABASE_OF[name]], world, radius) for name, parts in asked.items()}
+    out = {}
+    for name, parts in asked.items():
+        kinds = DATABASES.get(name, (name, "lidar"))
+        out[name] = _recall(_joined(parts), _joined([databases[kind] for kind in kinds if kind in databases]), world, radius)
+    return out
 
 
 def true_radius(settings: Settings) -> float:

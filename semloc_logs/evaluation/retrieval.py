@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.queries import SessionMap, build_query
-from semloc_logs.geometry import inverse, yaw_transform
+from semloc_logs.closures.queries import SessionMap, build_query, query_keyframes, query_members
+from semloc_logs.evaluation.places import Place, Street, asked_place, map_place
+from semloc_logs.evaluation.truth import TrueTrack
+from semloc_logs.geometry import apply, inverse
 from semloc_logs.settings import Settings
-from semloc_logs.subvolumes.cut import turn
-from semloc_logs.subvolumes.describe import Described, describe_map
+from semloc_logs.subvolumes.describe import describe_map
 from semloc_logs.subvolumes.describing import describe_submap
 from semloc_logs.subvolumes.network import Encoder
+from semloc_logs.voxels.store import blocks_path, read_blocks
 from semloc_logs.words.index import Index
 from semloc_logs.words.vocabulary import Vocabulary, train_vocabulary
 
 F64 = NDArray[np.float64]
+NEAR = 10.0  # m from the target's road
+FAR = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +56,10 @@ def word_recall(
     parts = [describe_submap(target.folder, s["id"], s["ground_z"], target.road(s), encoder, settings) for s in target.submaps]
     centre = np.concatenate([p.centre for p in parts]) * v
     descriptor = np.concatenate([p.descriptor for p in parts])
-    asked, target_T_asked = _query_words(query, keyframe, targetmap_T_querymap, settings, encoder)
-    true = asked.centre * v @ target_T_asked[:3, :3].T + target_T_asked[:3, 3]
+    place = query_place(query, keyframe, targetmap_T_querymap, settings)
+    d = settings.descriptor
+    asked = describe_map(place.state, place.low, place.ground_z, v, encoder, d.query_stride, d.min_occupied)
+    true = apply(place.common_T_map, asked.centre.astype(np.float64) * v)
     distance = np.linalg.norm(true[:, None, :] - centre[None], axis=2)
     possible = distance.min(1) < radius
     if not possible.any():
@@ -68,23 +75,43 @@ def word_recall(
     return WordRecall(float(exact[possible].mean()), float(coded[possible].mean()), int(possible.sum()), len(centre), radius)
 
 
-def _query_words(
-    query: SessionMap, keyframe: int, targetmap_T_querymap: F64, settings: Settings, encoder: Encoder
-) -> tuple[Described, F64]:
-    """Words of the query turned to the nearest heading of the search, and the transform of their frame into the target's map frame."""
-    v = settings.fusion.voxel_size
-    asked, _ = build_query(query, keyframe, settings)
+def query_place(query: SessionMap, keyframe: int, targetmap_T_querymap: F64, settings: Settings) -> Place:
+    """The query at ``keyframe``, turned to the nearest heading of the search, and its place in the target's map frame."""
+    asked = build_query(query, keyframe, settings)[0].blocks
     querymap_T_query = np.eye(4)
     querymap_T_query[:3, 3] = query.map_T_base[keyframe][:3, 3]
-    target_T_query = targetmap_T_querymap @ querymap_T_query
-    step = 2 * np.pi / settings.closures.headings
-    yaw = step * round(float(np.arctan2(target_T_query[1, 0], target_T_query[0, 0])) / step)
-    low, high = asked.blocks.bounds()
-    half = -(-int((settings.query.radius or 24.0) / v + 16) // 8) * 8
-    box = np.empty((2 * half, 2 * half, int(high[2] - low[2])), np.uint8)
-    state = asked.blocks.dense(low, tuple((high - low).tolist()))
-    turn(state, low.astype(np.int64), -yaw, np.array([0.0, 0.0, (low[2] + high[2]) / 2]), box)
     ground = float(query.ground_z[keyframe] - query.map_T_base[keyframe][2, 3])
-    d = settings.descriptor
-    described = describe_map(box, np.array([-half, -half, low[2]]), ground, v, encoder, d.query_stride, d.min_occupied)
-    return described, target_T_query @ inverse(yaw_transform(yaw))
+    members = query_members(query, keyframe, settings)
+    track = np.stack([apply(inverse(querymap_T_query) @ query.map_T_base[i], query.origins[i][None])[0] for i in members])
+    return asked_place(asked, track, ground, targetmap_T_querymap @ querymap_T_query, settings)
+
+
+def true_queries(query: SessionMap, target: SessionMap, tracks: Mapping[str, TrueTrack], settings: Settings) -> list[tuple[int, F64]]:
+    """Keyframes of ``query`` that ask within 10 m of the target's road, each with the true ``targetmap_T_querymap`` (4, 4) there.
+
+    Maps drift: the transform is that of the target's keyframe that is nearest.
+    """
+    common = [tracks[m.folder.name].at(m.stamps_ns)[0] for m in (query, target)]
+    out = []
+    for k in query_keyframes(query, settings):
+        here = common[0][k]
+        away = np.linalg.norm(common[1][:, :3, 3] - here[:3, 3], axis=1)
+        near = int(np.argmin(away))
+        if away[near] < NEAR:
+            targetmap_T_common = target.map_T_base[near] @ inverse(common[1][near])
+            out.append((k, targetmap_T_common @ here @ inverse(query.map_T_base[k])))
+    return out
+
+
+def real_street(query: SessionMap, target: SessionMap, tracks: Mapping[str, TrueTrack], name: str, settings: Settings) -> Street:
+    """The submaps of ``target`` as a database and the queries of ``query``, both called ``name``; far away from every simulated street."""
+    common_T_map = np.eye(4)
+    common_T_map[1, 3] = -FAR
+    database = []
+    for submap in target.submaps:
+        blocks = read_blocks(blocks_path(target.folder.blocks, submap["id"]), with_votes=False)
+        frames = range(submap["first"], submap["last"] + 1)
+        track = np.stack([apply(target.map_T_base[i], target.origins[i][None])[0] for i in frames])
+        database.append((name, map_place(blocks, track, submap["ground_z"], common_T_map)))
+    places = [query_place(query, k, common_T_map @ T, settings) for k, T in true_queries(query, target, tracks, settings)]
+    return Street(database, {name: places})

@@ -1,0 +1,75 @@
+"""FPFH beside our descriptor: the same subvolumes of the same maps, described by Open3D in a Python environment of its own.
+
+Rusu et al., Fast Point Feature Histograms, ICRA 2009. The points are the centres of the occupied voxels, the support is a sphere as
+wide as a subvolume about the occupied voxel nearest to its centre. FPFH does not depend on the heading, so it is told none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from semloc_logs.errors import SemlocError, SettingsError
+from semloc_logs.evaluation.peers import runner
+from semloc_logs.evaluation.places import Place
+from semloc_logs.evaluation.recall import Describe
+from semloc_logs.subvolumes.cut import SIZE
+from semloc_logs.subvolumes.describe import Described
+from semloc_logs.subvolumes.pairs import occupied
+
+SECONDS = 6 * 3600.0
+CELLS = 2  # voxels along the edge of the cells that points are thinned to: with all points it takes four times as long
+
+
+def fpfh_describes(python: str, folder: Path, places: Iterable[tuple[Place, bool]], described: Describe, voxel_size: float) -> Describe:
+    """Describes those ``places`` (and whether each is a query) where ``described`` does; features are kept in ``folder``.
+
+    SettingsError when ``python`` cannot be started, SemlocError when Open3D fails.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for place, is_query in places:
+        key = _key(place, is_query)
+        centre = described(place, is_query).centre
+        if not len(centre) or (folder / f"features_{key}.npy").exists():
+            continue
+        np.save(folder / f"centres_{key}.npy", centre * voxel_size)
+        np.save(folder / f"track_{key}.npy", place.track)
+        points = (np.argwhere(occupied(place.state)) + place.low + 0.5) * voxel_size
+        np.save(folder / f"points_{key}.npy", points.astype(np.float32))
+    if any(folder.glob("points_*.npy")):
+        _run(python, folder, voxel_size)
+
+    def describe(place: Place, is_query: bool) -> Described:
+        centre = described(place, is_query).centre
+        if not len(centre):
+            return Described(centre, np.zeros((0, 33), np.float32))
+        found = np.load(folder / f"features_{_key(place, is_query)}.npy")
+        return Described(centre, found.astype(np.float32))
+
+    return describe
+
+
+def _key(place: Place, is_query: bool) -> str:
+    content = hashlib.sha256(place.state.tobytes())
+    content.update(place.low.tobytes() + np.float64(place.ground_z).tobytes() + place.track.tobytes() + bytes([is_query]))
+    return content.hexdigest()[:24]
+
+
+def _run(python: str, folder: Path, voxel_size: float) -> None:
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    command = [python, "-I", str(runner("fpfh")), str(folder), repr(SIZE / 2 * voxel_size), repr(CELLS * voxel_size)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=SECONDS)
+    except (OSError, subprocess.TimeoutExpired) as problem:
+        raise SettingsError(f"FPFH cannot be had from {python} ({problem}): give --peer fpfh=PYTHON that has open3d.") from None
+    if done.returncode:
+        said = done.stderr.strip().splitlines()
+        raise SemlocError(f"Peer fpfh failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md.")
+    for name in ("points", "centres", "track"):
+        for path in folder.glob(f"{name}_*.npy"):
+            path.unlink()

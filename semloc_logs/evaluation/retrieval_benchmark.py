@@ -1,0 +1,84 @@
+"""`semloc benchmark retrieval`: is the true place of a subvolume among its nearest descriptors, trained beside random and FPFH?"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from semloc_logs.errors import SettingsError
+from semloc_logs.evaluation.fpfh import fpfh_describes
+from semloc_logs.evaluation.held_out import HeldOut, held_out
+from semloc_logs.evaluation.places import Place, Street
+from semloc_logs.evaluation.recall import NoEncoder, count_subvolumes, network_describes, recalls, retrieval_recall
+from semloc_logs.settings import Settings
+from semloc_logs.subvolumes.describe import load_encoder, random_encoder
+
+Figures = dict[str, dict[str, float | str]]
+Note = Callable[[str], None]
+SEEDS = 3
+REAL = {"real_log": "semantic", "real_geometry_labels": "semantic", "real_geometric": "geometric"}  # scenarios and their network
+
+
+@dataclass(frozen=True, slots=True)
+class RetrievalChoice:
+    """What is measured: ``variants`` of the network, ``weights`` instead of the shipped ones, descriptors of the database and words
+    that ask in each scenario, ``work``: a folder that keeps the simulated streets."""
+
+    variants: tuple[str, ...] = ("semantic",)
+    weights: Path | None = None
+    database: int = 100_000
+    queries: int = 2000
+    work: Path | None = None
+
+
+def retrieval_benchmark(
+    choice: RetrievalChoice,
+    peers: Mapping[str, str],
+    settings: Settings,
+    real: Mapping[str, Street] | None = None,
+    note: Note = lambda _: None,
+) -> Figures:
+    """Recall at 5 of each scenario: ``trained``, ``random`` (mean of three seeds) and ``fpfh``, where ``peers`` says which Python has it.
+
+    ``real`` streets, by name of their scenario, are asked for among the simulated ones: those of ``REAL``.
+    SettingsError for another peer, or weights of one variant for both.
+    """
+    if set(peers) - {"fpfh"}:
+        raise SettingsError(f"Descriptors of '{next(iter(set(peers) - {'fpfh'}))}' cannot be compared with: give --peer fpfh=PYTHON.")
+    if choice.weights is not None and len(choice.variants) > 1:
+        raise SettingsError("One file of weights is for one variant: give --variant semantic or --variant geometric.")
+    settings = settings.resolved()
+    with ExitStack() as stack:
+        work = choice.work or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="semloc-retrieval-")))
+        streets = held_out(work / "streets", settings, count_subvolumes(settings), choice.database, choice.queries, on_progress=note)
+        figures: Figures = {}
+        fpfh: dict[str, float] = {}
+        for variant in choice.variants:
+            world = replace(streets, others=tuple(street for name, street in (real or {}).items() if REAL[name] == variant))
+            columns = {"trained": retrieval_recall(world, load_encoder(variant, choice.weights))}
+            note(f"{variant}: trained weights are measured")
+            found = [retrieval_recall(world, random_encoder(variant, seed)) for seed in range(SEEDS)]
+            columns["random"] = {name: float(np.mean([f[name] for f in found])) for name in found[0]}
+            note(f"{variant}: random weights are measured")
+            if "fpfh" in peers:
+                fpfh |= _fpfh(world, peers["fpfh"], work / "fpfh")
+                columns["fpfh"] = fpfh
+            for name in columns["trained"]:
+                row = name if variant == "semantic" or name.startswith("real") else f"{variant}_{name}"
+                figures[row] = {who: column[name] for who, column in columns.items()} | {"unit": "recall at 5"}
+        return figures
+
+
+def _fpfh(world: HeldOut, python: str, folder: Path) -> dict[str, float]:
+    def places() -> Iterator[tuple[Place, bool]]:
+        for street in world.streets():
+            yield from ((place, False) for _, place in street.database)
+            yield from ((place, True) for asked in street.queries.values() for place in asked)
+
+    same = network_describes(NoEncoder().eval(), world.settings)
+    return recalls(world, fpfh_describes(python, folder, places(), same, world.settings.fusion.voxel_size))
