@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
+from numpy.typing import NDArray
 
 from semloc_logs.simulation.world import BUILDING, CAR, F64, I64, WALL, Mesh, cylinder, place
 
 Parts = list[tuple[Mesh, int]]  # meshes about the foot of a thing, each with its Cityscapes train id
 Rng = np.random.Generator
+T = TypeVar("T", bound=np.generic)
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
 _FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -130,7 +134,7 @@ def snow_cover(parts: Parts, depth: float, steepest: float = 0.6) -> Parts:
     return result
 
 
-def grid(rows: F64, columns: F64) -> tuple[F64, F64]:
+def grid(rows: NDArray[T], columns: NDArray[T]) -> tuple[NDArray[T], NDArray[T]]:
     """All pairs of (n,) and (m,) as two arrays (n * m,)."""
     a, b = np.meshgrid(rows, columns, indexing="ij")
     return a.ravel(), b.ravel()
