@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import click
@@ -20,8 +21,13 @@ from .options import Command, console_options, json_option, overwrite_option, pa
 @click.option("--there-and-back", is_flag=True, help="Drive the trajectory the other way in every other session.")
 @click.option("--sensor", default="hdl32", show_default=True, help="Simulated lidar: hdl64, hdl32, vlp32, vlp16, rosette or raster.")
 @click.option("--rate", type=float, default=2.0, show_default=True, help="Sweeps a second (Hz).")
-@click.option("--format", "format_", default="mcap", show_default=True, help="Form of the logs: mcap or bag.")
+@click.option(
+    "--format", "format_", default="mcap", show_default=True, help="Form of the logs: mcap, protobuf (in MCAP), bag (ROS 1) or ros2."
+)
 @click.option("--label-noise", type=float, default=0.0, show_default=True, help="Share of wrong labels, 0 to 1.")
+@click.option("--drift", type=float, default=0.007, show_default=True, help="Drift of the odometry, share of the way.")
+@click.option("--imu-rate", type=float, default=20.0, show_default=True, help="Samples of the IMU a second (Hz).")
+@click.option("--wet", type=float, default=0.0, show_default=True, help="How wet the road is, 0 to 1.")
 @click.option("--season", default="summer", show_default=True, help="Season of each drive, in turn: summer,autumn,winter,snow.")
 @click.option("--roadworks", type=float, default=0.0, show_default=True, help="Roadworks a kilometre, from the second drive on.")
 @click.option("--rebuilt", type=float, default=0.0, show_default=True, help="Share of houses gone or new, from the second drive on.")
@@ -41,6 +47,9 @@ def command(
     rate: float,
     format_: str,
     label_noise: float,
+    drift: float,
+    imu_rate: float,
+    wet: float,
     season: str,
     roadworks: float,
     rebuilt: float,
@@ -68,12 +77,15 @@ def command(
             rate_hz=rate,
             format=format_,
             label_noise=label_noise,
+            drift=drift,
+            imu_hz=imu_rate,
+            wet=wet,
             seasons=[name.strip() for name in season.split(",")],
             roadworks=roadworks,
             rebuilt=rebuilt,
             overwrite=overwrite,
         )
-    logs = sorted(str(p) for p in output.glob(f"session_*.{format_}"))
+    logs = sorted(str(output / name) for name in json.loads(truth.read_text()))
     if as_json:
         console.result_json({"truth": str(truth), "logs": logs})
     else:

@@ -21,6 +21,7 @@ from semloc_logs.simulation.street import build_street, street_ground
 from semloc_logs.simulation.survey import drive_network, opposite_lane, read_drive
 from semloc_logs.simulation.traffic import random_traffic
 from semloc_logs.simulation.trajectory import drive, smooth_line
+from semloc_logs.simulation.vehicle_sensors import VehicleSensors
 from semloc_logs.simulation.world import F64
 
 _BLOCK = 85.0  # m between crossings
@@ -40,12 +41,18 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """The lidar by its name in ``lidar.MODELS``, sweeps a second, columns a turn (None: the model's own), share of wrong labels."""
+    """The lidar by its name in ``lidar.MODELS``, sweeps a second, columns a turn (None: the model's own), share of wrong labels.
+
+    ``drift`` of the odometry as a share of the way, ``wet`` in [0, 1] how wet the road is, samples of the IMU a second (None: 20).
+    """
 
     name: str = "hdl32"
     rate_hz: float = 2.0
     columns: int | None = None
     label_noise: float = 0.0
+    drift: float = 0.007
+    wet: float = 0.0
+    imu_hz: float | None = None
 
 
 def simulate_sessions(
@@ -61,6 +68,9 @@ def simulate_sessions(
     part_m: tuple[float, float] = (0.0, math.inf),
     there_and_back: bool = False,
     label_noise: float = 0.0,
+    drift: float = 0.007,
+    wet: float = 0.0,
+    imu_hz: float | None = None,
     seasons: Sequence[str] = ("summer",),
     roadworks: float = 0.0,
     rebuilt: float = 0.0,
@@ -73,7 +83,7 @@ def simulate_sessions(
 
     Between sessions parked cars, people and a few trees change. ``seasons`` are those of the sessions, over and over again; from the second
     session on there are ``roadworks`` (sites a kilometre) and a share of ``rebuilt`` houses. ``sensor`` is a name in ``lidar.MODELS``,
-    ``format`` ``mcap`` or ``bag``.
+    ``format`` in ``log.FORMATS``.
     SettingsError for impossible values, SemlocError when the files are there already and ``overwrite`` is false.
     """
     if sessions < 1:
@@ -88,7 +98,8 @@ def simulate_sessions(
     else:
         network, lines = _recorded(seed, sessions, trajectory, part_m, there_and_back)
     planned = [Session(f"session_{k}{FORMATS[format]}", line, conditions[k]) for k, line in enumerate(lines)]
-    return write_sessions(directory, network, planned, seed=seed, sensor=Sensor(sensor, rate_hz, None, label_noise), overwrite=overwrite)
+    carried = Sensor(sensor, rate_hz, None, label_noise, drift, wet, imu_hz)
+    return write_sessions(directory, network, planned, seed=seed, sensor=carried, format=format, overwrite=overwrite)
 
 
 def _town(seed: int, sessions: int, length_m: float) -> tuple[RoadNetwork, list[F64]]:
@@ -123,15 +134,31 @@ def drawn_conditions(sessions: int, seasons: Sequence[str], roadworks: float, re
 
 
 def write_sessions(
-    directory: Path | str, network: RoadNetwork, sessions: Sequence[Session], *, seed: int, sensor: Sensor, overwrite: bool = False
+    directory: Path | str,
+    network: RoadNetwork,
+    sessions: Sequence[Session],
+    *,
+    seed: int,
+    sensor: Sensor,
+    format: str | None = None,
+    overwrite: bool = False,
 ) -> Path:
-    """Simulate and write the sessions, their trajectories (.tum) and, last of all, truth.json; its path."""
+    """Simulate and write the sessions, their trajectories (.tum) and, last of all, truth.json; its path.
+
+    ``format`` as in :func:`semloc_logs.simulation.log.write_session`.
+    """
     if sensor.name not in MODELS:
         raise SettingsError(f"there is no simulated sensor {sensor.name!r}: choose one of {', '.join(MODELS)}")
     if not 0.05 <= sensor.rate_hz <= 10:
         raise SettingsError(f"a simulated lidar cannot turn {sensor.rate_hz} times a second: give between 0.05 and 10 Hz")
     if not 0 <= sensor.label_noise <= 1:
         raise SettingsError(f"a share of {sensor.label_noise} wrong labels is impossible: give between 0 and 1")
+    if not 0 <= sensor.drift <= 0.2:
+        raise SettingsError(f"simulated odometry cannot drift by {sensor.drift} of the way: give between 0 and 0.2")
+    if not 0 <= sensor.wet <= 1:
+        raise SettingsError(f"a road cannot be wet by {sensor.wet}: give between 0 and 1")
+    if sensor.imu_hz is not None and not 1 <= sensor.imu_hz <= 1000:
+        raise SettingsError(f"a simulated IMU cannot sample {sensor.imu_hz} times a second: give between 1 and 1000 Hz")
     folder = Path(directory)
     truth = folder / "truth.json"
     there = [p.name for p in (truth, *(folder / s.file for s in sessions)) if p.exists()]
@@ -143,7 +170,7 @@ def write_sessions(
     except OSError as error:
         raise SemlocError(f"{folder} cannot be written ({error.strerror}): choose another folder") from error
     for session in sessions:
-        _write(folder, network, session, seed, sensor)
+        _write(folder, network, session, seed, sensor, format)
     entries = {s.file: {"trajectory": Path(s.file).with_suffix(".tum").name} for s in sessions}
     part = truth.with_suffix(".part")
     part.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
@@ -151,12 +178,12 @@ def write_sessions(
     return truth
 
 
-def _write(folder: Path, network: RoadNetwork, session: Session, seed: int, sensor: Sensor) -> None:
+def _write(folder: Path, network: RoadNetwork, session: Session, seed: int, sensor: Sensor, format: str | None) -> None:
     number = session.condition.number
     rng = np.random.default_rng([seed, 63, number])
     ground = street_ground(network, seed)
     start_ns = _START_NS + number * _DAY_NS
-    trajectory = drive(session.line, ground.slope_height, rng, start_ns=start_ns, speed=float(rng.uniform(6, 8)))
+    trajectory = drive(session.line, ground.slope_height, rng, start_ns=start_ns, speed=float(rng.uniform(6, 8)), drift=sensor.drift)
     traffic = random_traffic(rng, ground, [session.line], 0.4)
     frames = simulate_drive(
         build_street(network, seed, session.condition),
@@ -167,6 +194,7 @@ def _write(folder: Path, network: RoadNetwork, session: Session, seed: int, sens
         columns=sensor.columns,
         traffic=traffic,
         label_noise=sensor.label_noise,
+        wet=sensor.wet,
     )
-    write_session(folder / session.file, trajectory, frames)
+    write_session(folder / session.file, trajectory, frames, format=format, sensors=VehicleSensors(imu_hz=sensor.imu_hz))
     write_truth((folder / session.file).with_suffix(".tum"), trajectory)

@@ -54,9 +54,19 @@ def _slope(height: Callable[[F64, F64], F64], position: F64, direction: F64, ste
 
 
 def drive(
-    line: F64, height: Callable[[F64, F64], F64], rng: np.random.Generator, *, start_ns: int, rate_hz: float = 20.0, speed: float = 7.0
+    line: F64,
+    height: Callable[[F64, F64], F64],
+    rng: np.random.Generator,
+    *,
+    start_ns: int,
+    rate_hz: float = 20.0,
+    speed: float = 7.0,
+    drift: float = 0.007,
 ) -> Trajectory:
-    """A car drives all of a smooth line at about ``speed`` m/s, slower in bends; poses at ``rate_hz`` from ``start_ns`` on."""
+    """A car drives all of a smooth line at about ``speed`` m/s, slower in bends; poses at ``rate_hz`` from ``start_ns`` on.
+
+    ``drift`` is that of the odometry (:func:`drifting_odometry`).
+    """
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     tangent = np.gradient(line, along, axis=0)
     bend = np.linalg.norm(gaussian_filter1d(np.gradient(tangent, along, axis=0), 4, axis=0), axis=1)
@@ -67,7 +77,7 @@ def drive(
     at = np.arange(0.0, seconds[-1], 1.0 / rate_hz)
     poses = poses_along(line, np.interp(at, seconds, along), height, rng)
     stamps = start_ns + np.round(at * 1e9).astype(np.int64)
-    return Trajectory(stamps, poses, drifting_odometry(poses, rng))
+    return Trajectory(stamps, poses, drifting_odometry(poses, rng, drift))
 
 
 def drifting_odometry(world_T_base: F64, rng: np.random.Generator, drift: float = 0.007) -> F64:

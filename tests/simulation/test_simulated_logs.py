@@ -84,7 +84,7 @@ def test_other_readers_read_the_log(log: Path, trajectory: Trajectory, frames: l
     times = [time for _, time, _ in read]
     assert times == sorted(times)
     by_topic = {topic: [m for t, _, m in read if t == topic] for topic, _, _ in read}
-    assert set(by_topic) == {"/lidar/points", "/odometry", "/imu", "/tf_static", "/lidar/label_space"}
+    assert set(by_topic) == {"/lidar/points", "/odometry", "/imu", "/gnss", "/tf_static", "/lidar/label_space"}
     assert len(by_topic["/odometry"]) == len(by_topic["/imu"]) == len(trajectory.stamps_ns)
     assert by_topic["/lidar/label_space"][0].data == "cityscapes"
     edge = by_topic["/tf_static"][0].transforms[0]
