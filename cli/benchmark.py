@@ -36,7 +36,8 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
     metavar="NAME=PYTHON",
     multiple=True,
     callback=pairs,
-    help="What to compare with and the Python that has it (benchmarks/README.md): octomap or kiss_slam for fusion, fpfh for retrieval.",
+    help="What to compare with and the Python that has it (benchmarks/README.md): octomap or kiss_slam for fusion, fpfh for retrieval, "
+    "faiss for search.",
 )
 @click.option("--lengths", default="1,4,16", callback=_lengths, help="Multiples of a drive of 250 m, for memory; default 1,4,16.")
 @click.option(
@@ -147,6 +148,10 @@ def _measure(
         from semloc_logs.evaluation.fusion_speed import fusion_speed
 
         return fusion_speed(settings, logs, peers), []
+    if name == "search":
+        from semloc_logs.evaluation.search_speed import search_speed
+
+        return search_speed(settings, peers=peers), []
     from semloc_logs.evaluation.benchmarks import run_benchmark
 
     return run_benchmark(name, settings), []

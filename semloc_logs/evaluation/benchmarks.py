@@ -8,13 +8,10 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings
@@ -89,68 +86,17 @@ def fusion(settings: Settings) -> Figures:
 
 
 def encoder(settings: Settings) -> Figures:
-    """Descriptors of a map of 192 x 192 x 32 voxels: all at once, fully convolutionally, and one subvolume after the other."""
-    import torch
+    """Descriptors of a map, densely and one by one; see :mod:`semloc_logs.evaluation.encoder_speed`."""
+    from semloc_logs.evaluation.encoder_speed import encoder_speed
 
-    from semloc_logs.simulation.training_scenes import training_session
-    from semloc_logs.subvolumes.cut import WIDE, code_table
-    from semloc_logs.subvolumes.describe import describe_map, random_encoder
-    from semloc_logs.subvolumes.pairs import SceneFrame, fuse
-
-    blocks = fuse([SceneFrame(*frame[:2], frame[2], frame[3]) for frame in training_session(4, 24)], settings.fusion)
-    low, high = blocks.bounds()
-    middle = (low + high) // 2
-    corner = np.array([middle[0] - 96, middle[1] - 96, -8])
-    state = blocks.dense(corner, (192, 192, 32))
-    network = random_encoder("semantic")
-
-    def whole() -> int:
-        return len(describe_map(state, corner, 0.0, settings.fusion.voxel_size, network, 8, settings.descriptor.min_occupied).descriptor)
-
-    one = torch.from_numpy(code_table("semantic")[np.ascontiguousarray(state[:WIDE, :WIDE])[None]])
-
-    def single() -> None:
-        with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
-            network(one)
-
-    count = max(whole(), 1)
-    return {"descriptor": {"ours": 1e3 * _seconds(whole) / count, "unit": f"ms each of {count}", "one_by_one": 1e3 * _seconds(single)}}
+    return encoder_speed(settings)
 
 
 def search(settings: Settings) -> Figures:
-    """The five nearest of 300,000 words for each of 2,000 descriptors, beside all codes compared with numpy (and faiss if installed)."""
-    from semloc_logs.words.index import Index
-    from semloc_logs.words.vocabulary import train_vocabulary
+    """Words looked up; see :mod:`semloc_logs.evaluation.search_speed`."""
+    from semloc_logs.evaluation.search_speed import search_speed
 
-    rng = np.random.default_rng(0)
-    centres = rng.standard_normal((4000, 256)).astype(np.float32)
-    drawn = centres[rng.integers(len(centres), size=302_000)] + 0.6 * rng.standard_normal((302_000, 256), np.float32)
-    drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
-    database, queries = drawn[:300_000], drawn[300_000:]
-    vocabulary = train_vocabulary(database[:20_000])
-    word, code = vocabulary.words(database)
-    index = Index(vocabulary, word, code, np.zeros(len(word), np.int64))
-    allowed, probes = np.ones(1, bool), settings.closures.probes
-    asked = vocabulary.codes(queries, vocabulary.nearest_cells(queries, 1)[:, 0])
-
-    def ours() -> None:
-        index.search(queries, 5, probes, allowed)
-
-    def unpacked(x: NDArray[np.uint64]) -> NDArray[np.integer]:
-        return np.asarray(np.unpackbits(x.view(np.uint8)).reshape(-1, 64).sum(1))
-
-    count_bits = getattr(np, "bitwise_count", unpacked)  # from numpy 2.0 on
-
-    def brute() -> None:
-        for q in asked[:20]:
-            np.argpartition(count_bits(code ^ q), 5)
-
-    figures: dict[str, float | str] = {"ours": _seconds(ours), "unit": "s for 2000 queries", "numpy": _seconds(brute, 3) * len(asked) / 20}
-    if find_spec("faiss") is not None:
-        peer = import_module("faiss").IndexBinaryFlat(64)
-        peer.add(code.view(np.uint8).reshape(-1, 8))
-        figures["faiss_flat"] = _seconds(lambda: peer.search(asked.view(np.uint8).reshape(-1, 8), 5), 2)
-    return {"top5": figures}
+    return search_speed(settings)
 
 
 def annotate(settings: Settings) -> Figures:

@@ -1,0 +1,199 @@
+"""Speed of the encoder: one subvolume after the other, over a whole map at once, on one and on all cores, beside what the machine allows.
+
+Multiply-accumulates are counted where they happen, layer by layer, on the shapes that pass; so whatever the encoder's blocks are, the
+figures hold. The machine's peak is a plain matrix product in bf16 with one thread. With one thread processor time counts, which other
+programs disturb less; on all cores the clock on the wall. A dense descriptor needs fewer multiplications than a
+single one, because neighbouring subvolumes share their first layers.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from semloc_logs.errors import SemlocError
+from semloc_logs.settings import Settings
+from semloc_logs.simulation.training_scenes import training_session
+from semloc_logs.subvolumes.cut import WIDE, code_table
+from semloc_logs.subvolumes.describe import random_encoder
+from semloc_logs.subvolumes.network import Encoder, descriptors
+from semloc_logs.subvolumes.pairs import SceneFrame, fuse
+
+Figures = dict[str, dict[str, float | str]]
+EDGE = 192  # voxels of the piece of map, margin included
+SINGLES = 40  # subvolumes that are encoded one by one
+REPEATS = 5
+MATRIX = 2048
+ROUNDING = 0.01  # of a coordinate of a unit descriptor: bf16 has 8 binary digits
+
+
+def encoder_speed(settings: Settings) -> Figures:
+    """ms a descriptor, multiply-accumulates a descriptor, their rate, the difference between ways, and the share of each layer."""
+    threads = torch.get_num_threads()
+    cores = os.cpu_count() or 1
+    try:
+        torch.set_num_threads(1)
+        network, codes = random_encoder("semantic"), _piece(settings)
+        size = (EDGE - WIDE) // 8 + 1
+        corners = np.stack(
+            np.unravel_index(np.random.default_rng(0).choice(size * size, min(SINGLES, size * size), False), (size, size)), 1
+        )
+        whole = encode(network, codes).reshape(size, size, -1)
+        alone = one_by_one(network, codes, corners)
+        work = {"one by one": macs(network, codes[:WIDE, :WIDE]), "dense": macs(network, codes) / size**2}
+        taken = {"one by one": _median(lambda: one_by_one(network, codes, corners)) / len(corners)}
+        taken["dense"] = _median(lambda: encode(network, codes)) / size**2
+        peak = MATRIX**3 / _median(_product()) / 1e9
+        figures: Figures = {}
+        for way, seconds in taken.items():
+            rate = work[way] / seconds / 1e9
+            figures[way] = {"ours": 1e3 * seconds, "unit": "ms a descriptor, one thread", "mega_macs": work[way] / 1e6}
+            figures[way] |= {"giga_macs_a_second": rate, "share_of_peak": rate / peak, "least_ms": work[way] / peak / 1e6}
+        figures["bf16 matrix product"] = {"ours": peak, "unit": "10^9 multiply-accumulates a second, one thread"}
+        figures |= _on_cores(network, codes, whole.reshape(size**2, -1), cores)
+        apart = float(np.abs(whole[corners[:, 0], corners[:, 1]] - alone).max())
+        unlike = float(np.abs(np.roll(alone, 1, axis=0) - alone).max())
+        figures["dense beside one by one"] = {"ours": apart, "unit": "largest difference of a coordinate", "other_subvolumes": unlike}
+        if max(apart, *(float(row.get("difference", 0.0)) for row in figures.values())) > ROUNDING:
+            raise SemlocError(f"Descriptors of one map differ by {apart:.3f} between ways to encode it, more than bf16 rounds.")
+        figures |= layers(network, codes)
+        return figures
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _piece(settings: Settings) -> NDArray[np.uint8]:
+    """Codes (EDGE, EDGE, 32) of the middle of a simulated street."""
+    blocks = fuse([SceneFrame(*frame[:2], frame[2], frame[3]) for frame in training_session(4, 24)], settings.fusion)
+    low, high = blocks.bounds()
+    middle = (low + high) // 2
+    state = blocks.dense(np.array([middle[0] - EDGE // 2, middle[1] - EDGE // 2, -8]), (EDGE, EDGE, 32))
+    return np.ascontiguousarray(code_table("semantic")[state])
+
+
+@torch.inference_mode()
+def encode(network: Encoder, codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Unit descriptors (i * j, N) of codes (x, y, 32), margin included, as maps are described."""
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        return np.asarray(descriptors(network(torch.from_numpy(np.ascontiguousarray(codes))[None])).numpy())
+
+
+def one_by_one(network: Encoder, codes: NDArray[np.uint8], corners: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Unit descriptors (n, N) of the subvolumes at ``corners`` (n, 2), in steps of 8 voxels, each by itself."""
+    return np.concatenate([encode(network, codes[8 * i : 8 * i + WIDE, 8 * j : 8 * j + WIDE]) for i, j in corners])
+
+
+def _multiplications(module: nn.Module, output: Tensor) -> int:
+    """Multiply-accumulates of a convolution or of a fully connected layer that gave ``output``."""
+    weight = getattr(module, "weight", None)
+    if isinstance(weight, Tensor) and weight.ndim > 1 and not isinstance(module, nn.Embedding):
+        return output.numel() * math.prod(weight.shape[1:])
+    return 0
+
+
+def watch(network: Encoder, codes: NDArray[np.uint8]) -> dict[str, tuple[float, int]]:
+    """Seconds and multiply-accumulates of each layer that holds weights, and of all between them ("between"), in one run over ``codes``."""
+    seen: dict[str, tuple[float, int]] = {}
+    started: dict[str, float] = {}
+    hooks = []
+    for name, module in network.named_modules():
+        if next(module.children(), None) is None:
+
+            def before(_: nn.Module, __: Any, name: str = name) -> None:
+                started[name] = time.process_time()
+
+            def after(module: nn.Module, _: Any, output: Tensor, name: str = name) -> None:
+                seconds, count = seen.get(name, (0.0, 0))
+                seen[name] = seconds + time.process_time() - started[name], count + _multiplications(module, output)
+
+            hooks += [module.register_forward_pre_hook(before), module.register_forward_hook(after)]
+    try:
+        start = time.process_time()
+        encode(network, codes)
+        total = time.process_time() - start
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return seen | {"between": (total - sum(s for s, _ in seen.values()), 0)}
+
+
+def macs(network: Encoder, codes: NDArray[np.uint8]) -> int:
+    """Multiply-accumulates of one run over codes (x, y, 32)."""
+    return sum(count for _, count in watch(network, codes).values())
+
+
+def layers(network: Encoder, codes: NDArray[np.uint8]) -> Figures:
+    """ms, share of the multiplications and rate of each layer, medians; what lies between layers is the look-up, pooling and ReLU."""
+    runs = [watch(network, codes) for _ in range(REPEATS + 1)][1:]
+    total = sum(count for _, count in runs[0].values())
+    out: Figures = {}
+    for name in runs[0]:
+        seconds, count = float(np.median([run[name][0] for run in runs])), runs[0][name][1]
+        out[f"layer {name}"] = {"ours": 1e3 * seconds, "unit": "ms of a dense run", "share_of_macs": count / total}
+        if count:
+            out[f"layer {name}"]["giga_macs_a_second"] = count / max(seconds, 1e-9) / 1e9
+    return out
+
+
+def _on_cores(network: Encoder, codes: NDArray[np.uint8], expected: NDArray[np.float32], cores: int) -> Figures:
+    """The dense run on all cores by threads and by processes, and how far descriptors differ from those of one thread."""
+    torch.set_num_threads(cores)
+    by_threads = _median(lambda: encode(network, codes), time.perf_counter) / len(expected)
+    other = float(np.abs(encode(network, codes) - expected).max())
+    torch.set_num_threads(1)
+    weights = {k: v.numpy() for k, v in network.state_dict().items()}
+    with ProcessPoolExecutor(
+        cores, mp_context=get_context("spawn"), initializer=_begin, initargs=(network.variant, weights, codes)
+    ) as pool:
+        list(pool.map(_run, [1] * cores))
+        start = time.perf_counter()
+        list(pool.map(_run, [REPEATS] * cores))
+        by_processes = (time.perf_counter() - start) / (REPEATS * cores * len(expected))
+        apart = float(np.abs(pool.submit(_run, 1).result() - expected).max())
+    unit = f"ms a descriptor, {cores} cores"
+    return {
+        "dense, threads": {"ours": 1e3 * by_threads, "unit": unit, "difference": other},
+        "dense, processes": {"ours": 1e3 * by_processes, "unit": unit, "difference": apart},
+    }
+
+
+_work: list[Any] = []  # of a process of the pool: the network and the codes
+
+
+def _begin(variant: str, weights: dict[str, NDArray[Any]], codes: NDArray[np.uint8]) -> None:
+    torch.set_num_threads(1)
+    network = random_encoder(variant)
+    network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
+    _work[:] = [network, codes]
+
+
+def _run(times: int) -> NDArray[np.float32]:
+    for _ in range(times):
+        found = encode(*_work)
+    return found
+
+
+def _product() -> Callable[[], Any]:
+    a, b = (torch.randn(MATRIX, MATRIX, generator=torch.Generator().manual_seed(k)).bfloat16() for k in range(2))
+    return lambda: a @ b
+
+
+def _median(action: Callable[[], Any], clock: Callable[[], float] = time.process_time) -> float:
+    """Median seconds of some runs after one to warm up."""
+    action()
+    taken = []
+    for _ in range(REPEATS):
+        start = clock()
+        action()
+        taken.append(clock() - start)
+    return float(np.median(taken))
