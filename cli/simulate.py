@@ -19,8 +19,10 @@ from .options import Command, console_options, json_option, overwrite_option, pa
 @click.option("--from", "from_", type=float, default=0.0, show_default=True, help="Where to begin along the trajectory (m).")
 @click.option("--to", type=float, default=float("inf"), help="Where to end along the trajectory (m).  [default: its end]")
 @click.option("--there-and-back", is_flag=True, help="Drive the trajectory the other way in every other session.")
-@click.option("--sensor", default="hdl32", show_default=True, help="Simulated lidar: hdl64, hdl32, vlp32, vlp16, rosette or raster.")
-@click.option("--rate", type=float, default=2.0, show_default=True, help="Sweeps a second (Hz).")
+@click.option(
+    "--sensor", default="hdl32", show_default=True, help="Lidar (hdl64, hdl32, vlp32, vlp16, rosette, raster) or camera (stereo, depth)."
+)
+@click.option("--rate", type=float, default=2.0, show_default=True, help="Sweeps or pictures a second (Hz).")
 @click.option(
     "--format", "format_", default="mcap", show_default=True, help="Form of the logs: mcap, protobuf (in MCAP), bag (ROS 1) or ros2."
 )
@@ -29,6 +31,7 @@ from .options import Command, console_options, json_option, overwrite_option, pa
 @click.option("--imu-rate", type=float, default=20.0, show_default=True, help="Samples of the IMU a second (Hz).")
 @click.option("--wet", type=float, default=0.0, show_default=True, help="How wet the road is, 0 to 1.")
 @click.option("--season", default="summer", show_default=True, help="Season of each drive, in turn: summer,autumn,winter,snow.")
+@click.option("--daytime", default="noon", show_default=True, help="Light of each drive's pictures, in turn: noon,evening,overcast.")
 @click.option("--roadworks", type=float, default=0.0, show_default=True, help="Roadworks a kilometre, from the second drive on.")
 @click.option("--rebuilt", type=float, default=0.0, show_default=True, help="Share of houses gone or new, from the second drive on.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Number of the town.")
@@ -51,6 +54,7 @@ def command(
     imu_rate: float,
     wet: float,
     season: str,
+    daytime: str,
     roadworks: float,
     rebuilt: float,
     seed: int,
@@ -81,6 +85,7 @@ def command(
             imu_hz=imu_rate,
             wet=wet,
             seasons=[name.strip() for name in season.split(",")],
+            daytimes=[name.strip() for name in daytime.split(",")],
             roadworks=roadworks,
             rebuilt=rebuilt,
             overwrite=overwrite,

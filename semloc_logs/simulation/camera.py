@@ -122,9 +122,8 @@ def first_hits(scene: Scene, world_T_camera: F64, rays: F32, traffic: Scene | No
     if traffic is not None:
         nearer, other, other_normal = traffic.cast(origins, directions)
         moving = nearer < depth
-        depth, triangle = np.where(moving, nearer, depth), np.where(moving, other, triangle)
-        labels = np.where(moving, traffic.labels[other], labels)
-        normal = np.where(moving[:, None], other_normal, normal)
+        depth[moving], triangle[moving] = nearer[moving], other[moving]
+        labels[moving], normal[moving] = traffic.labels[other[moving]], other_normal[moving]
     return Hits(
         depth.reshape(shape), labels.reshape(shape), triangle.reshape(shape), moving.reshape(shape), np.asarray(normal).reshape(*shape, 3)
     )

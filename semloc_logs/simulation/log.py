@@ -26,6 +26,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.errors import LogError
 from semloc_logs.geometry import translation_quaternion
+from semloc_logs.simulation.camera_drive import CameraShot
+from semloc_logs.simulation.camera_log import camera_events
 from semloc_logs.simulation.drive import TURN_NS, DriveFrame
 from semloc_logs.simulation.messages import LATCHED, FoxgloveMessages, Made, Messages, RosMessages, antenna
 from semloc_logs.simulation.trajectory import Trajectory
@@ -161,8 +163,11 @@ def write_session(
     *,
     format: str | None = None,
     sensors: VehicleSensors | None = None,
+    shots: Iterable[CameraShot] = (),
 ) -> int:
     """Write a drive as the log ``path``, sweep by sweep; the number of sweeps. LogError when that is not possible.
+
+    ``shots`` are what cameras record (:mod:`semloc_logs.simulation.camera_log` has their topics).
 
     ``format`` is a name in ``FORMATS``; without, the ending says it: .mcap (ROS 2 messages), .bag, or none for a ROS 2 bag directory.
     """
@@ -176,6 +181,7 @@ def write_session(
         events = heapq.merge(
             *_vehicle(sink.messages, trajectory, sensors or VehicleSensors()),
             _lidar(sink.messages, frames, first),
+            camera_events(shots, sink.messages, first),
             key=lambda event: event[0],
         )
         for log_time, (topic, type_, message) in events:

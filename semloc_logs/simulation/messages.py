@@ -17,7 +17,7 @@ from semloc_logs.simulation.vehicle_sensors import ANTENNA
 from semloc_logs.simulation.world import F64
 
 LABEL_SPACE = "cityscapes"
-LATCHED = ("/tf_static", "/lidar/label_space")
+LATCHED = ("/tf_static", "/lidar/label_space", "/camera/label_space")
 Made = tuple[str, str, Any]
 _FIELDS = (("x", "<f4", 0), ("y", "<f4", 4), ("z", "<f4", 8), ("label", "<u2", 12), ("ring", "<u2", 14), ("t", "<u4", 16))  # kind, offset
 _POINT = np.dtype([(name, kind) for name, kind, _ in _FIELDS])
@@ -30,7 +30,11 @@ class Messages(Protocol):
 
     def mounted(self, stamp_ns: int, child: str, base_T_child: F64) -> Made: ...
 
-    def label_space(self) -> Made | None: ...
+    def label_space(self, topic: str = ...) -> Made | None: ...
+
+    def picture(self, topic: str, stamp_ns: int, frame_id: str, format_: str, data: bytes) -> Made: ...
+
+    def calibration(self, topic: str, stamp_ns: int, frame_id: str, size: tuple[int, int], matrix: F64, baseline: float) -> Made: ...
 
     def cloud(self, frame: DriveFrame) -> Made: ...
 
@@ -39,6 +43,11 @@ class Messages(Protocol):
     def imu(self, stamp_ns: int, force: F64, rate: F64) -> Made | None: ...
 
     def fix(self, stamp_ns: int, geodetic: F64, status: int, sigma: float) -> Made | None: ...
+
+
+def _matrices(matrix: F64, baseline: float) -> tuple[F64, F64, F64]:
+    """K, R and P of a camera without distortion that sits ``baseline`` metres to the right of its partner."""
+    return matrix, np.eye(3), np.column_stack([matrix, [-matrix[0, 0] * baseline, 0.0, 0.0]])
 
 
 def antenna() -> F64:
@@ -86,8 +95,29 @@ class RosMessages:
         edge = self._make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=pose)
         return "/tf_static", "tf2_msgs/msg/TFMessage", self._make("tf2_msgs/msg/TFMessage", transforms=[edge])
 
-    def label_space(self) -> Made:
-        return "/lidar/label_space", "std_msgs/msg/String", self._make("std_msgs/msg/String", data=LABEL_SPACE)
+    def label_space(self, topic: str = "/lidar/label_space") -> Made:
+        return topic, "std_msgs/msg/String", self._make("std_msgs/msg/String", data=LABEL_SPACE)
+
+    def picture(self, topic: str, stamp_ns: int, frame_id: str, format_: str, data: bytes) -> Made:
+        kind = "sensor_msgs/msg/CompressedImage"
+        header = self._header(stamp_ns, frame_id)
+        return topic, kind, self._make(kind, header=header, format=format_, data=np.frombuffer(data, np.uint8))
+
+    def calibration(self, topic: str, stamp_ns: int, frame_id: str, size: tuple[int, int], matrix: F64, baseline: float) -> Made:
+        kind = "sensor_msgs/msg/CameraInfo"
+        matrices = dict(zip("KRPD", (*(m.ravel() for m in _matrices(matrix, baseline)), np.zeros(5)), strict=True))
+        info = self._make(
+            kind,
+            header=self._header(stamp_ns, frame_id),
+            width=size[0],
+            height=size[1],
+            distortion_model="plumb_bob",
+            binning_x=0,
+            binning_y=0,
+            roi=self._make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
+            **{name if self._ros1 else name.lower(): value for name, value in matrices.items()},
+        )
+        return topic, kind, info
 
     def cloud(self, frame: DriveFrame) -> Made:
         points = _records(frame)
@@ -157,8 +187,23 @@ class FoxgloveMessages:
     def mounted(self, stamp_ns: int, child: str, base_T_child: F64) -> Made:
         return self._edge("/tf_static", stamp_ns, "base_link", child, base_T_child)
 
-    def label_space(self) -> Made | None:
+    def label_space(self, topic: str = "/lidar/label_space") -> Made | None:
         return None
+
+    def picture(self, topic: str, stamp_ns: int, frame_id: str, format_: str, data: bytes) -> Made:
+        from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+        picture = CompressedImage(frame_id=frame_id, format=format_, data=data)
+        picture.timestamp.FromNanoseconds(stamp_ns)
+        return topic, "foxglove.CompressedImage", picture
+
+    def calibration(self, topic: str, stamp_ns: int, frame_id: str, size: tuple[int, int], matrix: F64, baseline: float) -> Made:
+        from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+
+        K, R, P = (m.ravel().tolist() for m in _matrices(matrix, baseline))
+        calibration = CameraCalibration(frame_id=frame_id, width=size[0], height=size[1], K=K, R=R, P=P)
+        calibration.timestamp.FromNanoseconds(stamp_ns)
+        return topic, "foxglove.CameraCalibration", calibration
 
     def cloud(self, frame: DriveFrame) -> Made:
         from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud

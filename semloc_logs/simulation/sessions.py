@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from semloc_logs.errors import SemlocError, SettingsError
+from semloc_logs.simulation.camera import CAMERAS
+from semloc_logs.simulation.camera_drive import CameraShot, simulate_cameras
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.drive import simulate_drive
+from semloc_logs.simulation.drive import DriveFrame, simulate_drive
 from semloc_logs.simulation.lidar import MODELS
 from semloc_logs.simulation.log import FORMATS, write_session, write_truth
 from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, random_route
@@ -41,7 +43,8 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """The lidar by its name in ``lidar.MODELS``, sweeps a second, columns a turn (None: the model's own), share of wrong labels.
+    """The lidar or cameras by their name in ``lidar.MODELS`` or ``camera.CAMERAS``, sweeps or shots a second, columns a
+    turn (None: the model's own), share of wrong labels.
 
     ``drift`` of the odometry as a share of the way, ``wet`` in [0, 1] how wet the road is, samples of the IMU a second (None: 20).
     """
@@ -72,6 +75,7 @@ def simulate_sessions(
     wet: float = 0.0,
     imu_hz: float | None = None,
     seasons: Sequence[str] = ("summer",),
+    daytimes: Sequence[str] = ("noon",),
     roadworks: float = 0.0,
     rebuilt: float = 0.0,
     overwrite: bool = False,
@@ -81,9 +85,9 @@ def simulate_sessions(
     With a ``trajectory`` (a TUM or KITTI file) the streets lie along a recorded drive and every session drives the part of it between two
     lengths in metres, every other one, if ``there_and_back``, the other way in the other lane.
 
-    Between sessions parked cars, people and a few trees change. ``seasons`` are those of the sessions, over and over again; from the second
-    session on there are ``roadworks`` (sites a kilometre) and a share of ``rebuilt`` houses. ``sensor`` is a name in ``lidar.MODELS``,
-    ``format`` in ``log.FORMATS``.
+    Between sessions parked cars, people and a few trees change. ``seasons`` and ``daytimes`` are those of the sessions, over and over
+    again; from the second session on there are ``roadworks`` (sites a kilometre) and a share of ``rebuilt`` houses. ``sensor`` is a name in
+    ``lidar.MODELS`` or ``camera.CAMERAS``, ``format`` in ``log.FORMATS``.
     SettingsError for impossible values, SemlocError when the files are there already and ``overwrite`` is false.
     """
     if sessions < 1:
@@ -92,7 +96,7 @@ def simulate_sessions(
         raise SettingsError(f"a simulated session cannot be {length_m} m long: give between 50 and 100000 m")
     if format not in FORMATS:
         raise SettingsError(f"logs cannot be simulated as {format!r}: choose one of {', '.join(FORMATS)}")
-    conditions = drawn_conditions(sessions, seasons, roadworks, rebuilt)
+    conditions = drawn_conditions(sessions, seasons, roadworks, rebuilt, daytimes)
     if trajectory is None:
         network, lines = _town(seed, sessions, length_m)
     else:
@@ -126,11 +130,16 @@ def _recorded(seed: int, sessions: int, path: Path, part_m: tuple[float, float],
     return network, [other if there_and_back and k % 2 else plan[first:last] for k in range(sessions)]
 
 
-def drawn_conditions(sessions: int, seasons: Sequence[str], roadworks: float, rebuilt: float) -> list[Condition]:
-    """The conditions of ``sessions`` sessions: seasons in turn, works and rebuilt houses from the second one on."""
-    if not seasons:
-        raise SettingsError("simulated sessions need a season: give at least one")
-    return [Condition(k, seasons[k % len(seasons)], roadworks if k else 0.0, rebuilt if k else 0.0) for k in range(sessions)]
+def drawn_conditions(
+    sessions: int, seasons: Sequence[str], roadworks: float, rebuilt: float, daytimes: Sequence[str] = ("noon",)
+) -> list[Condition]:
+    """The conditions of ``sessions`` sessions: seasons and times of day in turn, works and rebuilt houses from the second one on."""
+    if not seasons or not daytimes:
+        raise SettingsError("simulated sessions need a season and a time of day: give at least one of each")
+    return [
+        Condition(k, seasons[k % len(seasons)], roadworks if k else 0.0, rebuilt if k else 0.0, daytimes[k % len(daytimes)])
+        for k in range(sessions)
+    ]
 
 
 def write_sessions(
@@ -147,10 +156,10 @@ def write_sessions(
 
     ``format`` as in :func:`semloc_logs.simulation.log.write_session`.
     """
-    if sensor.name not in MODELS:
-        raise SettingsError(f"there is no simulated sensor {sensor.name!r}: choose one of {', '.join(MODELS)}")
+    if sensor.name not in (*MODELS, *CAMERAS):
+        raise SettingsError(f"there is no simulated sensor {sensor.name!r}: choose one of {', '.join((*MODELS, *CAMERAS))}")
     if not 0.05 <= sensor.rate_hz <= 10:
-        raise SettingsError(f"a simulated lidar cannot turn {sensor.rate_hz} times a second: give between 0.05 and 10 Hz")
+        raise SettingsError(f"a simulated sensor cannot measure {sensor.rate_hz} times a second: give between 0.05 and 10 Hz")
     if not 0 <= sensor.label_noise <= 1:
         raise SettingsError(f"a share of {sensor.label_noise} wrong labels is impossible: give between 0 and 1")
     if not 0 <= sensor.drift <= 0.2:
@@ -185,16 +194,32 @@ def _write(folder: Path, network: RoadNetwork, session: Session, seed: int, sens
     start_ns = _START_NS + number * _DAY_NS
     trajectory = drive(session.line, ground.slope_height, rng, start_ns=start_ns, speed=float(rng.uniform(6, 8)), drift=sensor.drift)
     traffic = random_traffic(rng, ground, [session.line], 0.4)
-    frames = simulate_drive(
-        build_street(network, seed, session.condition),
-        trajectory,
-        MODELS[sensor.name],
-        rate_hz=sensor.rate_hz,
-        seed=seed + number,
-        columns=sensor.columns,
-        traffic=traffic,
-        label_noise=sensor.label_noise,
-        wet=sensor.wet,
-    )
-    write_session(folder / session.file, trajectory, frames, format=format, sensors=VehicleSensors(imu_hz=sensor.imu_hz))
+    world = build_street(network, seed, session.condition)
+    frames: Iterator[DriveFrame] = iter(())
+    shots: Iterator[CameraShot] = iter(())
+    if sensor.name in CAMERAS:
+        shots = simulate_cameras(
+            world,
+            trajectory,
+            sensor.name,
+            rate_hz=sensor.rate_hz,
+            seed=seed + number,
+            condition=session.condition,
+            traffic=traffic,
+            label_noise=sensor.label_noise,
+        )
+    else:
+        frames = simulate_drive(
+            world,
+            trajectory,
+            MODELS[sensor.name],
+            rate_hz=sensor.rate_hz,
+            seed=seed + number,
+            columns=sensor.columns,
+            traffic=traffic,
+            label_noise=sensor.label_noise,
+            wet=sensor.wet,
+        )
+    carried = VehicleSensors(imu_hz=sensor.imu_hz)
+    write_session(folder / session.file, trajectory, frames, format=format, sensors=carried, shots=shots)
     write_truth((folder / session.file).with_suffix(".tum"), trajectory)
