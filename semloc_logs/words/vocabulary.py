@@ -122,8 +122,8 @@ def _directions(descriptors: F32, cells: F32, rng: np.random.Generator) -> F32:
 def train_vocabulary(descriptors: NDArray[np.floating], cells: int = 256, children: int = 256, seed: int = 0) -> Vocabulary:
     """A vocabulary of ``cells`` x ``children`` words from unit descriptors (n, N).
 
-    There are at least 64 descriptors to a cell, so fewer than 16,384 give fewer cells; a cell with fewer descriptors than ``children``
-    has as many words as descriptors, and its last rows repeat the first, which no descriptor is given then. Raises SettingsError below
+    There are at least 64 descriptors to a cell, so fewer than 16,384 give fewer cells; a cell has at most one word for two
+    descriptors, and its last rows repeat the first, which no descriptor is given then. Raises SettingsError below
     256 descriptors and 64 dimensions.
     """
     n = len(descriptors)
@@ -150,7 +150,7 @@ def train_vocabulary(descriptors: NDArray[np.floating], cells: int = 256, childr
         if len(mine) >= 8:
             thresholds[c] = np.median(mine, axis=0)
         if len(mine):
-            k = min(children, len(mine))
+            k = min(children, max(1, len(mine) // 2))  # single descriptors lie farther from others than their mean does
             kids[c, :k] = kmeans(mine, k, rng, 8)
             kids[c, k:] = kids[c, 0]
     return Vocabulary(centroids, projection, thresholds, _bytes(kids).astype(np.float32) * np.float32(CHILD_STEP))

@@ -341,6 +341,16 @@ def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatc
     assert "0.8750" in semloc("train", "-o", tmp_path / "w", "--variant", "semantic", "--samples", 900, "--engine", "serial").stdout
 
 
+def test_vocabularies_of_both_variants_have_the_shipped_weights_and_shards(tmp_path: Path) -> None:
+    both = ("vocabulary", "--variant", "both", "-o", tmp_path / "v", "--shards", tmp_path)
+    assert semloc(*both, "--set", "descriptor.weights=w.safetensors").exit_code == 2
+    assert semloc(*both, "-w", tmp_path).exit_code == 2
+    found = semloc(*both)
+    assert found.exit_code == 2
+    assert "no shards of packed pairs" in found.output + found.stderr
+    assert not (tmp_path / "v").exists()
+
+
 def test_vocabulary_needs_a_variant(tmp_path: Path) -> None:
     assert semloc("vocabulary", "-o", tmp_path / "v.safetensors").exit_code == 2
 
