@@ -6,7 +6,7 @@ import numpy as np
 
 from semloc_logs.simulation import objects
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.ground import Ground
+from semloc_logs.simulation.ground import CLEAR, Ground
 from semloc_logs.simulation.objects import Parts
 from semloc_logs.simulation.sides import Side
 from semloc_logs.simulation.world import Mesh, MeshBuilder, place
@@ -60,9 +60,13 @@ class Setting:
 
     def parked(self, side: Side, u: float, v: float, share: float, *, across: bool = False) -> None:
         """A parking place, taken with probability ``share`` in each session by another vehicle."""
-        x, y, yaw = side.at(u, v)
         if self.change.random() > share:
             return
+        parts = objects.parked_vehicle(self.change)
+        if not across:  # at the kerb where the lane leaves room for it, or else partly on the pavement
+            wide = max(float(mesh.vertices[:, 1].max()) for mesh, _ in parts)
+            v = max(-wide - 0.2, wide - (side.road.half_width - side.road.lane - CLEAR - 0.5))
+        x, y, yaw = side.at(u, v)
         turn = (np.pi / 2 if across else 0.0) + (np.pi if self.change.random() < 0.2 else 0.0) + self.change.normal() * 0.04
-        shift = self.change.normal(size=2) * [0.3, 0.15]
-        self.put(objects.parked_vehicle(self.change), x + shift[0], y + shift[1], yaw + turn, moving=True)
+        shift = self.change.normal(size=2) * [0.3, 0.06]
+        self.put(parts, x + shift[0], y + shift[1], yaw + turn, moving=True)

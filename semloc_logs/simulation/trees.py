@@ -49,7 +49,7 @@ SPECIES = {
     "cone": Species((6.0, 16.0), (0.02, 0.14), (0.14, 0.24), "cone", 0.05, leaf=0.36, evergreen=True),
     "cypress": Species((3.0, 8.0), (0.0, 0.06), (0.1, 0.16), "cone", 0.03, leaf=0.24, evergreen=True),
     "pine": Species((8.0, 15.0), (0.5, 0.68), (0.18, 0.3), "flat", 0.05, cover=1.5, rise=0.3, evergreen=True),
-    "palm": Species((4.0, 10.0), (0.75, 0.85), (0.2, 0.3), "round", 0.01, evergreen=True),
+    "palm": Species((4.0, 10.0), (0.75, 0.85), (0.2, 0.3), "round", 0.004, evergreen=True),
 }
 _NAMES = list(SPECIES)
 _SHARES = np.array([s.share for s in SPECIES.values()]) / sum(s.share for s in SPECIES.values())

@@ -204,6 +204,7 @@ def tram(rng: Rng) -> Parts:
     arm = np.array(
         [[0.0, 0, height + 0.2], [0.9, 0, height + 0.8], [0.0, 0, height + 1.5], [0.0, -0.8, height + 1.5], [0.0, 0.8, height + 1.5]]
     )
+    arm[:, 0] += (piece - length) / 2
     pantograph = tubes(arm[[0, 1, 3]], arm[[1, 2, 4]], 0.05, 0.05, 4)
     return [(joined(*meshes, boxes(np.array(gaps)), pantograph), TRAIN)]
 
