@@ -30,6 +30,7 @@ from .options import Command, console_options, json_option, overwrite_option, pa
 @click.option("--drift", type=float, default=0.007, show_default=True, help="Drift of the odometry, share of the way.")
 @click.option("--imu-rate", type=float, default=20.0, show_default=True, help="Samples of the IMU a second (Hz).")
 @click.option("--wet", type=float, default=0.0, show_default=True, help="How wet the road is, 0 to 1.")
+@click.option("--repeating", is_flag=True, help="A town whose blocks are copies of one another.")
 @click.option("--season", default="summer", show_default=True, help="Season of each drive, in turn: summer,autumn,winter,snow.")
 @click.option("--daytime", default="noon", show_default=True, help="Light of each drive's pictures, in turn: noon,evening,overcast.")
 @click.option("--roadworks", type=float, default=0.0, show_default=True, help="Roadworks a kilometre, from the second drive on.")
@@ -46,6 +47,7 @@ def command(
     from_: float,
     to: float,
     there_and_back: bool,
+    repeating: bool,
     sensor: str,
     rate: float,
     format_: str,
@@ -77,6 +79,7 @@ def command(
             trajectory=trajectory,
             part_m=(from_, to),
             there_and_back=there_and_back,
+            repeating=repeating,
             sensor=sensor,
             rate_hz=rate,
             format=format_,

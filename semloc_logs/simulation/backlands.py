@@ -28,6 +28,19 @@ def put_bridge(setting: Setting, side: Side) -> None:
         ground.cover(over @ np.array([[c, s], [-s, c]]) + [x, y])
 
 
+def islands(setting: Setting) -> None:
+    """What stands on roundabouts and refuges."""
+    rng = setting.rng
+    for circle in setting.ground.network.circles:
+        if circle.inner > 1.5:
+            setting.put_tree(circle.x, circle.y, rng.uniform(0.3, 0.8))
+            for angle in np.arange(0, 2 * np.pi, rng.uniform(0.6, 2.0)):
+                x, y = circle.x + 0.6 * circle.inner * np.cos(angle), circle.y + 0.6 * circle.inner * np.sin(angle)
+                setting.put(objects.bush(rng, bare=setting.condition.bare), float(x), float(y), float(angle), aside=True)
+        elif circle.inner and rng.random() < 0.5:
+            setting.put(objects.pole(rng, "sign"), circle.x, circle.y, rng.uniform(0, 6.3), aside=True)
+
+
 def railway(setting: Setting) -> None:
     """Wagons on a siding, in one town of three, where there is room for it."""
     rng, ground = setting.rng, setting.ground

@@ -16,6 +16,8 @@ from semloc_logs.simulation.world import F64, ROAD, SIDEWALK, TERRAIN, Mesh
 CELL = 0.5  # m; kerbs are exact to half of it
 MARGIN = 48.0  # m of ground beside a road
 KERB = 0.12  # m
+STEEPEST = 0.08  # slope of a road without a survey
+_BANKS = (0.0, 0.0, 0.0, 0.06, 0.15, 0.28, -0.06, -0.2)  # slopes beside roads
 _DEPTH = 0.5  # m of what is dug up
 CLEAR = 1.4  # m to either side of a driven line
 
@@ -40,14 +42,14 @@ class Ground:
     _relief: Relief | None = field(init=False)
 
     def __post_init__(self) -> None:
-        lines = [r.path for r in self.network.roads]
+        lines = [r.path for r in (*self.network.roads, *self.network.stubs)]
         everything = np.concatenate([*lines, *([self.network.survey[:, :2]] if self.network.survey is not None else [])])
         self.corner = everything.min(0) - MARGIN
         shape = np.ceil((everything.max(0) + MARGIN - self.corner) / CELL).astype(int)
         beside = np.full(shape, np.inf, np.float32)
         walk = np.full(shape, np.inf, np.float32)
         self.clear = np.zeros(shape, np.bool_)
-        for road in self.network.roads:
+        for road in (*self.network.roads, *self.network.stubs):
             window, distance = self._near(road.path, shape)
             beside[window] = np.minimum(beside[window], distance - road.half_width)
             walk[window] = np.minimum(walk[window], distance - road.half_width - road.sidewalk)
@@ -57,7 +59,18 @@ class Ground:
                 window, distance = self._near(line, shape)
                 beside[window] = np.minimum(beside[window], distance - CLEAR - 0.4)
                 self.clear[window] |= distance < CLEAR
+        rounds = [(c, *self._near(np.array([[c.x, c.y]]), shape)) for c in self.network.circles]
+        for circle, window, distance in rounds:
+            if circle.outer:
+                beside[window] = np.minimum(beside[window], distance - circle.outer)
+                walk[window] = np.minimum(walk[window], distance - circle.outer - 2.0)
         self.beside = _rounded_corners(beside)
+        for circle, window, distance in rounds:  # islands last, for rounding the corners would close small ones
+            if circle.inner:
+                self.beside[window] = np.maximum(self.beside[window], circle.inner - distance)
+                walk[window] = np.where(distance < circle.inner, 1.0 if circle.inner > 1.5 else -1.0, walk[window])
+            if circle.outer and circle.inner:
+                self.clear[window] = np.where(distance < circle.outer, np.abs(distance - circle.lane) < CLEAR, self.clear[window])
         kind = np.where(self.beside < 0, ROAD, np.where(walk < 0, SIDEWALK, TERRAIN))
         self.kind = np.where(self.beside > MARGIN, 255, kind).astype(np.uint8)
         self.free = self.kind == TERRAIN
@@ -65,9 +78,11 @@ class Ground:
         wavelength = self.rng.uniform([25, 60, 90, 150], [60, 120, 200, 400])
         slope = self.rng.uniform(0, [0.006, 0.012, 0.02, 0.03])
         angle, phase = self.rng.uniform(0, 2 * np.pi, (2, 4))
+        steep = 0.0 if self.network.level else float(self.rng.choice([0.4, 1.0, 1.0, 1.6, 2.4]))
+        slope *= min(steep, STEEPEST / slope.sum())
         k = 2 * np.pi / wavelength
         self._waves = np.stack([k * np.cos(angle), k * np.sin(angle), phase, slope / k])
-        self._bank = (float(self.rng.uniform(4, 14)), float(self.rng.choice([0.0, 0.0, 0.06, 0.15, -0.06])))
+        self._bank = (float(self.rng.uniform(4, 14)), 0.0 if self.network.level else float(self.rng.choice(_BANKS)))
         self._relief = None if self.network.survey is None else Relief(self.network.survey, self.corner, everything.max(0) + MARGIN)
 
     def _near(self, line: F64, shape: NDArray[np.int64]) -> tuple[tuple[slice, slice], NDArray[np.float32]]:
@@ -98,7 +113,11 @@ class Ground:
 
     def _step(self, x: F64, y: F64, kind: NDArray[np.uint8], beside: NDArray[np.float32]) -> F64:
         start, bank = self._bank
-        rough = 0.05 * (np.sin(1.1 * x + 0.4 * y) + np.sin(0.7 * y - 0.5 * x + 1.0)) * np.clip((beside - 3) / 6, 0, 1)
+        rough = (
+            (0.0 if self.network.level else 0.05)
+            * (np.sin(1.1 * x + 0.4 * y) + np.sin(0.7 * y - 0.5 * x + 1.0))
+            * np.clip((beside - 3) / 6, 0, 1)
+        )
         rise = bank * np.clip(beside - start, 0, 12.0) * (1 + 0.5 * np.sin(0.03 * x + 0.05 * y))
         return np.where(kind == ROAD, 0.0, KERB + np.where(kind == TERRAIN, rough + rise, 0.0))
 

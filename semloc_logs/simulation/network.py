@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -34,13 +34,37 @@ class Road:
         return max(1.2, (self.half_width - (2.0 if self.parking else 0.0)) / 2)
 
 
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """A round piece of carriageway of a radius ``outer``, or none if that is 0, with an island of a radius ``inner`` in it; metres."""
+
+    x: float
+    y: float
+    outer: float
+    inner: float
+
+    @property
+    def lane(self) -> float:
+        """Radius of the driven line round the island."""
+        return self.inner + 2.6
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RoadNetwork:
-    """Crossings (k, 2) and the roads between them; ``survey`` are points (n, 3) of lanes that are driven, and how high they are."""
+    """Crossings (k, 2) and the roads between them.
+
+    ``survey`` are points (n, 3) of lanes that are driven, and how high they are; ``stubs`` are side streets that end blind, which no
+    route takes; ``circles`` are turning circles, refuges and roundabouts, the latter by the number of their crossing in ``roundabouts``;
+    ``level`` ground has no slopes, and nothing behind the plots.
+    """
 
     crossings: F64
     roads: tuple[Road, ...]
     survey: F64 | None = None
+    stubs: tuple[Road, ...] = ()
+    circles: tuple[Circle, ...] = ()
+    roundabouts: dict[int, Circle] = field(default_factory=dict)
+    level: bool = False
 
     def neighbours(self, crossing: int) -> list[tuple[int, int]]:
         """(road, other crossing) of every road at a crossing."""
@@ -55,8 +79,22 @@ def drawn_road(rng: Rng, a: int, b: int, path: F64, narrow: float) -> Road:
     return Road(a, b, path, float(half), float(sidewalk), parking)
 
 
+def repeating_network(rng: Rng, columns: int, rows: int, block: float) -> RoadNetwork:
+    """A straight grid on level ground all of whose blocks are copies of one: a trap for who recognises places."""
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij")
+    crossings = np.column_stack([x.ravel(), y.ravel()]) * np.array([block * rng.uniform(0.8, 1.2), block])
+    pairs = [(i * rows + j, (i + 1) * rows + j, 0) for i in range(columns - 1) for j in range(rows)]
+    pairs += [(i * rows + j, i * rows + j + 1, 1) for i in range(columns) for j in range(rows - 1)]
+    model = [drawn_road(rng, 0, 0, crossings, 1.0) for _ in range(2)]
+    roads = tuple(replace(model[k], a=a, b=b, path=resample(crossings[[a, b]], 1.0), look=k) for a, b, k in pairs)
+    return RoadNetwork(crossings, roads, level=True)
+
+
 def grid_network(rng: Rng, columns: int, rows: int, block: float) -> RoadNetwork:
-    """A bent grid of ``columns`` x ``rows`` crossings about ``block`` metres apart, some roads missing, none a dead end."""
+    """A bent grid of ``columns`` x ``rows`` crossings about ``block`` metres apart, some roads missing, none a dead end.
+
+    Some crossings are roundabouts, some side streets blind alleys, some wide roads have refuges in the middle.
+    """
     x, y = np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij")
     stretch = rng.uniform(0.75, 1.3)
     crossings = (
@@ -75,7 +113,44 @@ def grid_network(rng: Rng, columns: int, rows: int, block: float) -> RoadNetwork
             kept.append((a, b))
     narrow = rng.uniform(0.85, 1.3)
     roads = tuple(drawn_road(rng, a, b, _bend(rng, crossings[a], crossings[b]), narrow) for a, b in kept)
-    return RoadNetwork(crossings, roads)
+    more = rng.spawn(1)[0]  # what follows leaves the towns of a seed where they were
+    roundabouts = {}
+    for k in np.flatnonzero(np.bincount(np.array(kept).ravel(), minlength=len(crossings)) > 2).tolist():
+        if more.random() < 0.15:
+            inner = more.uniform(3.5, 6.5)
+            roundabouts[k] = Circle(float(crossings[k, 0]), float(crossings[k, 1]), inner + more.uniform(4.6, 6.0), inner)
+    stubs, ends = drawn_stubs(more, roads, roads, narrow)
+    return RoadNetwork(crossings, roads, None, stubs, (*roundabouts.values(), *ends, *_refuges(more, roads)), roundabouts)
+
+
+def drawn_stubs(rng: Rng, roads: tuple[Road, ...], every: tuple[Road, ...], narrow: float) -> tuple[tuple[Road, ...], tuple[Circle, ...]]:
+    """Blind alleys off some of the ``roads`` where they stay clear of ``every`` road, and the circles at their ends."""
+    stubs: list[Road] = []
+    circles: list[Circle] = []
+    for road in roads:
+        n, side, turn, length = len(road.path), rng.choice([-1.0, 1.0]), rng.normal() * 0.2, rng.uniform(28, 45)
+        wanted, radius = rng.random() < 0.25, rng.uniform(5.5, 8.0)
+        if not wanted or n < 60:
+            continue
+        k = int(n * rng.uniform(0.35, 0.65))
+        ahead = road.path[k + 2] - road.path[k - 2]
+        angle = np.arctan2(ahead[1], ahead[0]) + side * np.pi / 2 + turn
+        path = road.path[k] + np.linspace(0, length, int(length))[:, None] * np.array([np.cos(angle), np.sin(angle)])
+        others = np.concatenate([r.path for r in (*every, *stubs)])
+        if cKDTree(others).query(path[int(road.half_width) + 14 :])[0].min() > 14:
+            stubs.append(drawn_road(rng, -1, -1, path, narrow))
+            circles.append(Circle(float(path[-1, 0]), float(path[-1, 1]), max(radius, stubs[-1].half_width + 1), 0.0))
+    return tuple(stubs), tuple(circles)
+
+
+def _refuges(rng: Rng, roads: tuple[Road, ...]) -> list[Circle]:
+    """Narrow islands in the middle of roads that are wide enough, four circles in a row each."""
+    islands = []
+    for road in roads:
+        k, wanted, half = int(rng.uniform(0.2, 0.3) * len(road.path)), rng.random() < 0.5, road.lane - 1.55
+        if wanted and half > 0.5:
+            islands += [Circle(float(x), float(y), 0.0, min(half, 1.0)) for x, y in road.path[k : k + 4]]
+    return islands
 
 
 def _bend(rng: Rng, start: F64, end: F64) -> F64:
@@ -130,13 +205,28 @@ def left_of(direction: F64) -> F64:
 
 def lane_path(network: RoadNetwork, route: list[tuple[int, bool]]) -> F64:
     """The line (n, 2) that a car drives along a route, on the right, about every metre, corners cut not rounded."""
-    pieces = []
+    pieces: list[F64] = []
+    before: Circle | None = None
     for index, forwards in route:
         road = network.roads[index]
         centre = road.path if forwards else road.path[::-1]
         tangent = np.gradient(centre, axis=0)
         tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
         lane = centre - road.lane * left_of(tangent)
-        trim = min(int(road.half_width + 2), len(lane) // 3)
-        pieces.append(lane[trim : len(lane) - trim])
+        after = network.roundabouts.get(road.b if forwards else road.a)
+        first, last = (min(int((c.outer if c else road.half_width) + 2), len(lane) // 3) for c in (before, after))
+        piece = lane[first : len(lane) - last]
+        if before is not None and pieces:
+            pieces.append(_round(before, pieces[-1][-1], piece[0]))
+        pieces.append(piece)
+        before = after
     return np.concatenate(pieces)
+
+
+def _round(circle: Circle, start: F64, end: F64) -> F64:
+    """The line (n, 2) round an island, counter-clockwise from beside one point to beside another."""
+    middle = np.array([circle.x, circle.y])
+    first, last = (float(np.arctan2(*(p - middle)[::-1])) for p in (start, end))
+    # in and out of the circle a quarter of a lane's width is enough to turn
+    angle = np.linspace(first + 0.35, first + (last - first) % (2 * np.pi) - 0.35, 24)
+    return np.asarray(middle + circle.lane * np.column_stack([np.cos(angle), np.sin(angle)]))

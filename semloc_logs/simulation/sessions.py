@@ -17,7 +17,7 @@ from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drive import DriveFrame, simulate_drive
 from semloc_logs.simulation.lidar import MODELS
 from semloc_logs.simulation.log import FORMATS, write_session, write_truth
-from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, random_route
+from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, random_route, repeating_network
 from semloc_logs.simulation.objects import resample
 from semloc_logs.simulation.street import build_street, street_ground
 from semloc_logs.simulation.survey import drive_network, opposite_lane, read_drive
@@ -70,6 +70,7 @@ def simulate_sessions(
     trajectory: Path | None = None,
     part_m: tuple[float, float] = (0.0, math.inf),
     there_and_back: bool = False,
+    repeating: bool = False,
     label_noise: float = 0.0,
     drift: float = 0.007,
     wet: float = 0.0,
@@ -83,7 +84,8 @@ def simulate_sessions(
     """Drive ``sessions`` times about ``length_m`` metres through one random town, each time by another route; the path of truth.json.
 
     With a ``trajectory`` (a TUM or KITTI file) the streets lie along a recorded drive and every session drives the part of it between two
-    lengths in metres, every other one, if ``there_and_back``, the other way in the other lane.
+    lengths in metres, every other one, if ``there_and_back``, the other way in the other lane. A ``repeating`` town has blocks that are
+    copies of one another.
 
     Between sessions parked cars, people and a few trees change. ``seasons`` and ``daytimes`` are those of the sessions, over and over
     again; from the second session on there are ``roadworks`` (sites a kilometre) and a share of ``rebuilt`` houses. ``sensor`` is a name in
@@ -98,7 +100,7 @@ def simulate_sessions(
         raise SettingsError(f"logs cannot be simulated as {format!r}: choose one of {', '.join(FORMATS)}")
     conditions = drawn_conditions(sessions, seasons, roadworks, rebuilt, daytimes)
     if trajectory is None:
-        network, lines = _town(seed, sessions, length_m)
+        network, lines = _town(seed, sessions, length_m, repeating)
     else:
         network, lines = _recorded(seed, sessions, trajectory, part_m, there_and_back)
     planned = [Session(f"session_{k}{FORMATS[format]}", line, conditions[k]) for k, line in enumerate(lines)]
@@ -106,10 +108,11 @@ def simulate_sessions(
     return write_sessions(directory, network, planned, seed=seed, sensor=carried, format=format, overwrite=overwrite)
 
 
-def _town(seed: int, sessions: int, length_m: float) -> tuple[RoadNetwork, list[F64]]:
+def _town(seed: int, sessions: int, length_m: float, repeating: bool) -> tuple[RoadNetwork, list[F64]]:
     """A grid of streets, and another route through it for every session."""
     side = max(2, math.ceil(math.sqrt(length_m / _BLOCK / 2.5)))
-    network = grid_network(np.random.default_rng([seed, 61]), side, side + int(side < 3), _BLOCK)
+    kind = repeating_network if repeating else grid_network
+    network = kind(np.random.default_rng([seed, 61]), side, side + int(side < 3), _BLOCK)
     routes = [random_route(np.random.default_rng([seed, 62, k]), network, length_m + 30) for k in range(sessions)]
     return network, [smooth_line(lane_path(network, route))[: int(length_m / 0.5)] for route in routes]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semloc_logs.simulation.backlands import backlands, put_bridge, railway
+from semloc_logs.simulation.backlands import backlands, islands, put_bridge, railway
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.ground import Ground
 from semloc_logs.simulation.kerbs import kerbside
@@ -34,7 +34,7 @@ def build_street(path: F64 | RoadNetwork, seed: int, condition: Condition | int 
     for k, road in enumerate(network.roads):
         setting.turn_to(k, 1, road.look)
         put_bridge(setting, Side(road, 1))
-    for k, road in enumerate(network.roads):
+    for k, road in enumerate((*network.roads, *network.stubs)):
         for sign in (1, -1):
             side = Side(road, sign)
             setting.turn_to(k, 2 + (sign > 0), road.look)
@@ -43,8 +43,10 @@ def build_street(path: F64 | RoadNetwork, seed: int, condition: Condition | int 
             plots(setting, side, style)
             kerbside(setting, side, style)
     setting.turn_to(0, 4)
-    railway(setting)
-    backlands(setting)
+    islands(setting)
+    if not network.level:
+        railway(setting)
+        backlands(setting)
     mesh, labels = ground.mesh(setting.snow)
     setting.static.add(mesh, labels, ground="none")
     return join_worlds(setting.static.build(), setting.moving.build())

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.trajectory_file import TrajectoryFile, read_trajectory
-from semloc_logs.simulation.network import Road, RoadNetwork, drawn_road, left_of
+from semloc_logs.simulation.network import Road, RoadNetwork, drawn_road, drawn_stubs, left_of
 from semloc_logs.simulation.objects import resample
 from semloc_logs.simulation.world import F64
 
@@ -79,7 +79,13 @@ def drive_network(rng: Rng, drive: F64) -> RoadNetwork:
     heights = _agreeing_heights(drive, pairs)
     other = opposite_lane(plan)
     survey = np.concatenate([np.column_stack([line, heights]) for line in (plan, other)])
-    return RoadNetwork(np.array(nodes), tuple(roads), survey)
+    stubs, circles = drawn_stubs(rng, tuple(roads), (*roads, *_driven(plan)), narrow)
+    return RoadNetwork(np.array(nodes), tuple(roads), survey, stubs, circles)
+
+
+def _driven(plan: F64) -> list[Road]:
+    """All of a drive as a road, as far as what has to stay clear of it is concerned."""
+    return [Road(-1, -1, plan, 3.0, 0.0, False)]
 
 
 def opposite_lane(line: F64) -> F64:

@@ -11,7 +11,7 @@ import pytest
 from semloc_logs.errors import SettingsError
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.hall import build_hall, hall_walk
-from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route
+from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route, repeating_network
 from semloc_logs.simulation.street import build_street, street_ground
 from semloc_logs.simulation.traffic import random_traffic
 from semloc_logs.simulation.trajectory import drifting_odometry, drive, poses_along, smooth_line
@@ -263,3 +263,63 @@ def test_nothing_stands_in_the_lanes(seed: int) -> None:
                 origins = poses[:, :3, 3] + height * poses[:, :3, 2]
                 distance, _, _ = scene.cast(origins.astype(np.float32), (side * poses[:, :3, 1]).astype(np.float32))
                 assert (distance > 1).all()
+
+
+def test_routes_stay_on_the_road_and_keep_islands_to_their_left() -> None:
+    rounded = 0
+    for seed in range(12):
+        network = grid_network(np.random.default_rng(seed), 3, 3, 80.0)
+        ground = street_ground(network, seed)
+        line = smooth_line(lane_path(network, random_route(np.random.default_rng(seed), network, 600)))
+        assert ground.beside[ground.cell(*line.T)].max() < 0
+        for circle in network.roundabouts.values():
+            arm = line - [circle.x, circle.y]
+            near = np.flatnonzero(np.linalg.norm(arm[:-1], axis=1) < circle.lane + 0.6)
+            assert np.linalg.norm(arm, axis=1).min() > circle.inner + 1.0
+            step = np.diff(line, axis=0)[near]
+            assert (arm[near, 0] * step[:, 1] - arm[near, 1] * step[:, 0] > 0).all()
+            rounded += len(near)
+    assert rounded > 100
+
+
+def test_blind_alleys_and_refuges_are_drawn_and_no_route_takes_them() -> None:
+    networks = [grid_network(np.random.default_rng(seed), 3, 3, 85.0) for seed in range(20)]
+    assert sum(len(n.stubs) for n in networks) > 20
+    assert sum(c.inner < 1.5 and c.outer == 0 for n in networks for c in n.circles) > 8
+    for network in networks:
+        ground = street_ground(network, 0)
+        for stub in network.stubs:
+            assert ground.beside[ground.cell(*stub.path.T)].max() < -0.5
+        for circle in network.circles:
+            inside = ground.kind[ground.cell(np.array([circle.x]), np.array([circle.y]))][0]
+            assert inside == (ROAD if not circle.inner else TERRAIN if circle.inner > 1.5 else SIDEWALK)
+
+
+def test_blocks_of_a_repeating_town_are_copies() -> None:
+    network = repeating_network(np.random.default_rng(3), 3, 3, 60.0)
+    world = build_street(network, 3)
+    assert same(world, build_street(network, 3))
+    shift = network.crossings[3] - network.crossings[0]
+    x, y = np.meshgrid(np.arange(6.0, shift[0] - 6, 0.9), np.arange(6.0, 54.0, 0.9))
+    down = np.tile(np.array([0, 0, -1], np.float32), (x.size, 1))
+    views = []
+    for block in (0, 1):
+        origins = np.column_stack([x.ravel() + block * shift[0], y.ravel(), np.full(x.size, 60.0)])
+        distance, triangle, _ = Scene(world).cast(origins.astype(np.float32), down)
+        views.append((distance, world.labels[triangle]))
+    fixed = np.isin(views[0][1], (BUILDING, SIDEWALK, TERRAIN)) & np.isin(views[1][1], (BUILDING, SIDEWALK, TERRAIN))
+    assert (views[0][1] == BUILDING).mean() > 0.05
+    assert (np.abs(views[0][0] - views[1][0])[fixed] < 0.05).mean() > 0.97
+
+
+def test_towns_are_hilly_and_never_steeper_than_they_may_be() -> None:
+    network = grid_network(np.random.default_rng(0), 2, 2, 80.0)
+    steepest = []
+    for seed in range(30):
+        ground = street_ground(network, seed)
+        x, y = np.meshgrid(np.arange(-200.0, 200.0, 7), np.arange(-200.0, 200.0, 7))
+        rise = ground.slope_height(x.ravel() + 1, y.ravel()) - ground.slope_height(x.ravel(), y.ravel())
+        steepest.append(np.abs(rise).max())
+    assert max(steepest) < 0.081
+    assert max(steepest) > 0.045
+    assert min(steepest) < 0.02
