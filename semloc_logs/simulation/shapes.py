@@ -86,36 +86,6 @@ def resample(path: F64, spacing: float) -> F64:
     return np.column_stack([np.interp(at, along, path[:, k]) for k in range(path.shape[1])])
 
 
-def cover(outline: F64, z: float) -> Mesh:
-    """A level lid at z over any simple plan outline (n, 2), by cutting ears off it."""
-    n = len(outline)
-    following = np.roll(outline, -1, axis=0)
-    area = float((outline[:, 0] * following[:, 1] - outline[:, 1] * following[:, 0]).sum())
-    left = list(range(n)) if area > 0 else list(range(n))[::-1]
-    triangles: list[tuple[int, int, int]] = []
-    while len(left) > 3:
-        for k in range(len(left)):
-            a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
-            if _is_ear(outline, a, b, c, left):
-                break
-        triangles.append((a, b, c))
-        left.remove(b)
-    triangles.append((left[0], left[1], left[2]))
-    return Mesh(np.column_stack([outline, np.full(n, z)]), np.array(triangles, np.int64))
-
-
-def _is_ear(outline: F64, a: int, b: int, c: int, left: list[int]) -> bool:
-    p, q, r = outline[a], outline[b], outline[c]
-    others = outline[[k for k in left if k not in (a, b, c)]]
-
-    def side(u: F64, v: F64, w: F64) -> F64:
-        return np.asarray((v[0] - u[0]) * (w[..., 1] - u[1]) - (v[1] - u[1]) * (w[..., 0] - u[0]))
-
-    if side(p, q, r) < 0:
-        return False
-    return not bool(((side(p, q, others) > 0) & (side(q, r, others) > 0) & (side(r, p, others) > 0)).any())
-
-
 def snow_cover(parts: Parts, depth: float, steepest: float = 0.6) -> Parts:
     """The parts with a layer ``depth`` metres thick on buildings, walls and vehicles, where the normal's vertical share is ``steepest``.
 
