@@ -12,7 +12,7 @@ from semloc_logs.logs.open import open_log
 from semloc_logs.logs.session import Session
 from semloc_logs.simulation.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
 from semloc_logs.simulation.camera_drive import SKY, simulate_cameras, wrong_label_image
-from semloc_logs.simulation.log import write_session
+from semloc_logs.simulation.log import FORMATS, write_session
 from semloc_logs.simulation.trajectory import Trajectory
 from semloc_logs.simulation.world import BUILDING, POLE, ROAD, UNLABELLED, WALL, MeshBuilder, Scene, World, box
 
@@ -54,10 +54,10 @@ def test_masks_of_a_network_miss_edges_and_classes(yard: World) -> None:
     assert np.array_equal(wrong, wrong_label_image(hits, rays, pose, 0, 0.12, 0) != true)
 
 
-@pytest.mark.parametrize(("sensor", "ending"), [("depth", ".mcap"), ("depth", ".bag"), ("stereo", ".mcap")])
-def test_cameras_see_floor_and_walls_where_they_are(yard: World, tmp_path: Path, sensor: str, ending: str) -> None:
-    path, trajectory = tmp_path / f"log{ending}", standing()
-    write_session(path, trajectory, [], shots=simulate_cameras(yard, trajectory, sensor, rate_hz=2.0))
+@pytest.mark.parametrize(("sensor", "format_"), [("depth", "protobuf"), ("depth", "bag"), ("stereo", "mcap")])
+def test_cameras_see_floor_and_walls_where_they_are(yard: World, tmp_path: Path, sensor: str, format_: str) -> None:
+    path, trajectory = tmp_path / f"log{FORMATS[format_]}", standing()
+    write_session(path, trajectory, [], shots=simulate_cameras(yard, trajectory, sensor, rate_hz=2.0), format=format_)
     seen = clouds(path)
     assert len(seen) == 3
     for cloud in seen:

@@ -73,11 +73,10 @@ def test_surfaces_keep_their_colours_between_sessions(street: World) -> None:
     assert len(houses_a) > 5
 
 
-def test_light_and_season_change_the_picture(street: World) -> None:
+def test_light_and_season_change_the_picture(painter: Painter) -> None:
     def mean(condition: Condition, label: int) -> NDArray[np.float64]:
-        painter = Painter(Scene(street), condition)
         hits = first_hits(painter.scene, pose(30.0), pixel_rays(STEREO))
-        picture = painter.picture(pose(30.0), np.random.default_rng(0), STEREO, hits=hits)
+        picture = Painter(painter.scene, condition).picture(pose(30.0), np.random.default_rng(0), STEREO, hits=hits)
         return np.asarray(picture[hits.labels == label].mean(0), np.float64)
 
     summer, snow = (mean(Condition(season=season, daytime="overcast"), 9) for season in ("summer", "snow"))
