@@ -27,11 +27,11 @@ def kerbside(setting: Setting, side: Side, style: Style) -> None:
             x, y, _ = side.at(u + rng.normal(), 0.9 if walk > 2 else walk + 1.0)
             setting.put_tree(x, y, style.tree_size * rng.uniform(0.7, 1.2))
     for kind, rate in (
-        ("sign", 30.0),
-        ("parking", 90.0),
-        ("street", 90.0),
-        ("mast", 140.0),
-        ("bollard", 80.0),
+        ("sign", 45.0),
+        ("parking", 130.0),
+        ("street", 130.0),
+        ("mast", 260.0),
+        ("bollard", 140.0),
         ("gantry", 900.0),
         ("flag", 400.0),
     ):
@@ -48,7 +48,7 @@ def kerbside(setting: Setting, side: Side, style: Style) -> None:
         for u in rng.uniform(edge, max(edge + 1, side.length - edge - 8), rng.poisson(side.length / pitch if walk > 2.0 else 0.0)):
             x, y, yaw = side.at(float(u), walk - 1.1)
             setting.put(make(rng), x, y, yaw, aside=True)
-    for _ in range(setting.change.poisson(side.length / 40)):
+    for _ in range(setting.change.poisson(side.length / 80)):
         x, y, yaw = side.at(setting.change.uniform(0, side.length), setting.change.uniform(0.4, max(0.6, walk)))
         passer = objects.person if setting.change.random() < 0.7 else objects.two_wheeler
         setting.put(passer(setting.change), x, y, setting.change.uniform(0, 6.3), moving=True, aside=True)

@@ -73,8 +73,8 @@ class RoadNetwork:
 
 def drawn_road(rng: Rng, a: int, b: int, path: F64, narrow: float) -> Road:
     """A road along a centre line (n, 2), its widths drawn; ``narrow`` multiplies that of the carriageway."""
-    parking = bool(rng.random() < 0.55)
-    half = rng.uniform(2.3, 3.7) * narrow + (2.0 if parking else 0.0)
+    parking = bool(rng.random() < 0.75)
+    half = rng.uniform(2.5, 4.3) * narrow + (2.0 if parking else 0.0)
     sidewalk = 0.0 if rng.random() < 0.12 else rng.uniform(1.2, 3.8)
     return Road(a, b, path, float(half), float(sidewalk), parking)
 

@@ -84,7 +84,9 @@ def _plot(setting: Setting, side: Side, style: Style, u: float, gap: float, walk
     elif style.kind == "square":
         _square(setting, side, u, width + gap, walk, setback)
     _pave(setting, side, style, u - gap / 2, width + gap, walk, setback)
-    if style.setback > 1.5:
+    if gap > 1.8:  # beside the house
+        setting.parked(side, u + width + gap / 2, walk + rng.uniform(2.8, 7.0), 0.6, across=True)
+    if style.setback > 1.2:
         _frontage(setting, side, style, u - gap / 2, u + width + gap / 2, walk, built)
     _garden(setting, side, style, u - gap / 2, width + gap, walk, setback + (depth if built else 0.0), built)
 
@@ -179,7 +181,7 @@ def _garden(setting: Setting, side: Side, style: Style, u: float, width: float, 
         x, y, _ = side.at(u + rng.uniform(0, width), v)
         if not setting.ground.allowed(np.array([[x, y], [x + 0.6, y], [x - 0.6, y], [x, y + 0.6], [x, y - 0.6]])):
             continue
-        if rng.random() < 0.4:
+        if rng.random() < (0.2 if near else 0.5):
             setting.put_tree(x, y, rng.uniform(0.3, 1.1))
         elif rng.random() < 0.8:
             setting.put(objects.bush(rng, bare=setting.condition.bare), x, y, rng.uniform(0, 6.3))

@@ -37,19 +37,19 @@ class Style:
 
 
 _KINDS = {  # setback, storeys, plot, gap, share with a house, garden, share that is paved
-    "suburb": (3.5, 2.0, 12.0, 3.0, 0.95, 2.0, 0.1),
-    "twins": (4.0, 2.0, 9.0, 2.5, 1.0, 1.5, 0.1),
-    "rows": (2.0, 2.6, 7.0, 0.0, 0.97, 1.1, 0.4),
-    "terrace": (2.0, 2.3, 6.0, 0.0, 1.0, 0.8, 0.2),
+    "suburb": (2.3, 2.0, 12.0, 2.2, 0.95, 2.6, 0.4),
+    "twins": (2.7, 2.0, 9.0, 2.0, 1.0, 2.0, 0.35),
+    "rows": (1.5, 2.6, 7.0, 0.0, 0.97, 1.5, 0.5),
+    "terrace": (1.5, 2.3, 6.0, 0.0, 1.0, 1.2, 0.4),
     "city": (0.5, 4.5, 16.0, 0.8, 0.97, 0.2, 0.8),
     "park": (6.0, 1.5, 14.0, 25.0, 0.15, 5.0, 0.1),
-    "country": (6.0, 1.6, 15.0, 14.0, 0.5, 3.0, 0.1),
-    "yards": (5.0, 1.9, 28.0, 6.0, 0.85, 0.6, 0.6),
+    "country": (4.5, 1.6, 15.0, 12.0, 0.5, 4.0, 0.15),
+    "yards": (3.5, 1.9, 28.0, 6.0, 0.85, 0.8, 0.7),
     "open": (20.0, 1.0, 30.0, 30.0, 0.05, 0.3, 0.0),
     "car park": (24.0, 1.8, 32.0, 4.0, 0.9, 0.1, 1.0),
     "square": (22.0, 4.0, 14.0, 0.0, 0.95, 0.0, 1.0),
 }
-_USUAL = ("suburb", "suburb", "twins", "rows", "rows", "terrace", "city", "city", "park", "country", "yards")
+_USUAL = ("suburb", "suburb", "suburb", "twins", "rows", "rows", "terrace", "city", "city", "park", "country", "yards")
 _SOMETIMES = (*_USUAL, "open", "car park", "square")
 
 
@@ -79,8 +79,8 @@ def drawn_style(rng: Rng, town: Rng) -> Style:
         roofs.get(kind, ("gable", "cross", "hip")),
         float(rng.choice([9.0, 14.0, 25.0, 200.0])) * rng.uniform(0.8, 1.2),
         rng.uniform(0.45, 1.0),
-        rng.uniform(22, 40),
-        rng.uniform(0.1, 0.85),
+        rng.uniform(26, 55),
+        rng.uniform(0.35, 0.97),
         paved,
     )
 
