@@ -175,7 +175,7 @@ def _frontage(setting: Setting, side: Side, style: Style, u0: float, u1: float, 
 
 def _garden(setting: Setting, side: Side, style: Style, u: float, width: float, walk: float, behind: float, house: bool) -> None:
     rng = setting.rng
-    for _ in range(rng.poisson(style.garden * width / 6)):
+    for _ in range(rng.poisson(style.garden * width / 4)):
         near = rng.random() < (0.5 if house else 0.7)
         v = rng.uniform(walk + 0.8, max(walk + 1.0, walk + style.setback)) if near else behind + rng.uniform(1, 22)
         x, y, _ = side.at(u + rng.uniform(0, width), v)

@@ -37,13 +37,13 @@ class Style:
 
 
 _KINDS = {  # setback, storeys, plot, gap, share with a house, garden, share that is paved
-    "suburb": (2.3, 2.0, 12.0, 2.2, 0.95, 2.6, 0.4),
-    "twins": (2.7, 2.0, 9.0, 2.0, 1.0, 2.0, 0.35),
-    "rows": (1.5, 2.6, 7.0, 0.0, 0.97, 1.5, 0.5),
-    "terrace": (1.5, 2.3, 6.0, 0.0, 1.0, 1.2, 0.4),
+    "suburb": (2.3, 2.0, 12.0, 1.8, 0.97, 2.6, 0.6),
+    "twins": (2.7, 2.0, 9.0, 1.6, 1.0, 2.0, 0.55),
+    "rows": (1.5, 2.6, 7.0, 0.0, 0.97, 1.5, 0.7),
+    "terrace": (1.5, 2.3, 6.0, 0.0, 1.0, 1.2, 0.6),
     "city": (0.5, 4.5, 16.0, 0.8, 0.97, 0.2, 0.8),
     "park": (6.0, 1.5, 14.0, 25.0, 0.15, 5.0, 0.1),
-    "country": (4.5, 1.6, 15.0, 12.0, 0.5, 4.0, 0.15),
+    "country": (4.5, 1.6, 15.0, 12.0, 0.6, 4.0, 0.25),
     "yards": (3.5, 1.9, 28.0, 6.0, 0.85, 0.8, 0.7),
     "open": (20.0, 1.0, 30.0, 30.0, 0.05, 0.3, 0.0),
     "car park": (24.0, 1.8, 32.0, 4.0, 0.9, 0.1, 1.0),
@@ -56,7 +56,7 @@ _SOMETIMES = (*_USUAL, "open", "car park", "square")
 def drawn_style(rng: Rng, town: Rng) -> Style:
     """A side's style: a kind drawn from what the town has, then all of it varied."""
     favourite = _USUAL[int(town.integers(len(_USUAL)))]
-    kind = favourite if rng.random() < 0.55 else _SOMETIMES[int(rng.integers(len(_SOMETIMES)))]
+    kind = favourite if rng.random() < 0.7 else _SOMETIMES[int(rng.integers(len(_SOMETIMES)))]
     setback, storeys, plot, gap, built, garden, paved = _KINDS[kind]
     frontage = {"city": "none", "park": "none", "yards": "fence", "open": "rail", "country": "rail", "car park": "none", "square": "none"}
     roofs = {
@@ -69,7 +69,7 @@ def drawn_style(rng: Rng, town: Rng) -> Style:
     return Style(
         kind,
         {"terrace": "same", "twins": "mirror"}.get(kind, "none"),
-        setback * rng.uniform(0.5, 1.6) if setback < 10 else setback * rng.uniform(0.8, 1.1),
+        setback * rng.uniform(0.4, 1.3) if setback < 10 else setback * rng.uniform(0.8, 1.1),
         max(1.0, storeys * rng.uniform(0.7, 1.4)),
         plot * rng.uniform(0.75, 1.4),
         gap * rng.uniform(0.4, 1.6),
