@@ -151,7 +151,7 @@ def _pave(setting: Setting, side: Side, style: Style, u: float, width: float, wa
 
 def _frontage(setting: Setting, side: Side, style: Style, u0: float, u1: float, walk: float, house: bool) -> None:
     rng = setting.rng
-    if style.frontage == "none" or rng.random() < (0.2 if house else 0.5):
+    if style.frontage == "none" or rng.random() < (0.12 if house else 0.5):
         return
     opening = rng.uniform(2.5, 4.0)
     start = rng.uniform(u0, max(u0 + 0.1, u1 - opening))
