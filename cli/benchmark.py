@@ -50,6 +50,7 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
 @path_option("--weights", help="Weights instead of the shipped ones, for retrieval and completion.")
 @click.option("--database", type=click.IntRange(1), default=100_000, show_default=True, metavar="N", help="Descriptors, for retrieval.")
 @click.option("--queries", type=click.IntRange(1), default=2000, show_default=True, metavar="N", help="Words that ask, for retrieval.")
+@path_option("--picture", help="PNG of some subvolumes to write, for completion.")
 @path_option("--work", help="Folder that keeps the simulated streets, for retrieval and completion.")
 @json_option
 @settings_options
@@ -64,6 +65,7 @@ def command(
     weights: Path | None,
     database: int,
     queries: int,
+    picture: Path | None,
     work: Path | None,
     as_json: bool,
     settings: Settings,
@@ -74,8 +76,8 @@ def command(
     drives of several lengths), fuse (one session of the LOGs, beside reading and integrating alone), pipeline (seconds, memory and
     profile of a run on the LOGs), words (recall of word matches between two LOGs whose truth is known, trained weights beside random
     ones), labels (classes from geometry against the labels recorded in the LOGs), realism (simulated sweeps beside the labelled ones of
-    the LOGs), or retrieval (recall of descriptors on held-out simulated streets and, with --truth, of the first LOG's in the second
-    one's). Close other programs first: times are wall-clock.
+    the LOGs), retrieval (recall of descriptors on held-out simulated streets and, with --truth, of the first LOG's in the second
+    one's), or completion (of incomplete subvolumes of such streets). Close other programs first: times are wall-clock.
 
     \b
     Example:  semloc benchmark reading --json
@@ -90,6 +92,8 @@ def command(
         raise click.UsageError("words needs two logs and --truth FILE.")
     if name == "retrieval" and ((truth is None) != (not logs) or len(logs) not in (0, 2)):
         raise click.UsageError("retrieval takes two logs and --truth FILE, or neither.")
+    if name == "completion" and variant == "both":
+        raise click.UsageError("completion is of one variant: give --variant semantic or --variant geometric.")
     if name in ("pipeline", "fuse", "labels", "realism") and not logs:
         raise click.UsageError(f"{name} needs at least one log.")
     with console.progress():
@@ -101,6 +105,10 @@ def command(
             real = real_streets(logs, truth, settings) if truth is not None else None
             rows: Rows = []
             figures = retrieval_benchmark(RetrievalChoice(variants, weights, database, queries, work), peers, settings, real, console.note)
+        elif name == "completion":
+            from semloc_logs.evaluation.completion import completion_benchmark
+
+            figures, rows = completion_benchmark(variant, settings, weights, work, picture, console.note), []
         else:
             figures, rows = _measure(name, logs, truth, peers, lengths, settings)
     if as_json:

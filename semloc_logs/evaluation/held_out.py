@@ -89,7 +89,7 @@ def held_out(
 
     Another version of the simulation has files of its own. SettingsError when so many cannot be had.
     """
-    folder = folder / _version()
+    folder = folder / simulation_version()
     note = {"schema_version": 1, "fusion": settings.fingerprint("fusion"), "headings": settings.closures.headings, "extent": repr(extent)}
     paths: list[Path] = []
     counts = dict.fromkeys(SENSORS, 0)
@@ -112,7 +112,7 @@ def held_out(
     return HeldOut(tuple(paths), settings, database, queries)
 
 
-def _version() -> str:
+def simulation_version() -> str:
     """Of the simulation: a hash of its modules."""
     package = Path(simulation.__file__).parent
     return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(package.glob("*.py")))).hexdigest()[:12]

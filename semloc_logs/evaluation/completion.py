@@ -1,0 +1,166 @@
+"""`semloc benchmark completion`: how well the network completes subvolumes of streets that no training has seen (paper 4.3, figure 3)."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+
+from semloc_logs.errors import SettingsError
+from semloc_logs.evaluation.completion_picture import draw_completions
+from semloc_logs.evaluation.held_out import simulation_version
+from semloc_logs.settings import Settings
+from semloc_logs.simulation.training_data import SceneTask, make_shard
+from semloc_logs.subvolumes.cut import CLASSES, SIZE, code_table
+from semloc_logs.subvolumes.network import Completion
+from semloc_logs.subvolumes.pairs import read_shard
+from semloc_logs.voxels.grid import FREE_STATE
+
+U8 = NDArray[np.uint8]
+I64 = NDArray[np.int64]
+Figures = dict[str, dict[str, float | str]]
+
+SEEDS = (9001, 9002, 9003, 9004)  # of held-out streets: those of training count from 0
+PAIRS = 150  # of a street at most
+PAPER = 0.87  # accuracy (4.3)
+SHOWN = 6  # subvolumes in the picture
+BATCH = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Completed:
+    """Network codes (n, 32, 32, 32) of the subvolumes as few frames saw them, as the network completes them, and as all frames saw
+    them; ``classes`` is the code of free voxels."""
+
+    given: U8
+    said: U8
+    truth: U8
+    classes: int
+
+
+def load_completion(variant: str, weights: Path | None = None) -> Completion:
+    """The shipped network of ``variant`` with its decoder, or that of a file. Raises SettingsError when the file does not hold one."""
+    model = Completion(variant)
+    try:
+        if weights is not None:
+            tensors = load_file(weights)
+        else:
+            with as_file(files("semloc_logs.subvolumes") / "weights" / f"{variant}.safetensors") as path:
+                tensors = load_file(path)
+        counters = {k: v for k, v in model.state_dict().items() if not v.is_floating_point()}  # of no use after training
+        model.load_state_dict(counters | {k: v.float() for k, v in tensors.items()})
+    except (OSError, SafetensorError, RuntimeError) as problem:
+        said = str(problem).splitlines()[0]
+        raise SettingsError(f"{weights or 'The shipped weights'}: no weights of the {variant} encoder and decoder ({said}).") from None
+    return model.eval()
+
+
+@torch.inference_mode()
+def completed(model: Completion, pairs: tuple[U8, U8, U8]) -> Completed:
+    """What the network makes of the incomplete views of ``pairs``, of :func:`semloc_logs.subvolumes.pairs.read_shard`."""
+    table, classes = code_table(model.encoder.variant), CLASSES[model.encoder.variant]
+    complete = getattr(model, "complete", lambda codes: model(codes, None)[0])
+    given = table[pairs[0]]
+    said = np.zeros((len(given), SIZE, SIZE, SIZE), np.uint8)
+    for i in range(0, len(given), BATCH):
+        logits = complete(torch.from_numpy(given[i : i + BATCH]))
+        said[i : i + BATCH] = logits[:, : classes + 1].argmax(1).numpy()
+    return Completed(np.ascontiguousarray(given[:, 16:-16, 16:-16]), said, table[pairs[1]], classes)
+
+
+def completion_figures(found: Completed) -> Figures:
+    """Over the voxels that the complete map observed, as classes or free; ``all_free`` and ``copy_input`` are the two trivial answers.
+
+    ``accuracy``: share of right labels (the paper's figure); ``unobserved_accuracy``: the same where the input observed nothing;
+    ``mean_iou``: mean over the occupied classes that occur; ``occupied_iou``, ``free_iou``: of occupied and free whatever the class.
+    """
+    known = found.truth <= found.classes
+    truth = found.truth[known]
+    answers = {"ours": found.said[known], "all_free": np.full_like(truth, found.classes), "copy_input": found.given[known]}
+    hidden = answers["copy_input"] == found.classes + 1
+    figures: Figures = {}
+    for who, said in answers.items():
+        confusion = np.bincount(truth.astype(np.int64) * 32 + said, minlength=32 * 32).reshape(32, 32)
+        scores = _scores(confusion, found.classes)
+        scores["unobserved_accuracy"] = float((said == truth)[hidden].mean()) if hidden.any() else 0.0
+        for name, value in scores.items():
+            figures.setdefault(name, {})[who] = value
+    figures["accuracy"]["paper"] = PAPER
+    for name, row in figures.items():
+        row["unit"] = f"{'IoU' if name.endswith('iou') else 'share'} of {len(truth)} voxels"
+    return figures
+
+
+def _scores(confusion: I64, classes: int) -> dict[str, float]:
+    """Of a confusion (32, 32) of true and given codes."""
+    total = max(int(confusion.sum()), 1)
+    right = np.diag(confusion)
+    union = confusion.sum(0) + confusion.sum(1) - right
+    occurs = np.flatnonzero(confusion.sum(1)[:classes])
+    unknown = classes + 2  # occupied, class unknown: as good as any class for whether something is there
+    filled = np.isin(np.arange(32), [*range(classes), unknown])
+    both = int(confusion[filled][:, filled].sum())
+    either = int(confusion[filled].sum() + confusion[:, filled].sum()) - both
+    return {
+        "accuracy": int(right.sum()) / total,
+        "mean_iou": float((right[occurs] / union[occurs]).mean()) if len(occurs) else 0.0,
+        "occupied_iou": both / max(either, 1),
+        "free_iou": int(right[classes]) / max(int(union[classes]), 1),
+    }
+
+
+def completion_benchmark(
+    variant: str,
+    settings: Settings,
+    weights: Path | None = None,
+    work: Path | None = None,
+    picture: Path | None = None,
+    note: Callable[[str], None] = lambda _: None,
+) -> Figures:
+    """Figures on held-out streets, whose pairs are kept in the folder ``work``; ``picture`` is a PNG of some of them to look at."""
+    settings = settings.resolved()
+    model = load_completion(variant, weights)
+    with ExitStack() as stack:
+        folder = work or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="semloc-completion-")))
+        parts = []
+        for number, seed in enumerate(SEEDS):
+            shard = folder / "pairs" / simulation_version() / f"street-{seed}-{settings.fingerprint('fusion', 'training')}.parquet"
+            shard.parent.mkdir(parents=True, exist_ok=True)
+            pairs = read_shard(make_shard(SceneTask(seed, shard, settings)))
+            rows = np.random.default_rng(seed).permutation(len(pairs[0]))[:PAIRS]
+            parts.append(tuple(a[np.sort(rows)] for a in pairs))
+            note(f"pairs of {number + 1} of {len(SEEDS)} streets are cut")
+    a, b, c = (np.concatenate([p[k] for p in parts]) for k in range(3))
+    found = completed(model, (a, b, c))
+    if picture is not None:
+        rows = _worth_seeing(found)
+        draw_completions(picture, variant, *(_states(v[rows], found.classes) for v in (found.given, found.said, found.truth)))
+    return completion_figures(found)
+
+
+def _worth_seeing(found: Completed) -> I64:
+    """Rows with much to complete and many classes, far from each other in the list."""
+    occupied = found.truth < found.classes
+    hidden = (occupied & (found.given == found.classes + 1)).sum((1, 2, 3)) / np.maximum(occupied.sum((1, 2, 3)), 1)
+    kinds = np.array([len(np.unique(t[t < found.classes])) for t in found.truth])
+    score = kinds + 5 * hidden + 5 * np.minimum(occupied.mean((1, 2, 3)) / 0.1, 1)
+    groups = np.array_split(np.arange(len(score)), min(SHOWN, len(score)))
+    return np.array([g[np.argmax(score[g])] for g in groups if len(g)], np.int64)
+
+
+def _states(codes: U8, classes: int) -> U8:
+    """Voxel states of codes: classes, 254 free, 253 unobserved, 255 occupied of no known class."""
+    table = np.full(256, 255, np.uint8)
+    if classes > 1:
+        table[:classes] = np.arange(classes)
+    table[[classes, classes + 1]] = FREE_STATE, 253
+    return table[codes]
