@@ -107,6 +107,7 @@ def held_out(
                 counts[kind] += held
             paths.append(path)
             on_progress(f"{min(min(counts.values()), database)} of {database} descriptors' streets are simulated")
+    _scene.cache_clear()  # a town takes hundreds of megabytes
     if min(counts.values()) < database:
         raise SettingsError(f"{database} held-out descriptors cannot be had: {min(counts.values())} at most.")
     return HeldOut(tuple(paths), settings, database, queries)
