@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -139,7 +140,7 @@ def little_town(monkeypatch: pytest.MonkeyPatch) -> None:
             builder.add(box(5.0, 4.0, float(rng.uniform(1, 7)), float(x), side * float(rng.uniform(7, 9))), 2)
     scene = Scene(builder.build())
     network = path_network(np.random.default_rng(0), np.column_stack([np.arange(0.0, 61.0), np.zeros(61)]))
-    monkeypatch.setattr(module, "_scene", lambda *_: scene)
+    monkeypatch.setattr(module, "_scene", lru_cache(lambda *_: scene))
     monkeypatch.setattr(module, "_network", lambda town, _: network if town == 0 else RoadNetwork(np.zeros((0, 2)), ()))
     monkeypatch.setattr(module, "_ground", lambda *_: Flat())
     monkeypatch.setattr(module, "random_traffic", lambda rng, ground, lines, density: Traffic(ground, ()))
