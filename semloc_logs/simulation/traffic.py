@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from semloc_logs.geometry import inverse
 from semloc_logs.simulation import objects
 from semloc_logs.simulation.ground import Ground
+from semloc_logs.simulation.network import left_of
 from semloc_logs.simulation.trajectory import poses_along
 from semloc_logs.simulation.world import F64, Mesh, MeshBuilder, Scene
 
@@ -42,7 +44,10 @@ class Traffic:
 
 
 def random_traffic(rng: np.random.Generator, ground: Ground, lines: list[F64], density: float) -> Traffic:
-    """About ``density`` vehicles every 100 m of smooth lines (n, 2) with points every half metre (of :func:`trajectory.smooth_line`)."""
+    """About ``density`` vehicles, and walkers beside them, every 100 m of smooth lines (n, 2) with points every half metre.
+
+    Such lines come from :func:`trajectory.smooth_line`.
+    """
     vehicles = []
     for line in lines:
         length = 0.5 * (len(line) - 1)
@@ -50,4 +55,19 @@ def random_traffic(rng: np.random.Generator, ground: Ground, lines: list[F64], d
             (objects.moving_vehicle(rng), line, float(rng.uniform(0, length)), float(rng.uniform(4, 11)))
             for _ in range(rng.poisson(density * length / 100))
         ]
+        beside = pavement(ground, line)
+        for _ in range(rng.poisson(0.7 * density * length / 100)):
+            way = beside if rng.random() < 0.5 else beside[::-1]
+            vehicles.append((objects.person(rng), way, float(rng.uniform(0, length)), float(rng.uniform(0.7, 1.8))))
     return Traffic(ground, tuple(vehicles))
+
+
+def pavement(ground: Ground, line: F64) -> F64:
+    """The line (n, 2) that walkers take to the right of a driven line (n, 2) with points every half metre."""
+    tangent = np.gradient(line, axis=0)
+    right = -left_of(tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9))
+    steps = np.arange(1.5, 9.0, 0.25)
+    at = line[:, None] + steps[:, None] * right[:, None]
+    off = (ground.beside[ground.cell(at[..., 0].ravel(), at[..., 1].ravel())] > 0.6).reshape(at.shape[:2])
+    distance = np.where(off.any(1), steps[off.argmax(1)], 4.0)
+    return np.asarray(line + gaussian_filter1d(distance, 6.0, mode="nearest")[:, None] * right)

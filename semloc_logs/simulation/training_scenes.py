@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.hall import build_hall, hall_walk
 from semloc_logs.simulation.lidar import MODELS, LidarModel, full_sweep
 from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route
@@ -90,7 +91,14 @@ def _street(rng: np.random.Generator, seed: int, frames: int) -> _Drive:
         poses = np.concatenate([poses, again])
     seconds = np.arange(frames, dtype=np.float64) * spacing / rng.uniform(5, 10)
     traffic = random_traffic(rng, ground, [line, back], float(rng.choice([0.0, 0.6, 1.5])))
-    return _Drive(build_street(network, seed), poses, seconds, traffic)
+    return _Drive(build_street(network, seed, _condition(seed)), poses, seconds, traffic)
+
+
+def _condition(seed: int) -> Condition:
+    """Every other scene in summer, some of them with roadworks and scaffolds."""
+    rng = np.random.default_rng([seed, 78])
+    season = str(rng.choice(["summer", "summer", "summer", "autumn", "winter", "snow"]))
+    return Condition(0, season, float(rng.choice([0.0, 0.0, 8.0])), float(rng.choice([0.0, 0.0, 0.1])))
 
 
 def _hall(rng: np.random.Generator, seed: int, frames: int) -> _Drive:

@@ -13,9 +13,9 @@ from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.hall import build_hall, hall_walk
 from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route, repeating_network
 from semloc_logs.simulation.street import build_street, street_ground
-from semloc_logs.simulation.traffic import random_traffic
+from semloc_logs.simulation.traffic import pavement, random_traffic
 from semloc_logs.simulation.trajectory import drifting_odometry, drive, poses_along, smooth_line
-from semloc_logs.simulation.world import BUILDING, FENCE, POLE, ROAD, SIDEWALK, TERRAIN, TRAFFIC_SIGN, VEGETATION, Scene, World
+from semloc_logs.simulation.world import BUILDING, CAR, FENCE, PERSON, POLE, ROAD, SIDEWALK, TERRAIN, TRAFFIC_SIGN, VEGETATION, Scene, World
 
 
 @pytest.fixture(scope="module")
@@ -323,3 +323,15 @@ def test_towns_are_hilly_and_never_steeper_than_they_may_be() -> None:
     assert max(steepest) < 0.081
     assert max(steepest) > 0.045
     assert min(steepest) < 0.02
+
+
+def test_people_walk_beside_the_road(network: RoadNetwork) -> None:
+    ground = street_ground(network, 4)
+    line = smooth_line(lane_path(network, random_route(np.random.default_rng(0), network, 150)))
+    way = pavement(ground, line)
+    assert (ground.beside[ground.cell(*way.T)] > 0).mean() > 0.75
+    assert np.linalg.norm(way - line, axis=1).min() > 1.4
+    traffic = random_traffic(np.random.default_rng(1), ground, [line], 4.0)
+    labels = {label for parts, *_ in traffic.vehicles for _, label in parts}
+    assert PERSON in labels
+    assert CAR in labels
