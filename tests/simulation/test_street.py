@@ -227,7 +227,7 @@ def test_houses_and_trunks_are_the_same_in_every_season(network: RoadNetwork) ->
 
 
 def test_roadworks_close_a_side_and_leave_the_lane_open() -> None:
-    network = grid_network(np.random.default_rng(6), 2, 2, 70.0)
+    network = grid_network(np.random.default_rng(6), 2, 2, 58.0)
     before, after = build_street(network, 6), build_street(network, 6, Condition(0, roadworks=40.0))
     added = faces(after) - faces(before)
     assert {FENCE, TERRAIN, 255} <= {face[-1] for face in added}
