@@ -125,12 +125,14 @@ class Training(_Section):
     samples: int = Field(250_000, ge=32, description="subvolumes seen, nine of each cut pair")
     scenes: int = Field(60, ge=1, description="simulated scenes that pairs are cut from, when no session is given")
     batch: int = Field(12, ge=2, description="pairs of a step")
+    latent: int = Field(256, ge=8, le=1024, description="numbers of a descriptor")
     dropout: float = Field(0.10, ge=0, lt=1, description="share of the input's voxels that are dropped to unobserved")
     reconstruction_weight: float = Field(10.0, description="weight of the reconstruction loss against the prior's")
     occupied_weight: float = Field(10.0, description="weight of occupied voxels within it")
     contrastive_weight: float = Field(10.0, ge=0, description="weight of the contrastive term beside completion; 0 is the paper")
     shift: float = Field(0.6, ge=0, description="random shift of the contrastive view, largest per axis (m at 0.30 m voxels)")
     turn: float = Field(0.175, ge=0, description="random turn of the contrastive view, largest (rad)")
+    tilt: float = Field(0.006, ge=0, description="standard deviation of the incomplete view's vertical, per axis (rad)")
     seed: int = 0
 
 

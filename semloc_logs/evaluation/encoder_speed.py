@@ -23,11 +23,12 @@ from torch import Tensor, nn
 
 from semloc_logs.errors import SemlocError
 from semloc_logs.settings import Settings
-from semloc_logs.simulation.training_scenes import training_session
+from semloc_logs.simulation.training_data import scene_frame
+from semloc_logs.simulation.training_scenes import training_scene
 from semloc_logs.subvolumes.cut import WIDE, code_table
 from semloc_logs.subvolumes.describe import random_encoder
 from semloc_logs.subvolumes.network import Encoder, descriptors
-from semloc_logs.subvolumes.pairs import SceneFrame, fuse
+from semloc_logs.subvolumes.pairs import fuse
 
 Figures = dict[str, dict[str, float | str]]
 EDGE = 192  # voxels of the piece of map, margin included
@@ -74,7 +75,7 @@ def encoder_speed(settings: Settings) -> Figures:
 
 def _piece(settings: Settings) -> NDArray[np.uint8]:
     """Codes (EDGE, EDGE, 32) of the middle of a simulated street."""
-    blocks = fuse([SceneFrame(*frame[:2], frame[2], frame[3]) for frame in training_session(4, 24)], settings.fusion)
+    blocks = fuse([scene_frame(frame) for frame in training_scene(4, 24).mapped], settings.fusion)
     low, high = blocks.bounds()
     middle = (low + high) // 2
     state = blocks.dense(np.array([middle[0] - EDGE // 2, middle[1] - EDGE // 2, -8]), (EDGE, EDGE, 32))

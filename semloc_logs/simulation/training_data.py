@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from semloc_logs.settings import Settings
-from semloc_logs.simulation.training_scenes import training_session
+from semloc_logs.simulation.training_scenes import TrainingFrame, training_scene
 from semloc_logs.subvolumes.pairs import SceneFrame, cut_pairs, write_shard
 
 
@@ -24,10 +24,17 @@ class SceneTask:
 def make_shard(task: SceneTask) -> Path:
     """Simulate the scene of ``task.seed`` and write its pairs, unless they are there already."""
     if not task.shard.exists():
-        frames = [SceneFrame(points, origin, label, pose) for points, origin, label, pose in training_session(task.seed)]
+        scene = training_scene(task.seed)
+        mapped = [scene_frame(f) for f in scene.mapped]
+        asked = mapped if scene.asked is scene.mapped else [scene_frame(f) for f in scene.asked]
         rng = np.random.default_rng((task.settings.training.seed, 3, task.seed))
-        write_shard(task.shard, cut_pairs(frames, task.settings.fusion, task.settings.training, rng))
+        write_shard(task.shard, cut_pairs(mapped, task.settings.fusion, task.settings.training, rng, asked=asked))
     return task.shard
+
+
+def scene_frame(frame: TrainingFrame) -> SceneFrame:
+    """The simulated frame as one to be fused."""
+    return SceneFrame(frame.points, frame.origin, frame.labels, frame.world_T_base, frame.sigma)
 
 
 def scene_tasks(folder: Path, scenes: int, settings: Settings) -> list[SceneTask]:

@@ -1,29 +1,56 @@
-"""Labelled sweeps through random worlds: the training data of the shipped descriptor network.
+"""Labelled clouds through random worlds: the training data of the shipped descriptor network.
 
-:func:`training_session` is all that training needs: every seed is another town (every sixth a hall), another sensor and another drive.
-About two seconds a session on one core. Labels are true; :func:`semloc_logs.simulation.lidar.corrupt_labels` makes a network's of them.
+Every seed is another town (every sixth a hall), driven once to map it and, in most scenes, once more to ask: by another sensor, from
+another lane or in the other direction, in another season, among other parked cars. About ten seconds a scene on one core.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.simulation.conditions import Condition
+from semloc_logs.geometry import apply
+from semloc_logs.simulation.camera import CAMERAS, CameraModel, camera_points
+from semloc_logs.simulation.conditions import SEASONS, Condition
 from semloc_logs.simulation.hall import build_hall, hall_walk
-from semloc_logs.simulation.lidar import MODELS, LidarModel, full_sweep
+from semloc_logs.simulation.label_errors import corrupt_labels
+from semloc_logs.simulation.lidar import full_sweep
+from semloc_logs.simulation.lidar_models import MODELS, LidarModel
 from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route
 from semloc_logs.simulation.street import build_street, street_ground
 from semloc_logs.simulation.traffic import Traffic, random_traffic
 from semloc_logs.simulation.trajectory import poses_along, smooth_line
 from semloc_logs.simulation.world import F64, Scene, World
 
-TrainingFrame = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], F64]
 RAYS = 60_000  # a sweep at most
 RANGE = 60.0  # m
+ASKED = 36  # frames of the second drive
+LABEL_NOISE = 0.02, 0.2  # share of wrong labels of a session, least and most
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingFrame:
+    """``points`` (n, 3) and sensor ``origin`` (3,) float32 in the base frame, on the ground under the vehicle, x ahead, z up; ``labels``
+    (n,) Cityscapes train ids, 255 = none, some of them wrong; ``world_T_base`` (4, 4), true; ``sigma`` (n,) along the ray, of cameras."""
+
+    points: NDArray[np.float32]
+    origin: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+    world_T_base: F64
+    sigma: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingScene:
+    """Frames of the drive that maps a place, and of the drive that asks about it; these may be the same frames."""
+
+    mapped: list[TrainingFrame]
+    asked: list[TrainingFrame]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,37 +61,70 @@ class _Drive:
     traffic: Traffic | None
 
 
-def training_session(seed: int, frames: int = 60) -> Iterator[TrainingFrame]:
-    """A drive of ``frames`` sweeps through a random street, or with every sixth seed a walk through a hall.
+@dataclass(frozen=True, slots=True)
+class _Rig:
+    """A sensor on a vehicle; a camera is turned to the left by ``yaw`` radians. ``sector``: azimuths that a lidar is limited to."""
 
-    Yields (points (n, 3) float32 and sensor origin (3,) float32 in the base frame, labels (n,) uint8 Cityscapes train ids with
-    255 = none, ``world_T_base`` (4, 4)). The base frame is on the ground under the vehicle, x ahead, z up. The second part of most drives
-    comes back along the first in the other direction or in the same one; poses are true. The same arguments give the same frames.
+    model: LidarModel | CameraModel
+    columns: int = 0
+    sector: tuple[float, float] | None = None
+    yaw: float = 0.0
+    label_noise: float = 0.0
+
+    def frame(self, scene: Scene, pose: F64, rng: Rng, moving: Scene | None, seed: int, number: int) -> TrainingFrame:
+        """What it sees from ``pose`` (4, 4) of the base."""
+        if isinstance(self.model, CameraModel):
+            points, origin, labels, sigma = camera_points(scene, pose, rng, self.model, yaw=self.yaw, traffic=moving, step=3)
+        else:
+            base_T_lidar = np.eye(4)
+            base_T_lidar[2, 3] = self.model.height
+            lidar = pose @ base_T_lidar
+            turn = full_sweep(scene, lidar, rng, self.model, columns=self.columns, max_range=RANGE, sector=self.sector, traffic=moving)
+            origin = base_T_lidar[:3, 3].astype(np.float32)
+            points, labels, sigma = turn.points + origin, turn.labels, None
+        wrong = corrupt_labels(apply(pose, points), labels, seed, self.label_noise, frame=number)
+        return TrainingFrame(points, origin, wrong, pose, sigma)
+
+
+def training_scene(seed: int, frames: int = 60) -> TrainingScene:
+    """A drive of ``frames`` frames through a random street, or with every sixth seed a walk through a hall; and another one there.
+
+    The second part of most drives comes back along the first in the other direction or in the same one. Of two scenes in five the
+    frames that map are those that ask, as in the paper. The same arguments give the same frames.
     """
     rng = np.random.default_rng([seed, 77])
-    drive = _hall(rng, seed, frames) if seed % 6 == 5 else _street(rng, seed, frames)
-    model = MODELS[str(rng.choice(["hdl64", "hdl64", "hdl64", "hdl32", "vlp32", "vlp16"]))]
-    blind = 1.0 if drive.traffic is None else float(rng.uniform(1.5, 3.5))
+    hall = seed % 6 == 5
+    mapping, asking = _hall(rng, seed, frames) if hall else _street(rng, seed, frames)
+    rig = _rig(rng, hall)
+    mapped = list(_frames(mapping, rng, rig, 2 * seed))
+    if asking is None:
+        return TrainingScene(mapped, mapped)
+    return TrainingScene(mapped, list(_frames(asking, rng, rig if rng.random() < 0.4 else _rig(rng, hall), 2 * seed + 1)))
+
+
+def _rig(rng: Rng, hall: bool) -> _Rig:
+    """A random sensor: a lidar two times in three, else a camera."""
+    noise = float(rng.uniform(*LABEL_NOISE))
+    if rng.random() < 0.34:
+        camera = CAMERAS["depth" if hall else "stereo"]
+        camera = replace(camera, mount_height=camera.mount_height + rng.uniform(-0.3, 0.4))
+        yaw = float(rng.choice([0.0, 0.0, math.pi / 2, -math.pi / 2, math.pi]))
+        return _Rig(camera, yaw=yaw, label_noise=noise)
+    model = MODELS[str(rng.choice(["hdl64", "hdl64", "hdl64", "hdl32", "vlp32", "vlp16", "rosette", "raster"]))]
+    blind = 1.0 if hall else float(rng.uniform(1.5, 3.5))
     model = replace(model, height=model.height + rng.uniform(-0.3, 0.4), noise=rng.uniform(0.01, 0.03), min_range=blind)
     columns = min(int(RAYS * rng.uniform(0.6, 1.0) / len(model.elevations_deg)), model.columns)
-    sector = (-0.9, 0.9) if rng.random() < 0.1 else None
-    yield from _frames(drive, rng, model, columns, sector)
+    return _Rig(model, columns, (-0.9, 0.9) if rng.random() < 0.1 else None, label_noise=noise)
 
 
-def _frames(
-    drive: _Drive, rng: np.random.Generator, model: LidarModel, columns: int, sector: tuple[float, float] | None
-) -> Iterator[TrainingFrame]:
-    base_T_lidar = np.eye(4)
-    base_T_lidar[2, 3] = model.height
-    origin = base_T_lidar[:3, 3].astype(np.float32)
+def _frames(drive: _Drive, rng: Rng, rig: _Rig, seed: int) -> Iterator[TrainingFrame]:
     scene = Scene(drive.world)
-    for pose, seconds in zip(drive.world_T_base, drive.seconds, strict=True):
+    for number, (pose, seconds) in enumerate(zip(drive.world_T_base, drive.seconds, strict=True)):
         moving = drive.traffic.scene(float(seconds), pose) if drive.traffic else None
-        turn = full_sweep(scene, pose @ base_T_lidar, rng, model, columns=columns, max_range=RANGE, sector=sector, traffic=moving)
-        yield turn.points + origin, origin.copy(), turn.labels, pose
+        yield rig.frame(scene, pose, rng, moving, seed, number)
 
 
-def _network(rng: np.random.Generator, length: float) -> RoadNetwork:
+def _network(rng: Rng, length: float) -> RoadNetwork:
     """A few blocks of a town, or one winding road."""
     if rng.random() < 0.8:
         return grid_network(rng, 2, 2 + int(rng.random() < 0.5), float(rng.uniform(55, 95)))
@@ -73,35 +133,50 @@ def _network(rng: np.random.Generator, length: float) -> RoadNetwork:
     return path_network(rng, smooth_line(np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), 12.0))
 
 
-def _street(rng: np.random.Generator, seed: int, frames: int) -> _Drive:
+def _condition(rng: Rng, number: int) -> Condition:
+    season = str(rng.choice(SEASONS, p=[0.55, 0.15, 0.15, 0.15]))
+    works, rebuilt = float(rng.choice([0.0, 0.0, 4.0])), float(rng.choice([0.0, 0.0, 0.08]))
+    return Condition(number, season, works, rebuilt)
+
+
+def _street(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
     spacing = float(rng.uniform(1.5, 3.0))
-    returning = rng.random() < 0.6
+    returning = rng.random() < 0.5
     once = int(np.ceil(frames * 0.6)) if returning else frames
     network = _network(rng, once * spacing)
     route = random_route(rng, network, once * spacing + 40)
     line = smooth_line(lane_path(network, route))
     back = smooth_line(lane_path(network, [(road, not forwards) for road, forwards in route[::-1]]))
     ground = street_ground(network, seed)
-    poses = poses_along(line, 10 + spacing * np.arange(once, dtype=np.float64), ground.slope_height, rng)
+    start, speed = 12.0, float(rng.uniform(5, 10))
+
+    def again(count: int) -> F64:
+        """Along the first drive once more, the other way round or beside it."""
+        if rng.random() < 0.6:
+            begin = max(0.0, 0.5 * len(back) - once * spacing - 30)
+            return poses_along(back, begin + spacing * np.arange(count, dtype=np.float64), ground.slope_height, rng)
+        beside = line + rng.normal() * 0.7
+        at = start + rng.uniform(0, 20) + spacing * np.arange(count, dtype=np.float64)
+        return poses_along(beside, at, ground.slope_height, rng)
+
+    def drive(poses: F64, condition: Condition) -> _Drive:
+        seconds = np.arange(len(poses), dtype=np.float64) * spacing / speed
+        traffic = random_traffic(rng, ground, [line, back], float(rng.choice([0.0, 0.6, 1.5])))
+        return _Drive(build_street(network, seed, condition), poses, seconds, traffic)
+
+    poses = poses_along(line, start + spacing * np.arange(once, dtype=np.float64), ground.slope_height, rng)
     if returning:
-        opposite = rng.random() < 0.7
-        other = back if opposite else line + rng.normal() * 0.7
-        start = max(0.0, 0.5 * len(other) - once * spacing - 30) if opposite else 12.0 + rng.uniform(0, 20)
-        again = poses_along(other, start + spacing * np.arange(frames - once, dtype=np.float64), ground.slope_height, rng)
-        poses = np.concatenate([poses, again])
-    seconds = np.arange(frames, dtype=np.float64) * spacing / rng.uniform(5, 10)
-    traffic = random_traffic(rng, ground, [line, back], float(rng.choice([0.0, 0.6, 1.5])))
-    return _Drive(build_street(network, seed, _condition(seed)), poses, seconds, traffic)
+        poses = np.concatenate([poses, again(frames - once)])
+    mapping = drive(poses, _condition(rng, 0))
+    return mapping, drive(again(min(ASKED, once)), _condition(rng, 1)) if rng.random() < 0.6 else None
 
 
-def _condition(seed: int) -> Condition:
-    """Every other scene in summer, some of them with roadworks and scaffolds."""
-    rng = np.random.default_rng([seed, 78])
-    season = str(rng.choice(["summer", "summer", "summer", "autumn", "winter", "snow"]))
-    return Condition(0, season, float(rng.choice([0.0, 0.0, 8.0])), float(rng.choice([0.0, 0.0, 0.1])))
-
-
-def _hall(rng: np.random.Generator, seed: int, frames: int) -> _Drive:
+def _hall(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
     line = smooth_line(hall_walk(seed, 0.7 * frames + 10), 0.8)
-    poses = poses_along(line, 1 + 0.7 * np.arange(frames, dtype=np.float64), lambda x, y: np.zeros_like(x), rng, shake=0.01)
-    return _Drive(build_hall(seed), poses, np.arange(frames, dtype=np.float64), None)
+    world = build_hall(seed)
+
+    def drive(walked: F64, count: int) -> _Drive:
+        poses = poses_along(walked, 1 + 0.7 * np.arange(count, dtype=np.float64), lambda x, y: np.zeros_like(x), rng, shake=0.01)
+        return _Drive(world, poses, np.arange(count, dtype=np.float64), None)
+
+    return drive(line, frames), drive(line[::-1], min(ASKED, frames)) if rng.random() < 0.6 else None

@@ -1,4 +1,4 @@
-"""Training pairs: incomplete subvolumes from one or five frames beside complete ones from the fused map of all (paper 3.2).
+"""Training pairs: incomplete subvolumes from one frame, five, or 20 m of them beside complete ones from the fused map of all (paper 3.2).
 
 A pair is wider than a subvolume: the encoder run over it gives 3 x 3 descriptors, 8 voxels apart, so that each pair brings nine
 examples, eight of them hard. Pairs are packed into Parquet shards, one for each scene, so that training starts, stops and resumes
@@ -8,13 +8,14 @@ without making them again.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from semloc_logs import geometry
 from semloc_logs.settings import Fusion, Training
@@ -23,7 +24,10 @@ from semloc_logs.tables import replacing_file
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
 
 U8 = NDArray[np.uint8]
+Pair = tuple[U8, U8, U8]
 PER_FRAME = 12
+REACH, LONG = 30.0, 20.0  # m at 0.30 m voxels: subvolumes are so near to their frame; a long stretch
+ROW_GROUP = 32  # pairs that are read together
 BROAD = WIDE + 16  # edge of a pair in x and y (voxels)
 
 
@@ -35,13 +39,14 @@ class SceneFrame:
     origin: NDArray[np.float32]
     label: U8
     map_T_base: NDArray[np.float64]
+    sigma: NDArray[np.float32] | None = None  # of the points along their rays (m)
 
 
 def fuse(frames: Iterable[SceneFrame], fusion: Fusion) -> BlockMap:
     """The semantic map of some frames."""
     fuser = Fuser(fusion)
     for f in frames:
-        fuser.add(geometry.apply(f.map_T_base, f.points), f.label, geometry.apply(f.map_T_base, f.origin[None])[0])
+        fuser.add(f.points, f.label, f.origin, f.sigma, f.map_T_base)
     return fuser.finish()
 
 
@@ -56,23 +61,29 @@ def occupied(state: U8) -> NDArray[np.bool_]:
 
 
 def cut_pairs(
-    frames: Sequence[SceneFrame], fusion: Fusion, training: Training, rng: np.random.Generator, min_occupied: int = 40
-) -> list[tuple[U8, U8, U8]]:
+    frames: Sequence[SceneFrame],
+    fusion: Fusion,
+    training: Training,
+    rng: np.random.Generator,
+    min_occupied: int = 40,
+    asked: Sequence[SceneFrame] | None = None,
+) -> list[Pair]:
     """(incomplete (64, 64, 32), complete (32, 32, 32), complete seen a little shifted and turned (64, 64, 32)) voxel states.
 
-    The middle subvolume of the incomplete one, at least, has ``min_occupied`` occupied voxels.
+    ``frames`` are fused to the complete map; the incomplete views are of single frames, five in a row, or 20 m of the frames ``asked``, by
+    default the same. The middle subvolume of an incomplete view, at least, has ``min_occupied`` occupied voxels.
     """
     v = fusion.voxel_size
     scale = v / 0.30
     whole, whole_low = _dense(fuse(frames, fusion))
     surface = np.argwhere(occupied(whole)) + whole_low
+    asked = frames if asked is None else asked
     out = []
-    for i in range(len(frames)):
-        some = frames[i : i + 1] if rng.random() < 0.5 else frames[max(0, i - 2) : i + 3]
-        part, part_low = _dense(fuse(some, fusion))
+    for i in range(len(asked)):
+        part, part_low = _dense(fuse(_stretch(asked, i, scale, training.tilt, rng), fusion))
         seen = np.argwhere(occupied(part)) + part_low
-        here = frames[i].map_T_base[:2, 3] / v
-        seen = seen[np.linalg.norm(seen[:, :2] - here, axis=1) < 30 * scale / v]
+        here = asked[i].map_T_base[:2, 3] / v
+        seen = seen[np.linalg.norm(seen[:, :2] - here, axis=1) < REACH * scale / v]
         if not len(seen):
             continue
         for _ in range(PER_FRAME):
@@ -91,8 +102,23 @@ def cut_pairs(
             turn(whole, whole_low, yaw, centre, complete)
             shift = training.shift / 0.30 * np.array([*rng.uniform(-1, 1, 2), rng.uniform(-0.8, 0.8)])
             turn(whole, whole_low, yaw + rng.uniform(-training.turn, training.turn), centre + shift, other)
-            out.append((incomplete, complete, other))
+            if occupied(other).sum() >= min_occupied:
+                out.append((incomplete, complete, other))
     return out
+
+
+def _stretch(frames: Sequence[SceneFrame], i: int, scale: float, tilt: float, rng: np.random.Generator) -> list[SceneFrame]:
+    """Frame ``i`` alone, with its neighbours, or 20 m of them, their common vertical wrong by ``tilt`` radians."""
+    kind = rng.random()
+    some = list(frames[i : i + 1] if kind < 0.5 else frames[max(0, i - 2) : i + 3])
+    here = frames[i].map_T_base[:3, 3]
+    if kind > 0.8:
+        some = [f for f in frames if np.linalg.norm(f.map_T_base[:3, 3] - here) < LONG / 2 * scale]
+    turned, centred = np.eye(4), np.eye(4)
+    turned[:3, :3] = Rotation.from_rotvec([*rng.normal(0.0, tilt, 2), 0.0]).as_matrix()
+    centred[:3, 3] = here
+    around = centred @ turned @ geometry.inverse(centred)
+    return [replace(f, map_T_base=around @ f.map_T_base) for f in some]
 
 
 def write_shard(path: Path, pairs: Sequence[tuple[U8, U8, U8]]) -> None:
@@ -100,7 +126,12 @@ def write_shard(path: Path, pairs: Sequence[tuple[U8, U8, U8]]) -> None:
     names = ("incomplete", "complete", "other")
     columns = {n: pa.array([p[k].tobytes() for p in pairs], pa.binary()) for k, n in enumerate(names)}
     with replacing_file(path) as temporary:
-        pq.write_table(pa.table(columns), temporary, compression="zstd", use_dictionary=False, row_group_size=256)
+        pq.write_table(pa.table(columns), temporary, compression="zstd", use_dictionary=False, row_group_size=ROW_GROUP)
+
+
+def rows_of(path: Path) -> int:
+    """Pairs in a shard."""
+    return int(pq.read_metadata(path).num_rows)
 
 
 def read_shard(path: Path, draw: int | None = None) -> tuple[U8, U8, U8]:
