@@ -5,19 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from semloc_logs.subvolumes.cut import CLASSES, code_table
 from semloc_logs.subvolumes.network import Completion, descriptors
+from semloc_logs.subvolumes.training import targets
 
 U8 = NDArray[np.uint8]
-
-
-def targets(complete: U8, table: U8, classes: int) -> tuple[Tensor, Tensor]:
-    """Class indices of the complete subvolumes and which voxels count: unobserved ones and occupied ones of unknown class do not."""
-    codes = table[complete]
-    known = codes <= classes
-    return torch.from_numpy(np.where(known, codes, 0).astype(np.int64)), torch.from_numpy(known)
 
 
 @torch.inference_mode()
@@ -36,11 +29,11 @@ def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, 
     ours, theirs = [], []
     for i in range(0, len(pairs[0]), 32):
         part, whole, other = (a[i : i + 32] for a in pairs)
-        logits, mu, _ = model(torch.from_numpy(table[part]), None)
-        ours.append(descriptors(mu[:, :, 1:2, 1:2]))
+        codes = torch.from_numpy(table[part])
+        ours.append(descriptors(model.encoder(codes)[:, :, 1:2, 1:2]))
         theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 1:2, 1:2]))
-        said = logits[:, : classes + 1].argmax(1).numpy()
-        target, known = (t.numpy() for t in targets(whole, table, classes))
+        said = model.complete(codes)[:, : classes + 1].argmax(1).numpy()
+        target, known = (t.numpy() for t in targets(torch.from_numpy(whole), torch.from_numpy(table), classes))
         given = table[part[:, 16:-16, 16:-16]]
         seen += int(known.sum())
         right += int((known & (said == target)).sum())

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from scipy.spatial import cKDTree
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import STREET_VOXEL
+from semloc_logs.subvolumes.checkpoints import load_weights
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, code_table
 from semloc_logs.subvolumes.network import Encoder, channels_last, descriptors
 from semloc_logs.subvolumes.pairs import occupied
@@ -34,7 +32,7 @@ PATCH = 256  # voxels along the edge of the part of a map that is encoded at onc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Described:
-    """``centre`` (n, 3) of the subvolumes in voxels (map coordinates) and unit ``descriptor`` (n, 256)."""
+    """``centre`` (n, 3) of the subvolumes in voxels (map coordinates) and unit ``descriptor`` (n, latent)."""
 
     centre: F32
     descriptor: F32
@@ -43,23 +41,10 @@ class Described:
 @lru_cache(maxsize=8)
 def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
     """The shipped encoder of ``variant``, or that of a file. Raises SettingsError when the file does not hold one."""
-    encoder = Encoder(variant)
-    try:
-        if weights is not None:
-            tensors = load_file(weights)
-        else:
-            with as_file(files("semloc_logs.subvolumes") / "weights" / f"{variant}.safetensors") as path:
-                tensors = load_file(path)
-        found = {k.removeprefix("encoder."): v.float() for k, v in tensors.items() if k.startswith("encoder.")}
-        counters = {k: v for k, v in encoder.state_dict().items() if not v.is_floating_point()}  # of no use after training
-        encoder.load_state_dict(counters | found)
-    except (OSError, SafetensorError, RuntimeError) as problem:
-        raise SettingsError(
-            f"{weights or 'The shipped weights'}: no weights of the {variant} encoder ({str(problem).splitlines()[0]})."
-        ) from None
+    encoder = load_weights(Encoder, "encoder.", variant, weights)
     channels_last(encoder)
     torch.set_num_threads(1)  # more cores are used by more processes: the same sums in the same order, whatever the engine
-    return encoder.eval()
+    return encoder
 
 
 def random_encoder(variant: str, seed: int = 0) -> Encoder:
@@ -113,7 +98,7 @@ def describe_map(
         raise SettingsError(f"A stride of {stride} voxels is not possible: 4 or 8.")
     span = np.argwhere(filled.any(2))
     if not len(span):
-        return Described(np.zeros((0, 3), np.float32), np.zeros((0, 256), np.float32))
+        return Described(np.zeros((0, 3), np.float32), np.zeros((0, encoder.latent), np.float32))
     # crop to what is occupied, with room for windows that hang over the edge, on the stride's grid
     first = np.maximum((span.min(0) - SIZE // 2) // 8 * 8, -SIZE // 2)
     size = -(-(span.max(0) + SIZE // 2 - first) // 8) * 8
@@ -149,13 +134,13 @@ def describe_map(
         centres.append(corner + SIZE / 2)
         found.append(out)
     if not centres:
-        return Described(np.zeros((0, 3), np.float32), np.zeros((0, 256), np.float32))
+        return Described(np.zeros((0, 3), np.float32), np.zeros((0, encoder.latent), np.float32))
     return Described(np.concatenate(centres).astype(np.float32), np.concatenate(found))
 
 
 def _encode(codes: U8, wanted: NDArray[np.int64], encoder: Encoder, stride: int) -> F32:
-    """Descriptors (n, 256) of the windows whose corners within the margin are ``wanted`` (n, 2), patch by patch."""
-    out = np.zeros((len(wanted), 256), np.float32)
+    """Descriptors (n, latent) of the windows whose corners within the margin are ``wanted`` (n, 2), patch by patch."""
+    out = np.zeros((len(wanted), encoder.latent), np.float32)
     phase = wanted % 8
     for dx in range(0, 8, stride):
         for dy in range(0, 8, stride):

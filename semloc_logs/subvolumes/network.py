@@ -1,13 +1,14 @@
 """The paper's variational encoder-decoder (3.2, supplement 1), written so that it can be run over a whole map at once.
 
-Labels enter through a learned embedding (a factorised first convolution: an occupied, free or unobserved voxel is a table look-up,
-not a vector of L + 2 numbers). Three blocks of 3x3x3 convolution, 2x2x2 max-pooling and ReLU, then a fully connected layer written
-as a 4x4x4 convolution. Batch normalisation, which the paper lacks, lets it learn from few samples. The descriptor is the mean mu of
+Labels enter through a learned embedding (an occupied, free or unobserved voxel is a table look-up, not a vector of L + 2 numbers), and
+the first block maps 2x2x2 voxels at once. Two blocks of 3x3x3 convolution, 2x2x2 max-pooling and ReLU follow, then a fully connected layer
+written as a 4x4x4 convolution. Batch normalisation, which the paper lacks, lets it learn from few samples. The descriptor is the mean mu of
 the latent code, scaled to unit length.
 """
 
 from __future__ import annotations
 
+from itertools import islice, pairwise
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from semloc_logs.subvolumes.cut import CLASSES
 
 LATENT = 256
 EMBEDDING = 8
+CHANNELS = (16, 32, 64)
 
 
 class _LookUp(torch.autograd.Function):
@@ -46,29 +48,50 @@ def _halve(x: Tensor) -> Tensor:
     return torch.maximum(x[..., ::2], x[..., 1::2])
 
 
+def in_eights(volume: Tensor) -> Tensor:
+    """Voxels (b, x, y, z) -> (b, x / 2, y / 2, z / 2, 8), the eight voxels of each cell of twice the size side by side."""
+    b, x, y, z = volume.shape
+    return volume.reshape(b, x // 2, 2, y // 2, 2, z // 2, 2).permute(0, 1, 3, 5, 2, 4, 6).flatten(4)
+
+
+def from_eights(cells: Tensor) -> Tensor:
+    """The reverse of :func:`in_eights`."""
+    b, x, y, z, _ = cells.shape
+    return cells.reshape(b, x, y, z, 2, 2, 2).permute(0, 1, 4, 2, 5, 3, 6).reshape(b, 2 * x, 2 * y, 2 * z)
+
+
 class Encoder(nn.Module):
-    """Codes (b, x, y, 32) uint8 with a margin of 8 voxels in x and y -> mu (b, 256, (x - 40) / 8, (y - 40) / 8).
+    """Codes (b, x, y, 32) uint8 with a margin of 8 voxels in x and y -> mu (b, latent, (x - 40) / 8, (y - 40) / 8).
 
     Output (i, j) describes the subvolume whose corner is voxel (8 + 8 i, 8 + 8 j, 0).
     """
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
         super().__init__()
-        self.variant = variant
+        self.variant, self.latent = variant, latent
         self.embedding = nn.Embedding(CLASSES[variant] + 3, EMBEDDING)
-        self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in ((EMBEDDING, 16), (16, 32), (32, 64)))
-        self.norms = nn.ModuleList(nn.BatchNorm3d(c) for c in (16, 32, 64))
-        self.mean = nn.Conv3d(64, latent, 4)
+        self.first = nn.Linear(8 * EMBEDDING, CHANNELS[0])
+        self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in pairwise(CHANNELS))
+        self.norms = nn.ModuleList(nn.BatchNorm3d(c) for c in CHANNELS)
+        self.mean = nn.Conv3d(CHANNELS[-1], latent, 4)
         # without an affine part: mu keeps the prior's mean and variance, and no direction that all subvolumes share
         self.centre = nn.BatchNorm3d(latent, affine=False)
         self.log_variance = nn.Linear(latent, latent)
 
+    def first_block(self, codes: Tensor) -> Tensor:
+        """Codes -> (b, 16, x / 2, y / 2, 16): one linear map of the embeddings of each 2x2x2 voxels, at a fraction of the cost of the
+        paper's block, which convolves at full resolution."""
+        device = codes.device.type
+        reduced = torch.is_autocast_enabled(device)  # looked up in the precision of the convolutions: no copy of the volume
+        weight = self.embedding.weight.to(torch.get_autocast_dtype(device)) if reduced else self.embedding.weight
+        cells = in_eights(codes).int()
+        looked_up: Tensor = F.embedding(cells, weight) if codes.is_cuda else _LookUp.apply(cells, weight)  # type: ignore[no-untyped-call]
+        x: Tensor = self.first(looked_up.flatten(4))
+        return x.permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
+
     def forward(self, codes: Tensor) -> Tensor:
-        reduced = torch.is_autocast_enabled("cpu")  # looked up in the precision of the convolutions: no copy of the volume
-        weight = self.embedding.weight.to(torch.get_autocast_dtype("cpu")) if reduced else self.embedding.weight
-        looked_up: Tensor = _LookUp.apply(codes.int(), weight)  # type: ignore[no-untyped-call]
-        x = looked_up.permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
-        for block, norm in zip(self.blocks, self.norms, strict=True):
+        x = F.relu(self.norms[0](self.first_block(codes)))
+        for block, norm in zip(self.blocks, islice(self.norms, 1, None), strict=True):
             x = F.relu(norm(_halve(block(x))))  # ReLU before pooling, as in the paper, would cost eight times as much
         x = x[:, :, 1:-1, 1:-1]  # the pooled margin has served
         mu: Tensor = self.centre(self.mean(x))[..., 0]
@@ -76,20 +99,25 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Latent code (b, 256) -> logits (b, L + 2, 32, 32, 32): upsampling by repetition and convolution."""
+    """Latent code (b, latent) -> logits (L + 2, 8, b, 16, 16, 16) of a subvolume :func:`in_eights`, the eight moved to the front.
+
+    Upsampling by repetition and convolution as in the paper, but the last step says the 2x2x2 voxels of each cell at once.
+    """
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
         super().__init__()
-        self.start = nn.Linear(latent, 32 * 4**3)
-        self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in ((32, 32), (32, 16)))
-        self.last = nn.Conv3d(16, CLASSES[variant] + 2, 3, padding=1)
+        self.start = nn.Linear(latent, 24 * 4**3)
+        self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in ((24, 32), (32, 32)))
+        self.last = nn.Linear(32, 8 * (CLASSES[variant] + 2))
 
     def forward(self, code: Tensor) -> Tensor:
-        x = torch.tanh(self.start(code)).reshape(-1, 32, 4, 4, 4).contiguous(memory_format=torch.channels_last_3d)
+        x = torch.tanh(self.start(code)).reshape(-1, 24, 4, 4, 4).contiguous(memory_format=torch.channels_last_3d)
         for block in self.blocks:
             x = F.relu(block(x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4)))
-        logits: Tensor = self.last(x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4))
-        return logits
+        # classes first: a softmax over columns is vectorised, one over rows of twenty numbers is not
+        cells = x.permute(1, 0, 2, 3, 4).flatten(1)
+        logits = torch.addmm(self.last.bias[:, None], self.last.weight, cells)
+        return logits.reshape(-1, 8, x.shape[0], *x.shape[2:])
 
 
 def channels_last(module: nn.Module) -> None:
@@ -100,15 +128,20 @@ def channels_last(module: nn.Module) -> None:
 class Completion(nn.Module):
     """Encoder and decoder: what is trained. ``encoder`` alone describes."""
 
-    def __init__(self, variant: str) -> None:
+    def __init__(self, variant: str, latent: int = LATENT) -> None:
         super().__init__()
-        self.encoder = Encoder(variant)
-        self.decoder = Decoder(variant)
+        self.encoder = Encoder(variant, latent)
+        self.decoder = Decoder(variant, latent)
         channels_last(self)
 
+    def complete(self, codes: Tensor) -> Tensor:
+        """Logits (b, L + 2, 32, 32, 32) of the completed middle subvolumes of ``codes`` (b, 64, 64, 32), as the training weighed voxels."""
+        logits: Tensor = self(codes, None)[0]
+        return torch.stack([from_eights(of_class.movedim(0, -1)) for of_class in logits], 1)
+
     def forward(self, codes: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits of the completed middle subvolume, mu (b, 256, 3, 3) of all and log-variance (b, 256) of the middle one of ``codes``
-        (b, 64, 64, 32); without ``noise`` (b, 256) the mean is decoded."""
+        """Logits of the completed middle subvolume as the decoder gives them, mu (b, latent, 3, 3) of all and log-variance (b, latent) of
+        the middle one of ``codes`` (b, 64, 64, 32); without ``noise`` (b, latent) the mean is decoded."""
         every = self.encoder(codes)
         mu = every[:, :, every.shape[2] // 2, every.shape[3] // 2]
         log_variance = self.encoder.log_variance(torch.tanh(mu)).clamp(-8.0, 4.0)
@@ -117,5 +150,5 @@ class Completion(nn.Module):
 
 
 def descriptors(mu: Tensor) -> Tensor:
-    """Unit-length descriptors (b * i * j, 256) from mu (b, 256, i, j)."""
+    """Unit-length descriptors (b * i * j, latent) from mu (b, latent, i, j)."""
     return F.normalize(mu.float().permute(0, 2, 3, 1).reshape(-1, mu.shape[1]), dim=1)

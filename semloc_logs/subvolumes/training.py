@@ -1,4 +1,4 @@
-"""Training of the encoder-decoder on packed pairs (paper 3.2 and 4.3, supplement 1), resumable from a checkpoint.
+"""Training of the encoder-decoder on packed pairs (paper 3.2 and 4.3, supplement 1), on a CPU or a GPU, resumable from a checkpoint.
 
 Beside the paper's completion loss a contrastive term (InfoNCE over the batch) pulls the descriptor of an incomplete subvolume towards
 that of the complete one seen a little shifted and turned, which is what the database holds; ``training.contrastive_weight=0`` is the
@@ -7,36 +7,31 @@ paper. Adam replaces ADADELTA because the shipped runs see few samples.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import torch
-from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn import functional as F
 
-from semloc_logs.errors import SettingsError, WorkspaceError
+from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
-from semloc_logs.subvolumes.completion import targets
+from semloc_logs.subvolumes.batches import Batch, batches
+from semloc_logs.subvolumes.checkpoints import resume, save_checkpoint, save_weights
 from semloc_logs.subvolumes.cut import CLASSES, code_table
-from semloc_logs.subvolumes.network import Completion, descriptors
-from semloc_logs.subvolumes.pairs import occupied, read_shard
-from semloc_logs.tables import replacing_file
+from semloc_logs.subvolumes.network import Completion, descriptors, in_eights
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 RATE = 1.5e-3
+BATCH_OF_RATE = 12  # a larger batch steps farther, with the square root as Adam wants it
 TEMPERATURE = 0.1
 MIN_OCCUPIED = 40
-POOL, SCENES = 96, 12  # steps that draw from the same scenes, and how many
 FREEZE = 0.4  # of the steps: from then on batch normalisation uses its running statistics, as it will when it describes
-
-U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,32 +45,53 @@ class Progress:
     matched: float
 
 
-def _batches(shards: Sequence[Path], training: Training, first_step: int, steps: int) -> Iterator[tuple[U8, U8, U8]]:
-    """Batches of a fixed random sequence, from step ``first_step`` on, each of several scenes: their neighbours are negatives enough."""
-    pool: list[tuple[U8, U8, U8]] = []
-    chosen = -1
-    for step in range(first_step, steps):
-        if step // POOL != chosen:
-            chosen = step // POOL
-            draw = np.random.default_rng((training.seed, chosen))
-            pool = [read_shard(shards[k], int(draw.integers(1 << 16))) for k in draw.permutation(len(shards))[:SCENES]]
-        rng = np.random.default_rng((training.seed, 1, step))
-        sizes = np.bincount(rng.integers(len(pool), size=training.batch), minlength=len(pool))
-        rows = [rng.choice(len(shard[0]), n, replace=len(shard[0]) < n) for shard, n in zip(pool, sizes, strict=True)]
-        arrays = [np.concatenate([shard[k][r] for shard, r in zip(pool, rows, strict=True)]) for k in range(3)]
-        # quarter turns and mirror images of the whole triple are as good as new streets
-        quarter, mirror = int(rng.integers(4)), bool(rng.integers(2))
-        turned = [np.rot90(a[:, ::-1] if mirror else a, quarter, axes=(1, 2)) for a in arrays]
-        a, b, c = (np.ascontiguousarray(t) for t in turned)
-        a[rng.random(a.shape, np.float32) < training.dropout] = 253
-        yield a, b, c
-
-
-def _seen(part: U8) -> NDArray[np.bool_]:
+def _seen(part: Tensor) -> Tensor:
     """Which of the 3 x 3 subvolumes of each wide one hold enough occupied voxels to be described, flat (b * 9,)."""
-    columns = occupied(part).sum(3)
-    counts = [[columns[:, 8 + 8 * i : 40 + 8 * i, 8 + 8 * j : 40 + 8 * j].sum((1, 2)) for j in range(3)] for i in range(3)]
-    return np.ascontiguousarray(np.array(counts).transpose(2, 0, 1).reshape(-1) >= MIN_OCCUPIED)
+    columns = ((part != FREE_STATE) & (part != UNOBSERVED_STATE)).sum(3, dtype=torch.float32)[:, None, 8:-8, 8:-8]
+    return (F.avg_pool2d(columns, 32, stride=8) * 32**2).round().flatten() >= MIN_OCCUPIED
+
+
+def targets(complete: Tensor, table: Tensor, classes: int) -> tuple[Tensor, Tensor]:
+    """Class indices of the complete subvolumes and which voxels count: unobserved ones and occupied ones of unknown class do not."""
+    codes = table[complete.long()]
+    known = codes <= classes
+    return torch.where(known, codes, 0).long(), known
+
+
+@dataclass(slots=True, eq=False)
+class _Losses:
+    total: Tensor
+    reconstruction: Tensor
+    contrastive: Tensor
+    matched: float
+
+
+def _losses(model: Any, batch: Batch, noise: Tensor, table: Tensor, training: Training) -> _Losses:
+    classes, device = CLASSES[model.encoder.variant], noise.device.type
+    target, known = targets(in_eights(batch.complete).movedim(-1, 0), table, classes)
+    with torch.autocast(device, dtype=torch.bfloat16):
+        logits, mu, log_variance = model(table[batch.incomplete.long()], noise)
+        with torch.no_grad():  # the complete view is the goal; a gradient through it too would cost a third more
+            partner = model.encoder(table[batch.other.long()]) if training.contrastive_weight else mu
+    entropy = F.cross_entropy(logits[None], target[None], reduction="none").float()
+    weight = torch.where(target < classes, training.occupied_weight, 1.0) * known
+    reconstruction = (entropy * weight).sum() / weight.sum().clamp(min=1.0)
+    middle, log_variance = mu[:, :, mu.shape[2] // 2, mu.shape[3] // 2].float(), log_variance.float()
+    prior = 0.5 * (middle.square() + log_variance.exp() - 1 - log_variance).mean()
+    contrastive, matched = mu.new_zeros(()), 0.0
+    if training.contrastive_weight:
+        seen = _seen(batch.incomplete)
+        similarity = descriptors(mu)[seen] @ descriptors(partner)[seen].T / TEMPERATURE
+        own = torch.arange(len(similarity), device=similarity.device)
+        if len(own):  # dropout can take the last subvolume that is full enough, and the mean of nothing is NaN
+            contrastive = 0.5 * (F.cross_entropy(similarity, own) + F.cross_entropy(similarity.T, own))
+            matched = float((similarity.argmax(1) == own).float().mean())
+    total = training.reconstruction_weight * reconstruction + prior + training.contrastive_weight * contrastive
+    return _Losses(total, reconstruction, contrastive, matched)
+
+
+def _adam(model: Completion) -> torch.optim.Optimizer:
+    return torch.optim.Adam(model.parameters(), lr=RATE)
 
 
 def train(
@@ -85,96 +101,59 @@ def train(
     checkpoint: Path,
     on_step: Callable[[Progress], None] = lambda _: None,
     save_every: int = 100,
-) -> Completion:
+    *,
+    device: str = "cpu",
+    deadline: float = math.inf,
+    snapshots: Path | None = None,
+    network: Callable[[str, int], Completion] = Completion,
+    optimiser_of: Callable[[Completion], torch.optim.Optimizer] = _adam,
+) -> Completion | None:
     """Train from scratch or from ``checkpoint``, which is renewed every ``save_every`` steps; returns the finished network.
 
+    None, with a checkpoint to go on from, when the clock ``time.monotonic()`` passes ``deadline``. ``shards`` may wait in ``[i]`` for
+    scenes that are still being made. ``snapshots`` is a folder that gets the weights after 1/32, 1/16, ... 1/2 of the steps, for a learning
+    curve. On a GPU the network is compiled. Other networks and optimisers are for comparison.
     Raises SettingsError without shards and WorkspaceError when the checkpoint is of another run.
     """
-    shards = [path for path in shards if pq.read_metadata(path).num_rows]
-    if not shards:
+    if not len(shards):
         raise SettingsError("There is nothing to train on: give sessions with keyframes, or scenes to simulate.")
     torch.manual_seed(training.seed)
-    model = Completion(variant)
-    optimiser = torch.optim.Adam(model.parameters(), lr=RATE)
+    model = network(variant, training.latent).to(device)
+    optimiser = optimiser_of(model)
     steps = math.ceil(training.samples / (training.batch * 9))
-    done = _resume(checkpoint, model, optimiser, training) if checkpoint.exists() else 0
+    done = resume(checkpoint, model, optimiser, training) if checkpoint.exists() else 0
+    run: Any = torch.compile(model) if device == "cuda" else model
+    table = torch.from_numpy(code_table(variant)).to(device)
+    rate = optimiser.defaults["lr"] * math.sqrt(training.batch / BATCH_OF_RATE)
     model.train()
-    table, classes = code_table(variant), CLASSES[variant]
-    for step, (part, whole, other) in enumerate(_batches(shards, training, done, steps), start=done):
+    for step, batch in enumerate(batches(shards, training, done, steps, device), start=done):
         if step >= FREEZE * steps:
             for part_of_model in model.modules():
                 if isinstance(part_of_model, torch.nn.BatchNorm3d):
                     part_of_model.eval()
         for group in optimiser.param_groups:
-            group["lr"] = RATE * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
-        seen = torch.from_numpy(_seen(part))
-        noise = torch.from_numpy(np.random.default_rng((training.seed, 2, step)).standard_normal((len(part), 256), np.float32))
-        target, known = targets(whole, table, classes)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            logits, mu, log_variance = model(torch.from_numpy(table[part]), noise)
-            with torch.no_grad():  # the complete view is the goal; a gradient through it too would cost a third more
-                partner = model.encoder(torch.from_numpy(table[other]))
-        entropy = F.cross_entropy(logits, target, reduction="none").float()
-        weight = torch.where(target < classes, training.occupied_weight, 1.0) * known
-        reconstruction = (entropy * weight).sum() / weight.sum().clamp(min=1.0)
-        middle, log_variance = mu[:, :, 1, 1].float(), log_variance.float()
-        prior = 0.5 * (middle.square() + log_variance.exp() - 1 - log_variance).mean()
-        similarity = descriptors(mu)[seen] @ descriptors(partner)[seen].T / TEMPERATURE
-        own = torch.arange(len(similarity))
-        some = len(own) > 0  # dropout can take the last subvolume that is full enough, and the mean of nothing is NaN
-        contrastive = 0.5 * (F.cross_entropy(similarity, own) + F.cross_entropy(similarity.T, own)) if some else mu.new_zeros(())
-        loss = training.reconstruction_weight * reconstruction + prior + training.contrastive_weight * contrastive
+            group["lr"] = rate * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
+        normal = np.random.default_rng((training.seed, 2, step)).standard_normal((training.batch, training.latent), np.float32)
+        losses = _losses(run, batch, torch.from_numpy(normal).to(device), table, training)
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        losses.total.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
         optimiser.step()
-        matched = float((similarity.argmax(1) == own).float().mean()) if some else 0.0
+        late = time.monotonic() >= deadline
+        if (step + 1) % save_every == 0 or step + 1 == steps or late:
+            save_checkpoint(checkpoint, model, optimiser, training, step + 1)
+        samples = (step + 1) * training.batch * 9
+        if snapshots and step + 1 in {steps >> k for k in range(1, 6)}:
+            save_weights(snapshots / f"{variant}-{samples:09d}.safetensors", model, {"samples": str(samples)})
         on_step(
             Progress(
-                (step + 1) * training.batch * 9, float(loss.detach()), float(reconstruction.detach()), float(contrastive.detach()), matched
+                samples,
+                float(losses.total.detach()),
+                float(losses.reconstruction.detach()),
+                float(losses.contrastive.detach()),
+                losses.matched,
             )
         )
-        if (step + 1) % save_every == 0 or step + 1 == steps:
-            _save(checkpoint, model, optimiser, training, step + 1)
+        if late and step + 1 < steps:
+            return None
     return model
-
-
-def _save(path: Path, model: Completion, optimiser: torch.optim.Adam, training: Training, step: int) -> None:
-    tensors = {f"model.{k}": v.contiguous() for k, v in model.state_dict().items()}
-    for i, p in enumerate(model.parameters()):
-        tensors |= {f"adam.{i}.{k}": v.contiguous() for k, v in optimiser.state.get(p, {}).items() if isinstance(v, Tensor)}
-    note = {"step": str(step), "training": training.model_dump_json(), "variant": model.encoder.variant}
-    with replacing_file(path) as temporary:
-        save_file(tensors, temporary, metadata=note)
-
-
-def _resume(path: Path, model: Completion, optimiser: torch.optim.Adam, training: Training) -> int:
-    try:
-        with safe_open(path, "pt") as handle:
-            note = handle.metadata() or {}
-        tensors = load_file(path)
-        same = (
-            json.loads(note["training"]) == training.model_dump(mode="json")
-            and note.get("variant", model.encoder.variant) == model.encoder.variant
-        )
-        step = int(note["step"])
-    except (OSError, SafetensorError, KeyError, ValueError) as problem:
-        raise WorkspaceError(f"Checkpoint {path} cannot be read ({problem}): remove it to start over.") from None
-    if not same:
-        raise WorkspaceError(f"Checkpoint {path} is of a training with other settings: remove it to start over.")
-    try:
-        model.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
-    except RuntimeError:
-        raise WorkspaceError(f"Checkpoint {path} is of another network: remove it to start over.") from None
-    for i, p in enumerate(model.parameters()):
-        state = {k: tensors[f"adam.{i}.{k}"] for k in ("step", "exp_avg", "exp_avg_sq") if f"adam.{i}.{k}" in tensors}
-        if state:
-            optimiser.state[p] = state
-    return step
-
-
-def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
-    """The network in bf16 with a model card in the file's metadata."""
-    tensors = {k: v.to(torch.bfloat16).contiguous() for k, v in model.state_dict().items() if v.is_floating_point()}
-    with replacing_file(path) as temporary:
-        save_file(tensors, temporary, metadata={**card, "variant": model.encoder.variant})

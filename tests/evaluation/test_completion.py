@@ -26,11 +26,12 @@ def test_figures_by_hand() -> None:
     truth = codes(2, 2, 8, 8, FREE, FREE, FREE, FREE, UNOBSERVED, UNKNOWN)  # the last two do not count
     said = codes(2, 8, 8, 8, FREE, FREE, FREE, 2, FREE, FREE)
     given = codes(2, UNOBSERVED, 8, UNKNOWN, FREE, UNOBSERVED, UNOBSERVED, FREE, 3, 3)
-    figures = completion_figures(Completed(given, said, truth, CLASSES))
+    figures = completion_figures(Completed(given, said, truth, truth, CLASSES))
     assert figures["accuracy"]["ours"] == pytest.approx(6 / 8)
     assert figures["accuracy"]["all_free"] == pytest.approx(4 / 8)
     assert figures["accuracy"]["copy_input"] == pytest.approx(4 / 8)
     assert figures["accuracy"]["paper"] == 0.87
+    assert figures["accuracy"]["most_probable"] == 1.0
     assert figures["unobserved_accuracy"]["ours"] == pytest.approx(2 / 3)
     assert figures["unobserved_accuracy"]["all_free"] == pytest.approx(2 / 3)
     assert figures["mean_iou"]["ours"] == pytest.approx((1 / 3 + 2 / 3) / 2)
@@ -43,7 +44,7 @@ def test_figures_by_hand() -> None:
 
 def test_a_perfect_answer() -> None:
     truth = np.random.default_rng(0).integers(0, 20, (2, 4, 4, 4)).astype(np.uint8)
-    figures = completion_figures(Completed(np.full_like(truth, UNOBSERVED), truth, truth, CLASSES))
+    figures = completion_figures(Completed(np.full_like(truth, UNOBSERVED), truth, truth, truth, CLASSES))
     assert [row["ours"] for row in figures.values()] == [1.0] * len(figures)
 
 

@@ -13,11 +13,11 @@ from safetensors.torch import save_file
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.subvolumes import describe
+from semloc_logs.subvolumes.checkpoints import save_weights
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, random_encoder
-from semloc_logs.subvolumes.network import Completion, Decoder, Encoder, descriptors
+from semloc_logs.subvolumes.network import Completion, Decoder, Encoder, descriptors, from_eights, in_eights
 from semloc_logs.subvolumes.pairs import occupied
-from semloc_logs.subvolumes.training import save_weights
 
 U8 = NDArray[np.uint8]
 LOW = np.array([-64, 32, -16])
@@ -150,15 +150,24 @@ def test_other_strides_are_refused() -> None:
         describe_map(world(), LOW, 0.0, V, random_encoder("geometric"), 6, 40)
 
 
+def test_eights_there_and_back() -> None:
+    volume = torch.arange(2 * 4 * 6 * 8).reshape(2, 4, 6, 8)
+    cells = in_eights(volume)
+    assert cells.shape == (2, 2, 3, 4, 8)
+    assert sorted(cells[1, 1, 2, 3].tolist()) == sorted(volume[1, 2:4, 4:6, 6:8].flatten().tolist())
+    assert torch.equal(from_eights(cells), volume)
+
+
 def test_shapes_of_the_network() -> None:
     codes = torch.zeros((2, WIDE, WIDE, SIZE), dtype=torch.uint8)
     encoder = random_encoder("semantic")
     with torch.inference_mode():
         assert encoder(codes).shape == (2, 256, 1, 1)
         assert encoder(torch.zeros((1, WIDE + 24, WIDE + 8, SIZE), dtype=torch.uint8)).shape == (1, 256, 4, 2)
-        assert Decoder("semantic")(torch.zeros(3, 256)).shape == (3, 21, 32, 32, 32)
+        assert Decoder("semantic")(torch.zeros(3, 256)).shape == (21, 8, 3, 16, 16, 16)
+        assert Completion("semantic").eval().complete(torch.zeros((2, 64, 64, 32), dtype=torch.uint8)).shape == (2, 21, 32, 32, 32)
         logits, mu, log_variance = Completion("geometric").eval()(torch.zeros((2, 64, 64, 32), dtype=torch.uint8), None)
-    assert (logits.shape, mu.shape, log_variance.shape) == ((2, 3, 32, 32, 32), (2, 256, 3, 3), (2, 256))
+    assert (logits.shape, mu.shape, log_variance.shape) == ((3, 8, 2, 16, 16, 16), (2, 256, 3, 3), (2, 256))
     parameters = sum(p.numel() for p in Completion("semantic").parameters())
     assert 0.5e6 < parameters < 3e6  # about one million, as in the paper
 

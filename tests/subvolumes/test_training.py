@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -11,10 +13,12 @@ from numpy.typing import NDArray
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import Settings, Training
 from semloc_logs.subvolumes import training
-from semloc_logs.subvolumes.completion import completion_scores, targets
+from semloc_logs.subvolumes.batches import batches
+from semloc_logs.subvolumes.completion import completion_scores
 from semloc_logs.subvolumes.cut import SIZE, code_table
+from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.pairs import BROAD, SceneFrame, cut_pairs, occupied, read_shard, write_shard
-from semloc_logs.subvolumes.training import Progress, _batches, _seen, train
+from semloc_logs.subvolumes.training import Progress, _seen, targets, train
 
 U8 = NDArray[np.uint8]
 Pair = tuple[U8, U8, U8]
@@ -66,7 +70,8 @@ def test_the_three_views_of_a_batch_belong_together(tmp_path: Path) -> None:
         write_shard(paths[-1], rows)
     settings = Training(batch=5, dropout=0.1)
     turns, scenes = set(), set()
-    for a, b, c in _batches(paths, settings, 0, 40):
+    for batch in batches(paths, settings, 0, 40):
+        a, b, c = (np.asarray(view) for view in batch)
         assert a.shape == (5, BROAD, BROAD, SIZE)
         assert b.shape == (5, SIZE, SIZE, SIZE)
         for n in range(5):
@@ -88,23 +93,24 @@ def test_the_three_views_of_a_batch_belong_together(tmp_path: Path) -> None:
 
 def test_batches_are_the_same_each_time_and_from_any_step(shards: list[Path]) -> None:
     settings = Training(batch=3)
-    whole = list(_batches(shards[:2], settings, 0, 5))
-    rest = list(_batches(shards[:2], settings, 3, 5))
+    whole = list(batches(shards[:2], settings, 0, 5))
+    rest = list(batches(shards[:2], settings, 3, 5))
     assert len(whole) == 5
     for x, y in zip(whole[3:], rest, strict=True):
         for a, b in zip(x, y, strict=True):
             np.testing.assert_array_equal(a, b)
-    other = next(_batches(shards[:2], Training(batch=3, seed=1), 0, 5))
+    other = next(batches(shards[:2], Training(batch=3, seed=1), 0, 5))
     assert not np.array_equal(whole[0][0], other[0])
 
 
 def test_which_subvolumes_are_described_and_which_voxels_count() -> None:
     part = np.full((2, BROAD, BROAD, SIZE), 253, np.uint8)
     part[1, 8:16, 8:13, 3] = 2  # 40 voxels in the corner of the first subvolume only
-    seen = _seen(part).reshape(2, 3, 3)
+    seen = _seen(torch.from_numpy(part)).reshape(2, 3, 3)
     assert not seen[0].any()
-    assert np.argwhere(seen[1]).tolist() == [[0, 0]]
-    target, known = targets(np.array([0, 18, 254, 253, 255], np.uint8), code_table("semantic"), 19)
+    assert torch.argwhere(seen[1]).tolist() == [[0, 0]]
+    table = torch.from_numpy(code_table("semantic"))
+    target, known = targets(torch.tensor([0, 18, 254, 253, 255], dtype=torch.uint8), table, 19)
     assert known.tolist() == [True, True, True, False, False]
     assert target[known].tolist() == [0, 18, 19]
 
@@ -114,13 +120,14 @@ def short(steps: int, **more: float) -> Training:
 
 
 def test_the_loss_goes_down(shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "RATE", 0.05)  # of a warm-up over fifty steps
+    monkeypatch.setattr(training, "RATE", 0.1)  # of a warm-up over fifty steps
     seen: list[Progress] = []
-    model = train("geometric", shards[:1], short(6), tmp_path / "checkpoint", seen.append)
-    assert [p.samples for p in seen] == [18 * (i + 1) for i in range(6)]
+    model = train("geometric", shards[:1], short(12), tmp_path / "checkpoint", seen.append)
+    assert [p.samples for p in seen] == [18 * (i + 1) for i in range(12)]
     assert seen[-1].reconstruction < 0.8 * seen[0].reconstruction
     assert seen[-1].loss < seen[0].loss
     assert all(np.isfinite([p.loss, p.contrastive, p.matched]).all() for p in seen)
+    assert model is not None
     scores = completion_scores(model, tuple(a[:2] for a in read_shard(shards[0])))  # type: ignore[arg-type]
     assert set(scores) == {"accuracy", "all_free", "copy_input", "unobserved_accuracy", "iou", "recall5"}
     assert all(0 <= v <= 1 for v in scores.values())
@@ -146,6 +153,8 @@ def test_a_training_that_was_stopped_ends_where_an_unbroken_one_does(shards: lis
     seen: list[Progress] = []
     resumed = train("geometric", shards, settings, checkpoint, seen.append, save_every=2)
     assert [p.samples for p in seen] == [54, 72]  # from the checkpoint, not from the start
+    assert whole is not None
+    assert resumed is not None
     for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
         assert torch.equal(a, b), name
     for odd, message in ((short(4, seed=1), "settings"), (short(5), "settings")):
@@ -156,6 +165,37 @@ def test_a_training_that_was_stopped_ends_where_an_unbroken_one_does(shards: lis
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     with pytest.raises(WorkspaceError, match="broken"):
         train("geometric", shards, settings, checkpoint)
+
+
+def test_a_training_stops_in_time_and_leaves_snapshots(shards: list[Path], tmp_path: Path) -> None:
+    settings, checkpoint = short(4), tmp_path / "checkpoint"
+    seen: list[Progress] = []
+    for steps in (1, 2, 3):  # a deadline that is over allows one step each time
+        assert train("geometric", shards, settings, checkpoint, seen.append, deadline=0.0, snapshots=tmp_path) is None
+        assert [p.samples for p in seen] == [18 * (i + 1) for i in range(steps)]
+    assert train("geometric", shards, settings, checkpoint, seen.append, deadline=0.0) is not None
+    assert len(seen) == 4
+    assert sorted(p.name for p in tmp_path.glob("*.safetensors")) == ["geometric-000000018.safetensors", "geometric-000000036.safetensors"]
+    assert load_encoder("geometric", tmp_path / "geometric-000000036.safetensors").latent == 256
+
+
+def test_scenes_are_used_as_they_come(shards: list[Path]) -> None:
+    """The first pool asks for the first scenes, and those in the second half of the training for any."""
+    asked: list[int] = []
+
+    class Scenes(Sequence[Path]):
+        def __len__(self) -> int:
+            return 50
+
+        def __getitem__(self, index: Any) -> Any:
+            asked.append(index)
+            return shards[0]
+
+    list(batches(Scenes(), Training(batch=12), 0, 32 * 10))
+    assert len(asked) == 12 * 10
+    assert max(asked[:12]) < 12
+    assert max(asked[12:24]) < 12 + 8
+    assert max(asked[60:]) >= 40
 
 
 def test_nothing_to_train_on(shards: list[Path], tmp_path: Path) -> None:
@@ -170,6 +210,7 @@ def test_a_batch_without_anything_to_describe_keeps_the_weights_finite(tmp_path:
     bare[32, 32, :3] = 2
     write_shard(tmp_path / "shard", [(bare, bare[16:-16, 16:-16], bare)])
     model = train("geometric", [tmp_path / "shard"], short(1), tmp_path / "checkpoint", save_every=1)
+    assert model is not None
     assert all(torch.isfinite(p).all() for p in model.parameters())
 
 
@@ -187,7 +228,7 @@ def test_pairs_are_cut_from_the_same_place() -> None:
         T[:3, 3] = x, 0, 1.7
         some = rng.random(len(world)) < 0.4
         frames.append(SceneFrame(world[some] - np.array([x, 0, 1.7], np.float32), np.zeros(3, np.float32), label[some], T))
-    settings = Training(shift=0.0, turn=0.0)
+    settings = Training(shift=0.0, turn=0.0, tilt=0.0)
     pairs = cut_pairs(frames, fusion, settings, np.random.default_rng(1))
     assert len(pairs) > 10
     for part, whole, other in pairs:

@@ -1,0 +1,99 @@
+"""Batches of training pairs out of packed shards: a fixed random sequence, the same from whichever step it is begun.
+
+A pool is one row group of each of some scenes; batches are drawn from it until each of its pairs was drawn about once. The next pool is
+read by other threads meanwhile. Of the scenes, those that come first in the list are used first, so that scenes can still be made
+while training has begun. What is random about a pair is drawn where the network runs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semloc_logs.errors import SettingsError
+from semloc_logs.settings import Training
+from semloc_logs.subvolumes.pairs import ROW_GROUP, read_shard
+from semloc_logs.voxels.grid import UNOBSERVED_STATE
+
+U8 = NDArray[np.uint8]
+Pairs = tuple[U8, U8, U8]
+SCENES = 12  # of a pool, at least
+READERS = 4
+
+
+class Batch(NamedTuple):
+    """Voxel states uint8: incomplete (b, 64, 64, 32), complete (b, 32, 32, 32), complete and a little moved (b, 64, 64, 32)."""
+
+    incomplete: Tensor
+    complete: Tensor
+    other: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """Which scenes and row groups the pool number ``number`` is read from."""
+
+    number: int
+    scenes: tuple[int, ...]
+    groups: tuple[int, ...]
+
+
+def _plan(number: int, pools: int, shards: int, training: Training) -> _Plan:
+    draw = np.random.default_rng((training.seed, number))
+    wanted = max(SCENES, training.batch)
+    # all scenes are in use from the middle of the training on
+    known = min(shards, wanted + math.ceil(max(0, shards - wanted) * 2 * number / pools))
+    scenes = draw.permutation(known)[:wanted]
+    return _Plan(number, tuple(scenes.tolist()), tuple(draw.integers(1 << 16, size=len(scenes)).tolist()))
+
+
+def batches(shards: Sequence[Path], training: Training, first: int, steps: int, device: str = "cpu") -> Iterator[Batch]:
+    """The batches of the steps ``first`` .. ``steps`` - 1.
+
+    ``shards[i]`` may wait until the scene is there. Raises SettingsError when shards without a single pair are all there is.
+    """
+    per_pool = max(1, min(len(shards), max(SCENES, training.batch)) * ROW_GROUP // training.batch)
+    pools = -(-steps // per_pool)
+    readers = ThreadPoolExecutor(READERS)
+
+    def begin(number: int) -> list[Future[Pairs]]:
+        plan = _plan(number, pools, len(shards), training)
+        return [readers.submit(_read, shards, i, group) for i, group in zip(plan.scenes, plan.groups, strict=True)]
+
+    try:
+        coming = begin(first // per_pool)
+        for number in range(first // per_pool, pools):
+            pool = [pairs for pairs in (future.result() for future in coming) if len(pairs[0])]
+            coming = begin(number + 1) if number + 1 < pools else []
+            if not pool:
+                raise SettingsError("There is nothing to train on: none of the scenes or stretches of road gave a pair of subvolumes.")
+            for step in range(max(first, number * per_pool), min(steps, (number + 1) * per_pool)):
+                yield _batch(pool, training, step, device)
+    finally:
+        readers.shutdown(cancel_futures=True)
+
+
+def _read(shards: Sequence[Path], index: int, group: int) -> Pairs:
+    return read_shard(shards[index], group)
+
+
+def _batch(pool: Sequence[Pairs], training: Training, step: int, device: str) -> Batch:
+    rng = np.random.default_rng((training.seed, 1, step))
+    scenes = rng.integers(len(pool), size=training.batch)
+    rows = [int(rng.integers(len(pool[s][0]))) for s in scenes]
+    views = [torch.from_numpy(np.stack([pool[s][k][r] for s, r in zip(scenes, rows, strict=True)])).to(device) for k in range(3)]
+    # quarter turns and mirror images of the whole triple are as good as new streets
+    quarter, mirror = int(rng.integers(4)), bool(rng.integers(2))
+    turned = [torch.rot90(v.flip(1) if mirror else v, quarter, (1, 2)) for v in views]
+    generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
+    dropped = torch.rand(turned[0].shape, generator=generator, device=device) < training.dropout
+    return Batch(turned[0].masked_fill(dropped, UNOBSERVED_STATE), turned[1].contiguous(), turned[2].contiguous())

@@ -1,0 +1,90 @@
+"""Checkpoints of a training: network, optimiser and step in one safetensors file; and finished weights, written and read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from semloc_logs.errors import SettingsError, WorkspaceError
+from semloc_logs.settings import Training
+from semloc_logs.subvolumes.network import Completion
+from semloc_logs.tables import replacing_file
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def save_checkpoint(path: Path, model: Completion, optimiser: torch.optim.Optimizer, training: Training, step: int) -> None:
+    """What :func:`resume` needs to go on after ``step`` steps."""
+    tensors = {f"model.{k}": v.contiguous() for k, v in model.state_dict().items()}
+    for i, p in enumerate(model.parameters()):
+        tensors |= {f"optimiser.{i}.{k}": v.contiguous() for k, v in optimiser.state.get(p, {}).items() if isinstance(v, Tensor)}
+    note = {"step": str(step), "training": training.model_dump_json(), "variant": model.encoder.variant}
+    with replacing_file(path) as temporary:
+        save_file(tensors, temporary, metadata=note)
+
+
+def resume(path: Path, model: Completion, optimiser: torch.optim.Optimizer, training: Training) -> int:
+    """Put ``model`` and ``optimiser`` back to where the checkpoint was written; the number of steps done.
+
+    Raises WorkspaceError when the file is damaged, or of another training or network.
+    """
+    try:
+        with safe_open(path, "pt") as handle:
+            note = handle.metadata() or {}
+        tensors = load_file(path)
+        same = (
+            json.loads(note["training"]) == training.model_dump(mode="json")
+            and note.get("variant", model.encoder.variant) == model.encoder.variant
+        )
+        step = int(note["step"])
+    except (OSError, SafetensorError, KeyError, ValueError) as problem:
+        raise WorkspaceError(f"Checkpoint {path} cannot be read ({problem}): remove it to start over.") from None
+    if not same:
+        raise WorkspaceError(f"Checkpoint {path} is of a training with other settings: remove it to start over.")
+    try:
+        model.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
+    except RuntimeError:
+        raise WorkspaceError(f"Checkpoint {path} is of another network: remove it to start over.") from None
+    for i, p in enumerate(model.parameters()):
+        state = {k.split(".", 2)[2]: v for k, v in tensors.items() if k.startswith(f"optimiser.{i}.")}
+        if state:
+            # counters stay where they are, moments go where the parameters live
+            optimiser.state[p] = {k: v if k == "step" else v.to(p.device) for k, v in state.items()}
+    return step
+
+
+def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
+    """The network in bf16 with a model card in the file's metadata."""
+    tensors = {k: v.to("cpu", torch.bfloat16).contiguous() for k, v in model.state_dict().items() if v.is_floating_point()}
+    with replacing_file(path) as temporary:
+        save_file(tensors, temporary, metadata={**card, "variant": model.encoder.variant})
+
+
+def load_weights(build: Callable[[str, int], Network], part: str, variant: str, weights: Path | None = None) -> Network:
+    """The network that ``build(variant, latent)`` makes, with the shipped weights of ``variant`` or those of a file.
+
+    ``part`` is ``encoder.`` for the encoder alone, empty for all. Raises SettingsError when the file does not hold them.
+    """
+    try:
+        if weights is not None:
+            tensors = load_file(weights)
+        else:
+            with as_file(files("semloc_logs.subvolumes") / "weights" / f"{variant}.safetensors") as path:
+                tensors = load_file(path)
+        network = build(variant, len(tensors["encoder.mean.weight"]))
+        counters = {k: v for k, v in network.state_dict().items() if not v.is_floating_point()}  # of no use after training
+        network.load_state_dict(counters | {k.removeprefix(part): v.float() for k, v in tensors.items() if k.startswith(part)})
+    except (OSError, SafetensorError, KeyError, RuntimeError) as problem:
+        said = str(problem).splitlines()[0]
+        raise SettingsError(
+            f"{weights or 'The shipped weights'}: no weights of the {variant} {part.strip('.') or 'network'} ({said})."
+        ) from None
+    return network.eval()
