@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,7 @@ from .options import Command, EngineChoice, console_options, engine_options, jso
 
 if TYPE_CHECKING:
     from semloc_logs.engines import Engine
+    from semloc_logs.learning import Packed
     from semloc_logs.settings import Settings
 
 
@@ -28,33 +31,54 @@ if TYPE_CHECKING:
 @click.option("--scenes", type=int, metavar="N", help="Simulated scenes; default: training.scenes.")
 @click.option("--samples", type=int, metavar="N", help="Subvolumes seen in training; default: training.samples.")
 @path_option("--checkpoint", help="Folder of checkpoints and packed pairs; default: OUTPUT/checkpoint.")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True, help="Where the network trains.")
+@click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Stop after so many minutes with a checkpoint to go on from.")
+@path_option("--snapshots", help="Folder for the weights after 1/32, 1/16, ... 1/2 of the samples: a learning curve.")
 @json_option
 @engine_options
 @settings_options
 @console_options
 def command(
-    variant: str, output: Path, work: Path | None, checkpoint: Path | None, as_json: bool, engine: EngineChoice, settings: Settings
+    variant: str,
+    output: Path,
+    work: Path | None,
+    checkpoint: Path | None,
+    device: str,
+    minutes: float | None,
+    snapshots: Path | None,
+    as_json: bool,
+    engine: EngineChoice,
+    settings: Settings,
 ) -> int:
     """Learn the descriptor, self-supervised: an encoder-decoder completes what few frames saw to what all frames saw.
 
-    Two scenes (or stretches of road) are held out and measured at the end. Can be interrupted: the same command goes on from the
-    checkpoint. Use the result with --set descriptor.weights=FILE, and train a vocabulary for it.
+    Two scenes (or stretches of road) are held out and measured at the end. Scenes are simulated by --jobs processes while the network
+    trains. Can be interrupted, or limited by --minutes (exit code 3): the same command goes on from the checkpoint. Use the result with
+    --set descriptor.weights=FILE, and train a vocabulary for it.
 
     \b
     Example:  semloc train --variant semantic -o weights --scenes 60 --samples 250000
     """
     from semloc_logs.engines.engine import cores
-    from semloc_logs.learning import learn_descriptor, use_threads
+    from semloc_logs.learning import device_of, learn_descriptor, use_threads
 
     folder = checkpoint or output / "checkpoint"
-    with console.progress():
-        with engine.open(settings.training.scenes) as opened:
-            shards = packed_shards(folder, work, settings, opened)
+    chosen = device_of(device)
+    deadline = time.monotonic() + (60 * minutes if minutes else math.inf)
+    scores = {}
+    with console.progress(), engine.open(settings.training.scenes) as opened:
         use_threads(engine.jobs or cores())
-        scores = {}
+        shards = packed_shards(folder, work, settings, opened)
         for name in ("semantic", "geometric") if variant == "both" else (variant,):
             weights = output / f"{name}.safetensors"
-            scores[name] = learn_descriptor(name, shards, settings, folder / f"{name}.safetensors", weights, console.note)
+            where = folder / f"{name}.safetensors"
+            found = learn_descriptor(
+                name, shards, settings, where, weights, console.note, device=chosen, deadline=deadline, snapshots=snapshots
+            )
+            if found is None:
+                console.warn(f"{minutes:g} minutes are over and {where} is written: the same command goes on from there.")
+                return 3
+            scores[name] = found
             console.note(f"{weights} written")
     if as_json:
         console.result_json({name: {"weights": str(output / f"{name}.safetensors"), **found} for name, found in scores.items()})
@@ -67,7 +91,7 @@ def command(
     return 0
 
 
-def packed_shards(folder: Path, work: Path | None, settings: Settings, engine: Engine) -> list[Path]:
+def packed_shards(folder: Path, work: Path | None, settings: Settings, engine: Engine) -> Packed:
     """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes."""
     from semloc_logs.learning import session_shards, simulated_shards
     from semloc_logs.workspace import Workspace

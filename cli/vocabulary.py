@@ -61,7 +61,7 @@ def command(
             packed = given_shards(shards)
         else:
             with engine.open(settings.training.scenes) as opened:
-                packed = packed_shards(checkpoint or output.parent / "checkpoint", work, settings, opened)
+                packed = packed_shards(checkpoint or output.parent / "checkpoint", work, settings, opened).every
         files = {v: output / f"{v}.safetensors" for v in ("semantic", "geometric")} if variant == "both" else {variant: output}
         use_threads(engine.jobs or cores())
         made = {}

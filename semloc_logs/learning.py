@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +15,17 @@ import torch
 
 import semloc_logs
 from semloc_logs.engines import Engine
+from semloc_logs.engines.growing import Growing
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings, Training
 from semloc_logs.simulation.training_data import make_shard, scene_tasks
+from semloc_logs.subvolumes.checkpoints import save_weights
 from semloc_logs.subvolumes.completion import completion_scores
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.own_sessions import cut_stretch, stretch_tasks
-from semloc_logs.subvolumes.pairs import read_shard
+from semloc_logs.subvolumes.pairs import read_shard, rows_of
 from semloc_logs.subvolumes.sampling import shard_descriptors
-from semloc_logs.subvolumes.training import Progress, save_weights, train
+from semloc_logs.subvolumes.training import Progress, train
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import SessionFolder
 
@@ -31,17 +35,31 @@ SCORED = 600  # pairs of each of them
 REPORT_SECONDS = 2.0
 
 
-def simulated_shards(folder: Path, settings: Settings, engine: Engine, note: Note) -> list[Path]:
-    """Pairs from ``training.scenes`` simulated scenes; those that are there for the same settings stay."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Packed:
+    """Shards of pairs to train on, of which ``train[i]`` may wait until it is there, and those that only measure."""
+
+    train: Sequence[Path]
+    held_out: list[Path]
+
+    @property
+    def every(self) -> list[Path]:
+        """All of them, waited for."""
+        return [*self.train, *self.held_out]
+
+
+def simulated_shards(folder: Path, settings: Settings, engine: Engine, note: Note) -> Packed:
+    """Pairs from ``training.scenes`` simulated scenes; those that are there for the same settings stay.
+
+    They are made in the order in which training wants them, while ``engine`` is open.
+    """
     tasks = scene_tasks(_shard_folder(folder, "simulated", settings), settings.training.scenes, settings)
-    out = []
-    for shard in engine.map(make_shard, tasks):
-        out.append(shard)
-        note(f"scene {len(out)} of {len(tasks)}")
-    return out
+    count = len(tasks) - HELD_OUT if len(tasks) > HELD_OUT else len(tasks)
+    held_out = list(engine.map(make_shard, tasks[count:]))
+    return Packed(Growing(engine.map(make_shard, tasks[:count]), count, lambda n: note(f"scene {n} of {count}")), held_out)
 
 
-def session_shards(folder: Path, sessions: Sequence[SessionFolder], settings: Settings, engine: Engine, note: Note) -> list[Path]:
+def session_shards(folder: Path, sessions: Sequence[SessionFolder], settings: Settings, engine: Engine, note: Note) -> Packed:
     """Pairs from fused sessions with poses, a shard for each stretch of road. Raises SettingsError when there is none."""
     tasks = stretch_tasks(_shard_folder(folder, "sessions", settings), sessions, settings)
     if not tasks:
@@ -52,7 +70,8 @@ def session_shards(folder: Path, sessions: Sequence[SessionFolder], settings: Se
     for shard in engine.map(cut_stretch, tasks):
         out.append(shard)
         note(f"stretch {len(out)} of {len(tasks)}")
-    return out
+    full = [path for path in out if rows_of(path)]
+    return Packed(full[:-HELD_OUT], full[-HELD_OUT:]) if len(full) > HELD_OUT else Packed(full, [])
 
 
 def given_shards(folder: Path) -> list[Path]:
@@ -66,20 +85,30 @@ def given_shards(folder: Path) -> list[Path]:
 def _shard_folder(folder: Path, kind: str, settings: Settings) -> Path:
     """Shards of other settings lie in another folder."""
     t = settings.training
-    relevant = settings.model_copy(update={"training": Training(seed=t.seed, shift=t.shift, turn=t.turn)})
+    relevant = settings.model_copy(update={"training": Training(seed=t.seed, shift=t.shift, turn=t.turn, tilt=t.tilt)})
     return folder / f"{kind}-{relevant.fingerprint('fusion', 'training')}"
 
 
 def learn_descriptor(
-    variant: str, shards: Sequence[Path], settings: Settings, checkpoint: Path, output: Path, note: Note
-) -> dict[str, float]:
-    """Train ``variant`` on all but the last two shards, measure on those, write the weights with a card; the scores.
+    variant: str,
+    shards: Packed,
+    settings: Settings,
+    checkpoint: Path,
+    output: Path,
+    note: Note,
+    *,
+    device: str = "cpu",
+    deadline: float = math.inf,
+    snapshots: Path | None = None,
+) -> dict[str, float] | None:
+    """Train ``variant``, measure on the held-out shards, write the weights with a card; the scores.
 
-    Goes on from ``checkpoint`` if it is there. Raises SettingsError with fewer than three shards.
+    Goes on from ``checkpoint`` if it is there. None, with a checkpoint, where ``time.monotonic()`` passed ``deadline`` before the end.
+    Raises SettingsError when there are too few shards to hold any out.
     """
-    if len(shards) <= HELD_OUT:
+    if not shards.held_out:
         raise SettingsError(
-            f"Training needs at least {HELD_OUT + 1} scenes or stretches of road, not {len(shards)}: two of them only measure."
+            f"Training needs at least {HELD_OUT + 1} scenes or stretches of road, not {len(shards.train)}: two of them only measure."
         )
     training = settings.training
     started, spoke, first = time.monotonic(), 0.0, -1
@@ -95,11 +124,13 @@ def learn_descriptor(
             losses = f"reconstruction {step.reconstruction:.3f}, contrastive {step.contrastive:.3f}, matched {step.matched:.0%}"
             note(f"{variant}: {min(step.samples, training.samples)} of {training.samples} samples, {rate:.0f} a second, {losses}")
 
-    model = train(variant, shards[:-HELD_OUT], training, checkpoint, tell)
-    held_out = [tuple(part[:SCORED] for part in read_shard(shard)) for shard in shards[-HELD_OUT:]]
+    model = train(variant, shards.train, training, checkpoint, tell, device=device, deadline=deadline, snapshots=snapshots)
+    if model is None:
+        return None
+    held_out = [tuple(part[:SCORED] for part in read_shard(shard)) for shard in shards.held_out]
     part, whole, other = (np.concatenate([pairs[k] for pairs in held_out]) for k in range(3))
-    scores = completion_scores(model, (part, whole, other))
-    save_weights(output, model, _card(settings, shards, scores=scores))
+    scores = completion_scores(model.to("cpu"), (part, whole, other))
+    save_weights(output, model, _card(settings, len(shards.train), scores=scores))
     return scores
 
 
@@ -116,7 +147,7 @@ def learn_vocabulary(
     descriptors = shard_descriptors(shards, encoder, pairs_per_shard, note)
     note(f"{variant}: clustering {len(descriptors)} descriptors")
     vocabulary = train_vocabulary(descriptors, seed=settings.training.seed)
-    save_vocabulary(output, vocabulary, _card(settings, shards, variant=variant, descriptors=len(descriptors)))
+    save_vocabulary(output, vocabulary, _card(settings, len(shards), variant=variant, descriptors=len(descriptors)))
     return len(descriptors)
 
 
@@ -125,9 +156,18 @@ def use_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
-def _card(settings: Settings, shards: Sequence[Path], **facts: Any) -> dict[str, str]:
+def _card(settings: Settings, shards: int, **facts: Any) -> dict[str, str]:
     """What a model was made of, as strings for the file's metadata."""
     training = settings.training
-    said = {"version": semloc_logs.__version__, "samples": training.samples, "shards": len(shards), "seed": training.seed}
+    said = {"version": semloc_logs.__version__, "samples": training.samples, "shards": shards, "seed": training.seed}
     said |= {"voxel_size": settings.fusion.voxel_size, "training": training.model_dump(mode="json"), **facts}
     return {k: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for k, v in said.items()}
+
+
+def device_of(name: str) -> str:
+    """``cpu`` or ``cuda`` for ``auto``, ``cpu`` or ``cuda``. Raises SettingsError for a GPU that is not there."""
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise SettingsError("There is no GPU that torch can use here: train with --device cpu, or install a torch build for this GPU.")
+    return name

@@ -15,7 +15,7 @@ from semloc_logs import contracts
 from semloc_logs.engines import make_engine
 from semloc_logs.errors import SettingsError
 from semloc_logs.geometry import apply, yaw_transform
-from semloc_logs.learning import learn_descriptor, learn_vocabulary, session_shards
+from semloc_logs.learning import Packed, learn_descriptor, learn_vocabulary, session_shards
 from semloc_logs.settings import Settings, load
 from semloc_logs.subvolumes.own_sessions import session_frames, stretch_tasks
 from semloc_logs.subvolumes.pairs import read_shard, write_shard
@@ -56,31 +56,34 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
 def test_a_descriptor_is_learned_measured_and_described(shards: list[Path], tmp_path: Path) -> None:
     settings, notes = _settings(samples=54, batch=2, seed=5), list[str]()
     output, checkpoint = tmp_path / "geometric.safetensors", tmp_path / "checkpoint.safetensors"
-    scores = learn_descriptor("geometric", shards, settings, checkpoint, output, notes.append)
+    scores = learn_descriptor("geometric", Packed(shards[:2], shards[2:]), settings, checkpoint, output, notes.append)
+    assert scores is not None
     assert {"accuracy", "recall5"} <= set(scores)
     assert all(0 <= s <= 1 for s in scores.values())
     assert "54 of 54 samples" in notes[-1]
     with safe_open(output, "pt") as handle:
         card = handle.metadata()
     assert json.loads(card["scores"]) == pytest.approx(scores)
-    assert (card["variant"], card["samples"], card["seed"], card["shards"]) == ("geometric", "54", "5", "4")
+    assert (card["variant"], card["samples"], card["seed"], card["shards"]) == ("geometric", "54", "5", "2")
     # the finished checkpoint is not trained again, and gives the same network
     first, notes = load_file(output), []
-    assert learn_descriptor("geometric", shards, settings, checkpoint, output, notes.append) == pytest.approx(scores)
+    assert learn_descriptor("geometric", Packed(shards[:2], shards[2:]), settings, checkpoint, output, notes.append) == pytest.approx(
+        scores
+    )
     assert notes == []
     assert all(torch.equal(tensor, first[name]) for name, tensor in load_file(output).items())
 
 
 def test_two_scenes_are_too_few(shards: list[Path], tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="at least 3"):
-        learn_descriptor("geometric", shards[:2], _settings(), tmp_path / "c", tmp_path / "w", lambda _: None)
+        learn_descriptor("geometric", Packed(shards[:2], []), _settings(), tmp_path / "c", tmp_path / "w", lambda _: None)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_vocabulary_belongs_to_its_weights(shards: list[Path], tmp_path: Path) -> None:
     settings = _settings(samples=36, batch=2)
     weights = tmp_path / "geometric.safetensors"
-    learn_descriptor("geometric", shards, settings, tmp_path / "c.safetensors", weights, lambda _: None)
+    learn_descriptor("geometric", Packed(shards[:2], shards[2:]), settings, tmp_path / "c.safetensors", weights, lambda _: None)
     own = settings.model_copy(update={"descriptor": settings.descriptor.model_copy(update={"weights": weights})})
     output = tmp_path / "words.safetensors"
     # 24 pairs of nine descriptors are fewer than 256: three times the same shards are enough
@@ -155,7 +158,7 @@ def test_sessions_become_shards_of_pairs_once(tmp_path: Path) -> None:
     folder = SessionFolder(tmp_path / "sessions/drive")
     _session(folder, 12)
     settings = load().resolved()
-    (shard,) = session_shards(tmp_path / "shards", [folder], settings, make_engine("serial"), lambda _: None)
+    (shard,) = session_shards(tmp_path / "shards", [folder], settings, make_engine("serial"), lambda _: None).every
     part, whole, other = read_shard(shard)
     assert len(part) == len(whole) == len(other) > 20
     assert {0, 2, 254} <= set(np.unique(whole).tolist())
@@ -163,7 +166,7 @@ def test_sessions_become_shards_of_pairs_once(tmp_path: Path) -> None:
     session_shards(tmp_path / "shards", [folder], settings, make_engine("serial"), lambda _: None)
     assert shard.stat().st_mtime_ns == written
     other_voxels = load(assignments={"fusion.voxel_size": "0.2"}).resolved()
-    assert session_shards(tmp_path / "shards", [folder], other_voxels, make_engine("serial"), lambda _: None) != [shard]
+    assert session_shards(tmp_path / "shards", [folder], other_voxels, make_engine("serial"), lambda _: None).every != [shard]
 
 
 def test_sessions_without_poses_teach_nothing(tmp_path: Path) -> None:
