@@ -8,9 +8,11 @@ while training has begun. What is random about a pair is drawn where the network
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +30,7 @@ U8 = NDArray[np.uint8]
 Pairs = tuple[U8, U8, U8]
 SCENES = 12  # of a pool, at least
 READERS = 4
+AHEAD = 3  # batches that are put together before they are asked for
 
 
 class Batch(NamedTuple):
@@ -76,8 +79,12 @@ def batches(shards: Sequence[Path], training: Training, first: int, steps: int, 
             coming = begin(number + 1) if number + 1 < pools else []
             if not pool:
                 raise SettingsError("There is nothing to train on: none of the scenes or stretches of road gave a pair of subvolumes.")
-            for step in range(max(first, number * per_pool), min(steps, (number + 1) * per_pool)):
-                yield _batch(pool, training, step, device)
+            wanted = iter(range(max(first, number * per_pool), min(steps, (number + 1) * per_pool)))
+            drawn = deque(readers.submit(_drawn, pool, training, step) for step in islice(wanted, AHEAD))
+            while drawn:
+                this = drawn.popleft().result()
+                drawn.extend(readers.submit(_drawn, pool, training, step) for step in islice(wanted, 1))
+                yield _turned(this, training, device)
     finally:
         readers.shutdown(cancel_futures=True)
 
@@ -86,14 +93,27 @@ def _read(shards: Sequence[Path], index: int, group: int) -> Pairs:
     return read_shard(shards[index], group)
 
 
-def _batch(pool: Sequence[Pairs], training: Training, step: int, device: str) -> Batch:
+class _Drawn(NamedTuple):
+    """Pairs of one step, and how they are to be turned, mirrored and thinned."""
+
+    views: Pairs
+    quarter: int
+    mirror: bool
+    seed: int
+
+
+def _drawn(pool: Sequence[Pairs], training: Training, step: int) -> _Drawn:
     rng = np.random.default_rng((training.seed, 1, step))
     scenes = rng.integers(len(pool), size=training.batch)
     rows = [int(rng.integers(len(pool[s][0]))) for s in scenes]
-    views = [torch.from_numpy(np.stack([pool[s][k][r] for s, r in zip(scenes, rows, strict=True)])).to(device) for k in range(3)]
-    # quarter turns and mirror images of the whole triple are as good as new streets
-    quarter, mirror = int(rng.integers(4)), bool(rng.integers(2))
-    turned = [torch.rot90(v.flip(1) if mirror else v, quarter, (1, 2)) for v in views]
-    generator = torch.Generator(device).manual_seed(int(rng.integers(1 << 62)))
-    dropped = torch.rand(turned[0].shape, generator=generator, device=device) < training.dropout
-    return Batch(turned[0].masked_fill(dropped, UNOBSERVED_STATE), turned[1].contiguous(), turned[2].contiguous())
+    a, b, c = (np.stack([pool[s][k][r] for s, r in zip(scenes, rows, strict=True)]) for k in range(3))
+    return _Drawn((a, b, c), int(rng.integers(4)), bool(rng.integers(2)), int(rng.integers(1 << 62)))
+
+
+def _turned(drawn: _Drawn, training: Training, device: str) -> Batch:
+    """The batch where the network runs; quarter turns and mirror images of the whole triple are as good as new streets."""
+    views = (torch.from_numpy(view).to(device) for view in drawn.views)
+    a, b, c = (torch.rot90(v.flip(1) if drawn.mirror else v, drawn.quarter, (1, 2)) for v in views)
+    generator = torch.Generator(device).manual_seed(drawn.seed)
+    dropped = torch.rand(a.shape, generator=generator, device=device) < training.dropout
+    return Batch(a.masked_fill(dropped, UNOBSERVED_STATE), b.contiguous(), c.contiguous())

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -66,7 +65,7 @@ class _Losses:
     matched: float
 
 
-def _losses(model: Any, batch: Batch, noise: Tensor, table: Tensor, training: Training) -> _Losses:
+def _losses(model: Completion, batch: Batch, noise: Tensor, table: Tensor, training: Training) -> _Losses:
     classes, device = CLASSES[model.encoder.variant], noise.device.type
     target, known = targets(in_eights(batch.complete).movedim(-1, 0), table, classes)
     with torch.autocast(device, dtype=torch.bfloat16):
@@ -122,7 +121,9 @@ def train(
     optimiser = optimiser_of(model)
     steps = math.ceil(training.samples / (training.batch * 9))
     done = resume(checkpoint, model, optimiser, training) if checkpoint.exists() else 0
-    run: Any = torch.compile(model) if device == "cuda" else model
+    if device == "cuda":
+        model.encoder.compile()
+        model.decoder.compile()
     table = torch.from_numpy(code_table(variant)).to(device)
     rate = optimiser.defaults["lr"] * math.sqrt(training.batch / BATCH_OF_RATE)
     model.train()
@@ -134,7 +135,7 @@ def train(
         for group in optimiser.param_groups:
             group["lr"] = rate * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
         normal = np.random.default_rng((training.seed, 2, step)).standard_normal((training.batch, training.latent), np.float32)
-        losses = _losses(run, batch, torch.from_numpy(normal).to(device), table, training)
+        losses = _losses(model, batch, torch.from_numpy(normal).to(device), table, training)
         optimiser.zero_grad(set_to_none=True)
         losses.total.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
