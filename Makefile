@@ -3,13 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help install demo test fuzz lint format wheel clean
+.PHONY: help install demo test fuzz weights lint format wheel clean
 
 help:
 	@echo "make install   a virtual environment in $(VENV) with semloc and the tools of development"
 	@echo "make demo      two simulated drives, their loop closures, and an annotated log, in demo/"
 	@echo "make test      all tests"
 	@echo "make fuzz      damaged messages and logs for MINUTES (1) from SEED (0) on"
+	@echo "make weights   the descriptor of 16 million subvolumes, in weights/, in runs of MINUTES (9); goes on where it stopped"
 	@echo "make lint      ruff and mypy"
 	@echo "make format    ruff format"
 	@echo "make wheel     the wheel, in dist/"
@@ -32,6 +33,11 @@ test: install
 
 fuzz: install
 	$(BIN)/python -P benchmarks/fuzz.py --minutes $(or $(MINUTES),1) --seed $(or $(SEED),0)
+
+# exit code 3 says that the minutes are over: a batch system starts the same command again, here a loop does
+weights: install
+	@while :; do $(BIN)/semloc train -o weights --samples 16000000 --scenes 4000 --set training.batch=192 --minutes $(or $(MINUTES),9); \
+		code=$$?; [ $$code -eq 3 ] || exit $$code; done
 
 lint: install
 	$(BIN)/ruff check
