@@ -25,7 +25,7 @@ class Scan:
     map_T_sensor: F64
 
 
-def street_sweeps(count: int = 12, points: int = SWEEP_POINTS, seed: int = 1) -> list[Scan]:
+def street_sweeps(count: int = 12, points: int = SWEEP_POINTS, seed: int = 8) -> list[Scan]:
     """Sweeps 1.2 m apart of a simulated sensor of 64 beams along a street, ``points`` each (fewer if it cannot see so many).
 
     Their mean range is about 10 m, as that of real sweeps, and 98 % or more of the points are within 50 m.

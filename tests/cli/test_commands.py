@@ -1,6 +1,7 @@
 """What each command hands to the pipeline and prints of its answer; the stages themselves are stand-ins or hand-made files."""
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -326,7 +327,21 @@ def test_simulate_refuses_the_impossible(tmp_path: Path) -> None:
 def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained: list[tuple[str, int, int]] = []
 
-    def learn(variant: str, shards: list[Path], settings: Any, checkpoint: Path, output: Path, note: Any) -> dict[str, float]:
+    def learn(
+        variant: str,
+        shards: list[Path],
+        settings: Any,
+        checkpoint: Path,
+        output: Path,
+        note: Any,
+        *,
+        device: str,
+        deadline: float,
+        snapshots: Any,
+    ) -> dict[str, float] | None:
+        assert (device, snapshots) == ("cpu", None)
+        if deadline < time.monotonic() + 60:
+            return None
         trained.append((variant, len(shards), settings.training.samples))
         assert checkpoint == tmp_path / "w/checkpoint" / f"{variant}.safetensors"
         return {"accuracy": 0.875}
@@ -334,11 +349,15 @@ def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatc
     monkeypatch.setattr("semloc_logs.learning.simulated_shards", lambda folder, settings, *_: [Path("s")] * settings.training.scenes)
     monkeypatch.setattr("semloc_logs.learning.learn_descriptor", learn)
     monkeypatch.setattr("semloc_logs.learning.use_threads", lambda _: None)
-    done = semloc("train", "-o", tmp_path / "w", "--scenes", 5, "--samples", 900, "--engine", "serial", "--json")
+    options = ("--scenes", 5, "--samples", 900, "--engine", "serial", "--device", "cpu")
+    done = semloc("train", "-o", tmp_path / "w", *options, "--json")
     assert done.exit_code == 0, done.stderr
     assert trained == [("semantic", 5, 900), ("geometric", 5, 900)]
     assert json.loads(done.stdout)["semantic"]["accuracy"] == 0.875
-    assert "0.8750" in semloc("train", "-o", tmp_path / "w", "--variant", "semantic", "--samples", 900, "--engine", "serial").stdout
+    assert "0.8750" in semloc("train", "-o", tmp_path / "w", "--variant", "semantic", *options).stdout
+    unfinished = semloc("train", "-o", tmp_path / "w", *options, "--minutes", 0.5)
+    assert unfinished.exit_code == 3
+    assert "goes on from there" in unfinished.stderr
 
 
 def test_vocabularies_of_both_variants_have_the_shipped_weights_and_shards(tmp_path: Path) -> None:
