@@ -72,7 +72,8 @@ def completed(model: Completion, pairs: tuple[U8, U8, U8]) -> Completed:
 def completion_figures(found: Completed) -> Figures:
     """Over the voxels that the complete map observed, as classes or free; ``all_free`` and ``copy_input`` are the two trivial answers.
 
-    ``ours`` weighs what is occupied three times, ``most_probable`` says the likeliest label of each voxel.
+    ``ours`` weighs what is occupied three times, ``most_probable`` says the likeliest label of each voxel, ``input_completed`` keeps what
+    the input observed and is ours elsewhere.
 
     ``accuracy``: share of right labels (the paper's figure); ``unobserved_accuracy``: the same where the input observed nothing;
     ``mean_iou``: mean over the occupied classes that occur; ``occupied_iou``, ``free_iou``: of occupied and free whatever the class.
@@ -86,6 +87,7 @@ def completion_figures(found: Completed) -> Figures:
         "copy_input": found.given[known],
     }
     hidden = answers["copy_input"] == found.classes + 1
+    answers["input_completed"] = np.where(hidden, answers["ours"], answers["copy_input"])
     figures: Figures = {}
     for who, said in answers.items():
         confusion = np.bincount(truth.astype(np.int64) * 32 + said, minlength=32 * 32).reshape(32, 32)
