@@ -96,7 +96,7 @@ class _Ablated(Encoder):
         x = F.relu(self.norms[0](self.first_block(single)))
         for block, norm in zip(self.blocks, list(self.norms)[1:], strict=True):
             x = F.relu(norm(_halve(block(x))))
-        mu: Tensor = self.centre(self.mean(x)).flatten(1).reshape(b, i, j, -1).permute(0, 3, 1, 2)
+        mu: Tensor = self.latent_mean(x).flatten(1).reshape(b, i, j, -1).permute(0, 3, 1, 2)
         return mu
 
 

@@ -130,7 +130,7 @@ def train(
     for step, batch in enumerate(batches(shards, training, done, steps, device), start=done):
         if step >= FREEZE * steps:
             for part_of_model in model.modules():
-                if isinstance(part_of_model, torch.nn.BatchNorm3d):
+                if isinstance(part_of_model, (torch.nn.BatchNorm2d, torch.nn.BatchNorm3d)):
                     part_of_model.eval()
         for group in optimiser.param_groups:
             group["lr"] = rate * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
