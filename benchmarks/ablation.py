@@ -93,11 +93,15 @@ class _Ablated(Encoder):
             windows = windows[:, i // 2 : i // 2 + 1, j // 2 : j // 2 + 1]
             i = j = 1
         single = windows.reshape(-1, *windows.shape[3:]).permute(0, 2, 3, 1)
+        mu = torch.cat([self.alone(some) for some in single.split(64)])  # one-hot voxels of a whole map would not fit into memory
+        return mu.reshape(b, i, j, -1).permute(0, 3, 1, 2)
+
+    def alone(self, single: Tensor) -> Tensor:
+        """Subvolumes (n, 32, 32, 32) without a margin -> mu (n, latent), as in the paper."""
         x = F.relu(self.norms[0](self.first_block(single)))
         for block, norm in zip(self.blocks, list(self.norms)[1:], strict=True):
             x = F.relu(norm(_halve(block(x))))
-        mu: Tensor = self.latent_mean(x).flatten(1).reshape(b, i, j, -1).permute(0, 3, 1, 2)
-        return mu
+        return self.latent_mean(x).flatten(1)
 
 
 class _AblatedCompletion(Completion):
