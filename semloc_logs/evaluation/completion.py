@@ -33,7 +33,7 @@ PAPER = 0.87  # accuracy (4.3)
 SHOWN = 6  # subvolumes in the picture
 BATCH = 16
 COUNTED = Training().occupied_weight
-BALANCED = 3.0  # best mean IoU on training streets
+BALANCED = 3.0  # of 1, 2, 3, 5 and 10 the best mean IoU on a simulated street that is not among the SEEDS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,9 +63,8 @@ def completed(model: Completion, pairs: tuple[U8, U8, U8]) -> Completed:
         logits = model.complete(torch.from_numpy(given[i : i + BATCH]))[:, : classes + 1]
         for out, weight in ((said, BALANCED), (probable, COUNTED)):
             # an occupied voxel counted so often in training: its odds are too large by that
-            logits[:, :classes] -= math.log(weight)
-            out[i : i + BATCH] = logits.argmax(1).numpy()
-            logits[:, :classes] += math.log(weight)
+            excess = torch.tensor([math.log(weight)] * classes + [0.0])
+            out[i : i + BATCH] = (logits - excess[:, None, None, None]).argmax(1).numpy()
     return Completed(np.ascontiguousarray(given[:, 16:-16, 16:-16]), said, probable, table[pairs[1]], classes)
 
 

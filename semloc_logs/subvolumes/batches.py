@@ -11,7 +11,6 @@ import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -41,22 +40,14 @@ class Batch(NamedTuple):
     other: Tensor
 
 
-@dataclass(frozen=True, slots=True)
-class _Plan:
-    """Which scenes and row groups the pool number ``number`` is read from."""
-
-    number: int
-    scenes: tuple[int, ...]
-    groups: tuple[int, ...]
-
-
-def _plan(number: int, pools: int, shards: int, training: Training) -> _Plan:
+def _plan(number: int, pools: int, shards: int, training: Training) -> list[tuple[int, int]]:
+    """Scene and row group of each part of the pool ``number``."""
     draw = np.random.default_rng((training.seed, number))
     wanted = max(SCENES, training.batch)
     # all scenes are in use from the middle of the training on
     known = min(shards, wanted + math.ceil(max(0, shards - wanted) * 2 * number / pools))
     scenes = draw.permutation(known)[:wanted]
-    return _Plan(number, tuple(scenes.tolist()), tuple(draw.integers(1 << 16, size=len(scenes)).tolist()))
+    return list(zip(scenes.tolist(), draw.integers(1 << 16, size=len(scenes)).tolist(), strict=True))
 
 
 def batches(shards: Sequence[Path], training: Training, first: int, steps: int, device: str = "cpu") -> Iterator[Batch]:
@@ -69,8 +60,7 @@ def batches(shards: Sequence[Path], training: Training, first: int, steps: int, 
     readers = ThreadPoolExecutor(READERS)
 
     def begin(number: int) -> list[Future[Pairs]]:
-        plan = _plan(number, pools, len(shards), training)
-        return [readers.submit(_read, shards, i, group) for i, group in zip(plan.scenes, plan.groups, strict=True)]
+        return [readers.submit(_read, shards, scene, group) for scene, group in _plan(number, pools, len(shards), training)]
 
     try:
         coming = begin(first // per_pool)
@@ -89,8 +79,8 @@ def batches(shards: Sequence[Path], training: Training, first: int, steps: int, 
         readers.shutdown(cancel_futures=True)
 
 
-def _read(shards: Sequence[Path], index: int, group: int) -> Pairs:
-    return read_shard(shards[index], group)
+def _read(shards: Sequence[Path], scene: int, group: int) -> Pairs:
+    return read_shard(shards[scene], group)  # waits, in a thread of its own, for a scene that is not there yet
 
 
 class _Drawn(NamedTuple):

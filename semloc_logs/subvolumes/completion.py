@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from semloc_logs.subvolumes.cut import CLASSES, code_table
-from semloc_logs.subvolumes.network import Completion, descriptors
+from semloc_logs.subvolumes.network import Completion, as_volumes, descriptors
 from semloc_logs.subvolumes.training import targets
 
 U8 = NDArray[np.uint8]
@@ -30,9 +30,10 @@ def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, 
     for i in range(0, len(pairs[0]), 32):
         part, whole, other = (a[i : i + 32] for a in pairs)
         codes = torch.from_numpy(table[part])
-        ours.append(descriptors(model.encoder(codes)[:, :, 1:2, 1:2]))
+        logits, mu, _ = model(codes, None)
+        ours.append(descriptors(mu[:, :, 1:2, 1:2]))
         theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 1:2, 1:2]))
-        said = model.complete(codes)[:, : classes + 1].argmax(1).numpy()
+        said = as_volumes(logits)[:, : classes + 1].argmax(1).numpy()
         target, known = (t.numpy() for t in targets(torch.from_numpy(whole), torch.from_numpy(table), classes))
         given = table[part[:, 16:-16, 16:-16]]
         seen += int(known.sum())

@@ -124,6 +124,11 @@ class Decoder(nn.Module):
         return logits.reshape(-1, 8, x.shape[0], *x.shape[2:])
 
 
+def as_volumes(logits: Tensor) -> Tensor:
+    """What the decoder gives -> (b, L + 2, 32, 32, 32)."""
+    return torch.stack([from_eights(of_class.movedim(0, -1)) for of_class in logits], 1)
+
+
 def channels_last(module: nn.Module) -> None:
     """Lay out the weights as the convolutions want them: two to three times as fast on a CPU."""
     layouts = {4: torch.channels_last, 5: torch.channels_last_3d}
@@ -143,8 +148,7 @@ class Completion(nn.Module):
 
     def complete(self, codes: Tensor) -> Tensor:
         """Logits (b, L + 2, 32, 32, 32) of the completed middle subvolumes of ``codes`` (b, 64, 64, 32), as the training weighed voxels."""
-        logits: Tensor = self(codes, None)[0]
-        return torch.stack([from_eights(of_class.movedim(0, -1)) for of_class in logits], 1)
+        return as_volumes(self(codes, None)[0])
 
     def forward(self, codes: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Logits of the completed middle subvolume as the decoder gives them, mu (b, latent, 3, 3) of all and log-variance (b, latent) of
