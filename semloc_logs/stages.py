@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 import semloc_logs
+from semloc_logs.closures.agreement import decide
 from semloc_logs.closures.closing import Alignment, CloseTask, close_queries
 from semloc_logs.closures.picture import draw_closures
 from semloc_logs.closures.queries import SessionMap, query_keyframes
@@ -237,11 +238,13 @@ def close(
         chunks = [tuple(keyframes[i : i + QUERIES_A_TASK]) for i in range(0, len(keyframes), QUERIES_A_TASK)]
         tasks += [CloseTask(work.path.absolute(), folder.name, chunk, others, settings.model_dump_json()) for chunk in chunks]
     found: list[Alignment] = []
+    least = settings.closures.min_probability
     total, asked_queries = sum(len(t.keyframes) for t in tasks), 0
     for task, results in zip(tasks, engine.map(close_queries, tasks), strict=True):
         asked_queries += len(task.keyframes)
         found += [a for result in results for a in result]
-        note(f"query {asked_queries} of {total}: {sum(a.accepted for a in found)} closures")
+        note(f"query {asked_queries} of {total}: {sum(a.probability >= least for a in found)} probable places")
+    found = decide(found, maps, settings)
     positions = {name: m.map_T_base[:, :3, 3] for name, m in maps.items()}
     closures = unique_closures([a for a in found if a.accepted], positions, settings.query.every or 2.0)
     metadata = {

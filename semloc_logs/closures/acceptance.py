@@ -1,46 +1,112 @@
-"""The probability that an alignment is right, from its features, and the choice of what to report."""
+"""The probability that an alignment is right: from its own features, then together with what neighbouring queries say."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES, Features
 
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """What other queries of the session say about an alignment; see ``schemas/parquet/rejected.json``.
+
+    ``alone`` is the probability from the alignment's own features; the sums are of the ``alone`` of other queries' alignments.
+    """
+
+    alone: float
+    neighbours: int = 0
+    agreeing: float = 0.0
+    opposing: float = 0.0
+    far_agreeing: float = 0.0
+    far_opposing: float = 0.0
+    lookalike: float = 0.0
+
+
+AGREEMENT = ("alone", "neighbours", "agreeing", "opposing", "far_agreeing", "far_opposing", "lookalike")
+TOGETHER = ("log_odds", "log_agreeing", "share", "log_opposing", "log_far_agreeing", "log_far_opposing", "lookalike")
+
+
+def own_values(features: Features) -> F64:
+    """The features (8,) in the order of ``FEATURES``."""
+    return np.array([getattr(features, name) for name in FEATURES])
+
+
+def together_values(columns: Sequence[F64]) -> F64:
+    """Values (n, 7) in the order of ``TOGETHER`` from the columns (7, n) of ``AGREEMENT``."""
+    alone, neighbours, agreeing, opposing, far_agreeing, far_opposing, lookalike = (np.asarray(c, float) for c in columns)
+    p = np.clip(alone, 1e-6, 1 - 1e-6)
+    counts = [np.log1p(c) for c in (agreeing, opposing, far_agreeing, far_opposing)]
+    return np.stack([np.log(p / (1 - p)), counts[0], agreeing / np.maximum(neighbours, 1), *counts[1:], lookalike], axis=-1)
+
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A logistic model: ``weights`` of the features after clipping to ``low`` .. ``high``, and ``bias``."""
+    """A logistic model: ``weights`` of values after clipping to ``low`` .. ``high``, and ``bias``."""
 
     weights: tuple[float, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
     bias: float
 
-    def probability(self, features: Features) -> float:
-        """In [0, 1]."""
-        values = np.array([getattr(features, name) for name in FEATURES])
+    def probability(self, values: F64) -> F64:
+        """In [0, 1], of values (..., d)."""
         x = np.clip(np.nan_to_num(values, nan=0.0, posinf=1e3, neginf=-1e3), self.low, self.high)
-        return float(1.0 / (1.0 + np.exp(-(float(np.dot(self.weights, x)) + self.bias))))
+        return np.asarray(1.0 / (1.0 + np.exp(-(x @ np.array(self.weights) + self.bias))))
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any], names: Sequence[str]) -> Calibration:
+        """One of the two models of calibration.json."""
+        rows = [content["features"][name] for name in names]
+        weights, low, high = (tuple(float(r[k]) for r in rows) for k in ("weight", "low", "high"))
+        return cls(weights, low, high, float(content["bias"]))
+
+    def to_json(self, names: Sequence[str]) -> dict[str, Any]:
+        """The inverse of :meth:`from_json`, to four decimals."""
+        rows = {
+            n: {k: round(float(x), 4) for k, x in zip(("weight", "low", "high"), row, strict=True)}
+            for n, *row in zip(names, self.weights, self.low, self.high, strict=True)
+        }
+        return {"bias": round(self.bias, 4), "features": rows}
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """``alone`` of an alignment's own features, ``together`` of that probability's log-odds and the neighbours."""
+
+    alone: Calibration
+    together: Calibration
+
+    def decided(self, columns: Sequence[F64]) -> F64:
+        """Probabilities (n,) from the columns (7, n) of ``AGREEMENT``: that of the alignment alone where there are no neighbours."""
+        return np.where(np.asarray(columns[1]) > 0, self.together.probability(together_values(columns)), columns[0])
 
 
 @cache
-def shipped() -> Calibration:
+def shipped() -> Model:
     """The calibration in the package; ``benchmarks/calibrate.py`` makes it."""
     content = json.loads(files("semloc_logs.closures").joinpath("calibration.json").read_text())
-    rows = [content["features"][name] for name in FEATURES]
-    return Calibration(tuple(r["weight"] for r in rows), tuple(r["low"] for r in rows), tuple(r["high"] for r in rows), content["bias"])
+    return Model(Calibration.from_json(content["alone"], FEATURES), Calibration.from_json(content["together"], TOGETHER))
 
 
-def reason(features: Features, probability: float, least: float) -> str:
+def reason(features: Features, probability: float, least: float, agreement: Agreement) -> str:
     """One sentence that says why a hypothesis was rejected."""
-    f = features
-    if f.coverage < 0.2:
+    f, a = features, agreement
+    if a.alone >= least and a.lookalike > 0.5:
+        why = "this place looks like another one of its own session"
+    elif a.alone >= least and a.neighbours:
+        why = f"of {a.neighbours} neighbouring queries {a.agreeing:.1f} agree and {a.opposing:.1f} lie elsewhere"
+    elif f.coverage < 0.2:
         why = f"only {f.coverage:.0%} of the query's structure falls into observed space"
     elif f.structure < 0.5:
         why = f"only {f.structure:.0%} of the query's structure lies on structure of its class"
@@ -53,7 +119,7 @@ def reason(features: Features, probability: float, least: float) -> str:
     return f"probability {probability:.3f} below {least:g}: {why}"
 
 
-def fit_logistic(x: NDArray[np.float64], right: NDArray[np.bool_], ridge: float = 1.0) -> tuple[NDArray[np.float64], float]:
+def fit_logistic(x: F64, right: NDArray[np.bool_], ridge: float = 1.0) -> tuple[F64, float]:
     """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d), by Newton's method."""
     mean, scale = x.mean(0), x.std(0) + 1e-9
     a = np.c_[(x - mean) / scale, np.ones(len(x))]

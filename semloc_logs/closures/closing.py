@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis, pool
 from semloc_logs.alignment.icp import Fit
-from semloc_logs.alignment.pyramid import tau
+from semloc_logs.alignment.pyramid import tau, yaw_between
 from semloc_logs.alignment.verify import (
     Candidate,
     Features,
@@ -23,7 +23,7 @@ from semloc_logs.alignment.verify import (
     search_hypotheses,
     structure_scores,
 )
-from semloc_logs.closures.acceptance import reason, shipped
+from semloc_logs.closures.acceptance import Agreement, own_values, shipped
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.queries import SessionMap, build_query
 from semloc_logs.geometry import inverse
@@ -38,6 +38,8 @@ ALIGNED = 8  # candidates of a target session that are fitted on the points
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
+DRIFT = 0.01  # of the way: the odometry of a target that comes back to a place
+Fitted = tuple[float, Candidate, Fit, int]  # score, candidate, its fit, and the nearest keyframe of the target
 FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
 
 
@@ -54,7 +56,10 @@ class CloseTask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """A verified hypothesis with everything that is reported; ``accepted`` or with a ``reason``."""
+    """A verified hypothesis with everything that is reported; ``accepted`` or with a ``reason``.
+
+    ``probability`` is that of the alignment alone until :func:`semloc_logs.closures.agreement.decide` has compared all queries.
+    """
 
     query_session: str
     target_session: str
@@ -69,15 +74,21 @@ class Alignment:
     inliers: int
     words: int
     features: Features
-    reason: str
+    agreement: Agreement
+    reason: str = "not yet compared with other queries"
 
     @property
     def accepted(self) -> bool:
         return not self.reason
 
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the position in its worst direction, metres."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
 
 def close_queries(task: CloseTask) -> list[list[Alignment]]:
-    """For each keyframe of the task the alignments found, best first: at most one accepted for each target session."""
+    """For each keyframe of the task the alignments found, best first; not yet accepted or rejected."""
     database = open_database(task.work, task.targets, task.settings_json)
     session = SessionMap(Workspace(task.work).session(task.session))
     return [close_query(database, session, k) for k in task.keyframes]
@@ -180,7 +191,7 @@ def _align(
 ) -> list[Alignment]:
     """Candidates of one target session, aligned on the points, compared with each other, judged."""
     v = database.settings.fusion.voxel_size
-    fitted: list[tuple[float, Candidate, Fit, int]] = []
+    fitted: list[Fitted] = []
     for c in candidates[:ALIGNED]:
         near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
         fit = coarse_fit(c, database.surface(c.group, near), query)
@@ -191,13 +202,21 @@ def _align(
         better = fine_fit(fit.target_T_query, database.surface(c.group, near), query.points, v)
         fine.append((_score(query, database.target(c.group), better), c, better, near))
     fine = _distinct(fine, v)
-    scores = [f[0] for f in fine]
-    return [
-        _judge(
-            database, session, keyframe, query, query_T_base, f, max((x for o, x in enumerate(scores) if o != rank), default=0.0), rank == 0
-        )
-        for rank, f in enumerate(fine)
-    ]
+    target = database.sessions[database.places[candidates[0].group].session] if fine else session
+    return [_judge(database, session, keyframe, query, query_T_base, f, _rival(f, fine, target, v)) for f in fine]
+
+
+def _rival(one: Fitted, fitted: list[Fitted], target: SessionMap, voxel_size: float) -> float:
+    """The best score of another place; the same place, driven again and moved by the drift of the target's odometry, is no other one."""
+    best = 0.0
+    for other in fitted:
+        a, b = one[2].target_T_query, other[2].target_T_query
+        road = abs(float(target.distance[one[3]] - target.distance[other[3]]))
+        off = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+        drifted = off < 3.3 * voxel_size + DRIFT * road and yaw_between(a, b) < np.radians(5.0 + 0.02 * road)
+        if other is not one and not (drifted and road > 50 * voxel_size):
+            best = max(best, other[0])
+    return best
 
 
 def _score(query: Query, target: Target, fit: Fit) -> float:
@@ -206,9 +225,9 @@ def _score(query: Query, target: Target, fit: Fit) -> float:
     return structure * min(1.0, coverage / 0.5) - contradiction
 
 
-def _distinct(fitted: list[tuple[float, Candidate, Fit, int]], voxel_size: float) -> list[tuple[float, Candidate, Fit, int]]:
+def _distinct(fitted: list[Fitted], voxel_size: float) -> list[Fitted]:
     """Best first, each place once."""
-    kept: list[tuple[float, Candidate, Fit, int]] = []
+    kept: list[Fitted] = []
     for f in sorted(fitted, key=lambda f: -f[0]):
         if not any(same_place(f[2].target_T_query, o[2].target_T_query, voxel_size) for o in kept):
             kept.append(f)
@@ -221,11 +240,10 @@ def _judge(
     keyframe: int,
     query: Query,
     query_T_base: F64,
-    fitted: tuple[float, Candidate, Fit, int],
+    fitted: Fitted,
     second: float,
-    is_best: bool,
 ) -> Alignment:
-    """The alignment of one candidate with its features, probability, covariance and, if it is not accepted, the reason."""
+    """The alignment of one candidate with its features, probability and covariance."""
     settings = database.settings
     v = settings.fusion.voxel_size
     score, candidate, fine, _ = fitted
@@ -244,16 +262,12 @@ def _judge(
         support=float(np.log10(count + 1)),
         stiffness=float(np.log10(weakest + 1)),
     )
-    probability = shipped().probability(features)
+    probability = float(shipped().alone.probability(own_values(features)))
     same_source = session.json["label_source"] == target_session.json["label_source"]
     overlap, inliers = tau(query.blocks, target.blocks, v, T, settings.closures.kappa * v, None if same_source else cityscapes().coarse)
     map_T_query_base = T @ query_T_base
     nearest = database.nearest_keyframe(candidate.group, map_T_query_base[:3, 3])
     map_T_target = target_session.map_T_base[nearest]
-    least = settings.closures.min_probability
-    why = "" if probability >= least and is_best else reason(features, probability, least)
-    if probability >= least and not is_best:
-        why = "another place of the same session fits better"
     return Alignment(
         query_session=session.folder.name,
         target_session=place.session,
@@ -268,7 +282,7 @@ def _judge(
         inliers=inliers,
         words=candidate.votes,
         features=features,
-        reason=why,
+        agreement=Agreement(probability),
     )
 
 

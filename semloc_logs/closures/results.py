@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from semloc_logs import contracts
 from semloc_logs.alignment.verify import FEATURES
+from semloc_logs.closures.acceptance import AGREEMENT
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.tables import read_table, write_table
@@ -65,7 +66,9 @@ def write_closures(path: Path, rows: Sequence[Alignment], metadata: dict[str, An
 def write_rejected(path: Path, rows: Sequence[Alignment], metadata: dict[str, Any]) -> None:
     """rejected.parquet: also the reason and the features that acceptance looked at."""
     ordered = sorted(rows, key=lambda a: (a.query_session, a.query_stamp_ns, -a.probability, a.target_session, a.target_stamp_ns))
-    columns = _columns(ordered) | {"reason": [a.reason for a in ordered]} | {n: [getattr(a.features, n) for a in ordered] for n in FEATURES}
+    columns = _columns(ordered) | {n: [getattr(a, n) for a in ordered] for n in ("sigma", "reason")}
+    columns |= {n: [getattr(a.features, n) for a in ordered] for n in FEATURES}
+    columns |= {n: [getattr(a.agreement, n) for a in ordered] for n in AGREEMENT}
     write_table(path, contracts.table("rejected", columns), metadata, ("query_session", "query_stamp_ns"))
 
 

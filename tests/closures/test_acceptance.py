@@ -6,36 +6,80 @@ import numpy as np
 import pytest
 
 from semloc_logs.alignment.verify import FEATURES, Features
-from semloc_logs.closures.acceptance import Calibration, fit_logistic, reason, shipped
+from semloc_logs.closures.acceptance import (
+    AGREEMENT,
+    TOGETHER,
+    Agreement,
+    Calibration,
+    fit_logistic,
+    own_values,
+    reason,
+    shipped,
+    together_values,
+)
 
 GOOD = Features(structure=0.95, coverage=0.9, contradiction=0.02, fit=0.95, rmse=0.1, distinct=0.2, support=3.0, stiffness=3.0)
 
 
+def alone(features: Features, model: Calibration | None = None) -> float:
+    return float((model or shipped().alone).probability(own_values(features)))
+
+
+def decided(**agreement: float) -> float:
+    a = Agreement(**agreement)  # type: ignore[arg-type]
+    return float(shipped().decided([np.array([getattr(a, n)]) for n in AGREEMENT])[0])
+
+
 def test_features_are_named_in_their_order() -> None:
     assert tuple(f.name for f in dataclasses.fields(Features)) == FEATURES
+    assert tuple(f.name for f in dataclasses.fields(Agreement)) == AGREEMENT
+
+
+def test_values_of_the_agreement_by_hand() -> None:
+    columns = [np.array([x, x]) for x in (0.75, 4.0, 3.0, 1.0, np.e - 1, 0.0, 0.5)]
+    values = together_values(columns)
+    assert values.shape == (2, len(TOGETHER))
+    np.testing.assert_allclose(values[1], [np.log(3), np.log(4), 0.75, np.log(2), 1.0, 0.0, 0.5])
+
+
+def test_without_neighbours_the_alignment_alone_decides() -> None:
+    assert decided(alone=0.4321) == 0.4321
+    assert decided(alone=0.995, lookalike=0.9) == 0.995
+
+
+def test_neighbours_add_and_take() -> None:
+    several = {"alone": 0.9, "neighbours": 12}
+    assert decided(**several, agreeing=9.0) > decided(**several, agreeing=3.0) > decided(**several, agreeing=3.0, opposing=6.0)
+    assert decided(**several, agreeing=9.0, lookalike=1.0) <= decided(**several, agreeing=9.0)
+    assert decided(alone=0.97, neighbours=12, opposing=10.0) < 0.9
+
+
+def test_a_model_as_json_and_back() -> None:
+    model = shipped().together
+    assert Calibration.from_json(model.to_json(TOGETHER), TOGETHER) == model
 
 
 def test_probability_by_hand() -> None:
     model = Calibration((2.0, 0, 0, 0, 0, -1.0, 0, 0), (0.0,) * 8, (1.0,) * 8, 0.5)
     one = dataclasses.replace(GOOD, structure=0.25, distinct=0.5)
-    assert model.probability(one) == pytest.approx(1 / (1 + np.exp(-0.5)))
+    assert alone(one, model) == pytest.approx(1 / (1 + np.exp(-0.5)))
     clipped = dataclasses.replace(one, structure=7.0, distinct=-3.0)
-    assert model.probability(clipped) == pytest.approx(1 / (1 + np.exp(-2.5)))
+    assert alone(clipped, model) == pytest.approx(1 / (1 + np.exp(-2.5)))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_probabilities_are_numbers_whatever_the_features(value: float) -> None:
     for name in FEATURES:
-        p = shipped().probability(dataclasses.replace(GOOD, **{name: value}))
+        p = alone(dataclasses.replace(GOOD, **{name: value}))
         assert 0 <= p <= 1
 
 
 def test_the_shipped_calibration_knows_good_from_bad() -> None:
     bad = Features(structure=0.2, coverage=0.3, contradiction=0.5, fit=0.2, rmse=0.9, distinct=0.98, support=1.0, stiffness=0.5)
-    assert shipped().probability(GOOD) > 0.95
-    assert shipped().probability(bad) < 0.01
+    assert alone(GOOD) > 0.95
+    assert alone(bad) < 0.01
     for name, worse in (("structure", 0.5), ("contradiction", 0.4), ("distinct", 1.1)):
-        assert shipped().probability(dataclasses.replace(GOOD, **{name: worse})) <= shipped().probability(GOOD)
+        assert alone(dataclasses.replace(GOOD, **{name: worse})) <= alone(GOOD)
 
 
 @pytest.mark.parametrize(
@@ -49,9 +93,15 @@ def test_the_shipped_calibration_knows_good_from_bad() -> None:
     ],
 )
 def test_reasons(change: dict[str, float], said: str) -> None:
-    text = reason(dataclasses.replace(GOOD, **change), 0.1234, 0.99)
+    text = reason(dataclasses.replace(GOOD, **change), 0.1234, 0.99, Agreement(0.1234))
     assert said in text
     assert text.startswith("probability 0.123 below 0.99: ")
+
+
+def test_reasons_of_the_neighbours() -> None:
+    text = reason(GOOD, 0.5, 0.99, Agreement(0.995, 12, agreeing=1.04, opposing=7.96))
+    assert "of 12 neighbouring queries 1.0 agree and 8.0 lie elsewhere" in text
+    assert "looks like another one" in reason(GOOD, 0.5, 0.99, Agreement(0.995, 12, lookalike=0.9))
 
 
 def test_logistic_regression_recovers_known_weights() -> None:

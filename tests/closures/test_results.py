@@ -9,6 +9,7 @@ import pytest
 
 from semloc_logs import contracts
 from semloc_logs.alignment.verify import FEATURES, Features
+from semloc_logs.closures.acceptance import AGREEMENT, Agreement
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.results import read_closures, unique_closures, write_closures, write_rejected
 from semloc_logs.geometry import yaw_transform
@@ -38,6 +39,7 @@ def alignment(query: str, i: int, target: str, j: int, probability: float = 0.99
         inliers=1000 + i,
         words=i,
         features=features,
+        agreement=Agreement(0.9, 7, 5.0, 1.0, 2.0, 0.5, 0.25),
         reason="",
     )
     return dataclasses.replace(made, **more)
@@ -117,3 +119,6 @@ def test_rejections_as_a_table(n: int, tmp_path: Path) -> None:
     assert table["reason"].to_pylist() == [f"because {i}" for i in reversed(range(n))]  # the most probable first
     for name in FEATURES:
         assert table[name].to_pylist() == [getattr(a.features, name) for a in rows]
+    for name in AGREEMENT:
+        assert table[name].to_pylist() == [getattr(rows[0].agreement, name)] * n if n else not table.num_rows
+    assert table["sigma"].to_pylist() == pytest.approx([a.sigma for a in reversed(rows)])

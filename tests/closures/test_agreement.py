@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.verify import Features
+from semloc_logs.closures.acceptance import AGREEMENT, Agreement
+from semloc_logs.closures.agreement import agree, decide, place, strays
+from semloc_logs.closures.closing import Alignment
+from semloc_logs.closures.queries import SessionMap
+from semloc_logs.geometry import inverse, yaw_transform
+from semloc_logs.settings import Settings
+
+F64 = NDArray[np.float64]
+SETTINGS = Settings().resolved()
+MAP = yaw_transform(0.7, (40.0, -20.0, 1.0))  # target map from query map
+GOOD = Features(0.9, 0.9, 0.0, 0.9, 0.1, 0.2, 3.0, 3.0)
+
+
+def bend(n: int, step: float = 2.0) -> F64:
+    """A bent road (n, 4, 4), a keyframe every ``step`` metres."""
+    poses = [np.eye(4)]
+    for _ in range(n - 1):
+        poses.append(poses[-1] @ yaw_transform(0.02, (step, 0.0, 0.0)))
+    return np.array(poses)
+
+
+def session(poses: F64, posed: bool = True) -> SessionMap:
+    return cast(SessionMap, SimpleNamespace(map_T_base=poses, distance=2.0 * np.arange(len(poses)), posed=posed))
+
+
+ROAD = bend(60)
+MAPS = {"a": session(ROAD), "b": session(MAP @ ROAD)}
+
+
+def alignment(k: int, alone: float, error: F64 | None = None, query: str = "a", target: str = "b", at: int | None = None) -> Alignment:
+    """Query ``k`` aligned at the true place, or moved by ``error`` in the target's map; or at keyframe ``at`` of the target."""
+    at = k if at is None else at
+    moved = (np.eye(4) if error is None else error) @ MAPS[target].map_T_base[at]
+    return Alignment(
+        query,
+        target,
+        k,
+        at,
+        k,
+        at,
+        inverse(MAPS[target].map_T_base[at]) @ moved,
+        np.eye(6) * 1e-4,
+        0.8,
+        alone,
+        900,
+        5,
+        GOOD,
+        Agreement(alone),
+    )
+
+
+def decided(rows: list[Alignment], maps: dict[str, SessionMap] | None = None) -> dict[tuple[int, int], Alignment]:
+    out = decide(rows, maps or MAPS, SETTINGS)
+    assert len(out) == len(rows)
+    return {(a.query_keyframe, a.target_keyframe): a for a in out}
+
+
+def test_neighbours_of_one_transform_agree_and_are_counted_by_hand() -> None:
+    found = decided([alignment(k, 0.5) for k in range(20, 31)])
+    middle = found[25, 25].agreement
+    assert (middle.neighbours, round(middle.agreeing, 9), middle.opposing) == (10, 5.0, 0.0)
+    assert found[20, 20].agreement.neighbours == 10  # all within 25 m of road
+    far = decided([alignment(k, 0.5) for k in (10, 30, 50)])[30, 30].agreement
+    assert (far.neighbours, far.agreeing, round(far.far_agreeing, 9)) == (0, 0.0, 1.0)
+
+
+def test_one_that_lies_elsewhere_opposes_and_is_opposed() -> None:
+    moved = yaw_transform(0.0, (8.0, 0.0, 0.0))
+    rows = [alignment(k, 0.9, moved if k == 25 else None) for k in range(20, 31)]
+    found = decided(rows)
+    assert found[25, 25].agreement.opposing == pytest.approx(9.0)
+    assert found[25, 25].agreement.agreeing == 0.0
+    assert found[24, 24].agreement.opposing == pytest.approx(0.9)
+    assert found[24, 24].agreement.agreeing == pytest.approx(0.9 * 9)
+    assert found[25, 25].probability < found[24, 24].probability
+
+
+@pytest.mark.parametrize(("off", "agrees"), [(0.3, True), (3.0, False)])
+def test_what_odometry_may_drift_is_no_contradiction(off: float, agrees: bool) -> None:
+    rows = [alignment(20, 0.9), alignment(24, 0.9, yaw_transform(0.0, (off, 0.0, 0.0)))]
+    a = decided(rows)[20, 20].agreement
+    assert (a.agreeing > 0) == agrees
+    assert (a.opposing > 0) == (not agrees)
+
+
+def test_a_turned_neighbour_does_not_agree() -> None:
+    here = MAP @ ROAD[24]
+    turned = here @ yaw_transform(0.4) @ inverse(here)
+    assert decided([alignment(20, 0.9), alignment(24, 0.9, turned)])[20, 20].agreement.opposing == pytest.approx(0.9)
+
+
+def test_neighbours_rescue_a_right_one_and_a_second_choice_that_agrees_is_promoted() -> None:
+    rows = [alignment(k, 0.995) for k in range(20, 31) if k != 25] + [alignment(25, 0.9), alignment(25, 0.95, at=50)]
+    lenient = Settings.model_validate({"closures": {"min_probability": 0.91}}).resolved()
+    first, second = (a for a in decide(rows, MAPS, lenient) if a.query_keyframe == 25)
+    assert (first.target_keyframe, first.accepted, first.agreement.alone) == (25, True, 0.9)
+    assert (second.target_keyframe, second.accepted) == (50, False)
+    assert first.probability > 0.91 > second.probability
+
+
+def test_of_a_query_one_place_of_each_target_is_accepted() -> None:
+    found = decided([alignment(25, 0.999), alignment(25, 0.998, at=50)])
+    assert found[25, 25].accepted
+    assert "fits better" in found[25, 50].reason
+
+
+def test_sessions_that_overlap_each_other_do_not_contradict() -> None:
+    maps = {**MAPS, "c": session(yaw_transform(2.0, (500.0, 0.0, 0.0)) @ MAP @ ROAD)}
+    rows = [alignment(k, 0.99) for k in range(20, 31)]
+    both = rows + [dataclasses.replace(a, target_session="c") for a in rows]
+    for a in decide(both, maps, SETTINGS):
+        assert (a.agreement.neighbours, a.agreement.opposing) == (10, 0.0)
+
+
+def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself_and_makes_its_look_suspect() -> None:
+    poses = np.array([yaw_transform(0.0, (2.0 * i, 0.0, 0.0)) for i in range(60)])
+    maps = {"a": session(poses), "b": session(MAP @ poses)}
+    own = alignment(5, 0.999)
+    own = dataclasses.replace(own, target_session="a", target_keyframe=50, target_T_query=np.eye(4))
+    found = decide([own, alignment(5, 0.995), alignment(6, 0.995)], maps, SETTINGS)
+    refuted = next(a for a in found if a.target_session == "a")
+    assert refuted.probability == 0.0
+    assert "odometry" in refuted.reason
+    assert {a.agreement.lookalike for a in found if a.query_keyframe == 5} == {0.999}
+    assert [a.agreement.lookalike for a in found if a.query_keyframe == 6] == [0.0]
+
+
+def test_without_odometry_nobody_is_a_neighbour() -> None:
+    maps = {"a": session(ROAD, posed=False), "b": MAPS["b"]}
+    for a in decide([alignment(k, 0.992) for k in range(20, 24)], maps, SETTINGS):
+        assert a.agreement == Agreement(0.992)
+        assert a.accepted
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = [alignment(k, float(rng.uniform(0.01, 1)), at=int(rng.integers(60))) for k in range(40) for _ in range(2)]
+    shuffled = [rows[k] for k in rng.permutation(len(rows))]
+
+    def keys(found: list[Alignment]) -> list[Any]:
+        return [(a.query_keyframe, a.target_keyframe, a.probability, a.agreement, a.reason) for a in found]
+
+    assert keys(decide(rows, MAPS, SETTINGS)) == keys(decide(shuffled, MAPS, SETTINGS))
+
+
+def test_of_none() -> None:
+    assert decide([], MAPS, SETTINGS) == []
+    nothing = place([], {})
+    assert len(agree(nothing, 0.3)) == len(AGREEMENT)
+    assert not strays(nothing, 0.3).any()
