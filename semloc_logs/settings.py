@@ -97,11 +97,13 @@ class Descriptor(_Section):
 class Query(_Section):
     """What is asked of the database."""
 
-    frames: int = Field(5, ge=1, description="keyframes fused into a query; acc. of the paper is 5")
-    length: float | None = Field(None, gt=0, description="or all keyframes within this stretch of road (m)")
+    frames: int = Field(5, ge=1, description="keyframes fused into a query, as many before its own as after it; acc. of the paper is 5")
+    length: float | None = Field(None, gt=0, description="or all keyframes of this stretch of road (m), at most twice fusion.submap_length")
     every: float | None = Field(None, gt=0, description="distance between queries (m); default 2 m at 0.30 m voxels")
     every_angle: float = Field(0.349, gt=0, description="or turn between queries (rad)")
-    radius: float | None = Field(None, gt=0, description="a query map is cut off at this distance (m); default 24 m at 0.30 m voxels")
+    radius: float | None = Field(
+        None, gt=0, description="a query map has what is this near to its keyframes (m); default 24 m at 0.30 m voxels"
+    )
 
 
 class Closures(_Section):
@@ -176,6 +178,12 @@ class Settings(BaseSettings):
             submap_length=100 * scale,
         )
         query = fill(self.query, every=2 * scale, radius=24 * scale)
+        submap = fusion.get("submap_length", self.fusion.submap_length)
+        if self.query.length is not None and self.query.length > 2 * submap:
+            raise SettingsError(
+                f"Setting 'query.length' cannot be {self.query.length:g} m: a query is looked for in submaps of {submap:g} m, and may be "
+                f"twice as long; make fusion.submap_length larger, too."
+            )
         descriptor = fill(self.descriptor, reach=30 * scale)
         closures = fill(self.closures, exclude_distance=50 * scale)
         return self.model_copy(

@@ -245,8 +245,8 @@ def close(
         found += [a for result in results for a in result]
         note(f"query {asked_queries} of {total}: {sum(a.probability >= least for a in found)} probable places")
     found = decide(found, maps, settings)
-    positions = {name: m.map_T_base[:, :3, 3] for name, m in maps.items()}
-    closures = unique_closures([a for a in found if a.accepted], positions, settings.query.every or 2.0)
+    road = {name: m.distance for name, m in maps.items()}
+    closures = unique_closures([a for a in found if a.accepted], road, settings.query.every or 2.0)
     metadata = {
         "schema_version": 1,
         "voxel_size": settings.fusion.voxel_size,

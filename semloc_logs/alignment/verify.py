@@ -78,6 +78,12 @@ class Query:
     voxel_size: float
 
     @cached_property
+    def reach(self) -> int:
+        """Voxels from the origin to the farthest occupied voxel, over the ground."""
+        ijk, _ = self.blocks.occupied()
+        return int(np.ceil(np.linalg.norm(ijk[:, :2] + 0.5, axis=1).max(initial=0.0)))
+
+    @cached_property
     def evidence(self) -> Evidence:
         """Voxels to look up while searching: structure, and ground with a third of its weight to hold the height."""
         ijk, label = self.blocks.occupied()

@@ -96,8 +96,8 @@ def close_queries(task: CloseTask) -> list[list[Alignment]]:
 
 def close_query(database: Database, session: SessionMap, keyframe: int) -> list[Alignment]:
     """Alignments of the query at ``keyframe`` with every target session, best first."""
-    settings = database.settings
-    query, query_T_base = build_query(session, keyframe, settings)
+    database = database.asked_by(session, keyframe)
+    query, query_T_base = build_query(session, keyframe, database.settings)
     if not len(query.structure[0]):
         return []
     hypotheses = find_hypotheses(database, session, keyframe, query)
@@ -111,31 +111,19 @@ def close_query(database: Database, session: SessionMap, keyframe: int) -> list[
     return sorted(out, key=lambda a: (-a.probability, -a.features.structure, a.target_session, a.target_stamp_ns))
 
 
-def allowed_places(database: Database, session: SessionMap, keyframe: int) -> dict[str, NDArray[np.bool_]]:
-    """Which submaps may answer, by the variant of the words that they are asked with: semantic where both label sources know classes.
+def allowed_places(database: Database, session: SessionMap) -> dict[str, NDArray[np.bool_]]:
+    """Which units of the words may answer, by the variant of the words: semantic where both label sources know classes.
 
-    Of the query's own session those that come near the query neither in time nor along the road.
+    Of the query's own session those where it came by at another time (:meth:`Database.asked_by`).
     """
-    closures = database.settings.closures
     forced = database.settings.descriptor.variant
-    out: dict[str, NDArray[np.bool_]] = {}
+    groups: dict[str, NDArray[np.bool_]] = {}
     for g, place in enumerate(database.places):
-        target = database.sessions[place.session]
-        if place.session == session.folder.name:
-            submap = target.submaps[place.submap]
-            first, last = submap["first"], submap["last"]
-            seconds = np.array([target.stamps_ns[first], target.stamps_ns[last]]) - session.stamps_ns[keyframe]
-            road = np.array([target.distance[first], target.distance[last]]) - session.distance[keyframe]
-            if not session.posed or _gap(seconds) < closures.exclude_seconds * 1e9 or _gap(road) < (closures.exclude_distance or 0.0):
-                continue
-        variant = ("semantic" if session.has_classes and target.has_classes else "geometric") if forced == "auto" else forced
-        out.setdefault(variant, np.zeros(len(database.places), bool))[g] = True
-    return out
-
-
-def _gap(interval: NDArray[np.number]) -> float:
-    """Distance of 0 from the interval (2,)."""
-    return float(max(interval.min(), -interval.max(), 0.0))
+        if len(database.keyframes(g)):
+            semantic = session.has_classes and database.sessions[place.session].has_classes
+            variant = ("semantic" if semantic else "geometric") if forced == "auto" else forced
+            groups.setdefault(variant, np.zeros(len(database.places), bool))[g] = True
+    return {variant: database.allowed(variant, mine) for variant, mine in groups.items()}
 
 
 def find_hypotheses(database: Database, session: SessionMap, keyframe: int, query: Query) -> list[Hypothesis]:
@@ -145,11 +133,11 @@ def find_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
     parts: list[tuple[NDArray[np.int64], F64, F64, F64]] = []
     low, high = query.blocks.bounds()
     state = query.blocks.dense(low, tuple((high - low).tolist()))
-    half = -(-int((settings.query.radius or 24.0) / v + 16) // 8) * 8
+    half = -(-query.reach // 8) * 8 + 16
     box = np.empty((2 * half, 2 * half, int(high[2] - low[2])), np.uint8)
     middle = np.array([0.0, 0.0, (low[2] + high[2]) / 2])
     ground = float(session.ground_z[keyframe] - session.map_T_base[keyframe][2, 3])
-    for variant, allowed in allowed_places(database, session, keyframe).items():
+    for variant, allowed in allowed_places(database, session).items():
         words, encoder = database.words(variant), load_encoder(variant, settings.descriptor.weights)
         for heading in range(closures.headings):
             yaw = 2 * np.pi * heading / closures.headings

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from semloc_logs.alignment.icp import Surface
 from semloc_logs.alignment.verify import Target, surface_of, thin_points
@@ -18,14 +21,18 @@ from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import apply
 from semloc_logs.settings import Settings
 from semloc_logs.tables import read_table
+from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import blocks_path, read_blocks, read_keyframe
 from semloc_logs.words.index import Index
 from semloc_logs.words.vocabulary import load_vocabulary
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 KEPT_TARGETS, KEPT_SURFACES = 12, 24  # in memory at once
-SURFACE_KEYFRAMES = 9
+SURFACE_KEYFRAMES = 9  # for each query radius of a query's length
+UNIT = 16  # voxels: words of a submap are left out by squares, keyframes by stretches of this length
+AMBIGUOUS = 32  # voxels that a word may lie nearer to keyframes that are left out than to others: lanes lie apart, and odometry drifts
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +45,16 @@ class Place:
 
 @dataclass(eq=False)
 class Words:
-    """The index of one variant and the centres (n, 3), metres in the map frame, and groups (n,) of its entries."""
+    """The index of one variant and the centres (n, 3), metres in the map frame, and groups (n,) of its entries.
+
+    The index may be asked for words of some units only: squares (u,) of a submap ``unit_group`` around ``unit_middle`` (u, 2), metres.
+    """
 
     index: Index
     centre: F64
-    group: NDArray[np.int64]
+    group: I64
+    unit_group: I64
+    unit_middle: F64
 
 
 class _Recent:
@@ -69,62 +81,117 @@ class Database:
         self.settings = settings
         self.places = [Place(name, s["id"]) for name, session in self.sessions.items() for s in session.submaps]
         self._words: dict[str, Words] = {}
+        self._hidden: dict[str, NDArray[np.bool_]] = {}
+        self._asking = np.zeros(3)
         self._targets, self._surfaces = _Recent(KEPT_TARGETS), _Recent(KEPT_SURFACES)
 
     def words(self, variant: str) -> Words:
         """All words of ``variant``."""
         if variant not in self._words:
-            parts: list[tuple[NDArray[Any], ...]] = []
+            edge = UNIT * self.settings.fusion.voxel_size
+            nothing = np.zeros(0, np.int64)
+            parts: list[tuple[NDArray[Any], ...]] = [
+                (np.zeros((0, 3)), nothing.astype(np.uint16), nothing.astype(np.uint64), nothing, nothing, np.zeros((0, 2)))
+            ]
+            units = 0
             for g, place in enumerate(self.places):
                 table = read_table(blocks_path(self.sessions[place.session].folder.words, place.submap))
                 mine = np.flatnonzero(np.array(table["variant"].to_pylist(), dtype=object) == variant)
                 centre = np.stack([table[c].to_numpy()[mine] for c in "xyz"], 1).astype(float)
-                parts.append((centre, table["word"].to_numpy()[mine], table["code"].to_numpy()[mine], np.full(len(mine), g)))
-            centre, word, code, group = (
-                np.concatenate([p[k] for p in parts]) if parts else np.zeros((0, 3) if k == 0 else 0) for k in range(4)
-            )
+                square, unit = np.unique(np.floor(centre[:, :2] / edge), axis=0, return_inverse=True)
+                word, code = table["word"].to_numpy()[mine].astype(np.uint16), table["code"].to_numpy()[mine].astype(np.uint64)
+                parts.append((centre, word, code, unit.ravel() + units, np.full(len(square), g), (square + 0.5) * edge))
+                units += len(square)
+            centre, word, code, unit, unit_group, middle = (np.concatenate([p[k] for p in parts]) for k in range(6))
             vocabulary = load_vocabulary(variant, self.settings.descriptor.vocabulary)
-            self._words[variant] = Words(
-                Index(vocabulary, word.astype(np.uint16), code.astype(np.uint64), group.astype(np.int64)), centre, group.astype(np.int64)
-            )
+            self._words[variant] = Words(Index(vocabulary, word, code, unit), centre, unit_group[unit], unit_group, middle)
         return self._words[variant]
 
+    # -- what a query of one of the sessions may see of that session
+
+    def asked_by(self, session: SessionMap, keyframe: int) -> Database:
+        """This database as the query at ``keyframe`` sees it: without the keyframes of its own session that are near it in time or road.
+
+        Submaps that hold a revisit beside such keyframes stay, less these. What is kept in memory is shared.
+        """
+        view, closures, name = copy(self), self.settings.closures, session.folder.name
+        near = np.abs(session.stamps_ns - session.stamps_ns[keyframe]) < closures.exclude_seconds * 1e9
+        near |= np.abs(session.distance - session.distance[keyframe]) < (closures.exclude_distance or 0.0)
+        near[keyframe] = True
+        stretch = session.distance // (UNIT * self.settings.fusion.voxel_size)  # several queries share what is made without it
+        view._hidden = {name: np.isin(stretch, stretch[near]) | (not session.posed)} if name in self.sessions else {}
+        view._asking = session.map_T_base[keyframe][:3, 3]
+        return view
+
+    def keyframes(self, group: int) -> I64:
+        """The keyframes of a submap that the query may see, ascending."""
+        ids, hidden = self._submap_ids(group), self._hidden.get(self.places[group].session)
+        return ids if hidden is None else ids[~hidden[ids]]
+
+    def _submap_ids(self, group: int) -> I64:
+        submap = self.sessions[self.places[group].session].submaps[self.places[group].submap]
+        return np.arange(submap["first"], submap["last"] + 1)
+
+    def allowed(self, variant: str, groups: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which units of the words may answer, of submaps ``groups`` (g,): near keyframes that the query may see, not near hidden ones."""
+        words = self.words(variant)
+        out = groups[words.unit_group]
+        for g in (g for g in np.flatnonzero(groups).tolist() if self.places[g].session in self._hidden):
+            session = self.sessions[self.places[g].session]
+            hidden = self._hidden[self.places[g].session][self._submap_ids(g)]
+            if hidden.any():
+                mine, road = np.flatnonzero(words.unit_group == g), session.road(session.submaps[self.places[g].submap])
+                to_seen, to_hidden = (cKDTree(road[which]).query(words.unit_middle[mine])[0] for which in (~hidden, hidden))
+                out[mine] = to_seen < to_hidden + AMBIGUOUS * self.settings.fusion.voxel_size
+        return out
+
     def target(self, group: int) -> Target:
-        """The map of a submap."""
-        place = self.places[group]
+        """The map of a submap: fused anew without what the query may not see, where that came near the rest of it."""
+        place, seen = self.places[group], self.keyframes(group)
+        session = self.sessions[place.session]
+        apart = np.linalg.norm(session.map_T_base[seen, :3, 3] - self._asking, axis=1)
+        is_whole = len(seen) == len(self._submap_ids(group)) or not (apart < 1.5 * (self.settings.query.radius or 24.0)).any()
 
         def make() -> Target:
-            folder = self.sessions[place.session].folder.blocks
-            return Target(read_blocks(blocks_path(folder, place.submap), with_votes=False), self.settings.fusion.voxel_size)
+            if is_whole:
+                return Target(
+                    read_blocks(blocks_path(session.folder.blocks, place.submap), with_votes=False), self.settings.fusion.voxel_size
+                )
+            fuser = Fuser(self.settings.fusion)
+            for i in seen.tolist():
+                frame = read_keyframe(session.folder.keyframes, i)
+                fuser.add(frame.points, frame.label, session.origins[i], frame.sigma, session.map_T_base[i])
+            return Target(fuser.finish(), self.settings.fusion.voxel_size)
 
-        found: Target = self._targets.get(group, make)
+        found: Target = self._targets.get((group, None if is_whole else seen.tobytes()), make)
         return found
 
     def nearest_keyframe(self, group: int, position: F64) -> int:
-        """The keyframe of a submap that is nearest to ``position`` (3,) in the map frame."""
-        place = self.places[group]
-        session = self.sessions[place.session]
-        submap = session.submaps[place.submap]
-        track = session.map_T_base[submap["first"] : submap["last"] + 1, :3, 3]
-        return int(submap["first"] + np.argmin(np.linalg.norm(track - position, axis=1)))
+        """The keyframe of a submap, among those that the query may see, that is nearest to ``position`` (3,) in the map frame."""
+        seen = self.keyframes(group)
+        track = self.sessions[self.places[group].session].map_T_base[seen, :3, 3]
+        return int(seen[np.argmin(np.linalg.norm(track - position, axis=1))])
 
     def surface(self, group: int, keyframe: int) -> Surface:
-        """Tangent planes of what the submap's keyframes nearest to ``keyframe`` saw, in the map frame."""
-        place = self.places[group]
-        session = self.sessions[place.session]
-        submap = session.submaps[place.submap]
+        """Tangent planes of what the submap's keyframes around ``keyframe`` saw, as far along as a query is long, in the map frame."""
+        place, seen = self.places[group], self.keyframes(group)
+        session, query = self.sessions[place.session], self.settings.query
+        radius = query.radius or 24.0
 
         def make() -> Surface:
-            ids = np.arange(submap["first"], submap["last"] + 1)
-            away = np.linalg.norm(session.map_T_base[ids, :3, 3] - session.map_T_base[keyframe, :3, 3], axis=1)
-            radius = 1.2 * (self.settings.query.radius or 24.0)
+            away = np.linalg.norm(session.map_T_base[seen, :3, 3] - session.map_T_base[keyframe, :3, 3], axis=1)
+            chosen = seen[np.argsort(away, kind="stable")[:SURFACE_KEYFRAMES]]
+            along = seen[away <= (query.length or 0.0) / 2]
+            if len(along) > len(chosen):
+                count = math.ceil(SURFACE_KEYFRAMES * max(1.0, (query.length or 0.0) / radius))
+                chosen = along[np.unique(np.linspace(0, len(along) - 1, count).astype(int))]
             clouds = []
-            for i in np.sort(ids[np.argsort(away, kind="stable")[:SURFACE_KEYFRAMES]]):
-                frame = read_keyframe(session.folder.keyframes, int(i)).near(session.origins[i], radius)
+            for i in np.sort(chosen).tolist():
+                frame = read_keyframe(session.folder.keyframes, i).near(session.origins[i], 1.2 * radius)
                 clouds.append(apply(session.map_T_base[i], frame.points))
             return surface_of(thin_points(np.concatenate(clouds), self.settings.fusion.voxel_size / 2.5))
 
-        found: Surface = self._surfaces.get((place.session, keyframe, submap["id"]), make)
+        found: Surface = self._surfaces.get((group, keyframe, seen.tobytes()), make)
         return found
 
 

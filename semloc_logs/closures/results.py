@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from semloc_logs import contracts
 from semloc_logs.alignment.verify import FEATURES
@@ -19,26 +18,23 @@ from semloc_logs.tables import read_table, write_table
 from semloc_logs.voxels.store import pose_columns
 
 
-def unique_closures(accepted: Sequence[Alignment], positions: dict[str, NDArray[np.float64]], spacing: float) -> list[Alignment]:
+def unique_closures(accepted: Sequence[Alignment], road: dict[str, NDArray[np.float64]], spacing: float) -> list[Alignment]:
     """Accepted alignments without those found from both ends, sorted by query session and time.
 
-    Two are the same when their ends are the same two places to within ``spacing`` metres of road position; the more probable one stays.
-    ``positions`` gives the keyframes' positions (n, 3) by session.
+    Two are the same when their ends are the same two places to within ``spacing`` metres along the road; the more probable one stays.
+    ``road`` gives the keyframes' distances (n,), metres travelled, by session: of a drive with itself both ends lie at one place, and
+    only the way between tells them apart.
     """
-
-    def ends(a: Alignment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return positions[a.query_session][a.query_keyframe], positions[a.target_session][a.target_keyframe]
-
-    trees = {name: cKDTree(p) for name, p in positions.items()}
     kept: list[Alignment] = []
-    by_target: dict[tuple[str, str, int], list[Alignment]] = {}
+    by_ends: dict[tuple[str, str, int], list[Alignment]] = {}
     for a in sorted(accepted, key=lambda a: (-a.probability, -a.features.structure, a.query_session, a.query_stamp_ns)):
-        q, t = ends(a)
-        near = trees[a.query_session].query_ball_point(q, spacing)
-        twins = (o for k in near for o in by_target.get((a.target_session, a.query_session, k), ()))
-        if any(np.linalg.norm(ends(o)[0] - t) < spacing for o in twins):
+        asking, asked = road[a.query_session], road[a.target_session]
+        q, t = asking[a.query_keyframe], asked[a.target_keyframe]
+        near = range(np.searchsorted(asking, q - spacing, "right"), np.searchsorted(asking, q + spacing, "left"))
+        twins = (o for k in near for o in by_ends.get((a.target_session, a.query_session, k), ()))
+        if any(abs(asked[o.query_keyframe] - t) < spacing for o in twins):
             continue
-        by_target.setdefault((a.query_session, a.target_session, a.target_keyframe), []).append(a)
+        by_ends.setdefault((a.query_session, a.target_session, a.target_keyframe), []).append(a)
         kept.append(a)
     return sorted(kept, key=lambda a: (a.query_session, a.query_stamp_ns, a.target_session, a.target_stamp_ns))
 
