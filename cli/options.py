@@ -185,9 +185,27 @@ def label_options(function: Function) -> Function:
 def query_options(function: Function) -> Function:
     """What is asked of the database."""
     for decorate in (
-        click.option("--query-every", type=float, metavar="M", help="Distance between queries (m); default 2 m at 0.30 m voxels."),
-        click.option("--query-length", type=float, metavar="M", help="A query is fused from this stretch of road (m) instead."),
-        click.option("--query-frames", type=int, metavar="N", help="A query is fused from so many keyframes; default 5."),
+        click.option(
+            "--query-every",
+            type=float,
+            metavar="M",
+            help="A query after so much road (m), and after every turn of 20 degrees: fewer are quicker, more find more.  "
+            "[default: 2 at 0.30 m voxels, in proportion at others]",
+        ),
+        click.option(
+            "--query-length",
+            type=float,
+            metavar="M",
+            help="A query is fused from all keyframes of so much road (m) around it, instead of --query-frames: for cameras, "
+            "which see little at once, and for places that look alike.",
+        ),
+        click.option(
+            "--query-frames",
+            type=int,
+            metavar="N",
+            help="A query is fused from so many keyframes around it; 1 asks with single frames, as logs without poses always do.  "
+            "[default: 5]",
+        ),
     ):
         function = decorate(function)
     return function

@@ -178,7 +178,7 @@ class Settings(BaseSettings):
             submap_length=100 * scale,
         )
         query = fill(self.query, every=2 * scale, radius=24 * scale)
-        submap = fusion.get("submap_length", self.fusion.submap_length)
+        submap = self.fusion.submap_length or 100 * scale
         if self.query.length is not None and self.query.length > 2 * submap:
             raise SettingsError(
                 f"Setting 'query.length' cannot be {self.query.length:g} m: a query is looked for in submaps of {submap:g} m, and may be "

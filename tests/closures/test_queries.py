@@ -4,11 +4,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from semloc_logs import contracts
 from semloc_logs.closures.queries import SessionMap, build_query, query_keyframes, query_members
 from semloc_logs.closures.results import keyframe_at
+from semloc_logs.errors import SettingsError
 from semloc_logs.geometry import apply, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.tables import write_json, write_table
@@ -102,6 +104,26 @@ def test_the_query_map_lies_around_its_keyframe(tmp_path: Path) -> None:
     voxels = {tuple(v) for v in query.blocks.occupied()[0].tolist()}
     assert voxels <= {tuple(v) for v in np.floor(every / 0.3).astype(int).tolist()}
     assert len(voxels) > 0.5 * len(every)
+
+
+@pytest.mark.parametrize(("length", "reach"), [(None, 22.0), (20.0, 30.0), (90.0, 65.0)])
+def test_a_long_query_is_whole(tmp_path: Path, length: float | None, reach: float) -> None:
+    """Each keyframe of a drive of 120 m saw a wall 20 m ahead of it; the wall of the last member is in the query's map."""
+    wall = np.stack(np.broadcast_arrays(20.0, np.linspace(-3, 3, 21)[:, None], np.linspace(0.1, 2, 9)), -1).reshape(-1, 3)
+    poses = straight(61, 2.0)
+    s = session(tmp_path, poses, [wall.astype(np.float32)] * 61)
+    query, _ = build_query(s, 30, settings(length=length, frames=3))
+    farthest = query.points[:, 0].max()
+    np.testing.assert_allclose(farthest, reach, atol=1.1)  # the members are 2 m apart
+    assert query.reach * 0.3 == pytest.approx(np.hypot(farthest, 3), abs=0.5)
+
+
+def test_a_query_may_not_be_so_long_that_its_map_has_no_bounds() -> None:
+    assert settings(length=200.0).query.length == 200.0
+    with pytest.raises(SettingsError, match=r"query\.length"):
+        settings(length=201.0)
+    with pytest.raises(SettingsError, match=r"33\.|34"):
+        Settings.model_validate({"query": {"length": 34.0}, "fusion": {"voxel_size": 0.05}}).resolved()
 
 
 def test_the_keyframe_at_a_stamp(tmp_path: Path) -> None:

@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semloc_logs import contracts
+from semloc_logs.closures.closing import allowed_places
+from semloc_logs.closures.database import Database
+from semloc_logs.closures.queries import SessionMap
+from semloc_logs.geometry import yaw_transform
+from semloc_logs.settings import Settings
+from semloc_logs.tables import read_json, write_json, write_table
+from semloc_logs.voxels.selection import road_distance
+from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
+from semloc_logs.workspace import Workspace
+
+
+def drive_session(
+    work: Workspace,
+    name: str,
+    road: NDArray[np.float64],
+    submaps: list[tuple[int, int]],
+    words: list[NDArray[np.float64]],
+    seconds: float = 1.0,
+) -> SessionMap:
+    """A session along ``road`` (n, 2), a keyframe every ``seconds``, with words at ``words`` (m, 3) of each submap of keyframes."""
+    folder, n = work.session(name), len(road)
+    folder.keyframes.mkdir(parents=True)
+    folder.words.mkdir()
+    poses = np.array([yaw_transform(0.0, (x, y, 0.0)) for x, y in road])
+    columns: dict[str, Any] = {
+        "keyframe": np.arange(n),
+        "stamp_ns": (np.arange(n) * seconds * 1e9).astype(np.int64),
+        "log_time_ns": np.arange(n),
+        "topic": ["/points"] * n,
+        "posed": [True] * n,
+        "distance": road_distance(poses),
+        "ground_z": np.zeros(n),
+        "points": np.ones(n, np.int64),
+        **{f"origin_{c}": np.zeros(n) for c in "xyz"},
+        **pose_columns(poses),
+    }
+    write_table(folder.frames, contracts.table("frames", columns), {})
+    # each keyframe saw one point, 5 m to its left at the height of its number in decimetres
+    clouds = [Keyframe(np.array([[0.0, 5.0, 0.1 * i]], np.float32), np.full(1, 2, np.uint8)) for i in range(n)]
+    list(keep_keyframes(folder.keyframes, range(n), clouds, {}))
+    for i, centre in enumerate(words):
+        rows = {
+            "submap": np.full(len(centre), i),
+            **{c: centre[:, k] for k, c in enumerate("xyz")},
+            "word": np.zeros(len(centre)),
+            "code": np.zeros(len(centre)),
+            "variant": ["semantic"] * len(centre),
+        }
+        write_table(folder.words / f"submap-{i:05d}.parquet", contracts.table("words", rows), {})
+    json = [{"id": i, "first": a, "last": b - 1, "ground_z": 0.0, "blocks": 1} for i, (a, b) in enumerate(submaps)]
+    write_json(folder.session_json, {"posed": True, "label_source": "log", "submaps": json})
+    return SessionMap(folder)
+
+
+@pytest.fixture
+def out_and_back(tmp_path: Path) -> tuple[Database, SessionMap]:
+    """30 keyframes out, and back beside them 4 m to the left, one every 4 m and second; one submap holds both ways."""
+    x = np.r_[np.arange(30) * 4.0, np.arange(30)[::-1] * 4.0]
+    road = np.stack([x, np.repeat([0.0, 4.0], 30)], 1)
+    words = np.array([[4.0, 2.0, 1.0], [60.0, 2.0, 1.0], [112.0, 2.0, 1.0]])
+    session = drive_session(Workspace(tmp_path), "a", road, [(0, 60)], [words])
+    return Database(Workspace(tmp_path), ("a",), Settings().resolved()), session
+
+
+def test_a_query_sees_its_own_drive_but_for_what_is_near_in_time_and_road(out_and_back: tuple[Database, SessionMap]) -> None:
+    database, session = out_and_back
+    seen = database.asked_by(session, 59).keyframes(0)
+    # 30 s: keyframes 30 to 59; 50 m of road are fewer; what else lies in the same stretch of 16 voxels goes with them
+    assert seen[0] == 0
+    assert 28 <= seen[-1] <= 29
+    assert np.array_equal(seen, np.arange(seen[-1] + 1))
+    middle = database.asked_by(session, 5).keyframes(0)
+    assert 35 <= middle[0] <= 36
+    assert middle[-1] == 59
+    assert len(database.keyframes(0)) == 60  # the database itself is as it was
+
+
+def test_a_target_keyframe_is_never_near_the_query_in_time(out_and_back: tuple[Database, SessionMap]) -> None:
+    database, session = out_and_back
+    for keyframe in range(60):
+        view = database.asked_by(session, keyframe)
+        if len(view.keyframes(0)):
+            found = view.nearest_keyframe(0, session.map_T_base[keyframe, :3, 3])
+            assert abs(found - keyframe) >= 30
+
+
+def test_words_answer_where_the_drive_came_by_at_another_time(out_and_back: tuple[Database, SessionMap]) -> None:
+    database, session = out_and_back
+
+    def answering(keyframe: int) -> list[float]:
+        view = database.asked_by(session, keyframe)
+        words = view.words("semantic")
+        allowed = allowed_places(view, session)["semantic"]
+        at = words.unit_middle[allowed, 0]
+        return sorted(float(x) for x in words.centre[:, 0] if (np.abs(at - x) < 2.5).any())
+
+    assert answering(59) == [4.0, 60.0, 112.0]  # back at the start: all of the way out is older than 30 s
+    assert answering(45) == [4.0, 60.0]  # half-way back: the turn is recent, and the way out before it is not
+
+
+def test_the_map_of_a_submap_that_comes_near_the_query_is_made_without_what_it_may_not_see(
+    out_and_back: tuple[Database, SessionMap],
+) -> None:
+    database, session = out_and_back
+    view = database.asked_by(session, 59)
+    ijk, _ = view.target(0).blocks.occupied()
+    newest = view.keyframes(0)[-1]
+    assert set(ijk[:, 2].tolist()) == {int(0.1 * i / 0.3 + 1e-6) for i in range(newest + 1)}
+
+
+def test_a_drive_without_revisits_does_not_answer_itself(tmp_path: Path) -> None:
+    road = np.stack([np.arange(20) * 4.0, np.zeros(20)], 1)
+    session = drive_session(Workspace(tmp_path), "a", road, [(0, 20)], [np.array([[40.0, 2.0, 1.0]])])
+    view = Database(Workspace(tmp_path), ("a",), Settings().resolved()).asked_by(session, 10)
+    assert allowed_places(view, session) == {}
+
+
+def test_other_sessions_answer_whatever_their_time(tmp_path: Path) -> None:
+    work, road = Workspace(tmp_path), np.stack([np.arange(20) * 4.0, np.zeros(20)], 1)
+    word = np.array([[40.0, 2.0, 1.0]])
+    sessions = {name: drive_session(work, name, road, [(0, 20)], [word]) for name in "ab"}
+    view = Database(work, ("a", "b"), Settings().resolved()).asked_by(sessions["a"], 10)
+    allowed = allowed_places(view, sessions["a"])["semantic"]
+    words = view.words("semantic")
+    assert words.unit_group[allowed].tolist() == [1]
+    assert len(view.keyframes(1)) == 20
+
+
+def test_a_drive_without_poses_does_not_answer_itself(tmp_path: Path) -> None:
+    work = Workspace(tmp_path)
+    session = drive_session(work, "a", np.zeros((100, 2)), [(0, 100)], [np.array([[0.0, 2.0, 1.0]])])
+    write_json(session.folder.session_json, read_json(session.folder.session_json) | {"posed": False})
+    view = Database(work, ("a",), Settings().resolved()).asked_by(SessionMap(session.folder), 99)
+    assert allowed_places(view, session) == {}
