@@ -1,13 +1,15 @@
-"""How well query voxels lie on a target map under a transform, at three resolutions: the fast half of verification (paper 3.5).
+"""How well query voxels lie on a target map under a transform: the fast half of verification (paper 3.5).
 
-A level is a dense grid of bit masks: bit c is set where a voxel of coarse class c lies in the cell or beside it, so a look-up says
-at once whether a query voxel is aligned to within a cell. Coarse levels forgive the 20 degree and 1.2 m steps of the word matches.
+A map becomes a dense grid of bit masks: bit c is set where a voxel of coarse class c lies in the cell or beside it, so a look-up says
+at once whether a query voxel is aligned to within a cell, and another bit whether it contradicts free space. There are no coarser
+grids: they know nothing of contradictions, and lost places in halls that a few hundred look-ups in the finest grid find.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -16,9 +18,12 @@ from numpy.typing import NDArray
 from semloc_logs.geometry import inverse, yaw_transform
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 
-FACTORS = (1, 2, 4)
-FREE_BIT = 128  # observed free and nothing occupied beside it (finest level only)
+FREE_BIT = 128  # observed free and nothing occupied beside it
 ANY_BIT = 64  # occupied, unlabelled included
+REACH = 4  # cells that a search may shift by; a grid is padded by twice as many, so that no look-up leaves it
+HALF_DIAGONAL = float(np.sqrt(0.75))  # of a cell, in cells
+CHUNK = 128  # voxels counted before a sum is given up
+STRUCTURE_SHARE = 0.75  # of the score; the ground has the rest, to hold the height
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
@@ -35,11 +40,18 @@ class Level:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Query voxels: ``centres`` (n, 3) metres, class ``bits`` (n,), ``weights`` (n,) that add up to one."""
+    """Query voxels: ``centres`` (n, 3) metres and class ``bits`` (n,); the first ``structure`` of them are structure, the rest ground."""
 
     centres: F64
     bits: U8
-    weights: F64
+    structure: int
+
+    def first(self, count: int) -> Evidence:
+        """About ``count`` of the voxels: the first of the structure and of the ground."""
+        solid = min(self.structure, int(STRUCTURE_SHARE * count))
+        ground = min(len(self.bits) - self.structure, count - int(STRUCTURE_SHARE * count))
+        picked = np.r_[0:solid, self.structure : self.structure + ground]
+        return Evidence(self.centres[picked], self.bits[picked], solid)
 
 
 def _dilate(mask: U8) -> U8:
@@ -63,72 +75,96 @@ def class_bits(state: U8, coarse: U8) -> U8:
     return table[state]
 
 
-def build_pyramid(blocks: BlockMap, voxel_size: float, coarse: U8) -> list[Level]:
-    """Levels of 1, 2 and 4 voxels, finest first."""
+def build_level(blocks: BlockMap, voxel_size: float, coarse: U8) -> Level:
+    """The masks of a map, with a margin that a search cannot leave."""
     low, high = blocks.bounds()
-    state = blocks.dense(low - 4, tuple((high - low + 8).tolist()))
-    exact = class_bits(state, coarse)
-    corner = (low - 4) * voxel_size
-    levels = []
-    for factor in FACTORS:
-        n = np.array(exact.shape) // factor
-        cut = exact[: n[0] * factor, : n[1] * factor, : n[2] * factor].reshape(n[0], factor, n[1], factor, n[2], factor)
-        mask = _dilate(np.bitwise_or.reduce(cut, axis=(1, 3, 5)))
-        if factor == 1:
-            mask |= np.where((state == FREE_STATE) & (mask == 0), FREE_BIT, 0).astype(np.uint8)
-        levels.append(Level(mask, corner.astype(float), voxel_size * factor))
-    return levels
+    margin = 2 * REACH
+    state = blocks.dense(low - margin, tuple((high - low + 2 * margin).tolist()))
+    mask = _dilate(class_bits(state, coarse))
+    mask[(state == FREE_STATE) & (mask == 0)] = FREE_BIT
+    return Level(mask, (low - margin).astype(float) * voxel_size, voxel_size)
 
 
 @njit(cache=True, nogil=True)
-def _score(mask: U8, corner: F64, cell: float, centres: F64, bits: U8, weights: F64, c: float, s: float, t: F64) -> float:
-    total = 0.0
-    nx, ny, nz = mask.shape
+def _rotated(level: U8, corner: F64, cell: float, centres: F64, bits: U8, pose: F64, base: NDArray[np.int64], kept: U8) -> int:
+    """Flat cells of the voxels under ``pose`` into ``base``, their bits into ``kept``; those outside whatever the shift are left out."""
+    nx, ny, nz = level.shape
+    c, s = np.cos(pose[0]), np.sin(pose[0])
+    count = 0
     for n in range(len(centres)):
-        x = int(np.floor((c * centres[n, 0] - s * centres[n, 1] + t[0] - corner[0]) / cell))
-        y = int(np.floor((s * centres[n, 0] + c * centres[n, 1] + t[1] - corner[1]) / cell))
-        z = int(np.floor((centres[n, 2] + t[2] - corner[2]) / cell))
-        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
-            found = mask[x, y, z]
-            if found & bits[n]:
-                total += weights[n]
-            elif found & FREE_BIT:  # only the finest level knows
-                total -= weights[n]
-    return total
+        x = int(np.floor((c * centres[n, 0] - s * centres[n, 1] + pose[1] - corner[0]) / cell))
+        y = int(np.floor((s * centres[n, 0] + c * centres[n, 1] + pose[2] - corner[1]) / cell))
+        z = int(np.floor((centres[n, 2] + pose[3] - corner[2]) / cell))
+        if REACH <= x < nx - REACH and REACH <= y < ny - REACH and REACH <= z < nz - REACH:
+            base[count], kept[count] = (x * ny + y) * nz + z, bits[n]
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _add_hits(mask: U8, base: NDArray[np.int64], kept: U8, first: int, end: int, shift: int, lift: int, hits: NDArray[np.int64]) -> None:
+    """Aligned voxels less those in free space, shifted by ``lift`` cells down, not at all, and up, added to ``hits`` (3,)."""
+    down = same = up = 0
+    for n in range(first, end):
+        at, bit = base[n] + shift, kept[n]
+        below, here, above = mask[at - lift], mask[at], mask[at + lift]
+        down += int((below & bit) != 0) - int(below >= FREE_BIT)
+        same += int((here & bit) != 0) - int(here >= FREE_BIT)
+        up += int((above & bit) != 0) - int(above >= FREE_BIT)
+    hits[0] += down
+    hits[1] += same
+    hits[2] += up
 
 
 @njit(cache=True, nogil=True)
 def _search(
-    mask: U8, corner: F64, cell: float, centres: F64, bits: U8, weights: F64, start: F64, yaws: F64, steps: F64, lifts: F64
+    level: U8, corner: F64, cell: float, centres: F64, bits: U8, structure: int, shares: F64, start: F64, yaws: F64, step: int
 ) -> tuple[float, F64]:
-    """Best of all combinations of turns ``yaws``, shifts ``steps`` (both axes) and ``lifts`` around ``start`` (yaw, x, y, z)."""
-    best, best_pose = -2.0, start.copy()
-    t = np.empty(3)
+    mask, n = level.ravel(), len(centres)
+    ny, nz = level.shape[1], level.shape[2]
+    weight = shares / np.array([max(structure, 1), max(n - structure, 1)])
+    base, kept, hits = np.empty(n, np.int64), np.empty(n, np.uint8), np.empty(3, np.int64)
+    best, best_pose, pose = -2.0, start.copy(), start.copy()
     for dyaw in yaws:
-        c, s = np.cos(start[0] + dyaw), np.sin(start[0] + dyaw)
-        for dz in lifts:
-            for dx in steps:
-                for dy in steps:
-                    t[0], t[1], t[2] = start[1] + dx, start[2] + dy, start[3] + dz
-                    value = _score(mask, corner, cell, centres, bits, weights, c, s, t)
+        pose[0] = start[0] + dyaw
+        solid = _rotated(level, corner, cell, centres[:structure], bits[:structure], pose, base, kept)
+        ground = _rotated(level, corner, cell, centres[structure:], bits[structure:], pose, base[solid:], kept[solid:])
+        for dx in range(-2 * step, 2 * step + 1, step):
+            for dy in range(-2 * step, 2 * step + 1, step):
+                shift = (dx * ny + dy) * nz
+                hits[:] = 0
+                done = 0
+                while done < solid:
+                    end = min(done + CHUNK, solid)
+                    _add_hits(mask, base, kept, done, end, shift, step, hits)
+                    done = end
+                    if (hits.max() + solid - done) * weight[0] + ground * weight[1] <= best:
+                        break  # all that is left cannot make it the best
+                if done < solid:
+                    continue
+                upright = hits * weight[0]
+                hits[:] = 0
+                _add_hits(mask, base, kept, solid, solid + ground, shift, step, hits)
+                for dz in range(-1, 2):
                     # among equals the one nearest the start, so that ties do not drift
-                    value -= 1e-6 * (abs(dx) + abs(dy) + abs(dz) + abs(dyaw))
+                    value = upright[dz + 1] + hits[dz + 1] * weight[1] - 1e-6 * (abs(dx) + abs(dy) + abs(dz) + abs(dyaw))
                     if value > best:
                         best = value
-                        best_pose[0], best_pose[1], best_pose[2], best_pose[3] = start[0] + dyaw, t[0], t[1], t[2]
+                        best_pose[0], best_pose[1] = pose[0], start[1] + dx * cell
+                        best_pose[2], best_pose[3] = start[2] + dy * cell, start[3] + dz * step * cell
     return best, best_pose
 
 
-def search(
-    level: Level, evidence: Evidence, start: F64, yaws: Sequence[float], steps: Sequence[float], lifts: Sequence[float]
-) -> tuple[float, F64]:
+def search(level: Level, evidence: Evidence, start: F64, yaws: Sequence[float] | F64, step: int) -> tuple[float, F64]:
     """Best weighted share of aligned query voxels, less that of those in free space, near ``start``, and the pose that has it.
 
-    Poses are (yaw, x, y, z) of ``target_T_query``.
+    Tried are turns by ``yaws`` (rad), shifts of two ``step`` cells (1 or 2) to both sides along x and y and of one up and down. Poses
+    are (yaw, x, y, z) of ``target_T_query``.
     """
     e = evidence
-    arrays = [np.asarray(a, float) for a in (start, yaws, steps, lifts)]
-    value, pose = _search(level.mask, level.corner, level.cell, e.centres, e.bits, e.weights, *arrays)
+    arrays = np.asarray(start, float), np.asarray(yaws, float)
+    shares = np.array([STRUCTURE_SHARE, 1 - STRUCTURE_SHARE])
+    value, pose = _search(level.mask, level.corner, level.cell, e.centres, e.bits, e.structure, shares, *arrays, step)
     return float(value), pose
 
 
@@ -157,8 +193,6 @@ def tau(
     For each occupied query voxel the closest *observed* target voxel is taken; it counts as aligned when that one is occupied, of
     exactly the same class (of the same coarse class where ``coarse`` (256,) is given), and its centre is closer than ``kappa`` metres.
     """
-    from scipy.spatial import cKDTree
-
     ijk, label = query.occupied()
     if not len(ijk) or not len(target.keys):
         return 0.0, 0
@@ -170,30 +204,43 @@ def tau(
     if (low >= high).any():
         return 0.0, 0
     state = target.dense(low, tuple((high - low).tolist()))
-    cell = np.floor(centres / voxel_size).astype(int) - low
-    inside = ((cell >= 0) & (cell < state.shape)).all(1)
-    found = np.full(len(centres), UNOBSERVED_STATE, np.uint8)
-    found[inside] = state[tuple(cell[inside].T)]  # the voxel that a centre lies in is the closest one, if it is observed
-    rest = np.flatnonzero(found == UNOBSERVED_STATE)
-    observed = np.argwhere(state != UNOBSERVED_STATE)
-    if len(rest) and len(observed):
-        # candidates: observed voxels beside unobserved ones are the only ones that can be closest to an unobserved place
-        edge = observed[_beside_unobserved(state, observed)]
-        distance, index = cKDTree((edge + low + 0.5) * voxel_size).query(centres[rest], distance_upper_bound=kappa)
-        near = np.isfinite(distance)
-        found[rest[near]] = state[tuple(edge[index[near]].T)]
+    offsets, length = _offsets(kappa / voxel_size)
+    found = _closest_observed(state, centres / voxel_size - low, offsets, length, kappa / voxel_size)
     table = np.arange(256, dtype=np.uint8) if coarse is None else coarse
     hit = (found != UNOBSERVED_STATE) & (found != FREE_STATE)
     aligned = hit & (table[found] == table[label])
     return float(aligned.mean()), int(aligned.sum())
 
 
-def _beside_unobserved(state: U8, observed: NDArray[np.int64]) -> NDArray[np.bool_]:
-    padded = np.pad(state == UNOBSERVED_STATE, 1, constant_values=True)
-    x, y, z = (observed + 1).T
-    out = np.zeros(len(observed), bool)
-    for dx, dy, dz in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)):
-        out |= padded[x + dx, y + dy, z + dz]
+@lru_cache(maxsize=4)
+def _offsets(reach: float) -> tuple[NDArray[np.int64], F64]:
+    """Offsets (n, 3) of all cells whose centres may be within ``reach`` cells of a point in the middle one, nearest first; lengths (n,)."""
+    side = np.arange(-int(reach) - 1, int(reach) + 2)
+    all_of_them = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+    length = np.linalg.norm(all_of_them, axis=1)
+    order = np.argsort(length, kind="stable")
+    order = order[length[order] < reach + HALF_DIAGONAL]
+    return all_of_them[order], length[order]
+
+
+@njit(cache=True, nogil=True)
+def _closest_observed(state: U8, points: F64, offsets: NDArray[np.int64], length: F64, reach: float) -> U8:
+    """State of the observed cell whose centre is closest to each of ``points`` (n, 3), in cells; unobserved where none is within reach."""
+    out = np.full(len(points), UNOBSERVED_STATE, np.uint8)
+    nx, ny, nz = state.shape
+    for n in range(len(points)):
+        i, j, k = int(np.floor(points[n, 0])), int(np.floor(points[n, 1])), int(np.floor(points[n, 2]))
+        fx, fy, fz = points[n, 0] - i - 0.5, points[n, 1] - j - 0.5, points[n, 2] - k - 0.5
+        best = reach
+        for m in range(len(offsets)):
+            if length[m] - HALF_DIAGONAL >= best:
+                break
+            x, y, z = i + offsets[m, 0], j + offsets[m, 1], k + offsets[m, 2]
+            if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz and state[x, y, z] != UNOBSERVED_STATE:
+                d = np.sqrt((offsets[m, 0] - fx) ** 2 + (offsets[m, 1] - fy) ** 2 + (offsets[m, 2] - fz) ** 2)
+                if d < best:
+                    best = d
+                    out[n] = state[x, y, z]
     return out
 
 

@@ -1,4 +1,4 @@
-"""Verification and alignment of hypotheses (paper 3.5, and beyond): coarse to fine over the voxel pyramid, then on the points.
+"""Verification and alignment of hypotheses (paper 3.5, and beyond): a search over voxels, then on the points.
 
 The paper's ratio tau is reported; acceptance looks at stricter evidence, because ground lies on ground everywhere: *structure* is
 what is neither ground nor able to drive away.
@@ -12,32 +12,35 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.icp import Fit, Surface, align
+from semloc_logs.alignment.icp import Fit, Step, align
 from semloc_logs.alignment.pyramid import (
     ANY_BIT,
     FREE_BIT,
+    STRUCTURE_SHARE,
     Evidence,
     Level,
-    build_pyramid,
+    build_level,
     class_bits,
     look_up,
     pose_matrix,
     search,
     yaw_between,
 )
+from semloc_logs.alignment.surface import Surface, surface_of
 from semloc_logs.geometry import apply
-from semloc_logs.labels.shape import shape
 from semloc_logs.labels.space import GROUND, cityscapes
 from semloc_logs.voxels.grid import BlockMap
 from semloc_logs.voxels.selection import thin
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
-MOST_VOXELS = 3000  # of a query that are looked up in a search
+FIRST_VOXELS, SECOND_VOXELS = 200, 1200  # of a query that are looked up in a search
+FIRST_KEPT = 16  # hypotheses after the first search
 MOST_POINTS = 6000  # of a query that are fitted
+SOME_POINTS = 1500  # of them coarsely
+COARSE_RADII, FINE_RADII = (3.0, 1.5), (0.7, 0.4)  # of correspondences, voxels
 
 
 def structure_mask(label: U8) -> NDArray[np.bool_]:
@@ -48,14 +51,6 @@ def structure_mask(label: U8) -> NDArray[np.bool_]:
     return ~dynamic[label]
 
 
-def surface_of(points: NDArray[np.floating]) -> Surface:
-    """Tangent planes of ``points`` (n, 3), for ICP."""
-    s = shape(points, 14)
-    planar = np.where((s.scattered < 0.3) & (s.linear < 0.9), 1.0, 0.0)
-    p = np.asarray(points, float)
-    return Surface(p, s.normal.astype(float), planar, cKDTree(p))
-
-
 @dataclass(eq=False)
 class Target:
     """A database submap as verification needs it; the parts are built when they are first asked for."""
@@ -64,9 +59,27 @@ class Target:
     voxel_size: float
 
     @cached_property
-    def pyramid(self) -> list[Level]:
-        """Bit masks at 1, 2 and 4 voxels."""
-        return build_pyramid(self.blocks, self.voxel_size, cityscapes().coarse)
+    def level(self) -> Level:
+        """Bit masks to look voxels up in."""
+        return build_level(self.blocks, self.voxel_size, cityscapes().coarse)
+
+
+@dataclass(eq=False)
+class Surroundings:
+    """``points`` (n, 3) of a target around a place, as surfaces to align with; these are built when they are first asked for."""
+
+    points: F64
+    voxel_size: float
+
+    @cached_property
+    def coarse(self) -> Surface:
+        """A point a voxel, in cells as large as the search may be off."""
+        return surface_of(thin_points(self.points, self.voxel_size), COARSE_RADII[0] * self.voxel_size)
+
+    @cached_property
+    def fine(self) -> Surface:
+        """All points, in cells of half a voxel."""
+        return surface_of(self.points, self.voxel_size / 2)
 
 
 @dataclass(eq=False)
@@ -89,17 +102,14 @@ class Query:
         ijk, label = self.blocks.occupied()
         structure = structure_mask(label)
         rng = np.random.default_rng(0)
-        picked, weights = [], []
-        for mask, share in ((structure, 0.75), (~structure, 0.25)):
-            index = np.flatnonzero(mask)
-            if len(index) > int(share * MOST_VOXELS):
-                index = np.sort(rng.choice(index, int(share * MOST_VOXELS), replace=False))
-            picked.append(index)
-            weights.append(np.full(len(index), share / max(len(index), 1)))
+        picked = []
+        for mask, share in ((structure, STRUCTURE_SHARE), (~structure, 1 - STRUCTURE_SHARE)):
+            # in no order, so that the first of them stand for all
+            picked.append(rng.permutation(np.flatnonzero(mask))[: int(share * SECOND_VOXELS)])
         index = np.concatenate(picked)
         bits = class_bits(label, cityscapes().coarse)[index]
         bits = np.where(bits & (ANY_BIT - 1), bits & (ANY_BIT - 1), bits)  # of a known class: that class, else anything occupied
-        return Evidence((ijk[index].astype(float) + 0.5) * self.voxel_size, bits, np.concatenate(weights).astype(float))
+        return Evidence((ijk[index].astype(float) + 0.5) * self.voxel_size, bits, len(picked[0]))
 
     @cached_property
     def structure(self) -> tuple[F64, U8]:
@@ -124,39 +134,39 @@ class Candidate:
 def search_hypotheses(
     hypotheses: Sequence[Hypothesis], targets: dict[int, Target], query: Query, headings: int, most: int
 ) -> list[Candidate]:
-    """The ``most`` best candidates, best first, after a search at 4, 2 and 1 voxels around each hypothesis."""
-    v = query.voxel_size
-    turn = np.pi / headings
-    state = [(h, np.array(h.pose), 0.0) for h in hypotheses]
-    plan = (
-        (2, (-0.67 * turn, 0.0, 0.67 * turn), (-4 * v, 0.0, 4 * v), (-4 * v, 0.0, 4 * v), 3 * most),
-        (
-            1,
-            tuple(turn * np.linspace(-0.4, 0.4, 5)),
-            tuple(v * np.array([-4.0, -2.0, 0.0, 2.0, 4.0])),
-            (-2 * v, 0.0, 2 * v),
-            2 * most,
-        ),
-        (0, tuple(turn * np.linspace(-0.12, 0.12, 5)), tuple(v * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])), (-v, 0.0, v), most),
-    )
-    full = query.evidence
-    some = Evidence(full.centres[::3].copy(), full.bits[::3].copy(), 3 * full.weights[::3])  # enough for what is a metre off anyway
-    for level, yaws, steps, lifts, keep in plan:
+    """The ``most`` best candidates, best first, after two searches around each hypothesis: in steps of two voxels with few of the
+    query's voxels, then, for the best, of one with more."""
+    v, turn = query.voxel_size, np.pi / headings
+    found = _apart([(h, np.array(h.pose), 0.0) for h in hypotheses], 2 * v, len(hypotheses))
+    for yaws, step, share, keep in (
+        (turn * np.linspace(-0.8, 0.8, 5), 2, FIRST_VOXELS, FIRST_KEPT),
+        (turn * np.linspace(-0.3, 0.3, 7), 1, SECOND_VOXELS, most),
+    ):
+        some = query.evidence.first(share)
         moved = []
-        for h, pose, _ in state:
-            score, better = search(targets[h.group].pyramid[level], some if level else full, pose, yaws, steps, lifts)
+        for h, pose, _ in found:
+            score, better = search(targets[h.group].level, some, pose, yaws, step)
             moved.append((h, better, score))
         moved.sort(key=lambda m: (-m[2], m[0].group, tuple(m[1])))
-        state = []
-        for m in moved:  # hypotheses that have met are one
-            if not any(
-                o[0].group == m[0].group and np.abs(o[1][1:] - m[1][1:]).max() < 2 * v and abs(np.sin(o[1][0] - m[1][0])) < 0.05
-                for o in state
-            ):
-                state.append(m)
-            if len(state) == keep:
-                break
-    return [Candidate(h.group, pose_matrix(pose), score, h.votes) for h, pose, score in state]
+        found = _apart(moved, 2 * v, keep)
+    return [Candidate(h.group, pose_matrix(pose), score, h.votes) for h, pose, score in found]
+
+
+Found = tuple[Hypothesis, F64, float]
+
+
+def _apart(found: Sequence[Found], distance: float, most: int) -> list[Found]:
+    """The first ``most`` of ``found`` that are not beside an earlier one: hypotheses that have met are one."""
+    kept: list[Found] = []
+    for f in found:
+        if not any(
+            o[0].group == f[0].group and np.abs(o[1][1:] - f[1][1:]).max() < distance and abs(np.sin(o[1][0] - f[1][0])) < 0.05
+            for o in kept
+        ):
+            kept.append(f)
+        if len(kept) == most:
+            break
+    return kept
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,22 +192,28 @@ def structure_scores(query: Query, target: Target, target_T_query: F64) -> tuple
     centres, bits = query.structure
     if not len(centres):
         return 0.0, 0.0, 0.0, 0
-    mask = look_up(target.pyramid[0], apply(target_T_query, centres))
+    mask = look_up(target.level, apply(target_T_query, centres))
     seen, aligned, free = mask != 0, (mask & bits) != 0, (mask & FREE_BIT) != 0
     return float(aligned.sum() / max(seen.sum(), 1)), float(seen.mean()), float(free.mean()), int(aligned.sum())
 
 
-def coarse_fit(candidate: Candidate, surface: Surface, query: Query) -> Fit:
-    """Align a candidate on the points, from two voxels down to one."""
-    v = query.voxel_size
-    points = query.points[:: max(1, len(query.points) // (MOST_POINTS // 3))]
-    return align(points, surface, candidate.target_T_query, (3 * v, 1.5 * v), 8)
+def coarse_fit(candidate: Candidate, around: Surroundings, query: Query) -> Fit:
+    """Align a candidate on some of the points, from three voxels down to one and a half."""
+    v, stride = query.voxel_size, max(1, len(query.points) // SOME_POINTS)
+    return align(query.points, around.coarse, candidate.target_T_query, tuple(Step(r * v, 8, stride) for r in COARSE_RADII))
 
 
-def fine_fit(start: F64, surface: Surface, points: F64, voxel_size: float) -> Fit:
-    """Align to centimetres with all of (a bounded number of) ``points``."""
-    some = points[:: max(1, len(points) // MOST_POINTS)]
-    return align(some, surface, start, (1.5 * voxel_size, 0.7 * voxel_size, 0.4 * voxel_size), 10)
+def fine_fit(start: F64, around: Surroundings, query: Query) -> Fit:
+    """Align to centimetres with a bounded number of the points."""
+    v, stride = query.voxel_size, max(1, len(query.points) // MOST_POINTS)
+    first, last = (r * v for r in FINE_RADII)
+    return align(query.points, around.fine, start, (Step(first, 6, 3 * stride), Step(last, 10, 2 * stride), Step(last, 2, stride)))
+
+
+def measured(start: F64, around: Surroundings, query: Query) -> Fit:
+    """The fit of an alignment as it is, by the measure of a fine one."""
+    stride = max(1, len(query.points) // MOST_POINTS)
+    return align(query.points, around.fine, start, (Step(FINE_RADII[1] * query.voxel_size, 0, stride),))
 
 
 def thin_points(points: F64, cell: float) -> F64:

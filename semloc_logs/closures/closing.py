@@ -19,6 +19,7 @@ from semloc_logs.alignment.verify import (
     Target,
     coarse_fit,
     fine_fit,
+    measured,
     same_place,
     search_hypotheses,
     structure_scores,
@@ -34,7 +35,8 @@ from semloc_logs.subvolumes.describe import describe_map, load_encoder
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
-ALIGNED = 8  # candidates of a target session that are fitted on the points
+ALIGNED = 6  # candidates of a target session that are fitted on the points
+CLOSE = 0.9  # of the best score: what is worth a fine fit beside it
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
@@ -164,13 +166,12 @@ def find_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
 
 
 def verify_hypotheses(database: Database, query: Query, hypotheses: list[Hypothesis]) -> list[Candidate]:
-    """The best candidates of each target session after the search over the voxel pyramid, best first."""
+    """The best candidates of each target session after the search over their voxels, best first."""
     out: list[Candidate] = []
-    keep = max(ALIGNED, database.settings.closures.refined // len(database.sessions))
     for name in database.sessions:
         mine = [h for h in hypotheses if database.places[h.group].session == name]
         targets = {h.group: database.target(h.group) for h in mine}
-        out += search_hypotheses(mine, targets, query, database.settings.closures.headings, keep)
+        out += search_hypotheses(mine, targets, query, database.settings.closures.headings, ALIGNED)
     return out
 
 
@@ -180,14 +181,15 @@ def _align(
     """Candidates of one target session, aligned on the points, compared with each other, judged."""
     v = database.settings.fusion.voxel_size
     fitted: list[Fitted] = []
-    for c in candidates[:ALIGNED]:
+    for c in candidates:
         near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
         fit = coarse_fit(c, database.surface(c.group, near), query)
         fitted.append((_score(query, database.target(c.group), fit), c, fit, near))
     best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
     fine = []
-    for _, c, fit, near in best:
-        better = fine_fit(fit.target_T_query, database.surface(c.group, near), query.points, v)
+    for score, c, fit, near in best:
+        around = database.surface(c.group, near)
+        better = (fine_fit if score >= CLOSE * best[0][0] else measured)(fit.target_T_query, around, query)
         fine.append((_score(query, database.target(c.group), better), c, better, near))
     fine = _distinct(fine, v)
     target = database.sessions[database.places[candidates[0].group].session] if fine else session

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.alignment.icp import Surface
-from semloc_logs.alignment.verify import Target, surface_of, thin_points
+from semloc_logs.alignment.verify import Surroundings, Target, thin_points
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import apply
 from semloc_logs.settings import Settings
@@ -172,13 +171,13 @@ class Database:
         track = self.sessions[self.places[group].session].map_T_base[seen, :3, 3]
         return int(seen[np.argmin(np.linalg.norm(track - position, axis=1))])
 
-    def surface(self, group: int, keyframe: int) -> Surface:
-        """Tangent planes of what the submap's keyframes around ``keyframe`` saw, as far along as a query is long, in the map frame."""
+    def surface(self, group: int, keyframe: int) -> Surroundings:
+        """What the submap's keyframes around ``keyframe`` saw, as far along as a query is long, in the map frame, to align with."""
         place, seen = self.places[group], self.keyframes(group)
         session, query = self.sessions[place.session], self.settings.query
         radius = query.radius or 24.0
 
-        def make() -> Surface:
+        def make() -> Surroundings:
             away = np.linalg.norm(session.map_T_base[seen, :3, 3] - session.map_T_base[keyframe, :3, 3], axis=1)
             chosen = seen[np.argsort(away, kind="stable")[:SURFACE_KEYFRAMES]]
             along = seen[away <= (query.length or 0.0) / 2]
@@ -189,9 +188,10 @@ class Database:
             for i in np.sort(chosen).tolist():
                 frame = read_keyframe(session.folder.keyframes, i).near(session.origins[i], 1.2 * radius)
                 clouds.append(apply(session.map_T_base[i], frame.points))
-            return surface_of(thin_points(np.concatenate(clouds), self.settings.fusion.voxel_size / 2.5))
+            v = self.settings.fusion.voxel_size
+            return Surroundings(thin_points(np.concatenate(clouds), v / 2.5), v)
 
-        found: Surface = self._surfaces.get((group, keyframe, seen.tobytes()), make)
+        found: Surroundings = self._surfaces.get((group, keyframe, seen.tobytes()), make)
         return found
 
 

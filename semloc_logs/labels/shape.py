@@ -36,17 +36,22 @@ def shape(points: NDArray[np.floating], neighbours: int = 16, radius: float = np
         return Shape(up, up, zero, zero, zero + 1)
     p = np.ascontiguousarray(points, np.float64)
     distance, index = cKDTree(p).query(p, k=min(neighbours, n), distance_upper_bound=radius, workers=1)
-    return Shape(*_shapes(p, np.where(np.isfinite(distance), index, -1)))
+    return shapes_at(p, np.arange(n), np.where(np.isfinite(distance), index, -1))
+
+
+def shapes_at(points: F64, at: NDArray[np.int64], index: NDArray[np.int64]) -> Shape:
+    """Shape at the ``points`` number ``at`` (n,) from the points ``index`` (n, k) around each, -1 where there is none."""
+    return Shape(*_shapes(points, at, index))
 
 
 @njit(cache=True, nogil=True)
-def _shapes(p: F64, index: NDArray[np.int64]) -> tuple[F32, F32, F32, F32, F32]:
-    """Shape of the neighbours ``index`` (n, k) of each point, -1 where there is none."""
+def _shapes(p: F64, at: NDArray[np.int64], index: NDArray[np.int64]) -> tuple[F32, F32, F32, F32, F32]:
     n = len(index)
     normal, direction = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
     linear, planar, scattered = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     mean, d, values, a, vectors = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for i in range(n):
+        here = at[i]
         mean[:] = 0.0
         a[:] = 0.0
         count = 0
@@ -54,12 +59,12 @@ def _shapes(p: F64, index: NDArray[np.int64]) -> tuple[F32, F32, F32, F32, F32]:
             if j >= 0:
                 count += 1
                 for k in range(3):
-                    mean[k] += p[j, k] - p[i, k]
+                    mean[k] += p[j, k] - p[here, k]
         mean /= max(count, 1)
         for j in index[i]:
             if j >= 0:
                 for k in range(3):
-                    d[k] = p[j, k] - p[i, k] - mean[k]
+                    d[k] = p[j, k] - p[here, k] - mean[k]
                 for k in range(3):
                     for m in range(3):
                         a[k, m] += d[k] * d[m]

@@ -1,16 +1,19 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.icp import Fit, Surface, _point_information, align
-from semloc_logs.alignment.verify import surface_of
+from semloc_logs.alignment.icp import Fit, Step, _add_point, align
+from semloc_logs.alignment.surface import surface_of
 from semloc_logs.closures.closing import covariance_of
 from semloc_logs.geometry import apply, exp_se3, inverse, rotation_angle, yaw_transform
 
 F64 = NDArray[np.float64]
-RADII = (1.0, 0.5, 0.2)
+CELL = 0.4
+STEPS = tuple(Step(radius, 15) for radius in (1.0, 0.5, 0.2))
 
 
 def room(rng: np.random.Generator, n: int, noise: float = 0.01, corridor: bool = False) -> F64:
@@ -41,8 +44,8 @@ def error(found: F64, truth: F64) -> tuple[float, float]:
 def fit(truth: F64, start: F64, seed: int = 0, noise: float = 0.01) -> Fit:
     """The query is the room seen from the frame of ``truth``, sampled anew."""
     rng = np.random.default_rng(seed)
-    target = surface_of(room(rng, 1500, noise))
-    return align(apply(inverse(truth), room(rng, 700, noise)), target, start, RADII, 15)
+    target = surface_of(room(rng, 1500, noise), CELL)
+    return align(apply(inverse(truth), room(rng, 700, noise)), target, start, STEPS)
 
 
 SMALL = exp_se3(np.array([0.15, -0.2, 0.1]), np.array([0.03, -0.02, 0.06]))
@@ -65,8 +68,8 @@ def test_forward_and_backward_are_inverse() -> None:
     rng = np.random.default_rng(1)
     a, b = room(rng, 1200), apply(inverse(yaw_transform(0.7, (1.0, 0.0, 0.0))), room(rng, 1200))
     T = yaw_transform(0.7, (1.0, 0.0, 0.0))
-    there = align(b, surface_of(a), T @ SMALL, RADII, 15).target_T_query
-    back = align(a, surface_of(b), inverse(T @ SMALL), RADII, 15).target_T_query
+    there = align(b, surface_of(a, CELL), T @ SMALL, STEPS).target_T_query
+    back = align(a, surface_of(b, CELL), inverse(T @ SMALL), STEPS).target_T_query
     distance, angle = error(there @ back, np.eye(4))
     assert distance < 0.002
     assert angle < 0.0007
@@ -77,10 +80,10 @@ def test_far_from_the_origin_the_result_is_the_same() -> None:
     rng = np.random.default_rng(2)
     target, query = room(rng, 1200), room(rng, 600)
     shift = yaw_transform(0.0, (30_000.0, -20_000.0, 500.0))
-    near = align(query, surface_of(target), SMALL, RADII, 15)
-    far = align(query, surface_of(apply(shift, target)), shift @ SMALL, RADII, 15)
+    near = align(query, surface_of(target, CELL), SMALL, STEPS)
+    far = align(query, surface_of(apply(shift, target), CELL), shift @ SMALL, STEPS)
     assert error(inverse(shift) @ far.target_T_query, near.target_T_query)[0] < 1e-4
-    both = align(apply(shift, query), surface_of(apply(shift, target)), shift @ SMALL @ inverse(shift), RADII, 15)
+    both = align(apply(shift, query), surface_of(apply(shift, target), CELL), shift @ SMALL @ inverse(shift), STEPS)
     assert error(apply_both(shift, both.target_T_query), near.target_T_query)[0] < 1e-4
     np.testing.assert_allclose(far.information, near.information, rtol=0.02, atol=2)
 
@@ -91,9 +94,9 @@ def apply_both(shift: F64, T: F64) -> F64:
 
 def test_outliers_are_not_followed() -> None:
     rng = np.random.default_rng(3)
-    target = surface_of(room(rng, 1500))
+    target = surface_of(room(rng, 1500), CELL)
     query = np.concatenate([room(rng, 500), rng.uniform((-4, -2.5, 0), (4, 2.5, 3), (1500, 3))])
-    found = align(query, target, SMALL, RADII, 20)
+    found = align(query, target, SMALL, STEPS)
     assert error(found.target_T_query, np.eye(4))[0] < 0.01
     assert 0.5 < found.inliers < 0.95
 
@@ -108,37 +111,40 @@ def test_information_of_point_distances_is_that_of_numerical_differences() -> No
             step = 1e-6 * np.eye(6)[k]
             J[:, k] = (apply(exp_se3(step[:3], step[3:]), a[None])[0] - apply(exp_se3(-step[:3], -step[3:]), a[None])[0]) / 2e-6
         expected += w * J.T @ J
-    np.testing.assert_allclose(_point_information(arm, weight), expected, atol=1e-6)
+    found, g = np.zeros((6, 6)), np.zeros(6)
+    for a, w in zip(arm, weight, strict=True):
+        _add_point(found, g, a, np.array([0.1, -0.3, 0.2]), w)
+    np.testing.assert_allclose(np.triu(found), np.triu(expected), atol=1e-6)
+    o = np.array([0.1, -0.3, 0.2])
+    np.testing.assert_allclose(g, np.r_[weight.sum() * o, (np.cross(arm, o) * weight[:, None]).sum(0)])
 
 
 def test_leaves_without_any_plane_hold_an_alignment_too() -> None:
     rng = np.random.default_rng(1)
     cloud = rng.uniform(-3, 3, (800, 3))
-    target = surface_of(cloud)
-    flat = Surface(target.points, target.normals, np.zeros(800), target.tree)
+    target = surface_of(cloud, CELL)
+    flat = replace(target, planar=np.zeros(800))
     start = exp_se3(np.array([0.05, -0.04, 0.03]), np.array([0.01, 0.0, -0.02]))
-    assert error(align(cloud[::3], flat, start, (0.5, 0.3), 30).target_T_query, np.eye(4))[0] < 1e-3
+    assert error(align(cloud[::3], flat, start, (Step(0.5, 30), Step(0.3, 30))).target_T_query, np.eye(4))[0] < 1e-3
 
 
 def test_nothing_to_align() -> None:
-    target = surface_of(room(np.random.default_rng(0), 100))
+    target = surface_of(room(np.random.default_rng(0), 100), CELL)
     for query in (np.zeros((0, 3)), np.full((50, 3), 1e4), np.zeros((5, 3))):
-        found = align(query, target, SMALL, RADII)
+        found = align(query, target, SMALL, STEPS)
         assert found.inliers == 0
         assert found.rmse == np.inf
         assert not found.information.any()
         np.testing.assert_array_equal(found.target_T_query, SMALL)
-    empty = align(room(np.random.default_rng(0), 100), surface_of(np.zeros((0, 3))), SMALL, RADII)
+    empty = align(room(np.random.default_rng(0), 100), surface_of(np.zeros((0, 3)), CELL), SMALL, STEPS)
     assert empty.count == 0
 
 
 def test_covariance_of_a_room_and_of_a_corridor() -> None:
     rng = np.random.default_rng(4)
     for corridor in (False, True):
-        target = surface_of(room(rng, 1500, corridor=corridor))
-        found = align(
-            room(rng, 700, corridor=corridor)[:, :3], target, SMALL if not corridor else exp_se3(np.zeros(3), np.zeros(3)), RADII, 15
-        )
+        target = surface_of(room(rng, 1500, corridor=corridor), CELL)
+        found = align(room(rng, 700, corridor=corridor)[:, :3], target, SMALL if not corridor else exp_se3(np.zeros(3), np.zeros(3)), STEPS)
         C = covariance_of(found, np.eye(4), np.eye(4), 0.3)
         assert np.linalg.eigvalsh(C).min() > 0
         np.testing.assert_allclose(C, C.T)
@@ -153,14 +159,14 @@ def test_covariance_of_a_room_and_of_a_corridor() -> None:
 
 def test_covariance_says_what_is_not_known() -> None:
     rng = np.random.default_rng(4)
-    found = align(room(rng, 700, corridor=True), surface_of(room(rng, 1500, corridor=True)), np.eye(4), RADII, 15)
+    found = align(room(rng, 700, corridor=True), surface_of(room(rng, 1500, corridor=True), CELL), np.eye(4), STEPS)
     assert covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] > 0.3**2
 
 
 def test_covariance_lies_in_the_axes_of_the_target() -> None:
     """A corridor along the map's x is one along -y for a target that looks along the map's y."""
     rng = np.random.default_rng(5)
-    found = align(room(rng, 700, corridor=True), surface_of(room(rng, 1500, corridor=True)), np.eye(4), RADII, 15)
+    found = align(room(rng, 700, corridor=True), surface_of(room(rng, 1500, corridor=True), CELL), np.eye(4), STEPS)
     C = covariance_of(found, np.eye(4), yaw_transform(np.pi / 2, (3.0, 2.0, 0.0)), 0.3)
     assert abs(np.linalg.eigh(C[:3, :3])[1][1, -1]) > 0.99
 
@@ -168,7 +174,7 @@ def test_covariance_lies_in_the_axes_of_the_target() -> None:
 def test_covariance_grows_with_the_lever_arm() -> None:
     """A base frame far from what was aligned is less certain across the arm by angle times distance."""
     rng = np.random.default_rng(6)
-    found = align(room(rng, 700), surface_of(room(rng, 1500)), np.eye(4), RADII, 15)
+    found = align(room(rng, 700), surface_of(room(rng, 1500), CELL), np.eye(4), STEPS)
     near = covariance_of(found, np.eye(4), np.eye(4), 0.3)
     far = covariance_of(found, yaw_transform(0.0, (100.0, 0.0, 0.0)), np.eye(4), 0.3)
     np.testing.assert_allclose(far[3:, 3:], near[3:, 3:])
