@@ -41,6 +41,7 @@ from semloc_logs.subvolumes.describing import DescribeTask, variants_for
 from semloc_logs.tables import read_json, read_metadata, replacing_folder, write_json
 from semloc_logs.voxels.fusing import FuseTask, fuse_session
 from semloc_logs.voxels.store import blocks_path
+from semloc_logs.words.catalogue import Change, segments
 from semloc_logs.words.indexing import index_submap, write_words
 from semloc_logs.workspace import SessionFolder, Workspace
 
@@ -213,9 +214,11 @@ def close(
     """Words -> closures.parquet and rejected.parquet: every session of ``queries`` against all of ``targets`` (all if empty)."""
     asking, asked = _sessions(work, queries), _sessions(work, targets)
     maps = {f.name: SessionMap(f) for f in (*asking, *asked)}
+    variants: set[str] = set()
     sources = [str(m.json["label_source"]) for m in maps.values()]
     for name, m in maps.items():
         wanted = set(variants_for(str(m.json["label_source"]), sources, settings))
+        variants |= wanted
         if not m.folder.words_json.exists() or not wanted <= set(read_json(m.folder.words_json)["variants"]):
             raise WorkspaceError(f"Session {name} lacks {' and '.join(sorted(wanted))} words: run 'semloc describe -w {work.path}' first.")
     inputs = [f"{f.name} {_fingerprint(f.words_json)}" for f in (*asking, *asked)]
@@ -231,6 +234,10 @@ def close(
         report.kept.append("closures")
         report.closures = len(read_closures(work.closures))
         return report
+    for variant in sorted(variants):  # once, before every worker wants it
+        segments(work, variant, [f.name for f in asked], change := Change())
+        if said := str(change):
+            note(f"index of {variant} words: {said}")
     tasks = []
     for folder in asking:
         others = tuple(sorted(f.name for f in asked if self_closures or f.name != folder.name))

@@ -32,6 +32,7 @@ from semloc_logs.labels.space import cityscapes
 from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.cut import turn
 from semloc_logs.subvolumes.describe import describe_map, load_encoder
+from semloc_logs.words.index import Allowed
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
@@ -113,8 +114,8 @@ def close_query(database: Database, session: SessionMap, keyframe: int) -> list[
     return sorted(out, key=lambda a: (-a.probability, -a.features.structure, a.target_session, a.target_stamp_ns))
 
 
-def allowed_places(database: Database, session: SessionMap) -> dict[str, NDArray[np.bool_]]:
-    """Which units of the words may answer, by the variant of the words: semantic where both label sources know classes.
+def allowed_places(database: Database, session: SessionMap) -> dict[str, Allowed]:
+    """Which words may answer, by the variant of the words: semantic where both label sources know classes.
 
     Of the query's own session those where it came by at another time (:meth:`Database.asked_by`).
     """
@@ -146,12 +147,10 @@ def find_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
             turn(state, low.astype(np.int64), -yaw, middle, box)
             corner = np.array([-half, -half, low[2]])
             d = describe_map(box, corner, ground, v, encoder, settings.descriptor.query_stride, settings.descriptor.min_occupied)
-            m = words.index.search(d.descriptor, closures.neighbours, closures.probes, allowed)
+            m = words.search(d.descriptor, closures.neighbours, closures.probes, allowed)
             if len(m.query):
-                shift = words.centre[m.entry] - d.centre[m.query] * v
-                parts.append(
-                    (words.group[m.entry], np.full(len(m.query), yaw), shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3)
-                )
+                shift = m.centre - d.centre[m.query] * v
+                parts.append((m.group, np.full(len(m.query), yaw), shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3))
     if not parts:
         return []
     group, yaws, shift, weight = (np.concatenate([p[k] for p in parts]) for k in range(4))

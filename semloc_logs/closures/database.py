@@ -19,16 +19,16 @@ from semloc_logs.alignment.verify import Surroundings, Target, thin_points
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import apply
 from semloc_logs.settings import Settings
-from semloc_logs.tables import read_table
 from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import blocks_path, read_blocks, read_keyframe
-from semloc_logs.words.index import Index
+from semloc_logs.words.catalogue import read_words, segments
+from semloc_logs.words.index import Allowed, Index, Part
 from semloc_logs.words.vocabulary import load_vocabulary
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
-KEPT_TARGETS, KEPT_SURFACES = 12, 24  # in memory at once
+KEPT_TARGETS, KEPT_SURFACES, KEPT_SQUARES = 12, 24, 48  # in memory at once
 SURFACE_KEYFRAMES = 9  # for each query radius of a query's length
 UNIT = 16  # voxels: words of a submap are left out by squares, keyframes by stretches of this length
 AMBIGUOUS = 32  # voxels that a word may lie nearer to keyframes that are left out than to others: lanes lie apart, and odometry drifts
@@ -40,20 +40,6 @@ class Place:
 
     session: str
     submap: int
-
-
-@dataclass(eq=False)
-class Words:
-    """The index of one variant and the centres (n, 3), metres in the map frame, and groups (n,) of its entries.
-
-    The index may be asked for words of some units only: squares (u,) of a submap ``unit_group`` around ``unit_middle`` (u, 2), metres.
-    """
-
-    index: Index
-    centre: F64
-    group: I64
-    unit_group: I64
-    unit_middle: F64
 
 
 class _Recent:
@@ -76,34 +62,25 @@ class Database:
     """Submaps of ``targets`` in the order of their names; submap ``group`` is number g of :attr:`places`."""
 
     def __init__(self, workspace: Workspace, targets: tuple[str, ...], settings: Settings) -> None:
+        self._workspace = workspace
         self.sessions = {name: SessionMap(workspace.session(name)) for name in targets}
         self.settings = settings
         self.places = [Place(name, s["id"]) for name, session in self.sessions.items() for s in session.submaps]
-        self._words: dict[str, Words] = {}
+        self._words: dict[str, Index] = {}
         self._hidden: dict[str, NDArray[np.bool_]] = {}
         self._asking = np.zeros(3)
         self._targets, self._surfaces = _Recent(KEPT_TARGETS), _Recent(KEPT_SURFACES)
+        self._squares = _Recent(KEPT_SQUARES)
 
-    def words(self, variant: str) -> Words:
-        """All words of ``variant``."""
+    def words(self, variant: str) -> Index:
+        """All words of ``variant``; groups of its matches are numbers of :attr:`places`."""
         if variant not in self._words:
-            edge = UNIT * self.settings.fusion.voxel_size
-            nothing = np.zeros(0, np.int64)
-            parts: list[tuple[NDArray[Any], ...]] = [
-                (np.zeros((0, 3)), nothing.astype(np.uint16), nothing.astype(np.uint64), nothing, nothing, np.zeros((0, 2)))
+            numbers = {(place.session, place.submap): g for g, place in enumerate(self.places)}
+            parts = [
+                Part(segment, np.array([numbers[p] if p[0] in served else -1 for p in segment.places], np.int64))
+                for segment, served in segments(self._workspace, variant, tuple(self.sessions))
             ]
-            units = 0
-            for g, place in enumerate(self.places):
-                table = read_table(blocks_path(self.sessions[place.session].folder.words, place.submap))
-                mine = np.flatnonzero(np.array(table["variant"].to_pylist(), dtype=object) == variant)
-                centre = np.stack([table[c].to_numpy()[mine] for c in "xyz"], 1).astype(float)
-                square, unit = np.unique(np.floor(centre[:, :2] / edge), axis=0, return_inverse=True)
-                word, code = table["word"].to_numpy()[mine].astype(np.uint16), table["code"].to_numpy()[mine].astype(np.uint64)
-                parts.append((centre, word, code, unit.ravel() + units, np.full(len(square), g), (square + 0.5) * edge))
-                units += len(square)
-            centre, word, code, unit, unit_group, middle = (np.concatenate([p[k] for p in parts]) for k in range(6))
-            vocabulary = load_vocabulary(variant, self.settings.descriptor.vocabulary)
-            self._words[variant] = Words(Index(vocabulary, word, code, unit), centre, unit_group[unit], unit_group, middle)
+            self._words[variant] = Index(load_vocabulary(variant, self.settings.descriptor.vocabulary), parts)
         return self._words[variant]
 
     # -- what a query of one of the sessions may see of that session
@@ -131,18 +108,30 @@ class Database:
         submap = self.sessions[self.places[group].session].submaps[self.places[group].submap]
         return np.arange(submap["first"], submap["last"] + 1)
 
-    def allowed(self, variant: str, groups: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which units of the words may answer, of submaps ``groups`` (g,): near keyframes that the query may see, not near hidden ones."""
-        words = self.words(variant)
-        out = groups[words.unit_group]
+    def allowed(self, variant: str, groups: NDArray[np.bool_]) -> Allowed:
+        """Which words of submaps ``groups`` (g,) may answer: in squares near keyframes that the query may see, not near hidden ones."""
+        rows: dict[int, NDArray[np.bool_]] = {}
         for g in (g for g in np.flatnonzero(groups).tolist() if self.places[g].session in self._hidden):
             session = self.sessions[self.places[g].session]
             hidden = self._hidden[self.places[g].session][self._submap_ids(g)]
             if hidden.any():
-                mine, road = np.flatnonzero(words.unit_group == g), session.road(session.submaps[self.places[g].submap])
-                to_seen, to_hidden = (cKDTree(road[which]).query(words.unit_middle[mine])[0] for which in (~hidden, hidden))
-                out[mine] = to_seen < to_hidden + AMBIGUOUS * self.settings.fusion.voxel_size
-        return out
+                (square, middle), road = self._squares_of(variant, g), session.road(session.submaps[self.places[g].submap])
+                to_seen, to_hidden = (cKDTree(road[which]).query(middle)[0] for which in (~hidden, hidden))
+                rows[g] = (to_seen < to_hidden + AMBIGUOUS * self.settings.fusion.voxel_size)[square]
+        return Allowed(groups, rows)
+
+    def _squares_of(self, variant: str, group: int) -> tuple[I64, F64]:
+        """The square (n,) that each word of a submap lies in, and the squares' middles (s, 2), metres in the map frame."""
+        place = self.places[group]
+
+        def make() -> tuple[I64, F64]:
+            edge = UNIT * self.settings.fusion.voxel_size
+            table = read_words(self.sessions[place.session].folder, place.submap, variant)
+            square, number = np.unique(np.floor(np.stack([table[c].to_numpy() for c in "xy"], 1) / edge), axis=0, return_inverse=True)
+            return number.ravel(), (square + 0.5) * edge
+
+        found: tuple[I64, F64] = self._squares.get((variant, group), make)
+        return found
 
     def target(self, group: int) -> Target:
         """The map of a submap: fused anew without what the query may not see, where that came near the rest of it."""

@@ -17,7 +17,7 @@ from semloc_logs.subvolumes.describe import describe_map
 from semloc_logs.subvolumes.describing import describe_submap
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.voxels.store import blocks_path, read_blocks
-from semloc_logs.words.index import Index
+from semloc_logs.words.index import Allowed, Index
 from semloc_logs.words.vocabulary import Vocabulary, train_vocabulary
 
 F64 = NDArray[np.float64]
@@ -68,8 +68,8 @@ def word_recall(
     nearest = np.argsort(-similarity, axis=1, kind="stable")[:, :k]
     exact = np.asarray((np.take_along_axis(distance, nearest, 1) < radius).any(1))
     words = vocabulary or train_vocabulary(descriptor)
-    index = Index(words, *words.words(descriptor), np.zeros(len(centre), np.int64))
-    matches = index.search(asked.descriptor, k, settings.closures.probes, np.ones(1, bool))
+    index = Index.of_words(words, *words.words(descriptor), np.zeros(len(centre), np.int64))
+    matches = index.search(asked.descriptor, k, settings.closures.probes, Allowed(np.ones(1, bool)))
     coded = np.zeros(len(true), bool)
     np.logical_or.at(coded, matches.query, distance[matches.query, matches.entry] < radius)
     return WordRecall(float(exact[possible].mean()), float(coded[possible].mean()), int(possible.sum()), len(centre), radius)

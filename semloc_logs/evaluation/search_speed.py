@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings
-from semloc_logs.words.index import Index
+from semloc_logs.words.index import Allowed, Index
 from semloc_logs.words.vocabulary import Vocabulary, codes_of, train_vocabulary
 
 Figures = dict[str, dict[str, float | str]]
@@ -64,8 +64,10 @@ def _one_size(settings: Settings, vocabulary: Vocabulary, threshold: F32, size: 
         origins.append(d[truth[(truth >= start) & (truth < start + BLOCK)] - start])
     queries = np.concatenate(origins) + NOISE * draw(7, QUERIES)
     queries /= np.linalg.norm(queries, axis=1, keepdims=True)
-    index = Index(vocabulary, np.concatenate([w[0] for w in words]), np.concatenate([w[1] for w in words]), np.zeros(size, np.int64))
-    allowed = np.ones(1, bool)
+    index = Index.of_words(
+        vocabulary, np.concatenate([w[0] for w in words]), np.concatenate([w[1] for w in words]), np.zeros(size, np.int64)
+    )
+    allowed = Allowed(np.ones(1, bool))
     peer = _faiss(peers["faiss"], np.concatenate(flat), codes_of(vocabulary.projected(queries) - threshold), truth) if peers else {}
     figures: Figures = {}
     for probes in sorted({1, 4, 8, 16, settings.closures.probes}):

@@ -1,40 +1,76 @@
 """Inverted lists over the words of many submaps and the search for the nearest codes in them (paper 3.4).
 
-A query looks into the lists of its nearest cells in two steps. The codes nearest in Hamming distance, with all that are as near as the
-last, are found by counting bits. Of these the nearest are told by the *asymmetric* distance (Gordo et al. 2014): a bit that differs
-counts as much as the query's projection lies off the cell's threshold, as bits of projections close to it mean little. That finds more
-true neighbours than the Hamming distance alone does, for a few microseconds a query; the distance to the centroid of an entry's word
-adds nothing to it, so the second level of the vocabulary is not asked (benchmarks/README.md, Words).
+A query looks into the lists of its nearest cells. Where these hold more than a budget of codes, it looks at the words of these cells
+that are nearest to it, as many as hold the budget: so the work of a look-up does not grow with the map beyond that. The codes nearest in
+Hamming distance, with all that are as near as the last, are found by counting bits. Of these the nearest are told by the *asymmetric*
+distance (Gordo et al. 2014): a bit that differs counts as much as the query's projection lies off the cell's threshold, as bits of
+projections close to it mean little. That finds more true neighbours than the Hamming distance alone does, for a few microseconds a
+query; the distance to the centroid of an entry's word adds nothing to it (benchmarks/README.md, Words).
+
+What is found does not depend on how words are spread over segments: the budget counts words of all of them, and of equally near
+entries the first by submap and row is nearer.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from semloc_logs.words.kmeans import grid
+from semloc_logs.words.segment import WORDS, Held, Segment, segment_in_memory
 from semloc_logs.words.vocabulary import BITS, Vocabulary, codes_of
 
 U64 = NDArray[np.uint64]
+U32 = NDArray[np.uint32]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ranges = tuple[I64, I64, I64, I64]  # of each query: where its ranges start (n + 1,); of each range: first word, last word + 1, probe
 AT_ONCE = 64  # codes that are compared before any is looked at
 SHORTLIST = 32  # nearest codes in Hamming distance that are compared asymmetrically
+BUDGET = 32_768  # codes that a look-up compares, and those of one word more
+UNIT = 2.0**19  # distances of descriptors to words are multiples of 1 / UNIT: see :mod:`semloc_logs.words.vocabulary`
+QUERIES = 1024  # that are looked up together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """``query`` (m,) rows of the query, ``entry`` (m,) rows of the database, ``distance`` (m,) Hamming; nearest first for each query,
-    by the asymmetric distance."""
+    """``query`` (m,) rows of the query, ``group`` (m,) submaps, ``entry`` (m,) rows among the words of the submap, their ``centre`` (m, 3),
+    metres, and ``yaw`` (m,), radians, ``distance`` (m,) Hamming; nearest first for each query, by the asymmetric distance."""
 
     query: I32
-    entry: I32
+    group: I64
+    entry: I64
+    centre: F64
+    yaw: F64
     distance: I32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Allowed:
+    """Words that may answer: of submaps ``groups`` (g,), of some of them certain ``rows`` only, a mask (n,) of the words by number."""
+
+    groups: Bools
+    rows: Mapping[int, Bools] = field(default_factory=dict)
+
+    def of(self, group: I64) -> tuple[I64, Bools]:
+        """For each place, whose submap is ``group`` (places,): -2 if none of its words may answer, -1 if all may, else where its rows
+        begin in the masks that are returned one behind the other."""
+        open_ = np.where((group >= 0) & self.groups[group], -1, -2).astype(np.int64)
+        masks, length = [np.zeros(0, bool)], 0
+        for g, mask in self.rows.items():
+            open_[(group == g) & (open_ == -1)] = length
+            masks.append(mask)
+            length += len(mask)
+        return open_, np.concatenate(masks)
 
 
 def _count_bits(_: Any, x: Any) -> Any:
@@ -53,22 +89,104 @@ popcount: Any = intrinsic(_count_bits)
 lowest_bit: Any = intrinsic(_first_bit)
 
 
-@njit(cache=True, nogil=True)
-def _shortlist(
-    codes: U64, cells: I32, starts: I64, listed: U64, group: I32, allowed: NDArray[np.bool_], size: int, bound: int, entry: I32, probe: I32
-) -> tuple[int, int]:
-    """Allowed entries in the ``cells`` (p,) of one query with codes (p,) that are no farther than the one that is number ``size``.
+@njit(cache=True, nogil=True, fastmath={"reassoc"})  # sums of multiples of 1 / UNIT are exact in any order
+def _word_distances(projected: F32, cell: int, children: F32, square: F32, out: I32) -> None:
+    """Distance of a query, in units and less its own square, to the words of ``cell`` (k,) into ``out``."""
+    for c in range(children.shape[1]):
+        dot = np.float32(0.0)
+        for b in range(BITS):
+            dot += projected[b] * children[cell, c, b]
+        out[c] = np.int32(min(max((square[cell, c] - 2 * dot) * np.float32(UNIT), -(2.0**29)), 2.0**29))
 
-    Only those up to ``bound`` are looked at; where they are fewer than ``size`` they are returned all the same. Their rows and probes
-    come into ``entry`` and ``probe``, which have room for all; returns how many, and the distance of the farthest.
+
+@njit(cache=True, nogil=True)
+def _farthest(distance: I32, weight: I64, budget: int) -> int:
+    """The least distance within which there are entries of ``weight`` ``budget`` or more."""
+    low, high = np.int64(distance.min()), np.int64(distance.max())
+    while low < high:
+        middle = (low + high) >> 1
+        total = 0
+        for i in range(len(distance)):
+            total += weight[i] if distance[i] <= middle else 0
+        if total >= budget:
+            high = middle
+        else:
+            low = middle + 1
+    return int(low)
+
+
+@njit(cache=True, nogil=True)
+def _choose(projected: F32, cells: I32, children: F32, square: F32, live: I64, cell_live: I64, budget: int) -> Ranges:
+    """Ranges of words that each query with ``cells`` (n, p) looks into: its cells, or their nearest words that hold ``budget`` entries.
+
+    ``live`` (65536,) and ``cell_live`` (256,) are the entries of words and cells.
     """
-    count = np.zeros(BITS + 2, np.int64)  # entries found at each distance
+    n, p = cells.shape
+    k = children.shape[1]
+    offsets = np.zeros(n + 1, np.int64)
+    distance, weight = np.zeros(p * k, np.int32), np.zeros(p * k, np.int64)
+    first, last, probe, found = np.empty(n * p, np.int64), np.empty(n * p, np.int64), np.empty(n * p, np.int64), 0
+    for q in range(n):
+        if found + p * k > len(first):
+            more = np.empty(max(len(first), p * k), np.int64)
+            first, last, probe = np.concatenate((first, more)), np.concatenate((last, more)), np.concatenate((probe, more))
+        if cell_live[cells[q]].sum() <= budget:
+            for j in range(p):
+                first[found], last[found], probe[found] = cells[q, j] * 256, cells[q, j] * 256 + 256, j
+                found += 1
+        else:
+            for j in range(p):
+                _word_distances(projected[q], cells[q, j], children, square, distance[j * k : j * k + k])
+                weight[j * k : j * k + k] = live[cells[q, j] * 256 : cells[q, j] * 256 + k]
+            bound = _farthest(distance, weight, budget)
+            for j in range(p):
+                begun = False
+                for c in range(k):
+                    if distance[j * k + c] <= bound and weight[j * k + c]:
+                        if not begun:
+                            first[found], probe[found], begun = cells[q, j] * 256 + c, j, True
+                            found += 1
+                        last[found - 1] = cells[q, j] * 256 + c + 1
+                    elif weight[j * k + c]:  # words without entries do not part a range
+                        begun = False
+        offsets[q + 1] = found
+    return offsets, first[:found], last[:found], probe[:found]
+
+
+class _Lists(NamedTuple):
+    """The lists of a segment and which of their entries may answer (:meth:`Allowed.of`)."""
+
+    starts: U32
+    code: U64
+    place: U32
+    row: U32
+    begin: I64
+    rows: Bools
+
+
+@njit(cache=True, nogil=True)
+def _may_answer(lists: _Lists, entry: int) -> bool:
+    place, row = lists.place[entry], np.int64(lists.row[entry])
+    if place >= len(lists.begin):  # a file may be damaged
+        return False
+    first = lists.begin[place]
+    return bool(first == -1 or (first >= 0 and first + row < len(lists.rows) and lists.rows[first + row]))
+
+
+@njit(cache=True, nogil=True)
+def _look(codes: U64, ranges: Ranges, q: int, lists: _Lists, size: int, count: I64, state: I64, kept: I64) -> int:
+    """Positions and probes (2, m) of entries of a segment that query ``q`` with codes (p,) may want into ``kept``; returns how many.
+
+    ``count`` (66,) entries were found at each distance up to the bound; ``state`` is their sum and the bound, which falls to the distance
+    within which there are ``size``.
+    """
     distance = np.empty(AT_ONCE, np.int64)
-    within, kept = 0, 0
-    for p in range(len(cells)):
-        code, end = codes[p], starts[cells[p] + 1]
-        for first in range(starts[cells[p]], end, AT_ONCE):
-            block = listed[first : min(first + AT_ONCE, end)]
+    offsets, firsts, lasts, probes = ranges
+    within, bound, found = state[0], state[1], 0
+    for r in range(offsets[q], offsets[q + 1]):
+        code, end = codes[probes[r]], np.int64(lists.starts[lasts[r]])
+        for first in range(np.int64(lists.starts[firsts[r]]), end, AT_ONCE):
+            block = lists.code[first : min(first + AT_ONCE, end)]
             least = BITS
             for i in range(len(block)):  # without branches: the compiler makes it several at a time
                 distance[i] = popcount(code ^ block[i])
@@ -77,76 +195,169 @@ def _shortlist(
                 continue
             for i in range(len(block)):
                 d = distance[i]
-                if d <= bound and allowed[group[first + i]]:
+                if d <= bound and _may_answer(lists, first + i):
                     count[d] += 1
                     within += 1
-                    entry[kept], probe[kept] = first + i, p
-                    kept += 1
+                    kept[0, found], kept[1, found] = first + i, probes[r]
+                    found += 1
                     while within - count[bound] >= size:  # enough are nearer than the bound
                         within -= count[bound]
                         bound -= 1
-    left = 0
-    for i in range(kept):
-        if popcount(codes[probe[i]] ^ listed[entry[i]]) <= bound:
-            entry[left], probe[left] = entry[i], probe[i]
-            left += 1
-    return left, bound
+    state[0], state[1] = within, bound
+    return found
 
 
 @njit(cache=True, nogil=True)
-def _nearest(
-    margin: F32, codes: U64, cells: I32, starts: I64, listed: U64, group: I32, allowed: NDArray[np.bool_], k: int, size: int
-) -> tuple[I32, I32]:
-    """The k nearest allowed entries (n, k) of each query, -1 where there are fewer, and their Hamming distances, nearest first.
+def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, guess: bool, count: I64, state: I64) -> I64:
+    """Queries, positions and probes (3, m) of the entries of one segment that may answer and are among the ``size`` nearest so far.
 
-    ``margin`` (n, p, 64) is how far the query's projections lie off the thresholds of its cells, ``codes`` (n, p) their signs.
+    ``count`` (n, 66) and ``state`` (n, 2) are those of :func:`_look` and go on from segment to segment; ``guess`` at the first.
     """
-    n = len(cells)
-    nearest, hamming = np.full((n, k), -1, np.int32), np.zeros((n, k), np.int32)
-    entry, probe = np.empty(len(listed), np.int32), np.empty(len(listed), np.int32)
-    best = np.empty(k)
-    bound = BITS
-    for q in range(n):
-        best[:] = np.inf
-        # a query's last neighbours are about as far as those of the one before; where they are farther, all are looked at
-        count, bound = _shortlist(codes[q], cells[q], starts, listed, group, allowed, size, min(bound + 1, BITS), entry, probe)
-        if count < size:
-            count, bound = _shortlist(codes[q], cells[q], starts, listed, group, allowed, size, BITS, entry, probe)
-        for i in range(count):
-            different = codes[q, probe[i]] ^ listed[entry[i]]
-            bits, distance = popcount(different), 0.0
-            while different and distance < best[k - 1]:
-                b = lowest_bit(different)
-                distance += margin[q, probe[i], b]
-                different &= different - np.uint64(1)
-            if distance < best[k - 1]:
-                j = k - 1
-                while j > 0 and best[j - 1] > distance:
-                    best[j], nearest[q, j], hamming[q, j] = best[j - 1], nearest[q, j - 1], hamming[q, j - 1]
-                    j -= 1
-                best[j], nearest[q, j], hamming[q, j] = distance, entry[i], bits
+    offsets, firsts, lasts, _ = ranges
+    most = np.int64(0)
+    for q in range(len(codes)):
+        here = np.int64(0)
+        for r in range(offsets[q], offsets[q + 1]):
+            here += np.int64(lists.starts[lasts[r]]) - np.int64(lists.starts[firsts[r]])
+        most = max(most, here)
+    kept = np.empty((2, most), np.int64)
+    out, total, before = np.empty((3, 64 * len(codes) + most), np.int64), 0, BITS
+    for q in range(len(codes)):
+        if guess:  # a query's last neighbours are about as far as those of the one before; where they are farther, all are looked at
+            state[q, 1] = min(before + 1, BITS)
+        found = _look(codes[q], ranges, q, lists, size, count[q], state[q], kept)
+        if guess and state[q, 0] < size:
+            count[q] = 0
+            state[q] = 0, BITS
+            found = _look(codes[q], ranges, q, lists, size, count[q], state[q], kept)
+        before = int(state[q, 1])
+        if total + found > out.shape[1]:
+            more = np.empty((3, 2 * (total + found)), np.int64)
+            more[:, :total] = out[:, :total]
+            out = more
+        for i in range(found):
+            if popcount(codes[q, kept[1, i]] ^ lists.code[kept[0, i]]) <= before:
+                out[0, total], out[1, total], out[2, total] = q, kept[0, i], kept[1, i]
+                total += 1
+    return out[:, :total].copy()
+
+
+@njit(cache=True, nogil=True)
+def _nearest(margin: F32, codes: U64, bound: I64, query: I64, probe: I64, code: U64, key: I64, k: int) -> tuple[I64, I32]:
+    """The k nearest candidates (n, k) of each query, -1 where there are fewer, and their Hamming distances, nearest first.
+
+    ``margin`` (n, p, 64) is how far the query's projections lie off the thresholds of its cells, ``codes`` (n, p) their signs; candidates
+    beyond their query's ``bound`` (n,) are none. Of equally near ones that with the lesser ``key`` is nearer.
+    """
+    n = len(codes)
+    nearest, hamming = np.full((n, k), -1, np.int64), np.zeros((n, k), np.int32)
+    best = np.full((n, k), np.inf)
+    for i in range(len(query)):
+        q, p = query[i], probe[i]
+        different = codes[q, p] ^ code[i]
+        bits, distance = popcount(different), 0.0
+        if bits > bound[q]:
+            continue
+        while different and distance <= best[q, k - 1]:
+            b = lowest_bit(different)
+            distance += margin[q, p, b]
+            different &= different - np.uint64(1)
+        j = k
+        while j > 0 and (
+            distance < best[q, j - 1] or (distance == best[q, j - 1] and (nearest[q, j - 1] < 0 or key[i] < key[nearest[q, j - 1]]))
+        ):
+            if j < k:
+                best[q, j], nearest[q, j], hamming[q, j] = best[q, j - 1], nearest[q, j - 1], hamming[q, j - 1]
+            j -= 1
+        if j < k:
+            best[q, j], nearest[q, j], hamming[q, j] = distance, i, bits
     return nearest, hamming
 
 
+@njit(cache=True, nogil=True)
+def _count_live(starts: U32, place: U32, inside: Bools, live: I64) -> None:
+    for w in range(WORDS):
+        for i in range(np.int64(starts[w]), np.int64(starts[w + 1])):
+            live[w] += place[i] < len(inside) and inside[place[i]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A segment in a search: ``group`` (places,) is the number of the submap at each of its places, -1 for those that take no part."""
+
+    segment: Segment
+    group: I64
+
+
 class Index:
-    """Words of a database, sorted by vocabulary cell. ``group`` (n,) is the number of the submap that each word lies in."""
+    """Words of a database in segments. A look-up compares at most ``budget`` codes and those of one word more."""
 
-    def __init__(self, vocabulary: Vocabulary, word: NDArray[np.uint16], code: U64, group: NDArray[np.integer]) -> None:
+    def __init__(self, vocabulary: Vocabulary, parts: Sequence[Part], budget: int = BUDGET) -> None:
         self.vocabulary = vocabulary
-        cell = word.astype(np.int64) // 256
-        self.order = np.argsort(cell, kind="stable")
-        self._starts = np.searchsorted(cell[self.order], np.arange(len(vocabulary.cells) + 1))
-        self._codes = code[self.order]
-        self._group = group[self.order].astype(np.int32)
+        self.budget = budget
+        self.parts = sorted((p for p in parts if len(p.segment)), key=lambda p: -len(p.segment))
+        self._square = np.square(vocabulary.children).sum(2)
+        self._live = np.zeros(WORDS, np.int64)
+        for p in self.parts:
+            if (p.group >= 0).all():
+                self._live += np.diff(p.segment.starts)
+            else:
+                _count_live(p.segment.starts, p.segment.place, p.group >= 0, self._live)
+        self._cell_live = self._live.reshape(256, 256).sum(1)
 
-    def search(self, descriptors: F32, k: int, probes: int, allowed: NDArray[np.bool_]) -> Matches:
-        """The ``k`` nearest words of each descriptor (n, N) in its ``probes`` nearest cells among the ``allowed`` submaps."""
-        if not len(descriptors) or not len(self._codes):
-            empty = np.zeros(0, np.int32)
-            return Matches(empty, empty, empty)
-        cells = self.vocabulary.nearest_cells(descriptors, probes)
-        margin = self.vocabulary.margins(descriptors, cells)
-        size = max(SHORTLIST, k)
-        entry, distance = _nearest(np.abs(margin), codes_of(margin), cells, self._starts, self._codes, self._group, allowed, k, size)
-        query, rank = np.nonzero(entry >= 0)
-        return Matches(query.astype(np.int32), self.order[entry[query, rank]].astype(np.int32), distance[query, rank])
+    @classmethod
+    def of_words(cls, vocabulary: Vocabulary, word: NDArray[np.integer], code: U64, group: NDArray[np.integer]) -> Index:
+        """An index in memory of words (n,) and codes (n,) in the submaps ``group`` (n,); ``entry`` of matches are their rows."""
+        n = len(word)
+        groups = np.arange(int(group.max()) + 1 if n else 0)
+        columns = {"word": word, "code": code, "place": group, "row": np.arange(n), "centre": np.zeros((n, 3)), "yaw": np.zeros(n)}
+        held = Held("", "", tuple(groups.tolist()), n)
+        return cls(vocabulary, [Part(segment_in_memory((held,), columns), groups)])
+
+    def __len__(self) -> int:
+        return int(self._live.sum())
+
+    def search(self, descriptors: F32, k: int, probes: int, allowed: Allowed) -> Matches:
+        """The ``k`` nearest words of each descriptor (n, N) in its ``probes`` nearest cells among the ``allowed`` ones."""
+        found = [self._search(descriptors[i : i + QUERIES], k, probes, allowed) for i in range(0, len(descriptors), QUERIES)]
+        if not found:
+            found = [self._gather(np.zeros((4, 0), np.int64))]
+        query = np.concatenate([m.query + i * QUERIES for i, m in enumerate(found)]).astype(np.int32)
+        rest = (np.concatenate([getattr(m, name) for m in found]) for name in ("group", "entry", "centre", "yaw", "distance"))
+        return Matches(query, *rest)
+
+    def _search(self, descriptors: F32, k: int, probes: int, allowed: Allowed) -> Matches:
+        v = self.vocabulary
+        cells = v.nearest_cells(descriptors, probes)
+        margin = v.margins(descriptors, cells)
+        codes = codes_of(margin)
+        ranges = _choose(grid(v.projected(descriptors)), cells, v.children, self._square, self._live, self._cell_live, self.budget)
+        count, state = np.zeros((len(codes), BITS + 2), np.int64), np.tile(np.array([0, BITS]), (len(codes), 1))
+        found: list[NDArray[np.int64]] = []
+        near: list[tuple[U64, I64]] = []
+        for number, p in enumerate(self.parts):
+            s = p.segment
+            lists = _Lists(s.starts, s.code, s.place, s.row, *allowed.of(p.group))
+            m = _scan(codes, ranges, lists, max(SHORTLIST, k), number == 0, count, state)
+            found.append(np.concatenate([m, np.full((1, m.shape[1]), number)]))
+            near.append((s.code[m[1]], p.group[s.place[m[1]]] << 32 | s.row[m[1]]))
+        if not found:
+            return self._gather(np.zeros((4, 0), np.int64))
+        m = np.concatenate(found, axis=1)
+        code, key = (np.concatenate([n[i] for n in near]) for i in (0, 1))
+        nearest, hamming = _nearest(np.abs(margin), codes, state[:, 1].copy(), m[0], m[2], code, key, k)
+        query, rank = np.nonzero(nearest >= 0)
+        chosen = m[:, nearest[query, rank]]
+        return self._gather(np.stack([query, chosen[1], chosen[3], hamming[query, rank]]))
+
+    def _gather(self, chosen: I64) -> Matches:
+        """Matches of queries, positions, numbers of parts and distances (4, m)."""
+        query, position, number, distance = chosen
+        m = len(query)
+        group, entry, centre, yaw = np.zeros(m, np.int64), np.zeros(m, np.int64), np.zeros((m, 3)), np.zeros(m)
+        for i, p in enumerate(self.parts):
+            mine = np.flatnonzero(number == i)
+            at = position[mine]
+            group[mine], entry[mine] = p.group[p.segment.place[at]], p.segment.row[at]
+            centre[mine], yaw[mine] = p.segment.centre[at], p.segment.yaw[at]
+        return Matches(query.astype(np.int32), group, entry, centre, yaw, distance.astype(np.int32))

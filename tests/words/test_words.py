@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.words.index import SHORTLIST, Index, lowest_bit, popcount
+from semloc_logs.words.index import SHORTLIST, Allowed, Index, lowest_bit, popcount
 from semloc_logs.words.kmeans import grid, kmeans, nearest_centroids
 from semloc_logs.words.vocabulary import BITS, Vocabulary, load_vocabulary, save_vocabulary, train_vocabulary
 
 F32 = NDArray[np.float32]
+ALL = Allowed(np.array([True]))
 TOLERANCE = 2.0**-9  # of a similarity: descriptors are rounded to 2^-11
 
 
@@ -131,7 +132,7 @@ def test_the_nearest_words_are_those_of_brute_force(seed: int, k: int, probes: i
     word, code = v.words(d)
     group = np.random.default_rng(seed).integers(0, 5, 300)
     allowed = np.array(allow)
-    m = Index(v, word, code, group).search(q, k, probes, allowed)
+    m = Index.of_words(v, word, code, group).search(q, k, probes, Allowed(allowed))
     cells = v.nearest_cells(q, probes)
     for i in range(len(q)):
         expected = slow_search(v, word, code, q[i], cells[i], k, allowed[group])
@@ -161,11 +162,11 @@ def test_what_is_found_does_not_depend_on_the_other_queries() -> None:
     near = unit(3, 400)
     far = unit(77, 30, centres=3, spread=3.0)
     word, code = TRAINED.words(near)
-    index = Index(TRAINED, word, code, np.zeros(400, np.int64))
+    index = Index.of_words(TRAINED, word, code, np.zeros(400, np.int64))
     mixed = np.stack([near[:30], far], 1).reshape(60, 256)
 
     def found(q: F32) -> list[tuple[int, int, int]]:
-        m = index.search(q, 5, 3, np.array([True]))
+        m = index.search(q, 5, 3, ALL)
         return list(zip(m.query.tolist(), m.entry.tolist(), m.distance.tolist(), strict=True))
 
     together = found(mixed)
@@ -181,7 +182,7 @@ def test_a_bit_that_is_sure_outweighs_two_that_are_not() -> None:
     query = np.zeros((1, 64), np.float32)
     query[0, :3] = 0.5, -0.01, -0.01
     code = np.array([0b000, 0b111, 0b001], np.uint64)
-    m = Index(v, np.zeros(3, np.uint16), code, np.zeros(3, np.int64)).search(query, 3, 1, np.array([True]))
+    m = Index.of_words(v, np.zeros(3, np.uint16), code, np.zeros(3, np.int64)).search(query, 3, 1, ALL)
     assert m.entry.tolist() == [2, 1, 0]
     assert m.distance.tolist() == [0, 2, 1]
 
@@ -192,12 +193,12 @@ TRAINED = train_vocabulary(unit(0, 600), cells=9, children=3)
 def test_a_word_finds_itself_first_and_fewer_entries_than_asked_for_come_back() -> None:
     d = unit(3, 40)
     word, code = TRAINED.words(d)
-    index = Index(TRAINED, word, code, np.zeros(40, np.int64))
-    m = index.search(d, 100, 9, np.array([True]))
+    index = Index.of_words(TRAINED, word, code, np.zeros(40, np.int64))
+    m = index.search(d, 100, 9, ALL)
     assert np.bincount(m.query).tolist() == [40] * 40  # all there are, once
     first = np.r_[True, np.diff(m.query) > 0]
     assert (m.distance[first] == 0).all()
-    one = index.search(d, 1, 1, np.array([True]))
+    one = index.search(d, 1, 1, ALL)
     assert (one.distance == 0).all()
     assert (code[one.entry] == code).all()
 
@@ -206,9 +207,9 @@ def test_searches_with_nothing_to_find() -> None:
     d = unit(3, 5)
     word, code = TRAINED.words(d)
     for index, query, allowed in (
-        (Index(TRAINED, word, code, np.zeros(5, np.int64)), d, np.array([False])),
-        (Index(TRAINED, word, code, np.zeros(5, np.int64)), d[:0], np.array([True])),
-        (Index(TRAINED, word[:0], code[:0], np.zeros(0, np.int64)), d, np.array([True])),
+        (Index.of_words(TRAINED, word, code, np.zeros(5, np.int64)), d, Allowed(np.array([False]))),
+        (Index.of_words(TRAINED, word, code, np.zeros(5, np.int64)), d[:0], ALL),
+        (Index.of_words(TRAINED, word[:0], code[:0], np.zeros(0, np.int64)), d, ALL),
     ):
         m = index.search(query, 5, 3, allowed)
         assert [len(a) for a in (m.query, m.entry, m.distance)] == [0, 0, 0]
@@ -279,7 +280,7 @@ def test_descriptors_may_have_64_dimensions_and_half_precision() -> None:
     assert (v.cells.shape, v.projection.shape) == ((10, 64), (64, 64))
     np.testing.assert_allclose(v.projected(d), grid(d) @ v.projection.T, atol=1e-6)
     word, code = v.words(d)
-    m = Index(v, word, code, np.zeros(700, np.int64)).search(d[:50], 1, 1, np.array([True]))
+    m = Index.of_words(v, word, code, np.zeros(700, np.int64)).search(d[:50], 1, 1, ALL)
     assert (code[m.entry] == code[:50]).all()
     again = train_vocabulary(d, cells=10, children=4)  # multiples of 2^-11 below 1 have no more digits than half precision holds
     for k in ("cells", "projection", "thresholds", "children"):
