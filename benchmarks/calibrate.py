@@ -1,42 +1,88 @@
-"""Make semloc_logs/closures/calibration.json again: python benchmarks/calibrate.py DIR [EVERY]."""
+"""Make semloc_logs/closures/calibration.json again, from towns that no training has seen.
+
+    python benchmarks/calibrate.py collect DIR [--drives FOLDER] [--only TOWN]... [--jobs N]    simulate, ask, judge; resumes
+    python benchmarks/calibrate.py fit DIR [--install]                                          fit and report; seconds
+
+Collecting writes DIR/TOWN/judged.parquet, all alignments of a town with their features and errors; fitting reads these alone. It writes
+DIR/calibration.json and DIR/reliability.png; --install also replaces the calibration of the package.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 from pathlib import Path
 
-import numpy as np
+from towns import Place, Town, collect
 
+import semloc_logs.closures
 from semloc_logs.engines import make_engine
 from semloc_logs.engines.engine import single_threaded
-from semloc_logs.evaluation.calibration import TOWNS, calibrate, collect, reliability, simulate_towns
-from semloc_logs.settings import load
-from semloc_logs.stages import describe, fuse
-from semloc_logs.workspace import Workspace
+from semloc_logs.evaluation.calibration import calibration_json, fit, read_judged, recall_at, reliability
+from semloc_logs.evaluation.reliability_picture import draw_reliability
+
+LATER = ("summer", "autumn", "snow")
+TOWNS = (
+    Town("drawn", 1, noise=0.12, seasons=LATER),
+    Town("geometry", 2, ("hdl64",), "geometry", roadworks=4.0),
+    Town("repeating", 3, noise=0.05, repeating=True),
+    Town("sparse", 4, ("vlp16",), noise=0.12, seasons=LATER, drift=0.015),
+    Town("repeating-geometry", 5, ("hdl64",), "geometry", repeating=True),
+    Town("stereo", 6, ("stereo",), noise=0.12),
+    Town("there-and-back", 7, ("hdl64",), noise=0.08, trajectory="00", start=300.0, seasons=("summer", "snow"), length=160.0),
+    Town("mixed", 8, ("depth", "hdl32"), noise=0.08, sessions=2),
+    Town("repeating-sparse", 9, ("vlp16",), noise=0.12, repeating=True, drift=0.015),
+    Town("uniform", 10, ("hdl32",), "uniform"),
+    Town("there-and-back-geometry", 11, ("hdl32",), "geometry", trajectory="05", start=200.0, length=160.0),
+    Town("stereo-lidar", 12, ("stereo", "vlp32"), noise=0.12, sessions=2),
+    Town("repeating-uniform", 13, ("vlp32",), "uniform", repeating=True),
+    Town("repeating-stereo", 14, ("stereo", "hdl32"), "geometry", repeating=True, sessions=2),
+    Town("long", 15, noise=0.12, seasons=("summer", "winter"), length=260.0, sessions=2),
+)
+
+
+def ask(args: argparse.Namespace) -> None:
+    """Simulate, fuse, describe, ask and judge the towns that have no table yet."""
+    single_threaded()
+    place = Place(args.dir, make_engine("processes", args.jobs), args.drives)
+    collect(place, [town for town in TOWNS if not args.only or town.name in args.only], verbose=args.verbose)
+    place.engine.close()
+
+
+def report(args: argparse.Namespace) -> None:
+    """Fit both models; what is printed and drawn is of towns that the models have not seen."""
+    judged = read_judged(sorted(args.dir.glob("*/judged.parquet")))
+    fitted = fit(judged)
+    content = json.dumps(calibration_json(judged, fitted), indent=1) + "\n"
+    (args.dir / "calibration.json").write_text(content)
+    print(content)
+    for name, p in (("alone", fitted.alone), ("with neighbours", fitted.probability)):
+        print(f"{name}, of towns not seen:")
+        for line in (*reliability(p[judged.clear], judged.right[judged.clear]), *recall_at(judged, p)):
+            print("  " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
+    curves = {"alone": fitted.alone, "with neighbours": fitted.probability}
+    draw_reliability(args.dir / "reliability.png", {n: reliability(p[judged.clear], judged.right[judged.clear]) for n, p in curves.items()})
+    if args.install:
+        (Path(semloc_logs.closures.__file__).parent / "calibration.json").write_text(content)
 
 
 def main() -> None:
-    """Simulate, fuse, describe, ask every EVERY-th query, fit, print; what is done already is kept."""
-    folder, every = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 4
-    single_threaded()
-    engine, work = make_engine("processes"), Workspace(folder / "work")
-    logs = simulate_towns(folder)
-    sources = {str(town.seed): town.label_source for town in TOWNS}
-    for source in sorted(set(sources.values())):
-        mine = {name: [log] for name, log in logs.items() if sources[name.split("_")[0]] == source}
-        fuse(mine, work, load(assignments={"labels.source": source}).resolved(), {}, engine, print)
-    settings = load().resolved()
-    describe(work, [], settings, engine, print)
-    rows = collect(work, logs, settings, engine.map, every)
-    content = calibrate(rows)
-    (folder / "calibration.json").write_text(json.dumps(content, indent=1) + "\n")
-    print(json.dumps(content, indent=1))
-    for line in reliability(rows):  # under the calibration in the package, not under the new one
-        print(line)
-    nees = [r.nees for r in rows if r.right]
-    engine.close()
-    print("NEES of right alignments (6 degrees of freedom): median", np.median(nees) if nees else None)
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    first = commands.add_parser("collect")
+    first.add_argument("dir", type=Path)
+    first.add_argument("--drives", type=Path, help="folder of kitti_00.txt and kitti_05.txt; without it their towns are left out")
+    first.add_argument("--only", action="append", metavar="TOWN")
+    first.add_argument("--jobs", type=int, default=1)
+    first.add_argument("--verbose", action="store_true")
+    first.set_defaults(run=ask)
+    second = commands.add_parser("fit")
+    second.add_argument("dir", type=Path)
+    second.add_argument("--install", action="store_true")
+    second.set_defaults(run=report)
+    args = parser.parse_args()
+    args.run(args)
 
 
 if __name__ == "__main__":

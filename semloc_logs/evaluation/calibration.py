@@ -1,144 +1,247 @@
-"""How probable is it that an alignment is right? Learnt from queries in simulated towns, of which most have never been visited.
+"""How probable is it that an alignment is right? Learnt from queries in simulated towns, of which many have never been visited.
 
-Several towns are driven twice each, under other parked cars and with a network's label errors; every query is put to every session, so
-that streets that were never seen are asked about far more often than streets that were. A logistic model of the features of the
-best and of the rejected alignments gives the probability.
+Every town is judged against its truth into a table of its own; the two logistic models of the acceptance are fitted on all of them. What
+is reported is said of each town by models that never saw it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import fit_logistic
-from semloc_logs.closures.closing import Alignment, CloseTask, close_queries
-from semloc_logs.closures.queries import SessionMap, query_keyframes
-from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, TrueTrack, read_tum
-from semloc_logs.geometry import inverse, rotation_angle
-from semloc_logs.settings import Settings
-from semloc_logs.simulation.sessions import simulate_sessions
+from semloc_logs.closures.acceptance import TOGETHER, Calibration, Model, fit_logistic, together_values
+from semloc_logs.closures.agreement import Placed, agree, strays
+from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.results import keyframe_at
+from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, judge_closure, read_truth
+from semloc_logs.tables import read_metadata, read_table, write_table
+from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
-Map = Callable[[Callable[[CloseTask], list[list[Alignment]]], Iterable[CloseTask]], Iterator[list[list[Alignment]]]]
+Bools = NDArray[np.bool_]
 
-
-@dataclass(frozen=True, slots=True)
-class Town:
-    """One simulated town: ``label_source`` as the setting, ``sensor`` a name of the simulator's models."""
-
-    seed: int
-    sensor: str
-    label_noise: float
-    label_source: str
-
-
-TOWNS = (
-    Town(201, "hdl32", 0.12, "auto"),
-    Town(202, "hdl64", 0.0, "geometry"),
-    Town(203, "hdl32", 0.12, "auto"),
-    Town(204, "vlp32", 0.12, "geometry"),
-)
-LENGTH = 260.0  # of each drive (m)
-
-
-def simulate_towns(folder: Path, towns: Sequence[Town] = TOWNS) -> dict[str, Path]:
-    """Two drives through each town, by session name SEED_NUMBER; what is there already is kept."""
-    out: dict[str, Path] = {}
-    for town in towns:
-        place = folder / str(town.seed)
-        if not (place / "truth.json").exists():
-            simulate_sessions(
-                place, seed=town.seed, sessions=2, length_m=LENGTH, sensor=town.sensor, label_noise=town.label_noise, overwrite=True
-            )
-        out |= {f"{town.seed}_{k}": place / f"session_{k}.mcap" for k in range(2)}
-    return out
+# The sign with which evidence may count. The plane distances of fitting points (rmse) say more about the sensor than about the place.
+SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0, "distinct": -1, "support": 1, "stiffness": 1}
+TOGETHER_SIGNS = dict(zip(TOGETHER, (1, 1, 1, -1, 1, -1, -1), strict=True))
+EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
+THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """An alignment with its errors; infinite where the two sessions are of different towns."""
+    """Alignments (n) of several towns: ``features`` (n, 8), where they lie (``alone`` there is whatever the caller says), whether they
+    are ``right`` (n,), and their errors (n,) in metres and degrees."""
 
-    alignment: Alignment
-    error_m: float
-    error_deg: float
-    nees: float  # squared error over the covariance, 6 degrees of freedom
+    town: NDArray[np.object_]
+    features: F64
+    placed: Placed
+    right: Bools
+    error_m: F64
+    error_deg: F64
+    voxel_size: float
 
     @property
-    def right(self) -> bool:
-        return self.error_m <= CORRECT_M and self.error_deg <= CORRECT_DEG
+    def clear(self) -> Bools:
+        """Right, or wrong by three times the bounds (n,): what is in between teaches neither side."""
+        return np.asarray(self.right | (self.error_m > 3 * CORRECT_M) | (self.error_deg > 3 * CORRECT_DEG))
+
+    def __len__(self) -> int:
+        return len(self.town)
 
 
-def judge(a: Alignment, query: TrueTrack, target: TrueTrack) -> Judged:
-    """Errors of an alignment between sessions of one town."""
-    q = query.at(np.array([a.query_stamp_ns]))[0][0]
-    t = target.at(np.array([a.target_stamp_ns]))[0][0]
-    true = inverse(t) @ q
-    turn = a.target_T_query[:3, :3] @ true[:3, :3].T
-    x = np.r_[a.target_T_query[:3, 3] - true[:3, 3], Rotation.from_matrix(turn).as_rotvec()]
-    nees = float(x @ np.linalg.solve(a.covariance, x))
-    return Judged(a, float(np.linalg.norm((inverse(true) @ a.target_T_query)[:3, 3])), float(np.degrees(rotation_angle(turn))), nees)
+def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
+    """All alignments of a workspace whose closures were made with ``closures.min_probability=1``, judged, as the table ``output``.
+
+    Columns: those of rejected.parquet without the neighbours, and town, query, road, target_road, own_* and at_* (the query in its own
+    map by odometry, in the target's by alignment), error_m, error_deg, right.
+    """
+    maps = {f.name: SessionMap(f) for f in work.sessions()}
+    tracks = read_truth(truth, maps)
+    table = read_table(work.rejected)
+    rows = table.to_pylist()
+    judged = [judge_closure(row, tracks) for row in rows]
+    ends = [
+        (q, keyframe_at(q, row["query_stamp_ns"]), t, keyframe_at(t, row["target_stamp_ns"]))
+        for row, q, t in ((row, maps[row["query_session"]], maps[row["target_session"]]) for row in rows)
+    ]
+    found = poses_of(table)
+    own = np.array([q.map_T_base[k] for q, k, _, _ in ends]).reshape(-1, 4, 4)
+    at = np.array([t.map_T_base[k] @ T for (_, _, t, k), T in zip(ends, found, strict=True)]).reshape(-1, 4, 4)
+    columns: dict[str, Any] = {
+        "town": [town] * len(rows),
+        "query": [k for _, k, _, _ in ends],
+        "road": [float(q.distance[k]) for q, k, _, _ in ends],
+        "target_road": [float(t.distance[k]) for _, _, t, k in ends],
+        "error_m": [j.error_m for j in judged],
+        "error_deg": [j.error_deg for j in judged],
+        "right": [j.correct for j in judged],
+    }
+    columns |= {f"own_{i}{j}": own[:, i, j] for i in range(3) for j in range(4)} | {
+        f"at_{i}{j}": at[:, i, j] for i in range(3) for j in range(4)
+    }
+    kept = ["query_session", "target_session", "query_stamp_ns", "target_stamp_ns", "probability", "reason", "sigma", *FEATURES]
+    metadata = {k: read_metadata(work.rejected).get(k) for k in ("voxel_size", "queries")} | {"town": town}
+    write_table(output, pa.table({n: table[n] for n in kept} | columns), metadata)
 
 
-def collect(work: Workspace, logs: dict[str, Path], settings: Settings, run: Map, every: int) -> list[Judged]:
-    """All alignments of every ``every``-th query of every session with every other session; ``run`` is an engine's ``map``."""
-    tracks = {name: read_tum(log.with_suffix(".tum")) for name, log in logs.items()}
-    tasks = []
-    for name in logs:
-        keyframes = query_keyframes(SessionMap(work.session(name)), settings)[::every]
-        others = tuple(sorted(n for n in logs if n != name))
-        tasks += [CloseTask(work.path.absolute(), name, (k,), others, settings.model_dump_json()) for k in keyframes]
-    out = []
-    for task, results in zip(tasks, run(close_queries, tasks), strict=True):
-        for a in results[0]:
-            same_town = a.target_session.split("_")[0] == task.session.split("_")[0]
-            wrong = Judged(a, np.inf, 180.0, np.inf)
-            out.append(judge(a, tracks[a.query_session], tracks[a.target_session]) if same_town else wrong)
-    return out
+def read_judged(paths: Sequence[Path]) -> Judged:
+    """The tables of several towns."""
+    table = pa.concat_tables([read_table(path) for path in paths])
+    table = table.filter(table["right"].is_valid())
+    column = {name: table[name].to_numpy() for name in table.column_names if name not in ("town", "query_session", "target_session")}
+
+    def poses(prefix: str) -> F64:
+        out = np.tile(np.eye(4), (len(table), 1, 1))
+        for i in range(3):
+            for j in range(4):
+                out[:, i, j] = column[f"{prefix}_{i}{j}"]
+        return out
+
+    names = {name: np.array(table[name].to_pylist(), object) for name in ("town", "query_session", "target_session")}
+    placed = Placed(
+        names["query_session"],
+        names["target_session"],
+        column["query"],
+        column["road"],
+        column["target_road"],
+        poses("own"),
+        poses("at"),
+        column["sigma"],
+        column["probability"],
+        np.ones(len(table), bool),
+    )
+    right = column["right"].astype(bool)
+    features = np.stack([column[n] for n in FEATURES], axis=1)
+    return Judged(
+        names["town"], features, placed, right, column["error_m"], column["error_deg"], float(read_metadata(paths[0])["voxel_size"])
+    )
 
 
-# The sign with which evidence may count. The plane distances of fitting points (rmse) say more about the sensor than about the place.
-SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0, "distinct": -1, "support": 1, "stiffness": 1}
+# -- fitting
 
 
-def calibrate(rows: Sequence[Judged], ridge: float = 0.3) -> dict[str, Any]:
-    """The content of calibration.json from judged alignments; alignments between 1 and 3 metres off teach neither side.
+def fit_signed(x: F64, right: Bools, signs: Sequence[int], ridge: float = 0.3) -> Calibration:
+    """A logistic model of ``right`` (n,) on ``x`` (n, d) whose weights have the ``signs``.
 
     Features whose weight would have the wrong sign are left out one by one: in few towns they stand for something else.
     """
-    clear = [r for r in rows if r.right or r.error_m > 3 * CORRECT_M or r.error_deg > 3 * CORRECT_DEG]
-    x = np.array([[getattr(r.alignment.features, n) for n in FEATURES] for r in clear])
-    right = np.array([r.right for r in clear])
     low, high = np.quantile(x, 0.01, axis=0), np.quantile(x, 0.99, axis=0)
-    signs = np.array([SIGNS[n] for n in FEATURES])
-    used = np.flatnonzero(signs)
-    while True:
-        fitted, bias = fit_logistic(np.clip(x, low, high)[:, used], right, ridge)
-        strength = fitted * signs[used] * x[:, used].std(0)
-        if len(used) == 1 or strength.min() > 0:
+    clipped, sign = np.clip(x, low, high), np.array(signs)
+    used = np.flatnonzero(sign)
+    weights, bias = np.zeros(x.shape[1]), 0.0
+    while len(used):
+        fitted, bias = fit_logistic(clipped[:, used], right, ridge)
+        strength = fitted * sign[used] * clipped[:, used].std(0)
+        if strength.min() >= 0:
+            weights[used] = fitted
             break
         used = np.delete(used, int(np.argmin(strength)))
-    weights = np.zeros(len(FEATURES))
-    weights[used] = fitted
-    features = {
-        n: {"weight": round(float(weights[i]), 4), "low": round(float(low[i]), 4), "high": round(float(high[i]), 4)}
-        for i, n in enumerate(FEATURES)
-    }
-    return {"bias": round(bias, 4), "features": features, "alignments": len(clear), "right": int(right.sum())}
+    return Calibration(tuple(weights.tolist()), tuple(low.tolist()), tuple(high.tolist()), bias)
 
 
-def reliability(rows: Sequence[Judged], edges: Sequence[float] = (0.0, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0)) -> list[dict[str, float]]:
-    """How often alignments of each range of probability are right."""
-    p = np.array([r.alignment.probability for r in rows])
-    right = np.array([r.right for r in rows])
+def fit_alone(judged: Judged, rows: Bools) -> Calibration:
+    """The model of an alignment's own features, from the clear ones among ``rows`` (n,)."""
+    rows = rows & judged.clear
+    return fit_signed(judged.features[rows], judged.right[rows], [SIGNS[n] for n in FEATURES])
+
+
+def fit_together(judged: Judged, columns: Sequence[F64], rows: Bools) -> Calibration:
+    """The model of the agreement's ``columns`` (7, n), from the clear ones that have neighbours among ``rows`` (n,)."""
+    rows = rows & judged.clear & (columns[1] > 0)
+    return fit_signed(together_values(columns)[rows], judged.right[rows], [TOGETHER_SIGNS[n] for n in TOGETHER])
+
+
+def agreement_of(judged: Judged, alone: F64) -> list[F64]:
+    """The columns (7, n) of the agreement within each town, when alignments have the probabilities ``alone`` (n,) by themselves."""
+    out = [np.zeros(len(judged)) for _ in range(7)]
+    for town in sorted(set(judged.town)):
+        mine = np.flatnonzero(judged.town == town)
+        part = replace(judged.placed.part(mine), alone=alone[mine])
+        for column, values in zip(out, agree(part, judged.voxel_size), strict=True):
+            column[mine] = values
+    return out
+
+
+def decided_by(model: Model, judged: Judged) -> F64:
+    """The probabilities (n,) that the acceptance gives with ``model``."""
+    p = model.decided(agreement_of(judged, model.alone.probability(judged.features)))
+    return np.where(strays(judged.placed, judged.voxel_size), 0.0, p)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """The model of all towns; and what models that had not seen a town said of it: ``alone`` and ``probability`` (n,)."""
+
+    model: Model
+    alone: F64
+    probability: F64
+
+
+def fit(judged: Judged) -> Fitted:
+    """Fit both models, and each of them without each town in turn.
+
+    The second one learns from what the first one said of towns it had not seen. Where the held-out log-odds turn out too sure (Platt,
+    Probabilistic outputs for support vector machines, 1999), both models are tempered.
+    """
+    towns = sorted(set(judged.town))
+    kept = ~strays(judged.placed, judged.voxel_size)
+    held = {town: judged.town == town for town in towns}
+    alone = np.zeros(len(judged))
+    for mine in held.values():
+        alone[mine] = fit_alone(judged, ~mine & kept).probability(judged.features[mine])
+    own = fit_alone(judged, kept)
+    tempered = _temper(own, alone, judged, kept)
+    alone = _tempered(alone, own, tempered)
+    columns = agreement_of(judged, alone)
+    probability = np.zeros(len(judged))
+    for mine in held.values():
+        model = Model(tempered, fit_together(judged, columns, ~mine & kept))
+        probability[mine] = model.decided([c[mine] for c in columns])
+    whole = fit_together(judged, columns, kept)
+    together = _temper(whole, probability, judged, kept & (columns[1] > 0))
+    probability = np.where(columns[1] > 0, _tempered(probability, whole, together), probability)
+    probability[~kept] = 0.0
+    return Fitted(Model(tempered, together), alone, probability)
+
+
+def _log_odds(p: F64) -> F64:
+    p = np.clip(p, 1e-9, 1 - 1e-9)
+    return np.asarray(np.log(p / (1 - p)))
+
+
+def _temper(model: Calibration, held_out: F64, judged: Judged, rows: Bools) -> Calibration:
+    """``model`` with its log-odds scaled by at most one and moved, so that the ``held_out`` probabilities (n,) of ``rows`` would fit."""
+    rows = rows & judged.clear
+    scale, shift = fit_logistic(_log_odds(held_out[rows])[:, None], judged.right[rows], 1e-3)
+    if scale[0] >= 1:
+        return model
+    factor = max(float(scale[0]), 0.3)
+    return replace(model, weights=tuple(factor * w for w in model.weights), bias=factor * model.bias + shift)
+
+
+def _tempered(p: F64, before: Calibration, after: Calibration) -> F64:
+    """Probabilities of models like ``before``, tempered as ``after`` is."""
+    k = int(np.argmax(np.abs(before.weights)))
+    if before == after or before.weights[k] == 0:
+        return p
+    factor = after.weights[k] / before.weights[k]
+    return np.asarray(1 / (1 + np.exp(-(factor * _log_odds(p) + after.bias - factor * before.bias))))
+
+
+# -- what is reported
+
+
+def reliability(p: F64, right: Bools, edges: Sequence[float] = EDGES) -> list[dict[str, float]]:
+    """How often alignments of each range of probability ``p`` (n,) are right."""
     out = []
     for a, b in pairwise(edges):
         mine = (p >= a) & ((p < b) | (b == edges[-1]))
@@ -147,3 +250,38 @@ def reliability(rows: Sequence[Judged], edges: Sequence[float] = (0.0, 0.1, 0.5,
                 {"from": a, "to": b, "alignments": int(mine.sum()), "said": float(p[mine].mean()), "right": float(right[mine].mean())}
             )
     return out
+
+
+def recall_at(judged: Judged, p: F64, thresholds: Sequence[float] = THRESHOLDS) -> list[dict[str, float]]:
+    """For each threshold: accepted and false closures, and the share accepted of the queries that have a right alignment with a target.
+
+    Of a query and a target only the most probable alignment can be accepted.
+    """
+    placed = judged.placed
+    best: dict[tuple[Any, ...], int] = {}
+    possible: set[tuple[Any, ...]] = set()
+    for k, key in enumerate(zip(judged.town, placed.query_session, placed.query.tolist(), placed.target_session, strict=True)):
+        if key not in best or p[k] > p[best[key]]:
+            best[key] = k
+        if judged.right[k]:
+            possible.add(key)
+    chosen = np.array(sorted(best.values()), int)
+    out = []
+    for least in thresholds:
+        accepted = chosen[p[chosen] >= least]
+        right = int(judged.right[accepted].sum())
+        row = {"threshold": least, "accepted": len(accepted), "false": len(accepted) - right, "possible": len(possible)}
+        out.append(row | {"recall": right / max(len(possible), 1)})
+    return out
+
+
+def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
+    """The content of calibration.json: two logistic models, each of named features clipped to low .. high, and what they are made from."""
+    return {
+        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature, 'together' where a query has neighbours",
+        "alone": fitted.model.alone.to_json(FEATURES),
+        "together": fitted.model.together.to_json(TOGETHER),
+        "towns": len(set(judged.town)),
+        "alignments": int(judged.clear.sum()),
+        "right": int((judged.right & judged.clear).sum()),
+    }

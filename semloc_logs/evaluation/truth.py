@@ -128,7 +128,7 @@ def evaluate_closures(work: Workspace, truth: Path, settings: Settings, *, self_
     settings = _settings_of(work, settings.resolved())
     sessions = {f.name: SessionMap(f) for f in work.sessions()}
     tracks = read_truth(truth, sessions)
-    rows = [_judge(row, tracks) for row in read_closures(work.closures)]
+    rows = [judge_closure(row, tracks) for row in read_closures(work.closures)]
     queries, possible, answered = _count_queries(sessions, tracks, rows, settings, self_closures)
     return Evaluation(rows, queries, possible, answered)
 
@@ -145,7 +145,8 @@ def _settings_of(work: Workspace, settings: Settings) -> Settings:
     return settings.model_copy(update=update)
 
 
-def _judge(row: Mapping[str, Any], tracks: Mapping[str, TrueTrack]) -> Judged:
+def judge_closure(row: Mapping[str, Any], tracks: Mapping[str, TrueTrack]) -> Judged:
+    """A row of closures.parquet or rejected.parquet against the true tracks of its sessions."""
     ends = [_pose(tracks.get(row[f"{end}_session"]), row[f"{end}_stamp_ns"]) for end in ("query", "target")]
     error_m = error_deg = correct = None
     if ends[0] is not None and ends[1] is not None:

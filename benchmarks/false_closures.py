@@ -1,0 +1,165 @@
+"""False closures at the defaults: thousands of queries in towns that look alike, and all pairs of recorded logs.
+
+    python benchmarks/false_closures.py towns DIR [--queries 5000] [--jobs N]     simulate, ask, judge; resumes
+    python benchmarks/false_closures.py logs DIR LOGS [--small NAME]... [--jobs N]
+
+Two of three towns are cities whose blocks are copies of one another. Their tables DIR/TOWN/judged.parquet hold features, so after a new
+calibration the same command counts again without asking again. LOGS is a folder of logs, with *_truth.json for those whose truth is known
+(those of one file are of one place; a closure between logs of different places is false). Each pair is asked with the labels of the log,
+with those from geometry and without any.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import json
+from collections.abc import Mapping
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from towns import Place, Town, collect
+
+from semloc_logs.closures.acceptance import shipped
+from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.results import read_closures
+from semloc_logs.engines import Engine, make_engine
+from semloc_logs.engines.engine import single_threaded
+from semloc_logs.evaluation.calibration import decided_by, read_judged, recall_at
+from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
+from semloc_logs.settings import load
+from semloc_logs.stages import close, describe, fuse, session_name
+from semloc_logs.tables import read_metadata
+from semloc_logs.workspace import Workspace
+
+SENSORS = ("hdl32", "hdl64", "vlp16", "hdl32", "stereo")
+LABELS = ("auto", "geometry", "auto", "uniform")
+SOURCES = ("auto", "geometry", "uniform")  # auto: labels of the log, where it has any
+SMALL = ("room_*", "euroc_*")
+LEAST = 0.99
+
+
+def towns() -> list[Town]:
+    """Sixty short-driven towns, so that many streets of each are never seen by the other drives."""
+    drawn = zip(range(60), cycle(SENSORS), cycle(LABELS), strict=False)
+    return [
+        Town(f"{k:02d}", 100 + k, (sensor,), labels, noise=0.1, repeating=k % 3 > 0, sessions=4, length=160.0)
+        for k, sensor, labels in islice(drawn, 60)
+    ]
+
+
+def ask_towns(args: argparse.Namespace) -> None:
+    """Ask, then count under the calibration of the package."""
+    place = Place(args.dir, make_engine("processes", args.jobs))
+    paths = collect(place, towns(), args.queries, args.verbose)
+    place.engine.close()
+    judged = read_judged(paths)
+    p = decided_by(shipped(), judged)
+    print(f"{sum(read_metadata(path)['queries'] for path in paths)} queries in {len(paths)} towns")
+    for line in recall_at(judged, p):
+        print("  " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
+    for k in np.flatnonzero(~judged.right & (p >= LEAST)):
+        ends = f"{judged.placed.query_session[k]} query {judged.placed.query[k]} in {judged.placed.target_session[k]}"
+        print(
+            f"  false: town {judged.town[k]}, {ends}, probability {p[k]:.4f}, {judged.error_m[k]:.1f} m, {judged.error_deg[k]:.0f} degrees"
+        )
+
+
+# -- recorded logs
+
+
+def logs_of(folder: Path) -> list[Path]:
+    """Every log of a folder."""
+    return sorted(p for p in folder.iterdir() if p.suffix in (".mcap", ".bag", ".db3") or (p / "metadata.yaml").exists())
+
+
+def ask_logs(args: argparse.Namespace) -> None:
+    """Every log against every other one, by label source: at 0.30 m voxels all of them, at 0.05 m the small ones."""
+    engine = make_engine("processes", args.jobs)
+    every = logs_of(args.logs)
+    small = [log for log in every if any(fnmatch.fnmatch(log.name, name) for name in args.small or SMALL)]
+    wrong = 0
+    for source in SOURCES:
+        for voxel, logs in ((0.30, every), (0.05, small)):
+            if len(logs) > 1:
+                work = Workspace(args.dir / f"{source}-{voxel:g}")
+                ask_pairs(work, logs, {"labels.source": source, "fusion.voxel_size": str(voxel)}, engine)
+                wrong += count_pairs(work, args.logs, f"{source}, {voxel:g} m")
+    engine.close()
+    print(f"{wrong} false closures")
+
+
+def ask_pairs(work: Workspace, logs: list[Path], assignments: dict[str, str], engine: Engine) -> None:
+    """Fuse, describe and close; a log that cannot be fused is named and left out."""
+    settings = load(assignments=assignments).resolved()
+
+    def note(said: str) -> None:
+        print(f"  {said}", flush=True)
+
+    report = fuse({session_name(log): [log] for log in logs}, work, settings, {}, engine, note)
+    for failed in report.failed:
+        print(f"  left out: {failed}")
+    describe(work, [], settings, engine, note)
+    close(work, [], [], settings, engine, note)
+
+
+def count_pairs(work: Workspace, logs: Path, title: str) -> int:
+    """Print the closures of each pair of sessions with their errors; how many are false."""
+    sessions = {f.name: SessionMap(f) for f in work.sessions()}
+    place, tracks = places(logs, sessions)
+    pairs: dict[tuple[str, str], list[Any]] = {}
+    for row in read_closures(work.closures):
+        pairs.setdefault((row["query_session"], row["target_session"]), []).append(row)
+    wrong = 0
+    print(f"{title}: {sum(map(len, pairs.values()))} closures of {len(sessions)} sessions")
+    for (query, target), rows in sorted(pairs.items()):
+        judged = [judge_closure(row, tracks) for row in rows]
+        if place.get(query, query) != place.get(target, target):
+            wrong += len(rows)
+            print(f"  {query} in {target}: {len(rows)} closures, all false: other places")
+            continue
+        false = sum(j.correct is False for j in judged)
+        errors = [j.error_m for j in judged if j.error_m is not None]
+        wrong += false
+        figures = f"error median {np.median(errors):.3f} m, worst {max(errors):.3f} m" if errors else "truth unknown"
+        print(f"  {query} in {target}: {len(rows)} closures, {false} false, {figures}")
+    return wrong
+
+
+def places(logs: Path, sessions: Mapping[str, SessionMap]) -> tuple[dict[str, Path], dict[str, TrueTrack]]:
+    """The truth file that knows each session, which stands for its place, and the true tracks."""
+    place: dict[str, Path] = {}
+    tracks: dict[str, TrueTrack] = {}
+    for truth in sorted(logs.glob("*_truth.json")):
+        if any(Path(name).stem in sessions or name in sessions for name in json.loads(truth.read_text())):
+            found = read_truth(truth, sessions)
+            place |= dict.fromkeys(found, truth)
+            tracks |= found
+    return place, tracks
+
+
+def main() -> None:
+    """The command line."""
+    single_threaded()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    first = commands.add_parser("towns")
+    first.add_argument("dir", type=Path)
+    first.add_argument("--queries", type=int, default=5000)
+    first.add_argument("--verbose", action="store_true")
+    first.set_defaults(run=ask_towns)
+    second = commands.add_parser("logs")
+    second.add_argument("dir", type=Path)
+    second.add_argument("logs", type=Path)
+    second.add_argument("--small", action="append", metavar="NAME", help="logs also asked at 0.05 m voxels; default room_* and euroc_*")
+    second.set_defaults(run=ask_logs)
+    for command in (first, second):
+        command.add_argument("--jobs", type=int, default=2)
+    args = parser.parse_args()
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()

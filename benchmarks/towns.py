@@ -1,0 +1,126 @@
+"""Simulated towns that no training has seen, as workspaces of a folder: simulated, fused, described and asked, each step once."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from semloc_logs.engines import Engine
+from semloc_logs.evaluation.calibration import judge_town, read_judged
+from semloc_logs.settings import Settings, load
+from semloc_logs.simulation.sessions import simulate_sessions
+from semloc_logs.stages import close, describe, fuse
+from semloc_logs.tables import read_metadata
+from semloc_logs.workspace import Workspace
+
+FIRST_SEED = 200  # training has the seeds below
+
+
+@dataclass(frozen=True, slots=True)
+class Town:
+    """A town of ``seed``, driven ``sessions`` times about ``length`` metres with each of the ``sensors``.
+
+    ``trajectory``: number of a recorded drive that the streets lie along, driven there and back. ``labels`` is the source of the classes.
+    """
+
+    name: str
+    seed: int
+    sensors: tuple[str, ...] = ("hdl32",)
+    labels: str = "auto"
+    noise: float = 0.0
+    drift: float = 0.007
+    seasons: tuple[str, ...] = ("summer",)
+    roadworks: float = 0.0
+    repeating: bool = False
+    trajectory: str = ""
+    start: float = 0.0
+    sessions: int = 3
+    length: float = 130.0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the towns of a benchmark live, who works, and the folder of recorded drives, if there is one."""
+
+    folder: Path
+    engine: Engine
+    drives: Path | None = None
+
+    def has(self, town: Town) -> bool:
+        """Whether the town can be built here."""
+        return not town.trajectory or (self.drives is not None and self._drive(town).exists())
+
+    def _drive(self, town: Town) -> Path:
+        return (self.drives or Path()) / f"kitti_{town.trajectory}.txt"
+
+    def _part(self, town: Town) -> Path:
+        """The driven part of a recorded drive as a file: streets along all of it would take minutes to build."""
+        lines = self._drive(town).read_text().splitlines()
+        at = np.array([[float(word) for word in line.split()] for line in lines])[:, [3, 11]]
+        away = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))]) - town.start
+        part = self.folder / town.name / "drive.txt"
+        part.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text("".join(f"{line}\n" for line, m in zip(lines, away, strict=True) if 0 <= m <= town.length))
+        return part
+
+    def simulate(self, town: Town) -> dict[str, Path]:
+        """Logs by session name, with truth.json for all of them; what is there already is kept."""
+        home, logs, truth = self.folder / town.name, {}, {}
+        for sensor in town.sensors:
+            place = home / sensor
+            if not (place / "truth.json").exists():
+                simulate_sessions(
+                    place,
+                    seed=FIRST_SEED + town.seed,
+                    sessions=town.sessions,
+                    length_m=town.length,
+                    sensor=sensor,
+                    trajectory=self._part(town) if town.trajectory else None,
+                    there_and_back=bool(town.trajectory),
+                    repeating=town.repeating,
+                    label_noise=town.noise,
+                    drift=town.drift,
+                    seasons=town.seasons,
+                    roadworks=town.roadworks,
+                    overwrite=True,
+                )
+            for k in range(town.sessions):
+                logs[f"{sensor}_{k}"] = place / f"session_{k}.mcap"
+                truth[f"{sensor}_{k}"] = {"trajectory": f"{sensor}/session_{k}.tum"}
+        (home / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
+        return logs
+
+    def ask(self, town: Town, settings: Settings, note: Callable[[str], None]) -> Workspace:
+        """The town's workspace with the closures of every session with every session."""
+        work = Workspace(self.folder / town.name / "work")
+        logs = self.simulate(town)
+        started = load(assignments={"labels.source": town.labels}).resolved()
+        fuse({name: [log] for name, log in logs.items()}, work, started, {}, self.engine, note)
+        describe(work, [], settings, self.engine, note)
+        close(work, [], [], settings, self.engine, note)
+        return work
+
+
+def collect(place: Place, towns: Sequence[Town], queries: float = math.inf, verbose: bool = False) -> list[Path]:
+    """Tables DIR/TOWN/judged.parquet of the towns that can be built, until ``queries`` have been asked; those there are kept."""
+    settings = load(assignments={"closures.min_probability": "1"}).resolved()  # all alignments are kept, with their features
+    mine, tables, asked = [town for town in towns if place.has(town)], [], 0
+    for number, town in enumerate(mine, 1):
+        if asked >= queries:
+            break
+        start, table = time.perf_counter(), place.folder / town.name / "judged.parquet"
+        if not table.exists():
+            work = place.ask(town, settings, lambda said: print(f"  {said}", flush=True) if verbose else None)
+            judge_town(work, table.with_name("truth.json"), town.name, table)
+        judged = read_judged([table])
+        asked += int(read_metadata(table)["queries"])
+        tables.append(table)
+        figures = f"{len(judged)} alignments, {int(judged.right.sum())} right, {asked} queries so far"
+        print(f"{number} of {len(mine)}: {town.name}: {figures}, {time.perf_counter() - start:.0f} s", flush=True)
+    return tables
