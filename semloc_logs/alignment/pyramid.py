@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.geometry import inverse, yaw_transform
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
+from semloc_logs.voxels.keys import BLOCK, unpack
 
 FREE_BIT = 128  # observed free and nothing occupied beside it
 ANY_BIT = 64  # occupied, unlabelled included
@@ -54,18 +55,6 @@ class Evidence:
         return Evidence(self.centres[picked], self.bits[picked], solid)
 
 
-def _dilate(mask: U8) -> U8:
-    out = mask.copy()
-    for axis in range(3):
-        grown = out.copy()
-        a, b = [slice(None)] * 3, [slice(None)] * 3
-        a[axis], b[axis] = slice(1, None), slice(None, -1)
-        grown[tuple(a)] |= out[tuple(b)]
-        grown[tuple(b)] |= out[tuple(a)]
-        out = grown
-    return out
-
-
 def class_bits(state: U8, coarse: U8) -> U8:
     """Bit mask of voxel states: 1 << coarse class, ``ANY_BIT`` with it, 0 where not occupied. ``coarse`` (256,) maps classes to 0..5."""
     table = np.zeros(256, np.uint8)
@@ -79,10 +68,27 @@ def build_level(blocks: BlockMap, voxel_size: float, coarse: U8) -> Level:
     """The masks of a map, with a margin that a search cannot leave."""
     low, high = blocks.bounds()
     margin = 2 * REACH
-    state = blocks.dense(low - margin, tuple((high - low + 2 * margin).tolist()))
-    mask = _dilate(class_bits(state, coarse))
-    mask[(state == FREE_STATE) & (mask == 0)] = FREE_BIT
+    mask = np.zeros(tuple((high - low + 2 * margin).tolist()), np.uint8)
+    at = unpack(blocks.keys).astype(np.int64) * BLOCK - low + margin
+    _fill(mask, at, blocks.state, class_bits(np.arange(256, dtype=np.uint8), coarse))
     return Level(mask, (low - margin).astype(float) * voxel_size, voxel_size)
+
+
+@njit(cache=True, nogil=True)
+def _fill(mask: U8, at: NDArray[np.int64], state: U8, bits: U8) -> None:
+    """Bits of the occupied voxels of blocks (n,) with their corner ``at`` (n, 3), in their cells and the 26 beside; then free cells."""
+    for want_free in (False, True):
+        for n in range(len(at)):
+            for m in range(state.shape[1]):
+                value = state[n, m]
+                x, y, z = at[n, 0] + m // BLOCK**2, at[n, 1] + m // BLOCK % BLOCK, at[n, 2] + m % BLOCK
+                if not want_free and bits[value]:
+                    for dx in range(-1, 2):
+                        for dy in range(-1, 2):
+                            for dz in range(-1, 2):
+                                mask[x + dx, y + dy, z + dz] |= bits[value]
+                elif want_free and value == FREE_STATE and mask[x, y, z] == 0:
+                    mask[x, y, z] = FREE_BIT
 
 
 @njit(cache=True, nogil=True)
@@ -105,9 +111,11 @@ def _rotated(level: U8, corner: F64, cell: float, centres: F64, bits: U8, pose: 
 def _add_hits(mask: U8, base: NDArray[np.int64], kept: U8, first: int, end: int, shift: int, lift: int, hits: NDArray[np.int64]) -> None:
     """Aligned voxels less those in free space, shifted by ``lift`` cells down, not at all, and up, added to ``hits`` (3,)."""
     down = same = up = 0
-    for n in range(first, end):
-        at, bit = base[n] + shift, kept[n]
-        below, here, above = mask[at - lift], mask[at], mask[at + lift]
+    a, b, c = shift - lift, shift, shift + lift
+    for n in range(np.uint64(first), np.uint64(end)):
+        at, bit = base[n], kept[n]
+        # unsigned: numba would make sure of every index that it is not counted from the end
+        below, here, above = mask[np.uint64(at + a)], mask[np.uint64(at + b)], mask[np.uint64(at + c)]
         down += int((below & bit) != 0) - int(below >= FREE_BIT)
         same += int((here & bit) != 0) - int(here >= FREE_BIT)
         up += int((above & bit) != 0) - int(above >= FREE_BIT)
@@ -204,8 +212,11 @@ def tau(
     if (low >= high).any():
         return 0.0, 0
     state = target.dense(low, tuple((high - low).tolist()))
-    offsets, length = _offsets(kappa / voxel_size)
-    found = _closest_observed(state, centres / voxel_size - low, offsets, length, kappa / voxel_size)
+    reach = kappa / voxel_size
+    margin = int(reach) + 2
+    offsets, length = _offsets(reach)
+    around = np.pad(state, margin, constant_values=UNOBSERVED_STATE)
+    found = _closest_observed(around, centres / voxel_size - low + margin, offsets, length, reach)
     table = np.arange(256, dtype=np.uint8) if coarse is None else coarse
     hit = (found != UNOBSERVED_STATE) & (found != FREE_STATE)
     aligned = hit & (table[found] == table[label])
@@ -225,22 +236,30 @@ def _offsets(reach: float) -> tuple[NDArray[np.int64], F64]:
 
 @njit(cache=True, nogil=True)
 def _closest_observed(state: U8, points: F64, offsets: NDArray[np.int64], length: F64, reach: float) -> U8:
-    """State of the observed cell whose centre is closest to each of ``points`` (n, 3), in cells; unobserved where none is within reach."""
+    """State of the observed cell whose centre is closest to each of ``points`` (n, 3), in cells; unobserved where none is within reach.
+
+    The grid has a margin of ``reach`` cells and two on all sides.
+    """
     out = np.full(len(points), UNOBSERVED_STATE, np.uint8)
     nx, ny, nz = state.shape
+    margin = int(reach) + 1
+    flat = state.ravel()
+    steps = (offsets[:, 0] * ny + offsets[:, 1]) * nz + offsets[:, 2]
     for n in range(len(points)):
         i, j, k = int(np.floor(points[n, 0])), int(np.floor(points[n, 1])), int(np.floor(points[n, 2]))
+        if min(i, j, k) < margin or i >= nx - margin or j >= ny - margin or k >= nz - margin:
+            continue  # farther from the map than it may be
         fx, fy, fz = points[n, 0] - i - 0.5, points[n, 1] - j - 0.5, points[n, 2] - k - 0.5
-        best = reach
-        for m in range(len(offsets)):
+        middle, best = (i * ny + j) * nz + k, reach
+        for m in range(len(steps)):
             if length[m] - HALF_DIAGONAL >= best:
                 break
-            x, y, z = i + offsets[m, 0], j + offsets[m, 1], k + offsets[m, 2]
-            if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz and state[x, y, z] != UNOBSERVED_STATE:
+            value = flat[np.uint64(middle + steps[m])]
+            if value != UNOBSERVED_STATE:
                 d = np.sqrt((offsets[m, 0] - fx) ** 2 + (offsets[m, 1] - fy) ** 2 + (offsets[m, 2] - fz) ** 2)
                 if d < best:
                     best = d
-                    out[n] = state[x, y, z]
+                    out[n] = value
     return out
 
 

@@ -7,7 +7,7 @@ what is neither ground nor able to drive away.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,10 +36,11 @@ from semloc_logs.voxels.selection import thin
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
-FIRST_VOXELS, SECOND_VOXELS = 200, 1200  # of a query that are looked up in a search
+FIRST_VOXELS, SECOND_VOXELS = 200, 800  # of a query that are looked up in a search
 FIRST_KEPT = 16  # hypotheses after the first search
 MOST_POINTS = 6000  # of a query that are fitted
-SOME_POINTS = 1500  # of them coarsely
+SOME_POINTS = 1000  # of them coarsely
+RIVAL_STRIDE = 3  # of the points that a rival is measured by, which stand for all
 COARSE_RADII, FINE_RADII = (3.0, 1.5), (0.7, 0.4)  # of correspondences, voxels
 
 
@@ -63,23 +64,11 @@ class Target:
         """Bit masks to look voxels up in."""
         return build_level(self.blocks, self.voxel_size, cityscapes().coarse)
 
-
-@dataclass(eq=False)
-class Surroundings:
-    """``points`` (n, 3) of a target around a place, as surfaces to align with; these are built when they are first asked for."""
-
-    points: F64
-    voxel_size: float
-
     @cached_property
-    def coarse(self) -> Surface:
-        """A point a voxel, in cells as large as the search may be off."""
-        return surface_of(thin_points(self.points, self.voxel_size), COARSE_RADII[0] * self.voxel_size)
-
-    @cached_property
-    def fine(self) -> Surface:
-        """All points, in cells of half a voxel."""
-        return surface_of(self.points, self.voxel_size / 2)
+    def surface(self) -> Surface:
+        """The centres of the occupied voxels, to align with to a fraction of a voxel."""
+        ijk, _ = self.blocks.occupied()
+        return surface_of((ijk + 0.5) * self.voxel_size, COARSE_RADII[0] * self.voxel_size)
 
 
 @dataclass(eq=False)
@@ -140,7 +129,7 @@ def search_hypotheses(
     found = _apart([(h, np.array(h.pose), 0.0) for h in hypotheses], 2 * v, len(hypotheses))
     for yaws, step, share, keep in (
         (turn * np.linspace(-0.8, 0.8, 5), 2, FIRST_VOXELS, FIRST_KEPT),
-        (turn * np.linspace(-0.3, 0.3, 7), 1, SECOND_VOXELS, most),
+        (turn * np.linspace(-0.3, 0.3, 5), 1, SECOND_VOXELS, most),
     ):
         some = query.evidence.first(share)
         moved = []
@@ -148,7 +137,7 @@ def search_hypotheses(
             score, better = search(targets[h.group].level, some, pose, yaws, step)
             moved.append((h, better, score))
         moved.sort(key=lambda m: (-m[2], m[0].group, tuple(m[1])))
-        found = _apart(moved, 2 * v, keep)
+        found = _apart(moved, 3.3 * v if step == 1 else 2 * v, keep)
     return [Candidate(h.group, pose_matrix(pose), score, h.votes) for h, pose, score in found]
 
 
@@ -197,23 +186,24 @@ def structure_scores(query: Query, target: Target, target_T_query: F64) -> tuple
     return float(aligned.sum() / max(seen.sum(), 1)), float(seen.mean()), float(free.mean()), int(aligned.sum())
 
 
-def coarse_fit(candidate: Candidate, around: Surroundings, query: Query) -> Fit:
-    """Align a candidate on some of the points, from three voxels down to one and a half."""
+def coarse_fit(candidate: Candidate, target: Target, query: Query) -> Fit:
+    """Align a candidate with the target's voxels on some of the points, from three voxels down to one and a half."""
     v, stride = query.voxel_size, max(1, len(query.points) // SOME_POINTS)
-    return align(query.points, around.coarse, candidate.target_T_query, tuple(Step(r * v, 8, stride) for r in COARSE_RADII))
+    return align(query.points, target.surface, candidate.target_T_query, tuple(Step(r * v, 4, stride) for r in COARSE_RADII))
 
 
-def fine_fit(start: F64, around: Surroundings, query: Query) -> Fit:
-    """Align to centimetres with a bounded number of the points."""
+def fine_fit(start: F64, surface: Surface, query: Query) -> Fit:
+    """Align to centimetres with a bounded number of the points; the ``surface`` has a point every 0.4 voxels."""
     v, stride = query.voxel_size, max(1, len(query.points) // MOST_POINTS)
-    first, last = (r * v for r in FINE_RADII)
-    return align(query.points, around.fine, start, (Step(first, 6, 3 * stride), Step(last, 10, 2 * stride), Step(last, 2, stride)))
+    middle, last = (r * v for r in FINE_RADII)
+    return align(query.points, surface, start, (Step(middle, 6, 3 * stride), Step(last, 10, 2 * stride), Step(last, 1, stride)))
 
 
-def measured(start: F64, around: Surroundings, query: Query) -> Fit:
+def measured(start: F64, surface: Surface, query: Query) -> Fit:
     """The fit of an alignment as it is, by the measure of a fine one."""
-    stride = max(1, len(query.points) // MOST_POINTS)
-    return align(query.points, around.fine, start, (Step(FINE_RADII[1] * query.voxel_size, 0, stride),))
+    stride = RIVAL_STRIDE * max(1, len(query.points) // MOST_POINTS)
+    fit = align(query.points, surface, start, (Step(FINE_RADII[1] * query.voxel_size, 0, stride),))
+    return replace(fit, information=RIVAL_STRIDE * fit.information)
 
 
 def thin_points(points: F64, cell: float) -> F64:

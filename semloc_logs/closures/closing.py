@@ -38,6 +38,7 @@ from semloc_logs.workspace import Workspace
 F64 = NDArray[np.float64]
 ALIGNED = 6  # candidates of a target session that are fitted on the points
 CLOSE = 0.9  # of the best score: what is worth a fine fit beside it
+HOPELESS = 0.3  # below this score nothing is right
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
@@ -182,13 +183,14 @@ def _align(
     fitted: list[Fitted] = []
     for c in candidates:
         near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
-        fit = coarse_fit(c, database.surface(c.group, near), query)
+        fit = coarse_fit(c, database.target(c.group), query)
         fitted.append((_score(query, database.target(c.group), fit), c, fit, near))
     best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
     fine = []
     for score, c, fit, near in best:
-        around = database.surface(c.group, near)
-        better = (fine_fit if score >= CLOSE * best[0][0] else measured)(fit.target_T_query, around, query)
+        # reading keyframes takes longer than fitting them: not for what can no longer be accepted, nor stand against it
+        surface = database.surface(c.group, near) if score >= HOPELESS else database.target(c.group).surface
+        better = (fine_fit if score >= max(CLOSE * best[0][0], HOPELESS) else measured)(fit.target_T_query, surface, query)
         fine.append((_score(query, database.target(c.group), better), c, better, near))
     fine = _distinct(fine, v)
     target = database.sessions[database.places[candidates[0].group].session] if fine else session

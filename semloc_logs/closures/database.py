@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.alignment.verify import Surroundings, Target, thin_points
+from semloc_logs.alignment.surface import Surface, surface_of
+from semloc_logs.alignment.verify import Target, thin_points
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import apply
 from semloc_logs.settings import Settings
@@ -160,14 +161,17 @@ class Database:
         track = self.sessions[self.places[group].session].map_T_base[seen, :3, 3]
         return int(seen[np.argmin(np.linalg.norm(track - position, axis=1))])
 
-    def surface(self, group: int, keyframe: int) -> Surroundings:
+    def surface(self, group: int, keyframe: int) -> Surface:
         """What the submap's keyframes around ``keyframe`` saw, as far along as a query is long, in the map frame, to align with."""
         place, seen = self.places[group], self.keyframes(group)
         session, query = self.sessions[place.session], self.settings.query
         radius = query.radius or 24.0
+        stretch = session.distance[seen] // (UNIT * self.settings.fusion.voxel_size)
+        together = seen[stretch == stretch[np.searchsorted(seen, keyframe)]]  # share one surface
+        middle = int(together[len(together) // 2])
 
-        def make() -> Surroundings:
-            away = np.linalg.norm(session.map_T_base[seen, :3, 3] - session.map_T_base[keyframe, :3, 3], axis=1)
+        def make() -> Surface:
+            away = np.linalg.norm(session.map_T_base[seen, :3, 3] - session.map_T_base[middle, :3, 3], axis=1)
             chosen = seen[np.argsort(away, kind="stable")[:SURFACE_KEYFRAMES]]
             along = seen[away <= (query.length or 0.0) / 2]
             if len(along) > len(chosen):
@@ -178,9 +182,9 @@ class Database:
                 frame = read_keyframe(session.folder.keyframes, i).near(session.origins[i], 1.2 * radius)
                 clouds.append(apply(session.map_T_base[i], frame.points))
             v = self.settings.fusion.voxel_size
-            return Surroundings(thin_points(np.concatenate(clouds), v / 2.5), v)
+            return surface_of(thin_points(np.concatenate(clouds), v / 2.5), 2 * v)
 
-        found: Surroundings = self._surfaces.get((group, keyframe, seen.tobytes()), make)
+        found: Surface = self._surfaces.get((group, middle, seen.tobytes()), make)
         return found
 
 
