@@ -36,7 +36,7 @@ from semloc_logs.voxels.selection import thin
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
-FIRST_VOXELS, SECOND_VOXELS = 200, 800  # of a query that are looked up in a search
+FIRST_VOXELS, SECOND_VOXELS = 200, 1200  # of a query that are looked up in a search
 FIRST_KEPT = 16  # hypotheses after the first search
 MOST_POINTS = 6000  # of a query that are fitted
 SOME_POINTS = 1000  # of them coarsely
