@@ -30,7 +30,6 @@ RATE = 1.5e-3
 BATCH_OF_RATE = 12  # a larger batch steps farther, with the square root as Adam wants it
 TEMPERATURE = 0.1
 MIN_OCCUPIED = 40
-FREEZE = 0.4  # of the steps: from then on batch normalisation uses its running statistics, as it will when it describes
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,10 +127,6 @@ def train(
     rate = optimiser.defaults["lr"] * math.sqrt(training.batch / BATCH_OF_RATE)
     model.train()
     for step, batch in enumerate(batches(shards, training, done, steps, device), start=done):
-        if step >= FREEZE * steps:
-            for part_of_model in model.modules():
-                if isinstance(part_of_model, (torch.nn.BatchNorm2d, torch.nn.BatchNorm3d)):
-                    part_of_model.eval()
         for group in optimiser.param_groups:
             group["lr"] = rate * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
         normal = np.random.default_rng((training.seed, 2, step)).standard_normal((training.batch, training.latent), np.float32)
