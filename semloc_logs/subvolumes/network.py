@@ -8,6 +8,7 @@ the paper: beside the contrastive term it costs a third of the recall.
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -60,43 +61,94 @@ def from_eights(cells: Tensor) -> Tensor:
     return cells.reshape(b, x, y, z, 2, 2, 2).permute(0, 1, 4, 2, 5, 3, 6).reshape(b, 2 * x, 2 * y, 2 * z)
 
 
+def _turned(base: Tensor, group_in: bool) -> Tensor:
+    """Filters (4 * out, 4 * in or in, x, y, z) of a layer that turns with its input, from ``base`` (out, [4,] in, x, y, z).
+
+    Output channel r * out + i is filter i turned by r quarter turns about z, which also turns what it expects of its input's channels
+    (Cohen and Welling 2016, the group p4).
+    """
+    turns = []
+    for r in range(4):
+        turned = torch.rot90(base, r, (-3, -2))
+        turns.append(turned.roll(r, 1).flatten(1, 2) if group_in else turned)
+    return torch.cat(turns)
+
+
+class _Turning(nn.Module):
+    """The parameters of one layer of the encoder: ``base`` filters for one heading and a ``bias`` that all headings share."""
+
+    def __init__(self, inputs: int, outputs: int, size: tuple[int, int, int], *, group_in: bool = True) -> None:
+        super().__init__()
+        self.group_in = group_in
+        shape = (outputs // 4, 4, inputs // 4) if group_in else (outputs // 4, inputs)
+        bound = 1 / math.sqrt(inputs * math.prod(size))  # as the library's own layers begin
+        self.base = nn.Parameter(torch.empty(*shape, *size).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(outputs // 4).uniform_(-bound, bound))
+
+    def filters(self) -> tuple[Tensor, Tensor]:
+        """Weight (outputs, inputs, x, y, z) and bias (outputs,) for all four headings."""
+        return _turned(self.base, self.group_in), self.bias.repeat(4)
+
+
 class Encoder(nn.Module):
     """Codes (b, x, y, 32) uint8 with a margin of 8 voxels in x and y -> mu (b, latent, (x - 40) / 8, (y - 40) / 8).
 
-    Output (i, j) describes the subvolume whose corner is voxel (8 + 8 i, 8 + 8 j, 0).
+    Output (i, j) describes the subvolume whose corner is voxel (8 + 8 i, 8 + 8 j, 0). A map turned by a quarter has the same descriptors,
+    turned by :func:`quarter_turns`.
     """
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
         super().__init__()
         self.variant, self.latent = variant, latent
         self.embedding = nn.Embedding(CLASSES[variant] + 3, EMBEDDING)
-        self.first = nn.Linear(8 * EMBEDDING, CHANNELS[0])
-        self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in pairwise(CHANNELS))
-        self.mean = nn.Conv2d(4 * CHANNELS[-1], latent, 4)  # the four layers of z as channels: four times as fast as in three dimensions
+        self.first = _Turning(EMBEDDING, CHANNELS[0], (2, 2, 2), group_in=False)
+        self.blocks = nn.ModuleList(_Turning(a, b, (3, 3, 3)) for a, b in pairwise(CHANNELS))
+        self.mean = _Turning(CHANNELS[-1], latent, (4, 4, 4))
         self.log_variance = nn.Linear(latent, latent)
+        self._kept: list[tuple[Tensor, Tensor]] = []
 
-    def first_block(self, codes: Tensor) -> Tensor:
+    def train(self, mode: bool = True) -> Encoder:
+        """As of any module; what was kept of the old weights is forgotten."""
+        self._kept = []
+        return super().train(mode)
+
+    def _layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights and biases of all layers as the kernels want them, made once where they do not change."""
+        if self._kept:
+            return self._kept
+        first, *rest = (layer.filters() for layer in (self.first, *self.blocks, self.mean))
+        layers = [(first[0].permute(0, 2, 3, 4, 1).flatten(1), first[1])]
+        layers += [(w.contiguous(memory_format=torch.channels_last_3d), b) for w, b in rest[:-1]]
+        w, b = rest[-1]  # the four layers of z as channels: four times as fast as in three dimensions
+        layers.append((w.permute(0, 4, 1, 2, 3).flatten(1, 2).contiguous(memory_format=torch.channels_last), b))
+        if not self.training and not torch.is_grad_enabled():
+            self._kept = layers
+        return layers
+
+    def first_block(self, codes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """Codes -> (b, 16, x / 2, y / 2, 16): one linear map of the embeddings of each 2x2x2 voxels, at a fraction of the cost of the
         paper's block, which convolves at full resolution."""
         device = codes.device.type
         reduced = torch.is_autocast_enabled(device)  # looked up in the precision of the convolutions: no copy of the volume
-        weight = self.embedding.weight.to(torch.get_autocast_dtype(device)) if reduced else self.embedding.weight
+        table = self.embedding.weight.to(torch.get_autocast_dtype(device)) if reduced else self.embedding.weight
         cells = in_eights(codes).int()
-        looked_up: Tensor = F.embedding(cells, weight) if codes.is_cuda else _LookUp.apply(cells, weight)  # type: ignore[no-untyped-call]
-        x: Tensor = self.first(looked_up.flatten(4))
+        looked_up: Tensor = F.embedding(cells, table) if codes.is_cuda else _LookUp.apply(cells, table)  # type: ignore[no-untyped-call]
+        x = F.linear(looked_up.flatten(4), weight, bias)
         return x.permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
 
     def forward(self, codes: Tensor) -> Tensor:
-        x = F.relu(self.first_block(codes))
-        for block in self.blocks:
-            x = F.relu(_halve(block(x)))  # ReLU before pooling, as in the paper, would cost eight times as much
-        return self.latent_mean(x[:, :, 1:-1, 1:-1])  # the pooled margin has served
-
-    def latent_mean(self, x: Tensor) -> Tensor:
-        """Features (b, 64, x, y, 4) at an eighth of the resolution -> mu (b, latent, x - 3, y - 3)."""
+        first, *blocks, mean = self._layers()
+        x = F.relu(self.first_block(codes, *first))
+        for weight, bias in blocks:
+            x = F.relu(_halve(F.conv3d(x, weight, bias, padding=1)))  # ReLU before pooling, as in the paper, would cost eight times as much
+        x = x[:, :, 1:-1, 1:-1]  # the pooled margin has served
         columns = x.permute(0, 2, 3, 4, 1).flatten(3).permute(0, 3, 1, 2)
-        mu: Tensor = self.mean(columns)
-        return mu
+        return F.conv2d(columns, *mean)
+
+
+def quarter_turns(descriptor: Tensor, turns: int) -> Tensor:
+    """What descriptors (n, latent) become when what they describe is turned by ``turns`` quarters about z, counter-clockwise."""
+    return descriptor.reshape(len(descriptor), 4, -1).roll(turns, 1).reshape(len(descriptor), -1)
 
 
 class Decoder(nn.Module):
