@@ -54,6 +54,12 @@ def yaw_transform(yaw: float, translation: Array | tuple[float, float, float] = 
     return out
 
 
+def turned_about_z(points: Array, yaw: Array) -> Array:
+    """Points (n, 3), each turned about +z by its own of ``yaw`` (n,)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1], points[:, 2]], 1)
+
+
 def exp_se3(t: Array, rotation_vector: Array) -> Array:
     """Left increment of a transform: translation ``t`` and ``Exp(rotation_vector)`` side by side (not the se(3) exponential)."""
     out = np.eye(4)

@@ -86,6 +86,7 @@ class Descriptor(_Section):
     variant: Literal["auto", "semantic", "geometric"] = Field(
         "auto", description="auto: semantic where labels come from a log, else geometric"
     )
+    headings: int = Field(20, ge=4, multiple_of=4, description="yaw hypotheses about gravity: maps are described in a quarter of them, the rest is free")
     stride: Literal[4, 8] = Field(4, description="database subvolumes every so many voxels in x and y (4 or 8)")
     query_stride: Literal[4, 8] = Field(8, description="query subvolumes every so many voxels in x and y (4 or 8)")
     reach: float | None = Field(None, description="database subvolumes lie this near to the road (m); default 30 m at 0.30 m voxels")
@@ -109,7 +110,6 @@ class Query(_Section):
 class Closures(_Section):
     """From word matches to accepted closures (paper 3.4, 3.5)."""
 
-    headings: int = Field(18, ge=1, description="yaw hypotheses about gravity")
     neighbours: int = Field(5, ge=1, description="nearest database words of each query word (K)")
     probes: int = Field(8, ge=1, description="nearest vocabulary cells searched for each query word")
     hypotheses: int = Field(96, ge=1, description="pooled hypotheses of a query that are verified")

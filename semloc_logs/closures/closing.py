@@ -27,11 +27,10 @@ from semloc_logs.alignment.verify import (
 from semloc_logs.closures.acceptance import Agreement, own_values, shipped
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.queries import SessionMap, build_query
-from semloc_logs.geometry import inverse
+from semloc_logs.geometry import inverse, turned_about_z
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.settings import STREET_VOXEL
-from semloc_logs.subvolumes.cut import turn
-from semloc_logs.subvolumes.describe import describe_map, load_encoder
+from semloc_logs.subvolumes.describe import describe_map, load_encoder, quarter_turns
 from semloc_logs.words.index import Allowed
 from semloc_logs.workspace import Workspace
 
@@ -137,21 +136,15 @@ def find_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
     parts: list[tuple[NDArray[np.int64], F64, F64, F64]] = []
     low, high = query.blocks.bounds()
     state = query.blocks.dense(low, tuple((high - low).tolist()))
-    half = -(-query.reach // 8) * 8 + 16
-    box = np.empty((2 * half, 2 * half, int(high[2] - low[2])), np.uint8)
-    middle = np.array([0.0, 0.0, (low[2] + high[2]) / 2])
     ground = float(session.ground_z[keyframe] - session.map_T_base[keyframe][2, 3])
     for variant, allowed in allowed_places(database, session).items():
         words, encoder = database.words(variant), load_encoder(variant, settings.descriptor.weights)
-        for heading in range(closures.headings):
-            yaw = 2 * np.pi * heading / closures.headings
-            turn(state, low.astype(np.int64), -yaw, middle, box)
-            corner = np.array([-half, -half, low[2]])
-            d = describe_map(box, corner, ground, v, encoder, settings.descriptor.query_stride, settings.descriptor.min_occupied)
-            m = words.search(d.descriptor, closures.neighbours, closures.probes, allowed)
-            if len(m.query):
-                shift = m.centre - d.centre[m.query] * v
-                parts.append((m.group, np.full(len(m.query), yaw), shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3))
+        d = describe_map(state, low, ground, v, encoder, settings.descriptor.query_stride, settings.descriptor.min_occupied)
+        for turns in range(4):
+            m = words.search(quarter_turns(d.descriptor, turns), closures.neighbours, closures.probes, allowed)
+            yaw = np.mod(m.yaw + turns * np.pi / 2, 2 * np.pi)
+            shift = m.centre - turned_about_z(d.centre[m.query].astype(float) * v, yaw)
+            parts.append((m.group, yaw, shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3))
     if not parts:
         return []
     group, yaws, shift, weight = (np.concatenate([p[k] for p in parts]) for k in range(4))
@@ -171,7 +164,7 @@ def verify_hypotheses(database: Database, query: Query, hypotheses: list[Hypothe
     for name in database.sessions:
         mine = [h for h in hypotheses if database.places[h.group].session == name]
         targets = {h.group: database.target(h.group) for h in mine}
-        out += search_hypotheses(mine, targets, query, database.settings.closures.headings, ALIGNED)
+        out += search_hypotheses(mine, targets, query, database.settings.descriptor.headings, ALIGNED)
     return out
 
 

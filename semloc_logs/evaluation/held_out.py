@@ -2,7 +2,7 @@
 
 What the retrieval benchmark asks. Databases are fused from a drive along each street in summer, by a camera that looks ahead and by a
 LIDAR. Queries are fused from one or five frames of another drive: another line in the lane, other parked cars and traffic; with the
-camera turned by 0, 90 or 180 degrees, or with the LIDAR in snow. Each query map is turned by the search's heading that is nearest to
+camera turned by 0, 90 or 180 degrees, or with the LIDAR in snow. Each query map is turned by the paper's heading that is nearest to
 the true one, of a frame of unknown heading, so that what is left is anything up to half a step. Streets are kept in a folder.
 """
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from semloc_logs import simulation
 from semloc_logs.errors import SettingsError, WorkspaceError
-from semloc_logs.evaluation.places import Place, Street, asked_place, map_place, read_street, write_street
+from semloc_logs.evaluation.places import HEADINGS, Place, Street, asked_place, map_place, read_street, write_street
 from semloc_logs.geometry import apply, inverse, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.camera import CAMERAS, camera_points
@@ -90,7 +90,7 @@ def held_out(
     Another version of the simulation has files of its own. SettingsError when so many cannot be had.
     """
     folder = folder / simulation_version()
-    note = {"schema_version": 1, "fusion": settings.fingerprint("fusion"), "headings": settings.closures.headings, "extent": repr(extent)}
+    note = {"schema_version": 1, "fusion": settings.fingerprint("fusion"), "headings": HEADINGS, "extent": repr(extent)}
     paths: list[Path] = []
     counts = dict.fromkeys(SENSORS, 0)
     for town in range(8):

@@ -21,6 +21,8 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
 
+HEADINGS = 18  # of the paper: a query comes turned by the nearest of them
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
@@ -49,11 +51,11 @@ def map_place(blocks: BlockMap, track: F64, ground_z: float, common_T_map: F64) 
 
 
 def asked_place(blocks: BlockMap, track: F64, ground_z: float, common_T_query: F64, settings: Settings) -> Place:
-    """A query map about the origin of its level frame, turned by that heading of the search that is nearest to the true one.
+    """A query map about the origin of its level frame, turned by that heading of the paper that is nearest to the true one.
 
     ``track`` (n, 3) and ``ground_z`` are in the query's frame, metres. ``settings`` are resolved.
     """
-    step = 2 * np.pi / settings.closures.headings
+    step = 2 * np.pi / HEADINGS
     yaw = step * round(float(np.arctan2(common_T_query[1, 0], common_T_query[0, 0])) / step)
     low, high = blocks.bounds()
     half = -(-int((settings.query.radius or 24.0) / settings.fusion.voxel_size + 16) // 8) * 8

@@ -53,7 +53,7 @@ def word_recall(
     Without a ``vocabulary`` one is trained on the database's own descriptors.
     """
     v = settings.fusion.voxel_size
-    parts = [describe_submap(target.folder, s["id"], s["ground_z"], target.road(s), encoder, settings) for s in target.submaps]
+    parts = [d for s in target.submaps for d in describe_submap(target.folder, s["id"], s["ground_z"], target.road(s), encoder, settings)]
     centre = np.concatenate([p.centre for p in parts]) * v
     descriptor = np.concatenate([p.descriptor for p in parts])
     place = query_place(query, keyframe, targetmap_T_querymap, settings)

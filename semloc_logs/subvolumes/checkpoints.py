@@ -79,9 +79,8 @@ def load_weights(build: Callable[[str, int], Network], part: str, variant: str, 
         else:
             with as_file(files("semloc_logs.subvolumes") / "weights" / f"{variant}.safetensors") as path:
                 tensors = load_file(path)
-        network = build(variant, len(tensors["encoder.mean.weight"]))
-        counters = {k: v for k, v in network.state_dict().items() if not v.is_floating_point()}  # of no use after training
-        network.load_state_dict(counters | {k.removeprefix(part): v.float() for k, v in tensors.items() if k.startswith(part)})
+        network = build(variant, len(tensors["encoder.log_variance.bias"]))
+        network.load_state_dict({k.removeprefix(part): v.float() for k, v in tensors.items() if k.startswith(part)})
     except (OSError, SafetensorError, KeyError, RuntimeError) as problem:
         said = str(problem).splitlines()[0]
         raise SettingsError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.settings import Settings
-from semloc_logs.subvolumes.describe import Described, describe_map
+from semloc_logs.subvolumes.describe import Described, describe_turned
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.voxels.store import blocks_path, read_blocks
 from semloc_logs.workspace import SessionFolder
@@ -34,14 +34,29 @@ class DescribeTask:
 
 
 def describe_submap(
-    folder: SessionFolder, submap: int, ground_z: float, road: NDArray[np.floating], encoder: Encoder, settings: Settings
-) -> Described:
-    """Centres (voxels) and descriptors of every described subvolume of a submap, near the keyframes' positions ``road`` (m, 2), metres."""
+    folder: SessionFolder,
+    submap: int,
+    ground_z: float,
+    road: NDArray[np.floating],
+    encoder: Encoder,
+    settings: Settings,
+    yaws: Sequence[float] = (0.0,),
+) -> list[Described]:
+    """Centres (voxels) and descriptors of every described subvolume of a submap, near the keyframes' positions ``road`` (m, 2), metres.
+
+    One set for each of ``yaws``, as a query at that heading sees the submap.
+    """
     blocks = read_blocks(blocks_path(folder.blocks, submap), with_votes=False)
     low, high = blocks.bounds()
     state = blocks.dense(low, tuple((high - low).tolist()))
     d = settings.descriptor
-    return describe_map(state, low, ground_z, settings.fusion.voxel_size, encoder, d.stride, d.min_occupied, road, d.reach or np.inf)
+    v, reach = settings.fusion.voxel_size, d.reach or np.inf
+    return [describe_turned(state, low, ground_z, v, encoder, d.stride, d.min_occupied, road, reach, yaw) for yaw in yaws]
+
+
+def known_headings(settings: Settings) -> list[float]:
+    """The yaws that maps are described at, within a quarter turn (rad)."""
+    return [2 * np.pi * k / settings.descriptor.headings for k in range(settings.descriptor.headings // 4)]
 
 
 def variants_for(label_source: str, others: Iterable[str], settings: Settings) -> tuple[str, ...]:

@@ -146,11 +146,6 @@ class Encoder(nn.Module):
         return F.conv2d(columns, *mean)
 
 
-def quarter_turns(descriptor: Tensor, turns: int) -> Tensor:
-    """What descriptors (n, latent) become when what they describe is turned by ``turns`` quarters about z, counter-clockwise."""
-    return descriptor.reshape(len(descriptor), 4, -1).roll(turns, 1).reshape(len(descriptor), -1)
-
-
 class Decoder(nn.Module):
     """Latent code (b, latent) -> logits (L + 2, 8, b, 16, 16, 16) of a subvolume :func:`in_eights`, the eight moved to the front.
 
