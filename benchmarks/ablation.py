@@ -25,7 +25,7 @@ from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.checkpoints import save_weights
 from semloc_logs.subvolumes.completion import completion_scores
 from semloc_logs.subvolumes.cut import CLASSES, SIZE
-from semloc_logs.subvolumes.network import CHANNELS, Completion, Decoder, Encoder, _halve, channels_last
+from semloc_logs.subvolumes.network import CHANNELS, Completion, Decoder, Encoder, Turning, channels_last, halve, latent_mean
 from semloc_logs.subvolumes.pairs import read_shard
 from semloc_logs.subvolumes.training import Progress, train
 
@@ -37,7 +37,8 @@ class Row:
     """Changes to the paper's network and training."""
 
     adam: bool = True
-    norm: bool = True
+    norm: bool = False
+    turning: bool = True  # layers that turn with their input
     patch: bool = True  # the first block maps 2x2x2 embedded voxels at once; else convolves one-hot voxels
     wide: bool = True  # with a margin, fully convolutional, nine subvolumes of a pair
     contrastive: float = 10.0
@@ -46,7 +47,7 @@ class Row:
     batch: int = 12
 
 
-PAPER = {"adam": False, "norm": False, "patch": False, "wide": False, "contrastive": 0.0, "batch": 32}
+PAPER = {"adam": False, "turning": False, "patch": False, "wide": False, "contrastive": 0.0, "batch": 32}
 ROWS = {
     "all": Row(),
     "paper": Row(**PAPER),
@@ -58,50 +59,65 @@ ROWS = {
     "all but contrastive": Row(contrastive=0.0),
     "all but completion": Row(reconstruction=0.0),
     "all but first block in eights": Row(patch=False),
-    "all but batch normalisation": Row(norm=False),
+    "all but turning": Row(turning=False),
+    "all and batch normalisation": Row(norm=True),
     "N = 64": Row(latent=64),
     "N = 512": Row(latent=512),
 }
+
+
+class _Fixed(nn.Module):
+    """A layer as any other: filters that do not turn."""
+
+    def __init__(self, inputs: int, outputs: int, size: tuple[int, int, int], *, group_in: bool = True) -> None:
+        super().__init__()
+        layer = nn.Conv3d(inputs, outputs, size)
+        self.weight, self.bias = layer.weight, layer.bias
+
+    def filters(self) -> tuple[Tensor, Tensor | None]:
+        return self.weight, self.bias
 
 
 class _Ablated(Encoder):
     """The encoder with parts of it put back to the paper's."""
 
     def __init__(self, variant: str, latent: int, row: Row) -> None:
-        super().__init__(variant, latent)
+        layer = Turning if row.turning else _Fixed
+        super().__init__(variant, latent, layer)
         self.row = row
         if not row.patch:
-            self.first = nn.Conv3d(CLASSES[variant] + 3, CHANNELS[0], 3, padding=1)  # type: ignore[assignment]
+            self.first = layer(CLASSES[variant] + 3, CHANNELS[0], (3, 3, 3), group_in=False)
             self.embedding.weight.requires_grad_(False)
-        if not row.norm:
-            self.norms = nn.ModuleList(nn.Identity() for _ in CHANNELS)
-            self.centre = nn.Identity()  # type: ignore[assignment]
+        self.norms = nn.ModuleList(nn.BatchNorm3d(c) if row.norm else nn.Identity() for c in CHANNELS)
 
-    def first_block(self, codes: Tensor) -> Tensor:
+    def first_block(self, codes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         if self.row.patch:
-            return super().first_block(codes)
+            return super().first_block(codes, weight, bias)
         reduced = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else torch.float32
-        voxels = F.one_hot(codes.long(), CLASSES[self.variant] + 3).to(reduced).permute(0, 4, 1, 2, 3)
-        return _halve(self.first(voxels))
+        inputs = CLASSES[self.variant] + 3
+        voxels = F.one_hot(codes.long(), inputs).to(reduced).permute(0, 4, 1, 2, 3)
+        return halve(F.conv3d(voxels, weight.reshape(-1, 3, 3, 3, inputs).permute(0, 4, 1, 2, 3), bias, padding=1))
 
     def forward(self, codes: Tensor) -> Tensor:
         if self.row.wide:
-            return super().forward(codes)
+            return self.features(codes, slice(1, -1))
         windows = codes[:, 8:-8, 8:-8].unfold(1, SIZE, 8).unfold(2, SIZE, 8)  # (b, i, j, z, x, y)
         b, i, j = windows.shape[:3]
         if self.training:
             windows = windows[:, i // 2 : i // 2 + 1, j // 2 : j // 2 + 1]
             i = j = 1
         single = windows.reshape(-1, *windows.shape[3:]).permute(0, 2, 3, 1)
-        mu = torch.cat([self.alone(some) for some in single.split(64)])  # one-hot voxels of a whole map would not fit into memory
+        # without a margin, as in the paper; one-hot voxels of a whole map would not fit into memory
+        mu = torch.cat([self.features(some, slice(None)).flatten(1) for some in single.split(64)])
         return mu.reshape(b, i, j, -1).permute(0, 3, 1, 2)
 
-    def alone(self, single: Tensor) -> Tensor:
-        """Subvolumes (n, 32, 32, 32) without a margin -> mu (n, latent), as in the paper."""
-        x = F.relu(self.norms[0](self.first_block(single)))
-        for block, norm in zip(self.blocks, list(self.norms)[1:], strict=True):
-            x = F.relu(norm(_halve(block(x))))
-        return self.latent_mean(x).flatten(1)
+    def features(self, codes: Tensor, inner: slice) -> Tensor:
+        """Codes -> mu of the ``inner`` part."""
+        first, *blocks, mean = self._layers()
+        x = F.relu(self.norms[0](self.first_block(codes, *first)))
+        for (weight, bias), norm in zip(blocks, list(self.norms)[1:], strict=True):
+            x = F.relu(norm(halve(F.conv3d(x, weight, bias, padding=1))))
+        return latent_mean(x[:, :, inner, inner], *mean)
 
 
 class _AblatedCompletion(Completion):

@@ -176,7 +176,7 @@ def describe_turned(
     reach: float,
     yaw: float,
 ) -> Described:
-    """As :func:`describe_map`, but of the map turned by -``yaw`` about z: what a query at that heading looks like. Centres are the map's."""
+    """As :func:`describe_map`, but of the map turned by -``yaw`` about z: what a query at that heading sees. Centres are the map's."""
     shape = np.array(state.shape)
     middle = np.round((np.asarray(low) + shape / 2)[:2] / LAYER) * LAYER  # unturned, positions stay on the stride's grid
     c, s = np.cos(yaw), np.sin(yaw)

@@ -9,6 +9,7 @@ the paper: beside the contrastive term it costs a third of the recall.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -40,7 +41,7 @@ class _LookUp(torch.autograd.Function):
         return None, torch.stack(columns, 1).to(grad.dtype)
 
 
-def _halve(x: Tensor) -> Tensor:
+def halve(x: Tensor) -> Tensor:
     """2x2x2 max-pooling; without gradients as three maxima, which take half the time of the library's kernel in bf16."""
     if torch.is_grad_enabled() and x.requires_grad:
         return F.max_pool3d(x, 2)
@@ -74,7 +75,7 @@ def _turned(base: Tensor, group_in: bool) -> Tensor:
     return torch.cat(turns)
 
 
-class _Turning(nn.Module):
+class Turning(nn.Module):
     """The parameters of one layer of the encoder: ``base`` filters for one heading and a ``bias`` that all headings share."""
 
     def __init__(self, inputs: int, outputs: int, size: tuple[int, int, int], *, group_in: bool = True) -> None:
@@ -93,17 +94,17 @@ class _Turning(nn.Module):
 class Encoder(nn.Module):
     """Codes (b, x, y, 32) uint8 with a margin of 8 voxels in x and y -> mu (b, latent, (x - 40) / 8, (y - 40) / 8).
 
-    Output (i, j) describes the subvolume whose corner is voxel (8 + 8 i, 8 + 8 j, 0). A map turned by a quarter has the same descriptors,
-    turned by :func:`quarter_turns`.
+    Output (i, j) describes the subvolume whose corner is voxel (8 + 8 i, 8 + 8 j, 0). A map turned by a quarter about z has the same
+    descriptors but for the order of their numbers (``describe.quarter_turns``). Another ``layer`` is for comparison.
     """
 
-    def __init__(self, variant: str, latent: int = LATENT) -> None:
+    def __init__(self, variant: str, latent: int = LATENT, layer: Callable[..., Any] = Turning) -> None:
         super().__init__()
         self.variant, self.latent = variant, latent
         self.embedding = nn.Embedding(CLASSES[variant] + 3, EMBEDDING)
-        self.first = _Turning(EMBEDDING, CHANNELS[0], (2, 2, 2), group_in=False)
-        self.blocks = nn.ModuleList(_Turning(a, b, (3, 3, 3)) for a, b in pairwise(CHANNELS))
-        self.mean = _Turning(CHANNELS[-1], latent, (4, 4, 4))
+        self.first = layer(EMBEDDING, CHANNELS[0], (2, 2, 2), group_in=False)
+        self.blocks = nn.ModuleList(layer(a, b, (3, 3, 3)) for a, b in pairwise(CHANNELS))
+        self.mean = layer(CHANNELS[-1], latent, (4, 4, 4))
         self.log_variance = nn.Linear(latent, latent)
         self._kept: list[tuple[Tensor, Tensor]] = []
 
@@ -140,10 +141,14 @@ class Encoder(nn.Module):
         first, *blocks, mean = self._layers()
         x = F.relu(self.first_block(codes, *first))
         for weight, bias in blocks:
-            x = F.relu(_halve(F.conv3d(x, weight, bias, padding=1)))  # ReLU before pooling, as in the paper, would cost eight times as much
-        x = x[:, :, 1:-1, 1:-1]  # the pooled margin has served
-        columns = x.permute(0, 2, 3, 4, 1).flatten(3).permute(0, 3, 1, 2)
-        return F.conv2d(columns, *mean)
+            x = F.relu(halve(F.conv3d(x, weight, bias, padding=1)))  # ReLU before pooling, as in the paper, would cost eight times as much
+        return latent_mean(x[:, :, 1:-1, 1:-1], *mean)  # the pooled margin has served
+
+
+def latent_mean(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Features (b, 64, x, y, 4) at an eighth of the resolution -> mu (b, latent, x - 3, y - 3)."""
+    columns = x.permute(0, 2, 3, 4, 1).flatten(3).permute(0, 3, 1, 2)
+    return F.conv2d(columns, weight, bias)
 
 
 class Decoder(nn.Module):

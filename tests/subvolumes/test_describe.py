@@ -15,7 +15,7 @@ from semloc_logs.errors import SettingsError
 from semloc_logs.subvolumes import describe
 from semloc_logs.subvolumes.checkpoints import save_weights
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table
-from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, random_encoder
+from semloc_logs.subvolumes.describe import Described, describe_map, describe_turned, load_encoder, quarter_turns, random_encoder
 from semloc_logs.subvolumes.network import Completion, Decoder, Encoder, descriptors, from_eights, in_eights
 from semloc_logs.subvolumes.pairs import occupied
 
@@ -194,8 +194,45 @@ def test_weights_come_back_and_other_files_are_refused(tmp_path: Path) -> None:
         odd.write_bytes(content)
         with pytest.raises(SettingsError, match=r"odd\.safetensors"):
             load_encoder("geometric", odd)
-    save_file({"encoder.mean.bias": torch.zeros(3)}, odd)
+    save_file({"encoder.log_variance.bias": torch.zeros(3)}, odd)
     with pytest.raises(SettingsError, match=r"odd\.safetensors"):
         load_encoder("geometric", odd)
     with pytest.raises(SettingsError, match="missing"):
         load_encoder("geometric", tmp_path / "missing")
+
+
+def test_the_encoder_turns_with_its_input() -> None:
+    encoder = random_encoder("semantic", seed=4)
+    volume = torch.from_numpy(np.random.default_rng(5).integers(0, 21, (1, 64, 64, 32)).astype(np.uint8))
+    with torch.inference_mode():
+        as_it_lies = encoder(volume)
+        for turns in range(1, 4):
+            turned = torch.rot90(encoder(torch.rot90(volume, turns, (1, 2)).contiguous()), -turns, (2, 3))
+            expected = quarter_turns(descriptors(as_it_lies).numpy(), turns)
+            np.testing.assert_allclose(descriptors(turned).numpy(), expected, atol=1e-5)
+            assert np.abs(descriptors(as_it_lies).numpy() - expected).max() > 0.01  # a turn is no identity
+
+
+@pytest.mark.parametrize("yaw", [0.0, np.pi / 10, np.pi / 2, 4.0])
+def test_centres_of_a_turned_map_are_those_of_the_map(yaw: float) -> None:
+    """A single block in the map: all windows that hold it lie about it, and on every side."""
+    state = np.full((80, 96, 40), 254, np.uint8)
+    state[60:64, 20:24, 12:16] = 2
+    block = LOW[:2] + np.array([62, 22])
+    found = describe_turned(state, LOW, -4 * V, V, random_encoder("geometric"), 4, 40, block[None] * V, 30.0, yaw)
+    away = found.centre[:, :2] - block
+    assert len(away) >= 5
+    assert np.abs(away).max() < 16 * np.sqrt(2) + 2
+    assert np.abs(away.mean(0)).max() < 2.5
+
+
+def test_quarter_turns_of_the_query_meet_the_headings_of_the_map() -> None:
+    """The descriptor of a query at yaw a + 90 degrees is that of the map at a, one quarter turned."""
+    encoder, state = random_encoder("geometric", seed=2), world()
+    road, a = np.array([[0.0, 0.0]]), np.pi / 10
+    known = describe_turned(state, LOW, (12 - 16) * V, V, encoder, 8, 40, road, 30.0, a)
+    asked = describe_turned(state, LOW, (12 - 16) * V, V, encoder, 8, 40, road, 30.0, a + np.pi / 2)
+    away = np.linalg.norm(known.centre[:, None] - asked.centre[None], axis=2)
+    i, j = np.nonzero(away < 0.01)
+    assert len(i) > 10
+    np.testing.assert_allclose(quarter_turns(asked.descriptor[j], 1), known.descriptor[i], atol=0.05)
