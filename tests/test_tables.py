@@ -131,6 +131,7 @@ def columns(n: int = 3) -> dict[str, object]:
         "submap": np.arange(n),
         "variant": ["geometric"] * n,
         **{c: np.arange(n) * 1.5 for c in "xyz"},
+        "yaw": np.zeros(n),
         "word": np.arange(n),
         "code": np.full(n, 2**64 - 1, np.uint64),
     }

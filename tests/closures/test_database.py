@@ -52,6 +52,7 @@ def drive_session(
         rows = {
             "submap": np.full(len(centre), i),
             **{c: centre[:, k] for k, c in enumerate("xyz")},
+            "yaw": np.zeros(len(centre)),
             "word": np.zeros(len(centre)),
             "code": np.zeros(len(centre)),
             "variant": ["semantic"] * len(centre),
