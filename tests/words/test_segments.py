@@ -63,7 +63,7 @@ def make_session(work: Workspace, name: str, seed: int, counts: tuple[int, ...] 
     for submap, n in enumerate(counts):
         d = near_cells(100 * seed + submap, n)
         centre = np.random.default_rng(seed).uniform(-50, 50, (n, 3))
-        parts = [("semantic", centre[:3], *V.words(d[:3])), (VARIANT, centre, *V.words(d))]
+        parts = [("semantic", 0.5, centre[:3], *V.words(d[:3])), (VARIANT, 0.25, centre, *V.words(d))]
         write_words(blocks_path(folder.words, submap), submap, parts, {})
     write_json(folder.words_json, {"variants": [VARIANT, "semantic"], "fingerprint": seed})
 
