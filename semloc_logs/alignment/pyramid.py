@@ -213,7 +213,7 @@ def tau(
         return 0.0, 0
     state = target.dense(low, tuple((high - low).tolist()))
     reach = kappa / voxel_size
-    margin = int(reach) + 2
+    margin = 2 * int(reach) + 4  # twice: for points beside the map, and for what is around them
     offsets, length = _offsets(reach)
     around = np.pad(state, margin, constant_values=UNOBSERVED_STATE)
     found = _closest_observed(around, centres / voxel_size - low + margin, offsets, length, reach)
@@ -238,7 +238,7 @@ def _offsets(reach: float) -> tuple[NDArray[np.int64], F64]:
 def _closest_observed(state: U8, points: F64, offsets: NDArray[np.int64], length: F64, reach: float) -> U8:
     """State of the observed cell whose centre is closest to each of ``points`` (n, 3), in cells; unobserved where none is within reach.
 
-    The grid has a margin of ``reach`` cells and two on all sides.
+    The grid has a margin of twice ``reach`` and four cells on all sides.
     """
     out = np.full(len(points), UNOBSERVED_STATE, np.uint8)
     nx, ny, nz = state.shape
