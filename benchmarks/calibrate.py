@@ -16,7 +16,6 @@ from pathlib import Path
 from towns import Place, Town, collect
 
 import semloc_logs.closures
-from semloc_logs.engines import make_engine
 from semloc_logs.engines.engine import single_threaded
 from semloc_logs.evaluation.calibration import calibration_json, fit, read_judged, recall_at, reliability
 from semloc_logs.evaluation.reliability_picture import draw_reliability
@@ -44,9 +43,7 @@ TOWNS = (
 def ask(args: argparse.Namespace) -> None:
     """Simulate, fuse, describe, ask and judge the towns that have no table yet."""
     single_threaded()
-    place = Place(args.dir, make_engine("processes", args.jobs), args.drives)
-    collect(place, [town for town in TOWNS if not args.only or town.name in args.only], verbose=args.verbose)
-    place.engine.close()
+    collect(Place(args.dir, args.drives), [town for town in TOWNS if not args.only or town.name in args.only], args.jobs)
 
 
 def report(args: argparse.Namespace) -> None:
@@ -75,7 +72,6 @@ def main() -> None:
     first.add_argument("--drives", type=Path, help="folder of kitti_00.txt and kitti_05.txt; without it their towns are left out")
     first.add_argument("--only", action="append", metavar="TOWN")
     first.add_argument("--jobs", type=int, default=1)
-    first.add_argument("--verbose", action="store_true")
     first.set_defaults(run=ask)
     second = commands.add_parser("fit")
     second.add_argument("dir", type=Path)

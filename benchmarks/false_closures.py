@@ -52,9 +52,7 @@ def towns() -> list[Town]:
 
 def ask_towns(args: argparse.Namespace) -> None:
     """Ask, then count under the calibration of the package."""
-    place = Place(args.dir, make_engine("processes", args.jobs))
-    paths = collect(place, towns(), args.queries, args.verbose)
-    place.engine.close()
+    paths = collect(Place(args.dir), towns(), args.jobs, args.queries)
     judged = read_judged(paths)
     p = decided_by(shipped(), judged)
     print(f"{sum(read_metadata(path)['queries'] for path in paths)} queries in {len(paths)} towns")
@@ -148,7 +146,6 @@ def main() -> None:
     first = commands.add_parser("towns")
     first.add_argument("dir", type=Path)
     first.add_argument("--queries", type=int, default=5000)
-    first.add_argument("--verbose", action="store_true")
     first.set_defaults(run=ask_towns)
     second = commands.add_parser("logs")
     second.add_argument("dir", type=Path)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from semloc_logs.engines import Engine
+from semloc_logs.engines import make_engine
 from semloc_logs.evaluation.calibration import judge_town, read_judged
-from semloc_logs.settings import Settings, load
+from semloc_logs.settings import load
 from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.stages import close, describe, fuse
 from semloc_logs.tables import read_metadata
@@ -46,10 +46,9 @@ class Town:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the towns of a benchmark live, who works, and the folder of recorded drives, if there is one."""
+    """Where the towns of a benchmark live, and the folder of recorded drives, if there is one."""
 
     folder: Path
-    engine: Engine
     drives: Path | None = None
 
     def has(self, town: Town) -> bool:
@@ -96,31 +95,50 @@ class Place:
         (home / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
         return logs
 
-    def ask(self, town: Town, settings: Settings, note: Callable[[str], None]) -> Workspace:
-        """The town's workspace with the closures of every session with every session."""
-        work = Workspace(self.folder / town.name / "work")
+    def ask(self, town: Town) -> Workspace:
+        """The town's workspace with the alignments of every session with every session; all are kept as rejected, with their features."""
+        work, engine = Workspace(self.folder / town.name / "work"), make_engine("serial")
         logs = self.simulate(town)
-        started = load(assignments={"labels.source": town.labels}).resolved()
-        fuse({name: [log] for name, log in logs.items()}, work, started, {}, self.engine, note)
-        describe(work, [], settings, self.engine, note)
-        close(work, [], [], settings, self.engine, note)
+        settings = load(assignments={"labels.source": town.labels, "closures.min_probability": "1"}).resolved()
+        fuse({name: [log] for name, log in logs.items()}, work, settings, {}, engine, _silent)
+        describe(work, [], settings, engine, _silent)
+        close(work, [], [], settings, engine, _silent)
         return work
 
 
-def collect(place: Place, towns: Sequence[Town], queries: float = math.inf, verbose: bool = False) -> list[Path]:
-    """Tables DIR/TOWN/judged.parquet of the towns that can be built, until ``queries`` have been asked; those there are kept."""
-    settings = load(assignments={"closures.min_probability": "1"}).resolved()  # all alignments are kept, with their features
+def _silent(_: str) -> None:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class TownTask:
+    """One town to simulate, ask and judge; picklable."""
+
+    place: Place
+    town: Town
+
+
+def judged_table(task: TownTask) -> tuple[Path, float]:
+    """DIR/TOWN/judged.parquet, made unless it is there, and the seconds that took."""
+    start, table = time.perf_counter(), task.place.folder / task.town.name / "judged.parquet"
+    if not table.exists():
+        work = task.place.ask(task.town)
+        judge_town(work, table.with_name("truth.json"), task.town.name, table)
+    return table, time.perf_counter() - start
+
+
+def collect(place: Place, towns: Sequence[Town], jobs: int, queries: float = math.inf) -> list[Path]:
+    """Tables of the towns that can be built, one town a process, until ``queries`` have been asked; those there are kept."""
     mine, tables, asked = [town for town in towns if place.has(town)], [], 0
-    for number, town in enumerate(mine, 1):
-        if asked >= queries:
-            break
-        start, table = time.perf_counter(), place.folder / town.name / "judged.parquet"
-        if not table.exists():
-            work = place.ask(town, settings, lambda said: print(f"  {said}", flush=True) if verbose else None)
-            judge_town(work, table.with_name("truth.json"), town.name, table)
+    engine = make_engine("processes", jobs)
+    print(f"{len(mine)} towns at most, {jobs} at a time", flush=True)
+    for number, (table, seconds) in enumerate(engine.map(judged_table, [TownTask(place, town) for town in mine]), 1):
         judged = read_judged([table])
         asked += int(read_metadata(table)["queries"])
         tables.append(table)
         figures = f"{len(judged)} alignments, {int(judged.right.sum())} right, {asked} queries so far"
-        print(f"{number} of {len(mine)}: {town.name}: {figures}, {time.perf_counter() - start:.0f} s", flush=True)
+        print(f"{number}: {table.parent.name}: {figures}, {seconds:.0f} s", flush=True)
+        if asked >= queries:
+            break
+    engine.stop()
     return tables
