@@ -157,7 +157,7 @@ def test_rows_are_those_of_the_variant_with_their_places(tmp_path: Path) -> None
     for r, w in zip(at, word.tolist(), strict=True):
         assert segment.starts[w] <= r < segment.starts[w + 1]
     np.testing.assert_array_equal(segment.centre[at], np.random.default_rng(3).uniform(-50, 50, (4, 3)).astype(np.float32))
-    assert segment.yaw.tolist() == [0.0] * 9
+    assert segment.yaw.tolist() == [0.25] * 9
 
 
 def test_of_some_submaps_certain_rows_may_answer(tmp_path: Path) -> None:
