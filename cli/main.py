@@ -29,6 +29,7 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "close": ("close", "Words -> loop closures."),
     "annotate": ("annotate", "Closures -> channels of a log."),
     "evaluate": ("evaluate", "Closures against the truth."),
+    "show": ("show", "Pictures of closures and of rejected hypotheses."),
     "export": ("export", "Poses, pose graph or map for other programs."),
     "simulate": ("simulate", "Drive logs through a procedural town, with truth."),
     "train": ("train", "Learn the descriptor."),

@@ -143,7 +143,7 @@ def completion_benchmark(
     found = completed(model, (a, b, c))
     if picture is not None:
         rows = _worth_seeing(found)
-        draw_completions(picture, variant, *(_states(v[rows], found.classes) for v in (found.given, found.said, found.truth)))
+        draw_completions(picture, variant, *(states_of(v[rows], found.classes) for v in (found.given, found.said, found.truth)))
     return completion_figures(found)
 
 
@@ -157,7 +157,7 @@ def _worth_seeing(found: Completed) -> I64:
     return np.array([g[np.argmax(score[g])] for g in groups if len(g)], np.int64)
 
 
-def _states(codes: U8, classes: int) -> U8:
+def states_of(codes: U8, classes: int) -> U8:
     """Voxel states of codes: classes, 254 free, 253 unobserved, 255 occupied of no known class."""
     table = np.full(256, 255, np.uint8)
     if classes > 1:

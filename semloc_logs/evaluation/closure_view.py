@@ -1,0 +1,266 @@
+"""What there is to see of a closure or a rejected hypothesis: the query, the map it was laid on, and subvolumes that matched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.verify import Query, Target
+from semloc_logs.closures.closing import allowed_places
+from semloc_logs.closures.database import Database
+from semloc_logs.closures.queries import SessionMap, build_query, query_members
+from semloc_logs.closures.results import keyframe_at, read_closures
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.evaluation.completion import completed, load_completion, states_of
+from semloc_logs.geometry import inverse, turned_about_z
+from semloc_logs.settings import Settings
+from semloc_logs.subvolumes.cut import SIZE, turn
+from semloc_logs.subvolumes.describe import describe_map, load_encoder, quarter_turns
+from semloc_logs.tables import read_metadata, read_table
+from semloc_logs.voxels.grid import UNOBSERVED_STATE
+from semloc_logs.voxels.store import poses_of
+from semloc_logs.workspace import Workspace
+
+U8 = NDArray[np.uint8]
+F64 = NDArray[np.float64]
+APART = 3 * SIZE // 4  # voxels between subvolumes that are shown
+AGREES = 8  # voxels that a word match may lie off the alignment
+TURNED = np.radians(15.0)  # and by how much it may be turned against it
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Row ``row`` of closures.parquet or, if there is a ``reason``, of rejected.parquet; ``target_T_query`` (4, 4) is its pose."""
+
+    row: dict[str, Any]
+    target_T_query: F64
+
+    @property
+    def reason(self) -> str:
+        return str(self.row.get("reason") or "")
+
+    @property
+    def accepted(self) -> bool:
+        return "reason" not in self.row
+
+    @property
+    def covariance(self) -> F64 | None:
+        """(6, 6) of an accepted closure."""
+        return np.array(self.row["covariance"], float).reshape(6, 6) if "covariance" in self.row else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """States (32, 32, 32) of a subvolume of the query, turned into the target's axes, as the network completes it, and of the
+    target's nearest word; ``distance`` of the words in bits, and the target's centre in its map, metres."""
+
+    query: U8
+    completion: U8
+    target: U8
+    distance: int
+    centre: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosureView:
+    """A query in the map of its target: ``map_T_query`` (4, 4) as aligned, ``before`` as it would lie without an alignment.
+
+    ``roads`` are the positions (n, 3) of the target's and the query's keyframes, the latter in the query's frame.
+    """
+
+    choice: Choice
+    query: Query
+    target: Target
+    map_T_query: F64
+    before: F64
+    query_T_base: F64
+    map_R_target: F64
+    roads: tuple[F64, F64]
+    matches: tuple[Match, ...]
+    label_source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What to show: closure ``number`` (from 1 on, in the order of closures.parquet); or the answer to the query of ``session`` nearest to
+    ``at`` seconds, of the log or since its first keyframe; or the ``count`` best closures and the best rejected hypothesis."""
+
+    session: str | None = None
+    at: float | None = None
+    number: int | None = None
+    count: int = 2
+
+
+def choose(work: Workspace, wanted: Wanted) -> list[Choice]:
+    """The rows to show. The best closures are those of different pairs of sessions first, and the rejected hypothesis is one of a query
+    without a closure, if there is any. WorkspaceError when there is nothing to show."""
+    accepted, rejected = _choices(work, work.closures), _choices(work, work.rejected)
+    if wanted.number is not None:
+        if not 1 <= wanted.number <= len(accepted):
+            raise WorkspaceError(f"{work.closures} has {len(accepted)} closures, and no closure {wanted.number}: give a number from 1 on.")
+        return [accepted[wanted.number - 1]]
+    if wanted.session is not None:
+        accepted, rejected = ([c for c in rows if c.row["query_session"] == wanted.session] for rows in (accepted, rejected))
+    if wanted.at is not None:
+        found = _at(work, accepted + rejected, wanted.at)
+    else:
+        answered = {(c.row["query_session"], c.row["query_stamp_ns"]) for c in accepted}
+        silent = [c for c in rejected if (c.row["query_session"], c.row["query_stamp_ns"]) not in answered]
+        found = _varied(_best_first(accepted), wanted.count) + _best_first(silent or rejected)[:1]
+    if not found:
+        whose = f" of session '{wanted.session}'" if wanted.session else ""
+        raise WorkspaceError(f"{work.path} has neither a closure nor a rejected hypothesis{whose}: name another session, or close again.")
+    return found
+
+
+def _choices(work: Workspace, path: Path) -> list[Choice]:
+    if not path.exists():
+        raise WorkspaceError(f"{path} does not exist: run 'semloc close -w {work.path}' first.")
+    return [Choice(row, T) for row, T in zip(read_closures(path), poses_of(read_table(path)), strict=True)]
+
+
+def _best_first(choices: Sequence[Choice]) -> list[Choice]:
+    return sorted(choices, key=lambda c: (-c.row["probability"], -c.row["overlap"], c.row["query_session"], c.row["query_stamp_ns"]))
+
+
+def _at(work: Workspace, choices: Sequence[Choice], seconds: float) -> list[Choice]:
+    """The best choice of the query that is nearest to a time, accepted ones first."""
+
+    def away(choice: Choice) -> float:
+        first = SessionMap(work.session(choice.row["query_session"])).stamps_ns[0] / 1e9
+        stamp = choice.row["query_stamp_ns"] / 1e9
+        return float(abs(stamp - (seconds if seconds >= first else seconds + first)))
+
+    nearest = min(map(away, choices), default=0.0)
+    there = [c for c in choices if away(c) <= nearest + 1e-6]
+    return sorted(there, key=lambda c: (bool(c.reason), -c.row["probability"]))[:1]
+
+
+def _varied(choices: Sequence[Choice], count: int) -> list[Choice]:
+    """The first of each pair of sessions, then the others."""
+    first: dict[tuple[str, str], Choice] = {}
+    for c in choices:
+        first.setdefault((c.row["query_session"], c.row["target_session"]), c)
+    leading = list(first.values())
+    return [*leading, *(c for c in choices if c not in leading)][:count]
+
+
+def closing_settings(work: Workspace) -> Settings:
+    """The settings that the workspace's closures were found with, which its tables hold."""
+    try:
+        return Settings.model_validate(read_metadata(work.closures)["settings"]).resolved()
+    except (KeyError, ValueError):
+        raise WorkspaceError(f"{work.closures} does not say how it was made: run 'semloc close -w {work.path} --overwrite'.") from None
+
+
+def closure_view(work: Workspace, choice: Choice, settings: Settings, most_matches: int = 3) -> ClosureView:
+    """All that a picture of ``choice`` needs; ``settings`` are those that the closures were found with."""
+    row = choice.row
+    session, target = (SessionMap(work.session(row[f"{end}_session"])) for end in ("query", "target"))
+    asking, asked = keyframe_at(session, row["query_stamp_ns"]), keyframe_at(target, row["target_stamp_ns"])
+    database = Database(work, (row["target_session"],), settings).asked_by(session, asking)
+    query, query_T_base = build_query(session, asking, settings)
+    map_T_target = target.map_T_base[asked]
+    map_T_query = map_T_target @ choice.target_T_query @ inverse(query_T_base)
+    group = _group(database, asked)
+    before = np.eye(4)
+    if session.folder.name == target.folder.name:
+        before[:3, 3] = session.map_T_base[asking, :3, 3]  # as odometry says
+    else:
+        before = map_T_target @ inverse(query_T_base)  # as if the query had been at the target's keyframe
+    members = query_members(session, asking, settings)
+    road = session.map_T_base[members, :3, 3] - session.map_T_base[asking, :3, 3]
+    ground = float(session.ground_z[asking] - session.map_T_base[asking, 2, 3])
+    return ClosureView(
+        choice,
+        query,
+        database.target(group),
+        map_T_query,
+        before,
+        query_T_base,
+        map_T_target[:3, :3],
+        (target.map_T_base[:, :3, 3], road),
+        tuple(_matches(database, session, query, ground, map_T_query, group, most_matches)),
+        str(target.json["label_source"]),
+    )
+
+
+def drawn(view: ClosureView) -> dict[str, Any]:
+    """What a picture of the view shows, as JSON has it: the row, ``accepted``, and the word matches."""
+    matches = [{"bits": m.distance, "target_position_m": list(m.centre)} for m in view.matches]
+    return {**view.choice.row, "accepted": view.choice.accepted, "matches": matches}
+
+
+def _group(database: Database, keyframe: int) -> int:
+    """The submap in whose middle a keyframe of the only target session is."""
+
+    def off(g: int) -> int:
+        seen = database.keyframes(g)
+        return min(keyframe - seen[0], seen[-1] - keyframe) if len(seen) else -len(seen) - 1
+
+    return max(range(len(database.places)), key=off)
+
+
+def _matches(database: Database, session: SessionMap, query: Query, ground: float, map_T_query: F64, group: int, most: int) -> list[Match]:
+    """Word matches that agree with the alignment, nearest first, none beside another."""
+    settings, v = database.settings, database.settings.fusion.voxel_size
+    places = allowed_places(database, session)
+    if not places or not most:
+        return []
+    variant, allowed = next(iter(places.items()))  # a single target session is asked with one kind of words
+    encoder, words = load_encoder(variant, settings.descriptor.weights), database.words(variant)
+    low, high = query.blocks.bounds()
+    state = query.blocks.dense(low, tuple((high - low).tolist()))
+    d = describe_map(state, low, ground, v, encoder, settings.descriptor.query_stride, settings.descriptor.min_occupied)
+    aligned = float(np.arctan2(map_T_query[1, 0], map_T_query[0, 0]))
+    laid = turned_about_z(d.centre.astype(float), np.full(len(d.centre), aligned))  # voxels, in the map's axes
+    parts = []
+    for turns in range(4):
+        m = words.search(quarter_turns(d.descriptor, turns), settings.closures.neighbours, settings.closures.probes, allowed)
+        off = np.abs(m.centre - laid[m.query] * v - map_T_query[:3, 3]).max(1)
+        turned = np.abs(np.mod(m.yaw + turns * np.pi / 2 - aligned + np.pi, 2 * np.pi) - np.pi)
+        keep = (m.group == group) & (off < AGREES * v) & (turned < TURNED)
+        parts.append((m.distance[keep], m.query[keep], m.centre[keep]))
+    distance, asking, centre = (np.concatenate([p[k] for p in parts]) for k in range(3))
+    chosen: list[int] = []
+    for m in np.argsort(distance, kind="stable").tolist():
+        if all(np.abs(laid[asking[m], :2] - laid[asking[o], :2]).max() >= APART for o in chosen):
+            chosen.append(m)
+        if len(chosen) == most:
+            break
+    if not chosen:
+        return []
+    centres = centre[chosen]
+    box, corner = _turned(query, state, low, aligned)
+    corners = np.round(laid[asking[chosen]]).astype(int) - corner - SIZE // 2
+    given = np.stack([_cut(box, c, SIZE // 2) for c in corners])
+    blocks = database.target(group).blocks
+    theirs = np.stack([blocks.dense(np.round(c / v).astype(int) - SIZE // 2, (SIZE, SIZE, SIZE)) for c in centres])
+    said = completed(load_completion(variant, settings.descriptor.weights), (given, theirs, given))
+    inner = given[:, SIZE // 2 : -SIZE // 2, SIZE // 2 : -SIZE // 2]
+    completions = states_of(said.said, said.classes)
+    return [
+        Match(inner[i], completions[i], theirs[i], int(distance[m]), (float(c[0]), float(c[1]), float(c[2])))
+        for i, (m, c) in enumerate(zip(chosen, centres, strict=True))
+    ]
+
+
+def _turned(query: Query, state: U8, low: NDArray[np.integer], yaw: float) -> tuple[U8, NDArray[np.int64]]:
+    """States (x, y, z) of the whole query turned by ``yaw`` (rad) about the vertical through its origin, and the corner voxel (3,)."""
+    half = query.reach + SIZE // 2
+    box = np.empty((2 * half, 2 * half, state.shape[2]), np.uint8)
+    turn(state, low.astype(np.int64), -yaw, np.array([0.0, 0.0, low[2] + state.shape[2] / 2]), box)
+    return box, np.array([-half, -half, low[2]])
+
+
+def _cut(box: U8, corner: NDArray[np.integer], margin: int) -> U8:
+    """States of the subvolume at ``corner`` of ``box`` with a ``margin`` in x and y, unobserved outside."""
+    pad = SIZE + margin
+    padded = np.pad(box, pad, constant_values=UNOBSERVED_STATE)
+    x, y, z = (corner + pad).tolist()
+    return padded[x - margin : x + SIZE + margin, y - margin : y + SIZE + margin, z : z + SIZE]
