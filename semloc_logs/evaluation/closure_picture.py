@@ -71,7 +71,7 @@ def _facts(view: ClosureView) -> list[str]:
 
 
 class _Scene:
-    """The voxels of a view, cut around the aligned query, and the pictures of them; all have the same scale."""
+    """The voxels of a view, cut around the aligned query, and the pictures of them; those from above have the scale of the bar."""
 
     def __init__(self, view: ClosureView) -> None:
         self._view = view
