@@ -51,7 +51,7 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
 @click.option("--database", type=click.IntRange(1), default=100_000, show_default=True, metavar="N", help="Descriptors, for retrieval.")
 @click.option("--queries", type=click.IntRange(1), default=2000, show_default=True, metavar="N", help="Words that ask, for retrieval.")
 @path_option("--picture", help="PNG of some subvolumes to write, for completion.")
-@path_option("--work", help="Folder that keeps the simulated streets, for retrieval and completion.")
+@path_option("--work", help="Folder that keeps the simulated streets, for retrieval, completion and scaling.")
 @json_option
 @settings_options
 @console_options
@@ -77,7 +77,8 @@ def command(
     profile of a run on the LOGs), words (recall of word matches between two LOGs whose truth is known, trained weights beside random
     ones), labels (classes from geometry against the labels recorded in the LOGs), realism (simulated sweeps beside the labelled ones of
     the LOGs), retrieval (recall of descriptors on held-out simulated streets and, with --truth, of the first LOG's in the second
-    one's), or completion (of incomplete subvolumes of such streets). Close other programs first: times are wall-clock.
+    one's), completion (of incomplete subvolumes of such streets), or scaling (the look-up of words in maps of 10, 100 and 1000 km).
+    Close other programs first: times are wall-clock.
 
     \b
     Example:  semloc benchmark reading --json
@@ -109,6 +110,10 @@ def command(
             from semloc_logs.evaluation.completion import completion_benchmark
 
             figures, rows = completion_benchmark(variant, settings, weights, work, picture, console.note), []
+        elif name == "scaling":
+            from semloc_logs.evaluation.search_scaling import scaling_benchmark
+
+            figures, rows = scaling_benchmark(settings, work, console.note), []
         else:
             figures, rows = _measure(name, logs, truth, peers, lengths, settings)
     if as_json:

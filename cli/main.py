@@ -28,6 +28,7 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "describe": ("describe", "Maps -> semantic words."),
     "close": ("close", "Words -> loop closures."),
     "annotate": ("annotate", "Closures -> channels of a log."),
+    "index": ("index", "The index of the words: what it holds; up to date."),
     "evaluate": ("evaluate", "Closures against the truth."),
     "show": ("show", "Pictures of closures and of rejected hypotheses."),
     "export": ("export", "Poses, pose graph or map for other programs."),

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -108,6 +109,34 @@ def segments(work: Workspace, variant: str, names: Sequence[str], change: Change
             serving = _build(folder, variant, words, names, change)
     wanted = frozenset(names)
     return [(s, served & wanted) for s, served in serving.items() if served & wanted]
+
+
+def update(work: Workspace) -> dict[str, dict[str, Any]]:
+    """Bring the index of every variant up to date after checking all of its files.
+
+    For each variant what was ``changed``, a sentence, and its ``segments``: ``file``, ``words``, ``bytes``, ``sessions``. Raises
+    WorkspaceError when no session was described.
+    """
+    described = [f for f in work.sessions() if f.words_json.exists()]
+    variants = sorted({str(v) for f in described for v in read_json(f.words_json)["variants"]})
+    if not variants:
+        raise WorkspaceError(f"{work.path} has no described session: run 'semloc describe -w {work.path}' first.")
+    out: dict[str, dict[str, Any]] = {}
+    for variant in variants:
+        folder, change = work.path / "index" / variant, Change()
+        with _locked(folder):
+            _remove_damaged(_open_all(folder, variant)[0], variant)
+        held = [
+            {
+                "file": str(s.path.relative_to(work.path)) if s.path else "",
+                "words": len(s),
+                "bytes": s.path.stat().st_size if s.path else 0,
+                "sessions": sorted(served),
+            }
+            for s, served in segments(work, variant, [f.name for f in described], change)
+        ]
+        out[variant] = {"changed": str(change), "segments": held}
+    return out
 
 
 Serving = dict[Segment, frozenset[str]]

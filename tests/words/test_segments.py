@@ -20,7 +20,7 @@ from semloc_logs.errors import WorkspaceError
 from semloc_logs.tables import write_json
 from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words import catalogue
-from semloc_logs.words.catalogue import Change, merged_blocks, segments
+from semloc_logs.words.catalogue import Change, merged_blocks, segments, update
 from semloc_logs.words.index import SHORTLIST, Allowed, Index, Part
 from semloc_logs.words.indexing import write_words
 from semloc_logs.words.segment import WORDS, Held, Segment, open_segment, segment_in_memory, write_segment
@@ -245,6 +245,26 @@ def test_damage_within_the_arrays_is_not_merged(tmp_path: Path) -> None:
     assert found(index(work, ["a", "b", "c"]), 6) == fresh(work, ["a", "b", "c"], tmp_path / "fresh")
     for p in files(work):
         open_segment(p, VARIANT, check=True)
+
+
+def test_updating_checks_everything_and_says_what_there_is(tmp_path: Path) -> None:
+    work = Workspace(tmp_path)
+    with pytest.raises(WorkspaceError, match="no described session"):
+        update(work)
+    for i, name in enumerate("ab"):
+        make_session(work, name, i)
+    held = update(work)
+    assert sorted(held) == [VARIANT, "semantic"]
+    assert held[VARIANT]["changed"] == "2 sessions added"
+    (one,) = held[VARIANT]["segments"]
+    assert (one["words"], one["sessions"]) == (130, ["a", "b"])
+    path = work.path / one["file"]
+    assert path.stat().st_size == one["bytes"]
+    assert update(work)[VARIANT] == {"changed": "", "segments": [one]}
+    content = path.read_bytes()
+    path.write_bytes(content[:-2] + b"xy")
+    assert update(work)[VARIANT]["changed"] == "2 sessions added"
+    assert path.read_bytes() == content
 
 
 def test_places_beyond_the_list_are_never_found() -> None:
