@@ -99,6 +99,13 @@ def search(settings: Settings) -> Figures:
     return search_speed(settings)
 
 
+def verification(settings: Settings) -> Figures:
+    """Hypotheses searched, fitted and judged; see :mod:`semloc_logs.evaluation.verification_speed`."""
+    from semloc_logs.evaluation.verification_speed import verification_speed
+
+    return verification_speed(settings)
+
+
 def annotate(settings: Settings) -> Figures:
     """A hundred closures into a simulated MCAP log in place, beside rewriting the log with mcap-python."""
     from mcap.reader import make_reader
@@ -146,6 +153,7 @@ BENCHMARKS: dict[str, Callable[[Settings], Figures]] = {
     "fusion": fusion,
     "encoder": encoder,
     "search": search,
+    "verification": verification,
     "annotate": annotate,
 }
 
