@@ -146,16 +146,17 @@ Found = tuple[Hypothesis, F64, float]
 
 def _apart(found: Sequence[Found], distance: float, most: int) -> list[Found]:
     """The first ``most`` of ``found`` that are not beside an earlier one: hypotheses that have met are one."""
-    kept: list[Found] = []
-    for f in found:
-        if not any(
-            o[0].group == f[0].group and np.abs(o[1][1:] - f[1][1:]).max() < distance and abs(np.sin(o[1][0] - f[1][0])) < 0.05
-            for o in kept
-        ):
-            kept.append(f)
+    groups = np.array([f[0].group for f in found])
+    poses = np.array([f[1] for f in found]).reshape(-1, 4)
+    beside = (groups[:, None] == groups) & (np.abs(poses[:, None, 1:] - poses[:, 1:]).max(2) < distance)
+    beside &= np.abs(np.sin(poses[:, None, 0] - poses[:, 0])) < 0.05
+    kept: list[int] = []
+    for i in range(len(found)):
+        if not beside[i, kept].any():
+            kept.append(i)
         if len(kept) == most:
             break
-    return kept
+    return [found[i] for i in kept]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

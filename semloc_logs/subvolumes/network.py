@@ -13,12 +13,17 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import torch
+from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semloc_logs.subvolumes.cut import CLASSES
 
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
 LATENT = 256
 EMBEDDING = 8
 CHANNELS = (16, 32, 64)
@@ -91,6 +96,36 @@ class Turning(nn.Module):
         return _turned(self.base, self.group_in), self.bias.repeat(4)
 
 
+@njit(cache=True, nogil=True)
+def look_up_cells(codes: U8, table: F32, bias: F32, usual: int, out: F32) -> None:
+    """ReLU(bias + the rows of ``table`` (8, codes, channels) of the 2x2x2 ``codes`` (b, x, y, z) of each cell) into ``out`` (b, x / 2,
+    y / 2, z / 2, channels); cells that hold nothing but the ``usual`` code are made once."""
+    n = len(bias)
+    of_usual = bias.copy()
+    for k in range(8):
+        for c in range(n):
+            of_usual[c] += table[k, usual, c]
+    for c in range(n):
+        of_usual[c] = max(of_usual[c], np.float32(0))
+    for b in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            for j in range(out.shape[2]):
+                for m in range(out.shape[3]):
+                    cell, same = codes[b, 2 * i : 2 * i + 2, 2 * j : 2 * j + 2, 2 * m : 2 * m + 2], True
+                    for k in range(8):
+                        same &= cell[k >> 2, (k >> 1) & 1, k & 1] == usual
+                    if same:
+                        out[b, i, j, m] = of_usual
+                        continue
+                    total = bias.copy()
+                    for k in range(8):
+                        code = cell[k >> 2, (k >> 1) & 1, k & 1]
+                        for c in range(n):
+                            total[c] += table[k, code, c]
+                    for c in range(n):
+                        out[b, i, j, m, c] = max(total[c], np.float32(0))
+
+
 class Encoder(nn.Module):
     """Codes (b, x, y, 32) uint8 with a margin of 8 voxels in x and y -> mu (b, latent, (x - 40) / 8, (y - 40) / 8).
 
@@ -107,10 +142,11 @@ class Encoder(nn.Module):
         self.mean = layer(CHANNELS[-1], latent, (4, 4, 4))
         self.log_variance = nn.Linear(latent, latent)
         self._kept: list[tuple[Tensor, Tensor]] = []
+        self._table: F32 | None = None
 
     def train(self, mode: bool = True) -> Encoder:
         """As of any module; what was kept of the old weights is forgotten."""
-        self._kept = []
+        self._kept, self._table = [], None
         return super().train(mode)
 
     def _layers(self) -> list[tuple[Tensor, Tensor]]:
@@ -137,9 +173,20 @@ class Encoder(nn.Module):
         x = F.linear(looked_up.flatten(4), weight, bias)
         return x.permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
 
+    def _looked_up(self, codes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """The first block and its ReLU as a sum of eight rows of a table: what a voxel of each code adds to the cell it lies in."""
+        if self._table is None:
+            table = torch.einsum("ce,oke->kco", self.embedding.weight, weight.unflatten(1, (8, EMBEDDING)))
+            self._table = np.ascontiguousarray(table.float().numpy())
+        b, x, y, z = codes.shape
+        out = np.empty((b, x // 2, y // 2, z // 2, len(bias)), np.float32)
+        look_up_cells(codes.numpy(), self._table, bias.float().numpy(), CLASSES[self.variant] + 1, out)
+        return torch.from_numpy(out).permute(0, 4, 1, 2, 3)
+
     def forward(self, codes: Tensor) -> Tensor:
         first, *blocks, mean = self._layers()
-        x = F.relu(self.first_block(codes, *first))
+        describing = not (self.training or torch.is_grad_enabled() or codes.is_cuda)
+        x = self._looked_up(codes, *first) if describing else F.relu(self.first_block(codes, *first))
         for weight, bias in blocks:
             x = F.relu(halve(F.conv3d(x, weight, bias, padding=1)))  # ReLU before pooling, as in the paper, would cost eight times as much
         return latent_mean(x[:, :, 1:-1, 1:-1], *mean)  # the pooled margin has served

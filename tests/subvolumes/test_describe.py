@@ -236,3 +236,15 @@ def test_quarter_turns_of_the_query_meet_the_headings_of_the_map() -> None:
     i, j = np.nonzero(away < 0.01)
     assert len(i) > 10
     np.testing.assert_allclose(quarter_turns(asked.descriptor[j], 1), known.descriptor[i], atol=0.05)
+
+
+def test_looking_up_cells_is_the_first_block() -> None:
+    """Sums of table rows, which describing uses, against embedding and matrix product, which training uses."""
+    encoder = random_encoder("semantic", seed=3)
+    codes = np.random.default_rng(1).integers(0, 22, (2, 12, 10, 8)).astype(np.uint8)
+    codes[:, 4:] = 20  # nothing but unobserved voxels
+    volume = torch.from_numpy(codes)
+    with torch.no_grad():
+        first = encoder._layers()[0]
+        expected = torch.relu(encoder.first_block(volume, *first))
+        np.testing.assert_allclose(encoder._looked_up(volume, *first).numpy(), expected.numpy(), atol=1e-6)
