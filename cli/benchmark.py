@@ -37,7 +37,7 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
     multiple=True,
     callback=pairs,
     help="What to compare with and the Python that has it (benchmarks/README.md): octomap or kiss_slam for fusion, fpfh for retrieval, "
-    "faiss for search.",
+    "faiss for search, scan_context, fpfh_ransac, kiss_matcher or map_closures for localisation.",
 )
 @click.option("--lengths", default="1,4,16", callback=_lengths, help="Multiples of a drive of 250 m, for memory; default 1,4,16.")
 @click.option(
@@ -49,9 +49,14 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
 )
 @path_option("--weights", help="Weights instead of the shipped ones, for retrieval and completion.")
 @click.option("--database", type=click.IntRange(1), default=100_000, show_default=True, metavar="N", help="Descriptors, for retrieval.")
-@click.option("--queries", type=click.IntRange(1), default=2000, show_default=True, metavar="N", help="Words that ask, for retrieval.")
+@click.option(
+    "--queries",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Words that ask, for retrieval (default 2000), or queries of each condition, for localisation (default 40).",
+)
 @path_option("--picture", help="PNG of some subvolumes to write, for completion.")
-@path_option("--work", help="Folder that keeps the simulated streets, for retrieval, completion and scaling.")
+@path_option("--work", help="Folder that keeps the simulated streets, for retrieval, completion, scaling and localisation.")
 @json_option
 @settings_options
 @console_options
@@ -64,7 +69,7 @@ def command(
     variant: str,
     weights: Path | None,
     database: int,
-    queries: int,
+    queries: int | None,
     picture: Path | None,
     work: Path | None,
     as_json: bool,
@@ -77,8 +82,8 @@ def command(
     profile of a run on the LOGs), words (recall of word matches between two LOGs whose truth is known, trained weights beside random
     ones), labels (classes from geometry against the labels recorded in the LOGs), realism (simulated sweeps beside the labelled ones of
     the LOGs), retrieval (recall of descriptors on held-out simulated streets and, with --truth, of the first LOG's in the second
-    one's), completion (of incomplete subvolumes of such streets), or scaling (the look-up of words in maps of 10, 100 and 1000 km).
-    Close other programs first: times are wall-clock.
+    one's), completion (of incomplete subvolumes of such streets), scaling (the look-up of words in maps of 10, 100 and 1000 km), or
+    localisation (whole queries in a simulated city beside other systems). Close other programs first: times are wall-clock.
 
     \b
     Example:  semloc benchmark reading --json
@@ -88,6 +93,7 @@ def command(
               semloc benchmark labels labelled.mcap
               semloc benchmark realism labelled.mcap
               semloc benchmark retrieval --work streets --peer fpfh=open3d/bin/python
+              semloc benchmark localisation --work city --peer kiss_matcher=kiss/bin/python
     """
     if name == "words" and (len(logs) != 2 or truth is None):
         raise click.UsageError("words needs two logs and --truth FILE.")
@@ -105,7 +111,9 @@ def command(
             variants = ("semantic", "geometric") if variant == "both" else (variant,)
             real = real_streets(logs, truth, settings) if truth is not None else None
             rows: Rows = []
-            figures = retrieval_benchmark(RetrievalChoice(variants, weights, database, queries, work), peers, settings, real, console.note)
+            figures = retrieval_benchmark(
+                RetrievalChoice(variants, weights, database, queries or 2000, work), peers, settings, real, console.note
+            )
         elif name == "completion":
             from semloc_logs.evaluation.completion import completion_benchmark
 
@@ -114,6 +122,10 @@ def command(
             from semloc_logs.evaluation.search_scaling import scaling_benchmark
 
             figures, rows = scaling_benchmark(settings, work, console.note), []
+        elif name == "localisation":
+            from semloc_logs.profiling import localisation
+
+            figures, rows = localisation(work, queries or 40, peers, settings, console.note), []
         else:
             figures, rows = _measure(name, logs, truth, peers, lengths, settings)
     if as_json:

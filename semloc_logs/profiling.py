@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from unittest.mock import patch
@@ -17,14 +17,15 @@ from unittest.mock import patch
 import numpy as np
 
 from semloc_logs.closures.queries import SessionMap
-from semloc_logs.engines import make_engine
+from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SemlocError
+from semloc_logs.evaluation.localisation_benchmark import Localisation
 from semloc_logs.evaluation.places import Street
 from semloc_logs.evaluation.retrieval import real_street, true_queries, word_recall
 from semloc_logs.evaluation.truth import read_truth
 from semloc_logs.logs.session import open_session
 from semloc_logs.settings import Settings
-from semloc_logs.stages import fuse, run, session_name
+from semloc_logs.stages import describe, fuse, run, session_name
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.tables import read_metadata
@@ -281,3 +282,26 @@ def real_streets(logs: Sequence[Path], truth: Path, settings: Settings) -> dict[
             tracks = read_truth(truth, maps)
             out |= {name: real_street(query, target, tracks, name, labelled) for name in names}
     return out
+
+
+class _Prepare:
+    """The stages as the localisation benchmark needs them."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+
+    def fuse(self, logs: Mapping[str, Path], work: Workspace, settings: Settings) -> None:
+        fuse({name: [log] for name, log in logs.items()}, work, settings, {}, self._engine, lambda _: None)
+
+    def describe(self, work: Workspace, names: Sequence[str], settings: Settings) -> None:
+        describe(work, names, settings, self._engine, lambda _: None)
+
+
+def localisation(work: Path | None, queries: int, peers: Mapping[str, str], settings: Settings, note: Callable[[str], None]) -> Figures:
+    """Whole localisation beside ``peers`` (runner -> Python), ``queries`` for each condition, on all cores; kept in ``work``."""
+    engine = make_engine("processes")
+    with tempfile.TemporaryDirectory(prefix="semloc-localisation-") as folder:
+        try:
+            return Localisation(work or Path(folder), queries, peers, settings.resolved(), engine, _Prepare(engine), note).figures()
+        finally:
+            engine.close()

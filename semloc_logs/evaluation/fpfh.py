@@ -7,15 +7,12 @@ wide as a subvolume about the occupied voxel nearest to its centre. FPFH does no
 from __future__ import annotations
 
 import hashlib
-import os
-import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
-from semloc_logs.errors import SemlocError, SettingsError
-from semloc_logs.evaluation.peers import runner
+from semloc_logs.evaluation.peers import run_peer
 from semloc_logs.evaluation.places import Place
 from semloc_logs.evaluation.recall import Describe
 from semloc_logs.subvolumes.cut import SIZE
@@ -61,15 +58,7 @@ def _key(place: Place, is_query: bool) -> str:
 
 
 def _run(python: str, folder: Path, voxel_size: float) -> None:
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    command = [python, "-I", str(runner("fpfh")), str(folder), repr(SIZE / 2 * voxel_size), repr(CELLS * voxel_size)]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=SECONDS)
-    except (OSError, subprocess.TimeoutExpired) as problem:
-        raise SettingsError(f"FPFH cannot be had from {python} ({problem}): give --peer fpfh=PYTHON that has open3d.") from None
-    if done.returncode:
-        said = done.stderr.strip().splitlines()
-        raise SemlocError(f"Peer fpfh failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md.")
+    run_peer("fpfh", python, [str(folder), repr(SIZE / 2 * voxel_size), repr(CELLS * voxel_size)], SECONDS)
     for name in ("points", "centres", "track"):
         for path in folder.glob(f"{name}_*.npy"):
             path.unlink()

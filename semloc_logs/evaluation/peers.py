@@ -43,8 +43,31 @@ def runner(name: str) -> Path:
     known = sorted(p.name.removesuffix("_runner.py") for p in folder.glob("*_runner.py"))
     if name not in known:
         there = f"there are {', '.join(known)}" if known else "their scripts are in benchmarks/peers of the source checkout"
-        raise SettingsError(f"There is no peer '{name}' to fuse with: {there}.")
+        raise SettingsError(f"There is no peer '{name}' to compare with: {there}.")
     return folder / f"{name}_runner.py"
+
+
+def environment(threads: int) -> dict[str, str]:
+    """Of a peer's process: so many ``threads``, and no modules of ours."""
+    out = os.environ | dict.fromkeys(_THREADS, str(threads)) | {"OMP_WAIT_POLICY": "passive"}
+    out.pop("PYTHONPATH", None)
+    return out
+
+
+def run_peer(name: str, python: str, arguments: Sequence[str], seconds: float) -> str:
+    """What the script of peer ``name`` prints within ``seconds``, in one thread.
+
+    SettingsError when ``python`` cannot be started, SemlocError when the script fails.
+    """
+    command = [python, "-I", str(runner(name)), *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment(1), timeout=seconds)
+    except (OSError, subprocess.TimeoutExpired) as problem:
+        raise SettingsError(f"Peer {name} cannot be had from {python} ({problem}): give --peer {name}=PYTHON.") from None
+    if done.returncode:
+        said = done.stderr.strip().splitlines()
+        raise SemlocError(f"Peer {name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md.")
+    return done.stdout
 
 
 def write_scans(folder: Path, scans: Sequence[Scan]) -> None:
@@ -59,13 +82,11 @@ class Peer:
 
     def __init__(self, name: str, python: str, folder: Path, voxel_size: float, max_range: float, threads: int) -> None:
         self.name = name
-        environment = os.environ | dict.fromkeys(_THREADS, str(threads)) | {"OMP_WAIT_POLICY": "passive"}
-        environment.pop("PYTHONPATH", None)
         command = [python, "-I", str(runner(name)), str(folder), repr(voxel_size), repr(max_range)]
         self._errors = (folder / f"{name}-{threads}.err").open("w+")
         try:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True, env=environment
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True, env=environment(threads)
             )
         except OSError as problem:
             self._errors.close()

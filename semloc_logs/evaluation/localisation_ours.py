@@ -1,0 +1,190 @@
+"""Our localisation in the benchmark: as it is, with parts of it replaced, and where its time goes."""
+
+from __future__ import annotations
+
+import cProfile
+import os
+import pstats
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+
+from semloc_logs.alignment.hypotheses import Hypothesis
+from semloc_logs.alignment.verify import Query
+from semloc_logs.closures import closing
+from semloc_logs.closures.agreement import decide
+from semloc_logs.closures.database import Database
+from semloc_logs.closures.queries import SessionMap
+from semloc_logs.evaluation.localisation import Answer, World, read_world
+from semloc_logs.evaluation.localisation_worlds import DATABASE, WorldDrive
+from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.subvolumes.checkpoints import save_weights
+from semloc_logs.subvolumes.describe import load_encoder
+from semloc_logs.subvolumes.describing import describe_submap
+from semloc_logs.subvolumes.network import Completion
+from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
+from semloc_logs.workspace import Workspace
+
+STEP = 4.0  # m between hypotheses of the grid along the road, and across it
+PROFILED = 5  # queries
+PARTS = {  # of a query, by the functions that do them
+    "fuse": ("queries.py build_query",),
+    "describe": ("describe.py describe_map", "cut.py turn"),
+    "search words": ("index.py search",),
+    "verify": ("closing.py verify_hypotheses",),
+    "align and judge": ("closing.py _align",),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class OurSystem:
+    """A way of asking: ``labels`` of the log or from geometry; how a query is fused, ``weights`` trained or random; ``hypotheses`` by
+    words, of a grid over all of the road, or as many of that grid as words would give; every ``every``-th query is asked."""
+
+    name: str
+    query: tuple[tuple[str, Any], ...] = (("length", 20.0),)
+    labels: str = "auto"
+    weights: str = "trained"
+    hypotheses: str = "words"
+    every: int = 1
+
+
+OURS = (
+    OurSystem("ours"),
+    OurSystem("ours, one frame", (("frames", 1),)),
+    OurSystem("ours, no labels", labels="geometry"),
+    OurSystem("random weights", weights="random"),
+    OurSystem("grid, as many", hypotheses="some"),
+    OurSystem("grid, exhaustive", hypotheses="all", every=5),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class OurTask:
+    """Queries of one drive by one system; picklable."""
+
+    work: Path
+    drive: WorldDrive
+    system: OurSystem
+    keyframes: tuple[int, ...]
+    settings: Settings  # resolved, and the system's
+
+    def answers(self) -> list[Answer]:
+        """One for each keyframe; the first query is asked twice, to warm up."""
+        world = read_world(self.work, self.drive)
+        database = Database(world.work, (DATABASE,), self.settings)
+        with self._hypotheses():
+            closing.close_query(database, world.query, self.keyframes[0])
+            asked = [self._ask(database, world, k) for k in self.keyframes]
+        maps = {self.drive.name: world.query, DATABASE: world.database}
+        decided = decide([a for _, found in asked for a in found], maps, self.settings)
+        accepted = {a.query_keyframe for a in decided if a.accepted}
+        return [self._answer(world, k, seconds, found, k in accepted) for k, (seconds, found) in zip(self.keyframes, asked, strict=True)]
+
+    def profile(self) -> dict[str, float]:
+        """Seconds a query of the parts of some queries, under the profiler."""
+        world = read_world(self.work, self.drive)
+        database = Database(world.work, (DATABASE,), self.settings)
+        asked = self.keyframes[:PROFILED]
+        closing.close_query(database, world.query, asked[0])
+        profiler = cProfile.Profile()
+        for keyframe in asked:
+            profiler.runcall(closing.close_query, database, world.query, keyframe)
+        return {part: seconds / len(asked) for part, seconds in _parts(profiler).items()}
+
+    def _hypotheses(self) -> Any:
+        if self.system.hypotheses == "words":
+            return nullcontext()
+        most = self.settings.closures.hypotheses if self.system.hypotheses == "some" else None
+        return patch.object(closing, "find_hypotheses", partial(grid_hypotheses, most=most))
+
+    def _ask(self, database: Database, world: World, keyframe: int) -> tuple[float, list[closing.Alignment]]:
+        begin = time.perf_counter()
+        found = closing.close_query(database, world.query, keyframe)
+        return time.perf_counter() - begin, found
+
+    def _answer(self, world: World, keyframe: int, seconds: float, found: list[closing.Alignment], accepted: bool) -> Answer:
+        """Of the alignment that is most probable by itself, which is its score."""
+        if not found:
+            return Answer(keyframe, seconds, accepted=False)
+        best = found[0]
+        map_T_base = world.database.map_T_base[best.target_keyframe] @ best.target_T_query
+        return Answer(keyframe, seconds, best.probability, *world.errors(keyframe, map_T_base), accepted=accepted)
+
+
+def _parts(profiler: cProfile.Profile) -> dict[str, float]:
+    """Seconds of each of ``PARTS`` and of the rest."""
+    total: dict[str, float] = {}
+    for (path, _, name), (_, _, _, cumulative, _) in pstats.Stats(profiler).stats.items():  # type: ignore[attr-defined]
+        key = f"{Path(path).name} {name}"
+        total[key] = total.get(key, 0.0) + cumulative
+    out = {part: sum(total.get(f, 0.0) for f in functions) for part, functions in PARTS.items()}
+    return out | {"rest": max(0.0, total.get("closing.py close_query", 0.0) - sum(out.values()))}
+
+
+def grid_hypotheses(database: Database, session: SessionMap, keyframe: int, query: Query, most: int | None = None) -> list[Hypothesis]:
+    """Instead of word matches: every heading every few metres along and across the database's road, or ``most`` of these at random."""
+    settings = database.settings
+    step = STEP * settings.fusion.voxel_size / STREET_VOXEL
+    out: list[Hypothesis] = []
+    for group, place in enumerate(database.places):
+        target = database.sessions[place.session]
+        submap = target.submaps[place.submap]
+        ids = np.arange(submap["first"], submap["last"] + 1)
+        _, first = np.unique(np.floor(target.distance[ids] / step), return_index=True)
+        for pose in target.map_T_base[ids[first]]:
+            for across in (-step, 0.0, step):
+                x, y, z = pose[:3, 3] + across * pose[:3, 1]
+                for heading in range(settings.descriptor.headings):
+                    yaw = 2 * np.pi * heading / settings.descriptor.headings
+                    out.append(Hypothesis(group, (yaw, float(x), float(y), float(z)), 0, 0.0))
+    if most is None or len(out) <= most:
+        return out
+    rng = np.random.default_rng([7, keyframe])
+    return [out[i] for i in np.sort(rng.choice(len(out), most, replace=False))]
+
+
+def settings_of(system: OurSystem, settings: Settings, folder: Path) -> Settings:
+    """The settings that ``system`` asks with; random weights are kept in ``folder``."""
+    update: dict[str, Any] = {
+        "query": settings.query.model_copy(update=dict(system.query)),
+        "labels": settings.labels.model_copy(update={"source": system.labels}),
+    }
+    if system.weights == "random":
+        files = {"weights": folder / "random-weights.safetensors", "vocabulary": folder / "random-vocabulary.safetensors"}
+        update["descriptor"] = settings.descriptor.model_copy(update=files)
+    return settings.model_copy(update=update)
+
+
+def write_random(work: Workspace, settings: Settings) -> None:
+    """Random weights and a vocabulary of the database's descriptors by them, where ``settings`` (see :func:`settings_of`) name them."""
+    weights, vocabulary = settings.descriptor.weights, settings.descriptor.vocabulary
+    if weights is None or vocabulary is None or vocabulary.exists():
+        return
+    weights.parent.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(0)
+    save_weights(weights, Completion("semantic").eval(), {"note": "random"})
+    database = SessionMap(work.session(DATABASE))
+    encoder = load_encoder("semantic", weights)
+    parts = [describe_submap(database.folder, s["id"], s["ground_z"], database.road(s), encoder, settings) for s in database.submaps]
+    save_vocabulary(vocabulary, train_vocabulary(np.concatenate([d.descriptor for part in parts for d in part])), {"note": "random"})
+
+
+def link_workspace(source: Workspace, target: Workspace) -> None:
+    """The sessions of ``source`` without their words, as hard links in ``target``, unless they are there."""
+    for session in source.sessions():
+        goal = target.session(session.name)
+        if not goal.session_json.exists():
+            shutil.rmtree(goal.path, ignore_errors=True)
+            left_out: Callable[[str, list[str]], set[str]] = shutil.ignore_patterns("words", "words.json", "session.json")
+            shutil.copytree(session.path, goal.path, copy_function=os.link, ignore=left_out)
+            os.link(session.session_json, goal.session_json)
