@@ -89,7 +89,7 @@ class Descriptor(_Section):
     headings: int = Field(
         20, ge=4, multiple_of=4, description="yaw hypotheses about gravity: maps are described in a quarter of them, the rest is free"
     )
-    stride: Literal[4, 8] = Field(4, description="database subvolumes every so many voxels in x and y (4 or 8)")
+    stride: Literal[4, 8] = Field(8, description="database subvolumes every so many voxels in x and y (4 or 8)")
     query_stride: Literal[4, 8] = Field(8, description="query subvolumes every so many voxels in x and y (4 or 8)")
     reach: float | None = Field(None, description="database subvolumes lie this near to the road (m); default 30 m at 0.30 m voxels")
     min_occupied: int = Field(40, ge=1, description="subvolumes with fewer occupied voxels are not described")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from semloc_logs.errors import SemlocError
 from semloc_logs.settings import Settings
@@ -94,37 +94,28 @@ def one_by_one(network: Encoder, codes: NDArray[np.uint8], corners: NDArray[np.i
     return np.concatenate([encode(network, codes[8 * i : 8 * i + WIDE, 8 * j : 8 * j + WIDE]) for i, j in corners])
 
 
-def _multiplications(module: nn.Module, output: Tensor) -> int:
-    """Multiply-accumulates of a convolution or of a fully connected layer that gave ``output``."""
-    weight = getattr(module, "weight", None)
-    if isinstance(weight, Tensor) and weight.ndim > 1 and not isinstance(module, nn.Embedding):
-        return output.numel() * math.prod(weight.shape[1:])
-    return 0
+class _Watched(TorchDispatchMode):
+    """Seconds and multiply-accumulates of the convolutions of a run, in their order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[tuple[float, int]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        start = time.process_time()
+        output = func(*args, **(kwargs or {}))
+        if func in (torch.ops.aten.conv2d.default, torch.ops.aten.conv3d.default):
+            self.seen.append((time.process_time() - start, output.numel() * math.prod(args[1].shape[1:])))
+        return output
 
 
 def watch(network: Encoder, codes: NDArray[np.uint8]) -> dict[str, tuple[float, int]]:
-    """Seconds and multiply-accumulates of each layer that holds weights, and of all between them ("between"), in one run over ``codes``."""
-    seen: dict[str, tuple[float, int]] = {}
-    started: dict[str, float] = {}
-    hooks = []
-    for name, module in network.named_modules():
-        if next(module.children(), None) is None:
-
-            def before(_: nn.Module, __: Any, name: str = name) -> None:
-                started[name] = time.process_time()
-
-            def after(module: nn.Module, _: Any, output: Tensor, name: str = name) -> None:
-                seconds, count = seen.get(name, (0.0, 0))
-                seen[name] = seconds + time.process_time() - started[name], count + _multiplications(module, output)
-
-            hooks += [module.register_forward_pre_hook(before), module.register_forward_hook(after)]
-    try:
+    """Seconds and multiply-accumulates of each convolution, and of all between them ("between"), in one run over ``codes``."""
+    with _Watched() as watched:
         start = time.process_time()
         encode(network, codes)
         total = time.process_time() - start
-    finally:
-        for hook in hooks:
-            hook.remove()
+    seen = {f"convolution {n}": what for n, what in enumerate(watched.seen, 1)}
     return seen | {"between": (total - sum(s for s, _ in seen.values()), 0)}
 
 
@@ -134,15 +125,15 @@ def macs(network: Encoder, codes: NDArray[np.uint8]) -> int:
 
 
 def layers(network: Encoder, codes: NDArray[np.uint8]) -> Figures:
-    """ms, share of the multiplications and rate of each layer, medians; what lies between layers is the look-up, pooling and ReLU."""
+    """ms, share of the multiplications and rate of each layer, medians; what lies between them is the first block, pooling and ReLU."""
     runs = [watch(network, codes) for _ in range(REPEATS + 1)][1:]
     total = sum(count for _, count in runs[0].values())
     out: Figures = {}
     for name in runs[0]:
         seconds, count = float(np.median([run[name][0] for run in runs])), runs[0][name][1]
-        out[f"layer {name}"] = {"ours": 1e3 * seconds, "unit": "ms of a dense run", "share_of_macs": count / total}
+        out[name] = {"ours": 1e3 * seconds, "unit": "ms of a dense run", "share_of_macs": count / total}
         if count:
-            out[f"layer {name}"]["giga_macs_a_second"] = count / max(seconds, 1e-9) / 1e9
+            out[name]["giga_macs_a_second"] = count / max(seconds, 1e-9) / 1e9
     return out
 
 

@@ -25,7 +25,7 @@ from semloc_logs.evaluation.recall import (
     retrieval_recall,
     true_radius,
 )
-from semloc_logs.evaluation.retrieval_benchmark import RetrievalChoice, retrieval_benchmark
+from semloc_logs.evaluation.retrieval_benchmark import RetrievalChoice, densely, retrieval_benchmark
 from semloc_logs.geometry import apply, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.network import RoadNetwork, path_network
@@ -33,7 +33,7 @@ from semloc_logs.simulation.traffic import Traffic
 from semloc_logs.simulation.world import MeshBuilder, Scene, box
 from semloc_logs.subvolumes.describe import Described
 
-SETTINGS = Settings().resolved()
+SETTINGS = densely(Settings()).resolved()
 V = SETTINGS.fusion.voxel_size
 
 
@@ -50,9 +50,9 @@ def test_found_again_as_the_slow_reference_says() -> None:
 
 
 def test_the_radius_is_at_least_half_a_cell() -> None:
-    assert true_radius(SETTINGS) == pytest.approx(1.5)
-    wide = SETTINGS.model_copy(update={"descriptor": SETTINGS.descriptor.model_copy(update={"stride": 8})})
-    assert true_radius(wide) == pytest.approx(0.3 * np.sqrt(8**2 * 3) / 2)
+    for stride, radius in ((4, 1.5), (8, 0.3 * np.sqrt(8**2 * 3) / 2)):
+        settings = SETTINGS.model_copy(update={"descriptor": SETTINGS.descriptor.model_copy(update={"stride": stride})})
+        assert true_radius(settings) == pytest.approx(radius)
 
 
 def place(rng: np.random.Generator, x: float) -> Place:
