@@ -119,16 +119,20 @@ def reason(features: Features, probability: float, least: float, agreement: Agre
     return f"probability {probability:.3f} below {least:g}: {why}"
 
 
-def fit_logistic(x: F64, right: NDArray[np.bool_], ridge: float = 1.0) -> tuple[F64, float]:
-    """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d), by Newton's method."""
+def fit_logistic(x: F64, right: NDArray[np.bool_], ridge: float = 1.0, counts: F64 | None = None) -> tuple[F64, float]:
+    """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d), by Newton's method.
+
+    Row i counts ``counts`` (n,) times.
+    """
+    counts = np.ones(len(x)) if counts is None else counts
     mean, scale = x.mean(0), x.std(0) + 1e-9
     a = np.c_[(x - mean) / scale, np.ones(len(x))]
     w = np.zeros(a.shape[1])
     penalty = np.r_[np.full(x.shape[1], ridge), 1e-6]
     for _ in range(50):
         p = 1 / (1 + np.exp(-np.clip(a @ w, -30, 30)))
-        gradient = a.T @ (p - right) + penalty * w
-        hessian = (a * (p * (1 - p))[:, None]).T @ a + np.diag(penalty)
+        gradient = a.T @ (counts * (p - right)) + penalty * w
+        hessian = (a * (counts * p * (1 - p))[:, None]).T @ a + np.diag(penalty)
         step = np.linalg.solve(hessian, gradient)
         w -= step
         if np.abs(step).max() < 1e-8:

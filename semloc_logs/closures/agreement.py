@@ -172,7 +172,7 @@ def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], sett
         p = float(probability[k])
         if astray[k]:
             why = f"probability {p:.3f} below {least:g}: the session's own odometry puts it elsewhere"
-        elif p < least:
+        elif not p >= least:  # nor what is no number
             why = reason(a.features, p, least, agreement)
         else:
             why = "another place of the same session fits better" if asked in answered else ""

@@ -32,6 +32,7 @@ Bools = NDArray[np.bool_]
 # The sign with which evidence may count. The plane distances of fitting points (rmse) say more about the sensor than about the place.
 SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0, "distinct": -1, "support": 1, "stiffness": 1}
 TOGETHER_SIGNS = dict(zip(TOGETHER, (1, 1, 1, -1, 1, -1, -1), strict=True))
+COPIES, COPIES_COUNT = "repeating", 0.1  # how towns of copied blocks begin, and how much they count for an alignment by itself
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
 THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 
@@ -53,6 +54,11 @@ class Judged:
     def clear(self) -> Bools:
         """Right, or wrong by three times the bounds (n,): what is in between teaches neither side."""
         return np.asarray(self.right | (self.error_m > 3 * CORRECT_M) | (self.error_deg > 3 * CORRECT_DEG))
+
+    @property
+    def counts(self) -> F64:
+        """How much each counts (n,) for the model of an alignment by itself."""
+        return np.where([town.startswith(COPIES) for town in self.town], COPIES_COUNT, 1.0)
 
     def __len__(self) -> int:
         return len(self.town)
@@ -129,17 +135,18 @@ def read_judged(paths: Sequence[Path]) -> Judged:
 # -- fitting
 
 
-def fit_signed(x: F64, right: Bools, signs: Sequence[int], ridge: float = 0.3) -> Calibration:
-    """A logistic model of ``right`` (n,) on ``x`` (n, d) whose weights have the ``signs``.
+def fit_signed(x: F64, right: Bools, signs: Sequence[int], counts: F64, ridge: float = 0.3) -> Calibration:
+    """A logistic model of ``right`` (n,) on ``x`` (n, d), whose rows count ``counts`` (n,) times, with weights that have the ``signs``.
 
     Features whose weight would have the wrong sign are left out one by one: in few towns they stand for something else.
     """
-    low, high = np.quantile(x, 0.01, axis=0), np.quantile(x, 0.99, axis=0)
+    finite = np.where(np.isfinite(x), x, np.nan)
+    low, high = np.nanquantile(finite, 0.005, axis=0), np.nanquantile(finite, 0.999, axis=0)
     clipped, sign = np.clip(x, low, high), np.array(signs)
     used = np.flatnonzero(sign)
     weights, bias = np.zeros(x.shape[1]), 0.0
     while len(used):
-        fitted, bias = fit_logistic(clipped[:, used], right, ridge)
+        fitted, bias = fit_logistic(clipped[:, used], right, ridge, counts)
         strength = fitted * sign[used] * clipped[:, used].std(0)
         if strength.min() >= 0:
             weights[used] = fitted
@@ -149,15 +156,19 @@ def fit_signed(x: F64, right: Bools, signs: Sequence[int], ridge: float = 0.3) -
 
 
 def fit_alone(judged: Judged, rows: Bools) -> Calibration:
-    """The model of an alignment's own features, from the clear ones among ``rows`` (n,)."""
+    """The model of an alignment's own features, from the clear ones among ``rows`` (n,).
+
+    An alignment looks the same in each copy of a block, so nothing of its own can tell them apart; as many copies as these towns have
+    would only teach to doubt every place that a single sweep finds. Where there are neighbours the second model counts them in full.
+    """
     rows = rows & judged.clear
-    return fit_signed(judged.features[rows], judged.right[rows], [SIGNS[n] for n in FEATURES])
+    return fit_signed(judged.features[rows], judged.right[rows], [SIGNS[n] for n in FEATURES], judged.counts[rows])
 
 
 def fit_together(judged: Judged, columns: Sequence[F64], rows: Bools) -> Calibration:
     """The model of the agreement's ``columns`` (7, n), from the clear ones that have neighbours among ``rows`` (n,)."""
     rows = rows & judged.clear & (columns[1] > 0)
-    return fit_signed(together_values(columns)[rows], judged.right[rows], [TOGETHER_SIGNS[n] for n in TOGETHER])
+    return fit_signed(together_values(columns)[rows], judged.right[rows], [TOGETHER_SIGNS[n] for n in TOGETHER], np.ones(int(rows.sum())))
 
 
 def agreement_of(judged: Judged, alone: F64) -> list[F64]:
@@ -199,7 +210,7 @@ def fit(judged: Judged) -> Fitted:
     for mine in held.values():
         alone[mine] = fit_alone(judged, ~mine & kept).probability(judged.features[mine])
     own = fit_alone(judged, kept)
-    tempered = _temper(own, alone, judged, kept)
+    tempered = _temper(own, alone, judged, kept, judged.counts)
     alone = _tempered(alone, own, tempered)
     columns = agreement_of(judged, alone)
     probability = np.zeros(len(judged))
@@ -207,7 +218,7 @@ def fit(judged: Judged) -> Fitted:
         model = Model(tempered, fit_together(judged, columns, ~mine & kept))
         probability[mine] = model.decided([c[mine] for c in columns])
     whole = fit_together(judged, columns, kept)
-    together = _temper(whole, probability, judged, kept & (columns[1] > 0))
+    together = _temper(whole, probability, judged, kept & (columns[1] > 0), np.ones(len(judged)))
     probability = np.where(columns[1] > 0, _tempered(probability, whole, together), probability)
     probability[~kept] = 0.0
     return Fitted(Model(tempered, together), alone, probability)
@@ -218,10 +229,10 @@ def _log_odds(p: F64) -> F64:
     return np.asarray(np.log(p / (1 - p)))
 
 
-def _temper(model: Calibration, held_out: F64, judged: Judged, rows: Bools) -> Calibration:
+def _temper(model: Calibration, held_out: F64, judged: Judged, rows: Bools, counts: F64) -> Calibration:
     """``model`` with its log-odds scaled by at most one and moved, so that the ``held_out`` probabilities (n,) of ``rows`` would fit."""
     rows = rows & judged.clear
-    scale, shift = fit_logistic(_log_odds(held_out[rows])[:, None], judged.right[rows], 1e-3)
+    scale, shift = fit_logistic(_log_odds(held_out[rows])[:, None], judged.right[rows], 1e-3, counts[rows])
     if scale[0] >= 1:
         return model
     factor = max(float(scale[0]), 0.3)

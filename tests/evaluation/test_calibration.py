@@ -78,8 +78,8 @@ def test_weights_of_the_wrong_sign_are_left_out() -> None:
     rng = np.random.default_rng(3)
     x = rng.normal(size=(4000, 3))
     right = rng.random(4000) < 1 / (1 + np.exp(-(1.5 * x[:, 0] - 1.0 * x[:, 1] + 0.3)))
-    assert fit_signed(x, right, (1, -1, 0)).weights == pytest.approx((1.5, -1.0, 0.0), abs=0.15)
-    assert fit_signed(x, right, (1, 1, 0)).weights[1:] == (0.0, 0.0)
+    assert fit_signed(x, right, (1, -1, 0), np.ones(len(x))).weights == pytest.approx((1.5, -1.0, 0.0), abs=0.15)
+    assert fit_signed(x, right, (1, 1, 0), np.ones(len(x))).weights[1:] == (0.0, 0.0)
 
 
 def test_reliability_and_recall_by_hand() -> None:
