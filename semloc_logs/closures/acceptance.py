@@ -50,6 +50,11 @@ def together_values(columns: Sequence[F64]) -> F64:
     return np.stack([np.log(p / (1 - p)), counts[0], agreeing / np.maximum(neighbours, 1), *counts[1:], lookalike], axis=-1)
 
 
+def has_far(columns: Sequence[F64]) -> NDArray[np.bool_]:
+    """Where queries far along the road have been placed at all (n,), by the columns (7, n) of ``AGREEMENT``."""
+    return np.asarray(columns[4]) + np.asarray(columns[5]) > 0
+
+
 @dataclass(frozen=True, slots=True)
 class Calibration:
     """A logistic model: ``weights`` of values after clipping to ``low`` .. ``high``, and ``bias``."""
@@ -82,21 +87,31 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """``alone`` of an alignment's own features, ``together`` of that probability's log-odds and the neighbours."""
+    """``alone`` of an alignment's own features; of that probability's log-odds and the neighbours ``near``, and ``together`` with the far ones.
+
+    The far ones tell copies of a street apart, but a short log has none, and that says nothing against it.
+    """
 
     alone: Calibration
+    near: Calibration
     together: Calibration
 
     def decided(self, columns: Sequence[F64]) -> F64:
         """Probabilities (n,) from the columns (7, n) of ``AGREEMENT``: that of the alignment alone where there are no neighbours."""
-        return np.where(np.asarray(columns[1]) > 0, self.together.probability(together_values(columns)), columns[0])
+        values = together_values(columns)
+        by_neighbours = np.where(has_far(columns), self.together.probability(values), self.near.probability(values))
+        return np.where(np.asarray(columns[1]) > 0, by_neighbours, columns[0])
 
 
 @cache
 def shipped() -> Model:
     """The calibration in the package; ``benchmarks/calibrate.py`` makes it."""
     content = json.loads(files("semloc_logs.closures").joinpath("calibration.json").read_text())
-    return Model(Calibration.from_json(content["alone"], FEATURES), Calibration.from_json(content["together"], TOGETHER))
+    return Model(
+        Calibration.from_json(content["alone"], FEATURES),
+        Calibration.from_json(content["near"], TOGETHER),
+        Calibration.from_json(content["together"], TOGETHER),
+    )
 
 
 def reason(features: Features, probability: float, least: float, agreement: Agreement) -> str:

@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import TOGETHER, Calibration, Model, fit_logistic, together_values
+from semloc_logs.closures.acceptance import TOGETHER, Calibration, Model, fit_logistic, has_far, together_values
 from semloc_logs.closures.agreement import Placed, agree, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import keyframe_at
@@ -31,7 +31,7 @@ Bools = NDArray[np.bool_]
 
 # The sign with which evidence may count. The plane distances of fitting points (rmse) say more about the sensor than about the place.
 SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0, "distinct": -1, "support": 1, "stiffness": 1}
-TOGETHER_SIGNS = dict(zip(TOGETHER, (1, 1, 1, -1, 1, -1, -1), strict=True))
+TOGETHER_SIGNS, NEAR_SIGNS = (1, 1, 1, -1, 1, -1, -1), (1, 1, 1, -1, 0, 0, -1)  # of ``TOGETHER``
 COPIES, COPIES_COUNT = "repeating", 0.1  # how towns of copied blocks begin, and how much they count for an alignment by itself
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
 THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
@@ -165,10 +165,15 @@ def fit_alone(judged: Judged, rows: Bools) -> Calibration:
     return fit_signed(judged.features[rows], judged.right[rows], [SIGNS[n] for n in FEATURES], judged.counts[rows])
 
 
-def fit_together(judged: Judged, columns: Sequence[F64], rows: Bools) -> Calibration:
-    """The model of the agreement's ``columns`` (7, n), from the clear ones that have neighbours among ``rows`` (n,)."""
+def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Calibration) -> Model:
+    """The models of the agreement's ``columns`` (7, n), from the clear ones that have neighbours among ``rows`` (n,), beside ``alone``.
+
+    Near neighbours lie in the same copy of a block as the query does: for them copies count as for an alignment by itself.
+    """
     rows = rows & judged.clear & (columns[1] > 0)
-    return fit_signed(together_values(columns)[rows], judged.right[rows], [TOGETHER_SIGNS[n] for n in TOGETHER], np.ones(int(rows.sum())))
+    values, right = together_values(columns)[rows], judged.right[rows]
+    near = fit_signed(values, right, NEAR_SIGNS, judged.counts[rows])
+    return Model(alone, near, fit_signed(values, right, TOGETHER_SIGNS, np.ones(len(right))))
 
 
 def agreement_of(judged: Judged, alone: F64) -> list[F64]:
@@ -215,13 +220,14 @@ def fit(judged: Judged) -> Fitted:
     columns = agreement_of(judged, alone)
     probability = np.zeros(len(judged))
     for mine in held.values():
-        model = Model(tempered, fit_together(judged, columns, ~mine & kept))
+        model = fit_agreement(judged, columns, ~mine & kept, tempered)
         probability[mine] = model.decided([c[mine] for c in columns])
-    whole = fit_together(judged, columns, kept)
-    together = _temper(whole, probability, judged, kept & (columns[1] > 0), np.ones(len(judged)))
-    probability = np.where(columns[1] > 0, _tempered(probability, whole, together), probability)
+    whole = fit_agreement(judged, columns, kept, tempered)
+    far = (columns[1] > 0) & has_far(columns)
+    together = _temper(whole.together, probability, judged, kept & far, np.ones(len(judged)))
+    probability = np.where(far, _tempered(probability, whole.together, together), probability)
     probability[~kept] = 0.0
-    return Fitted(Model(tempered, together), alone, probability)
+    return Fitted(replace(whole, together=together), alone, probability)
 
 
 def _log_odds(p: F64) -> F64:
@@ -291,6 +297,7 @@ def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
     return {
         "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature, 'together' where a query has neighbours",
         "alone": fitted.model.alone.to_json(FEATURES),
+        "near": fitted.model.near.to_json(TOGETHER),
         "together": fitted.model.together.to_json(TOGETHER),
         "towns": len(set(judged.town)),
         "alignments": int(judged.clear.sum()),
