@@ -87,7 +87,7 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """``alone`` of an alignment's own features; of that probability's log-odds and the neighbours ``near``, and ``together`` with the far ones.
+    """``alone`` of an alignment's own features; ``near`` of that probability's log-odds and near neighbours, ``together`` of far ones too.
 
     The far ones tell copies of a street apart, but a short log has none, and that says nothing against it.
     """

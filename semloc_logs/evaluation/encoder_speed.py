@@ -94,11 +94,11 @@ def one_by_one(network: Encoder, codes: NDArray[np.uint8], corners: NDArray[np.i
     return np.concatenate([encode(network, codes[8 * i : 8 * i + WIDE, 8 * j : 8 * j + WIDE]) for i, j in corners])
 
 
-class _Watched(TorchDispatchMode):
+class _Watched(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Seconds and multiply-accumulates of the convolutions of a run, in their order."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.seen: list[tuple[float, int]] = []
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

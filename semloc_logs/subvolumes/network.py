@@ -176,7 +176,7 @@ class Encoder(nn.Module):
     def _looked_up(self, codes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """The first block and its ReLU as a sum of eight rows of a table: what a voxel of each code adds to the cell it lies in."""
         if self._table is None:
-            table = torch.einsum("ce,oke->kco", self.embedding.weight, weight.unflatten(1, (8, EMBEDDING)))
+            table = torch.einsum("ce,oke->kco", self.embedding.weight, weight.reshape(-1, 8, EMBEDDING))
             self._table = np.ascontiguousarray(table.float().numpy())
         b, x, y, z = codes.shape
         out = np.empty((b, x // 2, y // 2, z // 2, len(bias)), np.float32)
