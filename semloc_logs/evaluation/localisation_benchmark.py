@@ -114,7 +114,7 @@ class Localisation:
         """Fuse all drives for each source of labels, describe the database for each network."""
         for system in OURS:
             fused = self._fused(system)
-            settings = settings_of(system, self.settings, self.folder / "random")
+            settings = settings_of(system, self.settings, self.folder / f"random-{our_version()}")
             self.prepare.fuse({d.name: d.log for d in self.drives}, fused, settings)
             write_random(fused, settings)
             work = self._workspace(system)
@@ -137,7 +137,7 @@ class Localisation:
             if not keyframes:
                 continue
             for ours in OURS:
-                settings = settings_of(ours, self.settings, self.folder / "random")
+                settings = settings_of(ours, self.settings, self.folder / f"random-{our_version()}")
                 task = OurTask(self._workspace(ours).path, drive, ours, keyframes[:: ours.every], settings)
                 out.append(self._unit(task, our_version()))
             for peer in PEERS:

@@ -64,7 +64,7 @@ OURS = (
     OurSystem("ours, no labels", labels="geometry"),
     OurSystem("random weights", weights="random"),
     OurSystem("grid, as many", hypotheses="some"),
-    OurSystem("grid, exhaustive", hypotheses="all", every=5),
+    OurSystem("grid, exhaustive", hypotheses="all", every=20),
 )
 
 
@@ -82,8 +82,8 @@ class OurTask:
         """One for each keyframe; the first query is asked twice, to warm up."""
         world = read_world(self.work, self.drive)
         database = Database(world.work, (DATABASE,), self.settings)
+        closing.close_query(database, world.query, self.keyframes[0])
         with self._hypotheses():
-            closing.close_query(database, world.query, self.keyframes[0])
             asked = [self._ask(database, world, k) for k in self.keyframes]
         maps = {self.drive.name: world.query, DATABASE: world.database}
         decided = decide([a for _, found in asked for a in found], maps, self.settings)
@@ -135,6 +135,7 @@ def grid_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
     """Instead of word matches: every heading every few metres along and across the database's road, or ``most`` of these at random."""
     settings = database.settings
     step = STEP * settings.fusion.voxel_size / STREET_VOXEL
+    yaws = np.split(2 * np.pi * np.arange(settings.descriptor.headings) / settings.descriptor.headings, [settings.descriptor.headings // 2])
     out: list[Hypothesis] = []
     for group, place in enumerate(database.places):
         target = database.sessions[place.session]
@@ -143,10 +144,9 @@ def grid_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
         _, first = np.unique(np.floor(target.distance[ids] / step), return_index=True)
         for pose in target.map_T_base[ids[first]]:
             for across in (-step, 0.0, step):
-                x, y, z = pose[:3, 3] + across * pose[:3, 1]
-                for heading in range(settings.descriptor.headings):
-                    yaw = 2 * np.pi * heading / settings.descriptor.headings
-                    out.append(Hypothesis(group, (yaw, float(x), float(y), float(z)), 0, 0.0))
+                for half in (0, 1):  # opposite headings lie between each other: the search takes two at one place for the same
+                    x, y, z = (pose[:3, 3] + across * pose[:3, 1] + half * step / 2 * pose[:3, 0]).tolist()
+                    out += [Hypothesis(group, (float(yaw), x, y, z), 0, 0.0) for yaw in yaws[half]]
     if most is None or len(out) <= most:
         return out
     rng = np.random.default_rng([7, keyframe])

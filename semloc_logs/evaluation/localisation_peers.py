@@ -32,7 +32,7 @@ from semloc_logs.voxels.store import read_keyframe
 F64 = NDArray[np.float64]
 SECONDS = 3600.0
 CELL = 0.2  # m: points of a cloud are thinned to it
-CANDIDATES, TOLD = 10, 3
+CANDIDATES, TOLD = 5, 3
 
 
 @dataclass(frozen=True, slots=True)
