@@ -149,7 +149,7 @@ def _apart(found: Sequence[Found], distance: float, most: int) -> list[Found]:
     groups = np.array([f[0].group for f in found])
     poses = np.array([f[1] for f in found]).reshape(-1, 4)
     beside = (groups[:, None] == groups) & (np.abs(poses[:, None, 1:] - poses[:, 1:]).max(2) < distance)
-    beside &= np.abs(np.sin(poses[:, None, 0] - poses[:, 0])) < 0.05
+    beside &= np.cos(poses[:, None, 0] - poses[:, 0]) > np.cos(0.05)
     kept: list[int] = []
     for i in range(len(found)):
         if not beside[i, kept].any():
