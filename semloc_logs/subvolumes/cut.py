@@ -6,6 +6,8 @@ descriptors of a whole map can be computed at once and equal those of single sub
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 SIZE, MARGIN = 32, 8
+GRID = 8  # voxels: the coarsest stride
 WIDE = SIZE + 2 * MARGIN
 CLASSES = {"semantic": 19, "geometric": 1}
 
@@ -56,3 +59,45 @@ def turn(state: U8, low: NDArray[np.int64], yaw: float, centre: NDArray[np.float
                 for k in range(nz):
                     z = z0 + k
                     out[i, j, k] = state[x, y, z] if 0 <= z < state.shape[2] else 253
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turned:
+    """A map that was turned by -``yaw`` about z: ``state`` (x, y, z) whose corner is voxel ``low`` (3,) of the turned map.
+
+    The axis stands at ``middle`` (2,), voxels of the map.
+    """
+
+    state: U8
+    low: NDArray[np.int64]
+    middle: NDArray[np.float64]
+    yaw: float
+
+    @property
+    def _map_R_turned(self) -> NDArray[np.float64]:
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        return np.array([[c, -s], [s, c]])
+
+    def from_map(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Places (n, 2) of the map, in voxels, in the turned one."""
+        return np.asarray((points - self.middle) @ self._map_R_turned)
+
+    def to_map(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Places (n, 3) of the turned map, in voxels, in the map."""
+        out = points.astype(float)
+        out[:, :2] = out[:, :2] @ self._map_R_turned.T + self.middle
+        return out.astype(np.float32)
+
+
+def turned_map(state: U8, low: NDArray[np.integer], yaw: float) -> Turned:
+    """The box ``state`` whose corner is voxel ``low`` as a query at heading ``yaw`` sees it, with room for all of it.
+
+    Corner and axis are multiples of 8 voxels: what is described of a map that is not turned stays on its grid.
+    """
+    shape = np.array(state.shape)
+    middle = np.round((np.asarray(low) + shape / 2)[:2] / GRID) * GRID
+    c, s = abs(np.cos(yaw)), abs(np.sin(yaw))
+    half = np.ceil(np.array([[c, s], [s, c]]) @ (shape[:2] / 2 + GRID) / GRID).astype(np.int64) * GRID
+    box = np.empty((2 * half[0], 2 * half[1], shape[2]), np.uint8)
+    turn(state, np.asarray(low, np.int64), yaw, np.array([*middle, low[2] + shape[2] / 2]), box)
+    return Turned(box, np.array([-half[0], -half[1], low[2]], np.int64), middle, yaw)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.checkpoints import load_weights
-from semloc_logs.subvolumes.cut import MARGIN, SIZE, code_table, turn
+from semloc_logs.subvolumes.cut import MARGIN, SIZE, code_table
 from semloc_logs.subvolumes.network import Encoder, channels_last, descriptors
 from semloc_logs.subvolumes.pairs import occupied
 
@@ -162,32 +162,3 @@ def _encode(codes: U8, wanted: NDArray[np.int64], encoder: Encoder, stride: int)
                 grid = (wanted[rows] - corner) // 8
                 out[rows] = descriptors(mu[:, :, grid[:, 0], grid[:, 1]].unsqueeze(3)).numpy()
     return out
-
-
-def describe_turned(
-    state: U8,
-    low: NDArray[np.integer],
-    ground_z: float,
-    voxel_size: float,
-    encoder: Encoder,
-    stride: int,
-    min_occupied: int,
-    road: NDArray[np.floating],
-    reach: float,
-    yaw: float,
-) -> Described:
-    """As :func:`describe_map`, but of the map turned by -``yaw`` about z: what a query at that heading sees. Centres are the map's."""
-    shape = np.array(state.shape)
-    middle = np.round((np.asarray(low) + shape / 2)[:2] / LAYER) * LAYER  # unturned, positions stay on the stride's grid
-    c, s = np.cos(yaw), np.sin(yaw)
-    reaches = np.abs(np.array([[c, s], [-s, c]])) @ (shape[:2] / 2 + LAYER)
-    half = (np.ceil(reaches / LAYER) * LAYER).astype(int)
-    box = np.empty((2 * half[0], 2 * half[1], shape[2]), np.uint8)
-    turn(state, np.asarray(low, np.int64), yaw, np.array([*middle, low[2] + shape[2] / 2]), box)
-    map_R_turned = np.array([[c, -s], [s, c]])
-    turned_road = (road - middle * voxel_size) @ map_R_turned
-    corner = np.array([-half[0], -half[1], low[2]])
-    found = describe_map(box, corner, ground_z, voxel_size, encoder, stride, min_occupied, turned_road, reach)
-    centre = found.centre.astype(float)
-    centre[:, :2] = centre[:, :2] @ map_R_turned.T + middle
-    return Described(centre.astype(np.float32), found.descriptor)

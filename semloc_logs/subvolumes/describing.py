@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.settings import Settings
-from semloc_logs.subvolumes.describe import Described, describe_turned
+from semloc_logs.subvolumes.cut import turned_map
+from semloc_logs.subvolumes.describe import Described, describe_map
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.voxels.store import blocks_path, read_blocks
 from semloc_logs.workspace import SessionFolder
@@ -51,7 +52,12 @@ def describe_submap(
     state = blocks.dense(low, tuple((high - low).tolist()))
     d = settings.descriptor
     v, reach = settings.fusion.voxel_size, d.reach or np.inf
-    return [describe_turned(state, low, ground_z, v, encoder, d.stride, d.min_occupied, road, reach, yaw) for yaw in yaws]
+    out = []
+    for turned in (turned_map(state, low, yaw) for yaw in yaws):
+        near = turned.from_map(road / v) * v
+        found = describe_map(turned.state, turned.low, ground_z, v, encoder, d.stride, d.min_occupied, near, reach)
+        out.append(Described(turned.to_map(found.centre), found.descriptor))
+    return out
 
 
 def known_headings(settings: Settings) -> list[float]:

@@ -14,8 +14,8 @@ from safetensors.torch import save_file
 from semloc_logs.errors import SettingsError
 from semloc_logs.subvolumes import describe
 from semloc_logs.subvolumes.checkpoints import save_weights
-from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table
-from semloc_logs.subvolumes.describe import Described, describe_map, describe_turned, load_encoder, quarter_turns, random_encoder
+from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table, turned_map
+from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns, random_encoder
 from semloc_logs.subvolumes.network import Completion, Decoder, Encoder, descriptors, from_eights, in_eights
 from semloc_logs.subvolumes.pairs import occupied
 
@@ -218,24 +218,24 @@ def test_centres_of_a_turned_map_are_those_of_the_map(yaw: float) -> None:
     """A single block in the map: all windows that hold it lie about it, and on every side."""
     state = np.full((80, 96, 40), 254, np.uint8)
     state[60:64, 20:24, 12:16] = 2
-    block = LOW[:2] + np.array([62, 22])
-    found = describe_turned(state, LOW, -4 * V, V, random_encoder("geometric"), 4, 40, block[None] * V, 30.0, yaw)
-    away = found.centre[:, :2] - block
+    turned = turned_map(state, LOW, yaw)
+    found = describe_map(turned.state, turned.low, -4 * V, V, random_encoder("geometric"), 4, 40)
+    away = turned.to_map(found.centre)[:, :2] - (LOW[:2] + np.array([62, 22]))
     assert len(away) >= 5
     assert np.abs(away).max() < 16 * np.sqrt(2) + 2
     assert np.abs(away.mean(0)).max() < 2.5
+    np.testing.assert_allclose(turned.from_map(turned.to_map(found.centre)[:, :2]), found.centre[:, :2], atol=1e-4)
 
 
 def test_quarter_turns_of_the_query_meet_the_headings_of_the_map() -> None:
     """The descriptor of a query at yaw a + 90 degrees is that of the map at a, one quarter turned."""
     encoder, state = random_encoder("geometric", seed=2), world()
-    road, a = np.array([[0.0, 0.0]]), np.pi / 10
-    known = describe_turned(state, LOW, (12 - 16) * V, V, encoder, 8, 40, road, 30.0, a)
-    asked = describe_turned(state, LOW, (12 - 16) * V, V, encoder, 8, 40, road, 30.0, a + np.pi / 2)
-    away = np.linalg.norm(known.centre[:, None] - asked.centre[None], axis=2)
-    i, j = np.nonzero(away < 0.01)
+    turned = [turned_map(state, LOW, yaw) for yaw in (np.pi / 10, np.pi / 10 + np.pi / 2)]
+    found = [describe_map(t.state, t.low, (12 - 16) * V, V, encoder, 8, 40) for t in turned]
+    known, asked = (t.to_map(f.centre) for t, f in zip(turned, found, strict=True))
+    i, j = np.nonzero(np.linalg.norm(known[:, None] - asked[None], axis=2) < 0.01)
     assert len(i) > 10
-    np.testing.assert_allclose(quarter_turns(asked.descriptor[j], 1), known.descriptor[i], atol=0.05)
+    np.testing.assert_allclose(quarter_turns(found[1].descriptor[j], 1), found[0].descriptor[i], atol=0.05)
 
 
 def test_looking_up_cells_is_the_first_block() -> None:
