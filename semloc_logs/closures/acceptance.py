@@ -34,6 +34,7 @@ class Agreement:
 
 
 AGREEMENT = ("alone", "neighbours", "agreeing", "opposing", "far_agreeing", "far_opposing", "lookalike")
+SUPPORT = FEATURES.index("support")
 TOGETHER = ("log_odds", "log_agreeing", "share", "log_opposing", "log_far_agreeing", "log_far_opposing", "lookalike")
 
 
@@ -89,18 +90,24 @@ class Calibration:
 class Model:
     """``alone`` of an alignment's own features; ``near`` of that probability's log-odds and near neighbours, ``together`` of far ones too.
 
-    The far ones tell copies of a street apart, but a short log has none, and that says nothing against it.
+    The far ones tell copies of a street apart, but a short log has none, and that says nothing against it. With less support than
+    ``least_support`` hardly any right alignment was ever seen: a handful of voxels fits anywhere, and the probability is 0.
     """
 
     alone: Calibration
     near: Calibration
     together: Calibration
+    least_support: float
+
+    def own(self, values: F64) -> F64:
+        """Probability of an alignment by its own features, values (..., 8) in the order of ``FEATURES``."""
+        return np.where(values[..., SUPPORT] < self.least_support, 0.0, self.alone.probability(values))
 
     def decided(self, columns: Sequence[F64]) -> F64:
         """Probabilities (n,) from the columns (7, n) of ``AGREEMENT``: that of the alignment alone where there are no neighbours."""
         values = together_values(columns)
         by_neighbours = np.where(has_far(columns), self.together.probability(values), self.near.probability(values))
-        return np.where(np.asarray(columns[1]) > 0, by_neighbours, columns[0])
+        return np.where((np.asarray(columns[1]) > 0) & (np.asarray(columns[0]) > 0), by_neighbours, columns[0])
 
 
 @cache
@@ -111,6 +118,7 @@ def shipped() -> Model:
         Calibration.from_json(content["alone"], FEATURES),
         Calibration.from_json(content["near"], TOGETHER),
         Calibration.from_json(content["together"], TOGETHER),
+        float(content["least_support"]),
     )
 
 
@@ -134,10 +142,12 @@ def reason(features: Features, probability: float, least: float, agreement: Agre
     return f"probability {probability:.3f} below {least:g}: {why}"
 
 
-def fit_logistic(x: F64, right: NDArray[np.bool_], ridge: float = 1.0, counts: F64 | None = None) -> tuple[F64, float]:
+def fit_logistic(
+    x: F64, right: NDArray[np.bool_], ridge: float = 1.0, counts: F64 | None = None, offset: F64 | float = 0.0
+) -> tuple[F64, float]:
     """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d), by Newton's method.
 
-    Row i counts ``counts`` (n,) times.
+    Row i counts ``counts`` (n,) times; ``offset`` (n,) is added to its log-odds.
     """
     counts = np.ones(len(x)) if counts is None else counts
     mean, scale = x.mean(0), x.std(0) + 1e-9
@@ -145,7 +155,7 @@ def fit_logistic(x: F64, right: NDArray[np.bool_], ridge: float = 1.0, counts: F
     w = np.zeros(a.shape[1])
     penalty = np.r_[np.full(x.shape[1], ridge), 1e-6]
     for _ in range(50):
-        p = 1 / (1 + np.exp(-np.clip(a @ w, -30, 30)))
+        p = 1 / (1 + np.exp(-np.clip(a @ w + offset, -30, 30)))
         gradient = a.T @ (counts * (p - right)) + penalty * w
         hessian = (a * (counts * p * (1 - p))[:, None]).T @ a + np.diag(penalty)
         step = np.linalg.solve(hessian, gradient)

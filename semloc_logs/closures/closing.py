@@ -246,7 +246,7 @@ def _judge(
         support=float(np.log10(count + 1)),
         stiffness=float(np.log10(weakest + 1)),
     )
-    probability = float(shipped().alone.probability(own_values(features)))
+    probability = float(shipped().own(own_values(features)))
     same_source = session.json["label_source"] == target_session.json["label_source"]
     overlap, inliers = tau(query.blocks, target.blocks, v, T, settings.closures.kappa * v, None if same_source else cityscapes().coarse)
     map_T_query_base = T @ query_T_base

@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import TOGETHER, Calibration, Model, fit_logistic, has_far, together_values
+from semloc_logs.closures.acceptance import SUPPORT, TOGETHER, Calibration, Model, fit_logistic, has_far, together_values
 from semloc_logs.closures.agreement import Placed, agree, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import keyframe_at
@@ -31,8 +31,9 @@ Bools = NDArray[np.bool_]
 
 # The sign with which evidence may count. The plane distances of fitting points (rmse) say more about the sensor than about the place.
 SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0, "distinct": -1, "support": 1, "stiffness": 1}
-TOGETHER_SIGNS, NEAR_SIGNS = (1, 1, 1, -1, 1, -1, -1), (1, 1, 1, -1, 0, 0, -1)  # of ``TOGETHER``
+TOGETHER_SIGNS, NEAR_SIGNS = (1, 1, 1, -1, 1, -1, -1), (0, 1, 1, -1, 0, 0, -1)  # of ``TOGETHER``
 COPIES, COPIES_COUNT = "repeating", 0.1  # how towns of copied blocks begin, and how much they count for an alignment by itself
+FEWEST = 0.002  # of the right alignments have less support than any that is accepted
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
 THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 
@@ -135,8 +136,10 @@ def read_judged(paths: Sequence[Path]) -> Judged:
 # -- fitting
 
 
-def fit_signed(x: F64, right: Bools, signs: Sequence[int], counts: F64, ridge: float = 0.3) -> Calibration:
+def fit_signed(x: F64, right: Bools, signs: Sequence[int], counts: F64, ridge: float = 0.3, offset: F64 | float = 0.0) -> Calibration:
     """A logistic model of ``right`` (n,) on ``x`` (n, d), whose rows count ``counts`` (n,) times, with weights that have the ``signs``.
+
+    ``offset`` (n,) are log-odds that are known already.
 
     Features whose weight would have the wrong sign are left out one by one: in few towns they stand for something else.
     """
@@ -146,7 +149,7 @@ def fit_signed(x: F64, right: Bools, signs: Sequence[int], counts: F64, ridge: f
     used = np.flatnonzero(sign)
     weights, bias = np.zeros(x.shape[1]), 0.0
     while len(used):
-        fitted, bias = fit_logistic(clipped[:, used], right, ridge, counts)
+        fitted, bias = fit_logistic(clipped[:, used], right, ridge, counts, offset)
         strength = fitted * sign[used] * clipped[:, used].std(0)
         if strength.min() >= 0:
             weights[used] = fitted
@@ -168,12 +171,16 @@ def fit_alone(judged: Judged, rows: Bools) -> Calibration:
 def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Calibration) -> Model:
     """The models of the agreement's ``columns`` (7, n), from the clear ones that have neighbours among ``rows`` (n,), beside ``alone``.
 
-    Near neighbours lie in the same copy of a block as the query does: for them copies count as for an alignment by itself.
+    Near neighbours lie in the same copy of a block as the query does: for them copies count as for an alignment by itself. They add to its
+    log-odds, since in towns they are so often right together that they would outweigh what the alignment itself looks like.
     """
     rows = rows & judged.clear & (columns[1] > 0)
     values, right = together_values(columns)[rows], judged.right[rows]
-    near = fit_signed(values, right, NEAR_SIGNS, judged.counts[rows])
-    return Model(alone, near, fit_signed(values, right, TOGETHER_SIGNS, np.ones(len(right))))
+    known = _log_odds(columns[0][rows])
+    near = fit_signed(values, right, NEAR_SIGNS, judged.counts[rows], offset=known)
+    near = replace(near, weights=(1.0, *near.weights[1:]), low=(-30.0, *near.low[1:]), high=(30.0, *near.high[1:]))
+    together = fit_signed(values, right, TOGETHER_SIGNS, np.ones(len(right)))
+    return Model(alone, near, together, float(np.quantile(judged.features[judged.right, SUPPORT], FEWEST)))
 
 
 def agreement_of(judged: Judged, alone: F64) -> list[F64]:
@@ -189,7 +196,7 @@ def agreement_of(judged: Judged, alone: F64) -> list[F64]:
 
 def decided_by(model: Model, judged: Judged) -> F64:
     """The probabilities (n,) that the acceptance gives with ``model``."""
-    p = model.decided(agreement_of(judged, model.alone.probability(judged.features)))
+    p = model.decided(agreement_of(judged, model.own(judged.features)))
     return np.where(strays(judged.placed, judged.voxel_size), 0.0, p)
 
 
@@ -297,6 +304,7 @@ def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
     return {
         "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature, 'together' where a query has neighbours",
         "alone": fitted.model.alone.to_json(FEATURES),
+        "least_support": round(fitted.model.least_support, 4),
         "near": fitted.model.near.to_json(TOGETHER),
         "together": fitted.model.together.to_json(TOGETHER),
         "towns": len(set(judged.town)),
