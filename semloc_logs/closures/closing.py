@@ -41,7 +41,7 @@ HOPELESS = 0.3  # below this score nothing is right
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
-DRIFT = 0.01  # of the way: the odometry of a target that comes back to a place
+DRIFT = 0.01  # of the way: the odometry of a target
 Fitted = tuple[float, Candidate, Fit, int]  # score, candidate, its fit, and the nearest keyframe of the target
 FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
 
@@ -294,7 +294,8 @@ def covariance_of(fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: flo
     """Covariance (6, 6) of target_T_query from the fit's information, in the target's axes (DESIGN: closures.parquet).
 
     What noisy normals alone would claim to know is taken off first. Where the points then hold nothing (along a corridor) the error is
-    as large as the search lets it be: 3.3 voxels, 5 degrees.
+    as large as the search lets it be: 3.3 voxels, 5 degrees. The target's keyframe may lie metres from what was aligned: between them its
+    odometry drifts.
     """
     noise = max(fit.rmse if np.isfinite(fit.rmse) else 1.0, 0.02) ** 2
     prior = np.diag([1 / (3.3 * voxel_size) ** 2] * 3 + [1 / np.radians(5.0) ** 2] * 3)
@@ -304,5 +305,7 @@ def covariance_of(fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: flo
     A[:3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = map_T_target[:3, :3].T
-    C = turned @ A @ about_centre @ A.T @ turned.T + FLOOR
+    away = float(np.linalg.norm(map_T_query[:3, 3] - map_T_target[:3, 3]))
+    drift = np.diag([(DRIFT * away) ** 2 / 3] * 3 + [0.0] * 3)
+    C = turned @ A @ about_centre @ A.T @ turned.T + drift + FLOOR
     return np.asarray((C + C.T) / 2)
