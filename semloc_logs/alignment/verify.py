@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.icp import Fit, Step, align
-from semloc_logs.alignment.pyramid import (
+from semloc_logs.alignment.overlap import (
     ANY_BIT,
     FREE_BIT,
     STRUCTURE_SHARE,

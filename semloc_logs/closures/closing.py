@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis, pool
 from semloc_logs.alignment.icp import Fit
-from semloc_logs.alignment.pyramid import tau, yaw_between
+from semloc_logs.alignment.overlap import tau, yaw_between
 from semloc_logs.alignment.verify import (
     Candidate,
     Features,

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.pyramid import FREE_BIT, look_up
+from semloc_logs.alignment.overlap import FREE_BIT, look_up
 from semloc_logs.evaluation.closure_view import ClosureView
 from semloc_logs.evaluation.completion_picture import colours, render
 from semloc_logs.evaluation.solids import Solid, View, draw_solids, top_view

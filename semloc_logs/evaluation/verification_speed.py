@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.pyramid import pose_matrix, tau
+from semloc_logs.alignment.overlap import pose_matrix, tau
 from semloc_logs.alignment.surface import surface_of
 from semloc_logs.alignment.verify import Query, Target, coarse_fit, fine_fit, search_hypotheses
 from semloc_logs.evaluation.search_speed import timed

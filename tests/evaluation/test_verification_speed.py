@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.pyramid import pose_matrix, tau, yaw_between
+from semloc_logs.alignment.overlap import pose_matrix, tau, yaw_between
 from semloc_logs.alignment.surface import surface_of
 from semloc_logs.alignment.verify import FINE_RADII, coarse_fit, fine_fit, same_place, search_hypotheses, structure_scores
 from semloc_logs.evaluation.verification_speed import TRUTH, Scene, scene

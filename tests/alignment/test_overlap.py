@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.pyramid import ANY_BIT, FREE_BIT, build_level, class_bits, look_up, pose_matrix, search, tau, yaw_between
+from semloc_logs.alignment.overlap import ANY_BIT, FREE_BIT, build_level, class_bits, look_up, pose_matrix, search, tau, yaw_between
 from semloc_logs.alignment.verify import Query, Target, same_place, search_hypotheses, structure_mask, structure_scores
 from semloc_logs.geometry import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.labels.space import UNLABELLED, cityscapes
