@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +30,8 @@ from semloc_logs.closures.queries import SessionMap, build_query
 from semloc_logs.geometry import inverse, turned_about_z
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.settings import STREET_VOXEL
-from semloc_logs.subvolumes.describe import describe_map, load_encoder, quarter_turns
-from semloc_logs.words.index import Allowed
+from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns
+from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
@@ -129,22 +129,34 @@ def allowed_places(database: Database, session: SessionMap) -> dict[str, Allowed
     return {variant: database.allowed(variant, mine) for variant, mine in groups.items()}
 
 
+def match_words(database: Database, variant: str, allowed: Allowed, query: Query, ground_z: float) -> tuple[Described, Matches]:
+    """The subvolumes of a query whose ground is at ``ground_z`` (m), described once, and their nearest words in all headings.
+
+    The matches' ``yaw`` is that of ``target_T_query``.
+    """
+    settings = database.settings
+    descriptor, closures = settings.descriptor, settings.closures
+    low, high = query.blocks.bounds()
+    state = query.blocks.dense(low, tuple((high - low).tolist()))
+    encoder = load_encoder(variant, descriptor.weights)
+    d = describe_map(state, low, ground_z, settings.fusion.voxel_size, encoder, descriptor.query_stride, descriptor.min_occupied)
+    found = []
+    for turns in range(4):
+        m = database.words(variant).search(quarter_turns(d.descriptor, turns), closures.neighbours, closures.probes, allowed)
+        found.append(replace(m, yaw=np.mod(m.yaw + turns * np.pi / 2, 2 * np.pi)))
+    return d, Matches(*(np.concatenate([getattr(m, f.name) for m in found]) for f in fields(Matches)))
+
+
 def find_hypotheses(database: Database, session: SessionMap, keyframe: int, query: Query) -> list[Hypothesis]:
     """Word matches of the query in all headings, pooled."""
     settings = database.settings
     closures, v = settings.closures, settings.fusion.voxel_size
     parts: list[tuple[NDArray[np.int64], F64, F64, F64]] = []
-    low, high = query.blocks.bounds()
-    state = query.blocks.dense(low, tuple((high - low).tolist()))
     ground = float(session.ground_z[keyframe] - session.map_T_base[keyframe][2, 3])
     for variant, allowed in allowed_places(database, session).items():
-        words, encoder = database.words(variant), load_encoder(variant, settings.descriptor.weights)
-        d = describe_map(state, low, ground, v, encoder, settings.descriptor.query_stride, settings.descriptor.min_occupied)
-        for turns in range(4):
-            m = words.search(quarter_turns(d.descriptor, turns), closures.neighbours, closures.probes, allowed)
-            yaw = np.mod(m.yaw + turns * np.pi / 2, 2 * np.pi)
-            shift = m.centre - turned_about_z(d.centre[m.query].astype(float) * v, yaw)
-            parts.append((m.group, yaw, shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3))
+        d, m = match_words(database, variant, allowed, query, ground)
+        shift = m.centre - turned_about_z(d.centre[m.query].astype(float) * v, m.yaw)
+        parts.append((m.group, m.yaw, shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3))
     if not parts:
         return []
     group, yaws, shift, weight = (np.concatenate([p[k] for p in parts]) for k in range(4))

@@ -78,7 +78,7 @@ class Database:
         if variant not in self._words:
             numbers = {(place.session, place.submap): g for g, place in enumerate(self.places)}
             parts = [
-                Part(segment, np.array([numbers[p] if p[0] in served else -1 for p in segment.places], np.int64))
+                Part(segment, segment.numbered(numbers, served))
                 for segment, served in segments(self._workspace, variant, tuple(self.sessions))
             ]
             self._words[variant] = Index(load_vocabulary(variant, self.settings.descriptor.vocabulary), parts)

@@ -1,6 +1,6 @@
 """How probable is it that an alignment is right? Learnt from queries in simulated towns, of which many have never been visited.
 
-Every town is judged against its truth into a table of its own; the two logistic models of the acceptance are fitted on all of them. What
+Every town is judged against its truth into a table of its own; the three logistic models of the acceptance are fitted on all of them. What
 is reported is said of each town by models that never saw it.
 """
 
@@ -210,10 +210,10 @@ class Fitted:
 
 
 def fit(judged: Judged) -> Fitted:
-    """Fit both models, and each of them without each town in turn.
+    """Fit all models, and each of them without each town in turn.
 
-    The second one learns from what the first one said of towns it had not seen. Where the held-out log-odds turn out too sure (Platt,
-    Probabilistic outputs for support vector machines, 1999), both models are tempered.
+    Those of neighbours learn from what that of an alignment alone said of towns it had not seen. Where the held-out
+    log-odds turn out too sure (Platt, Probabilistic outputs for support vector machines, 1999), the first and the last are tempered.
     """
     towns = sorted(set(judged.town))
     kept = ~strays(judged.placed, judged.voxel_size)
@@ -300,7 +300,7 @@ def recall_at(judged: Judged, p: F64, thresholds: Sequence[float] = THRESHOLDS) 
 
 
 def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
-    """The content of calibration.json: two logistic models, each of named features clipped to low .. high, and what they are made from."""
+    """The content of calibration.json: three logistic models of named features clipped to low .. high, and what they are made from."""
     return {
         "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature, 'together' where a query has neighbours",
         "alone": fitted.model.alone.to_json(FEATURES),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Query, Target
-from semloc_logs.closures.closing import allowed_places
+from semloc_logs.closures.closing import allowed_places, match_words
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.queries import SessionMap, build_query, query_members
 from semloc_logs.closures.results import keyframe_at, read_closures
@@ -20,7 +20,6 @@ from semloc_logs.evaluation.completion import completed, load_completion, states
 from semloc_logs.geometry import inverse, turned_about_z
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import SIZE, turn
-from semloc_logs.subvolumes.describe import describe_map, load_encoder, quarter_turns
 from semloc_logs.tables import read_metadata, read_table
 from semloc_logs.voxels.grid import UNOBSERVED_STATE
 from semloc_logs.voxels.store import poses_of
@@ -213,30 +212,23 @@ def _matches(database: Database, session: SessionMap, query: Query, ground: floa
     if not places or not most:
         return []
     variant, allowed = next(iter(places.items()))  # a single target session is asked with one kind of words
-    encoder, words = load_encoder(variant, settings.descriptor.weights), database.words(variant)
-    low, high = query.blocks.bounds()
-    state = query.blocks.dense(low, tuple((high - low).tolist()))
-    d = describe_map(state, low, ground, v, encoder, settings.descriptor.query_stride, settings.descriptor.min_occupied)
+    d, m = match_words(database, variant, allowed, query, ground)
     aligned = float(np.arctan2(map_T_query[1, 0], map_T_query[0, 0]))
     laid = turned_about_z(d.centre.astype(float), np.full(len(d.centre), aligned))  # voxels, in the map's axes
-    parts = []
-    for turns in range(4):
-        m = words.search(quarter_turns(d.descriptor, turns), settings.closures.neighbours, settings.closures.probes, allowed)
-        off = np.abs(m.centre - laid[m.query] * v - map_T_query[:3, 3]).max(1)
-        turned = np.abs(np.mod(m.yaw + turns * np.pi / 2 - aligned + np.pi, 2 * np.pi) - np.pi)
-        keep = (m.group == group) & (off < AGREES * v) & (turned < TURNED)
-        parts.append((m.distance[keep], m.query[keep], m.centre[keep]))
-    distance, asking, centre = (np.concatenate([p[k] for p in parts]) for k in range(3))
+    off = np.abs(m.centre - laid[m.query] * v - map_T_query[:3, 3]).max(1)
+    turned = np.abs(np.mod(m.yaw - aligned + np.pi, 2 * np.pi) - np.pi)
+    keep = (m.group == group) & (off < AGREES * v) & (turned < TURNED)
+    distance, asking, centre = m.distance[keep], m.query[keep], m.centre[keep]
     chosen: list[int] = []
-    for m in np.argsort(distance, kind="stable").tolist():
-        if all(np.abs(laid[asking[m], :2] - laid[asking[o], :2]).max() >= APART for o in chosen):
-            chosen.append(m)
+    for i in np.argsort(distance, kind="stable").tolist():
+        if all(np.abs(laid[asking[i], :2] - laid[asking[o], :2]).max() >= APART for o in chosen):
+            chosen.append(i)
         if len(chosen) == most:
             break
     if not chosen:
         return []
     centres = centre[chosen]
-    box, corner = _turned(query, state, low, aligned)
+    box, corner = _turned(query, aligned)
     corners = np.round(laid[asking[chosen]]).astype(int) - corner - SIZE // 2
     given = np.stack([_cut(box, c, SIZE // 2) for c in corners])
     blocks = database.target(group).blocks
@@ -245,13 +237,15 @@ def _matches(database: Database, session: SessionMap, query: Query, ground: floa
     inner = given[:, SIZE // 2 : -SIZE // 2, SIZE // 2 : -SIZE // 2]
     completions = states_of(said.said, said.classes)
     return [
-        Match(inner[i], completions[i], theirs[i], int(distance[m]), (float(c[0]), float(c[1]), float(c[2])))
-        for i, (m, c) in enumerate(zip(chosen, centres, strict=True))
+        Match(inner[i], completions[i], theirs[i], int(distance[k]), (float(c[0]), float(c[1]), float(c[2])))
+        for i, (k, c) in enumerate(zip(chosen, centres, strict=True))
     ]
 
 
-def _turned(query: Query, state: U8, low: NDArray[np.integer], yaw: float) -> tuple[U8, NDArray[np.int64]]:
+def _turned(query: Query, yaw: float) -> tuple[U8, NDArray[np.int64]]:
     """States (x, y, z) of the whole query turned by ``yaw`` (rad) about the vertical through its origin, and the corner voxel (3,)."""
+    low, high = query.blocks.bounds()
+    state = query.blocks.dense(low, tuple((high - low).tolist()))
     half = query.reach + SIZE // 2
     box = np.empty((2 * half, 2 * half, state.shape[2]), np.uint8)
     turn(state, low.astype(np.int64), -yaw, np.array([0.0, 0.0, low[2] + state.shape[2] / 2]), box)

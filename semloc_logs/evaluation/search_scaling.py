@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 from semloc_logs.errors import SettingsError
 from semloc_logs.evaluation.held_out import HeldOut, held_out
 from semloc_logs.evaluation.recall import Describe, count_subvolumes, network_describes, true_radius
+from semloc_logs.evaluation.search_speed import timed
 from semloc_logs.geometry import apply
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import load_encoder
@@ -46,7 +47,6 @@ WORDS_A_KM = 10_000
 POOL = 100_000
 DATABASE = 50_000  # words of the streets
 QUERIES = 1600  # look-ups of one query
-REPEATS = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,11 +114,8 @@ class _World:
         shutil.rmtree(self.work.session(self.names.pop()).path)
 
     def index(self) -> Index:
-        numbers = {name: g for g, name in enumerate(self.names)}
-        parts = [
-            Part(segment, np.array([numbers[name] if name in served else -1 for name, _ in segment.places], np.int64))
-            for segment, served in segments(self.work, self.variant, self.names)
-        ]
+        numbers = {(name, 0): g for g, name in enumerate(self.names)}
+        parts = [Part(segment, segment.numbered(numbers, served)) for segment, served in segments(self.work, self.variant, self.names)]
         return Index(self.vocabulary, parts)
 
     def found(self, index: Index, probes: int) -> float:
@@ -180,7 +177,7 @@ def search_scaling(
             world.describe()
             adding, index = _timed(world.index)
             opening, index = _timed(world.index)
-            least, median = _search_times(lambda index=index: world.found(index, settings.closures.probes))  # type: ignore[misc]
+            least, median = timed(lambda index=index: world.found(index, settings.closures.probes))  # type: ignore[misc]
             share = world.found(index, settings.closures.probes)
             taken.append(least)
             rows = {"segments": len(index.parts), "bytes": sum(p.stat().st_size for p in Path(folder).glob("index/*/*.segment"))}
@@ -220,17 +217,6 @@ def _timed(action: Callable[[], Any]) -> tuple[float, Any]:
     start = time.perf_counter()
     result = action()
     return time.perf_counter() - start, result
-
-
-def _search_times(action: Callable[[], Any]) -> tuple[float, float]:
-    """Least and median processor milliseconds after one run to warm up."""
-    action()
-    taken = []
-    for _ in range(REPEATS):
-        start = time.process_time()
-        action()
-        taken.append(1e3 * (time.process_time() - start))
-    return min(taken), float(np.median(taken))
 
 
 def _private_bytes() -> int:

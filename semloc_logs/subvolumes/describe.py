@@ -19,7 +19,7 @@ from semloc_logs.errors import SettingsError
 from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.checkpoints import load_weights
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, code_table
-from semloc_logs.subvolumes.network import Encoder, channels_last, descriptors
+from semloc_logs.subvolumes.network import Encoder, descriptors
 from semloc_logs.subvolumes.pairs import occupied
 
 U8 = NDArray[np.uint8]
@@ -48,7 +48,6 @@ def quarter_turns(descriptor: F32, turns: int) -> F32:
 def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
     """The shipped encoder of ``variant``, or that of a file. Raises SettingsError when the file does not hold one."""
     encoder = load_weights(Encoder, "encoder.", variant, weights)
-    channels_last(encoder)
     torch.set_num_threads(1)  # more cores are used by more processes: the same sums in the same order, whatever the engine
     return encoder
 
@@ -56,9 +55,7 @@ def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
 def random_encoder(variant: str, seed: int = 0) -> Encoder:
     """An untrained encoder: what training has to beat."""
     torch.manual_seed(seed)
-    encoder = Encoder(variant).eval()
-    channels_last(encoder)
-    return encoder
+    return Encoder(variant).eval()
 
 
 def _window_sums(a: NDArray[np.int64], stride: int) -> NDArray[np.int64]:

@@ -300,7 +300,7 @@ def _merged(folder: Path, variant: str, group: Serving, change: Change) -> Servi
 def _renumbered(segment: Segment, served: frozenset[str], sessions: Sequence[Held]) -> NDArray[np.int64]:
     """The numbers that a segment's places have among those of ``sessions``, -1 for sessions that it does not serve."""
     numbers = {place: i for i, place in enumerate((h.name, submap) for h in sessions for submap in h.submaps)}
-    return np.array([numbers[p] if p[0] in served else -1 for p in segment.places], np.int64)
+    return segment.numbered(numbers, served)
 
 
 def merged_blocks(group: Sequence[Segment], places: Sequence[NDArray[np.int64]], most: int = 1_000_000) -> Iterator[Columns]:

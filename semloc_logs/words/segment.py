@@ -13,7 +13,7 @@ import mmap
 import os
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -66,6 +66,10 @@ class Segment:
     def places(self) -> list[tuple[str, int]]:
         """Session and submap of each number in ``place``."""
         return [(held.name, submap) for held in self.sessions for submap in held.submaps]
+
+    def numbered(self, numbers: Mapping[tuple[str, int], int], served: Container[str]) -> NDArray[np.int64]:
+        """The ``numbers`` of session and submap at each of the :attr:`places`, -1 for sessions that are not ``served``."""
+        return np.array([numbers[p] if p[0] in served else -1 for p in self.places], np.int64)
 
     def block(self, first: int, last: int) -> Columns:
         """Entries of the words ``first`` to ``last`` - 1, with their ``word``."""
