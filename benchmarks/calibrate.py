@@ -13,7 +13,7 @@ import argparse
 import json
 from pathlib import Path
 
-from towns import Place, Town, collect
+from towns import Place, Town, collect, short_towns
 
 import semloc_logs.closures
 from semloc_logs.engines.engine import single_threaded
@@ -37,6 +37,7 @@ TOWNS = (
     Town("repeating-uniform", 13, ("vlp32",), "uniform", repeating=True),
     Town("repeating-stereo", 14, ("stereo", "hdl32"), "geometry", repeating=True, sessions=2),
     Town("long", 15, noise=0.12, seasons=("summer", "winter"), length=260.0, sessions=2),
+    *short_towns(0, 8),
 )
 
 

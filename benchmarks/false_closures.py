@@ -15,12 +15,11 @@ import argparse
 import fnmatch
 import json
 from collections.abc import Mapping
-from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from towns import Place, Town, collect
+from towns import Place, collect, short_towns
 
 from semloc_logs.closures.acceptance import shipped
 from semloc_logs.closures.queries import SessionMap
@@ -34,25 +33,15 @@ from semloc_logs.stages import close, describe, fuse, session_name
 from semloc_logs.tables import read_metadata
 from semloc_logs.workspace import Workspace
 
-SENSORS = ("hdl32", "hdl64", "vlp16", "hdl32", "stereo")
-LABELS = ("auto", "geometry", "auto", "uniform")
+FIRST, MOST = 10, 60  # numbers of the towns: calibration has those before
 SOURCES = ("auto", "geometry", "uniform")  # auto: labels of the log, where it has any
 SMALL = ("room_*", "euroc_*")
 LEAST = 0.99
 
 
-def towns() -> list[Town]:
-    """Sixty short-driven towns, so that many streets of each are never seen by the other drives."""
-    drawn = zip(range(60), cycle(SENSORS), cycle(LABELS), strict=False)
-    return [
-        Town(f"{k:02d}", 100 + k, (sensor,), labels, noise=0.1, repeating=k % 3 > 0, sessions=4, length=160.0)
-        for k, sensor, labels in islice(drawn, 60)
-    ]
-
-
 def ask_towns(args: argparse.Namespace) -> None:
     """Ask, then count under the calibration of the package."""
-    paths = collect(Place(args.dir), towns(), args.jobs, args.queries)
+    paths = collect(Place(args.dir), short_towns(FIRST, MOST), args.jobs, args.queries)
     judged = read_judged(paths)
     p = decided_by(shipped(), judged)
     print(f"{sum(read_metadata(path)['queries'] for path in paths)} queries in {len(paths)} towns")

@@ -44,6 +44,25 @@ class Town:
     length: float = 130.0
 
 
+def short_towns(first: int, count: int) -> list[Town]:
+    """Short-driven towns by number, so that many streets of each are never seen by the other drives; two of three are cities of copied
+    blocks, and their names begin with ``repeating``."""
+    sensors, labels = ("hdl32", "hdl64", "vlp16", "hdl32", "stereo"), ("auto", "geometry", "auto", "uniform")
+    return [
+        Town(
+            f"{'repeating' if k % 3 else 'plain'}-{k:02d}",
+            100 + k,
+            (sensors[k % len(sensors)],),
+            labels[k % len(labels)],
+            noise=0.1,
+            repeating=k % 3 > 0,
+            sessions=4,
+            length=160.0,
+        )
+        for k in range(first, first + count)
+    ]
+
+
 @dataclass(frozen=True, slots=True)
 class Place:
     """Where the towns of a benchmark live, and the folder of recorded drives, if there is one."""

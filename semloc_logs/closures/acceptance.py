@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -34,8 +34,9 @@ class Agreement:
 
 
 AGREEMENT = ("alone", "neighbours", "agreeing", "opposing", "far_agreeing", "far_opposing", "lookalike")
-SUPPORT = FEATURES.index("support")
-TOGETHER = ("log_odds", "log_agreeing", "share", "log_opposing", "log_far_agreeing", "log_far_opposing", "lookalike")
+SUPPORT, DISTINCT = FEATURES.index("support"), FEATURES.index("distinct")
+TOGETHER = ("log_odds", "log_agreeing", "share", "log_opposing", "log_far_agreeing", "log_far_opposing")
+AS_GOOD = 0.7  # of the best score: what fits nearly as well as that
 
 
 def own_values(features: Features) -> F64:
@@ -43,12 +44,18 @@ def own_values(features: Features) -> F64:
     return np.array([getattr(features, name) for name in FEATURES])
 
 
+def unrivalled(own: Callable[[F64], F64], values: F64) -> F64:
+    """What ``own`` would say of features (..., 8) if no other place fitted; 0 where another one fits better by far."""
+    alone = np.where(np.arange(len(FEATURES)) == DISTINCT, 0.0, values)
+    return np.where(values[..., DISTINCT] > 1 / AS_GOOD, 0.0, own(alone))
+
+
 def together_values(columns: Sequence[F64]) -> F64:
-    """Values (n, 7) in the order of ``TOGETHER`` from the columns (7, n) of ``AGREEMENT``."""
-    alone, neighbours, agreeing, opposing, far_agreeing, far_opposing, lookalike = (np.asarray(c, float) for c in columns)
+    """Values (n, 6) in the order of ``TOGETHER`` from the columns (7, n) of ``AGREEMENT``."""
+    alone, neighbours, agreeing, opposing, far_agreeing, far_opposing, _ = (np.asarray(c, float) for c in columns)
     p = np.clip(alone, 1e-6, 1 - 1e-6)
     counts = [np.log1p(c) for c in (agreeing, opposing, far_agreeing, far_opposing)]
-    return np.stack([np.log(p / (1 - p)), counts[0], agreeing / np.maximum(neighbours, 1), *counts[1:], lookalike], axis=-1)
+    return np.stack([np.log(p / (1 - p)), counts[0], agreeing / np.maximum(neighbours, 1), *counts[1:]], axis=-1)
 
 
 def has_far(columns: Sequence[F64]) -> NDArray[np.bool_]:
@@ -90,14 +97,16 @@ class Calibration:
 class Model:
     """``alone`` of an alignment's own features; ``near`` of that probability's log-odds and near neighbours, ``together`` of far ones too.
 
-    The far ones tell copies of a street apart, but a short log has none, and that says nothing against it. With less support than
-    ``least_support`` hardly any right alignment was ever seen: a handful of voxels fits anywhere, and the probability is 0.
+    A short log has no far ones, and that says nothing against it. With less support than ``least_support`` hardly any right alignment was
+    ever seen: a handful of voxels fits anywhere, and the probability is 0. Where streets look like others by more than ``most_alike`` the
+    drive may as well have been in a copy: whatever agrees, the probability is at most a half.
     """
 
     alone: Calibration
     near: Calibration
     together: Calibration
     least_support: float
+    most_alike: float
 
     def own(self, values: F64) -> F64:
         """Probability of an alignment by its own features, values (..., 8) in the order of ``FEATURES``."""
@@ -107,7 +116,12 @@ class Model:
         """Probabilities (n,) from the columns (7, n) of ``AGREEMENT``: that of the alignment alone where there are no neighbours."""
         values = together_values(columns)
         by_neighbours = np.where(has_far(columns), self.together.probability(values), self.near.probability(values))
-        return np.where((np.asarray(columns[1]) > 0) & (np.asarray(columns[0]) > 0), by_neighbours, columns[0])
+        p = np.where((np.asarray(columns[1]) > 0) & (np.asarray(columns[0]) > 0), by_neighbours, columns[0])
+        return np.where(self.alike(columns), p / 2, p)
+
+    def alike(self, columns: Sequence[F64]) -> NDArray[np.bool_]:
+        """Where streets look like others (n,), by the columns (7, n) of ``AGREEMENT``."""
+        return np.asarray(np.asarray(columns[-1]) > self.most_alike)
 
 
 @cache
@@ -119,14 +133,15 @@ def shipped() -> Model:
         Calibration.from_json(content["near"], TOGETHER),
         Calibration.from_json(content["together"], TOGETHER),
         float(content["least_support"]),
+        float(content["most_alike"]),
     )
 
 
 def reason(features: Features, probability: float, least: float, agreement: Agreement) -> str:
     """One sentence that says why a hypothesis was rejected."""
     f, a = features, agreement
-    if a.alone >= least and a.lookalike > 0.5:
-        why = "this place looks like another one of its own session"
+    if a.lookalike > shipped().most_alike:
+        why = f"streets about it look like others ({a.lookalike:.0%})"
     elif a.alone >= least and a.neighbours:
         why = f"of {a.neighbours} neighbouring queries {a.agreeing:.1f} agree and {a.opposing:.1f} lie elsewhere"
     elif f.coverage < 0.2:

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.acceptance import AGREEMENT, Agreement, reason, shipped
+from semloc_logs.alignment.verify import FEATURES
+from semloc_logs.closures.acceptance import AGREEMENT, Agreement, own_values, reason, shipped, unrivalled
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import inverse
@@ -37,7 +38,8 @@ class Placed:
 
     ``query`` (n,) numbers a session's queries, ``road`` and ``target_road`` (n,) are metres along the two drives, ``map_T_query`` and
     ``target_T_query`` (n, 4, 4) the query's base in its own map by odometry and in the target's by alignment, ``sigma`` (n,) the standard
-    deviation of the latter's position in metres, ``alone`` (n,) its probability by itself. ``posed``: whether odometry is known.
+    deviation of the latter's position in metres, ``alone`` (n,) its probability by itself and ``unrivalled`` (n,) the same if no other
+    place fitted nearly as well. ``posed``: whether odometry is known.
     """
 
     query_session: NDArray[np.object_]
@@ -49,6 +51,7 @@ class Placed:
     target_T_query: F64
     sigma: F64
     alone: F64
+    unrivalled: F64
     posed: Bools
 
     def __len__(self) -> int:
@@ -76,6 +79,7 @@ def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Pl
         stack([t.map_T_base[k] @ a.target_T_query for a, (_, _, t, k) in zip(alignments, ends, strict=True)]),
         np.array([a.sigma for a in alignments], float),
         np.array([a.agreement.alone for a in alignments], float),
+        unrivalled(shipped().own, np.array([own_values(a.features) for a in alignments]).reshape(-1, len(FEATURES))),
         np.array([q.posed for q, _, _, _ in ends], bool),
     )
 
@@ -83,16 +87,16 @@ def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Pl
 def agree(placed: Placed, voxel_size: float) -> list[F64]:
     """The columns (7, n) of ``AGREEMENT``; whatever the order of the alignments."""
     out = [placed.alone.copy(), *(np.zeros(len(placed)) for _ in AGREEMENT[1:])]
+    support = np.zeros(len(placed))
     pairs = sorted(set(zip(placed.query_session, placed.target_session, strict=True)))
     for query, target in pairs:
         mine = np.flatnonzero((placed.query_session == query) & (placed.target_session == target) & placed.posed)
         group = placed.part(mine)
         out[1][mine] = _neighbours(group, NEAR * voxel_size / STREET_VOXEL)
-        voices = group.part(group.alone >= LEAST)
-        for k, row in enumerate(mine):
-            for column, value in zip(out[2:6], _sums(group.part(np.array([k])), voices, voxel_size), strict=True):
-                column[row] = value
-    out[6] = _lookalike(placed, voxel_size)
+        out[2][mine], out[3][mine], out[4][mine], out[5][mine] = _sums(group, group.alone, voxel_size)
+        agreeing = _sums(group, group.unrivalled, voxel_size)[0]
+        support[mine] = group.unrivalled * agreeing / np.maximum(out[1][mine], 1)
+    out[6] = _lookalike(placed, support, voxel_size)
     return out
 
 
@@ -105,25 +109,30 @@ def _neighbours(group: Placed, near: float) -> F64:
     return count[inverse_].astype(float)
 
 
-def _sums(one: Placed, voices: Placed, voxel_size: float) -> tuple[float, float, float, float]:
-    """Probabilities of other queries' alignments that agree with ``one`` and that do not, near it and far from it.
+def _sums(group: Placed, p: F64, voxel_size: float) -> F64:
+    """Probabilities ``p`` (n,) of other queries' alignments that agree with each (4, n) and that do not, near it and far from it.
 
     Of each query the most probable alignment of either kind counts, and as opposing only if it is more probable than an agreeing one.
     """
     scale = voxel_size / STREET_VOXEL
-    along = np.abs(voices.road - one.road[0])
-    there = (along <= FAR * scale) & (voices.query != one.query[0])
-    if not there.any():
-        return 0.0, 0.0, 0.0, 0.0
-    voices, along = voices.part(there), along[there]
-    agrees = _agrees(one, voices, along, voxel_size)
-    _, first, number = np.unique(voices.query, return_index=True, return_inverse=True)
-    for_it, against = np.zeros(len(first)), np.zeros(len(first))
-    np.maximum.at(for_it, number, np.where(agrees, voices.alone, 0.0))
-    np.maximum.at(against, number, np.where(agrees, 0.0, voices.alone))
-    against[against <= for_it] = 0.0
-    near = along[first] <= NEAR * scale
-    return float(for_it[near].sum()), float(against[near].sum()), float(for_it[~near].sum()), float(against[~near].sum())
+    loud = p >= LEAST
+    voices, p = group.part(loud), p[loud]
+    out = np.zeros((4, len(group)))
+    for k in range(len(group)):
+        along = np.abs(voices.road - group.road[k])
+        there = np.flatnonzero((along <= FAR * scale) & (voices.query != group.query[k]))
+        if not len(there):
+            continue
+        heard, along, said = voices.part(there), along[there], p[there]
+        agrees = _agrees(group.part(np.array([k])), heard, along, voxel_size)
+        _, first, number = np.unique(heard.query, return_index=True, return_inverse=True)
+        for_it, against = np.zeros(len(first)), np.zeros(len(first))
+        np.maximum.at(for_it, number, np.where(agrees, said, 0.0))
+        np.maximum.at(against, number, np.where(agrees, 0.0, said))
+        against[against <= for_it] = 0.0
+        near = along[first] <= NEAR * scale
+        out[:, k] = [for_it[near].sum(), against[near].sum(), for_it[~near].sum(), against[~near].sum()]
+    return out
 
 
 def _agrees(one: Placed, others: Placed, along: F64, voxel_size: float) -> Bools:
@@ -145,13 +154,41 @@ def strays(placed: Placed, voxel_size: float) -> Bools:
     return np.asarray(own & (off > OWN_SLACK * voxel_size + OWN_DRIFT * np.abs(placed.road - placed.target_road)))
 
 
-def _lookalike(placed: Placed, voxel_size: float) -> F64:
-    """How probable the same query's best alignment with a place of its own session is that it cannot be at (n,)."""
-    best: dict[tuple[str, int], float] = {}
-    keys = list(zip(placed.query_session, placed.query.tolist(), strict=True))
-    for k in np.flatnonzero(strays(placed, voxel_size)):
-        best[keys[k]] = max(best.get(keys[k], 0.0), float(placed.alone[k]))
-    return np.array([best.get(key, 0.0) for key in keys], float)
+def _lookalike(placed: Placed, support: F64, voxel_size: float) -> F64:
+    """How much the streets about either end of each alignment look like others (n,), in [0, 1].
+
+    A query looks like another place as far as two places of one target session, or one of its own where odometry says that it is not,
+    have ``support`` (n,) of it and its neighbours. Two drives through copies of a street see nothing that tells, but where one of them
+    came through several copies, or another session did, it shows. Hence the mean over the queries about either end, in the target
+    session that shows it most.
+    """
+    scale = voxel_size / STREET_VOXEL
+    by_target: dict[tuple[str, str], dict[int, list[int]]] = {}
+    for k, (session, target, query) in enumerate(zip(placed.query_session, placed.target_session, placed.query.tolist(), strict=True)):
+        by_target.setdefault((session, target), {}).setdefault(query, []).append(k)
+    astray = strays(placed, voxel_size)
+    out = np.zeros(len(placed))
+    for (session, _), queries in by_target.items():
+        road, much = np.zeros(len(queries)), np.zeros(len(queries))
+        for i, rows in enumerate(queries.values()):
+            road[i] = placed.road[rows[0]]
+            second = _second(placed.part(np.array(rows)), support[rows], voxel_size)
+            much[i] = max([second, *support[[k for k in rows if astray[k]]].tolist()])
+        for sessions, at in ((placed.query_session, placed.road), (placed.target_session, placed.target_road)):
+            for k in np.flatnonzero(sessions == session).tolist():
+                about = np.abs(road - at[k]) <= FAR * scale
+                out[k] = max(out[k], float(much[about].mean()) if about.any() else 0.0)
+    return out
+
+
+def _second(places: Placed, support: F64, voxel_size: float) -> float:
+    """The support that the second place of one query in one target has, of places that odometry can tell apart."""
+    best = 0.0
+    for a in range(len(support)):
+        off = np.linalg.norm(places.target_T_query[:, :3, 3] - places.target_T_query[a, :3, 3], axis=1)
+        apart = off > OWN_SLACK * voxel_size + OWN_DRIFT * np.abs(places.target_road - places.target_road[a])
+        best = max(best, float(np.minimum(support[apart], support[a]).max(initial=0.0)))
+    return best
 
 
 def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Settings) -> list[Alignment]:

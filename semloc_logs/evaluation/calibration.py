@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import SUPPORT, TOGETHER, Calibration, Model, fit_logistic, has_far, together_values
+from semloc_logs.closures.acceptance import SUPPORT, TOGETHER, Calibration, Model, fit_logistic, has_far, together_values, unrivalled
 from semloc_logs.closures.agreement import Placed, agree, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import keyframe_at
@@ -31,8 +31,9 @@ Bools = NDArray[np.bool_]
 
 # The sign with which evidence may count. The plane distances of fitting points (rmse) say more about the sensor than about the place.
 SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0, "distinct": -1, "support": 1, "stiffness": 1}
-TOGETHER_SIGNS, NEAR_SIGNS = (1, 1, 1, -1, 1, -1, -1), (0, 1, 1, -1, 0, 0, -1)  # of ``TOGETHER``
+TOGETHER_SIGNS, NEAR_SIGNS = (1, 1, 1, -1, 1, -1), (0, 1, 1, -1, 0, 0)  # of ``TOGETHER``
 COPIES, COPIES_COUNT = "repeating", 0.1  # how towns of copied blocks begin, and how much they count for an alignment by itself
+SURE = 0.99  # what would be accepted
 FEWEST = 0.002  # of the right alignments have less support than any that is accepted
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
 THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
@@ -57,9 +58,14 @@ class Judged:
         return np.asarray(self.right | (self.error_m > 3 * CORRECT_M) | (self.error_deg > 3 * CORRECT_DEG))
 
     @property
+    def copies(self) -> Bools:
+        """Which lie in towns of copied blocks (n,)."""
+        return np.array([town.startswith(COPIES) for town in self.town], bool)
+
+    @property
     def counts(self) -> F64:
         """How much each counts (n,) for the model of an alignment by itself."""
-        return np.where([town.startswith(COPIES) for town in self.town], COPIES_COUNT, 1.0)
+        return np.where(self.copies, COPIES_COUNT, 1.0)
 
     def __len__(self) -> int:
         return len(self.town)
@@ -124,6 +130,7 @@ def read_judged(paths: Sequence[Path]) -> Judged:
         poses("at"),
         column["sigma"],
         column["probability"],
+        column["probability"],
         np.ones(len(table), bool),
     )
     right = column["right"].astype(bool)
@@ -162,7 +169,7 @@ def fit_alone(judged: Judged, rows: Bools) -> Calibration:
     """The model of an alignment's own features, from the clear ones among ``rows`` (n,).
 
     An alignment looks the same in each copy of a block, so nothing of its own can tell them apart; as many copies as these towns have
-    would only teach to doubt every place that a single sweep finds. Where there are neighbours the second model counts them in full.
+    would only teach to doubt every place that a single sweep finds. Where there are neighbours, they tell.
     """
     rows = rows & judged.clear
     return fit_signed(judged.features[rows], judged.right[rows], [SIGNS[n] for n in FEATURES], judged.counts[rows])
@@ -171,24 +178,31 @@ def fit_alone(judged: Judged, rows: Bools) -> Calibration:
 def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Calibration) -> Model:
     """The models of the agreement's ``columns`` (7, n), from the clear ones that have neighbours among ``rows`` (n,), beside ``alone``.
 
-    Near neighbours lie in the same copy of a block as the query does: for them copies count as for an alignment by itself. They add to its
-    log-odds, since in towns they are so often right together that they would outweigh what the alignment itself looks like.
+    Neighbours in the same copy of a block agree about any copy. So the models are those of streets that look like no others; how much
+    like others is too much, towns of copies say: half of what the least so looking alignment had that is wrong and would be accepted.
     """
     rows = rows & judged.clear & (columns[1] > 0)
-    values, right = together_values(columns)[rows], judged.right[rows]
-    known = _log_odds(columns[0][rows])
-    near = fit_signed(values, right, NEAR_SIGNS, judged.counts[rows], offset=known)
+    ordinary = _agreement_model(judged, columns, rows & ~judged.copies, alone, 1.0)
+    fooled = rows & judged.copies & ~judged.right & (ordinary.decided(columns) >= SURE)
+    most_alike = float(columns[6][fooled].min(initial=2.0)) / 2  # of nothing 1: any street
+    return _agreement_model(judged, columns, rows & (columns[6] <= most_alike), alone, most_alike)
+
+
+def _agreement_model(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Calibration, most_alike: float) -> Model:
+    """Near neighbours add to an alignment's log-odds: they are so often right together that they would outweigh what it looks like."""
+    values, right, counts = together_values(columns)[rows], judged.right[rows], np.ones(rows.sum())
+    near = fit_signed(values, right, NEAR_SIGNS, counts, offset=_log_odds(columns[0][rows]))
     near = replace(near, weights=(1.0, *near.weights[1:]), low=(-30.0, *near.low[1:]), high=(30.0, *near.high[1:]))
-    together = fit_signed(values, right, TOGETHER_SIGNS, np.ones(len(right)))
-    return Model(alone, near, together, float(np.quantile(judged.features[judged.right, SUPPORT], FEWEST)))
+    together = fit_signed(values, right, TOGETHER_SIGNS, counts)
+    return Model(alone, near, together, float(np.quantile(judged.features[judged.right, SUPPORT], FEWEST)), most_alike)
 
 
-def agreement_of(judged: Judged, alone: F64) -> list[F64]:
+def agreement_of(judged: Judged, alone: F64, without_rivals: F64) -> list[F64]:
     """The columns (7, n) of the agreement within each town, when alignments have the probabilities ``alone`` (n,) by themselves."""
     out = [np.zeros(len(judged)) for _ in range(7)]
     for town in sorted(set(judged.town)):
         mine = np.flatnonzero(judged.town == town)
-        part = replace(judged.placed.part(mine), alone=alone[mine])
+        part = replace(judged.placed.part(mine), alone=alone[mine], unrivalled=without_rivals[mine])
         for column, values in zip(out, agree(part, judged.voxel_size), strict=True):
             column[mine] = values
     return out
@@ -196,7 +210,7 @@ def agreement_of(judged: Judged, alone: F64) -> list[F64]:
 
 def decided_by(model: Model, judged: Judged) -> F64:
     """The probabilities (n,) that the acceptance gives with ``model``."""
-    p = model.decided(agreement_of(judged, model.own(judged.features)))
+    p = model.decided(agreement_of(judged, model.own(judged.features), unrivalled(model.own, judged.features)))
     return np.where(strays(judged.placed, judged.voxel_size), 0.0, p)
 
 
@@ -218,23 +232,23 @@ def fit(judged: Judged) -> Fitted:
     towns = sorted(set(judged.town))
     kept = ~strays(judged.placed, judged.voxel_size)
     held = {town: judged.town == town for town in towns}
-    alone = np.zeros(len(judged))
+    alone, without_rivals = np.zeros(len(judged)), np.zeros(len(judged))
     for mine in held.values():
-        alone[mine] = fit_alone(judged, ~mine & kept).probability(judged.features[mine])
-    own = fit_alone(judged, kept)
-    tempered = _temper(own, alone, judged, kept, judged.counts)
-    alone = _tempered(alone, own, tempered)
-    columns = agreement_of(judged, alone)
+        own, features = fit_alone(judged, ~mine & kept).probability, judged.features[mine]
+        alone[mine], without_rivals[mine] = own(features), unrivalled(own, features)
+    whole = fit_alone(judged, kept)
+    tempered = _temper(whole, alone, judged, kept, judged.counts)
+    alone, without_rivals = (_tempered(p, whole, tempered) for p in (alone, without_rivals))
+    columns = agreement_of(judged, alone, without_rivals)
     probability = np.zeros(len(judged))
     for mine in held.values():
-        model = fit_agreement(judged, columns, ~mine & kept, tempered)
-        probability[mine] = model.decided([c[mine] for c in columns])
-    whole = fit_agreement(judged, columns, kept, tempered)
-    far = (columns[1] > 0) & has_far(columns)
-    together = _temper(whole.together, probability, judged, kept & far, np.ones(len(judged)))
-    probability = np.where(far, _tempered(probability, whole.together, together), probability)
+        probability[mine] = fit_agreement(judged, columns, ~mine & kept, tempered).decided([c[mine] for c in columns])
+    model = fit_agreement(judged, columns, kept, tempered)
+    far = (columns[1] > 0) & has_far(columns) & ~model.alike(columns)
+    together = _temper(model.together, probability, judged, kept & far, np.ones(len(judged)))
+    probability = np.where(far, _tempered(probability, model.together, together), probability)
     probability[~kept] = 0.0
-    return Fitted(replace(whole, together=together), alone, probability)
+    return Fitted(replace(model, together=together), alone, probability)
 
 
 def _log_odds(p: F64) -> F64:
@@ -305,6 +319,7 @@ def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
         "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature, 'together' where a query has neighbours",
         "alone": fitted.model.alone.to_json(FEATURES),
         "least_support": round(fitted.model.least_support, 4),
+        "most_alike": round(fitted.model.most_alike, 4),
         "near": fitted.model.near.to_json(TOGETHER),
         "together": fitted.model.together.to_json(TOGETHER),
         "towns": len(set(judged.town)),

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES, Features
 from semloc_logs.closures.acceptance import (
@@ -16,6 +17,7 @@ from semloc_logs.closures.acceptance import (
     reason,
     shipped,
     together_values,
+    unrivalled,
 )
 
 GOOD = Features(structure=0.95, coverage=0.9, contradiction=0.02, fit=0.95, rmse=0.1, distinct=0.2, support=3.0, stiffness=3.0)
@@ -39,18 +41,30 @@ def test_values_of_the_agreement_by_hand() -> None:
     columns = [np.array([x, x]) for x in (0.75, 4.0, 3.0, 1.0, np.e - 1, 0.0, 0.5)]
     values = together_values(columns)
     assert values.shape == (2, len(TOGETHER))
-    np.testing.assert_allclose(values[1], [np.log(3), np.log(4), 0.75, np.log(2), 1.0, 0.0, 0.5])
+    np.testing.assert_allclose(values[1], [np.log(3), np.log(4), 0.75, np.log(2), 1.0, 0.0])
 
 
 def test_without_neighbours_the_alignment_alone_decides() -> None:
     assert decided(alone=0.4321) == 0.4321
-    assert decided(alone=0.995, lookalike=0.9) == 0.995
+    assert decided(alone=0.995, lookalike=shipped().most_alike) == 0.995
+
+
+def test_in_streets_that_look_like_others_nothing_is_more_probable_than_a_half() -> None:
+    assert decided(alone=0.995, lookalike=0.9) == 0.995 / 2
+    assert decided(alone=0.9999, neighbours=12, agreeing=12.0, far_agreeing=80.0, lookalike=0.9) <= 0.5
+
+
+def test_without_rivals_an_alignment_is_judged_as_if_it_were_the_only_one() -> None:
+    def own(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return 1.0 - values[..., FEATURES.index("distinct")] / 10
+
+    values = np.array([own_values(dataclasses.replace(GOOD, distinct=d)) for d in (0.2, 1.4, 1.5)])
+    np.testing.assert_allclose(unrivalled(own, values), [1.0, 1.0, 0.0])
 
 
 def test_neighbours_add_and_take() -> None:
     several = {"alone": 0.9, "neighbours": 12}
     assert decided(**several, agreeing=9.0) > decided(**several, agreeing=3.0) > decided(**several, agreeing=3.0, opposing=6.0)
-    assert decided(**several, agreeing=9.0, lookalike=1.0) <= decided(**several, agreeing=9.0)
     assert decided(alone=0.97, neighbours=12, opposing=10.0) < 0.9
 
 
@@ -101,7 +115,7 @@ def test_reasons(change: dict[str, float], said: str) -> None:
 def test_reasons_of_the_neighbours() -> None:
     text = reason(GOOD, 0.5, 0.99, Agreement(0.995, 12, agreeing=1.04, opposing=7.96))
     assert "of 12 neighbouring queries 1.0 agree and 8.0 lie elsewhere" in text
-    assert "looks like another one" in reason(GOOD, 0.5, 0.99, Agreement(0.995, 12, lookalike=0.9))
+    assert "look like others (90%)" in reason(GOOD, 0.5, 0.99, Agreement(0.995, 12, lookalike=0.9))
 
 
 def test_logistic_regression_recovers_known_weights() -> None:

@@ -123,17 +123,52 @@ def test_sessions_that_overlap_each_other_do_not_contradict() -> None:
         assert (a.agreement.neighbours, a.agreement.opposing) == (10, 0.0)
 
 
-def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself_and_makes_its_look_suspect() -> None:
-    poses = np.array([yaw_transform(0.0, (2.0 * i, 0.0, 0.0)) for i in range(60)])
-    maps = {"a": session(poses), "b": session(MAP @ poses)}
-    own = alignment(5, 0.999)
-    own = dataclasses.replace(own, target_session="a", target_keyframe=50, target_T_query=np.eye(4))
-    found = decide([own, alignment(5, 0.995), alignment(6, 0.995)], maps, SETTINGS)
-    refuted = next(a for a in found if a.target_session == "a")
+STRAIGHT = np.array([yaw_transform(0.0, (2.0 * i, 0.0, 0.0)) for i in range(100)])
+STREETS = {"a": session(STRAIGHT), "b": session(STRAIGHT), "c": session(STRAIGHT)}
+COPIED = range(20, 40)
+
+
+def in_street(k: int, at: int, query: str = "a", target: str = "b") -> Alignment:
+    here = {"query_session": query, "target_session": target, "target_keyframe": at, "target_T_query": np.eye(4)}
+    return dataclasses.replace(alignment(k, 0.999), **here)  # type: ignore[arg-type]
+
+
+def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself() -> None:
+    refuted, right = sorted(decide([in_street(5, 50, target="a"), in_street(5, 5)], STREETS, SETTINGS), key=lambda a: a.target_session)
     assert refuted.probability == 0.0
     assert "odometry" in refuted.reason
-    assert {a.agreement.lookalike for a in found if a.query_keyframe == 5} == {0.999}
-    assert [a.agreement.lookalike for a in found if a.query_keyframe == 6] == [0.0]
+    assert right.probability > 0.9
+
+
+def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_else() -> None:
+    once = [in_street(k, k, target="c") for k in COPIED]
+    assert all(a.accepted and a.agreement.lookalike == 0 for a in decide(once, STREETS, SETTINGS))
+    twice = [in_street(k, at) for k in COPIED for at in (k, k + 30)]
+    there, back = [in_street(k, k, "c", "a") for k in COPIED], [in_street(k, k, "b", "c") for k in COPIED]
+    for a in decide(once + twice + there + back, STREETS, SETTINGS):
+        known = (a.query_session, a.target_session) == ("b", "c")  # neither asked nor was asked about the copies: b has both of them
+        assert (a.agreement.lookalike > 0.9) != known
+        assert a.accepted == known
+        assert known or "look like others" in a.reason
+
+
+def test_streets_that_a_session_itself_has_twice_look_alike() -> None:
+    rows = [in_street(k, k) for k in COPIED] + [in_street(k, k + 40, target="a") for k in COPIED]
+    for a in decide(rows, STREETS, SETTINGS):
+        assert a.agreement.lookalike > 0.9
+        assert not a.accepted
+
+
+@pytest.mark.parametrize("at", [lambda k: (7 * k) % 100, lambda k: k + 1])
+def test_second_places_that_do_not_agree_or_are_the_same_by_odometry_are_no_copies(at: Any) -> None:
+    rows = [in_street(k, where) for k in COPIED for where in (k, at(k))]
+    assert all(a.agreement.lookalike < 0.02 for a in decide(rows, STREETS, SETTINGS))
+
+
+def test_a_second_place_that_fits_much_worse_is_no_copy() -> None:
+    worse = dataclasses.replace(GOOD, distinct=1.5)
+    rows = [in_street(k, k) for k in COPIED] + [dataclasses.replace(in_street(k, k + 30), features=worse) for k in COPIED]
+    assert all(a.agreement.lookalike == 0 for a in decide(rows, STREETS, SETTINGS))
 
 
 def test_without_odometry_nobody_is_a_neighbour() -> None:

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -45,7 +45,7 @@ def judged(n: int = 1500, seed: int = 0, towns: int = 3) -> Judged:
     at[~right, :2, 3] += rng.uniform(20, 90, (int((~right).sum()), 2))
     road = np.array(2.0 * query, float)
     a, b = (np.full(n, name, object) for name in ("a", "b"))
-    placed = Placed(a, b, query, road, road.copy(), own, at, np.full(n, 0.02), np.zeros(n), np.ones(n, bool))
+    placed = Placed(a, b, query, road, road.copy(), own, at, np.full(n, 0.02), np.zeros(n), np.zeros(n), np.ones(n, bool))
     return Judged(town, features, placed, right, np.where(right, 0.1, 50.0), np.zeros(n), 0.3)
 
 
@@ -61,6 +61,37 @@ def test_neighbours_find_more_at_the_same_reliability_and_probabilities_mean_wha
     assert (content["towns"], content["alignments"], content["right"]) == (3, 1500, int(data.right.sum()))
     assert set(content["alone"]["features"]) == set(FEATURES)
     assert Calibration.from_json(content["together"], TOGETHER).weights[0] == round(fitted.model.together.weights[0], 4)
+
+
+def test_copied_blocks_teach_when_to_abstain_and_cost_nothing_elsewhere() -> None:
+    data = judged()
+    n = 400
+    copy = np.arange(n) % 2 == 1  # of each query the true place and one a block on, that fits as well
+    query = np.arange(n) % (n // 2) // 2
+    own = np.array([yaw_transform(0.0, (2.0 * k, 0.0, 0.0)) for k in query])
+    at = own @ np.where(copy[:, None, None], yaw_transform(0.0, (85.0, 0.0, 0.0)), np.eye(4))
+    road = np.array(2.0 * query, float)
+    a, b = (np.full(n, name, object) for name in ("a", "b"))
+    placed = Placed(a, b, query, road, road + 85.0 * copy, own, at, np.full(n, 0.02), np.zeros(n), np.zeros(n), np.ones(n, bool))
+    features = np.tile([0.75, 0.8, 0.2, 0.5, 0.1, 0.8, 3.0, 2.0], (n, 1)) + np.random.default_rng(1).normal(0, 0.01, (n, 8))
+    town = np.where(np.arange(n) < n // 2, "repeating-0", "repeating-1").astype(object)
+    poses = {f.name: np.concatenate([getattr(data.placed, f.name), getattr(placed, f.name)]) for f in fields(Placed)}
+    both = Judged(
+        np.concatenate([data.town, town]),
+        np.concatenate([data.features, features]),
+        Placed(**poses),
+        np.concatenate([data.right, ~copy]),
+        np.concatenate([data.error_m, np.where(copy, 85.0, 0.1)]),
+        np.zeros(len(data) + n),
+        0.3,
+    )
+    fitted = fit(both)
+    assert 0 < fitted.model.most_alike < 0.5
+    accepted = fitted.probability >= 0.99
+    assert not accepted[len(data) :].any()
+    without = fit(data)
+    assert without.model.most_alike == 1.0
+    assert accepted.sum() > 0.9 * (without.probability >= 0.99).sum()
 
 
 def test_what_is_said_of_a_town_does_not_depend_on_its_truth() -> None:
