@@ -29,6 +29,7 @@ SLACK, MOST_SLACK = 1.7, 3.3  # voxels between two alignments of one place, with
 DRIFT, ARM = 0.01, 0.015  # of the way: odometry, and an alignment's error of heading (rad)
 TURN, TURN_DRIFT = np.radians(4.0), np.radians(0.02)  # rad, and rad a metre
 LEAST = 0.02  # alignments less probable than this say nothing about others
+APART = 20.0  # m between a place and its copy, at voxels of 0.30 m: nearer ones lie in one view, whose free space tells them apart
 OWN_DRIFT, OWN_SLACK = 0.05, 10.0  # of the way, and voxels: farther off in its own map no query can be
 
 
@@ -182,11 +183,11 @@ def _lookalike(placed: Placed, support: F64, voxel_size: float) -> F64:
 
 
 def _second(places: Placed, support: F64, voxel_size: float) -> float:
-    """The support that the second place of one query in one target has, of places that odometry can tell apart."""
+    """The support that the second place of one query in one target has."""
     best = 0.0
     for a in range(len(support)):
         off = np.linalg.norm(places.target_T_query[:, :3, 3] - places.target_T_query[a, :3, 3], axis=1)
-        apart = off > OWN_SLACK * voxel_size + OWN_DRIFT * np.abs(places.target_road - places.target_road[a])
+        apart = off > APART * voxel_size / STREET_VOXEL + OWN_DRIFT * np.abs(places.target_road - places.target_road[a])
         best = max(best, float(np.minimum(support[apart], support[a]).max(initial=0.0)))
     return best
 
