@@ -45,12 +45,13 @@ def pool(group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, ce
             found.append(Hypothesis(int(group[first]), pose, int(count[b]), float(total[b])))
     found.sort(key=lambda h: (-h.weight, h.group, h.pose))
     kept: list[Hypothesis] = []
+    by_heading: dict[tuple[int, float], list[Hypothesis]] = {}
     for h in found:  # the same cell found twice is one hypothesis
-        if not any(
-            h.group == o.group and h.pose[0] == o.pose[0] and max(abs(a - b) for a, b in zip(h.pose, o.pose, strict=True)) < cell / 4
-            for o in kept
-        ):
-            kept.append(h)
+        beside = by_heading.setdefault((h.group, h.pose[0]), [])
+        if any(max(abs(a - b) for a, b in zip(h.pose, o.pose, strict=True)) < cell / 4 for o in beside):
+            continue
+        beside.append(h)
+        kept.append(h)
         if len(kept) == most:
             break
     return kept

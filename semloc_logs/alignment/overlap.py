@@ -23,6 +23,7 @@ FREE_BIT = 128  # observed free and nothing occupied beside it
 ANY_BIT = 64  # occupied, unlabelled included
 REACH = 4  # cells that a search may shift by; a grid is padded by twice as many, so that no look-up leaves it
 HALF_DIAGONAL = float(np.sqrt(0.75))  # of a cell, in cells
+CUBE = 4  # cells: where nothing is observed is left out by cubes
 CHUNK = 128  # voxels counted before a sum is given up
 STRUCTURE_SHARE = 0.75  # of the score; the ground has the rest, to hold the height
 
@@ -194,33 +195,57 @@ def look_up(level: Level, points: F64) -> U8:
 
 
 def tau(
-    query: BlockMap, target: BlockMap, voxel_size: float, target_T_query: F64, kappa: float, coarse: U8 | None = None
+    query: tuple[NDArray[np.int32], U8], target: BlockMap, voxel_size: float, target_T_query: F64, kappa: float, coarse: U8 | None = None
 ) -> tuple[float, int]:
     """The paper's overlap ratio (3.5) and the number of aligned voxels.
 
-    For each occupied query voxel the closest *observed* target voxel is taken; it counts as aligned when that one is occupied, of
-    exactly the same class (of the same coarse class where ``coarse`` (256,) is given), and its centre is closer than ``kappa`` metres.
+    For each occupied voxel of the ``query``, given by coordinates (n, 3) and classes (n,), the closest *observed* target voxel is taken; it
+    counts as aligned when that one is occupied, of exactly the same class (of the same coarse class where ``coarse`` (256,) is given), and
+    its centre is closer than ``kappa`` metres.
     """
-    ijk, label = query.occupied()
+    ijk, label = query
     if not len(ijk) or not len(target.keys):
         return 0.0, 0
+    reach = kappa / voxel_size
     centres = (ijk + 0.5) * voxel_size @ target_T_query[:3, :3].T + target_T_query[:3, 3]
-    low = np.floor(centres.min(0) / voxel_size).astype(int) - int(kappa / voxel_size) - 1
-    high = np.floor(centres.max(0) / voxel_size).astype(int) + int(kappa / voxel_size) + 2
+    points = centres / voxel_size
+    low, high = (np.floor(edge).astype(int) for edge in (points.min(0) - reach, points.max(0) + reach + 1))
     tl, th = target.bounds()
     low, high = np.maximum(low, tl), np.minimum(high, th)
     if (low >= high).any():
         return 0.0, 0
-    state = target.dense(low, tuple((high - low).tolist()))
-    reach = kappa / voxel_size
     margin = 2 * int(reach) + 4  # twice: for points beside the map, and for what is around them
-    offsets, length = _offsets(reach)
-    around = np.pad(state, margin, constant_values=UNOBSERVED_STATE)
-    found = _closest_observed(around, centres / voxel_size - low + margin, offsets, length, reach)
+    low = low - margin
+    around = target.dense(low, tuple((high - low + margin).tolist()))
+    found = _closest_observed(around, _near_observed(around, int(reach) + 1), points - low, *_offsets(reach), reach)
     table = np.arange(256, dtype=np.uint8) if coarse is None else coarse
     hit = (found != UNOBSERVED_STATE) & (found != FREE_STATE)
     aligned = hit & (table[found] == table[label])
     return float(aligned.mean()), int(aligned.sum())
+
+
+@njit(cache=True, nogil=True)
+def _near_observed(state: U8, reach: int) -> NDArray[np.bool_]:
+    """Whether there may be an observed cell within ``reach`` of the cells of each cube of ``CUBE`` cells."""
+    nx, ny, nz = state.shape[0] // CUBE + 1, state.shape[1] // CUBE + 1, state.shape[2] // CUBE + 1
+    near = np.zeros((nx, ny, nz), np.bool_)
+    for i in range(state.shape[0]):
+        for j in range(state.shape[1]):
+            for k in range(state.shape[2]):
+                if state[i, j, k] != UNOBSERVED_STATE:
+                    near[i // CUBE, j // CUBE, k // CUBE] = True
+    r = -(-reach // CUBE)
+    for axis in range(3):
+        wide = near.copy()
+        for i, j, k in np.argwhere(near):
+            if axis == 0:
+                wide[max(i - r, 0) : i + r + 1, j, k] = True
+            elif axis == 1:
+                wide[i, max(j - r, 0) : j + r + 1, k] = True
+            else:
+                wide[i, j, max(k - r, 0) : k + r + 1] = True
+        near = wide
+    return near
 
 
 @lru_cache(maxsize=4)
@@ -235,10 +260,10 @@ def _offsets(reach: float) -> tuple[NDArray[np.int64], F64]:
 
 
 @njit(cache=True, nogil=True)
-def _closest_observed(state: U8, points: F64, offsets: NDArray[np.int64], length: F64, reach: float) -> U8:
+def _closest_observed(state: U8, near: NDArray[np.bool_], points: F64, offsets: NDArray[np.int64], length: F64, reach: float) -> U8:
     """State of the observed cell whose centre is closest to each of ``points`` (n, 3), in cells; unobserved where none is within reach.
 
-    The grid has a margin of twice ``reach`` and four cells on all sides.
+    The grid has a margin of twice ``reach`` and four cells on all sides; ``near`` is that of :func:`_near_observed`.
     """
     out = np.full(len(points), UNOBSERVED_STATE, np.uint8)
     nx, ny, nz = state.shape
@@ -249,8 +274,14 @@ def _closest_observed(state: U8, points: F64, offsets: NDArray[np.int64], length
         i, j, k = int(np.floor(points[n, 0])), int(np.floor(points[n, 1])), int(np.floor(points[n, 2]))
         if min(i, j, k) < margin or i >= nx - margin or j >= ny - margin or k >= nz - margin:
             continue  # farther from the map than it may be
-        fx, fy, fz = points[n, 0] - i - 0.5, points[n, 1] - j - 0.5, points[n, 2] - k - 0.5
+        if not near[i // CUBE, j // CUBE, k // CUBE]:
+            continue
         middle, best = (i * ny + j) * nz + k, reach
+        here = flat[np.uint64(middle)]
+        if here != UNOBSERVED_STATE and reach > HALF_DIAGONAL:
+            out[n] = here  # no other centre is as close as that of the cell a point lies in
+            continue
+        fx, fy, fz = points[n, 0] - i - 0.5, points[n, 1] - j - 0.5, points[n, 2] - k - 0.5
         for m in range(len(steps)):
             if length[m] - HALF_DIAGONAL >= best:
                 break

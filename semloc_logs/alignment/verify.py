@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis
@@ -80,15 +81,20 @@ class Query:
     voxel_size: float
 
     @cached_property
+    def occupied(self) -> tuple[NDArray[np.int32], U8]:
+        """Coordinates (n, 3) and classes (n,) of the occupied voxels."""
+        return self.blocks.occupied()
+
+    @cached_property
     def reach(self) -> int:
         """Voxels from the origin to the farthest occupied voxel, over the ground."""
-        ijk, _ = self.blocks.occupied()
+        ijk, _ = self.occupied
         return int(np.ceil(np.linalg.norm(ijk[:, :2] + 0.5, axis=1).max(initial=0.0)))
 
     @cached_property
     def evidence(self) -> Evidence:
         """Voxels to look up while searching: structure, and ground with a third of its weight to hold the height."""
-        ijk, label = self.blocks.occupied()
+        ijk, label = self.occupied
         structure = structure_mask(label)
         rng = np.random.default_rng(0)
         picked = []
@@ -103,7 +109,7 @@ class Query:
     @cached_property
     def structure(self) -> tuple[F64, U8]:
         """Centres (n, 3) in metres and class bits (n,) of all structure voxels."""
-        ijk, label = self.blocks.occupied()
+        ijk, label = self.occupied
         keep = structure_mask(label)
         bits = class_bits(label[keep], cityscapes().coarse)
         centres: F64 = (ijk[keep].astype(float) + 0.5) * self.voxel_size
@@ -146,17 +152,24 @@ Found = tuple[Hypothesis, F64, float]
 
 def _apart(found: Sequence[Found], distance: float, most: int) -> list[Found]:
     """The first ``most`` of ``found`` that are not beside an earlier one: hypotheses that have met are one."""
-    groups = np.array([f[0].group for f in found])
+    groups = np.array([f[0].group for f in found], np.int64)
     poses = np.array([f[1] for f in found]).reshape(-1, 4)
-    beside = (groups[:, None] == groups) & (np.abs(poses[:, None, 1:] - poses[:, 1:]).max(2) < distance)
-    beside &= np.cos(poses[:, None, 0] - poses[:, 0]) > np.cos(0.05)
-    kept: list[int] = []
-    for i in range(len(found)):
-        if not beside[i, kept].any():
-            kept.append(i)
-        if len(kept) == most:
-            break
-    return [found[i] for i in kept]
+    return [found[i] for i in _first_apart(groups, poses, distance, most).tolist()]
+
+
+@njit(cache=True, nogil=True)
+def _first_apart(groups: NDArray[np.int64], poses: F64, distance: float, most: int) -> NDArray[np.int64]:
+    kept = np.empty(len(groups), np.int64)
+    count = 0
+    for i in range(len(groups)):
+        beside = count == most
+        for k in kept[:count]:
+            if groups[i] == groups[k] and np.cos(poses[i, 0] - poses[k, 0]) > np.cos(0.05):
+                beside |= np.abs(poses[i, 1:] - poses[k, 1:]).max() < distance
+        if not beside:
+            kept[count] = i
+            count += 1
+    return kept[:count]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

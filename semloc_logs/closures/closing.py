@@ -35,7 +35,7 @@ from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
-ALIGNED = 6  # candidates of a target session that are fitted on the points
+ALIGNED = 4  # candidates of a target session that are fitted on the points
 CLOSE = 0.9  # of the best score: what is worth a fine fit beside it
 HOPELESS = 0.3  # below this score nothing is right
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
@@ -260,7 +260,7 @@ def _judge(
     )
     probability = float(shipped().own(own_values(features)))
     same_source = session.json["label_source"] == target_session.json["label_source"]
-    overlap, inliers = tau(query.blocks, target.blocks, v, T, settings.closures.kappa * v, None if same_source else cityscapes().coarse)
+    overlap, inliers = tau(query.occupied, target.blocks, v, T, settings.closures.kappa * v, None if same_source else cityscapes().coarse)
     map_T_query_base = T @ query_T_base
     nearest = database.nearest_keyframe(candidate.group, map_T_query_base[:3, 3])
     map_T_target = target_session.map_T_base[nearest]

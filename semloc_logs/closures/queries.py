@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,11 @@ from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describing import KNOWS_CLASSES
 from semloc_logs.tables import read_json, read_table
 from semloc_logs.voxels.grid import Fuser
-from semloc_logs.voxels.store import poses_of, read_keyframe
+from semloc_logs.voxels.store import Keyframe, poses_of, read_keyframe
 from semloc_logs.workspace import SessionFolder
 
 F64 = NDArray[np.float64]
+KEPT = 8  # keyframes in memory
 
 
 @dataclass(eq=False)
@@ -56,6 +58,11 @@ class SessionMap:
     @cached_property
     def origins(self) -> F64:
         return np.stack([self.frames[f"origin_{c}"].to_numpy() for c in "xyz"], 1).astype(float)
+
+    @cached_property
+    def keyframe(self) -> Callable[[int], Keyframe]:
+        """What a keyframe saw; that of the last ones is kept, since neighbouring queries share keyframes."""
+        return lru_cache(maxsize=KEPT)(partial(read_keyframe, self.folder.keyframes))
 
     @property
     def posed(self) -> bool:
@@ -118,7 +125,7 @@ def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple
     radius = settings.query.radius or 24.0
     fuser, clouds = Fuser(settings.fusion), []
     for i in members:
-        frame = read_keyframe(session.folder.keyframes, i).near(session.origins[i], radius)
+        frame = session.keyframe(i).near(session.origins[i], radius)
         fuser.add(frame.points, frame.label, session.origins[i], frame.sigma, poses[i])
         clouds.append(apply(poses[i], frame.points))
     v = settings.fusion.voxel_size

@@ -100,7 +100,7 @@ def verification_speed(settings: Settings) -> Figures:
         "surface of a place": lambda: surface_of(s.points, 2 * v),
         "fine fit": lambda: fine_fit(start, surface, s.query),
         f"tau, {len(s.hypotheses)} hypotheses": lambda: [
-            tau(s.query.blocks, blocks, v, pose_matrix(np.array(h.pose)), kappa) for h in s.hypotheses
+            tau(s.query.occupied, blocks, v, pose_matrix(np.array(h.pose)), kappa) for h in s.hypotheses
         ],
     }
     figures: Figures = {}

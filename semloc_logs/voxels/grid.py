@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import UNLABELLED
@@ -37,9 +38,7 @@ class BlockMap:
 
     def occupied(self) -> tuple[NDArray[np.int32], U8]:
         """Voxel coordinates (m, 3) and class of the occupied voxels, in block order."""
-        row, cell = np.nonzero((self.state != FREE_STATE) & (self.state != UNOBSERVED_STATE))
-        base = unpack(self.keys)[row] * BLOCK
-        return base + np.stack([cell // 256, cell // 16 % 16, cell % 16], 1).astype(np.int32), self.state[row, cell]
+        return _occupied(unpack(self.keys).astype(np.int32) * np.int32(BLOCK), self.state)
 
     def bounds(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Lowest voxel and one past the highest voxel of the blocks; two zeros if there are none."""
@@ -51,16 +50,41 @@ class BlockMap:
     def dense(self, low: NDArray[np.integer], shape: tuple[int, int, int]) -> U8:
         """State of the box of ``shape`` voxels from voxel ``low``, unobserved where there is no block."""
         out = np.full(shape, UNOBSERVED_STATE, np.uint8)
-        low = np.asarray(low, np.int64)
-        for key, state in zip(unpack(self.keys), self.state, strict=True):
-            a = key.astype(np.int64) * BLOCK - low
-            s, e = np.maximum(a, 0), np.minimum(a + BLOCK, shape)
-            if (s < e).all():
-                block = state.reshape(BLOCK, BLOCK, BLOCK)
-                out[s[0] : e[0], s[1] : e[1], s[2] : e[2]] = block[
-                    s[0] - a[0] : e[0] - a[0], s[1] - a[1] : e[1] - a[1], s[2] - a[2] : e[2] - a[2]
-                ]
+        corner = unpack(self.keys).astype(np.int64) * BLOCK - np.asarray(low, np.int64)
+        inside = np.flatnonzero(((corner > -BLOCK) & (corner < np.array(shape))).all(1))
+        _copy_blocks(out, corner[inside], self.state, inside)
         return out
+
+
+@njit(cache=True, nogil=True)
+def _occupied(corner: NDArray[np.int32], state: U8) -> tuple[NDArray[np.int32], U8]:
+    """Coordinates (m, 3) and classes (m,) of the occupied voxels of blocks with their corner at ``corner`` (n, 3)."""
+    count = 0
+    for value in state.ravel():
+        count += value != FREE_STATE and value != UNOBSERVED_STATE
+    ijk, label = np.empty((count, 3), np.int32), np.empty(count, np.uint8)
+    at = 0
+    for n in range(len(state)):
+        for m in range(state.shape[1]):
+            value = state[n, m]
+            if value != FREE_STATE and value != UNOBSERVED_STATE:
+                ijk[at, 0], ijk[at, 1], ijk[at, 2] = corner[n, 0] + m // 256, corner[n, 1] + m // 16 % 16, corner[n, 2] + m % 16
+                label[at] = value
+                at += 1
+    return ijk, label
+
+
+@njit(cache=True, nogil=True)
+def _copy_blocks(out: U8, corner: I64, state: U8, rows: I64) -> None:
+    """The ``rows`` (m,) of ``state``, blocks with their corner at ``corner`` (m, 3) of ``out``, as far as they lie in it."""
+    nx, ny, nz = out.shape
+    for n in range(len(rows)):
+        x, y, z = corner[n]
+        first, end = max(z, 0), min(z + BLOCK, nz)
+        for i in range(max(x, 0), min(x + BLOCK, nx)):
+            for j in range(max(y, 0), min(y + BLOCK, ny)):
+                at = ((i - x) * BLOCK + j - y) * BLOCK - z
+                out[i, j, first:end] = state[rows[n], at + first : at + end]
 
 
 def empty_map() -> BlockMap:

@@ -26,6 +26,7 @@ from semloc_logs.words.kmeans import grid
 from semloc_logs.words.segment import WORDS, Held, Segment, segment_in_memory
 from semloc_logs.words.vocabulary import BITS, Vocabulary, codes_of
 
+U8 = NDArray[np.uint8]
 U64 = NDArray[np.uint64]
 U32 = NDArray[np.uint32]
 I32 = NDArray[np.int32]
@@ -34,7 +35,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ranges = tuple[I64, I64, I64, I64]  # of each query: where its ranges start (n + 1,); of each range: first word, last word + 1, probe
-AT_ONCE = 64  # codes that are compared before any is looked at
 SHORTLIST = 32  # nearest codes in Hamming distance that are compared asymmetrically
 BUDGET = 32_768  # codes that a look-up compares, and those of one word more
 UNIT = 2.0**19  # distances of descriptors to words are multiples of 1 / UNIT: see :mod:`semloc_logs.words.vocabulary`
@@ -174,44 +174,56 @@ def _may_answer(lists: _Lists, entry: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _look(codes: U64, ranges: Ranges, q: int, lists: _Lists, size: int, count: I64, state: I64, kept: I64) -> int:
-    """Positions and probes (2, m) of entries of a segment that query ``q`` with codes (p,) may want into ``kept``; returns how many.
-
-    ``count`` (66,) entries were found at each distance up to the bound; ``state`` is their sum and the bound, which falls to the distance
-    within which there are ``size``.
-    """
-    distance = np.empty(AT_ONCE, np.int64)
-    offsets, firsts, lasts, probes = ranges
-    within, bound, found = state[0], state[1], 0
-    for r in range(offsets[q], offsets[q + 1]):
-        code, end = codes[probes[r]], np.int64(lists.starts[lasts[r]])
-        for first in range(np.int64(lists.starts[firsts[r]]), end, AT_ONCE):
-            block = lists.code[first : min(first + AT_ONCE, end)]
-            least = BITS
-            for i in range(len(block)):  # without branches: the compiler makes it several at a time
-                distance[i] = popcount(code ^ block[i])
-                least = min(least, distance[i])
-            if least > bound:
-                continue
-            for i in range(len(block)):
-                d = distance[i]
-                if d <= bound and _may_answer(lists, first + i):
-                    count[d] += 1
-                    within += 1
-                    kept[0, found], kept[1, found] = first + i, probes[r]
-                    found += 1
-                    while within - count[bound] >= size:  # enough are nearer than the bound
-                        within -= count[bound]
-                        bound -= 1
-    state[0], state[1] = within, bound
-    return found
+def _bound(count: I64, within: int, limit: int, size: int) -> int:
+    """The least distance up to ``limit`` within which ``count`` (66,) has ``size`` entries, of which ``within`` are within ``limit``."""
+    while limit > 0 and within - int(count[limit]) >= size:
+        within -= int(count[limit])
+        limit -= 1
+    return limit
 
 
 @njit(cache=True, nogil=True)
-def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, guess: bool, count: I64, state: I64) -> I64:
+def _look(codes: U64, ranges: Ranges, q: int, lists: _Lists, size: int, count: I64, limit: int, distance: U8, at: I64) -> tuple[int, int]:
+    """Entries of a segment that query ``q`` with codes (p,) may want: their distances, and positions and probes in ``at`` (2, m).
+
+    ``count`` (66,) entries were found at each distance up to ``limit``. Returns how many are found now and the new limit, within which
+    there are ``size``; the entries of this segment within it have been added to ``count``.
+    """
+    offsets, firsts, lasts, probes = ranges
+    n, histogram = 0, count.copy()
+    for r in range(offsets[q], offsets[q + 1]):  # without branches: the compiler makes many at a time
+        code, first, end = codes[probes[r]], int(lists.starts[firsts[r]]), int(lists.starts[lasts[r]])
+        block, into = lists.code[first:end], distance[n : n + end - first]
+        for i in range(len(block)):
+            into[i] = np.uint8(popcount(code ^ block[i]))
+        n += end - first
+    for i in range(n):
+        histogram[distance[i]] += 1
+    bound, step = _bound(histogram, int(histogram[: limit + 1].sum()), limit, size), 1
+    while True:
+        found, n, new = 0, 0, count.copy()
+        for r in range(offsets[q], offsets[q + 1]):
+            first, end = int(lists.starts[firsts[r]]), int(lists.starts[lasts[r]])
+            into = distance[n : n + end - first]
+            for i in range(len(into)):
+                if into[i] <= bound and _may_answer(lists, first + i):
+                    at[0, found], at[1, found] = first + i, probes[r]
+                    new[into[i]] += 1
+                    found += 1
+            n += end - first
+        within = int(new[: bound + 1].sum())
+        if within >= size or bound == limit:
+            break
+        bound, step = min(bound + step, limit), 2 * step  # many may not answer: look farther
+    count[:] = new
+    return found, _bound(new, within, bound, size)
+
+
+@njit(cache=True, nogil=True)
+def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, count: I64, limit: I64) -> I64:
     """Queries, positions and probes (3, m) of the entries of one segment that may answer and are among the ``size`` nearest so far.
 
-    ``count`` (n, 66) and ``state`` (n, 2) are those of :func:`_look` and go on from segment to segment; ``guess`` at the first.
+    ``count`` (n, 66) and ``limit`` (n,) are those of :func:`_look` and go on from segment to segment.
     """
     offsets, firsts, lasts, _ = ranges
     most = np.int64(0)
@@ -220,24 +232,17 @@ def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, guess: bool, cou
         for r in range(offsets[q], offsets[q + 1]):
             here += np.int64(lists.starts[lasts[r]]) - np.int64(lists.starts[firsts[r]])
         most = max(most, here)
-    kept = np.empty((2, most), np.int64)
-    out, total, before = np.empty((3, 64 * len(codes) + most), np.int64), 0, BITS
+    distance, at = np.empty(most, np.uint8), np.empty((2, most), np.int64)
+    out, total = np.empty((3, 64 * len(codes) + most), np.int64), 0
     for q in range(len(codes)):
-        if guess:  # a query's last neighbours are about as far as those of the one before; where they are farther, all are looked at
-            state[q, 1] = min(before + 1, BITS)
-        found = _look(codes[q], ranges, q, lists, size, count[q], state[q], kept)
-        if guess and state[q, 0] < size:
-            count[q] = 0
-            state[q] = 0, BITS
-            found = _look(codes[q], ranges, q, lists, size, count[q], state[q], kept)
-        before = int(state[q, 1])
+        found, limit[q] = _look(codes[q], ranges, q, lists, size, count[q], limit[q], distance, at)
         if total + found > out.shape[1]:
             more = np.empty((3, 2 * (total + found)), np.int64)
             more[:, :total] = out[:, :total]
             out = more
         for i in range(found):
-            if popcount(codes[q, kept[1, i]] ^ lists.code[kept[0, i]]) <= before:
-                out[0, total], out[1, total], out[2, total] = q, kept[0, i], kept[1, i]
+            if popcount(codes[q, at[1, i]] ^ lists.code[at[0, i]]) <= limit[q]:
+                out[0, total], out[1, total], out[2, total] = q, at[0, i], at[1, i]
                 total += 1
     return out[:, :total].copy()
 
@@ -332,20 +337,20 @@ class Index:
         margin = v.margins(descriptors, cells)
         codes = codes_of(margin)
         ranges = _choose(grid(v.projected(descriptors)), cells, v.children, self._square, self._live, self._cell_live, self.budget)
-        count, state = np.zeros((len(codes), BITS + 2), np.int64), np.tile(np.array([0, BITS]), (len(codes), 1))
+        count, limit = np.zeros((len(codes), BITS + 2), np.int64), np.full(len(codes), BITS)
         found: list[NDArray[np.int64]] = []
         near: list[tuple[U64, I64]] = []
         for number, p in enumerate(self.parts):
             s = p.segment
             lists = _Lists(s.starts, s.code, s.place, s.row, *allowed.of(p.group))
-            m = _scan(codes, ranges, lists, max(SHORTLIST, k), number == 0, count, state)
+            m = _scan(codes, ranges, lists, max(SHORTLIST, k), count, limit)
             found.append(np.concatenate([m, np.full((1, m.shape[1]), number)]))
             near.append((s.code[m[1]], p.group[s.place[m[1]]] << 32 | s.row[m[1]]))
         if not found:
             return self._gather(np.zeros((4, 0), np.int64))
         m = np.concatenate(found, axis=1)
         code, key = (np.concatenate([n[i] for n in near]) for i in (0, 1))
-        nearest, hamming = _nearest(np.abs(margin), codes, state[:, 1].copy(), m[0], m[2], code, key, k)
+        nearest, hamming = _nearest(np.abs(margin), codes, limit, m[0], m[2], code, key, k)
         query, rank = np.nonzero(nearest >= 0)
         chosen = m[:, nearest[query, rank]]
         return self._gather(np.stack([query, chosen[1], chosen[3], hamming[query, rank]]))

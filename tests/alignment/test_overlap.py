@@ -97,7 +97,7 @@ def slow_tau(query: dict[Cell, int], target: dict[Cell, int], T: NDArray[np.floa
 def test_tau_is_that_of_brute_force(seed: int, yaw: float, t: tuple[float, float, float], coarse: bool, kappa: float) -> None:
     query, target = random_cells(seed, 40), random_cells(seed + 1, 300)
     T = yaw_transform(yaw, (t[0] + 1e-7, t[1] + 1e-7, t[2] + 1e-7)) @ exp_se3(np.zeros(3), np.array([0.03, -0.02, 0.0]))
-    found = tau(block_map(query), block_map(target), V, T, kappa, COARSE if coarse else None)
+    found = tau(block_map(query).occupied(), block_map(target), V, T, kappa, COARSE if coarse else None)
     assert found == pytest.approx(slow_tau(query, target, T, kappa, coarse))
 
 
@@ -105,22 +105,22 @@ def test_tau_of_a_map_with_itself_and_with_nothing() -> None:
     cells = random_cells(3)
     blocks = block_map(cells)
     n = sum(occupied(s) for s in cells.values())
-    assert tau(blocks, blocks, V, np.eye(4), 3.0) == (1.0, n)
+    assert tau(blocks.occupied(), blocks, V, np.eye(4), 3.0) == (1.0, n)
     shifted = block_map({tuple((np.array(c) + np.array([3, -40, 7])).tolist()): s for c, s in cells.items()})
-    assert tau(blocks, shifted, V, yaw_transform(0.0, (3 * V, -40 * V, 7 * V)), 3.0) == (1.0, n)
+    assert tau(blocks.occupied(), shifted, V, yaw_transform(0.0, (3 * V, -40 * V, 7 * V)), 3.0) == (1.0, n)
     for query, target in ((empty_map(), blocks), (blocks, empty_map()), (block_map({(0, 0, 0): 254}), blocks)):
-        assert tau(query, target, V, np.eye(4), 3.0) == (0.0, 0)
-    assert tau(blocks, blocks, V, yaw_transform(0.0, (1e5, 0.0, 0.0)), 3.0) == (0.0, 0)
+        assert tau(query.occupied(), target, V, np.eye(4), 3.0) == (0.0, 0)
+    assert tau(blocks.occupied(), blocks, V, yaw_transform(0.0, (1e5, 0.0, 0.0)), 3.0) == (0.0, 0)
 
 
 def test_free_space_counts_against_an_alignment_in_tau() -> None:
     """The closest observed voxel decides, not some occupied one within kappa."""
     query = block_map({(0, 0, 0): 2})
-    assert tau(query, block_map({(2, 0, 0): 2}), V, np.eye(4), 3.0)[0] == 1
-    assert tau(query, block_map({(2, 0, 0): 2, (0, 0, 1): 254}), V, np.eye(4), 3.0)[0] == 0
-    assert tau(query, block_map({(2, 0, 0): 3}), V, np.eye(4), 3.0)[0] == 0
-    assert tau(query, block_map({(2, 0, 0): 3}), V, np.eye(4), 3.0, COARSE)[0] == 1  # building and wall are construction
-    assert tau(query, block_map({(6, 0, 0): 2}), V, np.eye(4), 3.0)[0] == 0  # at kappa, not below it
+    assert tau(query.occupied(), block_map({(2, 0, 0): 2}), V, np.eye(4), 3.0)[0] == 1
+    assert tau(query.occupied(), block_map({(2, 0, 0): 2, (0, 0, 1): 254}), V, np.eye(4), 3.0)[0] == 0
+    assert tau(query.occupied(), block_map({(2, 0, 0): 3}), V, np.eye(4), 3.0)[0] == 0
+    assert tau(query.occupied(), block_map({(2, 0, 0): 3}), V, np.eye(4), 3.0, COARSE)[0] == 1  # building and wall are construction
+    assert tau(query.occupied(), block_map({(6, 0, 0): 2}), V, np.eye(4), 3.0)[0] == 0  # at kappa, not below it
 
 
 def town(seed: int = 0) -> dict[Cell, int]:

@@ -42,7 +42,7 @@ def slow_tau(s: Scene, T: F64, every: int) -> float:
 def test_the_ratio_is_the_papers(made: Scene) -> None:
     for h in made.hypotheses[:3]:
         T = pose_matrix(np.array(h.pose))
-        found, _ = tau(made.query.blocks, made.target.blocks, made.target.voxel_size, T, KAPPA)
+        found, _ = tau(made.query.occupied, made.target.blocks, made.target.voxel_size, T, KAPPA)
         assert found == pytest.approx(slow_tau(made, T, 60), abs=0.08)  # of a sample
 
 
@@ -50,7 +50,7 @@ def test_the_search_ranks_first_what_the_paper_ranks_first(made: Scene) -> None:
     """The paper's ranking is by tau of the hypotheses as refined; the true one is first in both, by far."""
     v = made.target.voxel_size
     candidates = search_hypotheses(made.hypotheses, {0: made.target}, made.query, 18, 6)
-    by_paper = [tau(made.query.blocks, made.target.blocks, v, c.target_T_query, KAPPA)[0] for c in candidates]
+    by_paper = [tau(made.query.occupied, made.target.blocks, v, c.target_T_query, KAPPA)[0] for c in candidates]
     assert int(np.argmax(by_paper)) == 0
     assert same_place(candidates[0].target_T_query, pose_matrix(TRUTH), v)
     assert candidates[0].score > 1.3 * candidates[1].score
