@@ -24,6 +24,7 @@ ANY_BIT = 64  # occupied, unlabelled included
 REACH = 4  # cells that a search may shift by; a grid is padded by twice as many, so that no look-up leaves it
 HALF_DIAGONAL = float(np.sqrt(0.75))  # of a cell, in cells
 CUBE = 4  # cells: where nothing is observed is left out by cubes
+FOUR_UNOBSERVED = UNOBSERVED_STATE * 0x01010101
 CHUNK = 128  # voxels counted before a sum is given up
 STRUCTURE_SHARE = 0.75  # of the score; the ground has the rest, to hold the height
 
@@ -216,7 +217,8 @@ def tau(
         return 0.0, 0
     margin = 2 * int(reach) + 4  # twice: for points beside the map, and for what is around them
     low = low - margin
-    around = target.dense(low, tuple((high - low + margin).tolist()))
+    shape = high - low + margin
+    around = target.dense(low, (int(shape[0]), int(shape[1]), int(-(-shape[2] // CUBE) * CUBE)))
     found = _closest_observed(around, _near_observed(around, int(reach) + 1), points - low, *_offsets(reach), reach)
     table = np.arange(256, dtype=np.uint8) if coarse is None else coarse
     hit = (found != UNOBSERVED_STATE) & (found != FREE_STATE)
@@ -229,11 +231,12 @@ def _near_observed(state: U8, reach: int) -> NDArray[np.bool_]:
     """Whether there may be an observed cell within ``reach`` of the cells of each cube of ``CUBE`` cells."""
     nx, ny, nz = state.shape[0] // CUBE + 1, state.shape[1] // CUBE + 1, state.shape[2] // CUBE + 1
     near = np.zeros((nx, ny, nz), np.bool_)
-    for i in range(state.shape[0]):
-        for j in range(state.shape[1]):
-            for k in range(state.shape[2]):
-                if state[i, j, k] != UNOBSERVED_STATE:
-                    near[i // CUBE, j // CUBE, k // CUBE] = True
+    fours = state.view(np.uint32)  # four cells at once, as many as a cube has above each other
+    for i in range(fours.shape[0]):
+        for j in range(fours.shape[1]):
+            for k in range(fours.shape[2]):
+                if fours[i, j, k] != FOUR_UNOBSERVED:
+                    near[i // CUBE, j // CUBE, k] = True
     r = -(-reach // CUBE)
     for axis in range(3):
         wide = near.copy()

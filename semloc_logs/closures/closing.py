@@ -193,9 +193,10 @@ def _align(
     best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
     fine = []
     for score, c, fit, near in best:
-        # reading keyframes takes longer than fitting them: not for what can no longer be accepted, nor stand against it
-        surface = database.surface(c.group, near) if score >= HOPELESS else database.target(c.group).surface
-        better = (fine_fit if score >= max(CLOSE * best[0][0], HOPELESS) else measured)(fit.target_T_query, surface, query)
+        if score >= max(CLOSE * best[0][0], HOPELESS):
+            better = fine_fit(fit.target_T_query, database.surface(c.group, near), query)
+        else:  # reading keyframes takes longer than fitting them: not for what can no longer be accepted
+            better = measured(fit.target_T_query, database.target(c.group).surface, query)
         fine.append((_score(query, database.target(c.group), better), c, better, near))
     fine = _distinct(fine, v)
     target = database.sessions[database.places[candidates[0].group].session] if fine else session
