@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -189,15 +190,29 @@ class Features:
 FEATURES = ("structure", "coverage", "contradiction", "fit", "rmse", "distinct", "support", "stiffness")
 
 
-def structure_scores(query: Query, target: Target, target_T_query: F64) -> tuple[float, float, float, int]:
-    """Shares of the query's structure that lies on structure of its class within a voxel (of what falls into observed space), that falls
+class Scores(NamedTuple):
+    """Shares of a query's structure that lies on structure of its class within a voxel (of what falls into observed space), that falls
     into observed space, and that falls into free space; and the number of aligned structure voxels."""
+
+    structure: float
+    coverage: float
+    contradiction: float
+    aligned: int
+
+    @property
+    def rank(self) -> float:
+        """What alignments of one query are ranked by: aligned structure, less what contradicts free space."""
+        return self.structure * min(1.0, self.coverage / 0.5) - self.contradiction
+
+
+def structure_scores(query: Query, target: Target, target_T_query: F64) -> Scores:
+    """The scores of an alignment."""
     centres, bits = query.structure
     if not len(centres):
-        return 0.0, 0.0, 0.0, 0
+        return Scores(0.0, 0.0, 0.0, 0)
     mask = look_up(target.level, apply(target_T_query, centres))
     seen, aligned, free = mask != 0, (mask & bits) != 0, (mask & FREE_BIT) != 0
-    return float(aligned.sum() / max(seen.sum(), 1)), float(seen.mean()), float(free.mean()), int(aligned.sum())
+    return Scores(float(aligned.sum() / max(seen.sum(), 1)), float(seen.mean()), float(free.mean()), int(aligned.sum()))
 
 
 def coarse_fit(candidate: Candidate, target: Target, query: Query) -> Fit:

@@ -16,7 +16,7 @@ from semloc_logs.alignment.verify import (
     Candidate,
     Features,
     Query,
-    Target,
+    Scores,
     coarse_fit,
     fine_fit,
     measured,
@@ -42,8 +42,17 @@ LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
 DRIFT = 0.01  # of the way: the odometry of a target
-Fitted = tuple[float, Candidate, Fit, int]  # score, candidate, its fit, and the nearest keyframe of the target
 FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """A candidate after a fit on the points; ``nearest`` is the target's keyframe nearest to it."""
+
+    candidate: Candidate
+    nearest: int
+    fit: Fit
+    scores: Scores
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,44 +198,39 @@ def _align(
     for c in candidates:
         near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
         fit = coarse_fit(c, database.target(c.group), query)
-        fitted.append((_score(query, database.target(c.group), fit), c, fit, near))
+        fitted.append(Fitted(c, near, fit, structure_scores(query, database.target(c.group), fit.target_T_query)))
     best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
     fine = []
-    for score, c, fit, near in best:
-        if score >= max(CLOSE * best[0][0], HOPELESS):
-            better = fine_fit(fit.target_T_query, database.surface(c.group, near), query)
+    for f in best:
+        target = database.target(f.candidate.group)
+        if f.scores.rank >= max(CLOSE * best[0].scores.rank, HOPELESS):
+            fit = fine_fit(f.fit.target_T_query, database.surface(f.candidate.group, f.nearest), query)
         else:  # reading keyframes takes longer than fitting them: not for what can no longer be accepted
-            better = measured(fit.target_T_query, database.target(c.group).surface, query)
-        fine.append((_score(query, database.target(c.group), better), c, better, near))
+            fit = measured(f.fit.target_T_query, target.surface, query)
+        fine.append(replace(f, fit=fit, scores=structure_scores(query, target, fit.target_T_query)))
     fine = _distinct(fine, v)
-    target = database.sessions[database.places[candidates[0].group].session] if fine else session
-    return [_judge(database, session, keyframe, query, query_T_base, f, _rival(f, fine, target, v)) for f in fine]
+    asked = database.sessions[database.places[candidates[0].group].session] if fine else session
+    return [_judge(database, session, keyframe, query, query_T_base, f, _rival(f, fine, asked, v)) for f in fine]
 
 
 def _rival(one: Fitted, fitted: list[Fitted], target: SessionMap, voxel_size: float) -> float:
-    """The best score of another place; the same place, driven again and moved by the drift of the target's odometry, is no other one."""
+    """The best rank of another place; the same place, driven again and moved by the drift of the target's odometry, is no other one."""
     best = 0.0
     for other in fitted:
-        a, b = one[2].target_T_query, other[2].target_T_query
-        road = abs(float(target.distance[one[3]] - target.distance[other[3]]))
+        a, b = one.fit.target_T_query, other.fit.target_T_query
+        road = abs(float(target.distance[one.nearest] - target.distance[other.nearest]))
         off = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
         drifted = off < 3.3 * voxel_size + DRIFT * road and yaw_between(a, b) < np.radians(5.0 + 0.02 * road)
         if other is not one and not (drifted and road > 50 * voxel_size):
-            best = max(best, other[0])
+            best = max(best, other.scores.rank)
     return best
-
-
-def _score(query: Query, target: Target, fit: Fit) -> float:
-    """What alignments of one query are ranked by: aligned structure, less what contradicts free space."""
-    structure, coverage, contradiction, _ = structure_scores(query, target, fit.target_T_query)
-    return structure * min(1.0, coverage / 0.5) - contradiction
 
 
 def _distinct(fitted: list[Fitted], voxel_size: float) -> list[Fitted]:
     """Best first, each place once."""
     kept: list[Fitted] = []
-    for f in sorted(fitted, key=lambda f: -f[0]):
-        if not any(same_place(f[2].target_T_query, o[2].target_T_query, voxel_size) for o in kept):
+    for f in sorted(fitted, key=lambda f: -f.scores.rank):
+        if not any(same_place(f.fit.target_T_query, o.fit.target_T_query, voxel_size) for o in kept):
             kept.append(f)
     return kept
 
@@ -243,21 +247,19 @@ def _judge(
     """The alignment of one candidate with its features, probability and covariance."""
     settings = database.settings
     v = settings.fusion.voxel_size
-    score, candidate, fine, _ = fitted
+    candidate, fine, scores = fitted.candidate, fitted.fit, fitted.scores
     place = database.places[candidate.group]
     target_session, target = database.sessions[place.session], database.target(candidate.group)
     T = fine.target_T_query
-    structure, coverage, contradiction, count = structure_scores(query, target, T)
-    weakest = _stiffness(fine)
     features = Features(
-        structure=structure,
-        coverage=coverage,
-        contradiction=contradiction,
+        structure=scores.structure,
+        coverage=scores.coverage,
+        contradiction=scores.contradiction,
         fit=fine.inliers,
         rmse=fine.rmse / v,
-        distinct=min(max(second, 0.0) / max(score, 1e-3), 2.0),
-        support=float(np.log10(count + 1)),
-        stiffness=float(np.log10(weakest + 1)),
+        distinct=min(max(second, 0.0) / max(scores.rank, 1e-3), 2.0),
+        support=float(np.log10(scores.aligned + 1)),
+        stiffness=float(np.log10(_stiffness(fine) + 1)),
     )
     probability = float(shipped().own(own_values(features)))
     same_source = session.json["label_source"] == target_session.json["label_source"]
