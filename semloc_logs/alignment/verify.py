@@ -163,10 +163,16 @@ def _first_apart(groups: NDArray[np.int64], poses: F64, distance: float, most: i
     kept = np.empty(len(groups), np.int64)
     count = 0
     for i in range(len(groups)):
-        beside = count == most
+        if count == most:
+            break
+        beside = False
         for k in kept[:count]:
-            if groups[i] == groups[k] and np.cos(poses[i, 0] - poses[k, 0]) > np.cos(0.05):
-                beside |= np.abs(poses[i, 1:] - poses[k, 1:]).max() < distance
+            near = groups[i] == groups[k]
+            for axis in range(1, 4):
+                near = near and abs(poses[i, axis] - poses[k, axis]) < distance
+            if near and np.cos(poses[i, 0] - poses[k, 0]) > np.cos(0.05):
+                beside = True
+                break
         if not beside:
             kept[count] = i
             count += 1
