@@ -54,12 +54,18 @@ def report(args: argparse.Namespace) -> None:
     content = json.dumps(calibration_json(judged, fitted), indent=1) + "\n"
     (args.dir / "calibration.json").write_text(content)
     print(content)
-    for name, p in (("alone", fitted.alone), ("with neighbours", fitted.probability)):
+    ordinary = ~judged.copies
+    said = {
+        "alone, outside cities of copies": (judged.part(ordinary), fitted.alone[ordinary]),
+        "with neighbours": (judged, fitted.probability),
+    }
+    curves = {}
+    for name, (part, p) in said.items():
+        curves[name] = reliability(p[part.clear], part.right[part.clear])
         print(f"{name}, of towns not seen:")
-        for line in (*reliability(p[judged.clear], judged.right[judged.clear]), *recall_at(judged, p)):
+        for line in (*curves[name], *recall_at(part, p)):
             print("  " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
-    curves = {"alone": fitted.alone, "with neighbours": fitted.probability}
-    draw_reliability(args.dir / "reliability.png", {n: reliability(p[judged.clear], judged.right[judged.clear]) for n, p in curves.items()})
+    draw_reliability(args.dir / "reliability.png", curves)
     if args.install:
         (Path(semloc_logs.closures.__file__).parent / "calibration.json").write_text(content)
 

@@ -32,7 +32,7 @@ Bools = NDArray[np.bool_]
 # The sign with which evidence may count. The plane distances of fitting points (rmse) say more about the sensor than about the place.
 SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0, "distinct": -1, "support": 1, "stiffness": 1}
 TOGETHER_SIGNS, NEAR_SIGNS = (1, 1, 1, -1, 1, -1), (0, 1, 1, -1, 0, 0)  # of ``TOGETHER``
-COPIES, COPIES_COUNT = "repeating", 0.05  # how towns of copied blocks begin, and how much they count for an alignment by itself
+COPIES, COPIES_COUNT = "repeating", 0.01  # how towns of copied blocks begin, and how much they count for an alignment by itself
 SURE = 0.99  # what would be accepted
 FEWEST = 0.002  # of the right alignments have less support than any that is accepted
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
@@ -69,6 +69,11 @@ class Judged:
 
     def __len__(self) -> int:
         return len(self.town)
+
+    def part(self, rows: Bools) -> Judged:
+        """Some of them."""
+        columns = {n: getattr(self, n)[rows] for n in ("town", "features", "right", "error_m", "error_deg")}
+        return replace(self, placed=self.placed.part(rows), **columns)
 
 
 def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
