@@ -115,6 +115,7 @@ class Closures(_Section):
     neighbours: int = Field(5, ge=1, description="nearest database words of each query word (K)")
     probes: int = Field(8, ge=1, description="nearest vocabulary cells searched for each query word")
     hypotheses: int = Field(96, ge=1, description="pooled hypotheses of a query that are verified")
+    places: int = Field(16, ge=1, description="submaps, of all sessions, that a query is verified in: those whose words agree best")
     kappa: float = Field(10.0, gt=0, description="kappa of the paper in voxels (3 m at 0.30 m)")
     min_probability: float = Field(0.99, ge=0.0, le=1.0, description="closures below this are rejected")
     exclude_seconds: float = Field(30.0, ge=0, description="within a session, keyframes nearer in time than this are no revisit")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,3 +56,12 @@ def pool(group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, ce
         if len(kept) == most:
             break
     return kept
+
+
+def of_best_groups(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
+    """Those in the ``most`` submaps that have the heaviest ones; of equals the submap with the lesser number."""
+    heaviest: dict[int, float] = {}
+    for h in hypotheses:
+        heaviest[h.group] = max(heaviest.get(h.group, 0.0), h.weight)
+    best = set(sorted(heaviest, key=lambda group: (-heaviest[group], group))[:most])
+    return [h for h in hypotheses if h.group in best]

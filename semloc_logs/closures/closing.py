@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.hypotheses import Hypothesis, pool
+from semloc_logs.alignment.hypotheses import Hypothesis, of_best_groups, pool
 from semloc_logs.alignment.icp import Fit
 from semloc_logs.alignment.overlap import tau, yaw_between
 from semloc_logs.alignment.verify import (
@@ -129,13 +129,10 @@ def allowed_places(database: Database, session: SessionMap) -> dict[str, Allowed
     Of the query's own session those where it came by at another time (:meth:`Database.asked_by`).
     """
     forced = database.settings.descriptor.variant
-    groups: dict[str, NDArray[np.bool_]] = {}
-    for g, place in enumerate(database.places):
-        if len(database.keyframes(g)):
-            semantic = session.has_classes and database.sessions[place.session].has_classes
-            variant = ("semantic" if semantic else "geometric") if forced == "auto" else forced
-            groups.setdefault(variant, np.zeros(len(database.places), bool))[g] = True
-    return {variant: database.allowed(variant, mine) for variant, mine in groups.items()}
+    semantic = database.has_classes & session.has_classes if forced == "auto" else np.full(len(database.places), forced == "semantic")
+    seen = database.seen()
+    groups = {"semantic": seen & semantic, "geometric": seen & ~semantic}
+    return {variant: database.allowed(variant, mine) for variant, mine in groups.items() if mine.any()}
 
 
 def match_words(database: Database, variant: str, allowed: Allowed, query: Query, ground_z: float) -> tuple[Described, Matches]:
@@ -176,7 +173,7 @@ def find_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
     for name in database.sessions:
         mine = np.flatnonzero(owner == name)
         found += pool(group[mine], yaws[mine], shift[mine], weight[mine], 2.4 * v / STREET_VOXEL, most)
-    return found
+    return of_best_groups(found, closures.places)
 
 
 def verify_hypotheses(database: Database, query: Query, hypotheses: list[Hypothesis]) -> list[Candidate]:

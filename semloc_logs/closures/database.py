@@ -29,7 +29,7 @@ from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
-KEPT_TARGETS, KEPT_SURFACES, KEPT_SQUARES = 12, 24, 48  # in memory at once
+KEPT_TARGETS, KEPT_SURFACES, KEPT_SQUARES = 16, 24, 48  # in memory at once
 SURFACE_KEYFRAMES = 9  # for each query radius of a query's length
 UNIT = 16  # voxels: words of a submap are left out by squares, keyframes by stretches of this length
 AMBIGUOUS = 32  # voxels that a word may lie nearer to keyframes that are left out than to others: lanes lie apart, and odometry drifts
@@ -67,6 +67,7 @@ class Database:
         self.sessions = {name: SessionMap(workspace.session(name)) for name in targets}
         self.settings = settings
         self.places = [Place(name, s["id"]) for name, session in self.sessions.items() for s in session.submaps]
+        self.has_classes = np.array([self.sessions[place.session].has_classes for place in self.places], bool)
         self._words: dict[str, Index] = {}
         self._hidden: dict[str, NDArray[np.bool_]] = {}
         self._asking = np.zeros(3)
@@ -99,6 +100,10 @@ class Database:
         view._hidden = {name: np.isin(stretch, stretch[near]) | (not session.posed)} if name in self.sessions else {}
         view._asking = session.map_T_base[keyframe][:3, 3]
         return view
+
+    def seen(self) -> NDArray[np.bool_]:
+        """Which submaps (g,) have keyframes that the query may see."""
+        return np.array([place.session not in self._hidden or len(self.keyframes(g)) > 0 for g, place in enumerate(self.places)], bool)
 
     def keyframes(self, group: int) -> I64:
         """The keyframes of a submap that the query may see, ascending."""
@@ -144,7 +149,7 @@ class Database:
         def make() -> Target:
             if is_whole:
                 return Target(
-                    read_blocks(blocks_path(session.folder.blocks, place.submap), with_votes=False), self.settings.fusion.voxel_size
+                    read_blocks(blocks_path(session.folder.blocks, place.submap), states_only=True), self.settings.fusion.voxel_size
                 )
             fuser = Fuser(self.settings.fusion)
             for i in seen.tolist():

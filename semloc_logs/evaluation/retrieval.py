@@ -109,7 +109,7 @@ def real_street(query: SessionMap, target: SessionMap, tracks: Mapping[str, True
     common_T_map[1, 3] = -FAR
     database = []
     for submap in target.submaps:
-        blocks = read_blocks(blocks_path(target.folder.blocks, submap["id"]), with_votes=False)
+        blocks = read_blocks(blocks_path(target.folder.blocks, submap["id"]), states_only=True)
         frames = range(submap["first"], submap["last"] + 1)
         track = np.stack([apply(target.map_T_base[i], target.origins[i][None])[0] for i in frames])
         database.append((name, map_place(blocks, track, submap["ground_z"], common_T_map)))

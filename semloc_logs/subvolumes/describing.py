@@ -47,7 +47,7 @@ def describe_submap(
 
     One set for each of ``yaws``, as a query at that heading sees the submap.
     """
-    blocks = read_blocks(blocks_path(folder.blocks, submap), with_votes=False)
+    blocks = read_blocks(blocks_path(folder.blocks, submap), states_only=True)
     low, high = blocks.bounds()
     state = blocks.dense(low, tuple((high - low).tolist()))
     d = settings.descriptor

@@ -130,9 +130,9 @@ def write_blocks(path: Path, blocks: BlockMap, metadata: dict[str, Any]) -> None
     write_table(path, pa.table([columns[n] for n in schema.names], schema=schema), metadata, ("bx", "by", "bz"))
 
 
-def read_blocks(path: Path, with_votes: bool = True) -> BlockMap:
-    """Inverse of :func:`write_blocks`; without votes, which search and verification do not need, in half the time."""
-    names = ["bx", "by", "bz", "state", "log_odds", *(["votes"] if with_votes else [])]
+def read_blocks(path: Path, states_only: bool = False) -> BlockMap:
+    """Inverse of :func:`write_blocks`; or without log-odds (0, 4096) and votes, which search and verification do not need."""
+    names = ["bx", "by", "bz", "state", *([] if states_only else ["log_odds", "votes"])]
     table = read_table(path, names).combine_chunks()
     nothing = np.zeros(0, np.int64)
     if not table.num_rows:
@@ -144,13 +144,12 @@ def read_blocks(path: Path, with_votes: bool = True) -> BlockMap:
         flat: NDArray[Any] = np.frombuffer(array.buffers()[1], dtype)
         return flat[array.offset * 4096 : (array.offset + len(array)) * 4096].reshape(-1, 4096)
 
-    ballots = votes = nothing
-    if with_votes:
-        array = table["votes"].chunk(0)
-        row = np.repeat(np.arange(len(array)), np.diff(array.offsets.to_numpy()))
-        cell, label, votes = (array.flatten().field(c).to_numpy().astype(np.int64) for c in ("cell", "label", "count"))
-        ballots = (row * 4096 + cell) * 256 + label
-    return BlockMap(keys, values("log_odds", np.int8), values("state", np.uint8), ballots, votes)
+    if states_only:
+        return BlockMap(keys, np.zeros((0, 4096), np.int8), values("state", np.uint8), nothing, nothing)
+    array = table["votes"].chunk(0)
+    row = np.repeat(np.arange(len(array)), np.diff(array.offsets.to_numpy()))
+    cell, label, votes = (array.flatten().field(c).to_numpy().astype(np.int64) for c in ("cell", "label", "count"))
+    return BlockMap(keys, values("log_odds", np.int8), values("state", np.uint8), (row * 4096 + cell) * 256 + label, votes)
 
 
 def write_voxels(folder: Path, submaps: Iterable[BlockMap], metadata: dict[str, Any], clamp: tuple[float, float]) -> int:

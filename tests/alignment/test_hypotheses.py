@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semloc_logs.alignment.hypotheses import pool
+from semloc_logs.alignment.hypotheses import Hypothesis, of_best_groups, pool
 
 
 def slow_pool(
@@ -71,3 +71,13 @@ def test_matches_of_other_submaps_and_headings_do_not_add_up() -> None:
     found = pool(np.array([0, 1, 1]), np.array([0.0, 0.0, 0.5]), t, np.ones(3), 1.0, 10)
     assert sorted((h.group, h.pose[0], h.votes) for h in found) == [(0, 0.0, 1), (1, 0.0, 1), (1, 0.5, 1)]
     assert pool(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0), 1.0, 5) == []
+
+
+def test_the_submaps_with_the_heaviest_hypotheses_are_looked_into() -> None:
+    found = [
+        Hypothesis(group, (0.0, float(k), 0.0, 0.0), 1, weight)
+        for k, (group, weight) in enumerate([(7, 1.0), (2, 3.0), (7, 4.0), (5, 3.0)])
+    ]
+    assert [h.group for h in of_best_groups(found, 2)] == [7, 2, 7]
+    assert of_best_groups(found, 9) == found
+    assert of_best_groups([], 3) == []

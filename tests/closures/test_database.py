@@ -86,6 +86,16 @@ def test_a_query_sees_its_own_drive_but_for_what_is_near_in_time_and_road(out_an
     assert len(database.keyframes(0)) == 60  # the database itself is as it was
 
 
+def test_submaps_of_which_nothing_may_be_seen_are_left_out(tmp_path: Path) -> None:
+    road = np.stack([np.arange(60) * 4.0, np.zeros(60)], 1)
+    none = np.zeros((0, 3))
+    session = drive_session(Workspace(tmp_path), "a", road, [(0, 30), (30, 60)], [none, none])
+    drive_session(Workspace(tmp_path), "b", road, [(0, 60)], [none])
+    database = Database(Workspace(tmp_path), ("a", "b"), Settings().resolved())
+    assert database.seen().tolist() == [True, True, True]
+    assert database.asked_by(session, 0).seen().tolist() == [False, True, True]
+
+
 def test_a_target_keyframe_is_never_near_the_query_in_time(out_and_back: tuple[Database, SessionMap]) -> None:
     database, session = out_and_back
     for keyframe in range(60):

@@ -57,8 +57,8 @@ def test_blocks_come_back_exactly(blocks: BlockMap, tmp_path: Path) -> None:
         a, b = getattr(blocks, name), getattr(found, name)
         np.testing.assert_array_equal(a, b)
         assert a.dtype == b.dtype
-    assert not len(read_blocks(path, with_votes=False).ballots)
-    np.testing.assert_array_equal(read_blocks(path, with_votes=False).state, blocks.state)
+    assert not len(read_blocks(path, states_only=True).ballots)
+    np.testing.assert_array_equal(read_blocks(path, states_only=True).state, blocks.state)
     assert found.bounds()[0].tolist() == blocks.bounds()[0].tolist()
     assert read_metadata(path) == METADATA
 
