@@ -138,7 +138,7 @@ class Localisation:
                 continue
             for ours in OURS:
                 settings = settings_of(ours, self.settings, self.folder / f"random-{our_version()}")
-                task = OurTask(self._workspace(ours).path, drive, ours, keyframes[:: ours.every], settings)
+                task = OurTask(self._workspace(ours).path, drive, ours, keyframes, settings)
                 out.append(self._unit(task, our_version()))
             for peer in PEERS:
                 if peer.runner in self.peers and not (peer.told and drive.condition == UNSEEN):

@@ -48,14 +48,13 @@ PARTS = {  # of a query, by the functions that do them
 @dataclass(frozen=True, slots=True)
 class OurSystem:
     """A way of asking: ``labels`` of the log or from geometry; how a query is fused, ``weights`` trained or random; ``hypotheses`` by
-    words, of a grid over all of the road, or as many of that grid as words would give; every ``every``-th query is asked."""
+    words, of a grid over all of the road, or as many of that grid as words would give."""
 
     name: str
     query: tuple[tuple[str, Any], ...] = (("length", 20.0),)
     labels: str = "auto"
     weights: str = "trained"
     hypotheses: str = "words"
-    every: int = 1
 
 
 OURS = (
@@ -64,7 +63,7 @@ OURS = (
     OurSystem("ours, no labels", labels="geometry"),
     OurSystem("random weights", weights="random"),
     OurSystem("grid, as many", hypotheses="some"),
-    OurSystem("grid, exhaustive", hypotheses="all", every=20),
+    OurSystem("grid, exhaustive", hypotheses="all"),
 )
 
 
