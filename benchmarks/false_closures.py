@@ -33,7 +33,7 @@ from semloc_logs.stages import close, describe, fuse, session_name
 from semloc_logs.tables import read_metadata
 from semloc_logs.workspace import Workspace
 
-FIRST, MOST = 10, 60  # numbers of the towns: calibration has those before
+FIRST, MOST = 30, 60  # numbers of the towns: calibration has those before
 SOURCES = ("auto", "geometry", "uniform")  # auto: labels of the log, where it has any
 SMALL = ("room_*", "euroc_*")
 LEAST = 0.99

@@ -196,6 +196,11 @@ class Features:
 FEATURES = ("structure", "coverage", "contradiction", "fit", "rmse", "distinct", "support", "stiffness")
 
 
+def rank(structure: F64 | float, coverage: F64 | float, contradiction: F64 | float) -> F64:
+    """Aligned structure, less what contradicts free space: what alignments are ranked by."""
+    return np.asarray(structure * np.minimum(1.0, np.divide(coverage, 0.5)) - contradiction)
+
+
 class Scores(NamedTuple):
     """Shares of a query's structure that lies on structure of its class within a voxel (of what falls into observed space), that falls
     into observed space, and that falls into free space; and the number of aligned structure voxels."""
@@ -207,8 +212,8 @@ class Scores(NamedTuple):
 
     @property
     def rank(self) -> float:
-        """What alignments of one query are ranked by: aligned structure, less what contradicts free space."""
-        return self.structure * min(1.0, self.coverage / 0.5) - self.contradiction
+        """What alignments of one query are ranked by."""
+        return float(rank(self.structure, self.coverage, self.contradiction))
 
 
 def structure_scores(query: Query, target: Target, target_T_query: F64) -> Scores:

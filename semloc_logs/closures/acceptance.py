@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import FEATURES, Features
+from semloc_logs.alignment.verify import FEATURES, Features, rank
 
 F64 = NDArray[np.float64]
 
@@ -36,12 +36,21 @@ class Agreement:
 AGREEMENT = ("alone", "neighbours", "agreeing", "opposing", "far_agreeing", "far_opposing", "lookalike")
 SUPPORT, DISTINCT = FEATURES.index("support"), FEATURES.index("distinct")
 TOGETHER = ("log_odds", "log_agreeing", "share", "log_opposing", "log_far_agreeing", "log_far_opposing")
-AS_GOOD = 0.7  # of the best score: what fits nearly as well as that
+AS_GOOD = 0.7  # of the best rank: what looks like a copy of the best place
+CLOSE, HOPELESS = 0.8, 0.3  # of the best rank, and rank: below them nothing is right
 
 
 def own_values(features: Features) -> F64:
     """The features (8,) in the order of ``FEATURES``."""
     return np.array([getattr(features, name) for name in FEATURES])
+
+
+def may_be_right(values: F64) -> NDArray[np.bool_]:
+    """Whether alignments with features (..., 8) are close to the best of their query and not hopeless; others are not fitted finely."""
+    structure, coverage, contradiction, distinct = (
+        values[..., FEATURES.index(n)] for n in ("structure", "coverage", "contradiction", "distinct")
+    )
+    return np.asarray((rank(structure, coverage, contradiction) >= HOPELESS) & ~(distinct > 1 / CLOSE))
 
 
 def unrivalled(own: Callable[[F64], F64], values: F64) -> F64:
@@ -79,7 +88,7 @@ class Calibration:
 
     @classmethod
     def from_json(cls, content: dict[str, Any], names: Sequence[str]) -> Calibration:
-        """One of the two models of calibration.json."""
+        """One of the models of calibration.json."""
         rows = [content["features"][name] for name in names]
         weights, low, high = (tuple(float(r[k]) for r in rows) for k in ("weight", "low", "high"))
         return cls(weights, low, high, float(content["bias"]))
@@ -112,11 +121,15 @@ class Model:
         """Probability of an alignment by its own features, values (..., 8) in the order of ``FEATURES``."""
         return np.where(values[..., SUPPORT] < self.least_support, 0.0, self.alone.probability(values))
 
-    def decided(self, columns: Sequence[F64]) -> F64:
+    def agreed(self, columns: Sequence[F64]) -> F64:
         """Probabilities (n,) from the columns (7, n) of ``AGREEMENT``: that of the alignment alone where there are no neighbours."""
         values = together_values(columns)
         by_neighbours = np.where(has_far(columns), self.together.probability(values), self.near.probability(values))
-        p = np.where((np.asarray(columns[1]) > 0) & (np.asarray(columns[0]) > 0), by_neighbours, columns[0])
+        return np.where((np.asarray(columns[1]) > 0) & (np.asarray(columns[0]) > 0), by_neighbours, columns[0])
+
+    def decided(self, columns: Sequence[F64]) -> F64:
+        """The same, at most a half where streets look like others."""
+        p = self.agreed(columns)
         return np.where(self.alike(columns), p / 2, p)
 
     def alike(self, columns: Sequence[F64]) -> NDArray[np.bool_]:
@@ -140,7 +153,7 @@ def shipped() -> Model:
 def reason(features: Features, probability: float, least: float, agreement: Agreement) -> str:
     """One sentence that says why a hypothesis was rejected."""
     f, a = features, agreement
-    if a.lookalike > shipped().most_alike:
+    if a.lookalike > shipped().most_alike and 2 * probability >= least:  # else it would be rejected anyway
         why = f"streets about it look like others ({a.lookalike:.0%})"
     elif a.alone >= least and a.neighbours:
         why = f"of {a.neighbours} neighbouring queries {a.agreeing:.1f} agree and {a.opposing:.1f} lie elsewhere"

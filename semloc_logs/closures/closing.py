@@ -24,7 +24,7 @@ from semloc_logs.alignment.verify import (
     search_hypotheses,
     structure_scores,
 )
-from semloc_logs.closures.acceptance import Agreement, own_values, shipped
+from semloc_logs.closures.acceptance import CLOSE, HOPELESS, Agreement, own_values, shipped
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.queries import SessionMap, build_query
 from semloc_logs.geometry import inverse, turned_about_z
@@ -36,8 +36,6 @@ from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
 ALIGNED = 4  # candidates of a target session that are fitted on the points
-CLOSE = 0.9  # of the best score: what is worth a fine fit beside it
-HOPELESS = 0.3  # below this score nothing is right
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
@@ -197,16 +195,16 @@ def _align(
         fit = coarse_fit(c, database.target(c.group), query)
         fitted.append(Fitted(c, near, fit, structure_scores(query, database.target(c.group), fit.target_T_query)))
     best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
-    fine = []
+    fine: list[Fitted] = []
     for f in best:
         target = database.target(f.candidate.group)
-        if f.scores.rank >= max(CLOSE * best[0].scores.rank, HOPELESS):
+        if f.scores.rank >= max(CLOSE * max((o.scores.rank for o in fine), default=0.0), HOPELESS):
             fit = fine_fit(f.fit.target_T_query, database.surface(f.candidate.group, f.nearest), query)
-        else:  # reading keyframes takes longer than fitting them: not for what can no longer be accepted
-            fit = measured(f.fit.target_T_query, target.surface, query)
-        fine.append(replace(f, fit=fit, scores=structure_scores(query, target, fit.target_T_query)))
+            fine.append(replace(f, fit=fit, scores=structure_scores(query, target, fit.target_T_query)))
+        else:  # reading keyframes takes longer than fitting them: not for what cannot be accepted
+            fine.append(replace(f, fit=measured(f.fit.target_T_query, target.surface, query)))
     fine = _distinct(fine, v)
-    asked = database.sessions[database.places[candidates[0].group].session] if fine else session
+    asked = database.sessions[database.places[candidates[0].group].session]
     return [_judge(database, session, keyframe, query, query_T_base, f, _rival(f, fine, asked, v)) for f in fine]
 
 

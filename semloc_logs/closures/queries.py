@@ -21,7 +21,7 @@ from semloc_logs.voxels.store import Keyframe, poses_of, read_keyframe
 from semloc_logs.workspace import SessionFolder
 
 F64 = NDArray[np.float64]
-KEPT = 8  # keyframes in memory
+KEPT = 64  # keyframes in memory: a query of 20 m and the next one
 
 
 @dataclass(eq=False)

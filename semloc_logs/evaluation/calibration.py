@@ -17,7 +17,17 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import SUPPORT, TOGETHER, Calibration, Model, fit_logistic, has_far, together_values, unrivalled
+from semloc_logs.closures.acceptance import (
+    SUPPORT,
+    TOGETHER,
+    Calibration,
+    Model,
+    fit_logistic,
+    has_far,
+    may_be_right,
+    together_values,
+    unrivalled,
+)
 from semloc_logs.closures.agreement import Placed, agree, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import keyframe_at
@@ -34,6 +44,7 @@ SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0
 TOGETHER_SIGNS, NEAR_SIGNS = (1, 1, 1, -1, 1, -1), (0, 1, 1, -1, 0, 0)  # of ``TOGETHER``
 COPIES, COPIES_COUNT = "repeating", 0.01  # how towns of copied blocks begin, and how much they count for an alignment by itself
 SURE = 0.99  # what would be accepted
+EXTREMES = 0.05  # of a town's lookalikes count as outliers
 FEWEST = 0.002  # of the right alignments have less support than any that is accepted
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
 THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
@@ -41,8 +52,8 @@ THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """Alignments (n) of several towns: ``features`` (n, 8), where they lie (``alone`` there is whatever the caller says), whether they
-    are ``right`` (n,), and their errors (n,) in metres and degrees."""
+    """Alignments (n) of several towns: ``features`` (n, 8), where they lie (``alone`` and ``unrivalled`` there are for the caller to say),
+    whether they are ``right`` (n,), and their errors (n,) in metres and degrees."""
 
     town: NDArray[np.object_]
     features: F64
@@ -135,7 +146,7 @@ def read_judged(paths: Sequence[Path]) -> Judged:
         poses("at"),
         column["sigma"],
         column["probability"],
-        column["probability"],
+        np.full(len(table), np.nan),
         np.ones(len(table), bool),
     )
     right = column["right"].astype(bool)
@@ -183,13 +194,17 @@ def fit_alone(judged: Judged, rows: Bools) -> Calibration:
 def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Calibration) -> Model:
     """The models of the agreement's ``columns`` (7, n), from the clear ones that have neighbours among ``rows`` (n,), beside ``alone``.
 
-    Neighbours in the same copy of a block agree about any copy. So the models are those of streets that look like no others; how much
-    like others is too much, towns of copies say: half of what the least so looking alignment had that is wrong and would be accepted.
+    Neighbours in the same copy of a block agree about any copy. So the models are those of streets that look like no others. How much
+    like others is too much: halfway between the right ones of the ordinary town that has the most of it, and the wrong ones that would be
+    accepted of the city of copies that has the least.
     """
     rows = rows & judged.clear & (columns[1] > 0)
     ordinary = _agreement_model(judged, columns, rows & ~judged.copies, alone, 1.0)
-    fooled = rows & judged.copies & ~judged.right & (ordinary.decided(columns) >= SURE)
-    most_alike = float(columns[6][fooled].min(initial=2.0)) / 2  # of nothing 1: any street
+    taken = rows & (ordinary.agreed(columns) >= SURE)
+    right, fooled = taken & judged.right & ~judged.copies, taken & ~judged.right & judged.copies
+    most = [np.quantile(columns[6][right & (judged.town == town)], 1 - EXTREMES) for town in sorted(set(judged.town[right]))]
+    least = [np.quantile(columns[6][fooled & (judged.town == town)], EXTREMES) for town in sorted(set(judged.town[fooled]))]
+    most_alike = float(max(most) + min(least)) / 2 if most and least else 1.0
     return _agreement_model(judged, columns, rows & (columns[6] <= most_alike), alone, most_alike)
 
 
@@ -216,7 +231,12 @@ def agreement_of(judged: Judged, alone: F64, without_rivals: F64) -> list[F64]:
 def decided_by(model: Model, judged: Judged) -> F64:
     """The probabilities (n,) that the acceptance gives with ``model``."""
     p = model.decided(agreement_of(judged, model.own(judged.features), unrivalled(model.own, judged.features)))
-    return np.where(strays(judged.placed, judged.voxel_size), 0.0, p)
+    return np.where(possible(judged), p, 0.0)
+
+
+def possible(judged: Judged) -> Bools:
+    """Which alignments (n,) acceptance considers at all."""
+    return np.asarray(~strays(judged.placed, judged.voxel_size) & may_be_right(judged.features))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,7 +255,7 @@ def fit(judged: Judged) -> Fitted:
     log-odds turn out too sure (Platt, Probabilistic outputs for support vector machines, 1999), the first and the last are tempered.
     """
     towns = sorted(set(judged.town))
-    kept = ~strays(judged.placed, judged.voxel_size)
+    kept = possible(judged)
     held = {town: judged.town == town for town in towns}
     alone, without_rivals = np.zeros(len(judged)), np.zeros(len(judged))
     for mine in held.values():
@@ -243,16 +263,18 @@ def fit(judged: Judged) -> Fitted:
         alone[mine], without_rivals[mine] = own(features), unrivalled(own, features)
     whole = fit_alone(judged, kept)
     tempered = _temper(whole, alone, judged, kept, judged.counts)
-    alone, without_rivals = (_tempered(p, whole, tempered) for p in (alone, without_rivals))
+    alone = _tempered(alone, whole, tempered)
+    without_rivals = np.where(without_rivals > 0, _tempered(without_rivals, whole, tempered), 0.0)
     columns = agreement_of(judged, alone, without_rivals)
-    probability = np.zeros(len(judged))
+    probability, alike = np.zeros(len(judged)), np.zeros(len(judged), bool)
     for mine in held.values():
-        probability[mine] = fit_agreement(judged, columns, ~mine & kept, tempered).decided([c[mine] for c in columns])
+        model = fit_agreement(judged, columns, ~mine & kept, tempered)
+        probability[mine], alike[mine] = (said([c[mine] for c in columns]) for said in (model.agreed, model.alike))
     model = fit_agreement(judged, columns, kept, tempered)
-    far = (columns[1] > 0) & has_far(columns) & ~model.alike(columns)
-    together = _temper(model.together, probability, judged, kept & far, np.ones(len(judged)))
+    far = (columns[1] > 0) & has_far(columns)
+    together = _temper(model.together, probability, judged, kept & far & ~alike, np.ones(len(judged)))
     probability = np.where(far, _tempered(probability, model.together, together), probability)
-    probability[~kept] = 0.0
+    probability = np.where(kept, np.where(alike, probability / 2, probability), 0.0)
     return Fitted(replace(model, together=together), alone, probability)
 
 
