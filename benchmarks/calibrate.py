@@ -38,7 +38,7 @@ TOWNS = (
     Town("repeating-stereo", 14, ("stereo", "hdl32"), "geometry", repeating=True, sessions=2),
     Town("long", 15, noise=0.12, seasons=("summer", "winter"), length=260.0, sessions=2),
     *short_towns(0, 8),
-    *short_towns(10, 18),
+    *short_towns(10, 19),
 )
 
 

@@ -38,6 +38,7 @@ SUPPORT, DISTINCT = FEATURES.index("support"), FEATURES.index("distinct")
 TOGETHER = ("log_odds", "log_agreeing", "share", "log_opposing", "log_far_agreeing", "log_far_opposing")
 AS_GOOD = 0.7  # of the best rank: what looks like a copy of the best place
 CLOSE, HOPELESS = 0.8, 0.3  # of the best rank, and rank: below them nothing is right
+LOOSE_FIT, LOOSE_STIFFNESS = 0.12, 0.3  # below both the points hold nothing: the right place, but a metre off
 
 
 def own_values(features: Features) -> F64:
@@ -46,11 +47,11 @@ def own_values(features: Features) -> F64:
 
 
 def may_be_right(values: F64) -> NDArray[np.bool_]:
-    """Whether alignments with features (..., 8) are close to the best of their query and not hopeless; others are not fitted finely."""
-    structure, coverage, contradiction, distinct = (
-        values[..., FEATURES.index(n)] for n in ("structure", "coverage", "contradiction", "distinct")
-    )
-    return np.asarray((rank(structure, coverage, contradiction) >= HOPELESS) & ~(distinct > 1 / CLOSE))
+    """Whether alignments with features (..., 8) are close to the best of their query, not hopeless and held by their points."""
+    of = {name: values[..., k] for k, name in enumerate(FEATURES)}
+    hopeful = rank(of["structure"], of["coverage"], of["contradiction"]) >= HOPELESS
+    loose = (of["fit"] < LOOSE_FIT) & (of["stiffness"] < LOOSE_STIFFNESS)
+    return np.asarray(hopeful & ~loose & ~(of["distinct"] > 1 / CLOSE))
 
 
 def unrivalled(own: Callable[[F64], F64], values: F64) -> F64:

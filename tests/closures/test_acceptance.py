@@ -13,6 +13,7 @@ from semloc_logs.closures.acceptance import (
     Agreement,
     Calibration,
     fit_logistic,
+    may_be_right,
     own_values,
     reason,
     shipped,
@@ -60,6 +61,22 @@ def test_without_rivals_an_alignment_is_judged_as_if_it_were_the_only_one() -> N
 
     values = np.array([own_values(dataclasses.replace(GOOD, distinct=d)) for d in (0.2, 1.4, 1.5)])
     np.testing.assert_allclose(unrivalled(own, values), [1.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "possible"),
+    [
+        ({}, True),
+        ({"distinct": 1.2}, True),
+        ({"distinct": 1.3}, False),
+        ({"structure": 0.31, "contradiction": 0.02}, False),
+        ({"structure": 0.5, "coverage": 0.25, "contradiction": 0.0}, False),
+        ({"fit": 0.1}, True),
+        ({"fit": 0.1, "stiffness": 0.2}, False),
+    ],
+)
+def test_what_may_be_right_at_all(change: dict[str, float], possible: bool) -> None:
+    assert bool(may_be_right(own_values(dataclasses.replace(GOOD, **change)))) == possible
 
 
 def test_neighbours_add_and_take() -> None:
