@@ -49,7 +49,7 @@ def ask(args: argparse.Namespace) -> None:
 
 
 def report(args: argparse.Namespace) -> None:
-    """Fit both models; what is printed and drawn is of towns that the models have not seen."""
+    """Fit the models; what is printed and drawn is of towns that the models have not seen."""
     judged = read_judged(sorted(args.dir.glob("*/judged.parquet")))
     fitted = fit(judged)
     content = json.dumps(calibration_json(judged, fitted), indent=1) + "\n"

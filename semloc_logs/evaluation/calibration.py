@@ -343,7 +343,8 @@ def recall_at(judged: Judged, p: F64, thresholds: Sequence[float] = THRESHOLDS) 
 def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
     """The content of calibration.json: three logistic models of named features clipped to low .. high, and what they are made from."""
     return {
-        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature, 'together' where a query has neighbours",
+        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature; 'near' where a query has neighbours, "
+        "'together' where it has far ones too; at most a half where lookalike exceeds most_alike",
         "alone": fitted.model.alone.to_json(FEATURES),
         "least_support": round(fitted.model.least_support, 4),
         "most_alike": round(fitted.model.most_alike, 4),
