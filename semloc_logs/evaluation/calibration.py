@@ -28,7 +28,8 @@ from semloc_logs.closures.acceptance import (
     together_values,
     unrivalled,
 )
-from semloc_logs.closures.agreement import Placed, agree, strays
+from semloc_logs.closures.agreement import agree
+from semloc_logs.closures.placing import Placed, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import keyframe_at
 from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, judge_closure, read_truth

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Features
 from semloc_logs.closures.acceptance import AGREEMENT, Agreement
-from semloc_logs.closures.agreement import agree, decide, place, strays
+from semloc_logs.closures.agreement import agree, decide
 from semloc_logs.closures.closing import Alignment
+from semloc_logs.closures.placing import place, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import inverse, yaw_transform
 from semloc_logs.settings import Settings

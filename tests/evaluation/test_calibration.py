@@ -12,7 +12,7 @@ import pytest
 from semloc_logs import contracts
 from semloc_logs.alignment.verify import FEATURES
 from semloc_logs.closures.acceptance import TOGETHER, Calibration
-from semloc_logs.closures.agreement import Placed
+from semloc_logs.closures.placing import Placed
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.evaluation import calibration
 from semloc_logs.evaluation.calibration import (
