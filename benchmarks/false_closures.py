@@ -26,7 +26,7 @@ from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import read_closures
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.engines.engine import single_threaded
-from semloc_logs.evaluation.calibration import decided_by, read_judged, recall_at
+from semloc_logs.evaluation.calibration import answers, decided_by, read_judged, recall_at
 from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
 from semloc_logs.settings import load
 from semloc_logs.stages import close, describe, fuse, session_name
@@ -45,9 +45,11 @@ def ask_towns(args: argparse.Namespace) -> None:
     judged = read_judged(paths)
     p = decided_by(shipped(), judged)
     print(f"{sum(read_metadata(path)['queries'] for path in paths)} queries in {len(paths)} towns")
-    for line in recall_at(judged, p):
-        print("  " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
-    for k in np.flatnonzero(~judged.right & (p >= LEAST)):
+    for name, rows in (("ordinary towns", ~judged.copies), ("cities of copies", judged.copies)):
+        for line in recall_at(judged.part(rows), p[rows]):
+            print(f"  {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
+    accepted = (k for k in answers(judged, p) if p[k] >= LEAST)
+    for k in (k for k in accepted if not judged.right[k]):
         ends = f"{judged.placed.query_session[k]} query {judged.placed.query[k]} in {judged.placed.target_session[k]}"
         print(
             f"  false: town {judged.town[k]}, {ends}, probability {p[k]:.4f}, {judged.error_m[k]:.1f} m, {judged.error_deg[k]:.0f} degrees"

@@ -6,7 +6,7 @@ is reported is said of each town by models that never saw it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -318,26 +318,29 @@ def reliability(p: F64, right: Bools, edges: Sequence[float] = EDGES) -> list[di
     return out
 
 
-def recall_at(judged: Judged, p: F64, thresholds: Sequence[float] = THRESHOLDS) -> list[dict[str, float]]:
-    """For each threshold: accepted and false closures, and the share accepted of the queries that have a right alignment with a target.
-
-    Of a query and a target only the most probable alignment can be accepted.
-    """
-    placed = judged.placed
+def answers(judged: Judged, p: F64) -> NDArray[np.int64]:
+    """The most probable alignment of each query with each target, which alone can be accepted, ascending."""
     best: dict[tuple[Any, ...], int] = {}
-    possible: set[tuple[Any, ...]] = set()
-    for k, key in enumerate(zip(judged.town, placed.query_session, placed.query.tolist(), placed.target_session, strict=True)):
+    for k, key in enumerate(_asked(judged)):
         if key not in best or p[k] > p[best[key]]:
             best[key] = k
-        if judged.right[k]:
-            possible.add(key)
-    chosen = np.array(sorted(best.values()), int)
+    return np.array(sorted(best.values()), np.int64)
+
+
+def _asked(judged: Judged) -> Iterator[tuple[Any, ...]]:
+    placed = judged.placed
+    return zip(judged.town, placed.query_session, placed.query.tolist(), placed.target_session, strict=True)
+
+
+def recall_at(judged: Judged, p: F64, thresholds: Sequence[float] = THRESHOLDS) -> list[dict[str, float]]:
+    """For each threshold: accepted and false closures, and the share accepted of the queries that have a right alignment with a target."""
+    chosen, able = answers(judged, p), len({key for key, right in zip(_asked(judged), judged.right, strict=True) if right})
     out = []
     for least in thresholds:
         accepted = chosen[p[chosen] >= least]
         right = int(judged.right[accepted].sum())
-        row = {"threshold": least, "accepted": len(accepted), "false": len(accepted) - right, "possible": len(possible)}
-        out.append(row | {"recall": right / max(len(possible), 1)})
+        row = {"threshold": least, "accepted": len(accepted), "false": len(accepted) - right, "possible": able}
+        out.append(row | {"recall": right / max(able, 1)})
     return out
 
 
