@@ -26,7 +26,7 @@ from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import read_closures
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.engines.engine import single_threaded
-from semloc_logs.evaluation.calibration import answers, decided_by, read_judged, recall_at
+from semloc_logs.evaluation.calibration import SURE, answers, decided_by, read_judged, recall_at
 from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
 from semloc_logs.settings import load
 from semloc_logs.stages import close, describe, fuse, session_name
@@ -36,7 +36,6 @@ from semloc_logs.workspace import Workspace
 FIRST, MOST = 30, 60  # numbers of the towns: calibration has those before
 SOURCES = ("auto", "geometry", "uniform")  # auto: labels of the log, where it has any
 SMALL = ("room_*", "euroc_*")
-LEAST = 0.99
 
 
 def ask_towns(args: argparse.Namespace) -> None:
@@ -48,7 +47,7 @@ def ask_towns(args: argparse.Namespace) -> None:
     for name, rows in (("ordinary towns", ~judged.copies), ("cities of copies", judged.copies)):
         for line in recall_at(judged.part(rows), p[rows]):
             print(f"  {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
-    accepted = (k for k in answers(judged, p) if p[k] >= LEAST)
+    accepted = (k for k in answers(judged, p) if p[k] >= SURE)
     for k in (k for k in accepted if not judged.right[k]):
         ends = f"{judged.placed.query_session[k]} query {judged.placed.query[k]} in {judged.placed.target_session[k]}"
         print(

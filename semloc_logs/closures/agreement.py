@@ -13,11 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import AGREEMENT, Agreement, may_be_right, own_values, reason, shipped
+from semloc_logs.closures.acceptance import AGREEMENT, Agreement, may_be_right, reason, shipped
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.lookalike import lookalike
-from semloc_logs.closures.placing import ARM, DRIFT, FAR, Placed, asked_roads, pairs_of, place, strays
+from semloc_logs.closures.placing import ARM, DRIFT, FAR, Placed, asked_roads, features_of, pairs_of, place, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import inverse
 from semloc_logs.settings import STREET_VOXEL, Settings
@@ -93,7 +92,7 @@ def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], sett
     placed = place(alignments, maps)
     columns = agree(placed, v)
     astray = strays(placed, v)
-    fitted = may_be_right(np.array([own_values(a.features) for a in alignments]).reshape(-1, len(FEATURES)))
+    fitted = may_be_right(features_of(alignments))
     probability = np.where(astray | ~fitted, 0.0, shipped().decided(columns))
     order = sorted(range(len(alignments)), key=lambda k: _rank(alignments[k], float(probability[k])))
     answered: set[tuple[str, int, str]] = set()

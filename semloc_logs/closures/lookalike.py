@@ -114,9 +114,5 @@ def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float)
 
 
 def _nearest(values: F64, wanted: F64) -> I64:
-    """Numbers (n,) of the ascending ``values`` nearest to the ``wanted`` ones (n,)."""
-    after = np.clip(np.searchsorted(values, wanted), 1, max(len(values) - 1, 1))
-    before = after - 1
-    return np.asarray(
-        np.where(np.abs(values[np.minimum(after, len(values) - 1)] - wanted) < np.abs(values[before] - wanted), after, before)
-    )
+    """Numbers (n,) of the ascending ``values`` nearest to the ``wanted`` ones (n,), of equally near ones the first."""
+    return np.searchsorted((values[1:] + values[:-1]) / 2, wanted)

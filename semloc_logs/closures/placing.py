@@ -52,6 +52,11 @@ class Placed:
         return Placed(*(getattr(self, name)[index] for name in self.__slots__))
 
 
+def features_of(alignments: Sequence[Alignment]) -> F64:
+    """Their features (n, 8) in the order of ``FEATURES``."""
+    return np.array([own_values(a.features) for a in alignments]).reshape(-1, len(FEATURES))
+
+
 def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Placed:
     """Where alignments put their queries."""
     ends = [(maps[a.query_session], a.query_keyframe, maps[a.target_session], a.target_keyframe) for a in alignments]
@@ -69,7 +74,7 @@ def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Pl
         stack([t.map_T_base[k] @ a.target_T_query for a, (_, _, t, k) in zip(alignments, ends, strict=True)]),
         np.array([a.sigma for a in alignments], float),
         np.array([a.agreement.alone for a in alignments], float),
-        unrivalled(shipped().own, np.array([own_values(a.features) for a in alignments]).reshape(-1, len(FEATURES))),
+        unrivalled(shipped().own, features_of(alignments)),
         np.array([q.posed for q, _, _, _ in ends], bool),
     )
 
