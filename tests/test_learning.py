@@ -122,6 +122,7 @@ def _session(folder: SessionFolder, n: int, posed: bool = True) -> list[np.ndarr
         "origin_x": np.full(n, 0.25, np.float32),
         "origin_y": np.zeros(n, np.float32),
         "origin_z": np.zeros(n, np.float32),
+        **{f"view_{c}": np.zeros(n, np.float32) for c in "xyz"},
         **pose_columns(poses),
     }
     write_table(folder.frames, contracts.table("frames", frames), METADATA)

@@ -8,20 +8,24 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.labels.shape import shapes_at
+from semloc_logs.labels.eigen import eigen
+from semloc_logs.labels.shape import shapes_of
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 NEIGHBOURS = 14  # that make a tangent plane
 RINGS = 4  # of cells around a point that they are looked for in
 SCATTERED, LINEAR = 0.3, 0.9  # planes are less than this
+THICK, LEAST_FLAT = 0.5, 8  # of slabs of uncertain points, and how many make one
+Arrays = tuple[F64, F64, F64, float, F64, I64, I64, I64]  # of a surface, in the order of its fields
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
     """Target ``points`` (n, 3) ordered by cells of ``cell`` metres from ``low`` (3,); points ``start[c]`` to ``start[c + 1]`` lie in cell
     ``c``, which the hash table ``keys`` -> ``rows`` finds. ``normals`` (n, 3) are unit vectors and ``planar`` (n,) is 1 where the
-    surroundings are a plane, 0 where not, -1 where nobody has asked yet."""
+    surroundings are a plane, 0 where not, -1 where nobody has asked yet. ``sigma`` is the median standard deviation of the points it was
+    made from, along their rays, metres."""
 
     points: F64
     normals: F64
@@ -31,24 +35,36 @@ class Surface:
     start: I64
     keys: I64
     rows: I64
+    sigma: float = 0.0
 
-    def nearest(self, points: F64, radius: float) -> I64:
-        """Number (m,) of the point nearest to each of ``points`` (m, 3), -1 where none is nearer than ``radius``."""
-        return np.asarray(_nearest(self.points, self.cell, self.low, self.start, self.keys, self.rows, points, radius))
-
-    def look_at(self, index: I64) -> None:
-        """Make the tangent planes of the points ``index`` that have none yet."""
-        wanted = np.unique(index[self.planar[index] < 0])
-        if len(wanted):
-            around = _around(self.points, self.cell, self.low, self.start, self.keys, self.rows, wanted)
-            s = shapes_at(self.points, wanted, around)
-            self.normals[wanted] = s.normal
-            self.planar[wanted] = (s.scattered < SCATTERED) & (s.linear < LINEAR)
+    @property
+    def arrays(self) -> Arrays:
+        """All of it, for compiled functions."""
+        return self.points, self.normals, self.planar, self.cell, self.low, self.start, self.keys, self.rows
 
 
 def surface_of(points: NDArray[np.floating], cell: float) -> Surface:
     """A surface of ``points`` (n, 3), best of some points in each of the occupied cells of ``cell`` metres."""
     p = np.asarray(points, float)
+    order, hashed = _hashed(p, cell)
+    return Surface(np.ascontiguousarray(p[order]), np.zeros_like(p), np.full(len(p), -1.0), cell, *hashed)
+
+
+def flattened_surface(points: F64, sigma: F64, kept: I64, radius: float, noise: float) -> Surface:
+    """A surface through the middle of what ``points`` (n, 3) of standard deviations ``sigma`` (n,), metres, saw of a wall.
+
+    Points of a camera lie in a slab as thick as their ranges are uncertain, in which the nearest one is near whatever the alignment: so
+    the points ``kept`` (m,) move onto the plane of those within ``radius`` metres, each of weight 1 / (noise^2 + sigma^2) (moving least
+    squares: Alexa et al., Computing and Rendering Point Set Surfaces, TVCG 2003, with planes).
+    """
+    order, hashed = _hashed(points, radius)
+    moved, normals, planar = _flattened(points[order], sigma[order], *hashed, points[kept], radius, noise)
+    order, hashed = _hashed(moved, radius)
+    return Surface(moved[order], normals[order], planar[order], radius, *hashed, float(np.median(sigma)))
+
+
+def _hashed(p: F64, cell: float) -> tuple[I64, tuple[F64, I64, I64, I64]]:
+    """The order of points (n, 3) by cells, and what finds them: ``low``, ``start``, ``keys`` and ``rows`` of :class:`Surface`."""
     low = p.min(0) if len(p) else np.zeros(3)
     key = _keys(p, cell, low)
     order = np.argsort(key, kind="stable")
@@ -57,8 +73,56 @@ def surface_of(points: NDArray[np.floating], cell: float) -> Surface:
     while size < 2 * len(first):
         size *= 2
     keys, rows = _table(key[order][first], size)
-    start = np.r_[first, len(p)].astype(np.int64)
-    return Surface(np.ascontiguousarray(p[order]), np.zeros_like(p), np.full(len(p), -1.0), cell, low, start, keys, rows)
+    return order, (low, np.r_[first, len(p)].astype(np.int64), keys, rows)
+
+
+@njit(cache=True, nogil=True)
+def _flattened(
+    around: F64, sigma: F64, low: F64, start: I64, keys: I64, rows: I64, points: F64, radius: float, noise: float
+) -> tuple[F64, F64, F64]:
+    """Each of ``points`` (m, 3) on the plane of those ``around`` it, in cells of ``radius``, the plane's normal, and whether it is one."""
+    moved, normals, planar = points.copy(), np.zeros((len(points), 3)), np.zeros(len(points))
+    mean, a, values, vectors = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for n in range(len(points)):
+        p = points[n]
+        x, y, z = int(np.floor((p[0] - low[0]) / radius)), int(np.floor((p[1] - low[1]) / radius)), int(np.floor((p[2] - low[2]) / radius))
+        mean[:], a[:], total, count = 0.0, 0.0, 0.0, 0
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                for dz in range(-1, 2):
+                    row = _find(keys, rows, _key(x + dx, y + dy, z + dz))
+                    if row < 0:
+                        continue
+                    for i in range(start[row], start[row + 1]):
+                        o0, o1, o2 = around[i, 0] - p[0], around[i, 1] - p[1], around[i, 2] - p[2]
+                        if o0 * o0 + o1 * o1 + o2 * o2 > radius * radius:
+                            continue
+                        w = 1.0 / (noise * noise + sigma[i] * sigma[i])
+                        total, count = total + w, count + 1
+                        mean[0] += w * o0
+                        mean[1] += w * o1
+                        mean[2] += w * o2
+                        a[0, 0] += w * o0 * o0
+                        a[1, 1] += w * o1 * o1
+                        a[2, 2] += w * o2 * o2
+                        a[0, 1] += w * o0 * o1
+                        a[0, 2] += w * o0 * o2
+                        a[1, 2] += w * o1 * o2
+        if count < LEAST_FLAT:
+            continue
+        mean /= total
+        a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
+        for k in range(3):
+            for m in range(3):
+                a[k, m] = a[k, m] / total - mean[k] * mean[m]
+        eigen(a, values, vectors)
+        s0, s1, s2 = np.sqrt(max(values[0], 0.0)), np.sqrt(max(values[1], 0.0)), np.sqrt(max(values[2], 0.0)) + 1e-9
+        off = mean[0] * vectors[0, 0] + mean[1] * vectors[1, 0] + mean[2] * vectors[2, 0]
+        for k in range(3):
+            normals[n, k] = vectors[k, 0]
+            moved[n, k] += off * vectors[k, 0]
+        planar[n] = 1.0 if s0 / s2 < THICK and (s2 - s1) / s2 < LINEAR else 0.0
+    return moved, normals, planar
 
 
 @njit(cache=True, nogil=True)
@@ -110,7 +174,27 @@ def _gap(offset: int, inside: float, cell: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _nearest(points: F64, cell: float, low: F64, start: I64, keys: I64, rows: I64, query: F64, radius: float) -> I64:
+def look_at(surface: Arrays, index: I64) -> None:
+    """Make the tangent planes of the points ``index`` (m,) that have none yet; -1 is no point."""
+    points, normals, planar, cell, low, start, keys, rows = surface
+    wanted, count = np.empty(len(index), np.int64), 0
+    for i in index:
+        if i >= 0 and planar[i] < 0:
+            planar[i] = 0.0  # so that it is taken once
+            wanted[count] = i
+            count += 1
+    if count:
+        wanted = wanted[:count]
+        normal, _, linear, _, scattered = shapes_of(points, wanted, _around(points, cell, low, start, keys, rows, wanted))
+        for n, i in enumerate(wanted):
+            normals[i] = normal[n]
+            planar[i] = 1.0 if scattered[n] < SCATTERED and linear[n] < LINEAR else 0.0
+
+
+@njit(cache=True, nogil=True)
+def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
+    """Number (m,) of the surface's point nearest to each of ``query`` (m, 3), -1 where none is nearer than ``radius``."""
+    points, _, _, cell, low, start, keys, rows = surface
     found = np.full(len(query), -1, np.int64)
     rings = int(np.ceil(radius / cell))
     for n in range(len(query)):

@@ -30,7 +30,7 @@ from semloc_logs.alignment.overlap import (
     search,
     yaw_between,
 )
-from semloc_logs.alignment.surface import Surface, surface_of
+from semloc_logs.alignment.surface import Surface, flattened_surface, surface_of
 from semloc_logs.geometry import apply
 from semloc_logs.labels.space import GROUND, cityscapes
 from semloc_logs.voxels.grid import BlockMap
@@ -44,6 +44,10 @@ MOST_POINTS = 6000  # of a query that are fitted
 SOME_POINTS = 1000  # of them coarsely
 RIVAL_STRIDE = 3  # of the points that a rival is measured by, which stand for all
 COARSE_RADII, FINE_RADII = (3.0, 1.5), (0.7, 0.4)  # of correspondences, voxels
+UNCERTAIN_RADII = (3.0, 2.0)  # of correspondences of uncertain points, voxels
+UNCERTAIN = 0.25  # voxels: the standard deviation above which points are
+NOISE = 1 / 6  # voxels: of planes that are certain
+HOLD = 5.0  # points on planes that a start weighs as much as
 
 
 def structure_mask(label: U8) -> NDArray[np.bool_]:
@@ -75,11 +79,15 @@ class Target:
 
 @dataclass(eq=False)
 class Query:
-    """A query map in its own level frame: fused ``blocks`` and the ``points`` (n, 3) of its keyframes."""
+    """A query map in its own level frame: fused ``blocks`` and the ``points`` (n, 3) of its keyframes.
+
+    ``spread`` (n, 3) is one standard deviation of each point along its ray, metres; None where all are certain.
+    """
 
     blocks: BlockMap
     points: F64
     voxel_size: float
+    spread: F64 | None = None
 
     @cached_property
     def occupied(self) -> tuple[NDArray[np.int32], U8]:
@@ -91,6 +99,16 @@ class Query:
         """Voxels from the origin to the farthest occupied voxel, over the ground."""
         ijk, _ = self.occupied
         return int(np.ceil(np.linalg.norm(ijk[:, :2] + 0.5, axis=1).max(initial=0.0)))
+
+    @cached_property
+    def sigma(self) -> float:
+        """Median standard deviation of the points along their rays, metres."""
+        return 0.0 if self.spread is None or not len(self.spread) else float(np.median(np.linalg.norm(self.spread, axis=1)))
+
+    @cached_property
+    def middle(self) -> F64:
+        """Mean (3,) of the points."""
+        return np.asarray(self.points.mean(0))
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -226,29 +244,58 @@ def structure_scores(query: Query, target: Target, target_T_query: F64) -> Score
     return Scores(float(aligned.sum() / max(seen.sum(), 1)), float(seen.mean()), float(free.mean()), int(aligned.sum()))
 
 
+def is_uncertain(sigma: float, voxel_size: float) -> bool:
+    """Whether points of a median standard deviation ``sigma`` along their rays, metres, lie in slabs rather than on surfaces."""
+    return sigma > UNCERTAIN * voxel_size
+
+
+def _fit(start: F64, surface: Surface, query: Query, steps: tuple[Step, ...], hold: float = 0.0) -> Fit:
+    return align(query.points, surface, start, steps, query.spread, NOISE * query.voxel_size, hold)
+
+
 def coarse_fit(candidate: Candidate, target: Target, query: Query) -> Fit:
     """Align a candidate with the target's voxels on some of the points, from three voxels down to one and a half."""
     v, stride = query.voxel_size, max(1, len(query.points) // SOME_POINTS)
-    return align(query.points, target.surface, candidate.target_T_query, tuple(Step(r * v, 4, stride) for r in COARSE_RADII))
+    return _fit(candidate.target_T_query, target.surface, query, tuple(Step(r * v, 4, stride) for r in COARSE_RADII))
 
 
 def fine_fit(start: F64, surface: Surface, query: Query) -> Fit:
-    """Align to centimetres with a bounded number of the points; the ``surface`` has a point every 0.4 voxels."""
+    """Align to centimetres with a bounded number of the points; the ``surface`` has a point every 0.4 voxels.
+
+    Of uncertain points, on either side, those farther off belong to a surface too; where few of them say anything, the start holds.
+    """
     v, stride = query.voxel_size, max(1, len(query.points) // MOST_POINTS)
+    if is_uncertain(max(surface.sigma, query.sigma), v):
+        middle, last = (r * v for r in UNCERTAIN_RADII)
+        return _fit(start, surface, query, (Step(middle, 10, 3 * stride), Step(last, 20, 2 * stride), Step(last, 1, stride)), HOLD)
     middle, last = (r * v for r in FINE_RADII)
-    return align(query.points, surface, start, (Step(middle, 6, 3 * stride), Step(last, 10, 2 * stride), Step(last, 1, stride)))
+    return _fit(start, surface, query, (Step(middle, 6, 3 * stride), Step(last, 10, 2 * stride), Step(last, 1, stride)))
 
 
 def measured(start: F64, surface: Surface, query: Query) -> Fit:
     """The fit of an alignment as it is, by the measure of a fine one."""
     stride = RIVAL_STRIDE * max(1, len(query.points) // MOST_POINTS)
-    fit = align(query.points, surface, start, (Step(FINE_RADII[1] * query.voxel_size, 0, stride),))
-    return replace(fit, information=RIVAL_STRIDE * fit.information)
+    fit = _fit(start, surface, query, (Step(FINE_RADII[1] * query.voxel_size, 0, stride),))
+    return replace(fit, information=RIVAL_STRIDE * fit.information, pull=RIVAL_STRIDE * fit.pull)
 
 
-def thin_points(points: F64, cell: float) -> F64:
-    """One point a cell."""
-    return points[thin(points.astype(np.float32), cell)]
+def thin_points(points: F64, cell: float, spread: F64) -> NDArray[np.int64]:
+    """Numbers of one point a cell: that of the least ``spread`` (n, 3), of equal ones the first."""
+    if not spread.any():
+        return thin(points.astype(np.float32), cell)
+    order = np.argsort(np.einsum("ij,ij->i", spread, spread), kind="stable")
+    return order[thin(points[order].astype(np.float32), cell)]
+
+
+def points_surface(points: F64, spread: F64, voxel_size: float) -> Surface:
+    """The surface of a target's ``points`` (n, 3) that a fine fit aligns with; ``spread`` (n, 3) as that of a query."""
+    v = voxel_size
+    kept = thin_points(points, v / 2.5, spread)
+    sigma = np.linalg.norm(spread[kept], axis=1)
+    if len(kept) and is_uncertain(float(np.median(sigma)), v):
+        p = points[kept]
+        return flattened_surface(p, sigma, thin(p.astype(np.float32), v), UNCERTAIN_RADII[1] * v, NOISE * v)
+    return surface_of(points[kept], 2 * v)
 
 
 def same_place(a: F64, b: F64, voxel_size: float) -> bool:

@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from semloc_logs.alignment.verify import FEATURES, Features, rank
+from semloc_logs.settings import STREET_VOXEL
 
 F64 = NDArray[np.float64]
 
@@ -38,7 +40,18 @@ SUPPORT, DISTINCT = FEATURES.index("support"), FEATURES.index("distinct")
 TOGETHER = ("log_odds", "log_agreeing", "share", "log_opposing", "log_far_agreeing", "log_far_opposing")
 AS_GOOD = 0.7  # of the best rank: what looks like a copy of the best place
 CLOSE, HOPELESS = 0.8, 0.3  # of the best rank, and rank: below them nothing is right
+RIGHT_WITHIN = 1.0  # m, at voxels of 0.30 m: what a right closure is (DESIGN: closures.parquet)
+MARGIN = 1.25  # standard deviations that count as one: neighbouring queries share their errors
 LOOSE_FIT, LOOSE_STIFFNESS = 0.12, 0.3  # below both the points hold nothing: the right place, but a metre off
+
+
+def precise(sigma: F64 | float, voxel_size: float) -> F64:
+    """Probability that positions of standard deviation ``sigma`` (n,) in their worst direction, metres, are within the bound of right ones.
+
+    A place may be right, and where in it not known: 1 m at voxels of 0.30 m.
+    """
+    bound = RIGHT_WITHIN * voxel_size / STREET_VOXEL
+    return np.asarray(erf(bound / (np.sqrt(2) * MARGIN * np.maximum(sigma, 1e-6))))
 
 
 def own_values(features: Features) -> F64:
@@ -151,10 +164,12 @@ def shipped() -> Model:
     )
 
 
-def reason(features: Features, probability: float, least: float, agreement: Agreement) -> str:
-    """One sentence that says why a hypothesis was rejected."""
+def reason(features: Features, probability: float, least: float, agreement: Agreement, sigma: float = 0.0, precision: float = 1.0) -> str:
+    """One sentence that says why a hypothesis was rejected; ``precision`` is that of :func:`precise` for ``sigma`` (m)."""
     f, a = features, agreement
-    if a.lookalike > shipped().most_alike and 2 * probability >= least:  # else it would be rejected anyway
+    if precision < least and probability >= least * precision:  # the place is right
+        why = f"where in this place is known to {sigma:.2f} m only"
+    elif a.lookalike > shipped().most_alike and 2 * probability >= least:  # else it would be rejected anyway
         why = f"streets about it look like others ({a.lookalike:.0%})"
     elif a.alone >= least and a.neighbours:
         why = f"of {a.neighbours} neighbouring queries {a.agreeing:.1f} agree and {a.opposing:.1f} lie elsewhere"

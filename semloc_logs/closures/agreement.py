@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.acceptance import AGREEMENT, Agreement, may_be_right, reason, shipped
+from semloc_logs.closures.acceptance import AGREEMENT, Agreement, may_be_right, precise, reason, shipped
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.lookalike import lookalike
 from semloc_logs.closures.placing import ARM, DRIFT, FAR, Placed, asked_roads, features_of, pairs_of, place, strays
@@ -93,7 +93,8 @@ def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], sett
     columns = agree(placed, v)
     astray = strays(placed, v)
     fitted = may_be_right(features_of(alignments))
-    probability = np.where(astray | ~fitted, 0.0, shipped().decided(columns))
+    precision = precise(placed.sigma, v)
+    probability = np.where(astray | ~fitted, 0.0, shipped().decided(columns) * precision)
     order = sorted(range(len(alignments)), key=lambda k: _rank(alignments[k], float(probability[k])))
     answered: set[tuple[str, int, str]] = set()
     out = []
@@ -106,7 +107,7 @@ def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], sett
         if astray[k]:
             why = f"probability {p:.3f} below {least:g}: the session's own odometry puts it elsewhere"
         elif not p >= least:  # nor what is no number
-            why = reason(a.features, p, least, agreement)
+            why = reason(a.features, p, least, agreement, a.sigma, float(precision[k]))
         else:
             why = "another place of the same session fits better" if asked in answered else ""
         answered.add(asked)

@@ -27,7 +27,7 @@ from semloc_logs.alignment.verify import (
 from semloc_logs.closures.acceptance import CLOSE, HOPELESS, Agreement, own_values, shipped
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.queries import SessionMap, build_query
-from semloc_logs.geometry import inverse, turned_about_z
+from semloc_logs.geometry import apply, inverse, turned_about_z
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns
@@ -39,16 +39,19 @@ ALIGNED = 4  # candidates of a target session that are fitted on the points
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
+SYSTEMATIC = 2.0  # standard deviations of uncertain ranges that may be common to all of them
 DRIFT = 0.01  # of the way: the odometry of a target
 FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A candidate after a fit on the points; ``nearest`` is the target's keyframe nearest to it."""
+    """A candidate after a fit on the points; ``nearest`` is the target's keyframe nearest to it, ``looking`` the one that looks at what the
+    query sees."""
 
     candidate: Candidate
     nearest: int
+    looking: int
     fit: Fit
     scores: Scores
 
@@ -193,13 +196,14 @@ def _align(
     for c in candidates:
         near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
         fit = coarse_fit(c, database.target(c.group), query)
-        fitted.append(Fitted(c, near, fit, structure_scores(query, database.target(c.group), fit.target_T_query)))
+        looking = database.looking_keyframe(c.group, apply(c.target_T_query, query.middle[None])[0])
+        fitted.append(Fitted(c, near, looking, fit, structure_scores(query, database.target(c.group), fit.target_T_query)))
     best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
     fine: list[Fitted] = []
     for f in best:
         target = database.target(f.candidate.group)
         if f.scores.rank >= max(CLOSE * max((o.scores.rank for o in fine), default=0.0), HOPELESS):
-            fit = fine_fit(f.fit.target_T_query, database.surface(f.candidate.group, f.nearest), query)
+            fit = fine_fit(f.fit.target_T_query, database.surface(f.candidate.group, f.looking), query)
             fine.append(replace(f, fit=fit, scores=structure_scores(query, target, fit.target_T_query)))
         else:  # reading keyframes takes longer than fitting them: not for what cannot be accepted
             fine.append(replace(f, fit=measured(f.fit.target_T_query, target.surface, query)))
@@ -262,6 +266,7 @@ def _judge(
     map_T_query_base = T @ query_T_base
     nearest = database.nearest_keyframe(candidate.group, map_T_query_base[:3, 3])
     map_T_target = target_session.map_T_base[nearest]
+    road = abs(float(target_session.distance[nearest] - target_session.distance[fitted.looking]))
     return Alignment(
         query_session=session.folder.name,
         target_session=place.session,
@@ -270,7 +275,7 @@ def _judge(
         query_stamp_ns=int(session.stamps_ns[keyframe]),
         target_stamp_ns=int(target_session.stamps_ns[nearest]),
         target_T_query=inverse(map_T_target) @ map_T_query_base,
-        covariance=covariance_of(fine, map_T_query_base, map_T_target, v),
+        covariance=covariance_of(fine, map_T_query_base, map_T_target, v, road),
         overlap=overlap,
         probability=probability,
         inliers=inliers,
@@ -300,22 +305,25 @@ def _beyond_noise(information: F64) -> F64:
     return np.asarray((vectors * kept) @ vectors.T * np.outer(scale, scale))
 
 
-def covariance_of(fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: float) -> F64:
+def covariance_of(fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: float, road: float = 0.0) -> F64:
     """Covariance (6, 6) of target_T_query from the fit's information, in the target's axes (DESIGN: closures.parquet).
 
     What noisy normals alone would claim to know is taken off first. Where the points then hold nothing (along a corridor) the error is
-    as large as the search lets it be: 3.3 voxels, 5 degrees. The target's keyframe may lie metres from what was aligned: between them its
+    as large as the search lets it be: 3.3 voxels, 5 degrees. Uncertain ranges may all be too long or too short, which no number of points
+    averages out. The target's keyframe may lie metres from what was aligned, and ``road`` metres from where that was seen: between them its
     odometry drifts.
     """
     noise = max(fit.rmse if np.isfinite(fit.rmse) else 1.0, 0.02) ** 2
     prior = np.diag([1 / (3.3 * voxel_size) ** 2] * 3 + [1 / np.radians(5.0) ** 2] * 3)
     about_centre = np.linalg.inv(_beyond_noise(fit.information) / (INFLATION * noise) + prior)
+    pulled = SYSTEMATIC * about_centre @ fit.pull / (INFLATION * noise)
+    about_centre += np.outer(pulled, pulled)
     x, y, z = map_T_query[:3, 3] - fit.centre
     A = np.eye(6)
     A[:3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = map_T_target[:3, :3].T
-    away = float(np.linalg.norm(map_T_query[:3, 3] - map_T_target[:3, 3]))
+    away = float(np.linalg.norm(map_T_query[:3, 3] - map_T_target[:3, 3])) + road
     drift = np.diag([(DRIFT * away) ** 2 / 3] * 3 + [0.0] * 3)
     C = turned @ A @ about_centre @ A.T @ turned.T + drift + FLOOR
     return np.asarray((C + C.T) / 2)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.alignment.surface import Surface, surface_of
-from semloc_logs.alignment.verify import Target, thin_points
+from semloc_logs.alignment.surface import Surface
+from semloc_logs.alignment.verify import Target, is_uncertain, points_surface
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import apply
 from semloc_logs.settings import Settings
@@ -166,28 +166,37 @@ class Database:
         track = self.sessions[self.places[group].session].map_T_base[seen, :3, 3]
         return int(seen[np.argmin(np.linalg.norm(track - position, axis=1))])
 
+    def looking_keyframe(self, group: int, position: F64) -> int:
+        """The keyframe of a submap, among those that the query may see, that looks at ``position`` (3,) in the map frame, on average."""
+        seen = self.keyframes(group)
+        views = self.sessions[self.places[group].session].views[seen]
+        return int(seen[np.argmin(np.linalg.norm(views - position, axis=1))])
+
     def surface(self, group: int, keyframe: int) -> Surface:
         """What the submap's keyframes around ``keyframe`` saw, as far along as a query is long, in the map frame, to align with."""
         place, seen = self.places[group], self.keyframes(group)
-        session, query = self.sessions[place.session], self.settings.query
+        session, query, v = self.sessions[place.session], self.settings.query, self.settings.fusion.voxel_size
         radius = query.radius or 24.0
-        stretch = session.distance[seen] // (UNIT * self.settings.fusion.voxel_size)
+        stretch = session.distance[seen] // (UNIT * v)
         together = seen[stretch == stretch[np.searchsorted(seen, keyframe)]]  # share one surface
         middle = int(together[len(together) // 2])
 
         def make() -> Surface:
             away = np.linalg.norm(session.map_T_base[seen, :3, 3] - session.map_T_base[middle, :3, 3], axis=1)
-            chosen = seen[np.argsort(away, kind="stable")[:SURFACE_KEYFRAMES]]
+            # uncertain ranges are less so nearby: every second keyframe of a stretch that is twice as long
+            sigma = session.keyframe(middle).sigma
+            every = 2 if sigma is not None and is_uncertain(float(np.median(sigma)), v) else 1
+            chosen = np.sort(seen[np.argsort(away, kind="stable")[: every * SURFACE_KEYFRAMES]])[::every]
             along = seen[away <= (query.length or 0.0) / 2]
             if len(along) > len(chosen):
                 count = math.ceil(SURFACE_KEYFRAMES * max(1.0, (query.length or 0.0) / radius))
                 chosen = along[np.unique(np.linspace(0, len(along) - 1, count).astype(int))]
-            clouds = []
-            for i in np.sort(chosen).tolist():
+            clouds, spreads = [], []
+            for i in chosen.tolist():
                 frame = read_keyframe(session.folder.keyframes, i).near(session.origins[i], 1.2 * radius)
                 clouds.append(apply(session.map_T_base[i], frame.points))
-            v = self.settings.fusion.voxel_size
-            return surface_of(thin_points(np.concatenate(clouds), v / 2.5), 2 * v)
+                spreads.append(frame.spread(session.origins[i]))
+            return points_surface(np.concatenate(clouds), np.concatenate(spreads), v)
 
         found: Surface = self._surfaces.get((group, middle, seen.tobytes()), make)
         return found

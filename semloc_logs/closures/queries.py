@@ -60,6 +60,12 @@ class SessionMap:
         return np.stack([self.frames[f"origin_{c}"].to_numpy() for c in "xyz"], 1).astype(float)
 
     @cached_property
+    def views(self) -> F64:
+        """Where each keyframe looks, on average (n, 3), metres in the map frame: before a camera, about a LIDAR."""
+        at = np.stack([self.frames[f"view_{c}"].to_numpy() for c in "xyz"], 1).astype(float)
+        return np.asarray(np.einsum("nij,nj->ni", self.map_T_base[:, :3, :3], at) + self.map_T_base[:, :3, 3])
+
+    @cached_property
     def keyframe(self) -> Callable[[int], Keyframe]:
         """What a keyframe saw; that of the last ones is kept, since neighbouring queries share keyframes."""
         return lru_cache(maxsize=KEPT)(partial(read_keyframe, self.folder.keyframes))
@@ -123,10 +129,12 @@ def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple
     query_T_map[:3, 3] = -session.map_T_base[keyframe][:3, 3]
     poses = query_T_map @ session.map_T_base
     radius = settings.query.radius or 24.0
-    fuser, clouds = Fuser(settings.fusion), []
+    fuser, clouds, spreads = Fuser(settings.fusion), [], []
     for i in members:
         frame = session.keyframe(i).near(session.origins[i], radius)
         fuser.add(frame.points, frame.label, session.origins[i], frame.sigma, poses[i])
         clouds.append(apply(poses[i], frame.points))
-    v = settings.fusion.voxel_size
-    return Query(fuser.finish(), thin_points(np.concatenate(clouds), v / 2), v), poses[keyframe]
+        spreads.append(frame.spread(session.origins[i]) @ poses[i][:3, :3].T)
+    v, points, spread = settings.fusion.voxel_size, np.concatenate(clouds), np.concatenate(spreads)
+    kept = thin_points(points, v / 2, spread)
+    return Query(fuser.finish(), points[kept], v, spread[kept]), poses[keyframe]

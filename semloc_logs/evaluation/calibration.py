@@ -25,6 +25,7 @@ from semloc_logs.closures.acceptance import (
     fit_logistic,
     has_far,
     may_be_right,
+    precise,
     together_values,
     unrivalled,
 )
@@ -232,7 +233,7 @@ def agreement_of(judged: Judged, alone: F64, without_rivals: F64) -> list[F64]:
 def decided_by(model: Model, judged: Judged) -> F64:
     """The probabilities (n,) that the acceptance gives with ``model``."""
     p = model.decided(agreement_of(judged, model.own(judged.features), unrivalled(model.own, judged.features)))
-    return np.where(possible(judged), p, 0.0)
+    return np.where(possible(judged), p * precise(judged.placed.sigma, judged.voxel_size), 0.0)
 
 
 def possible(judged: Judged) -> Bools:
@@ -275,7 +276,7 @@ def fit(judged: Judged) -> Fitted:
     far = (columns[1] > 0) & has_far(columns)
     together = _temper(model.together, probability, judged, kept & far & ~alike, np.ones(len(judged)))
     probability = np.where(far, _tempered(probability, model.together, together), probability)
-    probability = np.where(kept, np.where(alike, probability / 2, probability), 0.0)
+    probability = np.where(kept, np.where(alike, probability / 2, probability) * precise(judged.placed.sigma, judged.voxel_size), 0.0)
     return Fitted(replace(model, together=together), alone, probability)
 
 

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import thin_points
 from semloc_logs.closures.queries import SessionMap, query_members
 from semloc_logs.errors import SemlocError
 from semloc_logs.evaluation.localisation import Answer, World, read_world
@@ -27,6 +26,7 @@ from semloc_logs.evaluation.scan_context import nearest_contexts, scan_context
 from semloc_logs.geometry import apply, inverse
 from semloc_logs.settings import Settings
 from semloc_logs.tables import replacing_file
+from semloc_logs.voxels.selection import thin
 from semloc_logs.voxels.store import read_keyframe
 
 F64 = NDArray[np.float64]
@@ -147,7 +147,8 @@ def write_clouds(folder: Path, session: SessionMap, keyframes: Sequence[int], le
             for i in query_members(session, keyframe, stretch)
         ]
         with replacing_file(path) as temporary, temporary.open("wb") as file:
-            np.save(file, thin_points(np.concatenate(parts), CELL).astype(np.float32))
+            points = np.concatenate(parts).astype(np.float32)
+            np.save(file, points[thin(points, CELL)])
 
 
 def _cloud_name(session: SessionMap, keyframe: int) -> str:

@@ -36,16 +36,13 @@ def shape(points: NDArray[np.floating], neighbours: int = 16, radius: float = np
         return Shape(up, up, zero, zero, zero + 1)
     p = np.ascontiguousarray(points, np.float64)
     distance, index = cKDTree(p).query(p, k=min(neighbours, n), distance_upper_bound=radius, workers=1)
-    return shapes_at(p, np.arange(n), np.where(np.isfinite(distance), index, -1))
-
-
-def shapes_at(points: F64, at: NDArray[np.int64], index: NDArray[np.int64]) -> Shape:
-    """Shape at the ``points`` number ``at`` (n,) from the points ``index`` (n, k) around each, -1 where there is none."""
-    return Shape(*_shapes(points, at, index))
+    return Shape(*shapes_of(p, np.arange(n), np.where(np.isfinite(distance), index, -1)))
 
 
 @njit(cache=True, nogil=True)
-def _shapes(p: F64, at: NDArray[np.int64], index: NDArray[np.int64]) -> tuple[F32, F32, F32, F32, F32]:
+def shapes_of(p: F64, at: NDArray[np.int64], index: NDArray[np.int64]) -> tuple[F32, F32, F32, F32, F32]:
+    """The columns of :class:`Shape` at the points ``p`` number ``at`` (n,) from the points ``index`` (n, k) around each, -1 where there
+    is none."""
     n = len(index)
     normal, direction = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
     linear, planar, scattered = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)

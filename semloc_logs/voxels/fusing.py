@@ -131,6 +131,7 @@ class _Fused:
     on_progress: Callable[[str], None]
     grounds: list[float] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
+    views: list[F64] = field(default_factory=list)
     submaps: list[dict[str, Any]] = field(default_factory=list)
 
     def write(self) -> dict[str, Any]:
@@ -161,7 +162,11 @@ class _Fused:
             "distance": distance,
             "ground_z": self.grounds,
             "points": self.counts,
-            **{f"origin_{c}": np.array([o[k] for o in self.collected.origins], np.float32) for k, c in enumerate("xyz")},
+            **{
+                f"{name}_{c}": np.array([p[k] for p in found], np.float32)
+                for name, found in (("origin", self.collected.origins), ("view", self.views))
+                for k, c in enumerate("xyz")
+            },
             **pose_columns(self.poses),
         }
         write_table(folder.frames, contracts.table("frames", frames), self.metadata, ("keyframe",))
@@ -184,6 +189,7 @@ class _Fused:
             label = self.labeller.labels(i, level_points, origin, ids, scale, surface)
             keep = label != SKY
             self.counts.append(int(keep.sum()))
+            self.views.append(points[keep].mean(0, dtype=float) if keep.any() else self.collected.origins[i].astype(float))
             if (i + 1) % 50 == 0 or i + 1 == len(self.poses):
                 self.on_progress(f"labelled {i + 1} of {len(self.poses)} keyframes")
             yield Keyframe(points[keep], label[keep], None if sigma is None else sigma[keep])

@@ -54,6 +54,13 @@ class Keyframe:
         kept = np.linalg.norm(self.points - origin, axis=1) < radius
         return Keyframe(self.points[kept], self.label[kept], None if self.sigma is None else self.sigma[kept])
 
+    def spread(self, origin: NDArray[np.floating]) -> NDArray[np.float64]:
+        """One standard deviation (n, 3) of each point along its ray from ``origin`` (3,), metres, zeros where it is small."""
+        if self.sigma is None:
+            return np.zeros((len(self.points), 3))
+        ray = self.points - np.asarray(origin, float)
+        return np.asarray(ray * (self.sigma / np.maximum(np.linalg.norm(ray, axis=1), 1e-6))[:, None])
+
 
 def part_path(folder: Path, keyframe: int) -> Path:
     """The file that holds ``keyframe``."""

@@ -8,8 +8,11 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.icp import Fit, Step, _add_point, align
 from semloc_logs.alignment.surface import surface_of
-from semloc_logs.closures.closing import covariance_of
+from semloc_logs.alignment.verify import Query, fine_fit, points_surface
+from semloc_logs.closures.closing import SYSTEMATIC, covariance_of
 from semloc_logs.geometry import apply, exp_se3, inverse, rotation_angle, yaw_transform
+from semloc_logs.settings import Settings
+from semloc_logs.voxels.grid import Fuser
 
 F64 = NDArray[np.float64]
 CELL = 0.4
@@ -194,3 +197,66 @@ def test_errors_of_many_fits_stay_within_the_covariance() -> None:
         e = found.target_T_query[:3, 3]
         squared.append(float(e @ np.linalg.solve(C[:3, :3], e)))
     assert np.mean(squared) < 3  # three degrees of freedom
+
+
+def seen_by_a_camera(rng: np.random.Generator, points: F64, eye: F64, share: float, too_far: float = 0.0) -> tuple[F64, F64]:
+    """Points (n, 3) as a camera at ``eye`` (3,) has them, whose range has a standard deviation of ``share`` of it, and that spread (n, 3);
+    all of them ``too_far`` standard deviations off."""
+    spread = share * (points - eye)
+    return points + spread * (rng.normal(size=(len(points), 1)) + too_far), spread
+
+
+def test_uncertain_points_are_aligned_through_the_slab_they_lie_in() -> None:
+    """Two cameras at opposite ends of a hall, ranges wrong by 4 %: the nearest point of a slab is near wherever the query starts, so that a
+    plain fit stays there. Across the hall its long walls tell, along it the ends, of which each camera knows one well."""
+    rng, v = np.random.default_rng(3), 0.3
+    start = exp_se3(np.array([0.35, -0.3, 0.0]), np.array([0.0, 0.0, 0.03]))
+    there, there_spread = seen_by_a_camera(rng, room(rng, 6000) * [2, 2, 1], np.array([-6.0, 0.0, 1.5]), 0.04)
+    here, here_spread = seen_by_a_camera(rng, room(rng, 3000) * [2, 2, 1], np.array([6.0, 0.5, 1.5]), 0.04)
+    surface = points_surface(there, there_spread, v)
+    assert surface.sigma > 0.25 * v
+    query = Query(Fuser(Settings().resolved().fusion).finish(), here, v, here_spread)
+    found = fine_fit(start, surface, query).target_T_query
+    assert np.linalg.norm(found[1:3, 3]) < 0.06
+    assert error(found, np.eye(4))[0] < 0.22
+    plain = fine_fit(start, surface_of(there, 2 * v), replace(query, spread=None))
+    assert error(plain.target_T_query, np.eye(4))[0] > 0.3
+
+
+def test_a_certain_point_weighs_as_many_uncertain_ones_as_it_is_more_certain() -> None:
+    """A wall at x = 0, 40 points on it that are certain, 40 a decimetre behind it that are known to 0.2 m across it; noise 0.1 m:
+    the mean of weights 1 and 1 / (1 + 4)."""
+    grid = np.stack(np.meshgrid(0.0, np.arange(-2, 2, 0.1), np.arange(0, 2, 0.1)), -1).reshape(-1, 3)
+    rng = np.random.default_rng(0)
+    on = np.c_[np.zeros(40), rng.uniform(-1.5, 1.5, 40), rng.uniform(0.2, 1.8, 40)]
+    query, spread = np.r_[on, on + np.array([0.1, 0.0, 0.0])], np.r_[np.zeros((40, 3)), np.tile([0.2, 0.0, 0.0], (40, 1))]
+    wide = (Step(100.0, 15), Step(100.0, 0))  # so wide a kernel takes all as they are; the last step measures what was found
+    found = align(query, surface_of(grid, CELL), np.eye(4), wide, spread, 0.1)
+    assert found.target_T_query[0, 3] == pytest.approx(-0.1 * 0.2 / 1.2, rel=0.02)
+    assert found.rmse == pytest.approx(np.sqrt((0.1 * 0.2 / 1.2) ** 2 / 2 + 0.2 * (0.1 / 1.2) ** 2 / 2), rel=0.02)
+
+
+def test_a_start_holds_where_little_says_otherwise() -> None:
+    """One wall of 40 points, 0.1 m from where the query starts, against a hold of 40 points: half of the way."""
+    grid = np.stack(np.meshgrid(0.0, np.arange(-2, 2, 0.1), np.arange(0, 2, 0.1)), -1).reshape(-1, 3)
+    rng = np.random.default_rng(0)
+    query = np.c_[np.full(40, 0.1), rng.uniform(-1.5, 1.5, 40), rng.uniform(0.2, 1.8, 40)]
+    found = align(query, surface_of(grid, CELL), np.eye(4), (Step(100.0, 15),), hold=40.0)
+    assert found.target_T_query[0, 3] == pytest.approx(-0.05, rel=0.01)
+
+
+def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
+    """A wall ahead seen with ranges known to 0.1 m: its points average out, what they share does not."""
+    grid = np.stack(np.meshgrid(5.0, np.arange(-4, 4, 0.1), np.arange(0, 4, 0.1)), -1).reshape(-1, 3)
+    query = grid[::3]
+    spread = np.tile([0.1, 0.0, 0.0], (len(query), 1))
+    certain, uncertain = (align(query, surface_of(grid, CELL), np.eye(4), STEPS, known) for known in (None, spread))
+    assert not certain.pull.any()
+    more = covariance_of(uncertain, np.eye(4), np.eye(4), 0.3)[0, 0] - covariance_of(certain, np.eye(4), np.eye(4), 0.3)[0, 0]
+    assert np.sqrt(more) == pytest.approx(SYSTEMATIC * 0.1, rel=0.1)
+
+
+def test_what_was_seen_farther_along_the_road_is_less_certain_by_the_drift_between() -> None:
+    found = fit(np.eye(4), SMALL)
+    near, far = (covariance_of(found, np.eye(4), np.eye(4), 0.3, road) for road in (0.0, 30.0))
+    np.testing.assert_allclose(np.diag(far - near), [0.3**2 / 3] * 3 + [0.0] * 3, atol=1e-12)

@@ -15,6 +15,7 @@ from semloc_logs.closures.acceptance import (
     fit_logistic,
     may_be_right,
     own_values,
+    precise,
     reason,
     shipped,
     together_values,
@@ -154,3 +155,12 @@ def test_logistic_regression_of_separable_and_of_constant_features_stays_finite(
     assert ((p > 0.5) == (x[:, 0] > 0)).all()
     w, b = fit_logistic(x, np.ones(40, bool))
     assert (1 / (1 + np.exp(-(x @ w + b))) > 0.99).all()
+
+
+def test_a_place_that_is_not_known_to_a_metre_is_no_closure() -> None:
+    """Within 1 m = one margin of standard deviations of 0.8 m: 68.3 %; in a room of 5 cm voxels the bound is a sixth."""
+    np.testing.assert_allclose(precise(np.array([0.8, 0.4, 0.0]), 0.30), [0.6827, 0.9545, 1.0], atol=1e-4)
+    assert precise(0.8 / 6, 0.05) == pytest.approx(0.6827, abs=1e-4)
+    text = reason(GOOD, 0.682, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)
+    assert text == "probability 0.682 below 0.99: where in this place is known to 0.80 m only"
+    assert "0.80 m" not in reason(GOOD, 0.3, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)  # nor is it the place

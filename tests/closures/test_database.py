@@ -18,6 +18,8 @@ from semloc_logs.voxels.selection import road_distance
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import Workspace
 
+VIEW = (8.0, 0.0, 1.0)  # where a camera looks, in the base frame
+
 
 def drive_session(
     work: Workspace,
@@ -42,6 +44,7 @@ def drive_session(
         "ground_z": np.zeros(n),
         "points": np.ones(n, np.int64),
         **{f"origin_{c}": np.zeros(n) for c in "xyz"},
+        **{f"view_{c}": np.full(n, value) for c, value in zip("xyz", VIEW, strict=True)},
         **pose_columns(poses),
     }
     write_table(folder.frames, contracts.table("frames", columns), {})
@@ -103,6 +106,14 @@ def test_a_target_keyframe_is_never_near_the_query_in_time(out_and_back: tuple[D
         if len(view.keyframes(0)):
             found = view.nearest_keyframe(0, session.map_T_base[keyframe, :3, 3])
             assert abs(found - keyframe) >= 30
+
+
+def test_of_two_passes_the_one_that_looks_at_a_place_is_found(out_and_back: tuple[Database, SessionMap]) -> None:
+    database, session = out_and_back
+    at = session.map_T_base[20, :3, 3]
+    found = database.looking_keyframe(0, at + VIEW)
+    np.testing.assert_allclose(session.map_T_base[found, :3, 3], at)
+    assert database.looking_keyframe(0, at + VIEW) != database.nearest_keyframe(0, at + VIEW)
 
 
 def test_words_answer_where_the_drive_came_by_at_another_time(out_and_back: tuple[Database, SessionMap]) -> None:

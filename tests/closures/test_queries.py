@@ -33,6 +33,7 @@ def session(folder: Path, poses: NDArray[np.float64], clouds: list[NDArray[np.fl
         "ground_z": np.zeros(n),
         "points": [len(c) for c in clouds],
         **{f"origin_{c}": np.full(n, value) for c, value in zip("xyz", (0.5, 0.0, 1.5), strict=True)},
+        **{f"view_{c}": np.zeros(n) for c in "xyz"},
         **pose_columns(poses),
     }
     write_table(folder / "frames.parquet", contracts.table("frames", frames), {})

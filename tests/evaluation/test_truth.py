@@ -42,7 +42,7 @@ def _session(work: Workspace, name: str, start_s: int, poses: NDArray[np.float64
         "distance": steps,
         "ground_z": np.zeros(n),
         "points": np.zeros(n, int),
-        **{f"origin_{c}": np.zeros(n, np.float32) for c in "xyz"},
+        **{f"{name}_{c}": np.zeros(n, np.float32) for name in ("origin", "view") for c in "xyz"},
     }
     write_table(folder.frames, contracts.table("frames", frames), METADATA)
     write_json(folder.session_json, {"posed": True, "session_T_map": np.eye(4).tolist(), "voxel_size": 0.3})

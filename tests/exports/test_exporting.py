@@ -35,7 +35,7 @@ def _session(work: Workspace, name: str, poses: np.ndarray[Any, Any]) -> None:
         "distance": np.arange(n, dtype=float),
         "ground_z": np.zeros(n),
         "points": np.zeros(n, int),
-        **{f"origin_{c}": np.zeros(n, np.float32) for c in "xyz"},
+        **{f"{name}_{c}": np.zeros(n, np.float32) for name in ("origin", "view") for c in "xyz"},
     }
     write_table(folder.frames, contracts.table("frames", frames), METADATA)
     voxels = {"ix": [0, 2], "iy": [1, 1], "iz": [-1, 0], "label": [2, 255], "occupancy": [1.0, 2.0], "hits": [3, 4]}

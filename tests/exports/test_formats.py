@@ -50,7 +50,7 @@ def make(work: Workspace, session_T_map: NDArray[np.float64], posed: bool = True
         "distance": [0.0, 10.0],
         "ground_z": [0.0, 0.0],
         "points": [2, 1],
-        **{f"origin_{c}": np.zeros(2, np.float32) for c in "xyz"},
+        **{f"{name}_{c}": np.zeros(2, np.float32) for name in ("origin", "view") for c in "xyz"},
         **pose_columns(poses),
     }
     write_table(folder.frames, contracts.table("frames", frames), METADATA)
