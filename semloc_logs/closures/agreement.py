@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.closures.acceptance import AGREEMENT, Agreement, may_be_right, precise, reason, shipped
@@ -22,7 +23,7 @@ from semloc_logs.geometry import inverse
 from semloc_logs.settings import STREET_VOXEL, Settings
 
 F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+I64 = NDArray[np.int64]
 
 NEAR = 25.0  # m of road from a query to its neighbours, at voxels of 0.30 m
 SLACK, MOST_SLACK = 1.7, 3.3  # voxels between two alignments of one place, without and with their standard deviations
@@ -48,42 +49,70 @@ def agree(placed: Placed, voxel_size: float) -> list[F64]:
 
 def _sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> list[F64]:
     """For each of the ``probabilities`` (n,) those of other queries' alignments that agree with each and that do not, near it and far
-    from it (4, n).
+    from it (4, n); the ``group`` is ordered by query, and so by road.
 
     Of each query the most probable alignment of either kind counts, and as opposing only if it is more probable than an agreeing one.
     """
     scale = voxel_size / STREET_VOXEL
-    loud = np.max(probabilities, axis=0) >= LEAST
-    voices, said = group.part(loud), [np.where(p >= LEAST, p, 0.0)[loud] for p in probabilities]
-    out = [np.zeros((4, len(group))) for _ in probabilities]
-    for k in range(len(group)):
-        along = np.abs(voices.road - group.road[k])
-        there = np.flatnonzero((along <= FAR * scale) & (voices.query != group.query[k]))
-        if not len(there):
-            continue
-        heard, along = voices.part(there), along[there]
-        agrees = _agrees(group.part(np.array([k])), heard, along, voxel_size)
-        _, first, number = np.unique(heard.query, return_index=True, return_inverse=True)
-        near = along[first] <= NEAR * scale
-        for sums, p in zip(out, said, strict=True):
-            for_it, against = np.zeros(len(first)), np.zeros(len(first))
-            np.maximum.at(for_it, number, np.where(agrees, p[there], 0.0))
-            np.maximum.at(against, number, np.where(agrees, 0.0, p[there]))
-            against[against <= for_it] = 0.0
-            sums[:, k] = [for_it[near].sum(), against[near].sum(), for_it[~near].sum(), against[~near].sum()]
-    return out
+    p = np.where(np.array(probabilities) >= LEAST, np.array(probabilities), 0.0)
+    loud = np.flatnonzero(p.max(axis=0) >= LEAST)
+    v = group.part(loud)
+    first, end = np.searchsorted(v.road, group.road - FAR * scale, "left"), np.searchsorted(v.road, group.road + FAR * scale, "right")
+    out = np.zeros((len(p), 4, len(group)))
+    target_T_map = group.target_T_query @ inverse(group.map_T_query)  # as each alignment has it
+    voices = v.query, v.road, v.target_road, v.map_T_query, v.target_T_query, v.sigma, np.ascontiguousarray(p[:, loud])
+    _add_voices(out, (group.query, group.road, group.target_road, target_T_map, group.sigma), voices, first, end, voxel_size, scale)
+    return list(out)
 
 
-def _agrees(one: Placed, others: Placed, along: F64, voxel_size: float) -> Bools:
-    """Whether ``one`` and the odometry predict ``others`` (m), which lie ``along`` metres of road away."""
-    predicted = one.target_T_query[0] @ inverse(one.map_T_query[0]) @ others.map_T_query
-    off = np.linalg.norm(predicted[:, :3, 3] - others.target_T_query[:, :3, 3], axis=1)
-    trace = np.einsum("nij,nij->n", predicted[:, :3, :3], others.target_T_query[:, :3, :3])
-    turn = np.arccos(np.clip((trace - 1) / 2, -1, 1))
-    sigma = np.hypot(one.sigma[0], others.sigma)
-    allowed = np.minimum(SLACK * voxel_size + 2 * sigma, MOST_SLACK * voxel_size)
-    drift = DRIFT * (along + np.abs(others.target_road - one.target_road[0])) + ARM * along
-    return np.asarray((off <= allowed + drift) & (turn <= TURN + TURN_DRIFT * along * STREET_VOXEL / voxel_size))
+@njit(cache=True, nogil=True)
+def _add_voices(
+    out: F64,
+    group: tuple[I64, F64, F64, F64, F64],
+    voices: tuple[I64, F64, F64, F64, F64, F64, F64],
+    first: I64,
+    end: I64,
+    voxel_size: float,
+    scale: float,
+) -> None:
+    """Add to ``out`` (probabilities, 4, n) the voices ``first`` to ``end`` of each alignment's stretch of road."""
+    query, road, target_road, target_T_map, sigma = group
+    by, at, target_at, map_T_query, target_T_query, doubt, said = voices
+    for_it, against = np.zeros(len(said)), np.zeros(len(said))
+    for k in range(len(query)):
+        for n in range(first[k], end[k]):
+            if by[n] != query[k]:
+                along = abs(at[n] - road[k])
+                drift = DRIFT * (along + abs(target_at[n] - target_road[k])) + ARM * along
+                slack = min(SLACK * voxel_size + 2 * np.hypot(sigma[k], doubt[n]), MOST_SLACK * voxel_size)
+                agrees = _agrees(target_T_map[k], map_T_query[n], target_T_query[n], slack + drift, TURN + TURN_DRIFT * along / scale)
+                for i in range(len(said)):
+                    if agrees:
+                        for_it[i] = max(for_it[i], said[i, n])
+                    else:
+                        against[i] = max(against[i], said[i, n])
+            if n + 1 == end[k] or by[n + 1] != by[n]:  # the last voice of a query
+                far = 2 if abs(at[n] - road[k]) > NEAR * scale else 0
+                for i in range(len(said)):
+                    out[i, far, k] += for_it[i]
+                    out[i, far + 1, k] += against[i] if against[i] > for_it[i] else 0.0
+                    for_it[i] = against[i] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def _agrees(target_T_map: F64, map_T_query: F64, target_T_query: F64, most: float, turn: float) -> bool:
+    """Whether the query lies where ``target_T_map`` and its odometry put it, to within ``most`` metres and ``turn`` radians."""
+    off, trace = 0.0, 0.0
+    for i in range(3):
+        p = target_T_map[i, 3] - target_T_query[i, 3]
+        for m in range(3):
+            p += target_T_map[i, m] * map_T_query[m, 3]
+            r = 0.0
+            for j in range(3):
+                r += target_T_map[i, j] * map_T_query[j, m]
+            trace += r * target_T_query[i, m]
+        off += p * p
+    return bool(off <= most * most and np.arccos(min(max((trace - 1) / 2, -1.0), 1.0)) <= turn)
 
 
 def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Settings) -> list[Alignment]:

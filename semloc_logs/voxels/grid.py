@@ -78,13 +78,20 @@ def _occupied(corner: NDArray[np.int32], state: U8) -> tuple[NDArray[np.int32], 
 def _copy_blocks(out: U8, corner: I64, state: U8, rows: I64) -> None:
     """The ``rows`` (m,) of ``state``, blocks with their corner at ``corner`` (m, 3) of ``out``, as far as they lie in it."""
     nx, ny, nz = out.shape
+    flat = out.ravel()
     for n in range(len(rows)):
         x, y, z = corner[n]
         first, end = max(z, 0), min(z + BLOCK, nz)
+        block = state[rows[n]]
         for i in range(max(x, 0), min(x + BLOCK, nx)):
             for j in range(max(y, 0), min(y + BLOCK, ny)):
-                at = ((i - x) * BLOCK + j - y) * BLOCK - z
-                out[i, j, first:end] = state[rows[n], at + first : at + end]
+                at, to = ((i - x) * BLOCK + j - y) * BLOCK - z, (i * ny + j) * nz
+                if end - first == BLOCK:  # of a known length: the compiler moves them together
+                    for k in range(BLOCK):
+                        flat[np.uint64(to + first + k)] = block[np.uint64(at + first + k)]
+                else:
+                    for k in range(first, end):
+                        flat[np.uint64(to + k)] = block[np.uint64(at + k)]
 
 
 def empty_map() -> BlockMap:

@@ -51,7 +51,8 @@ class Keyframe:
 
     def near(self, origin: NDArray[np.floating], radius: float) -> Keyframe:
         """The points within ``radius`` metres of ``origin`` (3,)."""
-        kept = np.linalg.norm(self.points - origin, axis=1) < radius
+        off = self.points - np.asarray(origin, np.float32)
+        kept = np.einsum("ij,ij->i", off, off) < radius**2
         return Keyframe(self.points[kept], self.label[kept], None if self.sigma is None else self.sigma[kept])
 
     def spread(self, origin: NDArray[np.floating]) -> NDArray[np.float64]:

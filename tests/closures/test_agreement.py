@@ -1,21 +1,24 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Features
 from semloc_logs.closures.acceptance import AGREEMENT, Agreement
-from semloc_logs.closures.agreement import agree, decide
+from semloc_logs.closures.agreement import LEAST, MOST_SLACK, NEAR, SLACK, TURN, TURN_DRIFT, _sums, agree, decide
 from semloc_logs.closures.closing import Alignment
-from semloc_logs.closures.placing import place, strays
+from semloc_logs.closures.placing import ARM, DRIFT, FAR, Placed, place, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import inverse, yaw_transform
-from semloc_logs.settings import Settings
+from semloc_logs.settings import STREET_VOXEL, Settings
 
 F64 = NDArray[np.float64]
 SETTINGS = Settings().resolved()
@@ -224,3 +227,71 @@ def test_of_none() -> None:
     nothing = place([], {})
     assert len(agree(nothing, 0.3)) == len(AGREEMENT)
     assert not strays(nothing, 0.3).any()
+
+
+def slow_sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> list[F64]:
+    """For each of the ``probabilities`` (n,) those of other queries' alignments that agree with each and that do not, near it and far
+    from it (4, n).
+
+    Of each query the most probable alignment of either kind counts, and as opposing only if it is more probable than an agreeing one.
+    """
+    scale = voxel_size / STREET_VOXEL
+    loud = np.max(probabilities, axis=0) >= LEAST
+    voices, said = group.part(loud), [np.where(p >= LEAST, p, 0.0)[loud] for p in probabilities]
+    out = [np.zeros((4, len(group))) for _ in probabilities]
+    for k in range(len(group)):
+        along = np.abs(voices.road - group.road[k])
+        there = np.flatnonzero((along <= FAR * scale) & (voices.query != group.query[k]))
+        if not len(there):
+            continue
+        heard, along = voices.part(there), along[there]
+        agrees = slow_agrees(group.part(np.array([k])), heard, along, voxel_size)
+        _, first, number = np.unique(heard.query, return_index=True, return_inverse=True)
+        near = along[first] <= NEAR * scale
+        for sums, p in zip(out, said, strict=True):
+            for_it, against = np.zeros(len(first)), np.zeros(len(first))
+            np.maximum.at(for_it, number, np.where(agrees, p[there], 0.0))
+            np.maximum.at(against, number, np.where(agrees, 0.0, p[there]))
+            against[against <= for_it] = 0.0
+            sums[:, k] = [for_it[near].sum(), against[near].sum(), for_it[~near].sum(), against[~near].sum()]
+    return out
+
+
+def slow_agrees(one: Placed, others: Placed, along: F64, voxel_size: float) -> NDArray[np.bool_]:
+    """Whether ``one`` and the odometry predict ``others`` (m), which lie ``along`` metres of road away."""
+    predicted = one.target_T_query[0] @ inverse(one.map_T_query[0]) @ others.map_T_query
+    off = np.linalg.norm(predicted[:, :3, 3] - others.target_T_query[:, :3, 3], axis=1)
+    trace = np.einsum("nij,nij->n", predicted[:, :3, :3], others.target_T_query[:, :3, :3])
+    turn = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    sigma = np.hypot(one.sigma[0], others.sigma)
+    allowed = np.minimum(SLACK * voxel_size + 2 * sigma, MOST_SLACK * voxel_size)
+    drift = DRIFT * (along + np.abs(others.target_road - one.target_road[0])) + ARM * along
+    return np.asarray((off <= allowed + drift) & (turn <= TURN + TURN_DRIFT * along * STREET_VOXEL / voxel_size))
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.3, 0.05]))
+@settings(max_examples=40, deadline=None)
+def test_voices_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
+    """Alignments of a bent road, right, moved, turned or in other places, as many as three of a query, against the slow count."""
+    rng = np.random.default_rng(seed)
+    scale = voxel_size / 0.3
+    road = bend(60)
+    road[:, :3, 3] *= scale
+    query = np.sort(rng.integers(0, 60, 50))
+    error = np.array([yaw_transform(rng.normal(0, 0.05), rng.normal(0, rng.choice([0.1, 1.0, 10.0]) * scale, 3)) for _ in query])
+    placed = Placed(
+        np.full(50, "a", object),
+        np.full(50, "b", object),
+        query,
+        2.0 * scale * query,
+        2.0 * scale * query + rng.normal(0, 3 * scale, 50),
+        road[query],
+        error @ MAP @ road[query],
+        rng.uniform(0.01, 0.5, 50) * scale,
+        rng.uniform(0, 1, 50) ** 4,
+        rng.uniform(0, 1, 50) ** 4,
+        np.ones(50, bool),
+    )
+    probabilities = placed.alone, placed.unrivalled
+    for found, expected in zip(_sums(placed, probabilities, voxel_size), slow_sums(placed, probabilities, voxel_size), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-12)
