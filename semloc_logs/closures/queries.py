@@ -12,6 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Query, thin_points
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.geometry import apply, inverse, rotation_angle
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describing import KNOWS_CLASSES
@@ -61,7 +62,12 @@ class SessionMap:
 
     @cached_property
     def views(self) -> F64:
-        """Where each keyframe looks, on average (n, 3), metres in the map frame: before a camera, about a LIDAR."""
+        """Where each keyframe looks, on average (n, 3), metres in the map frame: before a camera, about a LIDAR.
+
+        WorkspaceError when the session was fused before this was written down.
+        """
+        if "view_x" not in self.frames.column_names:
+            raise WorkspaceError(f"{self.folder.frames} is of an earlier version: fuse session {self.folder.name} again with --overwrite.")
         at = np.stack([self.frames[f"view_{c}"].to_numpy() for c in "xyz"], 1).astype(float)
         return np.asarray(np.einsum("nij,nj->ni", self.map_T_base[:, :3, :3], at) + self.map_T_base[:, :3, 3])
 

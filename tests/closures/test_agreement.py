@@ -283,7 +283,7 @@ def test_voices_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
         np.full(50, "a", object),
         np.full(50, "b", object),
         query,
-        2.0 * scale * query,
+        np.asarray(2.0 * scale * query, float),
         2.0 * scale * query + rng.normal(0, 3 * scale, 50),
         road[query],
         error @ MAP @ road[query],

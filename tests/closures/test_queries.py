@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from semloc_logs import contracts
 from semloc_logs.closures.queries import SessionMap, build_query, query_keyframes, query_members
 from semloc_logs.closures.results import keyframe_at
-from semloc_logs.errors import SettingsError
+from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.geometry import apply, yaw_transform
 from semloc_logs.settings import Settings
-from semloc_logs.tables import write_json, write_table
+from semloc_logs.tables import read_table, write_json, write_table
 from semloc_logs.voxels.selection import road_distance
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import SessionFolder
@@ -130,3 +130,24 @@ def test_a_query_may_not_be_so_long_that_its_map_has_no_bounds() -> None:
 def test_the_keyframe_at_a_stamp(tmp_path: Path) -> None:
     s = session(tmp_path, straight(5))
     assert [keyframe_at(s, t) for t in (-5, 0, 10**8, 149_999_999, 150_000_001, 10**12)] == [0, 0, 1, 1, 2, 4]
+
+
+def test_a_session_of_an_earlier_version_is_named(tmp_path: Path) -> None:
+    s = session(tmp_path, straight(3))
+    np.testing.assert_allclose(s.views, s.map_T_base[:, :3, 3])
+    frames = read_table(s.folder.frames)
+    write_table(s.folder.frames, frames.drop_columns(["view_x", "view_y", "view_z"]), {})
+    with pytest.raises(WorkspaceError, match=r"frames\.parquet is of an earlier version: fuse session .* again with --overwrite"):
+        _ = SessionMap(s.folder).views
+
+
+def test_points_of_a_camera_keep_their_spread(tmp_path: Path) -> None:
+    """A point 4 m ahead of an eye at (0.5, 0, 1.5), known to 0.2 m along its ray, in a keyframe that looks along the map's y."""
+    poses = np.array([yaw_transform(np.pi / 2, (3.0, 2.0, 0.0))])
+    s = session(tmp_path, poses, [np.array([[4.5, 0.0, 1.5]], np.float32)])
+    cloud = Keyframe(np.array([[4.5, 0.0, 1.5]], np.float32), np.full(1, 2, np.uint8), np.full(1, 0.2, np.float32))
+    list(keep_keyframes(s.folder.keyframes, [0], [cloud], {}))
+    query, _ = build_query(s, 0, settings())
+    assert query.spread is not None
+    np.testing.assert_allclose(query.spread, [[0.0, 0.2, 0.0]], atol=1e-4)
+    assert query.sigma == pytest.approx(0.2, abs=1e-4)
