@@ -221,6 +221,7 @@ def close(
         variants |= wanted
         if not m.folder.words_json.exists() or not wanted <= set(read_json(m.folder.words_json)["variants"]):
             raise WorkspaceError(f"Session {name} lacks {' and '.join(sorted(wanted))} words: run 'semloc describe -w {work.path}' first.")
+        _ = m.views  # a session of an earlier version is refused before its queries are asked
     inputs = [f"{f.name} {_fingerprint(f.words_json)}" for f in (*asking, *asked)]
     sections = ("fusion", "labels", "descriptor", "query", "closures")
     fingerprint = _hash(settings.fingerprint(*sections), str(self_closures), repr(len(asking)), *inputs)

@@ -22,7 +22,8 @@ LONGEST_TURN = 0.2  # of one step, radians
 class Fit:
     """``target_T_query``; ``inliers`` share and ``count`` of query points within the last radius; ``rmse`` of their plane distances (m);
     ``information`` (6, 6), of (translation, rotation) as left increments about the query's centre ``centre`` in the target frame,
-    in units of 1 / (plane distance noise)^2; ``pull`` (6,): what it would say if all uncertain points were a standard deviation too far."""
+    in units of 1 / (plane distance noise)^2; ``pull`` (2, 6): the right side of its equations if all uncertain points of the query, or of
+    the target, were a standard deviation too far."""
 
     target_T_query: F64
     inliers: float
@@ -54,8 +55,9 @@ def align(
     """Refine ``target_T_query`` for ``query`` points (n, 3) step by step.
 
     Gauss-Newton on the distances to the target's tangent planes (point distances where the surface is not planar), Cauchy weights. A
-    step of no iterations moves nothing: the fit is that of the given transform. ``spread`` (n, 3) is one standard deviation of each point
-    along its ray, in metres; a point weighs as much as ``noise`` (m), that of planes, leaves it across the plane.
+    step of no iterations moves nothing: the fit is that of the given transform. ``spread`` (n, 3) is one standard deviation of each
+    point along its ray, in metres; a point weighs as much as ``noise`` (m), that of planes, leaves it across the plane. The start holds the
+    middle of the query as ``hold`` of its points on planes would; it may turn about it.
     """
     radii, iterations, strides = (np.array([getattr(step, name) for step in steps]) for name in ("radius", "iterations", "stride"))
     points = np.ascontiguousarray(query, float)
@@ -69,7 +71,7 @@ def align(
         float(hold),
     )
     if count < LEAST_POINTS:
-        return Fit(T, 0.0, count, float("inf"), information, centre, pull)
+        return Fit(T, 0.0, count, float("inf"), np.zeros((6, 6)), centre, np.zeros((2, 6)))
     return Fit(T, count / used, count, float(np.sqrt(squared / count)), information, centre, pull)
 
 
@@ -79,7 +81,7 @@ def _align(
 ) -> tuple[F64, F64, int, int, float, F64, F64]:
     """The transform, the centre of the points, how many were used and how many met a surface, their squares and information."""
     T, centre, count, used, squared = start, start[:3, 3].copy(), 0, 0, 0.0
-    information, pull = np.zeros((6, 6)), np.zeros(6)
+    information, pull = np.zeros((6, 6)), np.zeros((2, 6))
     query_centre = np.zeros(3)
     for n in range(len(query)):
         query_centre += query[n] / len(query)
@@ -112,8 +114,8 @@ def _align(
                 off = start[k, 3] - T[k, 3]
                 for m in range(3):
                     off += (start[k, m] - T[k, m]) * query_centre[m]
-                g[k] -= hold * off
-                H[k, k] += hold
+                g[k] -= hold / strides[step] * off
+                H[k, k] += hold / strides[step]
             move = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(6), g)
             angle = np.sqrt(move[3] ** 2 + move[4] ** 2 + move[5] ** 2)
             if angle > LONGEST_TURN:
@@ -147,9 +149,9 @@ def _normal_equations(
     moved: F64, ray: F64, index: I64, surface: Arrays, centre: F64, kernel: float, noise: float
 ) -> tuple[float, F64, F64, F64, F64]:
     """Sum of the squared plane distances, those of uncertain points (``ray`` (n, 3) or (0, 3); variance ``noise`` without) for as much as
-    they count; information (6, 6) and pull (6,) of the planes alone; normal equations (6, 6), (6,) of planes and points."""
-    points, normals, planar = surface[:3]
-    information, H, g, pull = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    they count; information (6, 6) and pull (2, 6) of the planes alone; normal equations (6, 6), (6,) of planes and points."""
+    points, normals, planar, spread = surface[0], surface[1], surface[2], surface[8]
+    information, H, g, pull = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros((2, 6))
     squared, J, o, a = 0.0, np.empty(6), np.empty(3), np.empty(3)
     for n in range(len(moved)):
         i = index[n]
@@ -161,17 +163,20 @@ def _normal_equations(
             J[k] = normals[i, k]
         J[3], J[4], J[5] = a[1] * J[2] - a[2] * J[1], a[2] * J[0] - a[0] * J[2], a[0] * J[1] - a[1] * J[0]
         r = o[0] * J[0] + o[1] * J[1] + o[2] * J[2]
-        across = along = off = 0.0
+        across = along = off = off_target = 0.0
         if len(ray):
             off = ray[n, 0] * J[0] + ray[n, 1] * J[1] + ray[n, 2] * J[2]
             across = off * off
             along = ray[n, 0] ** 2 + ray[n, 1] ** 2 + ray[n, 2] ** 2
+        if len(spread):
+            off_target = spread[i, 0] * J[0] + spread[i, 1] * J[1] + spread[i, 2] * J[2]
         certain = noise / (noise + across)
         squared += certain * r * r
         weight = planar[i] * certain / (1 + r * r / (kernel + across))
         for k in range(6):
             g[k] += weight * J[k] * r
-            pull[k] += weight * J[k] * off
+            pull[0, k] += weight * J[k] * off
+            pull[1, k] += weight * J[k] * off_target
             for m in range(k, 6):
                 information[k, m] += weight * J[k] * J[m]
         if planar[i] < 1.0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -17,15 +17,15 @@ NEIGHBOURS = 14  # that make a tangent plane
 RINGS = 4  # of cells around a point that they are looked for in
 SCATTERED, LINEAR = 0.3, 0.9  # planes are less than this
 THICK, LEAST_FLAT = 0.5, 8  # of slabs of uncertain points, and how many make one
-Arrays = tuple[F64, F64, F64, float, F64, I64, I64, I64]  # of a surface, in the order of its fields
+Arrays = tuple[F64, F64, F64, float, F64, I64, I64, I64, F64]  # of a surface, in the order of its fields
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
     """Target ``points`` (n, 3) ordered by cells of ``cell`` metres from ``low`` (3,); points ``start[c]`` to ``start[c + 1]`` lie in cell
     ``c``, which the hash table ``keys`` -> ``rows`` finds. ``normals`` (n, 3) are unit vectors and ``planar`` (n,) is 1 where the
-    surroundings are a plane, 0 where not, -1 where nobody has asked yet. ``sigma`` is the median standard deviation of the points it was
-    made from, along their rays, metres."""
+    surroundings are a plane, 0 where not, -1 where nobody has asked yet. ``spread`` (n, 3) is one standard deviation of the points
+    along their rays, metres, of a flattened surface; (0, 3) else."""
 
     points: F64
     normals: F64
@@ -35,12 +35,17 @@ class Surface:
     start: I64
     keys: I64
     rows: I64
-    sigma: float = 0.0
+    spread: F64 = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def arrays(self) -> Arrays:
         """All of it, for compiled functions."""
-        return self.points, self.normals, self.planar, self.cell, self.low, self.start, self.keys, self.rows
+        return self.points, self.normals, self.planar, self.cell, self.low, self.start, self.keys, self.rows, self.spread
+
+    @property
+    def sigma(self) -> float:
+        """Median standard deviation of the points along their rays, metres; 0 of a surface that is not flattened."""
+        return float(np.median(np.linalg.norm(self.spread, axis=1))) if len(self.spread) else 0.0
 
 
 def surface_of(points: NDArray[np.floating], cell: float) -> Surface:
@@ -50,17 +55,17 @@ def surface_of(points: NDArray[np.floating], cell: float) -> Surface:
     return Surface(np.ascontiguousarray(p[order]), np.zeros_like(p), np.full(len(p), -1.0), cell, *hashed)
 
 
-def flattened_surface(points: F64, sigma: F64, kept: I64, radius: float, noise: float) -> Surface:
-    """A surface through the middle of what ``points`` (n, 3) of standard deviations ``sigma`` (n,), metres, saw of a wall.
+def flattened_surface(points: F64, spread: F64, kept: I64, radius: float, noise: float) -> Surface:
+    """A surface through the middle of what ``points`` (n, 3) with ``spread`` (n, 3), a standard deviation along their rays, saw of a wall.
 
     Points of a camera lie in a slab as thick as their ranges are uncertain, in which the nearest one is near whatever the alignment: so
     the points ``kept`` (m,) move onto the plane of those within ``radius`` metres, each of weight 1 / (noise^2 + sigma^2) (moving least
     squares: Alexa et al., Computing and Rendering Point Set Surfaces, TVCG 2003, with planes).
     """
-    order, hashed = _hashed(points, radius)
+    (order, hashed), sigma = _hashed(points, radius), np.linalg.norm(spread, axis=1)
     moved, normals, planar = _flattened(points[order], sigma[order], *hashed, points[kept], radius, noise)
     order, hashed = _hashed(moved, radius)
-    return Surface(moved[order], normals[order], planar[order], radius, *hashed, float(np.median(sigma)))
+    return Surface(moved[order], normals[order], planar[order], radius, *hashed, np.ascontiguousarray(spread[kept][order]))
 
 
 def _hashed(p: F64, cell: float) -> tuple[I64, tuple[F64, I64, I64, I64]]:
@@ -176,7 +181,7 @@ def _gap(offset: int, inside: float, cell: float) -> float:
 @njit(cache=True, nogil=True)
 def look_at(surface: Arrays, index: I64) -> None:
     """Make the tangent planes of the points ``index`` (m,) that have none yet; -1 is no point."""
-    points, normals, planar, cell, low, start, keys, rows = surface
+    points, normals, planar, cell, low, start, keys, rows, _ = surface
     wanted, count = np.empty(len(index), np.int64), 0
     for i in index:
         if i >= 0 and planar[i] < 0:
@@ -194,7 +199,7 @@ def look_at(surface: Arrays, index: I64) -> None:
 @njit(cache=True, nogil=True)
 def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
     """Number (m,) of the surface's point nearest to each of ``query`` (m, 3), -1 where none is nearer than ``radius``."""
-    points, _, _, cell, low, start, keys, rows = surface
+    points, _, _, cell, low, start, keys, rows, _ = surface
     found = np.full(len(query), -1, np.int64)
     rings = int(np.ceil(radius / cell))
     for n in range(len(query)):

@@ -45,9 +45,10 @@ SOME_POINTS = 1000  # of them coarsely
 RIVAL_STRIDE = 3  # of the points that a rival is measured by, which stand for all
 COARSE_RADII, FINE_RADII = (3.0, 1.5), (0.7, 0.4)  # of correspondences, voxels
 UNCERTAIN_RADII = (3.0, 2.0)  # of correspondences of uncertain points, voxels
+AHEAD = 20.0  # voxels between a sensor and the mean of its points, above which it looks one way
 UNCERTAIN = 0.25  # voxels: the standard deviation above which points are
 NOISE = 1 / 6  # voxels: of planes that are certain
-HOLD = 5.0  # points on planes that a start weighs as much as
+HOLD = 10.0  # points on planes that a start weighs as much as
 
 
 def structure_mask(label: U8) -> NDArray[np.bool_]:
@@ -81,7 +82,7 @@ class Target:
 class Query:
     """A query map in its own level frame: fused ``blocks`` and the ``points`` (n, 3) of its keyframes.
 
-    ``spread`` (n, 3) is one standard deviation of each point along its ray, metres; None where all are certain.
+    ``spread`` (n, 3) is one standard deviation of each point along its ray, metres; zeros, or None, where they are certain.
     """
 
     blocks: BlockMap
@@ -107,8 +108,8 @@ class Query:
 
     @cached_property
     def middle(self) -> F64:
-        """Mean (3,) of the points."""
-        return np.asarray(self.points.mean(0))
+        """Where it looks (3,): the mean of its points, from its origin."""
+        return np.asarray(looked_at(np.zeros((1, 3)), self.points.mean(0)[None], self.voxel_size)[0])
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -244,6 +245,12 @@ def structure_scores(query: Query, target: Target, target_T_query: F64) -> Score
     return Scores(float(aligned.sum() / max(seen.sum(), 1)), float(seen.mean()), float(free.mean()), int(aligned.sum()))
 
 
+def looked_at(position: F64, mean: F64, voxel_size: float) -> F64:
+    """What keyframes at ``position`` (n, 3) whose points have a ``mean`` (n, 3) look at: that, or themselves where they look all around."""
+    ahead = np.linalg.norm(mean - position, axis=1) > AHEAD * voxel_size
+    return np.where(ahead[:, None], mean, position)
+
+
 def is_uncertain(sigma: float, voxel_size: float) -> bool:
     """Whether points of a median standard deviation ``sigma`` along their rays, metres, lie in slabs rather than on surfaces."""
     return sigma > UNCERTAIN * voxel_size
@@ -274,8 +281,9 @@ def fine_fit(start: F64, surface: Surface, query: Query) -> Fit:
 
 def measured(start: F64, surface: Surface, query: Query) -> Fit:
     """The fit of an alignment as it is, by the measure of a fine one."""
-    stride = RIVAL_STRIDE * max(1, len(query.points) // MOST_POINTS)
-    fit = _fit(start, surface, query, (Step(FINE_RADII[1] * query.voxel_size, 0, stride),))
+    v, stride = query.voxel_size, RIVAL_STRIDE * max(1, len(query.points) // MOST_POINTS)
+    radii = UNCERTAIN_RADII if is_uncertain(max(surface.sigma, query.sigma), v) else FINE_RADII
+    fit = _fit(start, surface, query, (Step(radii[1] * v, 0, stride),))
     return replace(fit, information=RIVAL_STRIDE * fit.information, pull=RIVAL_STRIDE * fit.pull)
 
 
@@ -294,7 +302,7 @@ def points_surface(points: F64, spread: F64, voxel_size: float) -> Surface:
     sigma = np.linalg.norm(spread[kept], axis=1)
     if len(kept) and is_uncertain(float(np.median(sigma)), v):
         p = points[kept]
-        return flattened_surface(p, sigma, thin(p.astype(np.float32), v), UNCERTAIN_RADII[1] * v, NOISE * v)
+        return flattened_surface(p, spread[kept], thin(p.astype(np.float32), v), UNCERTAIN_RADII[1] * v, NOISE * v)
     return surface_of(points[kept], 2 * v)
 
 

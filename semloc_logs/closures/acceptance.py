@@ -167,9 +167,10 @@ def shipped() -> Model:
 def reason(features: Features, probability: float, least: float, agreement: Agreement, sigma: float = 0.0, precision: float = 1.0) -> str:
     """One sentence that says why a hypothesis was rejected; ``precision`` is that of :func:`precise` for ``sigma`` (m)."""
     f, a = features, agreement
-    if precision < least and probability >= least * precision:  # the place is right
+    of_place = probability / max(precision, 1e-9)
+    if of_place >= least:
         why = f"where in this place is known to {sigma:.2f} m only"
-    elif a.lookalike > shipped().most_alike and 2 * probability >= least:  # else it would be rejected anyway
+    elif a.lookalike > shipped().most_alike and 2 * of_place >= least:  # else it would be rejected anyway
         why = f"streets about it look like others ({a.lookalike:.0%})"
     elif a.alone >= least and a.neighbours:
         why = f"of {a.neighbours} neighbouring queries {a.agreeing:.1f} agree and {a.opposing:.1f} lie elsewhere"

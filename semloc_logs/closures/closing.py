@@ -39,7 +39,7 @@ ALIGNED = 4  # candidates of a target session that are fitted on the points
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
-SYSTEMATIC = 2.0  # standard deviations of uncertain ranges that may be common to all of them
+SYSTEMATIC = 1.0  # standard deviations that uncertain ranges of a query, and of a target, may all be off by
 DRIFT = 0.01  # of the way: the odometry of a target
 FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
 
@@ -294,15 +294,17 @@ def _stiffness(fit: Fit) -> float:
     return float(max(np.linalg.eigvalsh(reduced).min(), 0.0))
 
 
-def _beyond_noise(information: F64) -> F64:
-    """Information (6, 6) less what normals that are 2 degrees off would pretend, in axes scaled so that lengths and angles compare."""
+def _beyond_noise(information: F64, pull: F64) -> tuple[F64, F64]:
+    """Information (6, 6) less what normals that are 2 degrees off would pretend, in axes scaled so that lengths and angles compare; and the
+    share of ``pull`` (n, 6) in what is left of it."""
     points, arms = float(np.trace(information[:3, :3])), float(np.trace(information[3:, 3:]))
     if points <= 0:
-        return np.zeros((6, 6))
+        return np.zeros((6, 6)), np.zeros_like(pull)
     scale = np.r_[1.0, 1.0, 1.0, np.full(3, max(np.sqrt(arms / points), 1e-6))]
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     kept = np.maximum(values - points * np.sin(NORMAL_NOISE) ** 2, 0.0)
-    return np.asarray((vectors * kept) @ vectors.T * np.outer(scale, scale))
+    share = np.divide(kept, values, out=np.zeros(6), where=values > 0)
+    return np.asarray((vectors * kept) @ vectors.T * np.outer(scale, scale)), pull / scale @ (vectors * share) @ vectors.T * scale
 
 
 def covariance_of(fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: float, road: float = 0.0) -> F64:
@@ -315,9 +317,10 @@ def covariance_of(fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: flo
     """
     noise = max(fit.rmse if np.isfinite(fit.rmse) else 1.0, 0.02) ** 2
     prior = np.diag([1 / (3.3 * voxel_size) ** 2] * 3 + [1 / np.radians(5.0) ** 2] * 3)
-    about_centre = np.linalg.inv(_beyond_noise(fit.information) / (INFLATION * noise) + prior)
-    pulled = SYSTEMATIC * about_centre @ fit.pull / (INFLATION * noise)
-    about_centre += np.outer(pulled, pulled)
+    information, pull = _beyond_noise(fit.information, fit.pull)
+    about_centre = np.linalg.inv(information / (INFLATION * noise) + prior)
+    pulled = SYSTEMATIC * pull / (INFLATION * noise) @ about_centre
+    about_centre += pulled.T @ pulled
     x, y, z = map_T_query[:3, 3] - fit.centre
     A = np.eye(6)
     A[:3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

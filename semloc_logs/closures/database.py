@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from semloc_logs.alignment.surface import Surface
-from semloc_logs.alignment.verify import Target, is_uncertain, points_surface
+from semloc_logs.alignment.verify import Target, is_uncertain, looked_at, points_surface
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.geometry import apply
 from semloc_logs.settings import Settings
@@ -167,9 +167,10 @@ class Database:
         return int(seen[np.argmin(np.linalg.norm(track - position, axis=1))])
 
     def looking_keyframe(self, group: int, position: F64) -> int:
-        """The keyframe of a submap, among those that the query may see, that looks at ``position`` (3,) in the map frame, on average."""
-        seen = self.keyframes(group)
-        views = self.sessions[self.places[group].session].views[seen]
+        """The keyframe of a submap, among those that the query may see, that looks at ``position`` (3,) in the map frame, on average; of a
+        sensor that looks all around the one that is there."""
+        seen, session = self.keyframes(group), self.sessions[self.places[group].session]
+        views = looked_at(session.map_T_base[seen, :3, 3], session.views[seen], self.settings.fusion.voxel_size)
         return int(seen[np.argmin(np.linalg.norm(views - position, axis=1))])
 
     def surface(self, group: int, keyframe: int) -> Surface:
@@ -177,16 +178,23 @@ class Database:
         place, seen = self.places[group], self.keyframes(group)
         session, query, v = self.sessions[place.session], self.settings.query, self.settings.fusion.voxel_size
         radius = query.radius or 24.0
-        stretch = session.distance[seen] // (UNIT * v)
-        together = seen[stretch == stretch[np.searchsorted(seen, keyframe)]]  # share one surface
+        stretch, topic = session.distance[seen] // (UNIT * v), session.topics[seen]
+        at = np.searchsorted(seen, keyframe)
+        together = seen[(stretch == stretch[at]) & (topic == topic[at])]  # share one surface
         middle = int(together[len(together) // 2])
 
         def make() -> Surface:
             away = np.linalg.norm(session.map_T_base[seen, :3, 3] - session.map_T_base[middle, :3, 3], axis=1)
-            # uncertain ranges are less so nearby: every second keyframe of a stretch that is twice as long
-            sigma = session.keyframe(middle).sigma
-            every = 2 if sigma is not None and is_uncertain(float(np.median(sigma)), v) else 1
-            chosen = np.sort(seen[np.argsort(away, kind="stable")[: every * SURFACE_KEYFRAMES]])[::every]
+            near = np.sort(np.argsort(away, kind="stable")[: 2 * SURFACE_KEYFRAMES])
+            sigma = read_keyframe(session.folder.keyframes, middle).near(session.origins[middle], 1.2 * radius).sigma
+            if sigma is not None and len(sigma) and is_uncertain(float(np.median(sigma)), v):
+                # uncertain ranges are less so nearby: of a stretch that is twice as long every second keyframe of each sensor
+                odd = np.zeros(len(near), bool)
+                for name in np.unique(topic[near]):
+                    odd[np.flatnonzero(topic[near] == name)[1::2]] = True
+                chosen = seen[near[~odd]]
+            else:
+                chosen = np.sort(seen[np.argsort(away, kind="stable")[:SURFACE_KEYFRAMES]])
             along = seen[away <= (query.length or 0.0) / 2]
             if len(along) > len(chosen):
                 count = math.ceil(SURFACE_KEYFRAMES * max(1.0, (query.length or 0.0) / radius))
@@ -195,7 +203,7 @@ class Database:
             for i in chosen.tolist():
                 frame = read_keyframe(session.folder.keyframes, i).near(session.origins[i], 1.2 * radius)
                 clouds.append(apply(session.map_T_base[i], frame.points))
-                spreads.append(frame.spread(session.origins[i]))
+                spreads.append(frame.spread(session.origins[i]) @ session.map_T_base[i][:3, :3].T)
             return points_surface(np.concatenate(clouds), np.concatenate(spreads), v)
 
         found: Surface = self._surfaces.get((group, middle, seen.tobytes()), make)

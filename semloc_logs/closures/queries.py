@@ -61,8 +61,13 @@ class SessionMap:
         return np.stack([self.frames[f"origin_{c}"].to_numpy() for c in "xyz"], 1).astype(float)
 
     @cached_property
+    def topics(self) -> NDArray[np.object_]:
+        """The stream (n,) of each keyframe's points."""
+        return np.array(self.frames["topic"].to_pylist(), object)
+
+    @cached_property
     def views(self) -> F64:
-        """Where each keyframe looks, on average (n, 3), metres in the map frame: before a camera, about a LIDAR.
+        """The mean of what each keyframe sees nearby (n, 3), metres in the map frame.
 
         WorkspaceError when the session was fused before this was written down.
         """

@@ -37,6 +37,8 @@ from semloc_logs.voxels.selection import road_distance, submap_ranges
 from semloc_logs.voxels.store import Keyframe, blocks_path, keep_keyframes, pose_columns, write_blocks, write_voxels
 from semloc_logs.workspace import SessionFolder
 
+VIEW = 24.0  # m at voxels of 0.30 m: as far as a query looks
+
 F64 = NDArray[np.float64]
 
 
@@ -189,7 +191,7 @@ class _Fused:
             label = self.labeller.labels(i, level_points, origin, ids, scale, surface)
             keep = label != SKY
             self.counts.append(int(keep.sum()))
-            self.views.append(points[keep].mean(0, dtype=float) if keep.any() else self.collected.origins[i].astype(float))
+            self.views.append(_view(points[keep], self.collected.origins[i], VIEW * scale))
             if (i + 1) % 50 == 0 or i + 1 == len(self.poses):
                 self.on_progress(f"labelled {i + 1} of {len(self.poses)} keyframes")
             yield Keyframe(points[keep], label[keep], None if sigma is None else sigma[keep])
@@ -203,6 +205,12 @@ class _Fused:
             self.submaps.append({"id": i, "first": first, "last": last - 1, "ground_z": ground, "blocks": len(blocks.keys)})
             self.on_progress(f"fused submap {i + 1} of {len(ranges)}")
             yield blocks
+
+
+def _view(points: NDArray[np.floating], origin: NDArray[np.floating], radius: float) -> F64:
+    """Mean (3,) of the points within ``radius`` metres of the sensor, its centre where there are none."""
+    near = points[np.linalg.norm(points - origin, axis=1) < radius]
+    return np.asarray(near.mean(0, dtype=float) if len(near) else origin, float)
 
 
 def fuse_ranges(

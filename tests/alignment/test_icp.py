@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.icp import Fit, Step, _add_point, align
-from semloc_logs.alignment.surface import surface_of
+from semloc_logs.alignment.surface import flattened_surface, surface_of
 from semloc_logs.alignment.verify import Query, fine_fit, points_surface
 from semloc_logs.closures.closing import SYSTEMATIC, covariance_of
 from semloc_logs.geometry import apply, exp_se3, inverse, rotation_angle, yaw_transform
@@ -246,14 +246,39 @@ def test_a_start_holds_where_little_says_otherwise() -> None:
 
 
 def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
-    """A wall ahead seen with ranges known to 0.1 m: its points average out, what they share does not."""
+    """A wall ahead seen with ranges known to 0.1 m: its points average out, what they share does not. Whose ranges they are is all one."""
     grid = np.stack(np.meshgrid(5.0, np.arange(-4, 4, 0.1), np.arange(0, 4, 0.1)), -1).reshape(-1, 3)
-    query = grid[::3]
-    spread = np.tile([0.1, 0.0, 0.0], (len(query), 1))
-    certain, uncertain = (align(query, surface_of(grid, CELL), np.eye(4), STEPS, known) for known in (None, spread))
+    query, along = grid[::3], np.array([0.1, 0.0, 0.0])
+    certain = align(query, surface_of(grid, CELL), np.eye(4), STEPS)
     assert not certain.pull.any()
-    more = covariance_of(uncertain, np.eye(4), np.eye(4), 0.3)[0, 0] - covariance_of(certain, np.eye(4), np.eye(4), 0.3)[0, 0]
-    assert np.sqrt(more) == pytest.approx(SYSTEMATIC * 0.1, rel=0.1)
+    least = covariance_of(certain, np.eye(4), np.eye(4), 0.3)[0, 0]
+    mapped = flattened_surface(grid, np.tile(along, (len(grid), 1)), np.arange(len(grid)), CELL, 0.05)
+    for found in (
+        align(query, surface_of(grid, CELL), np.eye(4), STEPS, np.tile(along, (len(query), 1))),
+        align(query, mapped, np.eye(4), STEPS),
+    ):
+        more = covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] - least
+        assert np.sqrt(more) == pytest.approx(SYSTEMATIC * 0.1, rel=0.1)
+
+
+def test_ranges_pull_no_farther_than_points_hold() -> None:
+    """A corridor whose normals are noisy: what they pretend to know along it is taken off, and what would pull at that with it."""
+    rng = np.random.default_rng(5)
+    points = room(rng, 700, corridor=True)
+    far = 0.1 * points / np.linalg.norm(points, axis=1)[:, None]
+    found = align(points, surface_of(room(rng, 1500, corridor=True), CELL), np.eye(4), STEPS, far)
+    assert covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] < 2 * (3.3 * 0.3) ** 2
+
+
+def test_a_fit_that_meets_too_little_knows_nothing() -> None:
+    """The first radius reaches the walls, the last one does not: nothing is left of what the first one knew."""
+    rng = np.random.default_rng(6)
+    points = room(rng, 700, noise=0.0)
+    off = points + np.array([0.17, 0.17, 0.17]) * rng.choice([-1, 1], (len(points), 1))
+    found = align(off, surface_of(room(rng, 1500, noise=0.0), CELL), np.eye(4), (Step(0.4, 1), Step(0.001, 1)))
+    assert (found.inliers, found.rmse) == (0.0, float("inf"))
+    assert not found.information.any()
+    assert not found.pull.any()
 
 
 def test_what_was_seen_farther_along_the_road_is_less_certain_by_the_drift_between() -> None:

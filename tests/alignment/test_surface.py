@@ -51,9 +51,10 @@ def test_flattened_points_lie_on_the_plane_of_a_slow_weighted_fit(seed: int) -> 
     """A slanted wall seen in a slab: every kept point lies on the plane of the weighted points around it."""
     rng, radius, noise = np.random.default_rng(seed), 0.6, 0.05
     points = rng.uniform(-1, 1, (250, 3)) * [1.0, 1.0, 0.1] + 1e3
-    sigma, kept = rng.uniform(0.0, 0.3, len(points)), np.arange(0, 250, 7)
-    surface = flattened_surface(points, sigma, kept, radius, noise)
-    assert surface.sigma == np.median(sigma)
+    spread, kept = rng.uniform(-0.2, 0.2, points.shape), np.arange(0, 250, 7)
+    sigma = np.linalg.norm(spread, axis=1)
+    surface = flattened_surface(points, spread, kept, radius, noise)
+    assert surface.sigma == np.median(sigma[kept])
     expected = []
     for p in points[kept]:
         around = np.linalg.norm(points - p, axis=1) <= radius

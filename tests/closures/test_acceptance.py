@@ -164,3 +164,6 @@ def test_a_place_that_is_not_known_to_a_metre_is_no_closure() -> None:
     text = reason(GOOD, 0.682, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)
     assert text == "probability 0.682 below 0.99: where in this place is known to 0.80 m only"
     assert "0.80 m" not in reason(GOOD, 0.3, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)  # nor is it the place
+    nearly = reason(GOOD, 0.986, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.29, 0.994)
+    assert "known to 0.29 m" in nearly  # the place alone would do
+    assert "look like others" in reason(GOOD, 0.34, 0.99, Agreement(0.999, 12, agreeing=12.0, lookalike=0.9), 0.8, 0.68)
