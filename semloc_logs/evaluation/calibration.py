@@ -46,7 +46,6 @@ SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0
 TOGETHER_SIGNS, NEAR_SIGNS = (1, 1, 1, -1, 1, -1), (0, 1, 1, -1, 0, 0)  # of ``TOGETHER``
 COPIES, COPIES_COUNT = "repeating", 0.01  # how towns of copied blocks begin, and how much they count for an alignment by itself
 SURE = 0.99  # what would be accepted
-CAUTION = 0.25  # of the way from ordinary towns to cities of copies: from there on streets look like others
 EXTREMES = 0.05  # of a town's lookalikes count as outliers
 FEWEST = 0.002  # of the right alignments have less support than any that is accepted
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
@@ -198,8 +197,8 @@ def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Ca
     """The models of the agreement's ``columns`` (7, n), from the clear ones that have neighbours among ``rows`` (n,), beside ``alone``.
 
     Neighbours in the same copy of a block agree about any copy. So the models are those of streets that look like no others. How much
-    like others is too much: a quarter of the way from the right ones of the ordinary town that has the most of it to the wrong ones that
-    would be accepted of the city of copies that has the least, since a wrong one costs more than some right ones.
+    like others is too much: the geometric mean of the right ones of the ordinary town that has the most of it and the wrong ones that
+    would be accepted of the city of copies that has the least: as many times the one as the other is it.
     """
     rows = rows & judged.clear & (columns[1] > 0)
     ordinary = _agreement_model(judged, columns, rows & ~judged.copies, alone, 1.0)
@@ -207,7 +206,7 @@ def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Ca
     right, fooled = taken & judged.right & ~judged.copies, taken & ~judged.right & judged.copies
     most = [np.quantile(columns[6][right & (judged.town == town)], 1 - EXTREMES) for town in sorted(set(judged.town[right]))]
     least = [np.quantile(columns[6][fooled & (judged.town == town)], EXTREMES) for town in sorted(set(judged.town[fooled]))]
-    most_alike = float(max(most) + CAUTION * (min(least) - max(most))) if most and least else 1.0
+    most_alike = float(np.sqrt(max(most) * min(least))) if most and least else 1.0
     return _agreement_model(judged, columns, rows & (columns[6] <= most_alike), alone, most_alike)
 
 
