@@ -46,6 +46,7 @@ SIGNS = {"structure": 1, "coverage": 1, "contradiction": -1, "fit": 1, "rmse": 0
 TOGETHER_SIGNS, NEAR_SIGNS = (1, 1, 1, -1, 1, -1), (0, 1, 1, -1, 0, 0)  # of ``TOGETHER``
 COPIES, COPIES_COUNT = "repeating", 0.01  # how towns of copied blocks begin, and how much they count for an alignment by itself
 SURE = 0.99  # what would be accepted
+BY_CHANCE = 0.05  # how much streets look like others by chance, in however few towns it was not seen
 EXTREMES = 0.05  # of a town's lookalikes count as outliers
 FEWEST = 0.002  # of the right alignments have less support than any that is accepted
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
@@ -206,7 +207,7 @@ def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Ca
     right, fooled = taken & judged.right & ~judged.copies, taken & ~judged.right & judged.copies
     most = [np.quantile(columns[6][right & (judged.town == town)], 1 - EXTREMES) for town in sorted(set(judged.town[right]))]
     least = [np.quantile(columns[6][fooled & (judged.town == town)], EXTREMES) for town in sorted(set(judged.town[fooled]))]
-    most_alike = float(np.sqrt(max(most) * min(least))) if most and least else 1.0
+    most_alike = float(np.sqrt(max(*most, BY_CHANCE) * min(least))) if most and least else 1.0
     return _agreement_model(judged, columns, rows & (columns[6] <= most_alike), alone, most_alike)
 
 
