@@ -79,7 +79,7 @@ def align(
 def _align(
     query: F64, spread: F64, surface: Arrays, start: F64, steps: tuple[F64, I64, I64], noise: float, hold: float
 ) -> tuple[F64, F64, int, int, float, F64, F64]:
-    """The transform, the centre of the points, how many were used and how many met a surface, their squares and information."""
+    """The transform, the centre of the points, how many were used and how many met a surface, their squares, information and pull."""
     T, centre, count, used, squared = start, start[:3, 3].copy(), 0, 0, 0.0
     information, pull = np.zeros((6, 6)), np.zeros((2, 6))
     query_centre = np.zeros(3)

@@ -185,16 +185,17 @@ class Database:
 
         def make() -> Surface:
             away = np.linalg.norm(session.map_T_base[seen, :3, 3] - session.map_T_base[middle, :3, 3], axis=1)
-            near = np.sort(np.argsort(away, kind="stable")[: 2 * SURFACE_KEYFRAMES])
+            order = np.argsort(away, kind="stable")
             sigma = read_keyframe(session.folder.keyframes, middle).near(session.origins[middle], 1.2 * radius).sigma
             if sigma is not None and len(sigma) and is_uncertain(float(np.median(sigma)), v):
                 # uncertain ranges are less so nearby: of a stretch that is twice as long every second keyframe of each sensor
+                near = np.sort(order[: 2 * SURFACE_KEYFRAMES])
                 odd = np.zeros(len(near), bool)
                 for name in np.unique(topic[near]):
                     odd[np.flatnonzero(topic[near] == name)[1::2]] = True
                 chosen = seen[near[~odd]]
             else:
-                chosen = np.sort(seen[np.argsort(away, kind="stable")[:SURFACE_KEYFRAMES]])
+                chosen = np.sort(seen[order[:SURFACE_KEYFRAMES]])
             along = seen[away <= (query.length or 0.0) / 2]
             if len(along) > len(chosen):
                 count = math.ceil(SURFACE_KEYFRAMES * max(1.0, (query.length or 0.0) / radius))
