@@ -170,6 +170,7 @@ def _normal_equations(
             along = ray[n, 0] ** 2 + ray[n, 1] ** 2 + ray[n, 2] ** 2
         if len(spread):
             off_target = spread[i, 0] * J[0] + spread[i, 1] * J[1] + spread[i, 2] * J[2]
+        across += off_target * off_target
         certain = noise / (noise + across)
         squared += certain * r * r
         weight = planar[i] * certain / (1 + r * r / (kernel + across))

@@ -40,18 +40,19 @@ LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
 SYSTEMATIC = 1.0  # standard deviations that uncertain ranges of a query, and of a target, may all be off by
+COMMON = 0.5  # of the variance of that: what query and target have in common, and cancels where both look the same way
 DRIFT = 0.01  # of the way: the odometry of a target
 FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A candidate after a fit on the points; ``nearest`` is the target's keyframe nearest to it, ``looking`` the one that looks at what the
-    query sees."""
+    """A candidate after a fit on the points; ``nearest`` is the target's keyframe nearest to it, ``sees`` (3,) what the query looks at, in
+    the target's map."""
 
     candidate: Candidate
     nearest: int
-    looking: int
+    sees: F64
     fit: Fit
     scores: Scores
 
@@ -196,14 +197,14 @@ def _align(
     for c in candidates:
         near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
         fit = coarse_fit(c, database.target(c.group), query)
-        looking = database.looking_keyframe(c.group, apply(c.target_T_query, query.middle[None])[0])
-        fitted.append(Fitted(c, near, looking, fit, structure_scores(query, database.target(c.group), fit.target_T_query)))
+        sees = apply(c.target_T_query, query.middle[None])[0]
+        fitted.append(Fitted(c, near, sees, fit, structure_scores(query, database.target(c.group), fit.target_T_query)))
     best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
     fine: list[Fitted] = []
     for f in best:
         target = database.target(f.candidate.group)
         if f.scores.rank >= max(CLOSE * max((o.scores.rank for o in fine), default=0.0), HOPELESS):
-            fit = fine_fit(f.fit.target_T_query, database.surface(f.candidate.group, f.looking), query)
+            fit = fine_fit(f.fit.target_T_query, database.surface(f.candidate.group, f.sees), query)
             fine.append(replace(f, fit=fit, scores=structure_scores(query, target, fit.target_T_query)))
         else:  # reading keyframes takes longer than fitting them: not for what cannot be accepted
             fine.append(replace(f, fit=measured(f.fit.target_T_query, target.surface, query)))
@@ -266,7 +267,8 @@ def _judge(
     map_T_query_base = T @ query_T_base
     nearest = database.nearest_keyframe(candidate.group, map_T_query_base[:3, 3])
     map_T_target = target_session.map_T_base[nearest]
-    road = abs(float(target_session.distance[nearest] - target_session.distance[fitted.looking]))
+    looking = database.looking_keyframe(candidate.group, fitted.sees)
+    road = abs(float(target_session.distance[nearest] - target_session.distance[looking]))
     return Alignment(
         query_session=session.folder.name,
         target_session=place.session,
@@ -319,7 +321,9 @@ def covariance_of(fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: flo
     prior = np.diag([1 / (3.3 * voxel_size) ** 2] * 3 + [1 / np.radians(5.0) ** 2] * 3)
     information, pull = _beyond_noise(fit.information, fit.pull)
     about_centre = np.linalg.inv(information / (INFLATION * noise) + prior)
-    pulled = SYSTEMATIC * pull / (INFLATION * noise) @ about_centre
+    of_query, of_target = SYSTEMATIC * pull / (INFLATION * noise) @ about_centre
+    alone, common = np.sqrt(1 - COMMON), np.sqrt(COMMON)
+    pulled = np.stack([alone * of_query, alone * of_target, common * (of_query - of_target)])
     about_centre += pulled.T @ pulled
     x, y, z = map_T_query[:3, 3] - fit.centre
     A = np.eye(6)

@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 from semloc_logs.alignment.surface import Surface
 from semloc_logs.alignment.verify import Target, is_uncertain, looked_at, points_surface
 from semloc_logs.closures.queries import SessionMap
-from semloc_logs.geometry import apply
+from semloc_logs.geometry import apply, inverse
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import Fuser
-from semloc_logs.voxels.store import blocks_path, read_blocks, read_keyframe
+from semloc_logs.voxels.store import Keyframe, blocks_path, read_blocks, read_keyframe
 from semloc_logs.words.catalogue import read_words, segments
 from semloc_logs.words.index import Allowed, Index, Part
 from semloc_logs.words.vocabulary import load_vocabulary
@@ -114,6 +114,20 @@ class Database:
         submap = self.sessions[self.places[group].session].submaps[self.places[group].submap]
         return np.arange(submap["first"], submap["last"] + 1)
 
+    def _beside(self, group: int) -> I64:
+        """The keyframes of a submap, and of the road a query's length before and behind it, that the query may see, ascending."""
+        ids, session = self._submap_ids(group), self.sessions[self.places[group].session]
+        if session.posed:
+            first, last = session.distance[ids[[0, -1]]] + np.array([-1.0, 1.0]) * self._reach
+            ids = np.arange(*np.searchsorted(session.distance, [first, np.nextafter(last, np.inf)]))
+        hidden = self._hidden.get(self.places[group].session)
+        return ids if hidden is None else ids[~hidden[ids]]
+
+    @property
+    def _reach(self) -> float:
+        """How far from its origin a query may see, metres, and a fifth more."""
+        return 1.2 * (self.settings.query.radius or 24.0)
+
     def allowed(self, variant: str, groups: NDArray[np.bool_]) -> Allowed:
         """Which words of submaps ``groups`` (g,) may answer: in squares near keyframes that the query may see, not near hidden ones."""
         rows: dict[int, NDArray[np.bool_]] = {}
@@ -161,39 +175,53 @@ class Database:
         return found
 
     def nearest_keyframe(self, group: int, position: F64) -> int:
-        """The keyframe of a submap, among those that the query may see, that is nearest to ``position`` (3,) in the map frame."""
-        seen = self.keyframes(group)
+        """The keyframe of a submap or beside it, of those that the query may see, that is nearest to ``position`` (3,) in the map frame."""
+        seen = self._beside(group)
         track = self.sessions[self.places[group].session].map_T_base[seen, :3, 3]
         return int(seen[np.argmin(np.linalg.norm(track - position, axis=1))])
 
     def looking_keyframe(self, group: int, position: F64) -> int:
-        """The keyframe of a submap, among those that the query may see, that looks at ``position`` (3,) in the map frame, on average; of a
-        sensor that looks all around the one that is there."""
-        seen, session = self.keyframes(group), self.sessions[self.places[group].session]
-        views = looked_at(session.map_T_base[seen, :3, 3], session.views[seen], self.settings.fusion.voxel_size)
+        """The keyframe of a submap or beside it, of those that the query may see, that looks at ``position`` (3,) in the map frame, on
+        average; of a sensor that looks all around the one that is there."""
+        seen = self._beside(group)
+        views = self._views(group, seen)
         return int(seen[np.argmin(np.linalg.norm(views - position, axis=1))])
 
-    def surface(self, group: int, keyframe: int) -> Surface:
-        """What the submap's keyframes around ``keyframe`` saw, as far along as a query is long, in the map frame, to align with."""
-        place, seen = self.places[group], self.keyframes(group)
+    def _views(self, group: int, keyframes: I64) -> F64:
+        """What keyframes (n,) of a submap's session look at (n, 3), metres in the map frame."""
+        session = self.sessions[self.places[group].session]
+        return looked_at(session.map_T_base[keyframes, :3, 3], session.views[keyframes], self.settings.fusion.voxel_size)
+
+    def surface(self, group: int, position: F64) -> Surface:
+        """What a submap's keyframes, and those beside it, saw around ``position`` (3,) in the map frame: of the one that looks there, and
+        of those about it, as far along as a query is long. In the map frame, to align with."""
+        place, seen, keyframe = self.places[group], self._beside(group), self.looking_keyframe(group, position)
         session, query, v = self.sessions[place.session], self.settings.query, self.settings.fusion.voxel_size
         radius = query.radius or 24.0
         stretch, topic = session.distance[seen] // (UNIT * v), session.topics[seen]
         at = np.searchsorted(seen, keyframe)
         together = seen[(stretch == stretch[at]) & (topic == topic[at])]  # share one surface
         middle = int(together[len(together) // 2])
+        beyond = None
+        if np.linalg.norm(position - self._views(group, together[[len(together) // 2]])[0]) > radius / 2:
+            # where no keyframe came, what they saw from afar: queries that lie in one cell share it
+            beyond = (np.floor(position / (UNIT * v)) + 0.5) * UNIT * v
+
+        def near(i: int) -> tuple[Keyframe, F64]:
+            frame, at = read_keyframe(session.folder.keyframes, i), session.origins[i]
+            return (frame.near(at if beyond is None else apply(inverse(session.map_T_base[i]), beyond[None])[0], self._reach)), at
 
         def make() -> Surface:
             away = np.linalg.norm(session.map_T_base[seen, :3, 3] - session.map_T_base[middle, :3, 3], axis=1)
             order = np.argsort(away, kind="stable")
-            sigma = read_keyframe(session.folder.keyframes, middle).near(session.origins[middle], 1.2 * radius).sigma
+            sigma = near(middle)[0].sigma
             if sigma is not None and len(sigma) and is_uncertain(float(np.median(sigma)), v):
                 # uncertain ranges are less so nearby: of a stretch that is twice as long every second keyframe of each sensor
-                near = np.sort(order[: 2 * SURFACE_KEYFRAMES])
-                odd = np.zeros(len(near), bool)
-                for name in np.unique(topic[near]):
-                    odd[np.flatnonzero(topic[near] == name)[1::2]] = True
-                chosen = seen[near[~odd]]
+                some = np.sort(order[: 2 * SURFACE_KEYFRAMES])
+                odd = np.zeros(len(some), bool)
+                for name in np.unique(topic[some]):
+                    odd[np.flatnonzero(topic[some] == name)[1::2]] = True
+                chosen = seen[some[~odd]]
             else:
                 chosen = np.sort(seen[order[:SURFACE_KEYFRAMES]])
             along = seen[away <= (query.length or 0.0) / 2]
@@ -202,12 +230,13 @@ class Database:
                 chosen = along[np.unique(np.linspace(0, len(along) - 1, count).astype(int))]
             clouds, spreads = [], []
             for i in chosen.tolist():
-                frame = read_keyframe(session.folder.keyframes, i).near(session.origins[i], 1.2 * radius)
+                frame, origin = near(i)
                 clouds.append(apply(session.map_T_base[i], frame.points))
-                spreads.append(frame.spread(session.origins[i]) @ session.map_T_base[i][:3, :3].T)
+                spreads.append(frame.spread(origin) @ session.map_T_base[i][:3, :3].T)
             return points_surface(np.concatenate(clouds), np.concatenate(spreads), v)
 
-        found: Surface = self._surfaces.get((group, middle, seen.tobytes()), make)
+        where = None if beyond is None else beyond.tobytes()
+        found: Surface = self._surfaces.get((group, middle, where, seen.tobytes()), make)
         return found
 
 
