@@ -268,6 +268,21 @@ def coarse_fit(candidate: Candidate, target: Target, query: Query) -> Fit:
     return _fit(candidate.target_T_query, target.surface, query, tuple(Step(r * v, 4, stride) for r in COARSE_RADII))
 
 
+def escaped(fit: Fit, candidate: Candidate, target: Target, query: Query, headings: int) -> Fit:
+    """The coarse ``fit`` of a candidate, or that of another start within four voxels of it that more of the query's voxels agree with.
+
+    Planes that few points meet hold a fit where it began; voxels of all structure tell more.
+    """
+    T, turn = fit.target_T_query, np.pi / headings
+    pose = np.array([np.arctan2(T[1, 0], T[0, 0]), *T[:3, 3]])
+    _, better = search(target.level, query.evidence, pose, turn * np.linspace(-0.6, 0.6, 5), 2)
+    if np.abs(better[1:] - pose[1:]).max() < query.voxel_size:
+        return fit
+    other = coarse_fit(replace(candidate, target_T_query=pose_matrix(better)), target, query)
+    ranks = [structure_scores(query, target, f.target_T_query).rank for f in (fit, other)]
+    return fit if ranks[0] >= ranks[1] else other
+
+
 def fine_fit(start: F64, surface: Surface, query: Query) -> Fit:
     """Align to centimetres with a bounded number of the points; the ``surface`` has a point every 0.4 voxels.
 

@@ -18,6 +18,7 @@ from semloc_logs.alignment.verify import (
     Query,
     Scores,
     coarse_fit,
+    escaped,
     fine_fit,
     measured,
     same_place,
@@ -194,9 +195,10 @@ def _align(
     """Candidates of one target session, aligned on the points, compared with each other, judged."""
     v = database.settings.fusion.voxel_size
     fitted: list[Fitted] = []
+    headings = database.settings.descriptor.headings
     for c in candidates:
         near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
-        fit = coarse_fit(c, database.target(c.group), query)
+        fit = escaped(coarse_fit(c, database.target(c.group), query), c, database.target(c.group), query, headings)
         sees = apply(c.target_T_query, query.middle[None])[0]
         fitted.append(Fitted(c, near, sees, fit, structure_scores(query, database.target(c.group), fit.target_T_query)))
     best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
