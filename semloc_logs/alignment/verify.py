@@ -40,7 +40,6 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 FIRST_VOXELS, SECOND_VOXELS = 200, 1200  # of a query that are looked up in a search
 FIRST_KEPT = 16  # hypotheses after the first search
-PROMISING = 0.6  # of the best score of a search: what scores less was never the best place
 MOST_POINTS = 6000  # of a query that are fitted
 SOME_POINTS = 1000  # of them coarsely
 RIVAL_STRIDE = 3  # of the points that a rival is measured by, which stand for all
@@ -165,8 +164,7 @@ def search_hypotheses(
             moved.append((h, better, score))
         moved.sort(key=lambda m: (-m[2], m[0].group, tuple(m[1])))
         found = _apart(moved, 3.3 * v if step == 1 else 2 * v, keep)
-    promising = PROMISING * max((score for _, _, score in found), default=0.0)
-    return [Candidate(h.group, pose_matrix(pose), score, h.votes) for h, pose, score in found if score >= promising]
+    return [Candidate(h.group, pose_matrix(pose), score, h.votes) for h, pose, score in found]
 
 
 Found = tuple[Hypothesis, F64, float]

@@ -29,7 +29,7 @@ from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
-KEPT_TARGETS, KEPT_SURFACES, KEPT_SQUARES = 16, 24, 48  # in memory at once
+KEPT_TARGETS, KEPT_SURFACES, KEPT_SQUARES, KEPT_KEYFRAMES = 16, 24, 48, 64  # in memory at once
 SURFACE_KEYFRAMES = 9  # for each query radius of a query's length
 UNIT = 16  # voxels: words of a submap are left out by squares, keyframes by stretches of this length
 AMBIGUOUS = 32  # voxels that a word may lie nearer to keyframes that are left out than to others: lanes lie apart, and odometry drifts
@@ -72,7 +72,7 @@ class Database:
         self._hidden: dict[str, NDArray[np.bool_]] = {}
         self._asking = np.zeros(3)
         self._targets, self._surfaces = _Recent(KEPT_TARGETS), _Recent(KEPT_SURFACES)
-        self._squares = _Recent(KEPT_SQUARES)
+        self._squares, self._keyframes = _Recent(KEPT_SQUARES), _Recent(KEPT_KEYFRAMES)
 
     def words(self, variant: str) -> Index:
         """All words of ``variant``; groups of its matches are numbers of :attr:`places`."""
@@ -208,8 +208,10 @@ class Database:
             beyond = (np.floor(position / (UNIT * v)) + 0.5) * UNIT * v
 
         def near(i: int) -> tuple[Keyframe, F64]:
-            frame, at = read_keyframe(session.folder.keyframes, i), session.origins[i]
-            return (frame.near(at if beyond is None else apply(inverse(session.map_T_base[i]), beyond[None])[0], self._reach)), at
+            # surfaces of neighbouring stretches share most of their keyframes
+            frame: Keyframe = self._keyframes.get((place.session, i), lambda: read_keyframe(session.folder.keyframes, i))
+            centre = session.origins[i] if beyond is None else apply(inverse(session.map_T_base[i]), beyond[None])[0]
+            return frame.near(centre, self._reach), session.origins[i]
 
         def make() -> Surface:
             away = np.linalg.norm(session.map_T_base[seen, :3, 3] - session.map_T_base[middle, :3, 3], axis=1)
