@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.icp import Fit, Step, _add_point, align
 from semloc_logs.alignment.surface import flattened_surface, surface_of
 from semloc_logs.alignment.verify import Query, fine_fit, points_surface
-from semloc_logs.closures.closing import SYSTEMATIC, covariance_of
+from semloc_logs.closures.closing import COMMON, SYSTEMATIC, covariance_of
 from semloc_logs.geometry import apply, exp_se3, inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import Fuser
@@ -259,6 +259,30 @@ def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
     ):
         more = covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] - least
         assert np.sqrt(more) == pytest.approx(SYSTEMATIC * 0.1, rel=0.1)
+
+
+def test_what_ranges_of_both_sides_have_in_common_counts_where_they_look_from_opposite_sides() -> None:
+    """The same wall, seen by both with ranges known to 0.1 m: half of the variance is their own, half is common and cancels or adds."""
+    grid = np.stack(np.meshgrid(5.0, np.arange(-4, 4, 0.1), np.arange(0, 4, 0.1)), -1).reshape(-1, 3)
+    query, along = grid[::3], np.array([0.1, 0.0, 0.0])
+    mapped = flattened_surface(grid, np.tile(along, (len(grid), 1)), np.arange(len(grid)), CELL, 0.05)
+    same, opposite = (
+        np.sqrt(covariance_of(align(query, mapped, np.eye(4), STEPS, np.tile(ray, (len(query), 1))), np.eye(4), np.eye(4), 0.3)[0, 0])
+        for ray in (along, -along)
+    )
+    assert same == pytest.approx(SYSTEMATIC * 0.1 * np.sqrt(2 * (1 - COMMON)), rel=0.1)
+    assert opposite == pytest.approx(SYSTEMATIC * 0.1 * np.sqrt(2 * (1 - COMMON) + 4 * COMMON), rel=0.1)
+
+
+def test_an_uncertain_wall_of_the_target_weighs_less_than_a_certain_one() -> None:
+    """Two walls face the query, of which the map has the second 0.1 m too far and knows it to 0.2 m; noise 0.1 m: weights 1 and 1 / 5."""
+    side = np.stack(np.meshgrid(0.0, np.arange(-2, 2, 0.1), np.arange(0, 2, 0.1)), -1).reshape(-1, 3)
+    walls = np.r_[side, side + np.array([10.0, 0.0, 0.0])]
+    spread = np.r_[np.zeros_like(side), np.tile([0.2, 0.0, 0.0], (len(side), 1))]
+    mapped = walls + np.r_[np.zeros_like(side), np.tile([0.1, 0.0, 0.0], (len(side), 1))]
+    surface = flattened_surface(mapped, spread, np.arange(len(mapped)), CELL, 0.1)
+    found = align(walls[::3], surface, np.eye(4), (Step(100.0, 15),), noise=0.1)
+    assert found.target_T_query[0, 3] == pytest.approx(0.1 * 0.2 / 1.2, rel=0.05)
 
 
 def test_ranges_pull_no_farther_than_points_hold() -> None:

@@ -29,8 +29,12 @@ def drive_session(
     submaps: list[tuple[int, int]],
     words: list[NDArray[np.float64]],
     seconds: float = 1.0,
+    saw: tuple[tuple[float, float], ...] = ((0.0, 5.0),),
 ) -> SessionMap:
-    """A session along ``road`` (n, 2), a keyframe every ``seconds``, with words at ``words`` (m, 3) of each submap of keyframes."""
+    """A session along ``road`` (n, 2), a keyframe every ``seconds``, with words at ``words`` (m, 3) of each submap of keyframes.
+
+    Each keyframe ``saw`` points ahead and to its left, metres, at the height of its number in decimetres.
+    """
     folder, n = work.session(name), len(road)
     folder.keyframes.mkdir(parents=True)
     folder.words.mkdir()
@@ -49,8 +53,7 @@ def drive_session(
         **pose_columns(poses),
     }
     write_table(folder.frames, contracts.table("frames", columns), {})
-    # each keyframe saw one point, 5 m to its left at the height of its number in decimetres
-    clouds = [Keyframe(np.array([[0.0, 5.0, 0.1 * i]], np.float32), np.full(1, 2, np.uint8)) for i in range(n)]
+    clouds = [Keyframe(np.array([[*p, 0.1 * i] for p in saw], np.float32), np.full(len(saw), 2, np.uint8)) for i in range(n)]
     list(keep_keyframes(folder.keyframes, range(n), clouds, {}))
     for i, centre in enumerate(words):
         rows = {
@@ -115,6 +118,26 @@ def test_of_two_passes_the_one_that_looks_at_a_place_is_found(out_and_back: tupl
     found = database.looking_keyframe(0, at + VIEW)
     np.testing.assert_allclose(session.map_T_base[found, :3, 3], at)
     assert database.looking_keyframe(0, at + VIEW) != database.nearest_keyframe(0, at + VIEW)
+
+
+def test_the_keyframe_nearest_to_a_place_may_lie_in_the_next_submap_but_is_never_hidden(tmp_path: Path) -> None:
+    road, none = np.stack([np.arange(60) * 4.0, np.zeros(60)], 1), np.zeros((0, 3))
+    session = drive_session(Workspace(tmp_path), "a", road, [(0, 30), (30, 60)], [none, none])
+    database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
+    assert database.nearest_keyframe(0, np.array([128.0, 0.0, 0.0])) == 32
+    assert database.nearest_keyframe(1, np.array([108.0, 0.0, 0.0])) == 27
+    assert database.nearest_keyframe(0, np.array([200.0, 0.0, 0.0])) == 36  # 28.8 m of road beyond the last one
+    view = database.asked_by(session, 59)  # hides 30 to 59 and what shares a stretch of 4.8 m with them
+    assert 28 <= view.nearest_keyframe(0, np.array([128.0, 0.0, 0.0])) < 30
+
+
+def test_beyond_the_end_of_a_drive_a_surface_has_what_was_seen_from_afar(tmp_path: Path) -> None:
+    road = np.stack([np.arange(10) * 4.0, np.zeros(10)], 1)
+    drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [np.zeros((0, 3))], saw=((0.0, 5.0), (45.0, 5.0)))
+    database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
+    at_the_end, beyond = (database.surface(0, np.array([x, 0.0, 0.0])).points[:, 0].max() for x in (36.0, 70.0))
+    assert at_the_end == 36.0  # of each keyframe what lies within 28.8 m of it
+    assert beyond == 36.0 + 45.0
 
 
 def test_what_looks_all_around_looks_where_it_is() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.overlap import pose_matrix, tau, yaw_between
 from semloc_logs.alignment.surface import surface_of
-from semloc_logs.alignment.verify import FINE_RADII, coarse_fit, fine_fit, same_place, search_hypotheses, structure_scores
+from semloc_logs.alignment.verify import FINE_RADII, coarse_fit, escaped, fine_fit, same_place, search_hypotheses, structure_scores
 from semloc_logs.evaluation.verification_speed import TRUTH, Scene, scene
 from semloc_logs.geometry import inverse
 from semloc_logs.settings import Settings
@@ -54,6 +56,19 @@ def test_the_search_ranks_first_what_the_paper_ranks_first(made: Scene) -> None:
     assert int(np.argmax(by_paper)) == 0
     assert same_place(candidates[0].target_T_query, pose_matrix(TRUTH), v)
     assert candidates[0].score > 1.3 * candidates[1].score
+
+
+def test_a_fit_escapes_to_where_more_voxels_agree(made: Scene) -> None:
+    """Started 1 m and more off, past what a coarse fit finds its way back from; the fit of the truth stays as it is."""
+    v = made.target.voxel_size
+    best = search_hypotheses(made.hypotheses, {0: made.target}, made.query, 18, 6)[0]
+    right = replace(best, target_T_query=pose_matrix(TRUTH))
+    settled = coarse_fit(right, made.target, made.query)
+    assert escaped(settled, right, made.target, made.query, 18) is settled
+    off = replace(best, target_T_query=pose_matrix(TRUTH + np.array([0.0, 1.1, 1.1, 0.0])))
+    stuck = coarse_fit(off, made.target, made.query)
+    assert not same_place(stuck.target_T_query, pose_matrix(TRUTH), v / 2)
+    assert same_place(escaped(stuck, off, made.target, made.query, 18).target_T_query, pose_matrix(TRUTH), v / 2)
 
 
 def test_the_transform_put_in_comes_back(made: Scene) -> None:
