@@ -17,7 +17,7 @@ import semloc_logs
 from semloc_logs.errors import SettingsError
 from semloc_logs.evaluation.held_out import simulation_version
 from semloc_logs.evaluation.localisation import UNITS, Answer, figures_of, read_world
-from semloc_logs.evaluation.localisation_ours import OURS, OurSystem, OurTask, link_workspace, settings_of, write_random
+from semloc_logs.evaluation.localisation_ours import OURS, WHOLE, OurSystem, OurTask, link_workspace, settings_of, write_random
 from semloc_logs.evaluation.localisation_peers import PEERS, PeerSystem, PeerTask
 from semloc_logs.evaluation.localisation_worlds import CONDITIONS, DATABASE, SENSORS, UNSEEN, WorldDrive, simulate_drive_log, world_drives
 from semloc_logs.evaluation.peers import runner
@@ -171,17 +171,24 @@ class Localisation:
     def _speed(self, units: Sequence[Unit]) -> Figures:
         """Queries a second of ours with all cores at work, and where the time of a query goes."""
         figures: Figures = {}
+
+        def say(name: str, unit: str, system: str, value: float) -> None:
+            figures.setdefault(name, {"unit": unit})[system] = value
+
+        jobs = self.engine.jobs
         for sensor in SENSORS:
             for system in OURS[:2]:
                 mine = [u for u in units if u.task.system == system and u.task.drive.sensor == sensor and u.task.drive.condition != UNSEEN]
                 seconds = [a.seconds for u in mine for a in read_unit(u)]
                 if not seconds:
                     continue
-                row = figures.setdefault(f"{sensor}: whole queries a second", {"unit": f"with {self.engine.jobs} processes"})
-                row[system.name] = self.engine.jobs * len(seconds) / sum(seconds)
-                for part, taken in next(iter(self.engine.map(profile_unit, mine[:1]))).items():
-                    row = figures.setdefault(f"{sensor}: {part}", {"unit": "s a query, under the profiler"})
-                    row[system.name] = taken
+                said = list(self.engine.map(profile_unit, mine[:1] * jobs))  # all at once
+                apart, along = len(seconds) / sum(seconds), jobs / sum(parts[WHOLE] for parts in said)
+                say(f"{sensor}: queries far apart a second", f"with {jobs} processes", system.name, jobs * apart)
+                say(f"{sensor}: queries along the road a second", f"with {jobs} processes", system.name, jobs * along)
+                for part in (p for p in said[0] if p != WHOLE):
+                    taken = sum(parts[part] for parts in said) / jobs
+                    say(f"{sensor}: {part}", "s a query along the road, under the profiler", system.name, taken)
         return figures
 
 

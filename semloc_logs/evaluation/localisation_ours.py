@@ -23,7 +23,7 @@ from semloc_logs.alignment.verify import Query
 from semloc_logs.closures import closing
 from semloc_logs.closures.agreement import decide
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.queries import SessionMap, query_keyframes
 from semloc_logs.evaluation.localisation import Answer, World, read_world
 from semloc_logs.evaluation.localisation_worlds import DATABASE, WorldDrive
 from semloc_logs.settings import STREET_VOXEL, Settings
@@ -35,7 +35,8 @@ from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import Workspace
 
 STEP = 4.0  # m between hypotheses of the grid along the road, and across it
-PROFILED = 5  # queries
+PROFILED = 30  # queries, one after the other along the road
+WHOLE = "whole query"
 PARTS = {  # of a query, by the functions that do them
     "fuse": ("queries.py build_query",),
     "describe": ("describe.py describe_map", "cut.py turn"),
@@ -90,15 +91,20 @@ class OurTask:
         return [self._answer(world, k, seconds, found, k in accepted) for k, (seconds, found) in zip(self.keyframes, asked, strict=True)]
 
     def profile(self) -> dict[str, float]:
-        """Seconds a query of the parts of some queries, under the profiler."""
+        """Seconds of a query when they come one after the other, as `semloc close` asks, and of its parts, under the profiler."""
         world = read_world(self.work, self.drive)
         database = Database(world.work, (DATABASE,), self.settings)
-        asked = self.keyframes[:PROFILED]
+        every = query_keyframes(world.query, self.settings)
+        asked = every[max(0, (len(every) - PROFILED) // 2) :][:PROFILED]
         closing.close_query(database, world.query, asked[0])
+        begin = time.perf_counter()
+        for keyframe in asked:
+            closing.close_query(database, world.query, keyframe)
+        whole = (time.perf_counter() - begin) / len(asked)
         profiler = cProfile.Profile()
         for keyframe in asked:
             profiler.runcall(closing.close_query, database, world.query, keyframe)
-        return {part: seconds / len(asked) for part, seconds in _parts(profiler).items()}
+        return {WHOLE: whole} | {part: seconds / len(asked) for part, seconds in _parts(profiler).items()}
 
     def _hypotheses(self) -> Any:
         if self.system.hypotheses == "words":
