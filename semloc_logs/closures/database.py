@@ -29,7 +29,7 @@ from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
-KEPT_TARGETS, KEPT_SURFACES, KEPT_SQUARES, KEPT_KEYFRAMES = 16, 24, 48, 64  # in memory at once
+KEPT_TARGETS, KEPT_SURFACES, KEPT_SQUARES, KEPT_KEYFRAMES = 16, 24, 48, 32  # in memory at once
 SURFACE_KEYFRAMES = 9  # for each query radius of a query's length
 UNIT = 16  # voxels: words of a submap are left out by squares, keyframes by stretches of this length
 AMBIGUOUS = 32  # voxels that a word may lie nearer to keyframes that are left out than to others: lanes lie apart, and odometry drifts
