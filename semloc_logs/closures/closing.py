@@ -36,8 +36,7 @@ from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
-ALIGNED = 4  # candidates of a target session that are fitted on the points
-PROMISING = 0.6  # of a target session's best search: what scores less is not fitted, since it was never the best place
+ALIGNED = 4  # candidates of a target session that are fitted on the points: also hopeless ones tell which streets look like others
 LEAST_HYPOTHESES = 16  # for a target session, however many there are
 NORMAL_NOISE = np.radians(2.0)
 INFLATION = 12.0  # of the covariance: neighbouring points share their errors
@@ -181,13 +180,12 @@ def find_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
 
 
 def verify_hypotheses(database: Database, query: Query, hypotheses: list[Hypothesis]) -> list[Candidate]:
-    """The promising candidates of each target session after the search over their voxels, best first."""
+    """The best candidates of each target session after the search over their voxels, best first."""
     out: list[Candidate] = []
     for name in database.sessions:
         mine = [h for h in hypotheses if database.places[h.group].session == name]
         targets = {h.group: database.target(h.group) for h in mine}
-        found = search_hypotheses(mine, targets, query, database.settings.descriptor.headings, ALIGNED)
-        out += [c for c in found if c is found[0] or c.score >= PROMISING * found[0].score]
+        out += search_hypotheses(mine, targets, query, database.settings.descriptor.headings, ALIGNED)
     return out
 
 
