@@ -207,7 +207,8 @@ def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Ca
     right, fooled = taken & judged.right & ~judged.copies, taken & ~judged.right & judged.copies
     most = [np.quantile(columns[6][right & (judged.town == town)], 1 - EXTREMES) for town in sorted(set(judged.town[right]))]
     least = [np.quantile(columns[6][fooled & (judged.town == town)], EXTREMES) for town in sorted(set(judged.town[fooled]))]
-    most_alike = float(np.sqrt(max(*most, BY_CHANCE) * min(least))) if most and least else 1.0
+    # an ordinary town whose streets look like others as much as copies do is given up where they do
+    most_alike = float(np.sqrt(max([BY_CHANCE, *(m for m in most if m < min(least))]) * min(least))) if least else 1.0
     return _agreement_model(judged, columns, rows & (columns[6] <= most_alike), alone, most_alike)
 
 
