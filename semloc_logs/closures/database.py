@@ -107,7 +107,11 @@ class Database:
 
     def keyframes(self, group: int) -> I64:
         """The keyframes of a submap that the query may see, ascending."""
-        ids, hidden = self._submap_ids(group), self._hidden.get(self.places[group].session)
+        return self._shown(group, self._submap_ids(group))
+
+    def _shown(self, group: int, ids: I64) -> I64:
+        """Those of the keyframes ``ids`` (n,) of a submap's session that the query may see."""
+        hidden = self._hidden.get(self.places[group].session)
         return ids if hidden is None else ids[~hidden[ids]]
 
     def _submap_ids(self, group: int) -> I64:
@@ -115,13 +119,12 @@ class Database:
         return np.arange(submap["first"], submap["last"] + 1)
 
     def _beside(self, group: int) -> I64:
-        """The keyframes of a submap, and of the road a query's length before and behind it, that the query may see, ascending."""
+        """The keyframes of a submap, and of as much road before and behind it as a query sees, that the query may see, ascending."""
         ids, session = self._submap_ids(group), self.sessions[self.places[group].session]
         if session.posed:
             first, last = session.distance[ids[[0, -1]]] + np.array([-1.0, 1.0]) * self._reach
             ids = np.arange(*np.searchsorted(session.distance, [first, np.nextafter(last, np.inf)]))
-        hidden = self._hidden.get(self.places[group].session)
-        return ids if hidden is None else ids[~hidden[ids]]
+        return self._shown(group, ids)
 
     @property
     def _reach(self) -> float:
