@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
@@ -29,33 +30,51 @@ def pool(group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, ce
     """
     if not len(group):
         return []
-    heading = np.unique(yaw, return_inverse=True)[1]
-    found: list[Hypothesis] = []
+    headings, heading = np.unique(yaw, return_inverse=True)
+    owner = np.asarray(group, np.int64) * len(headings) + heading
+    parts = []
     for offset in (0.0, 0.5):
         ijk = np.floor(translation / cell + offset).astype(np.int64)
-        key = np.stack([group, heading, ijk[:, 0], ijk[:, 1], ijk[:, 2]], 1)
-        order = np.lexsort(key.T[::-1])
-        start = np.flatnonzero(np.r_[True, (key[order][1:] != key[order][:-1]).any(1)])
+        ijk -= ijk.min(0)
+        y_span, z_span = (ijk.max(0) + 1)[1:]
+        at = (ijk[:, 0] * y_span + ijk[:, 1]) * z_span + ijk[:, 2]
+        order = np.lexsort((at, owner))
+        new = (at[order][1:] != at[order][:-1]) | (owner[order][1:] != owner[order][:-1])
+        start = np.flatnonzero(np.r_[True, new])
         total = np.add.reduceat(weight[order], start)
         count = np.diff(np.r_[start, len(order)])
         best = np.lexsort((start, -total))[:most]
         mean = np.add.reduceat(translation[order] * weight[order, None], start)[best] / total[best, None]
-        for i, b in enumerate(best):
-            first = order[start[b]]
-            pose = (float(yaw[first]), float(mean[i, 0]), float(mean[i, 1]), float(mean[i, 2]))
-            found.append(Hypothesis(int(group[first]), pose, int(count[b]), float(total[b])))
-    found.sort(key=lambda h: (-h.weight, h.group, h.pose))
-    kept: list[Hypothesis] = []
-    by_heading: dict[tuple[int, float], list[Hypothesis]] = {}
-    for h in found:  # the same cell found twice is one hypothesis
-        beside = by_heading.setdefault((h.group, h.pose[0]), [])
-        if any(max(abs(a - b) for a, b in zip(h.pose, o.pose, strict=True)) < cell / 4 for o in beside):
-            continue
-        beside.append(h)
-        kept.append(h)
-        if len(kept) == most:
+        first = order[start[best]]
+        parts.append((np.asarray(group)[first], np.c_[yaw[first], mean], count[best], total[best]))
+    groups, poses, votes, weights = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.lexsort((*poses.T[::-1], groups, -weights))
+    kept = order[first_apart(groups[order].astype(np.int64), poses[order], cell / 4, most)]  # a cell found twice is one hypothesis
+    columns = (groups[kept], map(tuple, poses[kept].tolist()), votes[kept], weights[kept])
+    return [Hypothesis(int(g), pose, int(n), float(w)) for g, pose, n, w in zip(*columns, strict=True)]
+
+
+@njit(cache=True, nogil=True)
+def first_apart(groups: NDArray[np.int64], poses: F64, distance: float, most: int) -> NDArray[np.int64]:
+    """Numbers of the first ``most`` of ``poses`` (n, 4) as (yaw, x, y, z) in submaps ``groups`` (n,) that are not beside an earlier one of
+    the same submap: within ``distance`` metres along each axis, and 0.05 rad."""
+    kept = np.empty(len(groups), np.int64)
+    count = 0
+    for i in range(len(groups)):
+        if count == most:
             break
-    return kept
+        beside = False
+        for k in kept[:count]:
+            near = groups[i] == groups[k]
+            for axis in range(1, 4):
+                near = near and abs(poses[i, axis] - poses[k, axis]) < distance
+            if near and np.cos(poses[i, 0] - poses[k, 0]) > np.cos(0.05):
+                beside = True
+                break
+        if not beside:
+            kept[count] = i
+            count += 1
+    return kept[:count]
 
 
 def of_best_groups(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:

@@ -83,8 +83,9 @@ def _align(
     T, centre, count, used, squared = start, start[:3, 3].copy(), 0, 0, 0.0
     information, pull = np.zeros((6, 6)), np.zeros((2, 6))
     query_centre = np.zeros(3)
-    for n in range(len(query)):
-        query_centre += query[n] / len(query)
+    for n in range(len(query) if hold > 0 else 0):
+        for k in range(3):
+            query_centre[k] += query[n, k] / len(query)
     radii, iterations, strides = steps
     for step in range(len(radii)):
         radius, last = radii[step], step == len(radii) - 1
@@ -150,7 +151,7 @@ def _normal_equations(
 ) -> tuple[float, F64, F64, F64, F64]:
     """Sum of the squared plane distances, those of uncertain points (``ray`` (n, 3) or (0, 3); variance ``noise`` without) for as much as
     they count; information (6, 6) and pull (2, 6) of the planes alone; normal equations (6, 6), (6,) of planes and points."""
-    points, normals, planar, spread = surface[0], surface[1], surface[2], surface[8]
+    points, normals, planar, _, spread = surface
     information, H, g, pull = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros((2, 6))
     squared, J, o, a = 0.0, np.empty(6), np.empty(3), np.empty(3)
     for n in range(len(moved)):

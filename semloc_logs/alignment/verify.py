@@ -12,10 +12,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.hypotheses import Hypothesis
+from semloc_logs.alignment.hypotheses import Hypothesis, first_apart
 from semloc_logs.alignment.icp import Fit, Step, align
 from semloc_logs.alignment.overlap import (
     ANY_BIT,
@@ -174,28 +173,7 @@ def _apart(found: Sequence[Found], distance: float, most: int) -> list[Found]:
     """The first ``most`` of ``found`` that are not beside an earlier one: hypotheses that have met are one."""
     groups = np.array([f[0].group for f in found], np.int64)
     poses = np.array([f[1] for f in found]).reshape(-1, 4)
-    return [found[i] for i in _first_apart(groups, poses, distance, most).tolist()]
-
-
-@njit(cache=True, nogil=True)
-def _first_apart(groups: NDArray[np.int64], poses: F64, distance: float, most: int) -> NDArray[np.int64]:
-    kept = np.empty(len(groups), np.int64)
-    count = 0
-    for i in range(len(groups)):
-        if count == most:
-            break
-        beside = False
-        for k in kept[:count]:
-            near = groups[i] == groups[k]
-            for axis in range(1, 4):
-                near = near and abs(poses[i, axis] - poses[k, axis]) < distance
-            if near and np.cos(poses[i, 0] - poses[k, 0]) > np.cos(0.05):
-                beside = True
-                break
-        if not beside:
-            kept[count] = i
-            count += 1
-    return kept[:count]
+    return [found[i] for i in first_apart(groups, poses, distance, most).tolist()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -184,7 +184,7 @@ def verify_hypotheses(database: Database, query: Query, hypotheses: list[Hypothe
     out: list[Candidate] = []
     for name in database.sessions:
         mine = [h for h in hypotheses if database.places[h.group].session == name]
-        targets = {h.group: database.target(h.group) for h in mine}
+        targets = {group: database.target(group) for group in {h.group for h in mine}}
         out += search_hypotheses(mine, targets, query, database.settings.descriptor.headings, ALIGNED)
     return out
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -20,7 +21,7 @@ from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.checkpoints import load_weights
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, code_table
 from semloc_logs.subvolumes.network import Encoder, descriptors
-from semloc_logs.subvolumes.pairs import occupied
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -66,11 +67,42 @@ def _window_sums(a: NDArray[np.int64], stride: int) -> NDArray[np.int64]:
     return np.asarray(c[i + SIZE, j + SIZE] - c[i, j + SIZE] - c[i + SIZE, j] + c[i, j])
 
 
-def _layers(filled: NDArray[np.bool_], bottom: int, stride: int) -> NDArray[np.int64]:
+@njit(cache=True, nogil=True)
+def _filled(state: U8, low: int, high: int) -> NDArray[np.int64]:
+    """How many voxels of each column (x, y) are occupied, from ``low`` on and below ``high``."""
+    out = np.zeros(state.shape[:2], np.int64)
+    for x in range(state.shape[0]):
+        for y in range(state.shape[1]):
+            column = state[x, y, low:high]
+            for z in range(len(column)):
+                out[x, y] += (column[z] != FREE_STATE) & (column[z] != UNOBSERVED_STATE)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _lowest(state: U8) -> NDArray[np.float64]:
+    """The lowest surface in each 4 x 4 columns (x / 4, y / 4): the voxel up to which two are occupied; NaN where there are fewer."""
+    out = np.full((state.shape[0] // 4, state.shape[1] // 4), np.nan)
+    level = np.zeros(state.shape[2], np.uint8)
+    for x in range(out.shape[0]):
+        for y in range(out.shape[1]):
+            level[:] = 0
+            for i in range(16):
+                column = state[4 * x + i // 4, 4 * y + i % 4]
+                for z in range(len(column)):
+                    level[z] += np.uint8((column[z] != FREE_STATE) & (column[z] != UNOBSERVED_STATE))
+            count = 0
+            for z in range(len(level)):
+                count += level[z]
+                if count >= 2:
+                    out[x, y] = z
+                    break
+    return out
+
+
+def _layers(state: U8, bottom: int, stride: int) -> NDArray[np.int64]:
     """Layer of each window: the one whose lowest 8 voxels hold the lowest surface (10 % quantile over 4 x 4 columns)."""
-    x, y = filled.shape[0] // 4, filled.shape[1] // 4
-    count = filled[: x * 4, : y * 4].reshape(x, 4, y, 4, -1).sum((1, 3)).cumsum(2)
-    lowest = np.where(count[:, :, -1] >= 2, (count < 2).sum(2), np.nan).astype(float)
+    lowest = _lowest(state)
     windows = np.lib.stride_tricks.sliding_window_view(lowest, (8, 8))[:: stride // 4, :: stride // 4].reshape(-1, 64)
     ordered = np.sort(windows, axis=1)  # NaN last
     known = np.isfinite(ordered).sum(1)
@@ -96,10 +128,9 @@ def describe_map(
     ``stride`` is 4 or 8 voxels. Positions are multiples of it in the map's voxel grid only if ``low`` is. With a ``road`` (m, 2), metres,
     only subvolumes whose centre lies within ``reach`` metres of it are described.
     """
-    filled = occupied(state)
     if stride not in (4, 8):
         raise SettingsError(f"A stride of {stride} voxels is not possible: 4 or 8.")
-    span = np.argwhere(filled.any(2))
+    span = np.argwhere(_filled(state, 0, state.shape[2]))
     if not len(span):
         return Described(np.zeros((0, 3), np.float32), np.zeros((0, encoder.latent), np.float32))
     # crop to what is occupied, with room for windows that hang over the edge, on the stride's grid
@@ -113,12 +144,11 @@ def describe_map(
     o = a - first + MARGIN
     box[o[0] : o[0] + b[0] - a[0], o[1] : o[1] + b[1] - a[1], SIZE : SIZE + state.shape[2]] = state[a[0] : b[0], a[1] : b[1]]
     bottom = bottom_z + SIZE  # of layer 0 in the box
-    inner = occupied(box[MARGIN:-MARGIN, MARGIN:-MARGIN])
+    inner = box[MARGIN:-MARGIN, MARGIN:-MARGIN]
     layer = _layers(inner, bottom, stride)
-    filled_columns = inner.sum(2, dtype=np.int64)
     table = code_table(encoder.variant)
     centres, found = [], []
-    has_enough = _window_sums(filled_columns, stride) >= min_occupied
+    has_enough = _window_sums(_filled(inner, 0, height), stride) >= min_occupied
     if road is not None:
         corners = np.moveaxis(np.indices(has_enough.shape), 0, -1) * stride + first + np.asarray(low)[:2]
         has_enough &= cKDTree(road).query((corners + SIZE / 2) * voxel_size, distance_upper_bound=reach)[0] < reach
@@ -127,11 +157,11 @@ def describe_map(
         z = bottom + LAYER * int(index)
         if z < 0 or z + SIZE > height:
             continue
-        enough = _window_sums(inner[:, :, z : z + SIZE].sum(2, dtype=np.int64), stride) >= min_occupied
+        enough = _window_sums(_filled(inner, z, z + SIZE), stride) >= min_occupied
         wanted = np.argwhere(enough & has_enough & (layer == index)) * stride  # corners of the windows within the inner box
         if not len(wanted):
             continue
-        codes = table[box[:, :, z : z + SIZE]]
+        codes = np.take(table, box[:, :, z : z + SIZE])
         out = _encode(codes, wanted, encoder, stride)
         corner = np.concatenate([wanted + first, np.full((len(wanted), 1), z - SIZE)], 1) + np.asarray(low)
         centres.append(corner + SIZE / 2)
