@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.bits import lowest_bit
 from semloc_logs.geometry import inverse, yaw_transform
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 from semloc_logs.voxels.keys import BLOCK, unpack
@@ -23,8 +24,9 @@ FREE_BIT = 128  # observed free and nothing occupied beside it
 ANY_BIT = 64  # occupied, unlabelled included
 REACH = 4  # cells that a search may shift by; a grid is padded by twice as many, so that no look-up leaves it
 HALF_DIAGONAL = float(np.sqrt(0.75))  # of a cell, in cells
-CUBE = 4  # cells: where nothing is observed is left out by cubes
-FOUR_UNOBSERVED = UNOBSERVED_STATE * 0x01010101
+CUBE = 4  # cells: what is observed is looked for by cubes, whose cells are the bits of a number
+FOUR_UNOBSERVED = np.uint32(UNOBSERVED_STATE * 0x01010101)
+LOW_BITS, GATHER = np.uint64(0x7F7F7F7F), np.uint64(0x10204080)
 CHUNK = 128  # voxels counted before a sum is given up
 STRUCTURE_SHARE = 0.75  # of the score; the ground has the rest, to hold the height
 
@@ -208,92 +210,108 @@ def tau(
     if not len(ijk) or not len(target.keys):
         return 0.0, 0
     reach = kappa / voxel_size
-    centres = (ijk + 0.5) * voxel_size @ target_T_query[:3, :3].T + target_T_query[:3, 3]
-    points = centres / voxel_size
-    low, high = (np.floor(edge).astype(int) for edge in (points.min(0) - reach, points.max(0) + reach + 1))
-    tl, th = target.bounds()
-    low, high = np.maximum(low, tl), np.minimum(high, th)
+    points, low, high = _in_voxels(ijk, target_T_query[:3, :3], target_T_query[:3, 3] / voxel_size)
+    first, last = target.bounds()
+    low, high = np.maximum(np.floor(low - reach).astype(int), first), np.minimum(np.floor(high + reach + 1).astype(int), last)
     if (low >= high).any():
         return 0.0, 0
     margin = 2 * int(reach) + 4  # twice: for points beside the map, and for what is around them
     low = low - margin
-    shape = high - low + margin
-    around = target.dense(low, (int(shape[0]), int(shape[1]), int(-(-shape[2] // CUBE) * CUBE)))
-    found = _closest_observed(around, _near_observed(around, int(reach) + 1), points - low, *_offsets(reach), reach)
+    x, y, z = (-(-(high - low + margin) // CUBE) * CUBE).tolist()
+    around = target.dense(low, (x, y, z))
+    found = _closest_observed(around, _observed_cubes(around), points, low, *_cubes(reach), reach)
     table = np.arange(256, dtype=np.uint8) if coarse is None else coarse
     hit = (found != UNOBSERVED_STATE) & (found != FREE_STATE)
-    aligned = hit & (table[found] == table[label])
-    return float(aligned.mean()), int(aligned.sum())
+    aligned = int((hit & (table[found] == table[label])).sum())
+    return aligned / len(found), aligned
 
 
 @njit(cache=True, nogil=True)
-def _near_observed(state: U8, reach: int) -> NDArray[np.bool_]:
-    """Whether there may be an observed cell within ``reach`` of the cells of each cube of ``CUBE`` cells."""
-    nx, ny, nz = state.shape[0] // CUBE + 1, state.shape[1] // CUBE + 1, state.shape[2] // CUBE + 1
-    near = np.zeros((nx, ny, nz), np.bool_)
+def _in_voxels(ijk: NDArray[np.int32], R: F64, t: F64) -> tuple[F64, F64, F64]:
+    """The centres of voxels (n, 3) after rotation ``R`` and a shift by ``t`` voxels, in voxels, and their least and greatest (3,)."""
+    out, low, high = np.empty((len(ijk), 3)), np.full(3, np.inf), np.full(3, -np.inf)
+    for n in range(len(ijk)):
+        x, y, z = ijk[n, 0] + 0.5, ijk[n, 1] + 0.5, ijk[n, 2] + 0.5
+        for k in range(3):
+            p = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + t[k]
+            out[n, k], low[k], high[k] = p, min(low[k], p), max(high[k], p)
+    return out, low, high
+
+
+@njit(cache=True, nogil=True)
+def _observed_cubes(state: U8) -> NDArray[np.uint64]:
+    """Which cells of each cube of ``CUBE`` cells of ``state`` (x, y, z) are observed: bit (4 i + j) 4 + k is that of cell (i, j, k)."""
+    nx, ny, nz = state.shape
+    out = np.zeros((nx // CUBE, ny // CUBE, nz // CUBE), np.uint64)
     fours = state.view(np.uint32)  # four cells at once, as many as a cube has above each other
-    for i in range(fours.shape[0]):
-        for j in range(fours.shape[1]):
-            for k in range(fours.shape[2]):
-                if fours[i, j, k] != FOUR_UNOBSERVED:
-                    near[i // CUBE, j // CUBE, k] = True
-    r = -(-reach // CUBE)
-    for axis in range(3):
-        wide = near.copy()
-        for i, j, k in np.argwhere(near):
-            if axis == 0:
-                wide[max(i - r, 0) : i + r + 1, j, k] = True
-            elif axis == 1:
-                wide[i, max(j - r, 0) : j + r + 1, k] = True
-            else:
-                wide[i, j, max(k - r, 0) : k + r + 1] = True
-        near = wide
-    return near
+    for x in range(nx):
+        for y in range(ny):
+            row, place = out[x // CUBE, y // CUBE], np.uint64(CUBE * (x % CUBE * CUBE + y % CUBE))
+            for k in range(len(row)):
+                different = np.uint64(fours[x, y, k] ^ FOUR_UNOBSERVED)
+                if different:
+                    # the highest bit of each byte that is not zero, then these four side by side
+                    bytes_ = (((different & LOW_BITS) + LOW_BITS) | different) & ~LOW_BITS & np.uint64(0xFFFFFFFF)
+                    row[k] |= (((bytes_ >> np.uint64(7)) * GATHER >> np.uint64(28)) & np.uint64(15)) << place
+    return out
 
 
 @lru_cache(maxsize=4)
-def _offsets(reach: float) -> tuple[NDArray[np.int64], F64]:
-    """Offsets (n, 3) of all cells whose centres may be within ``reach`` cells of a point in the middle one, nearest first; lengths (n,)."""
-    side = np.arange(-int(reach) - 1, int(reach) + 2)
-    all_of_them = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
-    length = np.linalg.norm(all_of_them, axis=1)
-    order = np.argsort(length, kind="stable")
-    order = order[length[order] < reach + HALF_DIAGONAL]
-    return all_of_them[order], length[order]
+def _cubes(reach: float) -> tuple[NDArray[np.int64], F64]:
+    """Offsets (n, 3) of the cubes that may have a centre of a cell within ``reach`` cells of a point in the middle one, those that may be
+    nearest first, and the squares (n,) of how near that is."""
+    r = -(-(int(reach) + 2) // CUBE)
+    side = np.arange(-r, r + 1)
+    every = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+    gap = np.maximum(CUBE * (np.abs(every) - 1) + 0.5, 0.0) * (every != 0)
+    least = np.square(gap).sum(1)
+    order = np.argsort(least, kind="stable")
+    order = order[least[order] < reach**2]
+    return every[order], least[order]
 
 
 @njit(cache=True, nogil=True)
-def _closest_observed(state: U8, near: NDArray[np.bool_], points: F64, offsets: NDArray[np.int64], length: F64, reach: float) -> U8:
+def _closest_observed(
+    state: U8, cubes: NDArray[np.uint64], points: F64, low: NDArray[np.int64], offsets: NDArray[np.int64], least: F64, reach: float
+) -> U8:
     """State of the observed cell whose centre is closest to each of ``points`` (n, 3), in cells; unobserved where none is within reach.
 
-    The grid has a margin of twice ``reach`` and four cells on all sides; ``near`` is that of :func:`_near_observed`.
+    The grid begins at cell ``low`` (3,) and has a margin of twice ``reach`` and four cells on all sides; ``cubes`` are those of
+    :func:`_observed_cubes`.
     """
     out = np.full(len(points), UNOBSERVED_STATE, np.uint8)
-    nx, ny, nz = state.shape
     margin = int(reach) + 1
-    flat = state.ravel()
-    steps = (offsets[:, 0] * ny + offsets[:, 1]) * nz + offsets[:, 2]
     for n in range(len(points)):
-        i, j, k = int(np.floor(points[n, 0])), int(np.floor(points[n, 1])), int(np.floor(points[n, 2]))
-        if min(i, j, k) < margin or i >= nx - margin or j >= ny - margin or k >= nz - margin:
+        px, py, pz = points[n, 0] - low[0], points[n, 1] - low[1], points[n, 2] - low[2]
+        i, j, k = int(np.floor(px)), int(np.floor(py)), int(np.floor(pz))
+        if min(i, j, k) < margin or i >= state.shape[0] - margin or j >= state.shape[1] - margin or k >= state.shape[2] - margin:
             continue  # farther from the map than it may be
-        if not near[i // CUBE, j // CUBE, k // CUBE]:
+        if state[i, j, k] != UNOBSERVED_STATE and reach > HALF_DIAGONAL:
+            out[n] = state[i, j, k]  # no other centre is as close as that of the cell a point lies in
             continue
-        middle, best = (i * ny + j) * nz + k, reach
-        here = flat[np.uint64(middle)]
-        if here != UNOBSERVED_STATE and reach > HALF_DIAGONAL:
-            out[n] = here  # no other centre is as close as that of the cell a point lies in
-            continue
-        fx, fy, fz = points[n, 0] - i - 0.5, points[n, 1] - j - 0.5, points[n, 2] - k - 0.5
-        for m in range(len(steps)):
-            if length[m] - HALF_DIAGONAL >= best:
+        best = reach**2
+        for m in range(len(offsets)):
+            if least[m] >= best:
                 break
-            value = flat[np.uint64(middle + steps[m])]
-            if value != UNOBSERVED_STATE:
-                d = np.sqrt((offsets[m, 0] - fx) ** 2 + (offsets[m, 1] - fy) ** 2 + (offsets[m, 2] - fz) ** 2)
+            x, y, z = i // CUBE + offsets[m, 0], j // CUBE + offsets[m, 1], k // CUBE + offsets[m, 2]
+            if x < 0 or y < 0 or z < 0 or x >= cubes.shape[0] or y >= cubes.shape[1] or z >= cubes.shape[2]:
+                continue
+            left = cubes[x, y, z]
+            if left == 0:
+                continue
+            # from the point to the first centres of the cube
+            ox, oy, oz = CUBE * x + 0.5 - px, CUBE * y + 0.5 - py, CUBE * z + 0.5 - pz
+            ax, ay, az = max(ox, -ox - CUBE + 1, 0.0), max(oy, -oy - CUBE + 1, 0.0), max(oz, -oz - CUBE + 1, 0.0)
+            if ax * ax + ay * ay + az * az >= best:
+                continue
+            while left:
+                b = lowest_bit(left)
+                left &= left - np.uint64(1)
+                dx, dy, dz = ox + (b >> 4), oy + ((b >> 2) & 3), oz + (b & 3)
+                d = dx * dx + dy * dy + dz * dz
                 if d < best:
                     best = d
-                    out[n] = value
+                    out[n] = state[CUBE * x + (b >> 4), CUBE * y + ((b >> 2) & 3), CUBE * z + (b & 3)]
     return out
 
 

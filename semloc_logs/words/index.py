@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.bits import lowest_bit, popcount
 from semloc_logs.words.kmeans import grid
 from semloc_logs.words.segment import WORDS, Held, Segment, segment_in_memory
 from semloc_logs.words.vocabulary import BITS, Vocabulary, codes_of
@@ -71,22 +71,6 @@ class Allowed:
             masks.append(mask)
             length += len(mask)
         return open_, np.concatenate(masks)
-
-
-def _count_bits(_: Any, x: Any) -> Any:
-    return types.int64(types.uint64), lambda context, builder, signature, arguments: builder.ctpop(arguments[0])
-
-
-def _first_bit(_: Any, x: Any) -> Any:
-    def instruction(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], context.get_constant(types.boolean, True))  # never asked about 0
-
-    return types.int64(types.uint64), instruction
-
-
-# instructions of the processor, where it has them, for compiled functions: how many bits of an uint64 are set, and the lowest of them
-popcount: Any = intrinsic(_count_bits)
-lowest_bit: Any = intrinsic(_first_bit)
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc"})  # sums of multiples of 1 / UNIT are exact in any order
