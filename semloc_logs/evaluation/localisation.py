@@ -31,23 +31,39 @@ LIMITS = {"1 m": (1.0, 5.0), "5 m": (5.0, 20.0)}  # metres and degrees within wh
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a system said to the query at ``keyframe``: errors of its first pose (None: it found none), its score, seconds, and whether
-    it would have accepted it (None: it does not say)."""
+    """What a system said to the query at ``keyframe``: errors of its first pose (None: it found none), its score, seconds, and errors of
+    the pose that it accepted after it had heard all queries (None: it accepted none), if it ``decides`` at all."""
 
     keyframe: int
     seconds: float
     score: float = -np.inf
     error_m: float | None = None
     error_deg: float | None = None
-    accepted: bool | None = None
+    decides: bool = False
+    accepted_m: float | None = None
+    accepted_deg: float | None = None
 
     def right(self, limit: str) -> bool:
-        """Whether the pose is within a limit of ``LIMITS``."""
-        metres, degrees = LIMITS[limit]
-        return self.error_m is not None and self.error_deg is not None and self.error_m <= metres and self.error_deg <= degrees
+        """Whether the first pose is within a limit of ``LIMITS``."""
+        return _within(limit, self.error_m, self.error_deg)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it accepted a pose."""
+        return self.accepted_m is not None
+
+    @property
+    def accepted_right(self) -> bool:
+        """Whether it accepted a pose that is within the least of ``LIMITS``."""
+        return _within("1 m", self.accepted_m, self.accepted_deg)
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self) | {"score": float(np.nan_to_num(self.score, neginf=-1e300))}
+
+
+def _within(limit: str, error_m: float | None, error_deg: float | None) -> bool:
+    metres, degrees = LIMITS[limit]
+    return error_m is not None and error_deg is not None and error_m <= metres and error_deg <= degrees
 
 
 @dataclass(eq=False)
@@ -133,9 +149,9 @@ def figures_of(answers: Sequence[Answer], elsewhere: Sequence[Answer]) -> dict[s
     if errors:
         out["median error"] = float(np.median(errors))
     out["time"] = float(np.median([a.seconds for a in answers]))
-    if answers[0].accepted is not None:
-        out["accepted and right"] = float(np.mean([bool(a.accepted) and a.right("1 m") for a in answers]))
-        out["accepted and wrong"] = float(sum(bool(a.accepted) and not a.right("1 m") for a in (*answers, *elsewhere)))
+    if answers[0].decides:
+        out["accepted and right"] = float(np.mean([a.accepted_right for a in answers]))
+        out["accepted and wrong"] = float(sum(a.accepted and not a.accepted_right for a in (*answers, *elsewhere)))
     return out
 
 

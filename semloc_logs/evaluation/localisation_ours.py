@@ -87,8 +87,8 @@ class OurTask:
             asked = [self._ask(database, world, k) for k in self.keyframes]
         maps = {self.drive.name: world.query, DATABASE: world.database}
         decided = decide([a for _, found in asked for a in found], maps, self.settings)
-        accepted = {a.query_keyframe for a in decided if a.accepted}
-        return [self._answer(world, k, seconds, found, k in accepted) for k, (seconds, found) in zip(self.keyframes, asked, strict=True)]
+        accepted = {a.query_keyframe: a for a in decided if a.accepted}
+        return [self._answer(world, k, *said, accepted.get(k)) for k, said in zip(self.keyframes, asked, strict=True)]
 
     def profile(self) -> dict[str, float]:
         """Seconds of a query when they come one after the other, as `semloc close` asks, and of its parts, under the profiler."""
@@ -117,13 +117,19 @@ class OurTask:
         found = closing.close_query(database, world.query, keyframe)
         return time.perf_counter() - begin, found
 
-    def _answer(self, world: World, keyframe: int, seconds: float, found: list[closing.Alignment], accepted: bool) -> Answer:
-        """Of the alignment that is most probable by itself, which is its score."""
-        if not found:
-            return Answer(keyframe, seconds, accepted=False)
-        best = found[0]
-        map_T_base = world.database.map_T_base[best.target_keyframe] @ best.target_T_query
-        return Answer(keyframe, seconds, best.probability, *world.errors(keyframe, map_T_base), accepted=accepted)
+    def _answer(
+        self, world: World, keyframe: int, seconds: float, found: list[closing.Alignment], accepted: closing.Alignment | None
+    ) -> Answer:
+        """First is what is most probable by itself, which is its score; accepted may be another one, that other queries agree with."""
+
+        def errors(alignment: closing.Alignment | None) -> tuple[float, float] | tuple[None, None]:
+            if alignment is None:
+                return None, None
+            return world.errors(keyframe, world.database.map_T_base[alignment.target_keyframe] @ alignment.target_T_query)
+
+        first = found[0] if found else None
+        (m, deg), (accepted_m, accepted_deg) = errors(first), errors(accepted)
+        return Answer(keyframe, seconds, first.probability if first else -np.inf, m, deg, True, accepted_m, accepted_deg)
 
 
 def _parts(profiler: cProfile.Profile) -> dict[str, float]:

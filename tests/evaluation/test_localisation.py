@@ -72,7 +72,7 @@ def test_errors_are_those_against_the_nearest_keyframe_of_a_map_that_lies_elsewh
 
 
 def answer(score: float, error: float) -> Answer:
-    return Answer(0, 1.0, score, error, 0.0, True)
+    return Answer(0, 1.0, score, error, 0.0, True, error, 0.0)
 
 
 def test_full_precision_ends_at_the_best_wrong_answer() -> None:
@@ -85,6 +85,12 @@ def test_full_precision_ends_at_the_best_wrong_answer() -> None:
     assert found["recall 5 m"] == pytest.approx(0.6)
     assert found["median error"] == pytest.approx(0.3)
     assert found["accepted and wrong"] == 3  # 3 m off, 40 m off, and elsewhere
+    assert found["accepted and right"] == pytest.approx(0.4)
+    promoted = Answer(0, 1.0, 0.9, 40.0, 0.0, True, 0.2, 0.0)  # its neighbours told it the right one
+    assert figures_of([promoted], []) == pytest.approx(
+        {"recall 1 m": 0, "recall 5 m": 0, "recall at 100 % precision": 0, "time": 1, "accepted and right": 1, "accepted and wrong": 0}
+    )
+    assert "accepted and right" not in figures_of([Answer(0, 1.0, 0.9, 0.1, 0.0)], [])  # a peer does not decide
 
 
 def test_scan_context_knows_the_turn_and_the_place() -> None:
