@@ -29,6 +29,7 @@ Figures = dict[str, dict[str, float | str]]
 Note = Callable[[str], None]
 Task = OurTask | PeerTask
 FUSION = ("labels", "voxels")
+TIMED = ("ours", "ours, one frame", "ours, every heading described")
 
 
 class Run(Protocol):
@@ -177,7 +178,7 @@ class Localisation:
 
         jobs = self.engine.jobs
         for sensor in SENSORS:
-            for system in OURS[:2]:
+            for system in (s for s in OURS if s.name in TIMED):
                 mine = [u for u in units if u.task.system == system and u.task.drive.sensor == sensor and u.task.drive.condition != UNSEEN]
                 seconds = [a.seconds for u in mine for a in read_unit(u)]
                 if not seconds:

@@ -9,7 +9,7 @@ import shutil
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,9 +28,11 @@ from semloc_logs.evaluation.localisation import Answer, World, read_world
 from semloc_logs.evaluation.localisation_worlds import DATABASE, WorldDrive
 from semloc_logs.settings import STREET_VOXEL, Settings
 from semloc_logs.subvolumes.checkpoints import save_weights
-from semloc_logs.subvolumes.describe import load_encoder
+from semloc_logs.subvolumes.cut import turned_map
+from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
 from semloc_logs.subvolumes.describing import describe_submap
 from semloc_logs.subvolumes.network import Completion
+from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import Workspace
 
@@ -49,7 +51,7 @@ PARTS = {  # of a query, by the functions that do them
 @dataclass(frozen=True, slots=True)
 class OurSystem:
     """A way of asking: ``labels`` of the log or from geometry; how a query is fused, ``weights`` trained or random; ``hypotheses`` by
-    words, of a grid over all of the road, or as many of that grid as words would give."""
+    words, by words of the query described again in every heading, of a grid over all of the road, or as many of that grid as words give."""
 
     name: str
     query: tuple[tuple[str, Any], ...] = (("length", 20.0),)
@@ -62,6 +64,7 @@ OURS = (
     OurSystem("ours"),
     OurSystem("ours, one frame", (("frames", 1),)),
     OurSystem("ours, no labels", labels="geometry"),
+    OurSystem("ours, every heading described", hypotheses="sweep"),
     OurSystem("random weights", weights="random"),
     OurSystem("grid, as many", hypotheses="some"),
     OurSystem("grid, exhaustive", hypotheses="all"),
@@ -96,19 +99,22 @@ class OurTask:
         database = Database(world.work, (DATABASE,), self.settings)
         every = query_keyframes(world.query, self.settings)
         asked = every[max(0, (len(every) - PROFILED) // 2) :][:PROFILED]
-        closing.close_query(database, world.query, asked[0])
-        begin = time.perf_counter()
-        for keyframe in asked:
-            closing.close_query(database, world.query, keyframe)
-        whole = (time.perf_counter() - begin) / len(asked)
         profiler = cProfile.Profile()
-        for keyframe in asked:
-            profiler.runcall(closing.close_query, database, world.query, keyframe)
+        with self._hypotheses():
+            closing.close_query(database, world.query, asked[0])
+            begin = time.perf_counter()
+            for keyframe in asked:
+                closing.close_query(database, world.query, keyframe)
+            whole = (time.perf_counter() - begin) / len(asked)
+            for keyframe in asked:
+                profiler.runcall(closing.close_query, database, world.query, keyframe)
         return {WHOLE: whole} | {part: seconds / len(asked) for part, seconds in _parts(profiler).items()}
 
     def _hypotheses(self) -> Any:
         if self.system.hypotheses == "words":
             return nullcontext()
+        if self.system.hypotheses == "sweep":
+            return patch.object(closing, "match_words", sweep_words)
         most = self.settings.closures.hypotheses if self.system.hypotheses == "some" else None
         return patch.object(closing, "find_hypotheses", partial(grid_hypotheses, most=most))
 
@@ -140,6 +146,28 @@ def _parts(profiler: cProfile.Profile) -> dict[str, float]:
         total[key] = total.get(key, 0.0) + cumulative
     out = {part: sum(total.get(f, 0.0) for f in functions) for part, functions in PARTS.items()}
     return out | {"rest": max(0.0, total.get("closing.py close_query", 0.0) - sum(out.values()))}
+
+
+def sweep_words(database: Database, variant: str, allowed: Allowed, query: Query, ground_z: float) -> tuple[Described, Matches]:
+    """What :func:`semloc_logs.closures.closing.match_words` finds when the query is turned into every heading and described there, as by
+    the paper (4), instead of once: what an encoder that turns with its input saves."""
+    settings = database.settings
+    descriptor, closures, v = settings.descriptor, settings.closures, settings.fusion.voxel_size
+    low, high = query.blocks.bounds()
+    state = query.blocks.dense(low, tuple((high - low).tolist()))
+    encoder = load_encoder(variant, descriptor.weights)
+    step = 2 * np.pi / descriptor.headings
+    words, found, rows = [], [], 0
+    for heading in range(descriptor.headings):
+        turned = turned_map(state, low, heading * step)
+        d = describe_map(turned.state, turned.low, ground_z, v, encoder, descriptor.query_stride, descriptor.min_occupied)
+        m = database.words(variant).search(d.descriptor, closures.neighbours, closures.probes, allowed)
+        yaw = (np.round(m.yaw / step).astype(int) - heading) % descriptor.headings * step
+        found.append(replace(m, query=m.query + np.int32(rows), yaw=yaw))
+        words.append(Described(turned.to_map(d.centre), d.descriptor))
+        rows += len(d.descriptor)
+    described = Described(*(np.concatenate([getattr(d, f.name) for d in words]) for f in fields(Described)))
+    return described, Matches(*(np.concatenate([getattr(m, f.name) for m in found]) for f in fields(Matches)))
 
 
 def grid_hypotheses(database: Database, session: SessionMap, keyframe: int, query: Query, most: int | None = None) -> list[Hypothesis]:

@@ -14,12 +14,15 @@ import pytest
 from semloc_logs.errors import SemlocError, SettingsError
 from semloc_logs.evaluation import peers
 from semloc_logs.evaluation.localisation import Answer, World, figures_of, recall_at_full_precision
-from semloc_logs.evaluation.localisation_ours import OURS, grid_hypotheses, link_workspace, settings_of
+from semloc_logs.evaluation.localisation_ours import OURS, grid_hypotheses, link_workspace, settings_of, sweep_words
 from semloc_logs.evaluation.localisation_peers import cloud_frame, database_keyframes
 from semloc_logs.evaluation.localisation_worlds import CROSSING, OPPOSITE, SEED, UNSEEN, WorldDrive, world_path
 from semloc_logs.evaluation.scan_context import nearest_contexts, scan_context
 from semloc_logs.geometry import apply, yaw_transform
 from semloc_logs.settings import load
+from semloc_logs.subvolumes.cut import turned_map
+from semloc_logs.subvolumes.describe import describe_map, load_encoder
+from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.workspace import Workspace
 
 
@@ -120,6 +123,32 @@ def test_a_grid_has_every_heading_along_and_beside_the_road() -> None:
     some = grid_hypotheses(database, None, 0, None, most=10)  # type: ignore[arg-type]
     assert len(some) == 10
     assert set(some) <= set(found)
+
+
+def test_a_sweep_finds_a_map_that_was_described_at_another_heading() -> None:
+    settings = load().resolved()
+    rng, step = np.random.default_rng(0), 2 * np.pi / settings.descriptor.headings
+    state = np.full((64, 48, 48), 253, np.uint8)
+    state[rng.random(state.shape) < 0.02] = 2
+    blocks = SimpleNamespace(bounds=lambda: (np.array([-32, -16, -3]), np.array([32, 32, 45])), dense=lambda low, shape: state)
+    turned = turned_map(state, np.array([-32, -16, -3]), 3 * step)
+    encoder = load_encoder("semantic", None)
+    known = describe_map(turned.state, turned.low, 0.0, 0.3, encoder, settings.descriptor.query_stride, settings.descriptor.min_occupied)
+    centre = turned.to_map(known.centre) * 0.3
+
+    def search(asked: np.ndarray, k: int, probes: int, allowed: Allowed) -> Matches:
+        away = np.linalg.norm(asked[:, None] - known.descriptor[None], axis=2)
+        best, n = away.argmin(1), np.arange(len(asked), dtype=np.int32)
+        return Matches(n, 0 * best, best, centre[best].astype(float), np.full(len(asked), 3 * step), (1000 * away.min(1)).astype(np.int32))
+
+    database = SimpleNamespace(settings=settings, words=lambda variant: SimpleNamespace(search=search))
+    allowed, query = Allowed(np.ones(1, bool)), SimpleNamespace(blocks=blocks)
+    described, found = sweep_words(database, "semantic", allowed, query, 0.0)  # type: ignore[arg-type]
+    assert len(described.centre) > 15 * len(known.centre)
+    same = found.distance == 0
+    assert same.sum() >= len(known.centre) > 0
+    assert set(found.yaw[same]) == {0.0}  # the very map: not turned
+    np.testing.assert_allclose(described.centre[found.query[same]] * 0.3, found.centre[same], atol=1e-4)
 
 
 def test_systems_differ_only_in_what_they_say() -> None:
