@@ -1,9 +1,10 @@
 """False closures at the defaults: thousands of queries in towns that look alike, and all pairs of recorded logs.
 
-    python benchmarks/false_closures.py towns DIR [--queries 5000] [--jobs N]     simulate, ask, judge; resumes
+    python benchmarks/false_closures.py towns DIR [--queries 5000] [--drives FOLDER] [--jobs N]     simulate, ask, judge; resumes
     python benchmarks/false_closures.py logs DIR LOGS [--small NAME]... [--jobs N]
 
-Two of three towns are cities whose blocks are copies of one another. Their tables DIR/TOWN/judged.parquet hold features, so after a new
+Two of three towns are cities whose blocks are copies of one another; with a folder of recorded drives there are also towns along these that
+stereo cameras drive there and back. Their tables DIR/TOWN/judged.parquet hold features, so after a new
 calibration the same command counts again without asking again. LOGS is a folder of logs, with *_truth.json for those whose truth is known
 (those of one file are of one place; a closure between logs of different places is false). Each pair is asked with the labels of the log,
 with those from geometry and without any.
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from towns import Place, collect, short_towns
+from towns import Place, Town, collect, short_towns
 
 from semloc_logs.closures.acceptance import shipped
 from semloc_logs.closures.queries import SessionMap
@@ -34,17 +35,32 @@ from semloc_logs.tables import read_metadata
 from semloc_logs.workspace import Workspace
 
 FIRST, MOST = 30, 60  # numbers of the towns: calibration has those before
+THERE_AND_BACK = tuple(  # each camera sees the other sides of things
+    Town(f"back-{drive}", seed, ("stereo",), labels, noise=noise, trajectory=drive, start=start, length=240.0)
+    for drive, seed, labels, noise, start in (
+        ("00", 16, "auto", 0.12, 700.0),
+        ("05", 17, "geometry", 0.12, 500.0),
+        ("07", 67, "auto", 0.1, 0.0),
+        ("06", 66, "geometry", 0.1, 300.0),
+        ("09", 69, "auto", 0.1, 400.0),
+    )
+)
 SOURCES = ("auto", "geometry", "uniform")  # auto: labels of the log, where it has any
 SMALL = ("room_*", "euroc_*")
 
 
 def ask_towns(args: argparse.Namespace) -> None:
     """Ask, then count under the calibration of the package."""
-    paths = collect(Place(args.dir), short_towns(FIRST, MOST), args.jobs, args.queries)
+    place = Place(args.dir, args.drives)
+    paths = collect(place, short_towns(FIRST, MOST), args.jobs, args.queries)
+    if args.drives:
+        paths += collect(place, THERE_AND_BACK, args.jobs)
     judged = read_judged(paths)
     p = decided_by(shipped(), judged)
     print(f"{sum(read_metadata(path)['queries'] for path in paths)} queries in {len(paths)} towns")
-    for name, rows in (("ordinary towns", ~judged.copies), ("cities of copies", judged.copies)):
+    back = np.array([town.startswith("back") for town in judged.town], bool)
+    kinds = {"ordinary towns": ~judged.copies & ~back, "cities of copies": judged.copies, "stereo, there and back": back}
+    for name, rows in ((n, r) for n, r in kinds.items() if r.any()):
         for line in recall_at(judged.part(rows), p[rows]):
             print(f"  {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
     accepted = (k for k in answers(judged, p) if p[k] >= SURE)
@@ -136,6 +152,7 @@ def main() -> None:
     first = commands.add_parser("towns")
     first.add_argument("dir", type=Path)
     first.add_argument("--queries", type=int, default=5000)
+    first.add_argument("--drives", type=Path, help="folder of kitti_00.txt and others: towns along these as well")
     first.set_defaults(run=ask_towns)
     second = commands.add_parser("logs")
     second.add_argument("dir", type=Path)

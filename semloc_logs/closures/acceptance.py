@@ -164,11 +164,22 @@ def shipped() -> Model:
     )
 
 
-def reason(features: Features, probability: float, least: float, agreement: Agreement, sigma: float = 0.0, precision: float = 1.0) -> str:
-    """One sentence that says why a hypothesis was rejected; ``precision`` is that of :func:`precise` for ``sigma`` (m)."""
+def reason(
+    features: Features,
+    probability: float,
+    least: float,
+    agreement: Agreement,
+    sigma: float = 0.0,
+    precision: float = 1.0,
+    share: float = 1.0,
+) -> str:
+    """One sentence that says why a hypothesis was rejected; ``precision`` is that of :func:`precise` for ``sigma`` (m), ``share`` what it
+    is worth beside other poses in the same place."""
     f, a = features, agreement
-    of_place = probability / max(precision, 1e-9)
-    if of_place >= least:
+    of_place = probability / max(precision * share, 1e-9)
+    if of_place >= least and share < precision:
+        why = f"of the poses in this place it is right with {share:.0%}"
+    elif of_place >= least:
         why = f"where in this place is known to {sigma:.2f} m only"
     elif a.lookalike > shipped().most_alike and 2 * of_place >= least:  # else it would be rejected anyway
         why = f"streets about it look like others ({a.lookalike:.0%})"

@@ -115,6 +115,37 @@ def _agrees(target_T_map: F64, map_T_query: F64, target_T_query: F64, most: floa
     return bool(off <= most * most and np.arccos(min(max((trace - 1) / 2, -1.0), 1.0)) <= turn)
 
 
+def shares(placed: Placed, voxel_size: float) -> F64:
+    """Share (n,) of each alignment in what the poses of its query beside it are worth alone, its own included.
+
+    Neighbours tell which place is right, not which of two poses that they agree with as well: a metre along the road, where each camera
+    saw the other sides of things. That only the alignments themselves tell.
+    """
+    out = np.ones(len(placed))
+    for rows in pairs_of(placed).values():
+        group = placed.part(rows)
+        out[rows] = _shares(group.query, group.target_T_query, group.alone, 2 * MOST_SLACK * voxel_size, 2 * TURN)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _shares(query: I64, target_T_query: F64, alone: F64, most: float, turn: float) -> F64:
+    """Of alignments ordered by ``query`` (n,); beside each other are those within ``most`` metres and ``turn`` radians about z."""
+    out, first = np.ones(len(query)), 0
+    for k in range(len(query)):
+        first = first if query[first] == query[k] else k
+        n, total, T = first, 0.0, target_T_query[k]
+        while n < len(query) and query[n] == query[k]:
+            U = target_T_query[n]
+            off = np.sqrt((T[0, 3] - U[0, 3]) ** 2 + (T[1, 3] - U[1, 3]) ** 2 + (T[2, 3] - U[2, 3]) ** 2)
+            turned = np.arctan2(T[0, 0] * U[1, 0] - T[1, 0] * U[0, 0], T[0, 0] * U[0, 0] + T[1, 0] * U[1, 0])
+            if off <= most and abs(turned) <= turn:
+                total += alone[n]
+            n += 1
+        out[k] = alone[k] / total if total > 0 else 1.0
+    return out
+
+
 def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Settings) -> list[Alignment]:
     """The alignments of all queries, best first for each query: at most one accepted for each target session, the others with a reason."""
     v, least = settings.fusion.voxel_size, settings.closures.min_probability
@@ -122,8 +153,8 @@ def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], sett
     columns = agree(placed, v)
     astray = strays(placed, v)
     fitted = may_be_right(features_of(alignments))
-    precision = precise(placed.sigma, v)
-    probability = np.where(astray | ~fitted, 0.0, shipped().decided(columns) * precision)
+    precision, share = precise(placed.sigma, v), shares(placed, v)
+    probability = np.where(astray | ~fitted, 0.0, shipped().decided(columns) * precision * share)
     order = sorted(range(len(alignments)), key=lambda k: _rank(alignments[k], float(probability[k])))
     answered: set[tuple[str, int, str]] = set()
     out = []
@@ -136,7 +167,7 @@ def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], sett
         if astray[k]:
             why = f"probability {p:.3f} below {least:g}: the session's own odometry puts it elsewhere"
         elif not p >= least:  # nor what is no number
-            why = reason(a.features, p, least, agreement, a.sigma, float(precision[k]))
+            why = reason(a.features, p, least, agreement, a.sigma, float(precision[k]), float(share[k]))
         else:
             why = "another place of the same session fits better" if asked in answered else ""
         answered.add(asked)

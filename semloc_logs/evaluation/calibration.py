@@ -29,7 +29,7 @@ from semloc_logs.closures.acceptance import (
     together_values,
     unrivalled,
 )
-from semloc_logs.closures.agreement import agree
+from semloc_logs.closures.agreement import agree, shares
 from semloc_logs.closures.placing import Placed, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import keyframe_at
@@ -235,7 +235,15 @@ def agreement_of(judged: Judged, alone: F64, without_rivals: F64) -> list[F64]:
 def decided_by(model: Model, judged: Judged) -> F64:
     """The probabilities (n,) that the acceptance gives with ``model``."""
     p = model.decided(agreement_of(judged, model.own(judged.features), unrivalled(model.own, judged.features)))
-    return np.where(possible(judged), p * precise(judged.placed.sigma, judged.voxel_size), 0.0)
+    return np.where(possible(judged), p * where_right(judged, model.own(judged.features)), 0.0)
+
+
+def where_right(judged: Judged, alone: F64) -> F64:
+    """Probability (n,) that of the poses in its place an alignment has the right one, by what each says ``alone`` (n,)."""
+    share = np.ones(len(judged))
+    for mine in (np.flatnonzero(judged.town == town) for town in sorted(set(judged.town))):
+        share[mine] = shares(replace(judged.placed.part(mine), alone=alone[mine]), judged.voxel_size)
+    return precise(judged.placed.sigma, judged.voxel_size) * share
 
 
 def possible(judged: Judged) -> Bools:
@@ -278,7 +286,7 @@ def fit(judged: Judged) -> Fitted:
     far = (columns[1] > 0) & has_far(columns)
     together = _temper(model.together, probability, judged, kept & far & ~alike, np.ones(len(judged)))
     probability = np.where(far, _tempered(probability, model.together, together), probability)
-    probability = np.where(kept, np.where(alike, probability / 2, probability) * precise(judged.placed.sigma, judged.voxel_size), 0.0)
+    probability = np.where(kept, np.where(alike, probability / 2, probability) * where_right(judged, alone), 0.0)
     return Fitted(replace(model, together=together), alone, probability)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Features
 from semloc_logs.closures.acceptance import AGREEMENT, Agreement
-from semloc_logs.closures.agreement import LEAST, MOST_SLACK, NEAR, SLACK, TURN, TURN_DRIFT, _sums, agree, decide
+from semloc_logs.closures.agreement import LEAST, MOST_SLACK, NEAR, SLACK, TURN, TURN_DRIFT, _sums, agree, decide, shares
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.placing import ARM, DRIFT, FAR, Placed, place, strays
 from semloc_logs.closures.queries import SessionMap
@@ -117,6 +117,35 @@ def test_of_a_query_one_place_of_each_target_is_accepted() -> None:
     found = decided([alignment(25, 0.999), alignment(25, 0.998, at=50)])
     assert found[25, 25].accepted
     assert "fits better" in found[25, 50].reason
+
+
+@pytest.mark.parametrize(
+    ("beside", "share"),
+    [
+        (yaw_transform(0.0, (1.0, 0.0, 0.0)), 0.75),
+        (yaw_transform(0.0, (1.9, 0.0, 0.0)), 0.75),
+        (yaw_transform(0.0, (2.1, 0.0, 0.0)), 1.0),  # neighbours that agree with both are 1 m from either
+    ],
+)
+def test_of_two_poses_in_a_place_each_has_its_share(beside: F64, share: float) -> None:
+    two = [alignment(25, 0.6), alignment(25, 0.2, beside)]
+    assert shares(place(two, MAPS), 0.3) == pytest.approx([share, 1 - share if share < 1 else 1])
+    turned = dataclasses.replace(alignment(25, 0.2), target_T_query=yaw_transform(np.radians(9.0)))
+    assert shares(place([two[0], turned], MAPS), 0.3).tolist() == [1, 1]
+    others = [alignment(25, 0.6), alignment(26, 0.2), alignment(25, 0.2, query="b", target="a")]
+    assert shares(place(others, MAPS), 0.3).tolist() == [1, 1, 1]
+
+
+def test_neighbours_do_not_choose_among_the_poses_of_a_place() -> None:
+    """Seen from opposite sides a street fits as well a metre further on, and neighbours agree with both."""
+    sure = [alignment(k, 0.999) for k in range(20, 31) if k != 25]
+    alone = decide([*sure, alignment(25, 0.6)], MAPS, SETTINGS)
+    assert [a.accepted for a in alone if a.query_keyframe == 25] == [True]
+    both = decide([*sure, alignment(25, 0.6), alignment(25, 0.2, yaw_transform(0.0, (1.0, 0.0, 0.0)))], MAPS, SETTINGS)
+    reasons = [a.reason for a in both if a.query_keyframe == 25]
+    assert len(reasons) == 2
+    assert "of the poses in this place it is right with 75%" in reasons[0]
+    assert all(a.accepted for a in both if a.query_keyframe != 25)
 
 
 def test_sessions_that_overlap_each_other_do_not_contradict() -> None:
