@@ -158,9 +158,9 @@ def test_logistic_regression_of_separable_and_of_constant_features_stays_finite(
 
 
 def test_a_place_that_is_not_known_to_a_metre_is_no_closure() -> None:
-    """Within 1 m = one of 1.4 standard deviations of 0.714 m: 68.3 %; in a room of 5 cm voxels the bound is a sixth."""
-    np.testing.assert_allclose(precise(np.array([1 / 1.4, 0.5 / 1.4, 0.0]), 0.30), [0.6827, 0.9545, 1.0], atol=1e-4)
-    assert precise(1 / 1.4 / 6, 0.05) == pytest.approx(0.6827, abs=1e-4)
+    """Within 1 m = one of 1.2 standard deviations of 0.833 m: 68.3 %; in a room of 5 cm voxels the bound is a sixth."""
+    np.testing.assert_allclose(precise(np.array([1 / 1.2, 0.5 / 1.2, 0.0]), 0.30), [0.6827, 0.9545, 1.0], atol=1e-4)
+    assert precise(1 / 1.2 / 6, 0.05) == pytest.approx(0.6827, abs=1e-4)
     text = reason(GOOD, 0.682, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)
     assert text == "probability 0.682 below 0.99: where in this place is known to 0.80 m only"
     assert "0.80 m" not in reason(GOOD, 0.3, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)  # nor is it the place
