@@ -3,8 +3,8 @@
     python benchmarks/false_closures.py towns DIR [--queries 5000] [--drives FOLDER] [--jobs N]     simulate, ask, judge; resumes
     python benchmarks/false_closures.py logs DIR LOGS [--small NAME]... [--jobs N]
 
-Two of three towns are cities whose blocks are copies of one another; with a folder of recorded drives there are also towns along these that
-stereo cameras drive there and back. Their tables DIR/TOWN/judged.parquet hold features, so after a new
+Two of three towns are cities whose blocks are copies of one another. Then come towns of cameras, most of them driven there and back along
+recorded drives, where these are in FOLDER. Their tables DIR/TOWN/judged.parquet hold features, so after a new
 calibration the same command counts again without asking again. LOGS is a folder of logs, with *_truth.json for those whose truth is known
 (those of one file are of one place; a closure between logs of different places is false). Each pair is asked with the labels of the log,
 with those from geometry and without any.
@@ -35,15 +35,18 @@ from semloc_logs.tables import read_metadata
 from semloc_logs.workspace import Workspace
 
 FIRST, MOST = 30, 60  # numbers of the towns: calibration has those before
-THERE_AND_BACK = tuple(  # each camera sees the other sides of things
-    Town(f"back-{drive}", seed, ("stereo",), labels, noise=noise, trajectory=drive, start=start, length=240.0)
-    for drive, seed, labels, noise, start in (
-        ("00", 16, "auto", 0.12, 700.0),
-        ("05", 17, "geometry", 0.12, 500.0),
-        ("07", 67, "auto", 0.1, 0.0),
-        ("06", 66, "geometry", 0.1, 300.0),
-        ("09", 69, "auto", 0.1, 400.0),
-    )
+CAMERAS = (  # stereo cameras there and back along recorded drives see the other sides of things
+    Town("camera-back-00", 16, ("stereo",), noise=0.12, trajectory="00", start=700.0, length=240.0),
+    Town("camera-back-05", 17, ("stereo",), "geometry", noise=0.12, trajectory="05", start=500.0, length=240.0),
+    Town("camera-back-06", 66, ("stereo",), "geometry", noise=0.1, trajectory="06", start=300.0, length=240.0),
+    Town("camera-back-07", 67, ("stereo",), noise=0.1, trajectory="07", length=240.0),
+    Town("camera-back-09", 69, ("stereo",), noise=0.1, trajectory="09", start=400.0, length=240.0),
+    Town("camera-1", 81, ("stereo",), noise=0.1, sessions=4, length=200.0),
+    Town("camera-back-05-far", 82, ("stereo",), noise=0.1, trajectory="05", start=1200.0, length=240.0),
+    Town("camera-2", 83, ("stereo",), "geometry", noise=0.1, sessions=4, length=200.0),
+    Town("camera-back-00-far", 84, ("stereo",), "geometry", noise=0.1, trajectory="00", start=1900.0, length=240.0),
+    Town("camera-lidar", 85, ("stereo", "hdl32"), noise=0.1, sessions=2, length=200.0),
+    Town("camera-depth-lidar", 86, ("depth", "vlp32"), noise=0.1, sessions=2, length=200.0),
 )
 SOURCES = ("auto", "geometry", "uniform")  # auto: labels of the log, where it has any
 SMALL = ("room_*", "euroc_*")
@@ -52,14 +55,12 @@ SMALL = ("room_*", "euroc_*")
 def ask_towns(args: argparse.Namespace) -> None:
     """Ask, then count under the calibration of the package."""
     place = Place(args.dir, args.drives)
-    paths = collect(place, short_towns(FIRST, MOST), args.jobs, args.queries)
-    if args.drives:
-        paths += collect(place, THERE_AND_BACK, args.jobs)
+    paths = collect(place, short_towns(FIRST, MOST), args.jobs, args.queries) + collect(place, CAMERAS, args.jobs)
     judged = read_judged(paths)
     p = decided_by(shipped(), judged)
     print(f"{sum(read_metadata(path)['queries'] for path in paths)} queries in {len(paths)} towns")
-    back = np.array([town.startswith("back") for town in judged.town], bool)
-    kinds = {"ordinary towns": ~judged.copies & ~back, "cities of copies": judged.copies, "stereo, there and back": back}
+    cameras = np.array([town.startswith("camera") for town in judged.town], bool)
+    kinds = {"ordinary towns": ~judged.copies & ~cameras, "cities of copies": judged.copies, "towns of cameras": cameras}
     for name, rows in ((n, r) for n, r in kinds.items() if r.any()):
         for line in recall_at(judged.part(rows), p[rows]):
             print(f"  {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
