@@ -116,20 +116,22 @@ def _agrees(target_T_map: F64, map_T_query: F64, target_T_query: F64, most: floa
 
 
 def shares(placed: Placed, voxel_size: float) -> F64:
-    """Share (n,) of each alignment in what the poses of its query beside it are worth alone, its own included.
+    """Share (n,) of each alignment in the odds that the poses of its query beside it have alone, its own included: one of them is right.
 
     Neighbours tell which place is right, not which of two poses that they agree with as well: a metre along the road, where each camera
     saw the other sides of things. That only the alignments themselves tell.
     """
+    alone = np.clip(placed.alone, 0.0, 1 - 1e-6)
+    odds = alone / (1 - alone)
     out = np.ones(len(placed))
     for rows in pairs_of(placed).values():
         group = placed.part(rows)
-        out[rows] = _shares(group.query, group.target_T_query, group.alone, 2 * MOST_SLACK * voxel_size, 2 * TURN)
+        out[rows] = _shares(group.query, group.target_T_query, odds[rows], 2 * MOST_SLACK * voxel_size, 2 * TURN)
     return out
 
 
 @njit(cache=True, nogil=True)
-def _shares(query: I64, target_T_query: F64, alone: F64, most: float, turn: float) -> F64:
+def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float) -> F64:
     """Of alignments ordered by ``query`` (n,); beside each other are those within ``most`` metres and ``turn`` radians about z."""
     out, first = np.ones(len(query)), 0
     for k in range(len(query)):
@@ -140,9 +142,9 @@ def _shares(query: I64, target_T_query: F64, alone: F64, most: float, turn: floa
             off = np.sqrt((T[0, 3] - U[0, 3]) ** 2 + (T[1, 3] - U[1, 3]) ** 2 + (T[2, 3] - U[2, 3]) ** 2)
             turned = np.arctan2(T[0, 0] * U[1, 0] - T[1, 0] * U[0, 0], T[0, 0] * U[0, 0] + T[1, 0] * U[1, 0])
             if off <= most and abs(turned) <= turn:
-                total += alone[n]
+                total += odds[n]
             n += 1
-        out[k] = alone[k] / total if total > 0 else 1.0
+        out[k] = odds[k] / total if total > 0 else 1.0
     return out
 
 
