@@ -31,7 +31,8 @@ def pool(group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, ce
     if not len(group):
         return []
     headings, heading = np.unique(yaw, return_inverse=True)
-    owner = np.asarray(group, np.int64) * len(headings) + heading
+    group = np.asarray(group, np.int64)
+    owner = group * len(headings) + heading
     parts = []
     for offset in (0.0, 0.5):
         ijk = np.floor(translation / cell + offset).astype(np.int64)
@@ -46,10 +47,10 @@ def pool(group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, ce
         best = np.lexsort((start, -total))[:most]
         mean = np.add.reduceat(translation[order] * weight[order, None], start)[best] / total[best, None]
         first = order[start[best]]
-        parts.append((np.asarray(group)[first], np.c_[yaw[first], mean], count[best], total[best]))
+        parts.append((group[first], np.c_[yaw[first], mean], count[best], total[best]))
     groups, poses, votes, weights = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((*poses.T[::-1], groups, -weights))
-    kept = order[first_apart(groups[order].astype(np.int64), poses[order], cell / 4, most)]  # a cell found twice is one hypothesis
+    kept = order[first_apart(groups[order], poses[order], cell / 4, most)]  # a cell found twice is one hypothesis
     columns = (groups[kept], map(tuple, poses[kept].tolist()), votes[kept], weights[kept])
     return [Hypothesis(int(g), pose, int(n), float(w)) for g, pose, n, w in zip(*columns, strict=True)]
 

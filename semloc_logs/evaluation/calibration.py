@@ -234,8 +234,9 @@ def agreement_of(judged: Judged, alone: F64, without_rivals: F64) -> list[F64]:
 
 def decided_by(model: Model, judged: Judged) -> F64:
     """The probabilities (n,) that the acceptance gives with ``model``."""
-    p = model.decided(agreement_of(judged, model.own(judged.features), unrivalled(model.own, judged.features)))
-    return np.where(possible(judged), p * where_right(judged, model.own(judged.features)), 0.0)
+    alone = model.own(judged.features)
+    p = model.decided(agreement_of(judged, alone, unrivalled(model.own, judged.features)))
+    return np.where(possible(judged), p * where_right(judged, alone), 0.0)
 
 
 def where_right(judged: Judged, alone: F64) -> F64:
