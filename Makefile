@@ -34,10 +34,12 @@ test: install
 fuzz: install
 	$(BIN)/python -P benchmarks/fuzz.py --minutes $(or $(MINUTES),1) --seed $(or $(SEED),0)
 
-# exit code 3 says that the minutes are over: a batch system starts the same command again, here a loop does
+# exit code 3 says that the minutes are over: a batch system starts the same command again, here a loop does, one variant in turn with the other
 weights: install
-	@while :; do $(BIN)/semloc train -o weights --samples 16000000 --scenes 4000 --set training.batch=192 --minutes $(or $(MINUTES),9); \
-		code=$$?; [ $$code -eq 3 ] || exit $$code; done
+	@left="semantic geometric"; while [ -n "$$left" ]; do again=""; for variant in $$left; do \
+		$(BIN)/semloc train -o weights --variant $$variant --samples $(or $(SAMPLES),16000000) --scenes 4000 --set training.batch=48 \
+			--jobs $(or $(JOBS),1) --minutes $(or $(MINUTES),9); \
+		code=$$?; case $$code in 0) ;; 3) again="$$again $$variant" ;; *) exit $$code ;; esac; done; left="$$again"; done
 
 lint: install
 	$(BIN)/ruff check

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,6 +62,8 @@ def command(
     """
     from semloc_logs.engines.engine import cores
     from semloc_logs.learning import device_of, learn_descriptor, use_threads
+    from semloc_logs.subvolumes.checkpoints import steps_done
+    from semloc_logs.subvolumes.schedule import samples_after
 
     folder = checkpoint or output / "checkpoint"
     chosen = device_of(device)
@@ -68,14 +71,16 @@ def command(
     scores = {}
     with console.progress(), engine.open(settings.training.scenes) as opened:
         use_threads(engine.jobs or cores())
-        shards = packed_shards(folder, work, settings, opened)
         for name in ("semantic", "geometric") if variant == "both" else (variant,):
             weights = output / f"{name}.safetensors"
             where = folder / f"{name}.safetensors"
-            found = learn_descriptor(
-                name, shards, settings, where, weights, console.note, device=chosen, deadline=deadline, snapshots=snapshots
-            )
+            shards = packed_shards(folder, work, settings, opened, samples_after(steps_done(where), settings.training))
+            with closing(shards):
+                found = learn_descriptor(
+                    name, shards, settings, where, weights, console.note, device=chosen, deadline=deadline, snapshots=snapshots
+                )
             if found is None:
+                opened.stop()  # scenes that are being made are made again
                 console.warn(f"{minutes:g} minutes are over and {where} is written: the same command goes on from there.")
                 return 3
             scores[name] = found
@@ -91,11 +96,11 @@ def command(
     return 0
 
 
-def packed_shards(folder: Path, work: Path | None, settings: Settings, engine: Engine) -> Packed:
-    """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes."""
+def packed_shards(folder: Path, work: Path | None, settings: Settings, engine: Engine, samples: int = 0) -> Packed:
+    """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes; ``samples`` have been seen of them."""
     from semloc_logs.learning import session_shards, simulated_shards
     from semloc_logs.workspace import Workspace
 
     if work is None:
-        return simulated_shards(folder, settings, engine, console.note)
+        return simulated_shards(folder, settings, engine, console.note, samples)
     return session_shards(folder, Workspace(work).sessions(), settings, engine, console.note)

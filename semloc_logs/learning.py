@@ -25,6 +25,7 @@ from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.own_sessions import cut_stretch, stretch_tasks
 from semloc_logs.subvolumes.pairs import read_shard, rows_of
 from semloc_logs.subvolumes.sampling import shard_descriptors
+from semloc_logs.subvolumes.schedule import scene_window
 from semloc_logs.subvolumes.training import Progress, train
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import SessionFolder
@@ -32,31 +33,55 @@ from semloc_logs.workspace import SessionFolder
 Note = Callable[[str], None]
 HELD_OUT = 2  # shards that only measure
 SCORED = 600  # pairs of each of them
+SCENES_AHEAD = 8  # scenes made before the training needs them
+SCENES_KEPT = 256  # scenes that stay after their use: another variant that is trained in turn needs them, too
 REPORT_SECONDS = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Packed:
-    """Shards of pairs to train on, of which ``train[i]`` may wait until it is there, and those that only measure."""
+    """Shards of pairs to train on, of which ``train[i]`` may wait until it is there, and those that only measure.
+
+    Shards that ``drop`` names as used, by number, are made again when they are needed again.
+    """
 
     train: Sequence[Path]
-    held_out: list[Path]
+    held_out: Sequence[Path]
+    drop: Callable[[int], None] = lambda _: None
 
     @property
     def every(self) -> list[Path]:
         """All of them, waited for."""
         return [*self.train, *self.held_out]
 
+    def close(self) -> None:
+        """Make no further shards."""
+        for shards in (self.train, self.held_out):
+            if isinstance(shards, Growing):
+                shards.close()
 
-def simulated_shards(folder: Path, settings: Settings, engine: Engine, note: Note) -> Packed:
-    """Pairs from ``training.scenes`` simulated scenes; those that are there for the same settings stay.
 
-    They are made in the order in which training wants them, while ``engine`` is open.
+def simulated_shards(folder: Path, settings: Settings, engine: Engine, note: Note, samples: int = 0) -> Packed:
+    """Pairs from ``training.scenes`` simulated scenes, as a training that has seen ``samples`` samples goes on to need them.
+
+    They are made in the order in which training uses them, a few ahead of it, while ``engine`` is open; shards that are there for the
+    same settings stay. Those that measure are made when they are read.
     """
     tasks = scene_tasks(_shard_folder(folder, "simulated", settings), settings.training.scenes, settings)
     count = len(tasks) - HELD_OUT if len(tasks) > HELD_OUT else len(tasks)
-    held_out = list(engine.map(make_shard, tasks[count:]))
-    return Packed(Growing(engine.map(make_shard, tasks[:count]), count, lambda n: note(f"scene {n} of {count}")), held_out)
+    first = scene_window(samples, count).start
+    made = engine.map(make_shard, tasks[first:count])
+    train = Growing(made, count, lambda n: note(f"scene {n} of {count}"), first=first, ahead=SCENES_AHEAD)
+    held_out = Growing(engine.map(make_shard, tasks[count:]), len(tasks) - count, ahead=0)
+    kept = first
+
+    def drop(before: int) -> None:
+        nonlocal kept
+        for task in tasks[kept:before]:
+            task.shard.unlink(missing_ok=True)
+        kept = max(kept, before)
+
+    return Packed(train, held_out, drop)
 
 
 def session_shards(folder: Path, sessions: Sequence[SessionFolder], settings: Settings, engine: Engine, note: Note) -> Packed:
@@ -106,7 +131,7 @@ def learn_descriptor(
     Goes on from ``checkpoint`` if it is there. None, with a checkpoint, where ``time.monotonic()`` passed ``deadline`` before the end.
     Raises SettingsError when there are too few shards to hold any out.
     """
-    if not shards.held_out:
+    if not len(shards.held_out):
         raise SettingsError(
             f"Training needs at least {HELD_OUT + 1} scenes or stretches of road, not {len(shards.train)}: two of them only measure."
         )
@@ -118,6 +143,7 @@ def learn_descriptor(
         now = time.monotonic()
         if first < 0:
             first = step.samples
+        shards.drop(scene_window(step.samples, len(shards.train)).start - SCENES_KEPT)
         if now - spoke >= REPORT_SECONDS or step.samples >= training.samples:
             spoke = now
             rate = (step.samples - first) / max(now - started, 1e-9)

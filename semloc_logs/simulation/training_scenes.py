@@ -1,7 +1,8 @@
 """Labelled clouds through random worlds: the training data of the shipped descriptor network.
 
-Every seed is another town (every sixth a hall), driven once to map it and, in most scenes, once more to ask: by another sensor, from
-another lane or in the other direction, in another season, among other parked cars. About ten seconds a scene on one core.
+Every seed is another place: of twelve, nine are towns, one is a hall, one a forest and one a furnished room. Each is mapped by one drive
+and, in most scenes, queried by a second one: with another sensor, from another lane or in the other direction, in another season, among
+other parked cars. About ten seconds a scene on one core.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from numpy.typing import NDArray
 from semloc_logs.geometry import apply
 from semloc_logs.simulation.camera import CAMERAS, CameraModel, camera_points
 from semloc_logs.simulation.conditions import SEASONS, Condition
+from semloc_logs.simulation.forest import build_forest
 from semloc_logs.simulation.hall import build_hall, hall_walk
 from semloc_logs.simulation.label_errors import corrupt_labels
 from semloc_logs.simulation.lidar import full_sweep
 from semloc_logs.simulation.lidar_models import MODELS, LidarModel
 from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route
+from semloc_logs.simulation.room import build_room, room_walk
 from semloc_logs.simulation.street import build_street, street_ground
 from semloc_logs.simulation.traffic import Traffic, random_traffic
 from semloc_logs.simulation.trajectory import poses_along, smooth_line
@@ -30,6 +33,8 @@ RAYS = 60_000  # a sweep at most
 RANGE = 60.0  # m
 ASKED = 36  # frames of the second drive
 LABEL_NOISE = 0.02, 0.2  # share of wrong labels of a session, least and most
+KINDS = {5: "hall", 8: "forest", 11: "room"}  # by seed modulo 12; the others are streets
+ROOM_SCALE = 6.0  # a room in voxels of 0.05 m looks as one six times as large in voxels of 0.30 m
 Rng = np.random.Generator
 
 
@@ -87,31 +92,50 @@ class _Rig:
 
 
 def training_scene(seed: int, frames: int = 60) -> TrainingScene:
-    """A drive of ``frames`` frames through a random street, or with every sixth seed a walk through a hall; and another one there.
+    """A drive of ``frames`` frames through a random place of the kind that ``KINDS`` gives the seed, and another one there.
 
     The second part of most drives comes back along the first in the other direction or in the same one. Of two scenes in five the
-    frames that map are those that ask, as in the paper. The same arguments give the same frames.
+    mapped frames are also the query frames, as in the paper. The same arguments give the same frames. A room is enlarged by ``ROOM_SCALE``.
     """
     rng = np.random.default_rng([seed, 77])
-    hall = seed % 6 == 5
-    mapping, asking = _hall(rng, seed, frames) if hall else _street(rng, seed, frames)
-    rig = _rig(rng, hall)
-    mapped = list(_frames(mapping, rng, rig, 2 * seed))
+    kind = KINDS.get(seed % 12, "street")
+    if kind == "hall":
+        mapping, asking = _hall(rng, seed, frames)
+    elif kind == "room":
+        mapping, asking = _room(rng, seed, frames)
+    else:
+        mapping, asking = _street(rng, seed, frames, forest=kind == "forest")
+    rig = _rig(rng, kind)
+    scale = ROOM_SCALE if kind == "room" else 1.0
+    mapped = [_enlarged(f, scale) for f in _frames(mapping, rng, rig, 2 * seed)]
     if asking is None:
         return TrainingScene(mapped, mapped)
-    return TrainingScene(mapped, list(_frames(asking, rng, rig if rng.random() < 0.4 else _rig(rng, hall), 2 * seed + 1)))
+    other = rig if rng.random() < 0.4 else _rig(rng, kind)
+    return TrainingScene(mapped, [_enlarged(f, scale) for f in _frames(asking, rng, other, 2 * seed + 1)])
 
 
-def _rig(rng: Rng, hall: bool) -> _Rig:
-    """A random sensor: a lidar two times in three, else a camera."""
+def _enlarged(frame: TrainingFrame, scale: float) -> TrainingFrame:
+    if scale == 1.0:
+        return frame
+    pose = frame.world_T_base.copy()
+    pose[:3, 3] *= scale
+    factor = np.float32(scale)
+    sigma = None if frame.sigma is None else frame.sigma * factor
+    return TrainingFrame(frame.points * factor, frame.origin * factor, frame.labels, pose, sigma)
+
+
+def _rig(rng: Rng, kind: str) -> _Rig:
+    """A random sensor: in rooms a depth camera four times in five, elsewhere a lidar two times in three, else a camera."""
     noise = float(rng.uniform(*LABEL_NOISE))
-    if rng.random() < 0.34:
-        camera = CAMERAS["depth" if hall else "stereo"]
+    if rng.random() < (0.8 if kind == "room" else 0.34):
+        camera = CAMERAS["depth" if kind in ("hall", "room") else "stereo"]
         camera = replace(camera, mount_height=camera.mount_height + rng.uniform(-0.3, 0.4))
         yaw = float(rng.choice([0.0, 0.0, math.pi / 2, -math.pi / 2, math.pi]))
         return _Rig(camera, yaw=yaw, label_noise=noise)
-    model = MODELS[str(rng.choice(["hdl64", "hdl64", "hdl64", "hdl32", "vlp32", "vlp16", "rosette", "raster"]))]
-    blind = 1.0 if hall else float(rng.uniform(1.5, 3.5))
+    model = MODELS[str(rng.choice(["hdl64", "hdl64", "hdl32", "vlp32", "vlp16", "vlp16", "rosette", "raster"]))]
+    if kind == "room":
+        model = replace(model, height=1.2)
+    blind = {"hall": 1.0, "room": 0.3}.get(kind) or float(rng.uniform(1.5, 3.5))
     model = replace(model, height=model.height + rng.uniform(-0.3, 0.4), noise=rng.uniform(0.01, 0.03), min_range=blind)
     columns = min(int(RAYS * rng.uniform(0.6, 1.0) / len(model.elevations_deg)), model.columns)
     return _Rig(model, columns, (-0.9, 0.9) if rng.random() < 0.1 else None, label_noise=noise)
@@ -139,7 +163,7 @@ def _condition(rng: Rng, number: int) -> Condition:
     return Condition(number, season, works, rebuilt)
 
 
-def _street(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
+def _street(rng: Rng, seed: int, frames: int, *, forest: bool = False) -> tuple[_Drive, _Drive | None]:
     spacing = float(rng.uniform(1.5, 3.0))
     returning = rng.random() < 0.5
     once = int(np.ceil(frames * 0.6)) if returning else frames
@@ -162,7 +186,8 @@ def _street(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
     def drive(poses: F64, condition: Condition) -> _Drive:
         seconds = np.arange(len(poses), dtype=np.float64) * spacing / speed
         traffic = random_traffic(rng, ground, [line, back], float(rng.choice([0.0, 0.6, 1.5])))
-        return _Drive(build_street(network, seed, condition), poses, seconds, traffic)
+        world = build_forest(network, seed, condition) if forest else build_street(network, seed, condition)
+        return _Drive(world, poses, seconds, traffic)
 
     poses = poses_along(line, start + spacing * np.arange(once, dtype=np.float64), ground.slope_height, rng)
     if returning:
@@ -180,3 +205,21 @@ def _hall(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
         return _Drive(world, poses, np.arange(count, dtype=np.float64), None)
 
     return drive(line, frames), drive(line[::-1], min(ASKED, frames)) if rng.random() < 0.6 else None
+
+
+def _room(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
+    """Walks with a sensor in the hand: nodding, by up to 30 degrees down."""
+    step = 0.12
+    line = smooth_line(room_walk(seed, step * frames + 3), 0.25)
+
+    def walk(along: F64, count: int, condition: int) -> _Drive:
+        places = 0.5 + step * np.arange(count, dtype=np.float64)
+        poses = poses_along(along, places, lambda x, y: np.zeros_like(x), rng, shake=0.05)
+        nod = np.eye(3)
+        pitch = float(rng.uniform(-0.1, 0.5))
+        nod[[0, 0, 2, 2], [0, 2, 0, 2]] = math.cos(pitch), math.sin(pitch), -math.sin(pitch), math.cos(pitch)
+        poses[:, :3, :3] = poses[:, :3, :3] @ nod
+        return _Drive(build_room(seed, condition), poses, np.arange(count, dtype=np.float64), None)
+
+    again = walk(line[::-1], min(ASKED, frames), 1) if rng.random() < 0.6 else None
+    return walk(line, frames, 0), again

@@ -1,13 +1,14 @@
 """Batches of training pairs out of packed shards: a fixed random sequence, the same from whichever step it is begun.
 
-A pool is one row group of each of some scenes; batches are drawn from it until each of its pairs was drawn about once. The next pool is
-read by other threads meanwhile. Of the scenes, those that come first in the list are used first, so that scenes can still be made
-while training has begun. What is random about a pair is drawn where the network runs.
+A pool is some row groups of some scenes; batches are drawn from it until each of its pairs was drawn about once. The next pool is
+read by other threads meanwhile. Scenes come into use one after the other and leave again (``schedule.scene_window``), so that they can be
+made while the network trains and dropped afterwards. What is random about a pair is drawn where the network runs.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,13 +24,18 @@ from torch import Tensor
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.pairs import ROW_GROUP, read_shard
+from semloc_logs.subvolumes.schedule import FIRST_SCENES, samples_after, scene_window
 from semloc_logs.voxels.grid import UNOBSERVED_STATE
 
 U8 = NDArray[np.uint8]
 Pairs = tuple[U8, U8, U8]
-SCENES = 12  # of a pool, at least
+PATIENCE = 5.0  # s beyond a deadline for pairs that are being read; scenes that are still to be made take longer
 READERS = 4
-AHEAD = 3  # batches that are put together before they are asked for
+AHEAD = 3  # batches that are put together before they are needed
+
+
+class OutOfTime(Exception):
+    """The deadline passed while a scene was being made."""
 
 
 class Batch(NamedTuple):
@@ -40,32 +46,36 @@ class Batch(NamedTuple):
     other: Tensor
 
 
-def _plan(number: int, pools: int, shards: int, training: Training) -> list[tuple[int, int]]:
-    """Scene and row group of each part of the pool ``number``."""
+def _plan(number: int, samples: int, shards: int, training: Training) -> list[tuple[int, int]]:
+    """Scene and row group of each part of the pool ``number``, before which ``samples`` samples have been seen."""
     draw = np.random.default_rng((training.seed, number))
-    wanted = max(SCENES, training.batch)
-    # all scenes are in use from the middle of the training on
-    known = min(shards, wanted + math.ceil(max(0, shards - wanted) * 2 * number / pools))
-    scenes = draw.permutation(known)[:wanted]
-    return list(zip(scenes.tolist(), draw.integers(1 << 16, size=len(scenes)).tolist(), strict=True))
+    parts = max(FIRST_SCENES, training.batch)
+    window = scene_window(samples, shards)
+    rounds = [draw.permutation(window) for _ in range(-(-parts // len(window)))]
+    scenes = np.concatenate(rounds)[:parts]
+    return list(zip(scenes.tolist(), draw.integers(1 << 16, size=parts).tolist(), strict=True))
 
 
-def batches(shards: Sequence[Path], training: Training, first: int, steps: int, device: str = "cpu") -> Iterator[Batch]:
+def batches(
+    shards: Sequence[Path], training: Training, first: int, steps: int, device: str = "cpu", *, deadline: float = math.inf
+) -> Iterator[Batch]:
     """The batches of the steps ``first`` .. ``steps`` - 1.
 
-    ``shards[i]`` may wait until the scene is there. Raises SettingsError when shards without a single pair are all there is.
+    ``shards[i]`` may wait until the scene is there. Raises OutOfTime where it still waits when ``time.monotonic()`` has passed
+    ``deadline`` by a few seconds, and SettingsError when shards without a single pair are all there is.
     """
-    per_pool = max(1, min(len(shards), max(SCENES, training.batch)) * ROW_GROUP // training.batch)
+    per_pool = max(1, max(FIRST_SCENES, training.batch) * ROW_GROUP // training.batch)
     pools = -(-steps // per_pool)
     readers = ThreadPoolExecutor(READERS)
 
     def begin(number: int) -> list[Future[Pairs]]:
-        return [readers.submit(_read, shards, scene, group) for scene, group in _plan(number, pools, len(shards), training)]
+        plan = _plan(number, samples_after(number * per_pool, training), len(shards), training)
+        return [readers.submit(_read, shards, scene, group) for scene, group in plan]
 
     try:
         coming = begin(first // per_pool)
         for number in range(first // per_pool, pools):
-            pool = [pairs for pairs in (future.result() for future in coming) if len(pairs[0])]
+            pool = [pairs for pairs in (_in_time(future, deadline) for future in coming) if len(pairs[0])]
             coming = begin(number + 1) if number + 1 < pools else []
             if not pool:
                 raise SettingsError("There is nothing to train on: none of the scenes or stretches of road gave a pair of subvolumes.")
@@ -76,7 +86,16 @@ def batches(shards: Sequence[Path], training: Training, first: int, steps: int, 
                 drawn.extend(readers.submit(_drawn, pool, training, step) for step in islice(wanted, 1))
                 yield _turned(this, training, device)
     finally:
-        readers.shutdown(cancel_futures=True)
+        readers.shutdown(wait=False, cancel_futures=True)
+
+
+def _in_time(future: Future[Pairs], deadline: float) -> Pairs:
+    if deadline == math.inf:
+        return future.result()
+    try:
+        return future.result(max(0.0, deadline - time.monotonic()) + PATIENCE)
+    except TimeoutError:
+        raise OutOfTime from None
 
 
 def _read(shards: Sequence[Path], scene: int, group: int) -> Pairs:

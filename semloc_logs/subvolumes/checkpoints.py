@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.network import Completion
+from semloc_logs.subvolumes.schedule import plateau_end, steps_of
 from semloc_logs.tables import replacing_file
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -40,11 +41,9 @@ def resume(path: Path, model: Completion, optimiser: torch.optim.Optimizer, trai
         with safe_open(path, "pt") as handle:
             note = handle.metadata() or {}
         tensors = load_file(path)
-        same = (
-            json.loads(note["training"]) == training.model_dump(mode="json")
-            and note.get("variant", model.encoder.variant) == model.encoder.variant
-        )
         step = int(note["step"])
+        same_network = note.get("variant", model.encoder.variant) == model.encoder.variant
+        same = same_network and _goes_on(json.loads(note["training"]), training.model_dump(mode="json"), step)
     except (OSError, SafetensorError, KeyError, ValueError) as problem:
         raise WorkspaceError(f"Checkpoint {path} cannot be read ({problem}): remove it to start over.") from None
     if not same:
@@ -59,6 +58,27 @@ def resume(path: Path, model: Completion, optimiser: torch.optim.Optimizer, trai
             # counters stay where they are, moments go where the parameters live
             optimiser.state[p] = {k: v if k == "step" else v.to(p.device) for k, v in state.items()}
     return step
+
+
+def steps_done(path: Path) -> int:
+    """Steps of the training whose checkpoint is at ``path``; 0 where there is none that can be read."""
+    try:
+        with safe_open(path, "pt") as handle:
+            return int((handle.metadata() or {})["step"])
+    except (OSError, SafetensorError, KeyError, ValueError):
+        return 0
+
+
+def _goes_on(before: dict[str, Any], now: dict[str, Any], step: int) -> bool:
+    """Whether the training of the settings ``now`` would have come by the same ``step``.
+
+    Before the rate falls it does not matter how many samples are to be seen in all.
+    """
+    lengths = ("samples", "scenes")
+    if {k: v for k, v in before.items() if k not in lengths} != {k: v for k, v in now.items() if k not in lengths}:
+        return False
+    steps = min(steps_of(Training.model_validate(settings)) for settings in (before, now))
+    return before["samples"] == now["samples"] or step <= plateau_end(steps)
 
 
 def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:

@@ -20,10 +20,11 @@ from torch.nn import functional as F
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
-from semloc_logs.subvolumes.batches import Batch, batches
+from semloc_logs.subvolumes.batches import Batch, OutOfTime, batches
 from semloc_logs.subvolumes.checkpoints import resume, save_checkpoint, save_weights
 from semloc_logs.subvolumes.cut import CLASSES, code_table
 from semloc_logs.subvolumes.network import Completion, descriptors, in_eights
+from semloc_logs.subvolumes.schedule import learning_rate, plateau_end, samples_after, steps_of
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 RATE = 1.5e-3
@@ -108,9 +109,12 @@ def train(
 ) -> Completion | None:
     """Train from scratch or from ``checkpoint``, which is renewed every ``save_every`` steps; returns the finished network.
 
-    None, with a checkpoint to go on from, when the clock ``time.monotonic()`` passes ``deadline``. ``shards`` may wait in ``[i]`` for
-    scenes that are still being made. ``snapshots`` is a folder that gets the weights after 1/32, 1/16, ... 1/2 of the steps, for a learning
-    curve. On a GPU the network is compiled. Other networks and optimisers are for comparison.
+    None, with a checkpoint to go on from, when the clock ``time.monotonic()`` passes ``deadline``.
+    ``shards`` may wait in ``[i]`` for scenes that are still being made. The checkpoint at which
+    the rate begins to fall stays beside the others, as NAME.plateau.safetensors: put in their
+    place, it is where a training with more samples goes on. ``snapshots`` is a folder that gets
+    the weights after 1/32, 1/16, ... 1/2 of the steps, for a learning curve. On a GPU the network
+    is compiled. Other networks and optimisers are for comparison.
     Raises SettingsError without shards and WorkspaceError when the checkpoint is of another run.
     """
     if not len(shards):
@@ -118,7 +122,7 @@ def train(
     torch.manual_seed(training.seed)
     model = network(variant, training.latent).to(device)
     optimiser = optimiser_of(model)
-    steps = math.ceil(training.samples / (training.batch * 9))
+    steps = steps_of(training)
     done = resume(checkpoint, model, optimiser, training) if checkpoint.exists() else 0
     if device == "cuda":
         model.encoder.compile()
@@ -126,9 +130,16 @@ def train(
     table = torch.from_numpy(code_table(variant)).to(device)
     rate = optimiser.defaults["lr"] * math.sqrt(training.batch / BATCH_OF_RATE)
     model.train()
-    for step, batch in enumerate(batches(shards, training, done, steps, device), start=done):
+    step, coming = done, batches(shards, training, done, steps, device, deadline=deadline)
+    while step < steps:
+        try:
+            batch = next(coming)
+        except OutOfTime:
+            if step > done:
+                save_checkpoint(checkpoint, model, optimiser, training, step)
+            return None
         for group in optimiser.param_groups:
-            group["lr"] = rate * min(1.0, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
+            group["lr"] = rate * learning_rate(step, steps)
         normal = np.random.default_rng((training.seed, 2, step)).standard_normal((training.batch, training.latent), np.float32)
         losses = _losses(model, batch, torch.from_numpy(normal).to(device), table, training)
         optimiser.zero_grad(set_to_none=True)
@@ -138,7 +149,9 @@ def train(
         late = time.monotonic() >= deadline
         if (step + 1) % save_every == 0 or step + 1 == steps or late:
             save_checkpoint(checkpoint, model, optimiser, training, step + 1)
-        samples = (step + 1) * training.batch * 9
+        if step + 1 == plateau_end(steps):
+            save_checkpoint(checkpoint.with_suffix(".plateau.safetensors"), model, optimiser, training, step + 1)
+        samples = samples_after(step + 1, training)
         if snapshots and step + 1 in {steps >> k for k in range(1, 6)}:
             save_weights(snapshots / f"{variant}-{samples:09d}.safetensors", model, {"samples": str(samples)})
         on_step(
@@ -150,6 +163,7 @@ def train(
                 losses.matched,
             )
         )
-        if late and step + 1 < steps:
+        step += 1
+        if late and step < steps:
             return None
     return model

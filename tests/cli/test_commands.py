@@ -14,6 +14,7 @@ from mcap.writer import Writer
 
 from semloc_logs import contracts, stages
 from semloc_logs.cli.main import program
+from semloc_logs.learning import Packed
 from semloc_logs.logs.annotate import AnnotateReport
 from semloc_logs.stages import Report
 from semloc_logs.tables import write_table
@@ -329,7 +330,7 @@ def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatc
 
     def learn(
         variant: str,
-        shards: list[Path],
+        shards: Packed,
         settings: Any,
         checkpoint: Path,
         output: Path,
@@ -342,11 +343,13 @@ def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatc
         assert (device, snapshots) == ("cpu", None)
         if deadline < time.monotonic() + 60:
             return None
-        trained.append((variant, len(shards), settings.training.samples))
+        trained.append((variant, len(shards.train), settings.training.samples))
         assert checkpoint == tmp_path / "w/checkpoint" / f"{variant}.safetensors"
         return {"accuracy": 0.875}
 
-    monkeypatch.setattr("semloc_logs.learning.simulated_shards", lambda folder, settings, *_: [Path("s")] * settings.training.scenes)
+    monkeypatch.setattr(
+        "semloc_logs.learning.simulated_shards", lambda folder, settings, *_: Packed([Path("s")] * settings.training.scenes, [])
+    )
     monkeypatch.setattr("semloc_logs.learning.learn_descriptor", learn)
     monkeypatch.setattr("semloc_logs.learning.use_threads", lambda _: None)
     options = ("--scenes", 5, "--samples", 900, "--engine", "serial", "--device", "cpu")

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from semloc_logs.subvolumes.completion import completion_scores
 from semloc_logs.subvolumes.cut import SIZE, code_table
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.pairs import BROAD, SceneFrame, cut_pairs, occupied, read_shard, write_shard
+from semloc_logs.subvolumes.schedule import learning_rate, scene_window
 from semloc_logs.subvolumes.training import Progress, _seen, targets, train
 
 U8 = NDArray[np.uint8]
@@ -175,27 +178,92 @@ def test_a_training_stops_in_time_and_leaves_snapshots(shards: list[Path], tmp_p
         assert [p.samples for p in seen] == [18 * (i + 1) for i in range(steps)]
     assert train("geometric", shards, settings, checkpoint, seen.append, deadline=0.0) is not None
     assert len(seen) == 4
-    assert sorted(p.name for p in tmp_path.glob("*.safetensors")) == ["geometric-000000018.safetensors", "geometric-000000036.safetensors"]
+    assert sorted(p.name for p in tmp_path.glob("geometric-*")) == ["geometric-000000018.safetensors", "geometric-000000036.safetensors"]
     assert load_encoder("geometric", tmp_path / "geometric-000000036.safetensors").latent == 256
 
 
+def test_scenes_come_into_use_and_leave_again() -> None:
+    assert scene_window(0, 4000) == range(12)
+    assert scene_window(3999, 4000) == range(12)
+    assert scene_window(4000, 4000) == range(13)
+    assert scene_window(10**6, 4000) == range(6, 262)
+    assert scene_window(16 * 10**6, 4000) == range(3744, 4000)
+    assert scene_window(10**6, 100) == range(100)
+
+
 def test_scenes_are_used_as_they_come(shards: list[Path]) -> None:
-    """The first pool asks for the first scenes, and those in the second half of the training for any."""
-    asked: list[int] = []
+    """A pool of 12 x 32 pairs, 3456 samples, begins with the first 12 scenes; one more is in use after 4000 samples."""
+    read: list[int] = []
 
     class Scenes(Sequence[Path]):
         def __len__(self) -> int:
             return 50
 
         def __getitem__(self, index: Any) -> Any:
-            asked.append(index)
+            read.append(index)
             return shards[0]
 
-    list(batches(Scenes(), Training(batch=12), 0, 32 * 10))
-    assert len(asked) == 12 * 10
-    assert max(asked[:12]) < 12
-    assert max(asked[12:24]) < 12 + 8
-    assert max(asked[60:]) >= 40
+    list(batches(Scenes(), Training(batch=12), 0, 32 * 20))
+    pools = [read[i : i + 12] for i in range(0, len(read), 12)]
+    assert len(pools) == 20
+    assert sorted(pools[0]) == list(range(12))
+    for number, pool in enumerate(pools):
+        assert max(pool) < 12 + 3456 * number // 4000
+        assert len(set(pool)) == 12
+    assert max(pools[-1]) >= 20
+    longer: list[int] = list(read)
+    read.clear()
+    list(batches(Scenes(), Training(batch=12, samples=10**7), 0, 32 * 20))
+    assert sorted(read) == sorted(longer)  # whatever the length of the training
+    read.clear()
+    list(batches(Scenes(), Training(batch=48), 0, 1))
+    assert sorted(set(read[:48])) == list(range(12))  # a batch of more pairs takes several parts of each scene
+    assert len(read) >= 48
+
+
+def test_a_scene_that_comes_too_late_ends_the_training_in_time(shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("semloc_logs.subvolumes.batches.PATIENCE", 0.2)
+    late, begun = threading.Event(), time.monotonic()
+
+    class Scenes(Sequence[Path]):
+        def __len__(self) -> int:
+            return 2
+
+        def __getitem__(self, index: Any) -> Any:
+            late.wait(20)
+            return shards[index]
+
+    try:
+        assert train("geometric", Scenes(), short(4), tmp_path / "checkpoint", deadline=time.monotonic()) is None
+    finally:
+        late.set()
+    assert time.monotonic() - begun < 10
+    assert not (tmp_path / "checkpoint").exists()
+
+
+def test_the_rate_rises_stays_and_falls() -> None:
+    rates = [learning_rate(step, 1000) for step in range(1000)]
+    assert rates[0] == pytest.approx(1 / 50)
+    assert rates[49:750] == [1.0] * 701
+    assert rates[875] == pytest.approx(0.02 + 0.98 / 2)
+    assert 0.02 < rates[999] < 0.021
+    assert learning_rate(700, 10**6) == rates[700]
+
+
+def test_a_training_can_be_made_longer_from_its_plateau(shards: list[Path], tmp_path: Path) -> None:
+    short_run, long_run = tmp_path / "short", tmp_path / "long"
+    train("geometric", shards, short(4), short_run)
+    whole = train("geometric", shards, short(8), long_run)
+    with pytest.raises(WorkspaceError, match="settings"):
+        train("geometric", shards, short(8), short_run)  # its rate has fallen already
+    plateau = tmp_path / "short.plateau.safetensors"
+    seen: list[Progress] = []
+    longer = train("geometric", shards, short(8), plateau, seen.append)
+    assert [p.samples for p in seen] == [18 * (i + 1) for i in range(3, 8)]
+    assert whole is not None
+    assert longer is not None
+    for (name, a), b in zip(whole.state_dict().items(), longer.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
 
 
 def test_nothing_to_train_on(shards: list[Path], tmp_path: Path) -> None:

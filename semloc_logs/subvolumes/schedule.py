@@ -1,0 +1,48 @@
+"""The schedule of a training: steps, samples, learning rate, and the scenes in use."""
+
+from __future__ import annotations
+
+import math
+
+from semloc_logs.settings import Training
+
+SAMPLES_A_PAIR = 9
+WARM_UP = 50  # steps
+DECAY = 0.25  # share of the steps, the last ones, over which the rate falls
+LAST_RATE = 0.02  # of the full rate, at the last step
+FIRST_SCENES = 12  # in use from the first step on
+SAMPLES_A_SCENE = 4000  # a further scene comes into use after so many samples: about as many as its pairs hold
+WINDOW = 256  # scenes in use at most
+
+
+def steps_of(training: Training) -> int:
+    """Steps of the whole training."""
+    return math.ceil(training.samples / (training.batch * SAMPLES_A_PAIR))
+
+
+def samples_after(steps: int, training: Training) -> int:
+    """Samples seen in so many steps."""
+    return steps * training.batch * SAMPLES_A_PAIR
+
+
+def learning_rate(step: int, steps: int) -> float:
+    """Share of the full rate at ``step`` of ``steps``: a warm-up, a plateau, then a cosine down to ``LAST_RATE`` (Hägele et al. 2024).
+
+    The plateau is the same however many steps there are, so a training can be made longer, or ended, after it has begun.
+    """
+    begin = plateau_end(steps)
+    if step < begin:
+        return min(1.0, (step + 1) / WARM_UP)
+    share = (step - begin) / max(1, steps - begin)
+    return min(1.0, (step + 1) / WARM_UP) * (LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
+
+
+def plateau_end(steps: int) -> int:
+    """The step of ``steps`` at which the rate begins to fall."""
+    return steps - int(DECAY * steps)
+
+
+def scene_window(samples: int, scenes: int) -> range:
+    """Numbers of the scenes in use when ``samples`` samples have been seen, of ``scenes`` there are."""
+    newest = min(scenes, FIRST_SCENES + samples // SAMPLES_A_SCENE)
+    return range(max(0, newest - WINDOW), newest)
