@@ -23,7 +23,6 @@ from semloc_logs.closures.queries import SessionMap, query_keyframes
 from semloc_logs.closures.results import keyframe_at, read_closures, unique_closures, write_closures, write_rejected
 from semloc_logs.engines import Engine, Serial
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError
-from semloc_logs.geometry import transform
 from semloc_logs.labels.model import fingerprint as label_fingerprint
 from semloc_logs.logs.annotate import (
     AnnotateReport,
@@ -36,6 +35,7 @@ from semloc_logs.logs.annotate import (
     recover,
 )
 from semloc_logs.logs.trajectory_file import TrajectoryFile
+from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describing import DescribeTask, variants_for
 from semloc_logs.tables import read_json, read_metadata, replacing_folder, write_json

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.geometry import (
+from semloc_logs.numerics.transforms import (
     apply,
     exp_se3,
     interpolate,

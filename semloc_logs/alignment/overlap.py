@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.bits import lowest_bit
-from semloc_logs.geometry import inverse, yaw_transform
+from semloc_logs.numerics.bits import lowest_bit
+from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 from semloc_logs.voxels.keys import BLOCK, unpack
 

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.labels.eigen import eigen
-from semloc_logs.labels.shape import shapes_of
+from semloc_logs.numerics.eigen import eigen
+from semloc_logs.numerics.local_shape import shapes_of
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -30,8 +30,8 @@ from semloc_logs.alignment.overlap import (
     yaw_between,
 )
 from semloc_logs.alignment.surface import Surface, flattened_surface, surface_of
-from semloc_logs.geometry import apply
 from semloc_logs.labels.space import GROUND, cityscapes
+from semloc_logs.numerics.transforms import apply
 from semloc_logs.voxels.grid import BlockMap
 from semloc_logs.voxels.selection import thin
 

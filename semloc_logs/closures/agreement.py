@@ -19,7 +19,7 @@ from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.lookalike import lookalike
 from semloc_logs.closures.placing import ARM, DRIFT, FAR, Placed, asked_roads, features_of, pairs_of, place, strays
 from semloc_logs.closures.queries import SessionMap
-from semloc_logs.geometry import inverse
+from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL, Settings
 
 F64 = NDArray[np.float64]

@@ -28,8 +28,8 @@ from semloc_logs.alignment.verify import (
 from semloc_logs.closures.acceptance import CLOSE, HOPELESS, Agreement, own_values, shipped
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.queries import SessionMap, build_query
-from semloc_logs.geometry import apply, inverse, turned_about_z
 from semloc_logs.labels.space import cityscapes
+from semloc_logs.numerics.transforms import apply, inverse, turned_about_z
 from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns
 from semloc_logs.words.index import Allowed, Matches

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.closures.placing import ARM, DRIFT, FAR, Pairs, Placed, strays
-from semloc_logs.geometry import inverse
+from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL
 
 F64 = NDArray[np.float64]

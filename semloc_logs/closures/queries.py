@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Query, thin_points
 from semloc_logs.errors import WorkspaceError
-from semloc_logs.geometry import apply, inverse, rotation_angle
+from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describing import KNOWS_CLASSES
 from semloc_logs.tables import read_json, read_table

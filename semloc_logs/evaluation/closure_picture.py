@@ -14,8 +14,8 @@ from semloc_logs.alignment.overlap import FREE_BIT, look_up
 from semloc_logs.evaluation.closure_view import ClosureView
 from semloc_logs.evaluation.completion_picture import colours, render
 from semloc_logs.evaluation.solids import Solid, View, draw_solids, top_view
-from semloc_logs.geometry import apply
 from semloc_logs.labels.space import cityscapes
+from semloc_logs.numerics.transforms import apply
 from semloc_logs.subvolumes.cut import SIZE
 from semloc_logs.tables import replacing_file
 from semloc_logs.voxels.lettering import FONT, INK, SOFT, Sheet

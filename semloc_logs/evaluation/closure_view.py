@@ -17,7 +17,7 @@ from semloc_logs.closures.queries import SessionMap, build_query, query_members
 from semloc_logs.closures.results import keyframe_at, read_closures
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.evaluation.completion import completed, load_completion, states_of
-from semloc_logs.geometry import inverse, turned_about_z
+from semloc_logs.numerics.transforms import inverse, turned_about_z
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import SIZE, turn
 from semloc_logs.tables import read_metadata, read_table

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from semloc_logs.closures.queries import SessionMap, query_keyframes
 from semloc_logs.evaluation.localisation_worlds import CROSSING, DATABASE, OPPOSITE, UNSEEN, WorldDrive
 from semloc_logs.evaluation.truth import read_tum
-from semloc_logs.geometry import inverse, rotation_angle
+from semloc_logs.numerics.transforms import inverse, rotation_angle
 from semloc_logs.settings import Settings
 from semloc_logs.workspace import Workspace
 

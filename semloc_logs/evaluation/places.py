@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
-from semloc_logs.geometry import apply, inverse, yaw_transform
+from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import turn
 from semloc_logs.tables import read_table, write_table

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from semloc_logs.evaluation.held_out import HeldOut
 from semloc_logs.evaluation.places import Place
-from semloc_logs.geometry import apply
+from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import MARGIN, SIZE
 from semloc_logs.subvolumes.describe import Described, describe_map

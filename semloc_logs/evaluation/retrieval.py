@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from semloc_logs.closures.queries import SessionMap, build_query, query_keyframes, query_members
 from semloc_logs.evaluation.places import Place, Street, asked_place, map_place
 from semloc_logs.evaluation.truth import TrueTrack
-from semloc_logs.geometry import apply, inverse
+from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import describe_map
 from semloc_logs.subvolumes.describing import describe_submap

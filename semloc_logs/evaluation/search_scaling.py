@@ -27,7 +27,7 @@ from semloc_logs.errors import SettingsError
 from semloc_logs.evaluation.held_out import HeldOut, held_out
 from semloc_logs.evaluation.recall import Describe, count_subvolumes, network_describes, true_radius
 from semloc_logs.evaluation.search_speed import timed
-from semloc_logs.geometry import apply
+from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.tables import write_json

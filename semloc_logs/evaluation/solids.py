@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.geometry import apply
+from semloc_logs.numerics.transforms import apply
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]

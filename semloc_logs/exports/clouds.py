@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.errors import WorkspaceError
-from semloc_logs.geometry import apply
+from semloc_logs.numerics.transforms import apply
 from semloc_logs.voxels.store import read_keyframe
 
 F64 = NDArray[np.float64]

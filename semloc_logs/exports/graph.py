@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import keyframe_at, read_closures
-from semloc_logs.geometry import inverse, transform, translation_quaternion
+from semloc_logs.numerics.transforms import inverse, transform, translation_quaternion
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]

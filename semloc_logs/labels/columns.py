@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.labels.eigen import eigen
+from semloc_logs.numerics.eigen import eigen
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

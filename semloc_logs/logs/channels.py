@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import ContractError
-from semloc_logs.geometry import inverse, transform
 from semloc_logs.logs.amend import RUN_KEY, NewChannel, NewMessage
+from semloc_logs.numerics.transforms import inverse, transform
 
 F64 = NDArray[np.float64]
 Encoding = Literal["ros2", "ros1", "protobuf", "json"]

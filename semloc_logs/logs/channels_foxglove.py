@@ -19,9 +19,9 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from semloc_logs.geometry import translation_quaternion
 from semloc_logs.logs.amend import NewChannel
 from semloc_logs.logs.channels import F64, TOPICS, ClosureRecord, Mark
+from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 
 _STRING, _INT64, _INT32, _DOUBLE = (

@@ -10,9 +10,9 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from semloc_logs.geometry import translation_quaternion
 from semloc_logs.logs.amend import NewChannel
 from semloc_logs.logs.channels import F64, TOPICS, ClosureRecord, Mark
+from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 
 CLOSURE = "semloc_msgs/msg/LoopClosure"

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from semloc_logs import geometry
 from semloc_logs.frames import Frame, Header, LidarFrame
 from semloc_logs.logs import livox
 from semloc_logs.logs.clouds import Field, Layout, decode_points
@@ -15,6 +14,7 @@ from semloc_logs.logs.definitions import binary
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.message_parts import Convert, check_time, foxglove, ros, transform
 from semloc_logs.logs.point_times import SWEEP_NS
+from semloc_logs.numerics import transforms
 
 _POINT_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
 _FOXGLOVE_KINDS = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}  # foxglove.PackedElementField
@@ -38,7 +38,7 @@ def _foxglove_cloud(header: Header, m: Any) -> Iterator[Frame]:
         if any((rotation.x, rotation.y, rotation.z, rotation.w)):  # left out by writers that mean the identity
             frame_T_cloud = transform(m.pose.position, rotation)
             if not np.array_equal(frame_T_cloud, np.eye(4)):
-                points = geometry.apply(frame_T_cloud, points).astype(np.float32)
+                points = transforms.apply(frame_T_cloud, points).astype(np.float32)
     yield LidarFrame(header, points, p.label, p.offset_ns, p.ring, remark=p.remark)
 
 

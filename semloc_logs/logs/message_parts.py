@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from semloc_logs import geometry
 from semloc_logs.frames import F64, Frame, Header
 from semloc_logs.logs.definitions import UndecodableError
 from semloc_logs.logs.log import Message
+from semloc_logs.numerics import transforms
 
 Convert = Callable[[Any, Message], Iterator[Frame]]  # a parsed message and the one it was parsed from -> frames
 Body = Callable[[Header, Any], Iterator[Frame]]  # the same where the header is all that is needed of the latter
@@ -79,4 +79,4 @@ def transform(translation: Any, rotation: Any) -> F64:
         raise UndecodableError("its pose has values that are not finite")
     if norm < 1e-6:
         raise UndecodableError("the quaternion of its pose is zero")
-    return geometry.transform(t, q)
+    return transforms.transform(t, q)

@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.frames import F64, Frame, ImuSample, NavSatSample
-from semloc_logs.geometry import rotation_between, transform, yaw_transform
 from semloc_logs.logs.log import Stream
 from semloc_logs.logs.poses import PoseTrack, is_time
 from semloc_logs.logs.roles import Roles
+from semloc_logs.numerics.transforms import rotation_between, transform, yaw_transform
 
 MAX_SIGMA = 5.0  # m; a fix that is less certain than this, horizontally, says nothing about a street's width
 MIN_SPEED = 1.0  # m/s; slower, the course over ground is noise, and the last one holds

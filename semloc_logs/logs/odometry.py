@@ -14,10 +14,10 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, LidarFrame
-from semloc_logs.geometry import apply, inverse, rotation_angle
 from semloc_logs.logs.poses import is_time
 from semloc_logs.logs.sweeps import LONGEST_SWEEP_NS
 from semloc_logs.logs.tally import span
+from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 
 MAX_SPEED = 100.0  # m/s; nothing on wheels is faster
 MAX_SPEED_CHANGE = 12.0  # m/s from one sweep to the next beyond what 30 m/s^2 explain: no brake and no crash survivor does that

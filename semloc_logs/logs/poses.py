@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs import geometry
 from semloc_logs.frames import F64, PoseSample, TransformSample
+from semloc_logs.numerics import transforms
 
 EDGE_NS = 100_000_000  # a stamp may lie this far outside of the stream: the nearest pose serves
 PERIODS_PER_GAP = 3.0  # a stream slower than max_gap / 3 may skip two poses before its hole counts as a gap
@@ -148,7 +148,7 @@ class PoseTrack:
         known &= stamps[right] - stamps[left] <= self.gap_limit_ns()
         if known.any():
             first, last = int(left[known].min()), int(right[known].max()) + 1
-            poses[known] = geometry.interpolate(stamps[first:last], self._matrices(first, last), at[known])
+            poses[known] = transforms.interpolate(stamps[first:last], self._matrices(first, last), at[known])
         return poses, known
 
     def gaps(self) -> list[tuple[int, int]]:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F32, F64, Camera
-from semloc_logs.geometry import rotation_angle, rotation_between
+from semloc_logs.numerics.transforms import rotation_angle, rotation_between
 
 PINHOLE = ("plumb_bob", "rational_polynomial", "thin_prism", "")
 FISHEYE = ("equidistant", "kannala_brandt", "fisheye")

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from semloc_logs.frames import F32
-from semloc_logs.geometry import Array, apply
+from semloc_logs.numerics.transforms import Array, apply
 
 _EVERY = 4  # clouds; a vehicle is not looked at more often
 _KEPT, _COMPARED = 4000, 500  # points of the first cloud, and of each that is compared with it

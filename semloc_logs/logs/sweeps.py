@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs import geometry
 from semloc_logs.frames import F32, F64, LidarFrame
+from semloc_logs.numerics import transforms
 
 LONGEST_SWEEP_NS = 1_000_000_000  # point times that span more are no sweep but garbage
 _BIN_NS = 1_000_000  # within a millisecond a vehicle at 30 m/s moves 3 cm
@@ -66,5 +66,5 @@ def deskew(points: F32, offset_ns: NDArray[np.int64], stamp_ns: int, base_T_sens
     poses, known = poses_at(stamps)
     if not known.all():
         return None
-    base_T_moving = geometry.inverse(poses[-1]) @ poses[:-1] @ base_T_sensor
+    base_T_moving = transforms.inverse(poses[-1]) @ poses[:-1] @ base_T_sensor
     return _move(np.ascontiguousarray(points, np.float32), bins, base_T_moving)

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs import geometry
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, DepthFrame, Frame, ImageFrame, LidarFrame
 from semloc_logs.logs.poses import is_time
+from semloc_logs.numerics import transforms
 
 TUM, KITTI = 8, 12  # numbers a line
 _LONGEST_LINE = 4096  # characters; a line of either format has about 150
@@ -215,7 +215,7 @@ def _from_quaternions(values: F64, path: Path, lines: list[int]) -> F64:
     bad = np.flatnonzero(np.abs(length - 1.0) > _UNIT)
     if len(bad):
         raise LogError(f"{path}, line {lines[bad[0]]}: the quaternion (x y z w) has the length {length[bad[0]]:.3g}, not 1.")
-    return geometry.transform(values[:, :3], values[:, 3:])
+    return transforms.transform(values[:, :3], values[:, 3:])
 
 
 def _from_matrices(values: F64, path: Path, lines: list[int]) -> F64:
@@ -227,7 +227,7 @@ def _from_matrices(values: F64, path: Path, lines: list[int]) -> F64:
         bad = np.flatnonzero(~((off <= _UNIT) & (np.linalg.det(rotation) > 0)))
     if len(bad):
         raise LogError(f"{path}, line {lines[bad[0]]}: the 3 x 3 part is no rotation.")
-    return geometry.transform(*geometry.translation_quaternion(poses))  # as written with six digits it is nearly one
+    return transforms.transform(*transforms.translation_quaternion(poses))  # as written with six digits it is nearly one
 
 
 def _read_times(path: Path) -> NDArray[np.int64]:

@@ -11,9 +11,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from semloc_logs import geometry
 from semloc_logs.frames import F64, TransformSample
 from semloc_logs.logs.poses import PoseTrack
+from semloc_logs.numerics import transforms
 
 HISTORY_SECONDS = 60.0  # how far back a moving edge remembers: frames wait for their transforms by far less
 MAX_EDGES = 10_000  # a log with more frames than this is broken; the rest is ignored and counted
@@ -124,7 +124,7 @@ class TransformTree:
             if edge in self._moving:
                 pose = self._moving[edge].at(stamp_ns)
             if pose is not None:
-                return pose if is_forward else geometry.inverse(pose)
+                return pose if is_forward else transforms.inverse(pose)
         return None
 
     def _path(self, target: str, source: str) -> list[str] | None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.geometry import apply, interpolate
+from semloc_logs.numerics.transforms import apply, interpolate
 from semloc_logs.simulation.camera import CAMERAS, CameraModel, Hits, base_T_camera, first_hits, measure, pixel_rays
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.images import Painter

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.geometry import apply, interpolate
+from semloc_logs.numerics.transforms import apply, interpolate
 from semloc_logs.simulation.lidar import LidarModel, Sweep, corrupt_labels, full_sweep
 from semloc_logs.simulation.traffic import Traffic
 from semloc_logs.simulation.trajectory import Trajectory

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.geometry import interpolate
+from semloc_logs.numerics.transforms import interpolate
 from semloc_logs.simulation.echoes import beyond_edges, is_heard, mixed_ranges, reflectance
 from semloc_logs.simulation.label_errors import CONFUSIONS as CONFUSIONS
 from semloc_logs.simulation.label_errors import corrupt_labels as corrupt_labels

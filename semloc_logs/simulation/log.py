@@ -25,7 +25,7 @@ from rosbags.rosbag2 import Writer as BagFolder
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.errors import LogError
-from semloc_logs.geometry import translation_quaternion
+from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.simulation.camera_drive import CameraShot
 from semloc_logs.simulation.camera_log import camera_events
 from semloc_logs.simulation.drive import TURN_NS, DriveFrame

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semloc_logs.geometry import yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.simulation.drive import DriveFrame, mounting
 from semloc_logs.simulation.lidar import MODELS, Sweep, full_sweep
 from semloc_logs.simulation.log import write_session

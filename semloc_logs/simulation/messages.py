@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.geometry import translation_quaternion
+from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.simulation.drive import TURN_NS, DriveFrame
 from semloc_logs.simulation.vehicle_sensors import ANTENNA
 from semloc_logs.simulation.world import F64

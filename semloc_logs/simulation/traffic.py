@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from semloc_logs.geometry import inverse
+from semloc_logs.numerics.transforms import inverse
 from semloc_logs.simulation import objects
 from semloc_logs.simulation.ground import Ground
 from semloc_logs.simulation.network import left_of

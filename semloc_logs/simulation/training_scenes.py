@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.geometry import apply
+from semloc_logs.numerics.transforms import apply
 from semloc_logs.simulation.camera import CAMERAS, CameraModel, camera_points
 from semloc_logs.simulation.conditions import SEASONS, Condition
 from semloc_logs.simulation.forest import build_forest

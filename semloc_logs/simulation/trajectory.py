@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from semloc_logs.geometry import inverse
+from semloc_logs.numerics.transforms import inverse
 from semloc_logs.simulation.objects import resample
 from semloc_logs.simulation.world import F64
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from semloc_logs.geometry import interpolate
+from semloc_logs.numerics.transforms import interpolate
 from semloc_logs.simulation.trajectory import Trajectory
 from semloc_logs.simulation.world import F64
 

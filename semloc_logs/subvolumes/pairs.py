@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from semloc_logs import geometry
+from semloc_logs.numerics import transforms
 from semloc_logs.settings import Fusion, Training
 from semloc_logs.subvolumes.cut import SIZE, WIDE, turn
 from semloc_logs.tables import replacing_file
@@ -117,7 +117,7 @@ def _stretch(frames: Sequence[SceneFrame], i: int, scale: float, tilt: float, rn
     turned, centred = np.eye(4), np.eye(4)
     turned[:3, :3] = Rotation.from_rotvec([*rng.normal(0.0, tilt, 2), 0.0]).as_matrix()
     centred[:3, 3] = here
-    around = centred @ turned @ geometry.inverse(centred)
+    around = centred @ turned @ transforms.inverse(centred)
     return [replace(f, map_T_base=around @ f.map_T_base) for f in some]
 
 

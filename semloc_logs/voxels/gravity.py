@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.labels.shape import shape
+from semloc_logs.numerics.local_shape import shape
 from semloc_logs.voxels.selection import thin
 
 F64 = NDArray[np.float64]

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.geometry import inverse, rotation_angle
+from semloc_logs.numerics.transforms import inverse, rotation_angle
 from semloc_logs.settings import Fusion
 
 UNPOSED_SPACING_NS = 400_000_000  # frames of a log without poses are taken this far apart

@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.bits import lowest_bit, popcount
+from semloc_logs.numerics.bits import lowest_bit, popcount
 from semloc_logs.words.kmeans import grid
 from semloc_logs.words.segment import WORDS, Held, Segment, segment_in_memory
 from semloc_logs.words.vocabulary import BITS, Vocabulary, codes_of

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.overlap import ANY_BIT, FREE_BIT, build_level, class_bits, look_up, pose_matrix, search, tau, yaw_between
 from semloc_logs.alignment.verify import Query, Target, same_place, search_hypotheses, structure_mask, structure_scores
-from semloc_logs.geometry import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.labels.space import UNLABELLED, cityscapes
+from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, empty_map
 from semloc_logs.voxels.keys import BLOCK, pack
 

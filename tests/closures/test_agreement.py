@@ -17,7 +17,7 @@ from semloc_logs.closures.agreement import LEAST, MOST_SLACK, NEAR, SLACK, TURN,
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.placing import ARM, DRIFT, FAR, Placed, place, strays
 from semloc_logs.closures.queries import SessionMap
-from semloc_logs.geometry import inverse, yaw_transform
+from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import STREET_VOXEL, Settings
 
 F64 = NDArray[np.float64]

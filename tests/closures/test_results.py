@@ -12,7 +12,7 @@ from semloc_logs.alignment.verify import FEATURES, Features
 from semloc_logs.closures.acceptance import AGREEMENT, Agreement
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.results import read_closures, unique_closures, write_closures, write_rejected
-from semloc_logs.geometry import yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.tables import read_metadata, read_table
 
 SECOND = 10**9

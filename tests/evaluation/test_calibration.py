@@ -26,7 +26,7 @@ from semloc_logs.evaluation.calibration import (
     reliability,
 )
 from semloc_logs.evaluation.reliability_picture import draw_reliability
-from semloc_logs.geometry import inverse, yaw_transform
+from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.tables import read_table, write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace

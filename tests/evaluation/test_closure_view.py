@@ -15,7 +15,7 @@ from semloc_logs.cli.main import program
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.evaluation.closure_picture import draw_views
 from semloc_logs.evaluation.closure_view import Choice, ClosureView, Match, Wanted, choose, drawn
-from semloc_logs.geometry import yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.tables import write_table
 from semloc_logs.voxels.grid import Fuser

@@ -11,7 +11,7 @@ from semloc_logs.evaluation import peers
 from semloc_logs.evaluation.fusion_speed import Case, clock_rate, measure, walk_all
 from semloc_logs.evaluation.peers import Peer, runner, write_scans
 from semloc_logs.evaluation.scans import Scan, depth_images, log_sweeps, street_sweeps
-from semloc_logs.geometry import apply
+from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Settings
 
 # answers as a peer does: one free voxel more a round

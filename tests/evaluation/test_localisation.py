@@ -18,7 +18,7 @@ from semloc_logs.evaluation.localisation_ours import OURS, grid_hypotheses, link
 from semloc_logs.evaluation.localisation_peers import cloud_frame, database_keyframes
 from semloc_logs.evaluation.localisation_worlds import CROSSING, OPPOSITE, SEED, UNSEEN, WorldDrive, world_path
 from semloc_logs.evaluation.scan_context import nearest_contexts, scan_context
-from semloc_logs.geometry import apply, yaw_transform
+from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import load
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import describe_map, load_encoder

@@ -26,7 +26,7 @@ from semloc_logs.evaluation.recall import (
     true_radius,
 )
 from semloc_logs.evaluation.retrieval_benchmark import RetrievalChoice, densely, retrieval_benchmark
-from semloc_logs.geometry import apply, yaw_transform
+from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.network import RoadNetwork, path_network
 from semloc_logs.simulation.traffic import Traffic

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.labels.eigen import eigen
+from semloc_logs.numerics.eigen import eigen
 
 F64 = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.labels.geometry import classify
-from semloc_logs.labels.shape import shape
 from semloc_logs.labels.space import BUILDING, POLE, ROAD, UNLABELLED, VEGETATION
+from semloc_logs.numerics.local_shape import shape
 
 F64 = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ from onnx import TensorProto, helper, numpy_helper
 
 from semloc_logs.errors import LogError, SettingsError
 from semloc_logs.frames import Camera, Frame, Header, ImageFrame, LabelNames, LidarFrame, PoseSample, TransformSample
-from semloc_logs.geometry import yaw_transform
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.log import Message, Stream
 from semloc_logs.logs.session import Session
+from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Labels
 
 MS = 1_000_000

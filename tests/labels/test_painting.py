@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.frames import Camera, Header
-from semloc_logs.geometry import inverse
 from semloc_logs.labels.painting import DOUBTFUL, Viewpoint, paint, without_borders
 from semloc_logs.labels.projection import Projector
 from semloc_logs.labels.space import UNPAINTED
+from semloc_logs.numerics.transforms import inverse
 
 F64 = NDArray[np.float64]
 HEIGHT, WIDTH, FOCAL = 400, 1200, 700.0

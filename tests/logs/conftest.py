@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from semloc_logs.geometry import Array, translation_quaternion
+from semloc_logs.numerics.transforms import Array, translation_quaternion
 
 STORES = {"ros2": get_typestore(Stores.ROS2_HUMBLE), "ros1": get_typestore(Stores.ROS1_NOETIC)}
 DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from semloc_logs.cli.main import program
 from semloc_logs.errors import LogError
-from semloc_logs.geometry import yaw_transform
 from semloc_logs.logs.definitions import UndecodableError
 from semloc_logs.logs.images import decode_compressed, decode_compressed_depth
 from semloc_logs.logs.inspect import inspect_log
 from semloc_logs.logs.session import Session, open_session
+from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S

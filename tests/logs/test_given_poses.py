@@ -14,12 +14,12 @@ import pytest
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, Header, LidarFrame, NavSatSample, PoseSample, TransformSample
-from semloc_logs.geometry import inverse, yaw_transform
 from semloc_logs.logs import odometry
 from semloc_logs.logs.log import Message, Stream
 from semloc_logs.logs.odometry import LidarOdometry
 from semloc_logs.logs.session import Session
 from semloc_logs.logs.trajectory_file import TrajectoryFile
+from semloc_logs.numerics.transforms import inverse, yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S

@@ -16,16 +16,16 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from semloc_logs import geometry
 from semloc_logs.cli.main import program
 from semloc_logs.errors import RoleError
 from semloc_logs.frames import LidarFrame
-from semloc_logs.geometry import Array, yaw_transform
 from semloc_logs.logs.decode import Decoder
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.problems import Problems
 from semloc_logs.logs.roles import find_roles, guess_roles, no_sensor
 from semloc_logs.logs.session import open_session
+from semloc_logs.numerics import transforms
+from semloc_logs.numerics.transforms import Array, yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
@@ -45,7 +45,7 @@ def half_room(world_T_sensor: Array, ahead: float, seed: int) -> Array:
     axis = rng.integers(0, 3, len(points))
     points[np.arange(len(points)), axis] = np.sign(rng.uniform(-1, 1, len(points))) * HALF[axis]
     points = points[points[:, 0] * ahead > 0]
-    return geometry.apply(geometry.inverse(world_T_sensor), points)
+    return transforms.apply(transforms.inverse(world_T_sensor), points)
 
 
 def drive(log: Any, *, mounts: tuple[str, ...] = ("front", "rear")) -> Path:
@@ -68,7 +68,7 @@ def test_two_lidars_see_one_room(recorder: Any, kind: str) -> None:
     seen: dict[str, list[Array]] = {}
     for cloud in session.clouds():
         assert cloud.session_T_base is not None
-        seen.setdefault(cloud.header.topic, []).append(geometry.apply(cloud.session_T_base, cloud.points))
+        seen.setdefault(cloud.header.topic, []).append(transforms.apply(cloud.session_T_base, cloud.points))
     assert {topic: len(found) for topic, found in seen.items()} == {"/front/points": 8, "/rear/points": 8}
     for topic, side in (("/front/points", 1), ("/rear/points", -1)):
         points = np.concatenate(seen[topic])
@@ -85,7 +85,7 @@ def test_the_fused_map_is_the_room(recorder: Any, tmp_path: Path) -> None:
     table = pyarrow.parquet.read_table(tmp_path / "w" / "sessions" / "drive" / "voxels")
     centres = np.stack([table[f"i{a}"].to_numpy() for a in "xyz"], 1) * 0.3 + 0.15
     session_T_map = np.array(json.loads((tmp_path / "w" / "sessions" / "drive" / "session.json").read_text())["session_T_map"])
-    room = geometry.apply(session_T_map, centres)
+    room = transforms.apply(session_T_map, centres)
     off = np.min(np.abs(HALF - np.abs(room)), axis=1)
     assert np.quantile(off, 0.99) < 0.35
     assert room[:, 0].min() < -9.5
@@ -129,7 +129,7 @@ def centroids(points: Array) -> Array:
         (without_ground, "front"),
         (lambda p: p[::5], "front"),
         (centroids, "front"),
-        (lambda p: geometry.apply(MOUNTS["front"], p), "base_link"),
+        (lambda p: transforms.apply(MOUNTS["front"], p), "base_link"),
     ],
     ids=["no ground", "thinned", "voxels", "in the base frame"],
 )

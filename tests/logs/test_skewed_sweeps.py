@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs import geometry
-from semloc_logs.geometry import Array, yaw_transform
 from semloc_logs.logs.point_times import offsets_ns
 from semloc_logs.logs.session import open_session
+from semloc_logs.numerics import transforms
+from semloc_logs.numerics.transforms import Array, yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S + 123_456_789
@@ -98,7 +98,7 @@ def walls(path: Path) -> tuple[list[float], Any]:
     found = []
     for cloud in session.clouds():
         assert cloud.session_T_base is not None
-        found.append(off_the_walls(geometry.apply(cloud.session_T_base, cloud.points)))
+        found.append(off_the_walls(transforms.apply(cloud.session_T_base, cloud.points)))
     assert len(found) == SWEEPS, session.problems
     return found, session
 
@@ -170,7 +170,7 @@ GARBAGE: dict[str, tuple[str, str, Encode]] = {
 def test_times_that_are_none_leave_the_sweep_as_it_was(recorder: Any, name: str) -> None:
     field, kind, encode = GARBAGE[name]
     found, session = walls(record(recorder(), field, encode, kind))
-    measured = [off_the_walls(geometry.apply(pose(0.1 * k) @ BASE_T_LIDAR, skewed(0.1 * k)[0])) for k in range(SWEEPS)]
+    measured = [off_the_walls(transforms.apply(pose(0.1 * k) @ BASE_T_LIDAR, skewed(0.1 * k)[0])) for k in range(SWEEPS)]
     np.testing.assert_allclose(found, measured, atol=1e-3)
     assert session.skipped == []
     assert session.to_json()["sweeps_deskewed"] == 0

@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F64, Camera, Header, ImageFrame, PosedCloud
-from semloc_logs.geometry import apply, exp_se3
 from semloc_logs.logs.depth import LabelImages
 from semloc_logs.logs.inspect import inspect_log
 from semloc_logs.logs.rectification import Rectification, rectification
@@ -19,6 +18,7 @@ from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session import open_session
 from semloc_logs.logs.stereo_clouds import StereoClouds, _grey
 from semloc_logs.logs.tally import Tally
+from semloc_logs.numerics.transforms import apply, exp_se3
 from semloc_logs.voxels.gravity import find_up
 from semloc_logs.voxels.keyframes import Collected
 from semloc_logs.voxels.selection import thin

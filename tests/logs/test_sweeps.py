@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs import geometry
 from semloc_logs.frames import Header, LidarFrame
-from semloc_logs.geometry import Array, yaw_transform
 from semloc_logs.logs.poses import PoseTrack
 from semloc_logs.logs.sweeps import deskew, sweep_in_base
+from semloc_logs.numerics import transforms
+from semloc_logs.numerics.transforms import Array, yaw_transform
 
 S = 1_000_000_000
 STAMP = 1_700_000_000 * S
@@ -35,7 +35,7 @@ def world_points(n: int = 500) -> Array:
 
 def measured(world: Array, offset_ns: NDArray[np.int64]) -> Array:
     """What a moving sensor sees of resting points, point by point."""
-    seen = [geometry.apply(geometry.inverse(pose(o * 1e-9) @ BASE_T_SENSOR), p[None])[0] for p, o in zip(world, offset_ns, strict=True)]
+    seen = [transforms.apply(transforms.inverse(pose(o * 1e-9) @ BASE_T_SENSOR), p[None])[0] for p, o in zip(world, offset_ns, strict=True)]
     return np.array(seen)
 
 
@@ -59,7 +59,7 @@ def test_without_poses_for_the_whole_span_the_sweep_stays() -> None:
     frame = LidarFrame(Header("/l", STAMP, STAMP, "lidar"), world.astype(np.float32), offset_ns=offset)
     points, _, is_deskewed = sweep_in_base(frame, BASE_T_SENSOR, track(-0.2, 0.2).at_many, min_range=0.0, max_range=200.0)
     assert not is_deskewed
-    np.testing.assert_allclose(points, geometry.apply(BASE_T_SENSOR, world), atol=1e-4)
+    np.testing.assert_allclose(points, transforms.apply(BASE_T_SENSOR, world), atol=1e-4)
 
 
 @pytest.mark.parametrize("span", [0, 5 * S, 2**62])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semloc_logs import geometry
 from semloc_logs.frames import Header, TransformSample
-from semloc_logs.geometry import Array, yaw_transform
 from semloc_logs.logs.transforms import TransformTree
+from semloc_logs.numerics import transforms
+from semloc_logs.numerics.transforms import Array, yaw_transform
 
 S = 1_000_000_000
 
@@ -28,7 +28,7 @@ def test_chain_and_its_inverse() -> None:
     found = tree.lookup("base_link", "lidar", 0)
     assert found is not None
     # 3 m ahead on a mast that is turned to the left is 3 m to the left of it
-    np.testing.assert_allclose(geometry.apply(found, np.zeros((1, 3)))[0], [1.0, 3.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(transforms.apply(found, np.zeros((1, 3)))[0], [1.0, 3.0, 2.0], atol=1e-12)
     back = tree.lookup("/lidar", "base_link", 5)
     assert back is not None
     np.testing.assert_allclose(back @ found, np.eye(4), atol=1e-12)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semloc_logs.geometry import apply, interpolate, yaw_transform
+from semloc_logs.numerics.transforms import apply, interpolate, yaw_transform
 from semloc_logs.simulation.lidar import CONFUSIONS, MODELS, beam_directions, corrupt_labels, full_sweep, sweep
 from semloc_logs.simulation.world import CAR, POLE, SIDEWALK, WALL, MeshBuilder, Scene, box
 

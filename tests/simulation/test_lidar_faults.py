@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semloc_logs.geometry import yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.simulation.echoes import beyond_edges, is_heard, is_pane, mixed_ranges, reflectance
 from semloc_logs.simulation.label_errors import CONFUSIONS, corrupt_labels
 from semloc_logs.simulation.lidar import MODELS, full_sweep

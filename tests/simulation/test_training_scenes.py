@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from semloc_logs.geometry import apply
+from semloc_logs.numerics.transforms import apply
 from semloc_logs.simulation.camera import CameraModel
 from semloc_logs.simulation.lidar_models import MODELS
 from semloc_logs.simulation.training_scenes import _rig, training_scene

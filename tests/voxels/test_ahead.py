@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from semloc_logs.voxels.ahead import ahead
+from semloc_logs.numerics.prefetch import ahead
 
 
 def test_items_come_in_their_order() -> None:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semloc_logs.geometry import yaw_transform
+from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Fusion
 from semloc_logs.voxels.selection import UNPOSED_SPACING_NS, KeyframeSelector, road_distance, submap_ranges, thin
 

@@ -14,8 +14,8 @@ from numba import njit
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
 
-from semloc_logs.bits import lowest_bit, popcount
 from semloc_logs.errors import SettingsError
+from semloc_logs.numerics.bits import lowest_bit, popcount
 from semloc_logs.words.index import SHORTLIST, Allowed, Index
 from semloc_logs.words.kmeans import grid, kmeans, nearest_centroids
 from semloc_logs.words.vocabulary import BITS, Vocabulary, load_vocabulary, save_vocabulary, train_vocabulary

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.labels.eigen import eigen
+from semloc_logs.numerics.eigen import eigen
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
