@@ -31,7 +31,7 @@ from semloc_logs.evaluation.calibration import SURE, answers, decided_by, read_j
 from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
 from semloc_logs.settings import load
 from semloc_logs.stages import close, describe, fuse, session_name
-from semloc_logs.tables import read_metadata
+from semloc_logs.tables.table import read_metadata
 from semloc_logs.workspace import Workspace
 
 FIRST, MOST = 30, 60  # numbers of the towns: calibration has those before

@@ -28,7 +28,7 @@ from semloc_logs.settings import Settings
 from semloc_logs.stages import describe, fuse, run, session_name
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
 from semloc_logs.subvolumes.network import Encoder
-from semloc_logs.tables import read_metadata
+from semloc_logs.tables.table import read_metadata
 from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import read_keyframe
 from semloc_logs.words.vocabulary import Vocabulary, load_vocabulary

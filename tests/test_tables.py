@@ -12,10 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from semloc_logs import contracts
 from semloc_logs.errors import ContractError, WorkspaceError
 from semloc_logs.schemas import read_text
-from semloc_logs.tables import read_json, read_metadata, read_table, replacing_file, replacing_folder, write_json, write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import read_json, read_metadata, read_table, replacing_file, replacing_folder, write_json, write_table
 
 
 def leftovers(folder: Path) -> list[str]:
@@ -88,7 +88,7 @@ def test_what_a_killed_run_left_is_removed_and_nothing_else(tmp_path: Path) -> N
 WRITER = """
 import sys
 from pathlib import Path
-from semloc_logs.tables import replacing_file, replacing_folder
+from semloc_logs.tables.table import replacing_file, replacing_folder
 root = Path(sys.argv[1])
 print("ready", flush=True)
 n = 0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
-from semloc_logs.tables import read_table, replacing_file
+from semloc_logs.tables.table import read_table, replacing_file
 from semloc_logs.workspace import Workspace
 
 WIDTH = 1400

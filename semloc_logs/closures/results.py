@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs import contracts
 from semloc_logs.alignment.verify import FEATURES
 from semloc_logs.closures.acceptance import AGREEMENT
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.queries import SessionMap
-from semloc_logs.tables import read_table, write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.store import pose_columns
 
 

@@ -34,7 +34,7 @@ from semloc_logs.closures.placing import Placed, strays
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.closures.results import keyframe_at
 from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, judge_closure, read_truth
-from semloc_logs.tables import read_metadata, read_table, write_table
+from semloc_logs.tables.table import read_metadata, read_table, write_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 

@@ -17,7 +17,7 @@ from semloc_logs.evaluation.solids import Solid, View, draw_solids, top_view
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.subvolumes.cut import SIZE
-from semloc_logs.tables import replacing_file
+from semloc_logs.tables.table import replacing_file
 from semloc_logs.voxels.lettering import FONT, INK, SOFT, Sheet
 from semloc_logs.voxels.picture import GEOMETRY_NAMES
 

@@ -20,7 +20,7 @@ from semloc_logs.evaluation.completion import completed, load_completion, states
 from semloc_logs.numerics.transforms import inverse, turned_about_z
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import SIZE, turn
-from semloc_logs.tables import read_metadata, read_table
+from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.voxels.grid import UNOBSERVED_STATE
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace

@@ -32,7 +32,7 @@ from semloc_logs.simulation.street import build_street, street_ground
 from semloc_logs.simulation.traffic import Traffic, random_traffic
 from semloc_logs.simulation.trajectory import poses_along, smooth_line
 from semloc_logs.simulation.world import Scene
-from semloc_logs.tables import read_metadata
+from semloc_logs.tables.table import read_metadata
 from semloc_logs.voxels.grid import BlockMap, Fuser
 
 F32 = NDArray[np.float32]

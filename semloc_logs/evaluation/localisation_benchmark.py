@@ -22,7 +22,7 @@ from semloc_logs.evaluation.localisation_peers import PEERS, PeerSystem, PeerTas
 from semloc_logs.evaluation.localisation_worlds import CONDITIONS, DATABASE, SENSORS, UNSEEN, WorldDrive, simulate_drive_log, world_drives
 from semloc_logs.evaluation.peers import runner
 from semloc_logs.settings import Settings
-from semloc_logs.tables import read_json, write_json
+from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
 
 Figures = dict[str, dict[str, float | str]]

@@ -14,7 +14,7 @@ from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import turn
-from semloc_logs.tables import read_table, write_table
+from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.grid import BlockMap
 
 F64 = NDArray[np.float64]

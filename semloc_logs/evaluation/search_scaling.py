@@ -30,7 +30,7 @@ from semloc_logs.evaluation.search_speed import timed
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import load_encoder
-from semloc_logs.tables import write_json
+from semloc_logs.tables.table import write_json
 from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words.catalogue import segments
 from semloc_logs.words.index import Allowed, Index, Part

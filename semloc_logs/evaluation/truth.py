@@ -18,7 +18,7 @@ from semloc_logs.closures.results import read_closures
 from semloc_logs.errors import TruthError, WorkspaceError
 from semloc_logs.numerics.transforms import interpolate, inverse, rotation_angle, transform
 from semloc_logs.settings import Closures, Query, Settings
-from semloc_logs.tables import read_metadata, read_table
+from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 

@@ -13,7 +13,7 @@ from semloc_logs.exports.clouds import Bounds, SessionPoints
 from semloc_logs.exports.formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.graph import pose_graph
 from semloc_logs.numerics.transforms import translation_quaternion
-from semloc_logs.tables import read_table, replacing_file
+from semloc_logs.tables.table import read_table, replacing_file
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 

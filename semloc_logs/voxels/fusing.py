@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import semloc_logs
-from semloc_logs import contracts
 from semloc_logs.errors import LogError
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.space import SKY
@@ -25,7 +24,8 @@ from semloc_logs.logs.trajectory_file import TrajectoryFile
 from semloc_logs.numerics.prefetch import ahead
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, Fusion, Settings
-from semloc_logs.tables import replacing_folder, write_json, write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import replacing_folder, write_json, write_table
 from semloc_logs.voxels.carve import Carver
 from semloc_logs.voxels.gravity import ground_height
 from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map

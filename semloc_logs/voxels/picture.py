@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from semloc_logs.labels.space import GROUND, UNLABELLED, cityscapes
-from semloc_logs.tables import read_table, replacing_file
+from semloc_logs.tables.table import read_table, replacing_file
 from semloc_logs.voxels.keys import BLOCK
 from semloc_logs.voxels.lettering import Sheet
 

@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
-from semloc_logs.tables import read_json, read_table
+from semloc_logs.tables.table import read_json, read_table
 from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words.segment import WORDS, Columns, Held, Segment, in_order, open_segment, segment_in_memory, write_segment
 from semloc_logs.workspace import SessionFolder, Workspace

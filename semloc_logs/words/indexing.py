@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs import contracts
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.describing import DescribeTask, describe_submap, known_headings
-from semloc_logs.tables import write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import write_table
 from semloc_logs.words.vocabulary import load_vocabulary
 
 Part = tuple[str, float, NDArray[np.floating], NDArray[np.uint16], NDArray[np.uint64]]  # variant, yaw, centres (n, 3), words, codes

@@ -12,12 +12,13 @@ import yaml
 from click.testing import CliRunner, Result
 from mcap.writer import Writer
 
-from semloc_logs import contracts, stages
+from semloc_logs import stages
 from semloc_logs.cli.main import program
 from semloc_logs.learning import Packed
 from semloc_logs.logs.annotate import AnnotateReport
 from semloc_logs.stages import Report
-from semloc_logs.tables import write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semloc_logs import contracts
 from semloc_logs.alignment.verify import FEATURES, Features
 from semloc_logs.closures.acceptance import AGREEMENT, Agreement
 from semloc_logs.closures.closing import Alignment
 from semloc_logs.closures.results import read_closures, unique_closures, write_closures, write_rejected
 from semloc_logs.numerics.transforms import yaw_transform
-from semloc_logs.tables import read_metadata, read_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import read_metadata, read_table
 
 SECOND = 10**9
 ROAD = dict.fromkeys("abc", np.arange(100.0))  # three sessions along the same road, a keyframe every metre

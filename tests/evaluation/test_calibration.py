@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from semloc_logs import contracts
 from semloc_logs.alignment.verify import FEATURES
 from semloc_logs.closures.acceptance import TOGETHER, Calibration
 from semloc_logs.closures.placing import Placed
@@ -27,7 +26,8 @@ from semloc_logs.evaluation.calibration import (
 )
 from semloc_logs.evaluation.reliability_picture import draw_reliability
 from semloc_logs.numerics.transforms import inverse, yaw_transform
-from semloc_logs.tables import read_table, write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
 

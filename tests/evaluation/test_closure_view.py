@@ -9,7 +9,6 @@ import pyarrow as pa
 import pytest
 from click.testing import CliRunner
 
-from semloc_logs import contracts
 from semloc_logs.alignment.verify import Query, Target
 from semloc_logs.cli.main import program
 from semloc_logs.errors import WorkspaceError
@@ -17,7 +16,8 @@ from semloc_logs.evaluation.closure_picture import draw_views
 from semloc_logs.evaluation.closure_view import Choice, ClosureView, Match, Wanted, choose, drawn
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Settings
-from semloc_logs.tables import write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import write_table
 from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace

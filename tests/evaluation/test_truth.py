@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs import contracts
 from semloc_logs.errors import TruthError, WorkspaceError
 from semloc_logs.evaluation.truth import evaluate_closures, read_tum
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import load
-from semloc_logs.tables import write_json, write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
 

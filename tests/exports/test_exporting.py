@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semloc_logs import contracts
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports import export
 from semloc_logs.numerics.transforms import yaw_transform
-from semloc_logs.tables import write_json, write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
 

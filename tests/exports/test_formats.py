@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs import contracts
 from semloc_logs.errors import SemlocError, WorkspaceError
 from semloc_logs.exports import POINT_FORMATS, Selection, export
 from semloc_logs.exports import formats as formats_module
 from semloc_logs.exports.clouds import SessionPoints
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.numerics.transforms import apply, yaw_transform
-from semloc_logs.tables import write_json, write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import Workspace
 

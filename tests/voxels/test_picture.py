@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs import contracts
-from semloc_logs.tables import write_table
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import write_table
 from semloc_logs.voxels.picture import LARGE, Canvas, Caption, colour_table, draw_map
 
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
-from semloc_logs.tables import write_json
+from semloc_logs.tables.table import write_json
 from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words import catalogue
 from semloc_logs.words.catalogue import Change, merged_blocks, segments, update
