@@ -26,9 +26,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from fuzz_inputs import damage, layout, logs, messages
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.decode import Decoder
+from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Message
-from semloc_logs.logs.open import open_log
+from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problems
 
 LIMIT_S = {"decoders": 2.0, "layouts": 2.0, "logs": 10.0}  # of processor time; a log's twenty definitions take one of them

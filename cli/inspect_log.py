@@ -25,8 +25,8 @@ def command(logs: tuple[Path, ...], topics: dict[str, str], as_json: bool) -> in
     Example:  semloc inspect drive.mcap --json | jq .problems
     """
     from semloc_logs.errors import LogError, SemlocError
-    from semloc_logs.logs.annotate import recover
-    from semloc_logs.logs.inspect import inspect_log
+    from semloc_logs.logs.annotation.annotate import recover
+    from semloc_logs.logs.session.inspect import inspect_log
 
     found: list[dict[str, Any]] = []
     failed: list[SemlocError] = []

@@ -17,7 +17,7 @@ from .console import console
 
 if TYPE_CHECKING:
     from semloc_logs.engines import Engine
-    from semloc_logs.logs.trajectory_file import TrajectoryFile
+    from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
     from semloc_logs.settings import Settings
 
 Function = Callable[..., Any]
@@ -221,7 +221,7 @@ class PoseChoice:
 
     def by_session(self, sessions: Iterable[str]) -> dict[str, TrajectoryFile]:
         """Files of poses; UsageError when it is not clear which session a file belongs to."""
-        from semloc_logs.logs.trajectory_file import TrajectoryFile
+        from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 
         names = list(sessions)
         files, times = _by_session("--poses", names, self.files), _by_session("--pose-times", names, self.times)

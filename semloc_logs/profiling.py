@@ -23,7 +23,7 @@ from semloc_logs.evaluation.localisation_benchmark import Localisation
 from semloc_logs.evaluation.places import Street
 from semloc_logs.evaluation.retrieval import real_street, true_queries, word_recall
 from semloc_logs.evaluation.truth import read_truth
-from semloc_logs.logs.session import open_session
+from semloc_logs.logs.session.session import open_session
 from semloc_logs.settings import Settings
 from semloc_logs.stages import describe, fuse, run, session_name
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder

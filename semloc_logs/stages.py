@@ -24,7 +24,7 @@ from semloc_logs.closures.results import keyframe_at, read_closures, unique_clos
 from semloc_logs.engines import Engine, Serial
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError
 from semloc_logs.labels.model import fingerprint as label_fingerprint
-from semloc_logs.logs.annotate import (
+from semloc_logs.logs.annotation.annotate import (
     AnnotateReport,
     ClosureRecord,
     Results,
@@ -34,7 +34,7 @@ from semloc_logs.logs.annotate import (
     content_fingerprint,
     recover,
 )
-from semloc_logs.logs.trajectory_file import TrajectoryFile
+from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describing import DescribeTask, variants_for

@@ -17,7 +17,7 @@ from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings
 
 if TYPE_CHECKING:
-    from semloc_logs.logs.annotate import ClosureRecord
+    from semloc_logs.logs.annotation.annotate import ClosureRecord
 
 Figures = dict[str, dict[str, float | str]]
 REPEATS = 5
@@ -45,8 +45,8 @@ def reading(settings: Settings) -> Figures:
     """All messages of a simulated MCAP log, undecoded: MB of payload a second; and clouds decoded and posed."""
     from mcap.reader import make_reader
 
-    from semloc_logs.logs.open import open_log
-    from semloc_logs.logs.session import open_session
+    from semloc_logs.logs.containers.open import open_log
+    from semloc_logs.logs.session.session import open_session
 
     with tempfile.TemporaryDirectory(prefix="semloc-") as folder:
         log = _drive(Path(folder))
@@ -111,7 +111,7 @@ def annotate(settings: Settings) -> Figures:
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
-    from semloc_logs.logs.annotate import ClosureRecord
+    from semloc_logs.logs.annotation.annotate import ClosureRecord
 
     with tempfile.TemporaryDirectory(prefix="semloc-") as folder:
         log = _drive(Path(folder))
@@ -141,7 +141,7 @@ def annotate(settings: Settings) -> Figures:
 
 
 def _annotated(log: Path, records: Sequence[ClosureRecord]) -> float:
-    from semloc_logs.logs.annotate import Results, annotate_in_place
+    from semloc_logs.logs.annotation.annotate import Results, annotate_in_place
 
     start = time.perf_counter()
     annotate_in_place(log, Results(records, "session_0", {}, {r.query_stamp_ns: r.query_stamp_ns for r in records}))

@@ -129,7 +129,7 @@ def log_sweeps(log: Path, count: int = 12, *, repeat: bool = True) -> list[Scan]
     LogError when there is no cloud.
     """
     from semloc_logs.labels.space import guess_space, to_cityscapes
-    from semloc_logs.logs.session import open_session
+    from semloc_logs.logs.session.session import open_session
 
     session = open_session([log], {}, max_range=100.0)
     seen: list[Scan] = []

@@ -30,8 +30,8 @@ from semloc_logs.labels.space import (
     spaces,
 )
 from semloc_logs.labels.surface import GroundSurface
-from semloc_logs.logs.depth import label_ids
-from semloc_logs.logs.session import Session
+from semloc_logs.logs.sensors.depth import label_ids
+from semloc_logs.logs.session.session import Session
 from semloc_logs.settings import Labels
 
 _MOST_COLOURS = 4096  # that are remembered of one topic, to guess the palette

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from semloc_logs.frames import F32, F64
 from semloc_logs.labels.projection import Projector
 from semloc_logs.labels.space import UNPAINTED
-from semloc_logs.logs.sweeps import in_base
+from semloc_logs.logs.sensors.sweeps import in_base
 
 COLUMN = np.radians(0.4)  # the azimuth step of spinning LIDARs is 0.1 to 0.4 degrees
 MOST_GAP = np.radians(2.5)  # between rings: 2 degrees with 16 of them

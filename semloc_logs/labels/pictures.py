@@ -14,7 +14,7 @@ from semloc_logs.frames import F64, Camera, ImageFrame, PosedCloud
 from semloc_logs.labels.painting import U32, Viewpoint, paint, without_borders
 from semloc_logs.labels.projection import Projector
 from semloc_logs.labels.space import UNPAINTED
-from semloc_logs.logs.session import Session
+from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import inverse
 
 POSED_TOLERANCE_NS = 250_000_000  # between picture and cloud, where poses take out the motion between them

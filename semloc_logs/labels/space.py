@@ -64,7 +64,7 @@ class LabelSpace:
         return out
 
     def train_ids_of_colours(self, packed: U32) -> tuple[U8, dict[int, int]]:
-        """Train ids of colours ``packed`` as by :func:`semloc_logs.logs.depth.label_ids`; and how often which colour is not in the palette.
+        """Train ids of colours ``packed`` as by :func:`semloc_logs.logs.sensors.depth.label_ids`; and how often which colour is not in the palette.
 
         Black means unlabelled where a palette does not use it.
         """

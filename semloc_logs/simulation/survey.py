@@ -13,7 +13,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.trajectory_file import TrajectoryFile, read_trajectory
+from semloc_logs.logs.poses.trajectory_file import TrajectoryFile, read_trajectory
 from semloc_logs.simulation.network import Road, RoadNetwork, drawn_road, drawn_stubs, left_of
 from semloc_logs.simulation.objects import resample
 from semloc_logs.simulation.world import F64

@@ -18,9 +18,9 @@ from semloc_logs.errors import LogError
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.space import SKY
 from semloc_logs.labels.surface import ground_surface
-from semloc_logs.logs.depth import RangeNoise
-from semloc_logs.logs.session import open_session
-from semloc_logs.logs.trajectory_file import TrajectoryFile
+from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.logs.sensors.depth import RangeNoise
+from semloc_logs.logs.session.session import open_session
 from semloc_logs.numerics.prefetch import ahead
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, Fusion, Settings

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.labels.labeller import Labeller
-from semloc_logs.logs.session import Session
+from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.prefetch import ahead
 from semloc_logs.settings import Fusion
 from semloc_logs.voxels.gravity import surface_normals

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.session import Session
-from semloc_logs.logs.tally import span
+from semloc_logs.logs.session.session import Session
+from semloc_logs.logs.session.tally import span
 from semloc_logs.numerics.transforms import inverse, rotation_between
 from semloc_logs.voxels.gravity import find_up
 from semloc_logs.voxels.keyframes import Collected

@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from semloc_logs import stages
 from semloc_logs.cli.main import program
 from semloc_logs.learning import Packed
-from semloc_logs.logs.annotate import AnnotateReport
+from semloc_logs.logs.annotation.annotate import AnnotateReport
 from semloc_logs.stages import Report
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
@@ -293,7 +293,7 @@ def test_inspect_goes_on_after_a_bad_log(tmp_path: Path) -> None:
 
 def test_inspect_says_3_when_data_are_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lost = {"path": "a.mcap", "skipped": ["/points: 3 messages cannot be read."], "problems": [], "streams": []}
-    monkeypatch.setattr("semloc_logs.logs.inspect.inspect_log", lambda *_: lost)
+    monkeypatch.setattr("semloc_logs.logs.session.inspect.inspect_log", lambda *_: lost)
     done = semloc("inspect", "a.mcap", "--json")
     assert done.exit_code == 3
     assert done.stderr == "Warning: a.mcap: /points: 3 messages cannot be read.\n"
@@ -309,7 +309,7 @@ def test_commands_that_open_a_log_repair_it_first(tmp_path: Path, monkeypatch: p
         repaired.append(path)
         return False
 
-    for module in ("semloc_logs.logs.annotate", "semloc_logs.stages"):
+    for module in ("semloc_logs.logs.annotation.annotate", "semloc_logs.stages"):
         monkeypatch.setattr(f"{module}.recover", recover)
     log = _log(tmp_path / "a.mcap")
     done = semloc(*(a.format(log=log, work=tmp_path / "w") for a in args))

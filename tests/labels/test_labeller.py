@@ -17,7 +17,7 @@ from semloc_logs.errors import LogError, SettingsError
 from semloc_logs.frames import Camera, Frame, Header, ImageFrame, LabelNames, LidarFrame, PoseSample, TransformSample
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.log import Message, Stream
-from semloc_logs.logs.session import Session
+from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Labels
 
@@ -223,7 +223,7 @@ def test_what_the_model_lacks_is_said(tmp_path: Path) -> None:
 
 
 def test_a_real_drive_without_poses(shared: Path, tmp_path: Path) -> None:
-    from semloc_logs.logs.session import open_session
+    from semloc_logs.logs.session.session import open_session
 
     settings = by_brightness(tmp_path, 94, 311)
     session = open_session([shared / "logs" / "kitti_drive_camera_lidar.mcap"], min_range=0.9, max_range=80.0)

@@ -9,7 +9,7 @@ import pytest
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Camera, Header
 from semloc_logs.labels.projection import Projector
-from semloc_logs.logs.depth import Unprojector
+from semloc_logs.logs.sensors.depth import Unprojector
 
 
 def camera(D: tuple[float, ...] = (), model: str = "plumb_bob", focal: float = 500.0, width: int = 640, height: int = 480) -> Camera:

@@ -20,9 +20,9 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs import splice
-from semloc_logs.logs.amend import read_ending
-from semloc_logs.logs.annotate import ClosureRecord, Results, annotate_copy, annotate_in_place, content_fingerprint, recover
+from semloc_logs.logs.annotation import tail_swap
+from semloc_logs.logs.annotation.annotate import ClosureRecord, Results, annotate_copy, annotate_in_place, content_fingerprint, recover
+from semloc_logs.logs.annotation.mcap_append import read_ending
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 CONFORMANCE = SHARED / "odd_logs" / "mcap_conformance"
@@ -297,7 +297,7 @@ def test_interruption_at_every_step_of_writing_in_place(tmp_path: Path, monkeypa
     for steps in range(10_000):
         log.write_bytes(before)
         with monkeypatch.context() as patch:
-            patch.setattr(splice, "os", Dying(steps, grain=997))
+            patch.setattr(tail_swap, "os", Dying(steps, grain=997))
             try:
                 annotate_in_place(log, Results(wanted, "a", {}, log_times=NO_TIMES))
                 finished = True
@@ -324,7 +324,7 @@ def test_interruption_of_the_repair_itself(tmp_path: Path, monkeypatch: pytest.M
 
     def interrupted(action: Any, steps: int) -> bool:
         with monkeypatch.context() as patch:
-            patch.setattr(splice, "os", Dying(steps, grain=997))
+            patch.setattr(tail_swap, "os", Dying(steps, grain=997))
             try:
                 action()
             except Crash:
@@ -363,7 +363,7 @@ def test_full_disk_while_writing_leaves_the_log_as_it_was(tmp_path: Path, monkey
 
     for write in (1, 2):  # the saved tail, then the log
         with monkeypatch.context() as patch:
-            patch.setattr(splice, "os", Full(write, 1))
+            patch.setattr(tail_swap, "os", Full(write, 1))
             with pytest.raises(LogError, match=r"unchanged.*No space left"):
                 annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
         assert log.read_bytes() == before
@@ -374,7 +374,7 @@ def test_a_saved_tail_of_another_file_is_not_put_back(tmp_path: Path, monkeypatc
     log = tmp_path / "log.mcap"
     write_log(log)
     with monkeypatch.context() as patch:
-        patch.setattr(splice, "os", Dying(12, grain=997))
+        patch.setattr(tail_swap, "os", Dying(12, grain=997))
         with pytest.raises(Crash):
             annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
     write_log(log, count=21)
@@ -387,7 +387,7 @@ def test_a_saved_tail_of_another_file_is_not_put_back(tmp_path: Path, monkeypatc
 def test_two_writers(tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     write_log(log)
-    with splice.locked(log), pytest.raises(LogError, match="another process"):
+    with tail_swap.locked(log), pytest.raises(LogError, match="another process"):
         annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
 
 

@@ -19,7 +19,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.annotate import (
+from semloc_logs.logs.annotation.annotate import (
     AnnotateReport,
     ClosureRecord,
     Results,

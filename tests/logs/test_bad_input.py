@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from semloc_logs.cli.main import program
 from semloc_logs.errors import LogError
-from semloc_logs.logs.definitions import UndecodableError
-from semloc_logs.logs.images import decode_compressed, decode_compressed_depth
-from semloc_logs.logs.inspect import inspect_log
-from semloc_logs.logs.session import Session, open_session
+from semloc_logs.logs.messages.definitions import UndecodableError
+from semloc_logs.logs.messages.image_codecs import decode_compressed, decode_compressed_depth
+from semloc_logs.logs.session.inspect import inspect_log
+from semloc_logs.logs.session.session import Session, open_session
 from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000
@@ -322,7 +322,7 @@ def test_bombs_in_a_log_cost_nothing(recorder: Any) -> None:
     path = log.write()
     code = f"""
 import json, resource, sys
-from semloc_logs.logs.session import open_session
+from semloc_logs.logs.session.session import open_session
 import cv2
 session = open_session([{str(path)!r}])
 held = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()

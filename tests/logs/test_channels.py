@@ -16,9 +16,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.errors import ContractError
-from semloc_logs.logs.amend import NewChannel, NewMessage
-from semloc_logs.logs.channels import COLUMNS, TOPICS, ClosureRecord, Encoding, LogFacts, channel_metadata, encode, run_id
-from semloc_logs.logs.channels_foxglove import loop_closure_class
+from semloc_logs.logs.annotation.channels import COLUMNS, TOPICS, ClosureRecord, Encoding, LogFacts, channel_metadata, encode, run_id
+from semloc_logs.logs.annotation.channels_foxglove import loop_closure_class
+from semloc_logs.logs.annotation.mcap_append import NewChannel, NewMessage
 from semloc_logs.numerics.transforms import transform, yaw_transform
 from semloc_logs.schemas import read_text
 

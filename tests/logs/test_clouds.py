@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.logs.clouds import Field, Layout, decode_points
-from semloc_logs.logs.definitions import UndecodableError
-from semloc_logs.logs.point_times import offsets_ns
+from semloc_logs.logs.messages.definitions import UndecodableError
+from semloc_logs.logs.messages.point_fields import Field, Layout, decode_points
+from semloc_logs.logs.messages.point_times import offsets_ns
 
 STAMP = 1_700_000_000_123_456_789
 XYZ = [Field("x", 0, "f4"), Field("y", 4, "f4"), Field("z", 8, "f4")]

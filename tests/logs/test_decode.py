@@ -18,8 +18,8 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.frames import Camera, DepthFrame, ImageFrame, ImuSample, LabelNames, LidarFrame, NavSatSample, PoseSample, TransformSample
-from semloc_logs.logs.decode import Decoder
 from semloc_logs.logs.log import Definition, Message
+from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problems
 
 STORES = {"cdr": get_typestore(Stores.ROS2_HUMBLE), "ros1": get_typestore(Stores.ROS1_NOETIC)}

@@ -8,8 +8,8 @@ import pytest
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Camera, DepthFrame, Header, ImageFrame
-from semloc_logs.logs.depth import DepthClouds, Unprojector, depth_sigma, label_ids
 from semloc_logs.logs.roles import Roles
+from semloc_logs.logs.sensors.depth import DepthClouds, Unprojector, depth_sigma, label_ids
 
 
 def camera(width: int = 8, height: int = 6, focal: float = 4.0, D: tuple[float, ...] = (), model: str = "plumb_bob") -> Camera:

@@ -25,9 +25,9 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.decode import Decoder
+from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Definition, Message
-from semloc_logs.logs.open import open_log
+from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problems
 
 ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)

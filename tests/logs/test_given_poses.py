@@ -14,11 +14,11 @@ import pytest
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, Header, LidarFrame, NavSatSample, PoseSample, TransformSample
-from semloc_logs.logs import odometry
 from semloc_logs.logs.log import Message, Stream
-from semloc_logs.logs.odometry import LidarOdometry
-from semloc_logs.logs.session import Session
-from semloc_logs.logs.trajectory_file import TrajectoryFile
+from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.logs.session import lidar_odometry
+from semloc_logs.logs.session.lidar_odometry import LidarOdometry
+from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
 S = 1_000_000_000
@@ -149,7 +149,7 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> Any:
         return points, points
 
     made.register_frame = register_frame
-    monkeypatch.setattr(odometry, "_kiss_icp", lambda *_: (made, "1.3.0"))
+    monkeypatch.setattr(lidar_odometry, "_kiss_icp", lambda *_: (made, "1.3.0"))
     return made
 
 

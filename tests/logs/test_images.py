@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.logs.definitions import UndecodableError
-from semloc_logs.logs.images import decode_compressed, decode_compressed_depth, decode_raw, depth_metres, is_depth
-from semloc_logs.logs.rvl import decode_rvl
+from semloc_logs.logs.messages.definitions import UndecodableError
+from semloc_logs.logs.messages.image_codecs import decode_compressed, decode_compressed_depth, decode_raw, depth_metres, is_depth
+from semloc_logs.logs.messages.rvl import decode_rvl
 
 
 def png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:

@@ -19,11 +19,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from semloc_logs.cli.main import program
 from semloc_logs.errors import RoleError
 from semloc_logs.frames import LidarFrame
-from semloc_logs.logs.decode import Decoder
 from semloc_logs.logs.log import Definition, Message, Stream
+from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problems
 from semloc_logs.logs.roles import find_roles, guess_roles, no_sensor
-from semloc_logs.logs.session import open_session
+from semloc_logs.logs.session.session import open_session
 from semloc_logs.numerics import transforms
 from semloc_logs.numerics.transforms import Array, yaw_transform
 

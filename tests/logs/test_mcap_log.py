@@ -18,10 +18,10 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import PoseSample
+from semloc_logs.logs.containers.base import decompress, in_log_time_order
+from semloc_logs.logs.containers.mcap import McapLog
+from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Definition, Message, Stream
-from semloc_logs.logs.mcap_log import McapLog
-from semloc_logs.logs.open import open_log
-from semloc_logs.logs.reading import decompress, in_log_time_order
 
 ENTRIES = [("/a", 10), ("/b", 20), ("/a", 30), ("/a", 25), ("/b", 40), ("/a", 35), ("/b", 50), ("/a", 60)]
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from semloc_logs.frames import Header, PoseSample
-from semloc_logs.logs.poses import PoseTrack
+from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.numerics.transforms import Array, yaw_transform
 
 S = 1_000_000_000

@@ -10,8 +10,8 @@ import pytest
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import DepthFrame, LidarFrame
+from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log
-from semloc_logs.logs.open import open_log
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 ODD = SHARED / "odd_logs"

@@ -16,8 +16,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import PoseSample
+from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log, Stream
-from semloc_logs.logs.open import open_log
 
 POSE = "geometry_msgs/msg/PoseStamped"
 STORE1, STORE2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)

@@ -12,8 +12,8 @@ import pytest
 from semloc_logs.errors import LogError, RoleError
 from semloc_logs.frames import Camera, DepthFrame, Frame, Header, ImageFrame, ImuSample, LidarFrame, PoseSample, TransformSample
 from semloc_logs.logs.log import Message, Stream
-from semloc_logs.logs.session import Session, open_session
-from semloc_logs.logs.waiting import MAX_WAITING
+from semloc_logs.logs.session.frame_queue import MAX_WAITING
+from semloc_logs.logs.session.session import Session, open_session
 from semloc_logs.numerics.transforms import Array, rotation_angle, yaw_transform
 
 S = 1_000_000_000

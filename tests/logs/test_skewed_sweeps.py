@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.logs.point_times import offsets_ns
-from semloc_logs.logs.session import open_session
+from semloc_logs.logs.messages.point_times import offsets_ns
+from semloc_logs.logs.session.session import open_session
 from semloc_logs.numerics import transforms
 from semloc_logs.numerics.transforms import Array, yaw_transform
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semloc_logs.logs.poses import PoseTrack
-from semloc_logs.logs.stamps import StampOrder
-from semloc_logs.logs.standstill import Standstill
+from semloc_logs.logs.messages.stamps import StampOrder
+from semloc_logs.logs.poses.standstill import Standstill
+from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000

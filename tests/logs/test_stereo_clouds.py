@@ -11,13 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F64, Camera, Header, ImageFrame, PosedCloud
-from semloc_logs.logs.depth import LabelImages
-from semloc_logs.logs.inspect import inspect_log
-from semloc_logs.logs.rectification import Rectification, rectification
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.session import open_session
-from semloc_logs.logs.stereo_clouds import StereoClouds, _grey
-from semloc_logs.logs.tally import Tally
+from semloc_logs.logs.sensors.depth import LabelImages
+from semloc_logs.logs.sensors.rectification import Rectification, rectification
+from semloc_logs.logs.sensors.stereo_pairs import StereoClouds, _grey
+from semloc_logs.logs.session.inspect import inspect_log
+from semloc_logs.logs.session.session import open_session
+from semloc_logs.logs.session.tally import Tally
 from semloc_logs.numerics.transforms import apply, exp_se3
 from semloc_logs.voxels.gravity import find_up
 from semloc_logs.voxels.keyframes import Collected
@@ -257,7 +257,7 @@ def test_the_room_would_not_be_there_with_a_wrong_rectification(monkeypatch: pyt
         assert right_T_left is not None
         return rectification(left, right, shape, exp_se3(np.zeros(3), np.array(turn)) @ right_T_left, rectified=rectified)
 
-    monkeypatch.setattr("semloc_logs.logs.stereo_clouds.rectification", wrong)
+    monkeypatch.setattr("semloc_logs.logs.sensors.stereo_pairs.rectification", wrong)
     session = open_session([REAL], max_range=10.0)
     cloud = next(session.clouds(), None)
     session.close()

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.frames import Header, LidarFrame
-from semloc_logs.logs.poses import PoseTrack
-from semloc_logs.logs.sweeps import deskew, sweep_in_base
+from semloc_logs.logs.poses.track import PoseTrack
+from semloc_logs.logs.sensors.sweeps import deskew, sweep_in_base
 from semloc_logs.numerics import transforms
 from semloc_logs.numerics.transforms import Array, yaw_transform
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, Header, LidarFrame
-from semloc_logs.logs.trajectory_file import FilePoses, Trajectory, TrajectoryFile, read_trajectory, seconds_to_ns
+from semloc_logs.logs.poses.trajectory_file import FilePoses, Trajectory, TrajectoryFile, read_trajectory, seconds_to_ns
 
 TUM_LINE = "{stamp} 1 2 3 0 0 0.6 0.8"
 

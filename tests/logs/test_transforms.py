@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semloc_logs.frames import Header, TransformSample
-from semloc_logs.logs.transforms import TransformTree
+from semloc_logs.logs.poses.tf_tree import TransformTree
 from semloc_logs.numerics import transforms
 from semloc_logs.numerics.transforms import Array, yaw_transform
 

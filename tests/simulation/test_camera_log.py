@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.frames import PosedCloud
-from semloc_logs.logs.open import open_log
-from semloc_logs.logs.session import Session
+from semloc_logs.logs.containers.open import open_log
+from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.simulation.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
 from semloc_logs.simulation.camera_drive import SKY, simulate_cameras, wrong_label_image

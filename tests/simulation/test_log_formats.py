@@ -10,7 +10,7 @@ import pytest
 
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.errors import LogError
-from semloc_logs.logs.inspect import inspect_log
+from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.drive import simulate_drive

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semloc_logs.logs.navsat import LocalFrame
+from semloc_logs.logs.poses.navsat import LocalFrame
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.simulation.trajectory import Trajectory, drifting_odometry, drive, smooth_line
 from semloc_logs.simulation.vehicle_sensors import ANTENNA, DATUM, GRAVITY, VehicleSensors, fixes, geodetic, inertial

@@ -1,0 +1,225 @@
+"""Loop closures as messages of a log, in the log's own encoding: one foreign channel would make it unreadable for some readers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.errors import ContractError
+from semloc_logs.logs.annotation.mcap_append import RUN_KEY, NewChannel, NewMessage
+from semloc_logs.numerics.transforms import inverse, transform
+
+F64 = NDArray[np.float64]
+Encoding = Literal["ros2", "ros1", "protobuf", "json"]
+TOPICS = ("/semloc/loop_closures", "/semloc/pose", "/semloc/markers")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosureRecord:
+    """A row of closures.parquet, and where it lies for those who look at the log.
+
+    ``covariance`` has 36 numbers. ``session_T_query`` (4, 4) is the pose of the query's base frame in the *target's* session frame, None
+    when the target has no poses. ``session_position`` (3,) is the place of this log's end in this log's session frame, None without poses.
+    """
+
+    query_session: str
+    target_session: str
+    query_stamp_ns: int
+    target_stamp_ns: int
+    t_x: float
+    t_y: float
+    t_z: float
+    q_x: float
+    q_y: float
+    q_z: float
+    q_w: float
+    covariance: tuple[float, ...]
+    overlap: float
+    probability: float
+    inliers: int
+    words: int
+    session_T_query: F64 | None = None
+    session_position: F64 | None = None
+
+    @classmethod
+    def from_row(
+        cls, row: Mapping[str, object], *, session_T_query: F64 | None = None, session_position: F64 | None = None
+    ) -> ClosureRecord:
+        """From a row of the table as plain Python values; ``ContractError`` when a column is missing or has another type."""
+        try:
+            values: dict[str, object] = {}
+            for name in COLUMNS:
+                value = row[name]
+                kind = _TYPES[name]
+                values[name] = tuple(float(x) for x in value) if kind is tuple else kind(value)  # type: ignore[attr-defined]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ContractError(
+                f"A row of closures.parquet lacks a good value for {error}; write the table again with `semloc close`."
+            ) from error
+        if len(values["covariance"]) != 36:  # type: ignore[arg-type]
+            raise ContractError(
+                "The covariance of a row of closures.parquet has not 36 numbers; write the table again with `semloc close`."
+            )
+        return cls(**values, session_T_query=session_T_query, session_position=session_position)  # type: ignore[arg-type]
+
+    def columns(self) -> dict[str, object]:
+        """The columns of closures.parquet, in their order."""
+        return {name: getattr(self, name) for name in COLUMNS}
+
+    def target_T_query(self) -> F64:
+        """Pose of the query's base frame in the target's base frame (4, 4)."""
+        return transform(np.array([self.t_x, self.t_y, self.t_z]), np.array([self.q_x, self.q_y, self.q_z, self.q_w]))
+
+    def covariance_in_session(self) -> F64:
+        """(6, 6) covariance of ``session_T_query`` due to the closure: the same errors along the axes of the target's session frame."""
+        session_T_query = np.eye(4) if self.session_T_query is None else self.session_T_query
+        session_R_target = session_T_query[:3, :3] @ self.target_T_query()[:3, :3].T
+        turn = np.kron(np.eye(2), session_R_target)
+        return np.asarray(turn @ np.array(self.covariance).reshape(6, 6) @ turn.T)
+
+
+COLUMNS = tuple(f.name for f in fields(ClosureRecord) if not f.name.startswith("session_"))
+_TYPES: dict[str, type] = {
+    name: str if name.endswith("_session") else int if name.endswith("_ns") or name in ("inliers", "words") else float for name in COLUMNS
+} | {"covariance": tuple}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mark:
+    """What is drawn at this log's end of a closure, in the frame ``frame_id``: a sphere, a text and, within one session, a line."""
+
+    stamp_ns: int
+    frame_id: str
+    key: int  # number of the closure in this log
+    position: F64
+    other: F64 | None  # position of the other end, known when it lies in the same session
+    size: float  # diameter of the sphere, m
+    text: str
+    color: tuple[float, float, float, float]
+
+    def text_position(self) -> F64:
+        """Above the sphere (3,)."""
+        return np.asarray(self.position + np.array([0.0, 0.0, 1.5 * self.size]))
+
+
+class Encoder(Protocol):
+    """The three messages in one encoding: their channels in the order of ``TOPICS``, and their bytes."""
+
+    def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]: ...
+    def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes: ...
+    def pose(self, closure: ClosureRecord, frame_id: str) -> bytes: ...
+    def mark(self, mark: Mark) -> bytes: ...
+
+
+@dataclass(frozen=True, slots=True)
+class LogFacts:
+    """What has to be known of a log to write into it: encoding, profile, metadata for new channels, first and last receive time.
+
+    ``old_markers``: the log defines visualization_msgs/Marker as ROS 2 did before Humble; readers know one definition of a type.
+    """
+
+    encoding: Encoding
+    profile: str
+    channel_metadata: Mapping[str, str]
+    start_ns: int
+    end_ns: int
+    messages: int
+    old_markers: bool = False
+
+
+def is_old_marker(name: str, definition: bytes) -> bool:
+    """Whether a ROS 2 definition contains visualization_msgs/Marker as it was before Humble."""
+    own = name.startswith("visualization_msgs/msg/Marker")
+    return (own or b"MSG: visualization_msgs/Marker\n" in definition) and b"mesh_file" not in definition
+
+
+def run_id(closures: Sequence[ClosureRecord], session: str, settings: Mapping[str, str], version: str) -> str:
+    """Sixteen hexadecimal digits that name this result: the same closures, settings and version give the same."""
+    rows = [list(c.columns().values()) for c in closures]
+    content = json.dumps([version, session, sorted(settings.items()), rows], allow_nan=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def encode(
+    closures: Sequence[ClosureRecord],
+    session: str,
+    facts: LogFacts,
+    *,
+    log_times: Mapping[int, int],
+    frame_id: str,
+    size: float,
+    metadata: Mapping[str, str],
+) -> tuple[list[NewChannel], list[NewMessage]]:
+    """Channels and messages for the closures in which ``session`` takes part, in log-time order.
+
+    ``log_times`` maps the stamp of an end to the receive time of the log at that frame; an end without one takes its stamp, moved into
+    the log's time range. ``size`` is the diameter of the markers in metres; ``metadata`` goes to the channels. Channels without messages
+    are left out.
+    """
+    encoder = _encoder(facts)
+    messages: list[NewMessage] = []
+    mine = [c for c in closures if session in (c.query_session, c.target_session)]
+    for c in mine:
+        if not np.isfinite([*c.covariance, c.t_x, c.t_y, c.t_z, c.q_x, c.q_y, c.q_z, c.q_w, c.overlap, c.probability]).all():
+            raise ContractError(
+                f"The closure of {c.query_session} at {c.query_stamp_ns} ns has a number that is not finite; run `semloc close`."
+            )
+    for key, closure in enumerate(sorted(mine, key=_order)):
+        is_query = closure.query_session == session
+        stamp = closure.query_stamp_ns if is_query else closure.target_stamp_ns
+        log_time = min(max(log_times.get(stamp, _clip(stamp, facts)), 0), (1 << 64) - 1)
+        messages.append(NewMessage(0, log_time, encoder.loop_closure(closure, stamp)))
+        if is_query and closure.session_T_query is not None:
+            messages.append(NewMessage(1, log_time, encoder.pose(closure, f"semloc/{closure.target_session}")))
+        if closure.session_position is not None:
+            messages.append(NewMessage(2, log_time, encoder.mark(_mark(closure, is_query, stamp, key, frame_id, size))))
+    messages.sort(key=lambda m: m.log_time_ns)  # stable: closures of one frame stay in their order
+    return _used(encoder.channels({**facts.channel_metadata, **metadata}), messages)
+
+
+def channel_metadata(run: str, version: str) -> dict[str, str]:
+    """Metadata by which our channels are known."""
+    return {RUN_KEY: run, "semloc.version": version}
+
+
+def _encoder(facts: LogFacts) -> Encoder:
+    encoding = facts.encoding
+    if encoding == "ros1" or encoding == "ros2":
+        from semloc_logs.logs.annotation.channels_ros import RosEncoder
+
+        return RosEncoder(1 if encoding == "ros1" else 2, old_markers=facts.old_markers)
+    from semloc_logs.logs.annotation.channels_foxglove import FoxgloveEncoder
+
+    return FoxgloveEncoder(encoding)
+
+
+def _order(closure: ClosureRecord) -> tuple[str, int, str, int]:
+    return closure.query_session, closure.query_stamp_ns, closure.target_session, closure.target_stamp_ns
+
+
+def _clip(stamp: int, facts: LogFacts) -> int:
+    return min(max(stamp, facts.start_ns), facts.end_ns) if facts.messages else stamp
+
+
+def _mark(closure: ClosureRecord, is_query: bool, stamp: int, key: int, frame_id: str, size: float) -> Mark:
+    position = np.asarray(closure.session_position, float)
+    other, name = None, closure.target_session if is_query else closure.query_session
+    if closure.query_session == closure.target_session:
+        name = "an earlier place" if closure.target_stamp_ns <= closure.query_stamp_ns else "a later place"
+        if closure.session_T_query is not None:
+            other = (closure.session_T_query @ inverse(closure.target_T_query()))[:3, 3]
+    good = min(1.0, max(0.0, 2 * closure.probability - 1))  # red at 0.5 and below, green at 1
+    return Mark(stamp, frame_id, key, position, other, size, f"{name} {closure.probability:.2f}", (1 - good, good, 0.1, 0.9))
+
+
+def _used(channels: list[NewChannel], messages: list[NewMessage]) -> tuple[list[NewChannel], list[NewMessage]]:
+    """Without channels that have no message."""
+    used = sorted({m.channel for m in messages})
+    number = {old: new for new, old in enumerate(used)}
+    return [channels[k] for k in used], [NewMessage(number[m.channel], m.log_time_ns, m.data) for m in messages]

@@ -1,0 +1,168 @@
+"""Our three messages as protobuf, or as the JSON that Foxglove defines for the same schemas."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.message import Message
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from semloc_logs.logs.annotation.channels import F64, TOPICS, ClosureRecord, Mark
+from semloc_logs.logs.annotation.mcap_append import NewChannel
+from semloc_logs.numerics.transforms import translation_quaternion
+from semloc_logs.schemas import read_text
+
+_STRING, _INT64, _INT32, _DOUBLE = (
+    FieldDescriptor.TYPE_STRING,
+    FieldDescriptor.TYPE_INT64,
+    FieldDescriptor.TYPE_INT32,
+    FieldDescriptor.TYPE_DOUBLE,
+)
+# the fields of schemas/messages/LoopClosure.proto after the timestamp, in the order of their numbers
+_FIELDS = (
+    ("query_session", _STRING),
+    ("target_session", _STRING),
+    ("query_stamp_ns", _INT64),
+    ("target_stamp_ns", _INT64),
+    *((name, _DOUBLE) for name in ("t_x", "t_y", "t_z", "q_x", "q_y", "q_z", "q_w", "covariance", "overlap", "probability")),
+    ("inliers", _INT32),
+    ("words", _INT32),
+)
+
+
+class FoxgloveEncoder:
+    """Messages with ``encoding`` protobuf or json."""
+
+    def __init__(self, encoding: Literal["protobuf", "json"]) -> None:
+        self.encoding = encoding
+
+    def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]:
+        out = []
+        for topic, kind in zip(TOPICS, (loop_closure_class(), PoseInFrame, SceneUpdate), strict=True):
+            name = kind.DESCRIPTOR.full_name
+            if self.encoding == "protobuf":
+                data, schema_encoding = build_file_descriptor_set(kind).SerializeToString(deterministic=True), "protobuf"
+            elif topic == TOPICS[0]:
+                data, schema_encoding = read_text("messages/LoopClosure.json").encode(), "jsonschema"
+            else:
+                data, schema_encoding = json.dumps({"title": name, **json_schema(kind.DESCRIPTOR)}).encode(), "jsonschema"
+            out.append(NewChannel(topic, self.encoding, name, schema_encoding, data, metadata))
+        return out
+
+    def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes:
+        return self._bytes(loop_closure_class()(timestamp=_time(stamp_ns), **closure.columns()))
+
+    def pose(self, closure: ClosureRecord, frame_id: str) -> bytes:
+        session_T_query = np.eye(4) if closure.session_T_query is None else closure.session_T_query
+        message = PoseInFrame(timestamp=_time(closure.query_stamp_ns), frame_id=frame_id)
+        _set_pose(message.pose, *translation_quaternion(session_T_query))
+        return self._bytes(message)
+
+    def mark(self, mark: Mark) -> bytes:
+        update = SceneUpdate()
+        entity = update.entities.add(timestamp=_time(mark.stamp_ns), frame_id=mark.frame_id, id=f"semloc/{mark.key}")
+        entity.lifetime.SetInParent()  # zero: stays
+        color = dict(zip("rgba", mark.color, strict=True))
+        sphere = entity.spheres.add(size=dict.fromkeys("xyz", mark.size), color=color)
+        _set_pose(sphere.pose, mark.position)
+        text = entity.texts.add(billboard=True, font_size=mark.size, color=color, text=mark.text)
+        _set_pose(text.pose, mark.text_position())
+        if mark.other is not None:
+            points = [Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in (mark.position, mark.other)]
+            line = entity.lines.add(type=LinePrimitive.LINE_LIST, thickness=mark.size / 5, points=points, color=color)
+            _set_pose(line.pose, np.zeros(3))
+        return self._bytes(update)
+
+    def _bytes(self, message: Message) -> bytes:
+        if self.encoding == "protobuf":
+            return bytes(message.SerializeToString(deterministic=True))
+        return json.dumps(_json_value(message), allow_nan=False).encode()
+
+
+@cache
+def loop_closure_class() -> Any:
+    """The protobuf class of schemas/messages/LoopClosure.proto."""
+    file = descriptor_pb2.FileDescriptorProto(name="semloc/LoopClosure.proto", package="semloc", syntax="proto3")
+    file.dependency.append(timestamp_pb2.DESCRIPTOR.name)
+    message = file.message_type.add(name="LoopClosure")
+    once, many = FieldDescriptor.LABEL_OPTIONAL, FieldDescriptor.LABEL_REPEATED
+    message.field.add(name="timestamp", number=1, label=once, type=FieldDescriptor.TYPE_MESSAGE, type_name=".google.protobuf.Timestamp")
+    for number, (name, kind) in enumerate(_FIELDS, 2):
+        message.field.add(name=name, number=number, label=many if name == "covariance" else once, type=kind)
+    pool = descriptor_pool.Default()
+    pool.AddSerializedFile(file.SerializeToString())
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("semloc.LoopClosure"))
+
+
+def json_schema(descriptor: Descriptor) -> dict[str, Any]:
+    """JSON Schema of a protobuf message in Foxglove's JSON: times as sec and nsec, enumerations as numbers, bytes as base64."""
+    if descriptor.full_name in ("google.protobuf.Timestamp", "google.protobuf.Duration"):
+        title = "time" if descriptor.name == "Timestamp" else "duration"
+        return {"type": "object", "title": title, "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
+    properties = {}
+    for field in descriptor.fields:
+        one = _json_field_schema(field)
+        properties[field.name] = {"type": "array", "items": one} if _is_repeated(field) else one
+    return {"type": "object", "properties": properties}
+
+
+def _json_field_schema(field: FieldDescriptor) -> dict[str, Any]:
+    if field.message_type is not None:
+        return json_schema(field.message_type)
+    if field.enum_type is not None:
+        return {"oneOf": [{"title": v.name, "const": v.number} for v in field.enum_type.values]}
+    if field.type == FieldDescriptor.TYPE_BYTES:
+        return {"type": "string", "contentEncoding": "base64"}
+    kinds = {
+        FieldDescriptor.CPPTYPE_STRING: "string",
+        FieldDescriptor.CPPTYPE_BOOL: "boolean",
+        FieldDescriptor.CPPTYPE_DOUBLE: "number",
+        FieldDescriptor.CPPTYPE_FLOAT: "number",
+    }
+    return {"type": kinds.get(field.cpp_type, "integer")}
+
+
+def _is_repeated(field: FieldDescriptor) -> bool:
+    if hasattr(field, "is_repeated"):  # protobuf 6.31 and later, where label is deprecated
+        return bool(field.is_repeated)
+    return bool(field.label == FieldDescriptor.LABEL_REPEATED)
+
+
+def _json_value(message: Message) -> dict[str, Any]:
+    """A message as Foxglove's JSON, every field present."""
+    if message.DESCRIPTOR.full_name in ("google.protobuf.Timestamp", "google.protobuf.Duration"):
+        return {"sec": message.seconds, "nsec": message.nanos}
+    out = {}
+    for field in message.DESCRIPTOR.fields:
+        value = getattr(message, field.name)
+        out[field.name] = [_json_item(v) for v in value] if _is_repeated(field) else _json_item(value)
+    return out
+
+
+def _json_item(value: Any) -> Any:
+    if isinstance(value, Message):
+        return _json_value(value)
+    return base64.b64encode(value).decode() if isinstance(value, bytes) else value
+
+
+def _time(stamp_ns: int) -> timestamp_pb2.Timestamp:
+    sec, nanos = divmod(stamp_ns, 10**9)
+    return timestamp_pb2.Timestamp(seconds=sec, nanos=nanos)
+
+
+def _set_pose(pose: Pose, position: F64, quaternion: F64 | tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)) -> None:
+    pose.position.x, pose.position.y, pose.position.z = (float(v) for v in position)
+    q = pose.orientation
+    q.x, q.y, q.z, q.w = (float(v) for v in quaternion)

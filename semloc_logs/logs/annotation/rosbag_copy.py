@@ -1,0 +1,140 @@
+"""ROS bags that are no MCAP files, as raw messages: what has to be known to write beside them, and a copy of them as MCAP."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2.metadata import dump_qos_v8
+from rosbags.typesys import Stores, get_typestore
+
+from semloc_logs.errors import LogError
+from semloc_logs.logs.annotation.channels import LogFacts, is_old_marker
+
+QOS_KEY = "offered_qos_profiles"
+
+
+@contextlib.contextmanager
+def opened(log: Path) -> Iterator[Sequence[Any]]:
+    """Open rosbags readers of a .bag, a .db3, or a ROS 2 bag folder (the .db3 or .mcap files in it where metadata.yaml is missing)."""
+    with contextlib.ExitStack() as stack:
+        with _told(log):
+            readers = [stack.enter_context(r) for r in _readers(log)]
+        yield readers
+
+
+def bag_facts(log: Path, readers: Sequence[Any]) -> LogFacts:
+    """Encoding, QoS and time range of an open bag."""
+    with _told(log):
+        used = [r for r in readers if r.message_count]
+        start, end = min((r.start_time for r in used), default=0), max((r.end_time - 1 for r in used), default=0)
+        ros1 = isinstance(readers[0], Reader1)
+        profiles = [] if ros1 else [dump_qos_v8(c.ext.offered_qos_profiles) for r in readers for c in r.connections]
+    metadata = {} if ros1 else {QOS_KEY: next(filter(None, profiles), "")}
+    name = "ros1" if ros1 else "ros2"
+    old_markers = not ros1 and any(
+        is_old_marker(c.msgtype, c.msgdef.data.encode()) for r in readers for c in r.connections if c.msgdef.data
+    )
+    return LogFacts("ros1" if ros1 else "ros2", name, metadata, start, end, sum(r.message_count for r in readers), old_markers)
+
+
+def write_copy(log: Path, readers: Sequence[Any], file: BinaryIO, library: str) -> int:
+    """Write every message of an open bag as it is to an MCAP file; returns their number.
+
+    Raises ``LogError`` when fewer messages come out than the bag counts.
+    """
+    ros1 = isinstance(readers[0], Reader1)
+    writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start("ros1" if ros1 else "ros2", library)
+    schemas: dict[tuple[str, str, str], int] = {}
+    written = 0
+    for reader in readers:
+        channels: dict[int, int] = {}
+        for connection in reader.connections:
+            schema = _schema(connection, ros1)
+            if schema not in schemas:
+                schemas[schema] = writer.register_schema(schema[0], schema[1], schema[2].encode())
+            encoding, metadata = _channel(connection, ros1)
+            channels[connection.id] = writer.register_channel(connection.topic, encoding, schemas[schema], metadata)
+        for connection, time, data in _guarded(log, reader):
+            writer.add_message(channels[connection.id], max(0, time), bytes(data), max(0, time))
+            written += 1
+    expected = sum(r.message_count for r in readers)
+    if written != expected:
+        raise LogError(
+            f"{log} holds {expected} messages but only {written} could be read; repair it with `rosbag reindex` or `ros2 bag reindex`."
+        )
+    writer.finish()  # type: ignore[no-untyped-call]
+    return written
+
+
+def _readers(log: Path) -> list[Any]:
+    if log.suffix == ".bag":
+        return [Reader1(log)]
+    folder = log.parent if log.name == "metadata.yaml" else log
+    if not folder.is_dir():
+        return [Reader2(log)]
+    if (folder / "metadata.yaml").exists():
+        return [Reader2(folder)]
+    files = sorted(f for f in folder.iterdir() if f.suffix in (".db3", ".mcap"))
+    if not files:
+        raise LogError(f"{folder} holds no ROS 2 bag: neither metadata.yaml nor .db3 or .mcap files; give the folder of a bag.")
+    return [Reader2(f) for f in files]
+
+
+def _guarded(log: Path, reader: Any) -> Iterator[tuple[Any, int, bytes]]:
+    """The messages of a reader, with one kind of error; errors of the one who writes them pass by."""
+    with _told(log):
+        messages = reader.messages(reader.connections) if reader.connections else iter(())
+    while True:
+        with _told(log):
+            item = next(messages, None)
+        if item is None:
+            return
+        yield item
+
+
+@contextlib.contextmanager
+def _told(log: Path) -> Iterator[None]:
+    """Whatever the library raises on a damaged bag (it is of many types, AssertionError among them) becomes a LogError."""
+    try:
+        yield
+    except LogError:
+        raise
+    except Exception as error:
+        raise LogError(
+            f"{log} cannot be read as a bag ({type(error).__name__}: {error}); repair it with `rosbag reindex` or `ros2 bag reindex`."
+        ) from error
+
+
+def _schema(connection: Any, ros1: bool) -> tuple[str, str, str]:
+    """Name, encoding and text of a connection's definition; a ROS 2 type that is not defined is looked up among the standard ones."""
+    name, definition = connection.msgtype, connection.msgdef
+    if ros1:
+        return name.replace("/msg/", "/"), "ros1msg", definition.data
+    if definition.format == MessageDefinitionFormat.IDL:
+        return name, "ros2idl", definition.data
+    if definition.format == MessageDefinitionFormat.MSG:
+        return name, "ros2msg", definition.data
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    if name in store.fielddefs:
+        return name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0]
+    return name, "", ""
+
+
+def _channel(connection: Any, ros1: bool) -> tuple[str, dict[str, str]]:
+    if not ros1:
+        metadata = {QOS_KEY: dump_qos_v8(connection.ext.offered_qos_profiles)}
+        return connection.ext.serialization_format, metadata | ({"topic_type_hash": connection.digest} if connection.digest else {})
+    metadata = {"md5sum": connection.digest, "topic": connection.topic}
+    if connection.ext.callerid is not None:
+        metadata["callerid"] = connection.ext.callerid
+    if connection.ext.latching is not None:
+        metadata["latching"] = str(connection.ext.latching)
+    return "ros1", metadata

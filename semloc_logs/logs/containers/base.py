@@ -1,0 +1,192 @@
+"""What all containers share: problems by topic, messages of several parts in log-time order, careful decompression."""
+
+from __future__ import annotations
+
+import bz2
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
+from heapq import heappop, heappush, heapreplace
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import lz4.frame
+import zstandard
+
+from semloc_logs.errors import LogError
+from semloc_logs.frames import Frame
+from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.messages.decode import Decoder
+from semloc_logs.logs.problems import Problems
+
+MAX_CHUNK = 2 << 30  # no recorder writes chunks of 2 GiB; a larger claim is damage or a decompression bomb
+_STEP = 1 << 22
+
+
+class BaseLog(ABC):
+    """The parts of :class:`~semloc_logs.logs.log.Log` that do not depend on the container."""
+
+    def __init__(self, path: Path, format: str, problems: Problems | None = None) -> None:
+        self.path = path
+        self.format = format
+        self.encoding = ""
+        self.start_ns: int | None = None
+        self.end_ns: int | None = None
+        self.streams: list[Stream] = []
+        self._problems = Problems() if problems is None else problems
+        self._decoder = Decoder(self._problems)
+
+    @property
+    def problems(self) -> list[str]:
+        """What was skipped and why, in sentences."""
+        return self._problems.sentences()
+
+    @abstractmethod
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
+        """The messages of ``topics`` in log-time order."""
+
+    def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
+        """The decoded messages of ``topics`` in log-time order."""
+        self._problems.forget_skipped("decoding", topics)
+        for message in self.messages(topics):
+            yield from self._decoder.frames(message)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Releases the files."""
+
+
+def open_file(path: Path) -> BinaryIO:
+    """``path`` for reading; LogError when that is not possible."""
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise LogError(f"{path} cannot be opened: {error.strerror}.") from error
+
+
+@contextmanager
+def closed_on_error(file: BinaryIO, path: Path) -> Iterator[None]:
+    """Closes ``file`` when it turns out to be no log, and says so as a LogError that names ``path``."""
+    try:
+        yield
+    except (LogError, OSError) as error:
+        file.close()
+        raise LogError(f"{path} cannot be read: {error}.") from error
+
+
+class SizedFile(Protocol):
+    """A binary file."""
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        """Moves to ``offset``."""
+
+    def read(self, size: int = -1, /) -> bytes:
+        """At most ``size`` bytes."""
+
+
+def encoding_of(streams: Iterable[Stream]) -> str:
+    """``ros2``, ``ros1``, ``protobuf`` or ``json``: what most streams are recorded in, "" without streams that are."""
+    names = {"cdr": "ros2", "ros1": "ros1", "protobuf": "protobuf", "json": "json"}
+    found = [names[s.encoding] for s in streams if s.encoding in names]
+    return max(sorted(set(found)), key=found.count, default="")
+
+
+def in_log_time_order(parts: Iterable[tuple[int, Callable[[], Iterator[Message]]]]) -> Iterator[Message]:
+    """Merges parts, each (a lower bound of its log times, a function that opens it), each in log-time order by itself.
+
+    A part is opened when its time has come, so memory holds only parts that overlap; equal times keep the order of the parts.
+    """
+    waiting = sorted(((start, k, part) for k, (start, part) in enumerate(parts)), key=lambda w: w[:2], reverse=True)
+    heap: list[tuple[int, int, Message, Iterator[Message]]] = []
+    while waiting or heap:
+        while waiting and (not heap or waiting[-1][0] <= heap[0][0]):
+            _, order, part = waiting.pop()
+            opened = iter(part())
+            if (first := next(opened, None)) is not None:
+                heappush(heap, (first.log_time_ns, order, first, opened))
+        if not heap:
+            continue
+        _, order, message, opened = heap[0]
+        yield message
+        if len(heap) == 1:  # nearly always: parts rarely overlap, so run through this one until the next is due
+            due = waiting[-1][0] if waiting else None
+            for message in opened:
+                if due is not None and message.log_time_ns >= due:
+                    heap[0] = (message.log_time_ns, order, message, opened)
+                    break
+                yield message
+            else:
+                heappop(heap)
+        elif (following := next(opened, None)) is not None:
+            heapreplace(heap, (following.log_time_ns, order, following, opened))
+        else:
+            heappop(heap)
+
+
+def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> bytes:
+    """``size`` bytes at ``offset``; LogError when the file does not have them (nothing is allocated for the claim)."""
+    if offset < 0 or size < 0 or offset + size > file_size:
+        raise LogError(f"{size} bytes are claimed at byte {offset}, but the file ends at byte {file_size}")
+    file.seek(offset)
+    data = file.read(size)
+    if len(data) != size:
+        raise LogError(f"only {len(data)} of {size} bytes could be read at byte {offset}")
+    return data
+
+
+def decompress(data: bytes, compression: str, size: int) -> bytes:
+    """The ``size`` bytes that ``data`` holds; LogError for another size, a claim beyond reason or damaged data."""
+    if compression in ("", "none"):
+        unpacked = data
+    elif compression not in ("zstd", "lz4", "bz2"):
+        raise LogError(f"the compression {compression[:40]!r} is unknown")
+    elif size > MAX_CHUNK:
+        raise LogError(f"a chunk claims {size} bytes, more than {MAX_CHUNK}")
+    else:
+        try:
+            unpacked = _unpack(data, compression, size)
+        except (zstandard.ZstdError, RuntimeError, EOFError, OSError, ValueError, MemoryError) as error:
+            raise LogError(f"its {compression} data are damaged ({error})") from error
+    if len(unpacked) != size:
+        raise LogError(f"it holds {len(unpacked)} bytes where {size} are claimed")
+    return unpacked
+
+
+def _unpack(data: bytes, compression: str, size: int) -> bytes:
+    """Decompresses at once what is plausible, and in steps what claims to grow more than 64-fold."""
+    plausible = size <= max(64 * len(data), _STEP)
+    if compression == "zstd":
+        if plausible and zstandard.frame_content_size(data) in (size, -1):
+            return bytes(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
+        return _gather(zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True).read, size)
+    if compression == "bz2":
+        engine = bz2.BZ2Decompressor()
+        return _gather(_feed(engine, data), size)
+    return _gather(_feed(lz4.frame.LZ4FrameDecompressor(), data), size)
+
+
+class _Engine(Protocol):
+    @property
+    def eof(self) -> bool: ...
+
+    def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
+
+
+def _feed(engine: _Engine, data: bytes) -> Callable[[int], bytes]:
+    rest = [data]
+
+    def read(size: int) -> bytes:
+        if engine.eof:
+            return b""
+        return engine.decompress(rest.pop() if rest else b"", max_length=size)
+
+    return read
+
+
+def _gather(read: Callable[[int], bytes], size: int) -> bytes:
+    """At most ``size + 1`` bytes: one too many shows that the claim was too small."""
+    pieces, have = [], 0
+    while have <= size and (piece := read(min(_STEP, size + 1 - have))):
+        pieces.append(piece)
+        have += len(piece)
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)

@@ -1,0 +1,82 @@
+"""Parts that messages of several types share, headers above all, and how a converter of one type comes about."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+
+from semloc_logs.frames import F64, Frame, Header
+from semloc_logs.logs.log import Message
+from semloc_logs.logs.messages.definitions import UndecodableError
+from semloc_logs.numerics import transforms
+
+Convert = Callable[[Any, Message], Iterator[Frame]]  # a parsed message and the one it was parsed from -> frames
+Body = Callable[[Header, Any], Iterator[Frame]]  # the same where the header is all that is needed of the latter
+
+# what hostile values in a well-formed message may raise in converters
+BAD_VALUES = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, MemoryError, cv2.error)
+
+
+def ros(body: Body) -> Convert:
+    """A converter of ROS messages that begin with a std_msgs/Header."""
+    return lambda m, message: body(ros_header(m, message), m)
+
+
+def foxglove(body: Body, frame: str = "frame_id") -> Convert:
+    """A converter of Foxglove's messages, whose time and ``frame`` stand among their other fields."""
+    return lambda m, message: body(foxglove_header(m, message, getattr(m, frame)), m)
+
+
+def check_time(time_ns: int) -> int:
+    """Nanoseconds that fit 64-bit integers, also after a difference of two."""
+    if abs(time_ns) >= 1 << 62:
+        raise UndecodableError(f"its time of {time_ns} ns is impossible")
+    return time_ns
+
+
+def stamp_ns(time: Any, message: Message) -> int:
+    """Nanoseconds of a ROS time, a protobuf timestamp or a JSON {sec, nsec}; log time where a message has none."""
+    if time is None:
+        return message.log_time_ns
+    for seconds, nanoseconds in (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec")):
+        s, n = getattr(time, seconds, None), getattr(time, nanoseconds, None)
+        if s is not None and n is not None:
+            return check_time(int(s) * 1_000_000_000 + int(n))
+    raise UndecodableError("its time stamp has neither seconds nor nanoseconds")
+
+
+def ros_header(m: Any, message: Message) -> Header:
+    """The header of a message with a std_msgs/Header."""
+    return Header(message.topic, stamp_ns(m.header.stamp, message), message.log_time_ns, m.header.frame_id)
+
+
+def foxglove_header(m: Any, message: Message, frame_id: Any) -> Header:
+    """The header of a message with a ``timestamp``; anything but a string is no ``frame_id``."""
+    if not isinstance(frame_id, str):
+        frame_id = ""
+    return Header(message.topic, stamp_ns(m.timestamp, message), message.log_time_ns, frame_id)
+
+
+def vector(v: Any) -> F64:
+    """x, y, z (3,); what is not there is 0."""
+    return np.array([v.x or 0.0, v.y or 0.0, v.z or 0.0], float)
+
+
+def quaternion(q: Any) -> F64:
+    """x, y, z, w (4,), of any length; what is not there is 0."""
+    return np.array([q.x or 0.0, q.y or 0.0, q.z or 0.0, q.w or 0.0], float)
+
+
+def transform(translation: Any, rotation: Any) -> F64:
+    """A pose (4, 4) in metres. UndecodableError when it is not finite or its quaternion is zero."""
+    t, q = vector(translation), quaternion(rotation)
+    norm = math.hypot(*q)
+    if not (np.isfinite(t).all() and math.isfinite(norm)):
+        raise UndecodableError("its pose has values that are not finite")
+    if norm < 1e-6:
+        raise UndecodableError("the quaternion of its pose is zero")
+    return transforms.transform(t, q)

@@ -1,0 +1,73 @@
+"""Messages with pictures, raw and compressed, and the calibrations of cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from semloc_logs.frames import F64, Camera, DepthFrame, Frame, Header, ImageFrame
+from semloc_logs.logs.messages import image_codecs
+from semloc_logs.logs.messages.definitions import UndecodableError, binary
+from semloc_logs.logs.messages.headers import Convert, foxglove, ros
+
+
+def _picture(header: Header, pixels: Any, encoding: str, depth: bool) -> Iterator[Frame]:
+    if depth:
+        yield DepthFrame(header, image_codecs.depth_metres(pixels))
+    else:
+        yield ImageFrame(header, pixels, encoding)
+
+
+def _raw(header: Header, m: Any) -> Iterator[Frame]:
+    encoding = str(m.encoding)
+    big_endian = bool(getattr(m, "is_bigendian", False))
+    pixels = image_codecs.decode_raw(binary(m.data), int(m.width or 0), int(m.height or 0), int(m.step or 0), encoding, big_endian)
+    yield from _picture(header, pixels, encoding, image_codecs.is_depth(header.topic, encoding))
+
+
+def _compressed(header: Header, m: Any) -> Iterator[Frame]:
+    format_ = str(m.format or "")
+    data = binary(m.data)
+    if "compresseddepth" in format_.lower() or header.topic.endswith("/compressedDepth"):
+        yield DepthFrame(header, image_codecs.decode_compressed_depth(data, format_))
+        return
+    pixels = image_codecs.decode_compressed(data)
+    depth = pixels.ndim == 2 and pixels.dtype == np.uint16
+    recorded = format_.partition(";")[0].strip()  # image_transport names the encoding before compression first
+    depth = depth and image_codecs.is_depth(header.topic, recorded if ";" in format_ else "mono16")
+    yield from _picture(header, pixels, format_, depth)
+
+
+def _camera(header: Header, m: Any) -> Iterator[Frame]:
+    def values(name: str, shape: tuple[int, int] | None) -> F64:
+        recorded = getattr(m, name, None)
+        recorded = getattr(m, name.lower(), ()) if recorded is None else recorded
+        array = np.array(() if recorded is None else recorded, float)
+        if not np.isfinite(array).all():
+            raise UndecodableError(f"its matrix {name} is not finite")
+        if shape is None:
+            return array.reshape(-1)
+        return array.reshape(shape) if array.size else np.zeros(shape)
+
+    K, D, R, P = values("K", (3, 3)), values("D", None), values("R", (3, 3)), values("P", (3, 4))
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise UndecodableError("its camera is not calibrated (the focal length is zero)")
+    if len(D) > 14:  # no model of the field has more
+        raise UndecodableError(f"it has {len(D)} distortion coefficients")
+    if not R.any():
+        R = np.eye(3)
+    if not P.any():
+        P = np.hstack([K, np.zeros((3, 1))])
+    yield Camera(header, int(m.width or 0), int(m.height or 0), K, D, R, P, str(m.distortion_model or ""))
+
+
+CONVERTERS: dict[str, Convert] = {
+    "sensor_msgs/msg/Image": ros(_raw),
+    "sensor_msgs/msg/CompressedImage": ros(_compressed),
+    "sensor_msgs/msg/CameraInfo": ros(_camera),
+    "foxglove.RawImage": foxglove(_raw),
+    "foxglove.CompressedImage": foxglove(_compressed),
+    "foxglove.CameraCalibration": foxglove(_camera),
+}

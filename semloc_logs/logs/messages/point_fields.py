@@ -1,0 +1,127 @@
+"""Point clouds as recorded, a block of bytes and a list of fields, to arrays; without a loop over points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.frames import F32
+from semloc_logs.logs.messages.definitions import UndecodableError
+from semloc_logs.logs.messages.point_times import NO_SENSE, OTHER_CLOCK, offsets_ns
+
+LABELS = ("label", "semantic", "class", "objtag")
+RINGS = ("ring", "line")
+TIMES = (
+    "t", "time", "timestamp", "time_stamp", "offset_time", "time_offset", "time_offset_ns", "timestamp_offset", "point_time_offset",
+    "relative_timestamp",
+)  # fmt: skip
+_USED = {"x", "y", "z", *LABELS, *RINGS, *TIMES}
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One value of a point: ``kind`` is a numpy type code such as ``f4``."""
+
+    name: str
+    offset: int
+    kind: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """``points`` (n, 3) with label, time (relative to the header stamp) and ring where recorded.
+
+    ``not_finite`` counts the positions with NaN or infinity, ``remark`` says what is wrong with the times.
+    """
+
+    points: F32
+    label: NDArray[np.uint32] | None
+    offset_ns: NDArray[np.int64] | None
+    ring: NDArray[np.uint16] | None
+    not_finite: int = 0
+    remark: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """``height`` rows of ``width`` points; bytes from point to point and from row to row."""
+
+    width: int
+    height: int
+    point_step: int
+    row_step: int
+    big_endian: bool = False
+
+
+def decode_points(data: bytes | memoryview, layout: Layout, fields: Sequence[Field], stamp_ns: int) -> Points:
+    """Points whose position is finite and not exactly zero. UndecodableError when the layout does not fit the data."""
+    if layout.width == 0 or layout.height == 0:
+        return Points(np.empty((0, 3), np.float32), None, None, None)  # its fields may be missing too
+    rows = _rows(data, layout, fields)
+    columns = {name.lower(): name for name in reversed(rows.dtype.names or ())}
+    for axis in "xyz":
+        if axis not in columns:
+            raise UndecodableError(f"it has no field {axis} within the {layout.point_step} bytes of a point")
+        if rows.dtype[columns[axis]].kind != "f":
+            raise UndecodableError(f"its field {axis} is no floating point number but {rows.dtype[columns[axis]].name}")
+    xyz = np.empty((rows.size, 3), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes infinite and is dropped below
+        for k, axis in enumerate("xyz"):
+            xyz[:, k].reshape(rows.shape)[...] = rows[columns[axis]]
+    valid = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
+    finite = int(np.count_nonzero(valid))
+    valid &= (xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0)
+    everything = bool(valid.all())
+
+    def column(names: Sequence[str], kinds: str) -> NDArray[np.generic] | None:
+        for name in names:
+            if name in columns and rows.dtype[columns[name]].kind in kinds:
+                values = rows[columns[name]].reshape(-1)
+                return values if everything else values[valid]
+        return None
+
+    label, ring, time = column(LABELS, "iu"), column(RINGS, "iu"), column(TIMES, "iuf")
+    offset, remark = _offsets(time, stamp_ns)
+    return Points(
+        points=xyz if everything else xyz[valid],
+        label=None if label is None else label.astype(np.uint32),
+        offset_ns=offset,
+        ring=None if ring is None else ring.astype(np.uint16),
+        not_finite=len(xyz) - finite,
+        remark=remark,
+    )
+
+
+def _offsets(time: NDArray[np.generic] | None, stamp_ns: int) -> tuple[NDArray[np.int64] | None, str]:
+    """Times relative to ``stamp_ns`` where they make sense, and a remark where they do not at once."""
+    if time is None:
+        return None, ""
+    offset, is_other_clock = offsets_ns(time, stamp_ns)
+    return offset, NO_SENSE if offset is None else OTHER_CLOCK if is_other_clock else ""
+
+
+def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> NDArray[np.void]:
+    """A view (height, width) of the points as records."""
+    width, height, step, row = layout.width, layout.height, layout.point_step, layout.row_step
+    if height <= 1 or row < width * step:
+        row = width * step  # often left at zero, or wrong where it does not matter
+    needed = (height - 1) * row + width * step
+    if step <= 0 or needed > len(data):
+        raise UndecodableError(f"{width} x {height} points of {step} bytes need {needed} bytes, but it has {len(data)}")
+    names: dict[str, Field] = {}
+    for field in fields:
+        if field.name.lower() in _USED and field.offset >= 0 and field.offset + np.dtype(field.kind).itemsize <= step:
+            names.setdefault(field.name, field)
+    order = ">" if layout.big_endian else "<"
+    dtype = np.dtype(
+        {
+            "names": list(names),
+            "formats": [order + f.kind for f in names.values()],
+            "offsets": [f.offset for f in names.values()],
+            "itemsize": step,
+        }
+    )
+    return np.ndarray((height, width), dtype, buffer=data, strides=(row, step))

@@ -1,0 +1,119 @@
+"""When each point of a sweep was measured: units and origins of recorded point times, and whether they can be believed."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.frames import F32, LidarFrame
+
+SWEEP_NS = 1_000_000_000  # no time of a point is further from its header than a second
+_LEAST_SPAN_NS = 5_000_000  # a sweep takes longer than this, which tells milliseconds from microseconds
+_PERIODS_PER_SWEEP = 1.5  # a sweep is over when the next one begins, give or take
+_PERIODS_KEPT = 16
+_ORDERED = 0.5  # the share of neighbours measured nearly together: above 0.9 in sweeps, 0.1 where times are noise
+_NEARLY = 0.05  # of the sweep's span
+_LOOKED_AT = 20_000  # points that are compared
+_CELLS = 180  # cells of azimuth of 2 degrees
+
+NO_SENSE = "times"  # remarks of a LidarFrame, see semloc_logs.logs.session.tally
+OTHER_CLOCK = "clock"
+
+
+def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int64] | None, bool]:
+    """Times of points relative to ``stamp_ns``, whatever their unit and origin, and whether the origin is that of another clock.
+
+    None when nothing makes sense of them. The unit (s, ms, us, ns) and origin (the stamp, or the epoch) are those with which the
+    points span more than 5 ms and stay within a second of the stamp; failing that the unit with which they span as much on a clock
+    of their own (such as seconds since power-on), whose first point is taken to be measured at the stamp; failing that (a flash
+    sensor) those that keep them within a second at all.
+    """
+    if time.size == 0:
+        return np.zeros(0, np.int64), False
+    low, high = time.min().item(), time.max().item()
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return None, False
+    # in integers, because nanoseconds since 1970 do not fit a float64; the parts of a second are exact enough as float
+    ranges = [(unit, _to_ns(low, unit), _to_ns(high, unit)) for unit in _units(time)]
+    near = [(u, o) for u, first, last in ranges for o in (0, stamp_ns) if max(abs(first - o), abs(last - o)) < SWEEP_NS]
+    sweeps = {u: first for u, first, last in ranges if _LEAST_SPAN_NS <= last - first < 2 * SWEEP_NS}
+    for unit, origin in near:
+        if unit in sweeps:
+            return _shift(time, unit, origin), False
+    for unit, first in sweeps.items():
+        return _shift(time, unit, first), True
+    return (_shift(time, *near[0]), False) if near else (None, False)
+
+
+def _units(time: NDArray[np.generic]) -> tuple[int, ...]:
+    """Nanoseconds of the units to try, the usual ones of the type first."""
+    return (1, 1_000, 1_000_000, 1_000_000_000) if time.dtype.kind in "iu" else (1_000_000_000, 1_000_000, 1_000, 1)
+
+
+def _to_ns(value: float, unit: int) -> int:
+    return int(value) * unit + int((value - int(value)) * unit)
+
+
+def _shift(time: NDArray[np.generic], unit: int, origin: int) -> NDArray[np.int64]:
+    """``time * unit - origin`` as int64; only called where every result is below a second."""
+    if time.dtype.kind in "iu":
+        whole, rest = divmod(origin, unit)
+        # unsigned 64-bit arithmetic wraps, so the small difference is right even where the times are not
+        difference = time.astype(np.uint64) - np.uint64(whole % (1 << 64))
+        return difference.view(np.int64) * np.int64(unit) - np.int64(rest)
+    seconds = time.astype(np.float64)
+    base = np.floor(seconds.min())
+    fraction = np.rint((seconds - base) * unit).astype(np.int64)
+    return np.asarray(fraction + np.int64(int(base) * unit - origin), np.int64)
+
+
+class PointTimes:
+    """Compares the point times of the sweeps of a log with what sweeps are like, topic by topic."""
+
+    def __init__(self) -> None:
+        self._newest: dict[tuple[str, str], int] = {}
+        self._periods: dict[tuple[str, str], deque[int]] = {}
+
+    def checked(self, frame: LidarFrame) -> LidarFrame:
+        """The sweep as it is, or without times and remarked when they cannot be believed.
+
+        A sweep does not take much longer than the time to the next one; clouds gathered from several sweeps do. And points recorded
+        one after the other, or seen in the same direction, were measured nearly together; where they were not, it is no time.
+        """
+        key, stamp_ns = (frame.header.topic, frame.header.frame_id), frame.header.stamp_ns
+        periods = self._periods.setdefault(key, deque(maxlen=_PERIODS_KEPT))
+        step = stamp_ns - self._newest.get(key, stamp_ns)
+        if step > 0:
+            periods.append(step)
+        self._newest[key] = stamp_ns
+        offset = frame.offset_ns
+        if offset is None or not len(offset):
+            return frame
+        # the longest of some: several sensors on one topic come in bursts
+        longest = _PERIODS_PER_SWEEP * max(periods) if len(periods) > 1 else SWEEP_NS
+        if int(offset.max()) - int(offset.min()) <= longest and in_order(offset, frame.points):
+            return frame
+        return replace(frame, offset_ns=None, remark=NO_SENSE)
+
+
+def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:
+    """Whether neighbours among ``points`` (n, 3), as recorded or by their direction, have nearly the same time."""
+    span = int(offset_ns.max()) - int(offset_ns.min())
+    if span == 0 or len(offset_ns) < 100:
+        return True
+    near = max(1.0, _NEARLY * span)
+    some = slice(0, _LOOKED_AT)
+    if float(np.mean(np.abs(np.diff(offset_ns[some])) < near)) > _ORDERED:
+        return True
+    every = max(1, len(offset_ns) // _LOOKED_AT)
+    cell = ((np.arctan2(points[::every, 1], points[::every, 0]) + np.pi) * (_CELLS / (2 * np.pi))).astype(np.int64)
+    time = offset_ns[::every]
+    order = np.lexsort((time, cell))
+    starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    middle = starts + np.diff(starts, append=len(order)) // 2
+    median = np.zeros(int(cell.max()) + 1, np.int64)
+    median[cell[order[starts]]] = time[order[middle]]
+    return float(np.mean(np.abs(time - median[cell]) < near)) > _ORDERED

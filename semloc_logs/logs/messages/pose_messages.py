@@ -1,0 +1,115 @@
+"""Messages that say where the vehicle is: poses, transforms, inertial and satellite measurements."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from semloc_logs.frames import F64, Frame, Header, ImuSample, NavSatSample, PoseSample, TransformSample
+from semloc_logs.logs.log import Message
+from semloc_logs.logs.messages.definitions import UndecodableError
+from semloc_logs.logs.messages.headers import BAD_VALUES, Convert, foxglove, quaternion, ros, transform, vector
+
+# -- poses and transforms
+
+
+def _pose(header: Header, m: Any) -> Iterator[Frame]:
+    yield PoseSample(header, "", transform(m.pose.position, m.pose.orientation))
+
+
+def _pose_with_covariance(header: Header, m: Any) -> Iterator[Frame]:
+    yield from _pose(header, m.pose)
+
+
+def _odometry(header: Header, m: Any) -> Iterator[Frame]:
+    pose = m.pose.pose
+    yield PoseSample(header, m.child_frame_id, transform(pose.position, pose.orientation))
+
+
+def _transform(header: Header, m: Any) -> Iterator[Frame]:
+    pose = transform(m.transform.translation, m.transform.rotation)
+    yield TransformSample(header, m.child_frame_id, pose, _is_static(header))
+
+
+def _foxglove_transform(header: Header, m: Any) -> Iterator[Frame]:
+    yield TransformSample(header, str(m.child_frame_id or ""), transform(m.translation, m.rotation), _is_static(header))
+
+
+def _is_static(header: Header) -> bool:
+    return header.topic.rstrip("/").endswith("tf_static")
+
+
+def _each(convert: Convert) -> Convert:
+    """The transforms that make sense, and then the error of the first that does not: one bad edge does not cost the others."""
+
+    def convert_all(m: Any, message: Message) -> Iterator[Frame]:
+        transforms = m.transforms or ()
+        damage: list[Exception] = []
+        for one in transforms:
+            try:
+                yield from convert(one, message)
+            except (UndecodableError, *BAD_VALUES) as error:
+                damage.append(error)
+        if damage:
+            raise UndecodableError(f"{len(damage)} of its {len(transforms)} transforms cannot be used ({damage[0]})")
+
+    return convert_all
+
+
+# -- inertial and satellite
+
+
+def _imu(header: Header, m: Any) -> Iterator[Frame]:
+    acceleration, rate = vector(m.linear_acceleration), vector(m.angular_velocity)
+    if not (np.isfinite(acceleration).all() and np.isfinite(rate).all()):
+        raise UndecodableError("its measurements are not finite")
+    yield ImuSample(header, acceleration, rate, _imu_orientation(m))
+
+
+def _imu_orientation(m: Any) -> F64 | None:
+    """The quaternion of an IMU that reports one: without, the first element of its covariance is -1, or it is no unit quaternion."""
+    q, covariance = getattr(m, "orientation", None), getattr(m, "orientation_covariance", None)
+    if q is None or (covariance is not None and len(covariance) and float(covariance[0]) == -1.0):
+        return None
+    orientation = quaternion(q)
+    return orientation if abs(math.hypot(*orientation) - 1.0) < 0.1 else None
+
+
+def _nav_sat(header: Header, m: Any) -> Iterator[Frame]:
+    latitude, longitude, altitude = float(m.latitude or 0.0), float(m.longitude or 0.0), float(m.altitude or 0.0)
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360 and math.isfinite(altitude)):
+        raise UndecodableError("its latitude, longitude or altitude is no number on Earth")
+    yield NavSatSample(header, latitude, longitude, altitude, _fix_covariance(m))
+
+
+def _fix_covariance(m: Any) -> F64 | None:
+    """``position_covariance`` where its type is not "unknown" and it can be one."""
+    recorded = getattr(m, "position_covariance", None)
+    if not getattr(m, "position_covariance_type", 0) or recorded is None or len(recorded) != 9:
+        return None
+    covariance = np.array(recorded, float).reshape(3, 3)
+    return covariance if np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all() else None
+
+
+def _nav_sat_fix(header: Header, m: Any) -> Iterator[Frame]:
+    if m.status.status >= 0:  # below: the receiver itself says that it has no fix
+        yield from _nav_sat(header, m)
+
+
+CONVERTERS: dict[str, Convert] = {
+    "sensor_msgs/msg/Imu": ros(_imu),
+    "sensor_msgs/msg/NavSatFix": ros(_nav_sat_fix),
+    "nav_msgs/msg/Odometry": ros(_odometry),
+    "geometry_msgs/msg/PoseStamped": ros(_pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ros(_pose_with_covariance),
+    "geometry_msgs/msg/TransformStamped": ros(_transform),
+    "tf2_msgs/msg/TFMessage": _each(ros(_transform)),
+    "tf/msg/tfMessage": _each(ros(_transform)),
+    "foxglove.PoseInFrame": foxglove(_pose),
+    "foxglove.FrameTransform": foxglove(_foxglove_transform, "parent_frame_id"),
+    "foxglove.FrameTransforms": _each(foxglove(_foxglove_transform, "parent_frame_id")),
+    "foxglove.LocationFix": foxglove(_nav_sat),
+}

@@ -1,0 +1,259 @@
+"""Which frame of a log is the vehicle, the base frame, and where it is at any time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from semloc_logs.errors import LogError
+from semloc_logs.frames import F64, Frame, PoseSample, TransformSample
+from semloc_logs.logs.poses.tf_tree import Edge, TransformTree, frame_name
+from semloc_logs.logs.poses.track import PoseTrack
+from semloc_logs.logs.roles import Roles
+
+BASE_LINK = "base_link"
+_LATE_TF_NS = 1_000_000_000  # a pose waits so long for the transform that leads to the base frame
+
+
+@dataclass(frozen=True)
+class BaseFrame:
+    """``name`` of the base frame; ``pose_frame`` whose pose the stream gives (None without poses).
+
+    ``assumed`` is the one sensor frame that nothing connects with the base and that is therefore taken to be the base itself.
+    ``notes`` say in sentences what was assumed.
+    """
+
+    name: str
+    pose_frame: str | None
+    assumed: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+def choose_base_frame(tree: TransformTree, sensors: Sequence[str], pose_child: str | None, pose_topic: str | None) -> BaseFrame:
+    """The base frame as documented: ``base_link`` where TF connects it with a sensor and the pose; else the frame that the pose is of;
+    the sensor's own frame where the pose does not say (``pose_child`` ""), or there is none (None).
+
+    ``sensors``: frame ids of the range sensors, the most important first.
+    """
+    sensors = [frame_name(s) for s in sensors]
+    reachable = any(tree.connected(BASE_LINK, s) for s in sensors) or (not sensors and BASE_LINK in tree.frames)
+    first = sensors[0] if sensors else (BASE_LINK if reachable else "")
+    if pose_child is None:
+        return BaseFrame(BASE_LINK if reachable else first, None)
+    child = frame_name(pose_child)
+    if not child:
+        notes = []
+        if reachable and first != BASE_LINK:
+            notes.append(
+                f"{pose_topic} does not name the frame that it is the pose of: it is taken as that of the sensor frame '{first}'; "
+                f"record nav_msgs/Odometry with child_frame_id if it is another."
+            )
+        return BaseFrame(first, first, notes=tuple(notes))
+    name = BASE_LINK if reachable and tree.connected(BASE_LINK, child) else child
+    if not sensors or any(tree.connected(name, s) for s in sensors):
+        return BaseFrame(name, child)
+    note = (
+        f"No transform connects the sensor frame '{first}' with '{child}', the frame of {pose_topic}: they are taken as one; "
+        f"record /tf_static if the sensor sits elsewhere."
+    )
+    return BaseFrame(child, child, assumed=first, notes=(note,))
+
+
+class PoseSource(Protocol):
+    """Poses that are not a stream of the log: of a file, or made from what the log has.
+
+    ``name`` is what sentences call it; ``child`` the frame that its poses are of, "" for the base frame, None while nobody knows;
+    ``is_over`` says that no more poses will come. ``problems`` are about poses that are missing, ``notes`` about what was assumed.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def session_frame(self) -> str: ...
+    @property
+    def child(self) -> str | None: ...
+    @property
+    def is_over(self) -> bool: ...
+    @property
+    def problems(self) -> list[str]: ...
+    @property
+    def notes(self) -> list[str]: ...
+
+    def take(self, frame: Frame) -> None:
+        """A frame of the log, in the order of recording."""
+
+    def poses(self, base_T: Callable[[str, int], F64 | None]) -> Iterator[tuple[int, F64]]:
+        """Stamps (ns) and ``session_T_child`` (4, 4) that are new since the last call; ``base_T`` gives ``base_T_frame`` at a time."""
+
+    def finish(self) -> None:
+        """All frames of the log have been seen."""
+
+    def to_json(self) -> dict[str, object]:
+        """For session.json."""
+
+
+class BasePoses:
+    """Poses and transforms of a log as they come -> ``session_T_base`` and ``base_T_sensor``.
+
+    Poses stay raw until :meth:`settle` has chosen the base frame. ``static_count``: static TF messages that are still to come, from
+    the log's own statistics; once they are all there, nobody has to wait for more. ``source`` gives the poses instead of the log's
+    pose topic and TF, ``fallback`` gives them when neither has any.
+    """
+
+    def __init__(self, roles: Roles, static_count: int = 0, source: PoseSource | None = None, fallback: PoseSource | None = None) -> None:
+        self.tree = TransformTree()
+        self.track = PoseTrack()
+        self.base: BaseFrame | None = None
+        self.session_frame = ""
+        self._roles = roles
+        self.source = source
+        self._fallback = fallback
+        self._has_topic = source is None and roles.pose is not None and roles.pose not in (*roles.tf, *roles.tf_static)
+        self._child: str | None = None
+        self._edge: Edge | None = None
+        self._raw: deque[tuple[int, F64]] = deque()
+        self._static_count = static_count
+        self._static_times: set[tuple[str, int]] = set()
+
+    def take(self, sample: PoseSample | TransformSample) -> None:
+        """A sample of the pose topic or of TF."""
+        header = sample.header
+        if self._has_topic and header.topic == self._roles.pose:
+            if self._child is None:
+                self._child, self.session_frame = frame_name(sample.child_frame_id), frame_name(header.frame_id)
+            self._raw.append((header.stamp_ns, sample.frame_T_child))
+            self._move()
+        elif isinstance(sample, TransformSample):
+            if header.topic in self._roles.tf_static:
+                sample = replace(sample, static=True)
+                self._static_times.add((header.topic, header.log_time_ns))
+            self.tree.add(sample)
+            if self._edge == (frame_name(header.frame_id), frame_name(sample.child_frame_id)) and not sample.static:
+                self._raw.append((header.stamp_ns, sample.frame_T_child))
+                self._move()
+
+    def settle(self, sensors: Sequence[str], *, is_patient: bool, must: bool) -> bool:
+        """Chooses the base frame once the transforms that decide it are there, or now if it ``must``; False: not yet.
+
+        ``is_patient``: a pose edge in TF that is not called odom may still be topped by a better one. With a pose topic that has
+        nothing yet, the answer stays False even if it must: its frame is unknown.
+        """
+        edge = None
+        if self.source is not None:
+            child = self.source.child
+            if child is None:
+                return False
+        elif self._has_topic:
+            child = self._child
+            if child is None:
+                return False
+        else:
+            edge = self._pose_edge(sensors)
+            if not must and self._roles.tf and (edge is None or (is_patient and not edge[0].endswith("odom"))):
+                return False
+            child = edge[1] if edge else None
+            if edge is None and self._fallback is not None:
+                child = self._fallback.child
+        if not must and not self._is_settled(sensors, child):
+            return False
+        if not self._has_topic and edge is None and self.source is None:
+            self.source = self._fallback
+        self._fallback = None
+        self.base = self._choose(sensors, child)
+        if edge is not None:
+            self._edge, self.session_frame = edge, edge[0]
+            track = self.tree.track(*edge)
+            if track is not None:
+                self._raw.extend(zip(track.stamps_ns.tolist(), track.poses, strict=True))
+        self._pull()
+        self._move()
+        return True
+
+    def _choose(self, sensors: Sequence[str], child: str | None) -> BaseFrame:
+        source = self.source
+        if source is None:
+            return choose_base_frame(self.tree, sensors, child, self._roles.pose or "TF")
+        self.session_frame = source.session_frame
+        if not child:
+            base = choose_base_frame(self.tree, sensors, None, source.name)
+            return replace(base, pose_frame=base.name)
+        known = {*self.tree.frames, *map(frame_name, sensors)}
+        if frame_name(child) not in known:
+            raise LogError(
+                f"{source.name} gives the poses of '{child}', but the log has no such frame: name one of {', '.join(sorted(known))}."
+            )
+        return choose_base_frame(self.tree, sensors, child, source.name)
+
+    def show(self, frame: Frame) -> None:
+        """A frame of the log that poses may be made of."""
+        source = self.source or self._fallback
+        if source is not None:
+            source.take(frame)
+            self._pull()
+
+    def _pull(self) -> None:
+        """Takes what is new from the source of poses, if there is one."""
+        if self.source is not None and self.base is not None:
+            new = list(self.source.poses(self.base_T))
+            if new:
+                self._raw.extend(new)
+                self._move()
+
+    def finish(self) -> None:
+        """No more transforms will come: poses that wait for one are given up."""
+        if self.source is not None:
+            self.source.finish()
+            self._pull()
+        self._move(is_end=True)
+
+    def base_T(self, frame_id: str, stamp_ns: int) -> F64 | None:
+        """``base_T_frame`` (4, 4) at a time; None when nothing says where that frame is."""
+        if self.base is None:
+            return None
+        if self.base.assumed is not None and frame_name(frame_id) == self.base.assumed:
+            return np.eye(4)
+        return self.tree.lookup(self.base.name, frame_id, stamp_ns)
+
+    def poses_have_passed(self, stamp_ns: int) -> bool:
+        """Whether the poses reach beyond ``stamp_ns``, or there is nothing to wait for."""
+        if self.base is None or self.base.pose_frame is None:
+            return self.base is not None
+        if self.source is not None and self.source.is_over and not self._raw:
+            return True
+        return self.track.end_ns is not None and self.track.end_ns >= stamp_ns
+
+    def transforms_have_passed(self, frame_id: str, stamp_ns: int) -> bool:
+        """Whether :meth:`base_T` has its final answer."""
+        if self.base is None:
+            return False
+        return frame_name(frame_id) == self.base.assumed or self.tree.has_passed(self.base.name, frame_id, stamp_ns)
+
+    def _pose_edge(self, sensors: Sequence[str]) -> Edge | None:
+        frames = [*sensors, BASE_LINK, "base_footprint"]
+        return next((edge for frame in frames if (edge := self.tree.pose_edge(frame)) is not None), None)
+
+    def _is_settled(self, sensors: Sequence[str], child: str | None) -> bool:
+        if (child == "" and self._has_topic) or not (self._roles.tf or self._roles.tf_static):
+            return True
+        if all(self.tree.connected(BASE_LINK, f) for f in (*sensors, *([child] if child else []))):
+            return True
+        return not self._roles.tf and len(self._static_times) >= self._static_count
+
+    def _move(self, is_end: bool = False) -> None:
+        """Raw poses -> poses of the base frame, as soon as the transform between the two is known at their time."""
+        base = self.base
+        if base is None or base.pose_frame is None:
+            return
+        while self._raw:
+            stamp_ns, pose = self._raw[0]
+            is_late = is_end or self._raw[-1][0] - stamp_ns >= _LATE_TF_NS
+            if not is_late and not self.tree.has_passed(base.pose_frame, base.name, stamp_ns):
+                return
+            child_T_base = self.tree.lookup(base.pose_frame, base.name, stamp_ns)
+            self._raw.popleft()
+            if child_T_base is not None:
+                self.track.append(stamp_ns, pose @ child_T_base)

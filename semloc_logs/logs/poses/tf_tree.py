@@ -1,0 +1,153 @@
+"""The TF tree of a log: which frame is where in which other frame, at any time.
+
+Frame names are compared without leading slash. Edges form an undirected graph, so that a log whose publishers contradict the rule
+"one parent each" (loops, two parents) still gives an answer, and disconnected frames give None.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+
+import numpy as np
+
+from semloc_logs.frames import F64, TransformSample
+from semloc_logs.logs.poses.track import PoseTrack
+from semloc_logs.numerics import transforms
+
+HISTORY_SECONDS = 60.0  # how far back a moving edge remembers: frames wait for their transforms by far less
+MAX_EDGES = 10_000  # a log with more frames than this is broken; the rest is ignored and counted
+
+Edge = tuple[str, str]  # (parent, child)
+
+
+def frame_name(frame_id: str) -> str:
+    """The frame's name without leading slash and blanks."""
+    return frame_id.strip().lstrip("/")
+
+
+class TransformTree:
+    """Static and dynamic transforms as they come; ``ignored`` counts samples that made no sense."""
+
+    def __init__(self) -> None:
+        self.ignored = 0
+        self._static: dict[Edge, F64] = {}
+        self._moving: dict[Edge, PoseTrack] = {}
+        self._neighbours: dict[str, list[str]] = {}
+        self._parents: dict[str, list[str]] = {}
+        self._paths: dict[Edge, list[str] | None] = {}
+
+    def add(self, sample: TransformSample) -> None:
+        """Takes one edge; dynamic samples of an edge overrule static ones."""
+        parent, child = frame_name(sample.header.frame_id), frame_name(sample.child_frame_id)
+        edge = (parent, child)
+        is_new = edge not in self._static and edge not in self._moving
+        usable = parent and child and parent != child and np.isfinite(sample.frame_T_child).all()
+        if not usable or (is_new and len(self._static) + len(self._moving) >= MAX_EDGES):
+            self.ignored += 1
+            return
+        if sample.static and edge not in self._moving:
+            self._static[edge] = sample.frame_T_child
+        elif not sample.static:
+            self._moving.setdefault(edge, PoseTrack(keep_seconds=HISTORY_SECONDS)).add(sample)
+            self._static.pop(edge, None)
+        if is_new:
+            self._neighbours.setdefault(parent, []).append(child)
+            self._neighbours.setdefault(child, []).append(parent)
+            self._parents.setdefault(child, []).append(parent)
+            self._paths.clear()
+
+    @property
+    def frames(self) -> list[str]:
+        """All frame names, sorted."""
+        return sorted(self._neighbours)
+
+    @property
+    def edges(self) -> list[tuple[str, str, bool]]:
+        """(parent, child, static) of every edge, sorted."""
+        return sorted([(*edge, True) for edge in self._static] + [(*edge, False) for edge in self._moving])
+
+    def connected(self, target: str, source: str) -> bool:
+        """Whether edges lead from one frame to the other; a frame is always connected with itself."""
+        return self._path(frame_name(target), frame_name(source)) is not None
+
+    def is_static(self, target: str, source: str) -> bool:
+        """Whether the frames are connected by static edges alone."""
+        path = self._path(frame_name(target), frame_name(source))
+        return path is not None and not any(self._moving_edge(a, b) for a, b in pairwise(path))
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
+        """``target_T_source`` (4, 4), dynamic edges interpolated at ``stamp_ns``; None when unconnected or unknown at that time."""
+        path = self._path(frame_name(target), frame_name(source))
+        if path is None:
+            return None
+        result = np.eye(4)
+        for here, there in pairwise(path):
+            step = self._step(here, there, stamp_ns)
+            if step is None:
+                return None
+            result = result @ step
+        return result
+
+    def has_passed(self, target: str, source: str, stamp_ns: int) -> bool:
+        """Whether the frames are connected and all dynamic edges between them have reached ``stamp_ns``: a lookup will not change."""
+        path = self._path(frame_name(target), frame_name(source))
+        edges = [] if path is None else [edge for a, b in pairwise(path) for edge in ((a, b), (b, a))]
+        ends = [self._moving[edge].end_ns for edge in edges if edge in self._moving]
+        return path is not None and all(end is not None and end >= stamp_ns for end in ends)
+
+    def track(self, parent: str, child: str) -> PoseTrack | None:
+        """The remembered history of a dynamic edge."""
+        return self._moving.get((frame_name(parent), frame_name(child)))
+
+    def pose_edge(self, frame: str) -> Edge | None:
+        """The dynamic edge that says where ``frame`` drives: below ``odom`` if there is one above it, else the topmost dynamic edge.
+
+        ``odom`` first, because odometry is continuous, whereas ``map`` -> ``odom`` jumps with every correction.
+        """
+        chain: list[Edge] = []
+        here, seen = frame_name(frame), {frame_name(frame)}
+        while parents := [p for p in self._parents.get(here, []) if p not in seen]:
+            parent = next((p for p in parents if p.endswith("odom")), parents[0])
+            if (parent, here) in self._moving:
+                chain.append((parent, here))
+            seen.add(parent)
+            here = parent
+        return next((edge for edge in chain if edge[0].endswith("odom")), chain[-1] if chain else None)
+
+    def _moving_edge(self, here: str, there: str) -> bool:
+        return (here, there) in self._moving or (there, here) in self._moving
+
+    def _step(self, here: str, there: str, stamp_ns: int) -> F64 | None:
+        for edge, is_forward in (((here, there), True), ((there, here), False)):
+            pose = self._static.get(edge)
+            if edge in self._moving:
+                pose = self._moving[edge].at(stamp_ns)
+            if pose is not None:
+                return pose if is_forward else transforms.inverse(pose)
+        return None
+
+    def _path(self, target: str, source: str) -> list[str] | None:
+        """Frame names from target to source along the fewest edges."""
+        if target == source:
+            return [target]
+        if target not in self._neighbours or source not in self._neighbours:
+            return None
+        if (target, source) not in self._paths:
+            came_from = {target: target}
+            queue = deque([target])
+            while queue and source not in came_from:
+                here = queue.popleft()
+                for there in self._neighbours[here]:
+                    if there not in came_from:
+                        came_from[there] = here
+                        queue.append(there)
+            self._paths[target, source] = _walk_back(came_from, target, source) if source in came_from else None
+        return self._paths[target, source]
+
+
+def _walk_back(came_from: dict[str, str], target: str, source: str) -> list[str]:
+    path = [source]
+    while path[-1] != target:
+        path.append(came_from[path[-1]])
+    return path[::-1]
