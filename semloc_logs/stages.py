@@ -23,7 +23,7 @@ from semloc_logs.closures.queries import SessionMap, query_keyframes
 from semloc_logs.closures.results import keyframe_at, read_closures, unique_closures, write_closures, write_rejected
 from semloc_logs.engines import Engine, Serial
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError
-from semloc_logs.labels.model import fingerprint as label_fingerprint
+from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import (
     AnnotateReport,
     ClosureRecord,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.closures.queries import SessionMap
 from semloc_logs.errors import LogError
-from semloc_logs.labels.geometry import classify
+from semloc_logs.labels.from_geometry import classify
 from semloc_logs.labels.space import UNLABELLED, cityscapes
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, Settings

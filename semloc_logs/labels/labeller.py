@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import ImageFrame, PosedCloud
-from semloc_logs.labels.geometry import classify
-from semloc_logs.labels.model import Segmenter
+from semloc_logs.labels.camera_labels import CAMERA_SHIFT, Pictures
+from semloc_logs.labels.from_geometry import classify
 from semloc_logs.labels.painting import DOUBTFUL
-from semloc_logs.labels.pictures import CAMERA_SHIFT, Pictures
+from semloc_logs.labels.segmentation import Segmenter
 from semloc_logs.labels.space import (
     SKY,
     THINGS,
@@ -29,7 +29,7 @@ from semloc_logs.labels.space import (
     space_of_names,
     spaces,
 )
-from semloc_logs.labels.surface import GroundSurface
+from semloc_logs.labels.sweep_ground import GroundSurface
 from semloc_logs.logs.sensors.depth import label_ids
 from semloc_logs.logs.session.session import Session
 from semloc_logs.settings import Labels

@@ -17,7 +17,7 @@ import semloc_logs
 from semloc_logs.errors import LogError
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.space import SKY
-from semloc_logs.labels.surface import ground_surface
+from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.logs.sensors.depth import RangeNoise
 from semloc_logs.logs.session.session import open_session

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.labels.surface import CELL, GroundSurface
+from semloc_logs.labels.sweep_ground import CELL, GroundSurface
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_metadata, read_table, write_table
 from semloc_logs.voxels.keys import pack, unpack

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.labels.geometry import classify
+from semloc_logs.labels.from_geometry import classify
 from semloc_logs.labels.space import BUILDING, POLE, ROAD, UNLABELLED, VEGETATION
 from semloc_logs.numerics.local_shape import shape
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.labels.model import Segmenter, fingerprint
+from semloc_logs.labels.segmentation import Segmenter, fingerprint
+from semloc_logs.labels.segmentation_spec import read_spec
 from semloc_logs.labels.space import UNPAINTED
-from semloc_logs.labels.spec import read_spec
 from semloc_logs.settings import Labels
 
 ROAD, VEGETATION, CAR = 0, 8, 13

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.labels.surface import ground_surface
+from semloc_logs.labels.sweep_ground import ground_surface
 
 F64 = NDArray[np.float64]
 EYE = np.array([0.0, 0.0, 1.8])

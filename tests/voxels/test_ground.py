@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.errors import SemlocError
-from semloc_logs.labels.surface import ground_surface
+from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.voxels.ground import GroundMap, GroundMapper, read_ground, write_ground
 
 F64 = NDArray[np.float64]

@@ -11,9 +11,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.labels.columns import Voxels, VoxelShapes, objects, voxel_shapes, voxelise
 from semloc_logs.labels.space import BUILDING, POLE, ROAD, UNLABELLED, VEGETATION
-from semloc_logs.labels.surface import REACH, GroundSurface, ground_surface
+from semloc_logs.labels.sweep_ground import REACH, GroundSurface, ground_surface
+from semloc_logs.labels.voxel_features import Voxels, VoxelShapes, objects, voxel_shapes, voxelise
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]

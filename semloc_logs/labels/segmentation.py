@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import SettingsError
+from semloc_logs.labels.segmentation_spec import Spec, read_spec
 from semloc_logs.labels.space import U8, U32, UNLABELLED, UNPAINTED, is_file_name, read_space
-from semloc_logs.labels.spec import Spec, read_spec
 from semloc_logs.settings import Labels
 
 Net = Callable[[NDArray[Any]], NDArray[Any]]  # a batch of one picture -> the output
