@@ -115,8 +115,8 @@ def profile_fuse(logs: Sequence[Path], settings: Settings, rounds: int = 3, func
     with (
         tempfile.TemporaryDirectory(prefix="semloc-fuse-") as folder,
         # the profiler sees one thread
-        patch("semloc_logs.voxels.fusing.ahead", lambda items, depth=2: items),
-        patch("semloc_logs.voxels.keyframes.ahead", lambda items, depth=2: items),
+        patch("semloc_logs.mapping.session_fusion.ahead", lambda items, depth=2: items),
+        patch("semloc_logs.mapping.keyframes.ahead", lambda items, depth=2: items),
     ):
         whole(Path(folder), profiler)
     stats = _stats(profiler)

@@ -31,9 +31,9 @@ from semloc_logs.alignment.overlap import (
 )
 from semloc_logs.alignment.surface import Surface, flattened_surface, surface_of
 from semloc_logs.labels.space import GROUND, cityscapes
+from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.voxels.grid import BlockMap
-from semloc_logs.voxels.selection import thin
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]

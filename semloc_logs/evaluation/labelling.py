@@ -19,9 +19,9 @@ from semloc_logs.closures.queries import SessionMap
 from semloc_logs.errors import LogError
 from semloc_logs.labels.from_geometry import classify
 from semloc_logs.labels.space import UNLABELLED, cityscapes
+from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, Settings
-from semloc_logs.voxels.fusing import FuseTask, fuse_session
 from semloc_logs.voxels.grid import BlockMap, Fuser
 from semloc_logs.voxels.keys import pack
 from semloc_logs.voxels.store import read_keyframe

@@ -23,10 +23,10 @@ from semloc_logs.evaluation.localisation import Answer, World, read_world
 from semloc_logs.evaluation.localisation_worlds import WorldDrive
 from semloc_logs.evaluation.peers import run_peer
 from semloc_logs.evaluation.scan_context import nearest_contexts, scan_context
+from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Settings
 from semloc_logs.tables.table import replacing_file
-from semloc_logs.voxels.selection import thin
 from semloc_logs.voxels.store import read_keyframe
 
 F64 = NDArray[np.float64]

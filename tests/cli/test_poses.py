@@ -17,8 +17,8 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.cli.main import program
+from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.settings import load
-from semloc_logs.voxels.fusing import FuseTask, fuse_session
 from semloc_logs.workspace import SessionFolder
 
 S = 1_000_000_000
@@ -143,7 +143,7 @@ def test_a_failure_half_way_leaves_no_thread_and_no_file(tmp_path: Path, monkeyp
     def fails(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("semloc_logs.voxels.fusing.write_blocks", fails)
+    monkeypatch.setattr("semloc_logs.mapping.session_fusion.write_blocks", fails)
     with pytest.raises(OSError, match="no space") as problem:  # which holds all that it passed through
         fuse_session(FuseTask((drive(tmp_path / "a.mcap", GOOD),), folder, settings))
     assert problem.value

@@ -11,11 +11,11 @@ from semloc_logs.alignment.verify import looked_at
 from semloc_logs.closures.closing import allowed_places
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.queries import SessionMap
+from semloc_logs.mapping.selection import road_distance
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_json, read_table, write_json, write_table
-from semloc_logs.voxels.selection import road_distance
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import Workspace
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from semloc_logs.closures.queries import SessionMap, build_query, query_keyframes, query_members
 from semloc_logs.closures.results import keyframe_at
 from semloc_logs.errors import SettingsError, WorkspaceError
+from semloc_logs.mapping.selection import road_distance
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_json, write_table
-from semloc_logs.voxels.selection import road_distance
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import SessionFolder
 

@@ -18,10 +18,10 @@ from semloc_logs.logs.sensors.stereo_pairs import StereoClouds, _grey
 from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.logs.session.session import open_session
 from semloc_logs.logs.session.tally import Tally
+from semloc_logs.mapping.keyframes import Collected
+from semloc_logs.mapping.selection import thin
+from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.numerics.transforms import apply, exp_se3
-from semloc_logs.voxels.gravity import find_up
-from semloc_logs.voxels.keyframes import Collected
-from semloc_logs.voxels.selection import thin
 
 MS = 1_000_000
 REAL = Path(__file__).resolve().parents[3] / "shared" / "logs" / "euroc_v101_stereo.bag"

@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from semloc_logs.mapping.selection import submap_ranges
+from semloc_logs.mapping.session_fusion import fuse_ranges
 from semloc_logs.settings import Fusion, Settings
-from semloc_logs.voxels.fusing import fuse_ranges
 from semloc_logs.voxels.grid import Fuser
-from semloc_logs.voxels.selection import submap_ranges
 from semloc_logs.voxels.store import Keyframe
 
 FUSION = Settings(fusion=Fusion(voxel_size=0.5, max_range=6.0)).resolved().fusion

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.mapping.keyframes import collect
+from semloc_logs.mapping.levelling import level
+from semloc_logs.mapping.up_direction import find_up, ground_height
 from semloc_logs.settings import load
-from semloc_logs.voxels.gravity import find_up, ground_height
-from semloc_logs.voxels.keyframes import collect
-from semloc_logs.voxels.levelling import level
 
 F64 = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import SemlocError
 from semloc_logs.labels.sweep_ground import ground_surface
-from semloc_logs.voxels.ground import GroundMap, GroundMapper, read_ground, write_ground
+from semloc_logs.mapping.ground import GroundMap, GroundMapper, read_ground, write_ground
 
 F64 = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import pytest
 
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.frames import Header, PosedCloud
-from semloc_logs.voxels.keyframes import Collected
+from semloc_logs.mapping.keyframes import Collected
 
 CLOUD = PosedCloud(
     Header("/points", 1, 2, "lidar"), np.arange(12, dtype=np.float32).reshape(4, 3), np.zeros(3, np.float32), None, None, {}, None

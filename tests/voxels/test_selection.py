@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from semloc_logs.mapping.selection import UNPOSED_SPACING_NS, KeyframeSelector, road_distance, submap_ranges, thin
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Fusion
-from semloc_logs.voxels.selection import UNPOSED_SPACING_NS, KeyframeSelector, road_distance, submap_ranges, thin
 
 steps = st.lists(st.floats(0, 60, allow_subnormal=False), min_size=1, max_size=200)
 

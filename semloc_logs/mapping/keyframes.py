@@ -15,10 +15,10 @@ from semloc_logs.errors import WorkspaceError
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.session.session import Session
+from semloc_logs.mapping.selection import KeyframeSelector, thin
+from semloc_logs.mapping.up_direction import surface_normals
 from semloc_logs.numerics.prefetch import ahead
 from semloc_logs.settings import Fusion
-from semloc_logs.voxels.gravity import surface_normals
-from semloc_logs.voxels.selection import KeyframeSelector, thin
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.local_shape import shape
-from semloc_logs.voxels.selection import thin
 
 F64 = NDArray[np.float64]
 MOST_POINTS = 12_000  # of a keyframe that normals are taken from

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from semloc_logs.errors import LogError
 from semloc_logs.logs.session.session import Session
 from semloc_logs.logs.session.tally import span
+from semloc_logs.mapping.keyframes import Collected
+from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.numerics.transforms import inverse, rotation_between
-from semloc_logs.voxels.gravity import find_up
-from semloc_logs.voxels.keyframes import Collected
 
 F64 = NDArray[np.float64]
 REACH = 3_000_000  # voxels; of the tables that are indexed by place the coarse one of the ground ends first (voxels/keys.py)
