@@ -22,12 +22,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semloc_logs.settings import Settings
-from semloc_logs.subvolumes.checkpoints import save_weights
-from semloc_logs.subvolumes.completion import completion_scores
 from semloc_logs.subvolumes.cut import CLASSES, SIZE
 from semloc_logs.subvolumes.network import CHANNELS, Completion, Decoder, Encoder, Turning, channels_last, halve, latent_mean
-from semloc_logs.subvolumes.pairs import read_shard
-from semloc_logs.subvolumes.training import Progress, train
+from semloc_logs.training.checkpoints import save_weights
+from semloc_logs.training.completion_scores import completion_scores
+from semloc_logs.training.network_training import Progress, train
+from semloc_logs.training.pairs import read_shard
 
 HELD_OUT = 2
 

@@ -15,8 +15,8 @@ import torch
 from semloc_logs.subvolumes.cut import code_table
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.network import descriptors
-from semloc_logs.subvolumes.pairs import read_shard
-from semloc_logs.subvolumes.sampling import shard_descriptors
+from semloc_logs.training.descriptor_samples import shard_descriptors
+from semloc_logs.training.pairs import read_shard
 from semloc_logs.words import index as index_module
 from semloc_logs.words.vocabulary import train_vocabulary
 

@@ -15,8 +15,8 @@ from .options import Command, EngineChoice, console_options, engine_options, jso
 
 if TYPE_CHECKING:
     from semloc_logs.engines import Engine
-    from semloc_logs.learning import Packed
     from semloc_logs.settings import Settings
+    from semloc_logs.training.runs import Packed
 
 
 @click.command(cls=Command)
@@ -61,9 +61,9 @@ def command(
     Example:  semloc train --variant semantic -o weights --scenes 60 --samples 250000
     """
     from semloc_logs.engines.engine import cores
-    from semloc_logs.learning import device_of, learn_descriptor, use_threads
-    from semloc_logs.subvolumes.checkpoints import steps_done
-    from semloc_logs.subvolumes.schedule import samples_after
+    from semloc_logs.training.checkpoints import steps_done
+    from semloc_logs.training.runs import device_of, learn_descriptor, use_threads
+    from semloc_logs.training.schedule import samples_after
 
     folder = checkpoint or output / "checkpoint"
     chosen = device_of(device)
@@ -98,7 +98,7 @@ def command(
 
 def packed_shards(folder: Path, work: Path | None, settings: Settings, engine: Engine, samples: int = 0) -> Packed:
     """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes; ``samples`` have been seen of them."""
-    from semloc_logs.learning import session_shards, simulated_shards
+    from semloc_logs.training.runs import session_shards, simulated_shards
     from semloc_logs.workspace import Workspace
 
     if work is None:

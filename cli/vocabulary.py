@@ -50,7 +50,7 @@ def command(
               semloc vocabulary --variant both -o semloc_logs/words/vocabularies --shards weights/checkpoint/simulated-0123456789
     """
     from semloc_logs.engines.engine import cores
-    from semloc_logs.learning import given_shards, learn_vocabulary, use_threads
+    from semloc_logs.training.runs import given_shards, learn_vocabulary, use_threads
 
     if variant == "both" and settings.descriptor.weights is not None:
         raise click.UsageError("descriptor.weights are those of one variant: name it with --variant.")

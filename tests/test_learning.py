@@ -13,13 +13,13 @@ from safetensors.torch import load_file
 
 from semloc_logs.engines import make_engine
 from semloc_logs.errors import SettingsError
-from semloc_logs.learning import Packed, learn_descriptor, learn_vocabulary, session_shards
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import Settings, load
-from semloc_logs.subvolumes.own_sessions import session_frames, stretch_tasks
-from semloc_logs.subvolumes.pairs import read_shard, write_shard
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
+from semloc_logs.training.own_sessions import session_frames, stretch_tasks
+from semloc_logs.training.pairs import read_shard, write_shard
+from semloc_logs.training.runs import Packed, learn_descriptor, learn_vocabulary, session_shards
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import SessionFolder
 

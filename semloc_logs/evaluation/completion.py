@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from semloc_logs.evaluation.completion_picture import draw_completions
 from semloc_logs.evaluation.held_out import simulation_version
 from semloc_logs.settings import Settings, Training
-from semloc_logs.simulation.training_data import SceneTask, make_shard
-from semloc_logs.subvolumes.checkpoints import load_weights
 from semloc_logs.subvolumes.cut import CLASSES, SIZE, code_table
 from semloc_logs.subvolumes.network import Completion
-from semloc_logs.subvolumes.pairs import read_shard
+from semloc_logs.training.checkpoints import load_weights
+from semloc_logs.training.pairs import read_shard
+from semloc_logs.training.scene_shards import SceneTask, make_shard
 from semloc_logs.voxels.grid import FREE_STATE
 
 U8 = NDArray[np.uint8]
@@ -55,7 +55,7 @@ def load_completion(variant: str, weights: Path | None = None) -> Completion:
 
 @torch.inference_mode()
 def completed(model: Completion, pairs: tuple[U8, U8, U8]) -> Completed:
-    """What the network makes of the incomplete views of ``pairs``, of :func:`semloc_logs.subvolumes.pairs.read_shard`."""
+    """What the network makes of the incomplete views of ``pairs``, of :func:`semloc_logs.training.pairs.read_shard`."""
     table, classes = code_table(model.encoder.variant), CLASSES[model.encoder.variant]
     given = table[pairs[0]]
     said, probable = (np.zeros((len(given), SIZE, SIZE, SIZE), np.uint8) for _ in range(2))

@@ -23,12 +23,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from semloc_logs.errors import SemlocError
 from semloc_logs.settings import Settings
-from semloc_logs.simulation.training_data import scene_frame
-from semloc_logs.simulation.training_scenes import training_scene
 from semloc_logs.subvolumes.cut import WIDE, code_table
 from semloc_logs.subvolumes.describe import random_encoder
 from semloc_logs.subvolumes.network import Encoder, descriptors
-from semloc_logs.subvolumes.pairs import fuse
+from semloc_logs.training.pairs import fuse
+from semloc_logs.training.scene_shards import scene_frame
+from semloc_logs.training.training_scenes import training_scene
 
 Figures = dict[str, dict[str, float | str]]
 EDGE = 192  # voxels of the piece of map, margin included

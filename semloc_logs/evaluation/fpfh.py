@@ -17,7 +17,7 @@ from semloc_logs.evaluation.places import Place
 from semloc_logs.evaluation.recall import Describe
 from semloc_logs.subvolumes.cut import SIZE
 from semloc_logs.subvolumes.describe import Described
-from semloc_logs.subvolumes.pairs import occupied
+from semloc_logs.training.pairs import occupied
 
 SECONDS = 6 * 3600.0
 CELLS = 2  # voxels along the edge of the cells that points are thinned to: with all points it takes four times as long

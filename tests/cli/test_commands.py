@@ -14,11 +14,11 @@ from mcap.writer import Writer
 
 from semloc_logs import stages
 from semloc_logs.cli.main import program
-from semloc_logs.learning import Packed
 from semloc_logs.logs.annotation.annotate import AnnotateReport
 from semloc_logs.stages import Report
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
+from semloc_logs.training.runs import Packed
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
 
@@ -349,10 +349,10 @@ def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatc
         return {"accuracy": 0.875}
 
     monkeypatch.setattr(
-        "semloc_logs.learning.simulated_shards", lambda folder, settings, *_: Packed([Path("s")] * settings.training.scenes, [])
+        "semloc_logs.training.runs.simulated_shards", lambda folder, settings, *_: Packed([Path("s")] * settings.training.scenes, [])
     )
-    monkeypatch.setattr("semloc_logs.learning.learn_descriptor", learn)
-    monkeypatch.setattr("semloc_logs.learning.use_threads", lambda _: None)
+    monkeypatch.setattr("semloc_logs.training.runs.learn_descriptor", learn)
+    monkeypatch.setattr("semloc_logs.training.runs.use_threads", lambda _: None)
     options = ("--scenes", 5, "--samples", 900, "--engine", "serial", "--device", "cpu")
     done = semloc("train", "-o", tmp_path / "w", *options, "--json")
     assert done.exit_code == 0, done.stderr

@@ -11,8 +11,8 @@ from semloc_logs.evaluation import completion as module
 from semloc_logs.evaluation.completion import Completed, completed, completion_benchmark, completion_figures, load_completion
 from semloc_logs.evaluation.completion_picture import colours, draw_completions, render
 from semloc_logs.settings import Settings
-from semloc_logs.simulation.training_data import SceneTask
-from semloc_logs.subvolumes.pairs import BROAD, write_shard
+from semloc_logs.training.pairs import BROAD, write_shard
+from semloc_logs.training.scene_shards import SceneTask
 
 CLASSES, FREE, UNOBSERVED, UNKNOWN = 19, 19, 20, 21
 

@@ -10,7 +10,7 @@ import pytest
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.simulation.camera import CameraModel
 from semloc_logs.simulation.lidar_models import MODELS
-from semloc_logs.simulation.training_scenes import _rig, training_scene
+from semloc_logs.training.training_scenes import _rig, training_scene
 
 
 @pytest.mark.parametrize("seed", [0, 2, 5, 8, 11])

@@ -13,11 +13,11 @@ from safetensors.torch import save_file
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.subvolumes import describe
-from semloc_logs.subvolumes.checkpoints import save_weights
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table, turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns, random_encoder
 from semloc_logs.subvolumes.network import Completion, Decoder, Encoder, descriptors, from_eights, in_eights
-from semloc_logs.subvolumes.pairs import occupied
+from semloc_logs.training.checkpoints import save_weights
+from semloc_logs.training.pairs import occupied
 
 U8 = NDArray[np.uint8]
 LOW = np.array([-64, 32, -16])

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import Settings, Training
-from semloc_logs.subvolumes import training
-from semloc_logs.subvolumes.batches import batches
-from semloc_logs.subvolumes.completion import completion_scores
 from semloc_logs.subvolumes.cut import SIZE, code_table
 from semloc_logs.subvolumes.describe import load_encoder
-from semloc_logs.subvolumes.pairs import BROAD, SceneFrame, cut_pairs, occupied, read_shard, write_shard
-from semloc_logs.subvolumes.schedule import learning_rate, scene_window
-from semloc_logs.subvolumes.training import Progress, _seen, targets, train
+from semloc_logs.training import network_training
+from semloc_logs.training.batches import batches
+from semloc_logs.training.completion_scores import completion_scores
+from semloc_logs.training.network_training import Progress, _seen, targets, train
+from semloc_logs.training.pairs import BROAD, SceneFrame, cut_pairs, occupied, read_shard, write_shard
+from semloc_logs.training.schedule import learning_rate, scene_window
 
 U8 = NDArray[np.uint8]
 Pair = tuple[U8, U8, U8]
@@ -123,7 +123,7 @@ def short(steps: int, **more: float) -> Training:
 
 
 def test_the_loss_goes_down(shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "RATE", 0.1)  # of a warm-up over fifty steps
+    monkeypatch.setattr(network_training, "RATE", 0.1)  # of a warm-up over fifty steps
     seen: list[Progress] = []
     model = train("geometric", shards[:1], short(12), tmp_path / "checkpoint", seen.append)
     assert [p.samples for p in seen] == [18 * (i + 1) for i in range(12)]
@@ -222,7 +222,7 @@ def test_scenes_are_used_as_they_come(shards: list[Path]) -> None:
 
 
 def test_a_scene_that_comes_too_late_ends_the_training_in_time(shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("semloc_logs.subvolumes.batches.PATIENCE", 0.2)
+    monkeypatch.setattr("semloc_logs.training.batches.PATIENCE", 0.2)
     late, begun = threading.Event(), time.monotonic()
 
     class Scenes(Sequence[Path]):

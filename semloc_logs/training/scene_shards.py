@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from semloc_logs.settings import Settings
-from semloc_logs.simulation.training_scenes import TrainingFrame, training_scene
-from semloc_logs.subvolumes.pairs import SceneFrame, cut_pairs, write_shard
+from semloc_logs.training.pairs import SceneFrame, cut_pairs, write_shard
+from semloc_logs.training.training_scenes import TrainingFrame, training_scene
 
 
 @dataclass(frozen=True, slots=True)

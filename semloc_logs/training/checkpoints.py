@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.network import Completion
-from semloc_logs.subvolumes.schedule import plateau_end, steps_of
 from semloc_logs.tables.table import replacing_file
+from semloc_logs.training.schedule import plateau_end, steps_of
 
 Network = TypeVar("Network", bound=nn.Module)
 

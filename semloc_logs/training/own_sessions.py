@@ -10,8 +10,8 @@ import numpy as np
 
 from semloc_logs.mapping.selection import submap_ranges
 from semloc_logs.settings import STREET_VOXEL, Settings
-from semloc_logs.subvolumes.pairs import SceneFrame, cut_pairs, write_shard
 from semloc_logs.tables.table import read_table
+from semloc_logs.training.pairs import SceneFrame, cut_pairs, write_shard
 from semloc_logs.voxels.store import poses_of, read_keyframe
 from semloc_logs.workspace import SessionFolder
 

@@ -20,11 +20,11 @@ from torch.nn import functional as F
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
-from semloc_logs.subvolumes.batches import Batch, OutOfTime, batches
-from semloc_logs.subvolumes.checkpoints import resume, save_checkpoint, save_weights
 from semloc_logs.subvolumes.cut import CLASSES, code_table
 from semloc_logs.subvolumes.network import Completion, descriptors, in_eights
-from semloc_logs.subvolumes.schedule import learning_rate, plateau_end, samples_after, steps_of
+from semloc_logs.training.batches import Batch, OutOfTime, batches
+from semloc_logs.training.checkpoints import resume, save_checkpoint, save_weights
+from semloc_logs.training.schedule import learning_rate, plateau_end, samples_after, steps_of
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 RATE = 1.5e-3

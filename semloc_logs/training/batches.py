@@ -23,8 +23,8 @@ from torch import Tensor
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
-from semloc_logs.subvolumes.pairs import ROW_GROUP, read_shard
-from semloc_logs.subvolumes.schedule import FIRST_SCENES, samples_after, scene_window
+from semloc_logs.training.pairs import ROW_GROUP, read_shard
+from semloc_logs.training.schedule import FIRST_SCENES, samples_after, scene_window
 from semloc_logs.voxels.grid import UNOBSERVED_STATE
 
 U8 = NDArray[np.uint8]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.subvolumes.cut import code_table
 from semloc_logs.subvolumes.network import Encoder, descriptors
-from semloc_logs.subvolumes.pairs import read_shard
+from semloc_logs.training.pairs import read_shard
 
 
 @torch.inference_mode()

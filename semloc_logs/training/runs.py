@@ -18,15 +18,15 @@ from semloc_logs.engines import Engine
 from semloc_logs.engines.growing import Growing
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings, Training
-from semloc_logs.simulation.training_data import make_shard, scene_tasks
-from semloc_logs.subvolumes.checkpoints import save_weights
-from semloc_logs.subvolumes.completion import completion_scores
 from semloc_logs.subvolumes.describe import load_encoder
-from semloc_logs.subvolumes.own_sessions import cut_stretch, stretch_tasks
-from semloc_logs.subvolumes.pairs import read_shard, rows_of
-from semloc_logs.subvolumes.sampling import shard_descriptors
-from semloc_logs.subvolumes.schedule import scene_window
-from semloc_logs.subvolumes.training import Progress, train
+from semloc_logs.training.checkpoints import save_weights
+from semloc_logs.training.completion_scores import completion_scores
+from semloc_logs.training.descriptor_samples import shard_descriptors
+from semloc_logs.training.network_training import Progress, train
+from semloc_logs.training.own_sessions import cut_stretch, stretch_tasks
+from semloc_logs.training.pairs import read_shard, rows_of
+from semloc_logs.training.scene_shards import make_shard, scene_tasks
+from semloc_logs.training.schedule import scene_window
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import SessionFolder
 

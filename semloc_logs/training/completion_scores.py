@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.subvolumes.cut import CLASSES, code_table
 from semloc_logs.subvolumes.network import Completion, as_volumes, descriptors
-from semloc_logs.subvolumes.training import targets
+from semloc_logs.training.network_training import targets
 
 U8 = NDArray[np.uint8]
 
