@@ -38,11 +38,11 @@ from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Settings
-from semloc_logs.subvolumes.describing import DescribeTask, variants_for
+from semloc_logs.subvolumes.submap_descriptors import DescribeTask, variants_for
 from semloc_logs.tables.table import read_json, read_metadata, replacing_folder, write_json
 from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words.catalogue import Change, segments
-from semloc_logs.words.indexing import index_submap, write_words
+from semloc_logs.words.submap_words import index_submap, write_words
 from semloc_logs.workspace import SessionFolder, Workspace
 
 Note = Callable[[str], None]

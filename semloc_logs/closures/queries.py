@@ -15,7 +15,7 @@ from semloc_logs.alignment.verify import Query, thin_points
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 from semloc_logs.settings import Settings
-from semloc_logs.subvolumes.describing import KNOWS_CLASSES
+from semloc_logs.subvolumes.submap_descriptors import KNOWS_CLASSES
 from semloc_logs.tables.table import read_json, read_table
 from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import Keyframe, poses_of, read_keyframe

@@ -29,8 +29,8 @@ from semloc_logs.evaluation.localisation_worlds import DATABASE, WorldDrive
 from semloc_logs.settings import STREET_VOXEL, Settings
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
-from semloc_logs.subvolumes.describing import describe_submap
 from semloc_logs.subvolumes.network import Completion
+from semloc_logs.subvolumes.submap_descriptors import describe_submap
 from semloc_logs.training.checkpoints import save_weights
 from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary

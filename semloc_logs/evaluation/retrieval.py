@@ -14,8 +14,8 @@ from semloc_logs.evaluation.truth import TrueTrack
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import describe_map
-from semloc_logs.subvolumes.describing import describe_submap
 from semloc_logs.subvolumes.network import Encoder
+from semloc_logs.subvolumes.submap_descriptors import describe_submap
 from semloc_logs.voxels.store import blocks_path, read_blocks
 from semloc_logs.words.index import Allowed, Index
 from semloc_logs.words.vocabulary import Vocabulary, train_vocabulary

@@ -22,8 +22,8 @@ from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words import catalogue
 from semloc_logs.words.catalogue import Change, merged_blocks, segments, update
 from semloc_logs.words.index import SHORTLIST, Allowed, Index, Part
-from semloc_logs.words.indexing import write_words
 from semloc_logs.words.segment import WORDS, Held, Segment, open_segment, segment_in_memory, write_segment
+from semloc_logs.words.submap_words import write_words
 from semloc_logs.words.vocabulary import BITS, Vocabulary
 from semloc_logs.workspace import Workspace
 

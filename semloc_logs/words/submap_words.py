@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.subvolumes.describe import load_encoder
-from semloc_logs.subvolumes.describing import DescribeTask, describe_submap, known_headings
+from semloc_logs.subvolumes.submap_descriptors import DescribeTask, describe_submap, known_headings
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
 from semloc_logs.words.vocabulary import load_vocabulary
