@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from towns import Place, Town, collect, short_towns
 
-from semloc_logs.closures.acceptance import shipped
-from semloc_logs.closures.queries import SessionMap
-from semloc_logs.closures.results import read_closures
+from semloc_logs.closures.acceptance.calibration import shipped
+from semloc_logs.closures.closure_tables import read_closures
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.engines.engine import single_threaded
 from semloc_logs.evaluation.calibration import SURE, answers, decided_by, read_judged, recall_at

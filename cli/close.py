@@ -37,7 +37,7 @@ def command(
     \b
     Example:  semloc close -w work --query tuesday --target monday --query-every 5
     """
-    from semloc_logs.closures.results import read_closures
+    from semloc_logs.closures.closure_tables import read_closures
     from semloc_logs.stages import close
     from semloc_logs.workspace import Workspace
 

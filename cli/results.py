@@ -65,7 +65,7 @@ def show_closures(work: Workspace) -> None:
     """The closures of a workspace as a table, and where they lie."""
     import numpy as np
 
-    from semloc_logs.closures.results import read_closures
+    from semloc_logs.closures.closure_tables import read_closures
 
     rows = read_closures(work.closures)
     drawn = []

@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SemlocError
 from semloc_logs.evaluation.localisation_benchmark import Localisation

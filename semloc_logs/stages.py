@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 import semloc_logs
-from semloc_logs.closures.agreement import decide
-from semloc_logs.closures.closing import Alignment, CloseTask, close_queries
+from semloc_logs.closures.acceptance.consistency import decide
+from semloc_logs.closures.closure_tables import keyframe_at, read_closures, unique_closures, write_closures, write_rejected
+from semloc_logs.closures.matching import Alignment, CloseTask, close_queries
 from semloc_logs.closures.picture import draw_closures
-from semloc_logs.closures.queries import SessionMap, query_keyframes
-from semloc_logs.closures.results import keyframe_at, read_closures, unique_closures, write_closures, write_rejected
+from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.engines import Engine, Serial
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint

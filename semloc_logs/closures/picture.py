@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.closing import Alignment
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.matching import Alignment
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.tables.table import read_table, replacing_file
 from semloc_logs.workspace import Workspace

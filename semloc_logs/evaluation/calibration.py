@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import (
+from semloc_logs.closures.acceptance.calibration import (
     SUPPORT,
     TOGETHER,
     Calibration,
@@ -29,10 +29,10 @@ from semloc_logs.closures.acceptance import (
     together_values,
     unrivalled,
 )
-from semloc_logs.closures.agreement import agree, shares
-from semloc_logs.closures.placing import Placed, strays
-from semloc_logs.closures.queries import SessionMap
-from semloc_logs.closures.results import keyframe_at
+from semloc_logs.closures.acceptance.consistency import agree, shares
+from semloc_logs.closures.acceptance.placements import Placed, strays
+from semloc_logs.closures.closure_tables import keyframe_at
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, judge_closure, read_truth
 from semloc_logs.tables.table import read_metadata, read_table, write_table
 from semloc_logs.voxels.store import poses_of

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Query, Target
-from semloc_logs.closures.closing import allowed_places, match_words
+from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.queries import SessionMap, build_query, query_members
-from semloc_logs.closures.results import keyframe_at, read_closures
+from semloc_logs.closures.matching import allowed_places, match_words
+from semloc_logs.closures.query import SessionMap, build_query, query_members
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.evaluation.completion import completed, load_completion, states_of
 from semloc_logs.numerics.transforms import inverse, turned_about_z

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.errors import LogError
 from semloc_logs.labels.from_geometry import classify
 from semloc_logs.labels.space import UNLABELLED, cityscapes

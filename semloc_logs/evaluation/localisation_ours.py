@@ -20,10 +20,10 @@ import torch
 
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.verify import Query
-from semloc_logs.closures import closing
-from semloc_logs.closures.agreement import decide
+from semloc_logs.closures import matching
+from semloc_logs.closures.acceptance.consistency import decide
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.queries import SessionMap, query_keyframes
+from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.evaluation.localisation import Answer, World, read_world
 from semloc_logs.evaluation.localisation_worlds import DATABASE, WorldDrive
 from semloc_logs.settings import STREET_VOXEL, Settings
@@ -85,7 +85,7 @@ class OurTask:
         """One for each keyframe; the first query is asked twice, to warm up."""
         world = read_world(self.work, self.drive)
         database = Database(world.work, (DATABASE,), self.settings)
-        closing.close_query(database, world.query, self.keyframes[0])
+        matching.close_query(database, world.query, self.keyframes[0])
         with self._hypotheses():
             asked = [self._ask(database, world, k) for k in self.keyframes]
         maps = {self.drive.name: world.query, DATABASE: world.database}
@@ -101,13 +101,13 @@ class OurTask:
         asked = every[max(0, (len(every) - PROFILED) // 2) :][:PROFILED]
         profiler = cProfile.Profile()
         with self._hypotheses():
-            closing.close_query(database, world.query, asked[0])
+            matching.close_query(database, world.query, asked[0])
             begin = time.perf_counter()
             for keyframe in asked:
-                closing.close_query(database, world.query, keyframe)
+                matching.close_query(database, world.query, keyframe)
             whole = (time.perf_counter() - begin) / len(asked)
             for keyframe in asked:
-                profiler.runcall(closing.close_query, database, world.query, keyframe)
+                profiler.runcall(matching.close_query, database, world.query, keyframe)
         return {WHOLE: whole} | {part: seconds / len(asked) for part, seconds in _parts(profiler).items()}
 
     def _hypotheses(self) -> Any:
@@ -118,17 +118,17 @@ class OurTask:
         most = self.settings.closures.hypotheses if self.system.hypotheses == "some" else None
         return patch.object(closing, "find_hypotheses", partial(grid_hypotheses, most=most))
 
-    def _ask(self, database: Database, world: World, keyframe: int) -> tuple[float, list[closing.Alignment]]:
+    def _ask(self, database: Database, world: World, keyframe: int) -> tuple[float, list[matching.Alignment]]:
         begin = time.perf_counter()
-        found = closing.close_query(database, world.query, keyframe)
+        found = matching.close_query(database, world.query, keyframe)
         return time.perf_counter() - begin, found
 
     def _answer(
-        self, world: World, keyframe: int, seconds: float, found: list[closing.Alignment], accepted: closing.Alignment | None
+        self, world: World, keyframe: int, seconds: float, found: list[matching.Alignment], accepted: matching.Alignment | None
     ) -> Answer:
         """First is what is most probable by itself, which is its score; accepted may be another one, that other queries agree with."""
 
-        def errors(alignment: closing.Alignment | None) -> tuple[float, float] | tuple[None, None]:
+        def errors(alignment: matching.Alignment | None) -> tuple[float, float] | tuple[None, None]:
             if alignment is None:
                 return None, None
             return world.errors(keyframe, world.database.map_T_base[alignment.target_keyframe] @ alignment.target_T_query)
@@ -149,7 +149,7 @@ def _parts(profiler: cProfile.Profile) -> dict[str, float]:
 
 
 def sweep_words(database: Database, variant: str, allowed: Allowed, query: Query, ground_z: float) -> tuple[Described, Matches]:
-    """What :func:`semloc_logs.closures.closing.match_words` finds when the query is turned into every heading and described there, as by
+    """What :func:`semloc_logs.closures.matching.match_words` finds when the query is turned into every heading and described there, as by
     the paper (4), instead of once: what an encoder that turns with its input saves."""
     settings = database.settings
     descriptor, closures, v = settings.descriptor, settings.closures, settings.fusion.voxel_size

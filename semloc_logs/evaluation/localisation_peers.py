@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.queries import SessionMap, query_members
+from semloc_logs.closures.query import SessionMap, query_members
 from semloc_logs.errors import SemlocError
 from semloc_logs.evaluation.localisation import Answer, World, read_world
 from semloc_logs.evaluation.localisation_worlds import WorldDrive

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.closures.queries import SessionMap, query_keyframes
-from semloc_logs.closures.results import read_closures
+from semloc_logs.closures.closure_tables import read_closures
+from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.errors import TruthError, WorkspaceError
 from semloc_logs.numerics.transforms import interpolate, inverse, rotation_angle, transform
 from semloc_logs.settings import Closures, Query, Settings

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports.clouds import Bounds, SessionPoints
 from semloc_logs.exports.formats import write_las, write_pcd, write_ply, write_xyz

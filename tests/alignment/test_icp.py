@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.icp import Fit, Step, _add_point, align
 from semloc_logs.alignment.surface import flattened_surface, surface_of
 from semloc_logs.alignment.verify import Query, fine_fit, points_surface
-from semloc_logs.closures.closing import COMMON, SYSTEMATIC, covariance_of
+from semloc_logs.closures.matching import COMMON, SYSTEMATIC, covariance_of
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import Fuser

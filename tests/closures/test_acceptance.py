@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES, Features
-from semloc_logs.closures.acceptance import (
+from semloc_logs.closures.acceptance.calibration import (
     AGREEMENT,
     TOGETHER,
     Agreement,

@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import looked_at
-from semloc_logs.closures.closing import allowed_places
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.matching import allowed_places
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.mapping.selection import road_distance
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Settings

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.closures.queries import SessionMap, build_query, query_keyframes, query_members
-from semloc_logs.closures.results import keyframe_at
+from semloc_logs.closures.closure_tables import keyframe_at
+from semloc_logs.closures.query import SessionMap, build_query, query_keyframes, query_members
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.mapping.selection import road_distance
 from semloc_logs.numerics.transforms import apply, yaw_transform

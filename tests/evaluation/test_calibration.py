@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import TOGETHER, Calibration
-from semloc_logs.closures.placing import Placed
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.acceptance.calibration import TOGETHER, Calibration
+from semloc_logs.closures.acceptance.placements import Placed
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.evaluation import calibration
 from semloc_logs.evaluation.calibration import (
     Judged,

@@ -153,7 +153,7 @@ def test_only_what_lies_in_the_bounds(form: str, tmp_path: Path) -> None:
 
 
 def test_bounds_skip_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from semloc_logs.closures.queries import SessionMap
+    from semloc_logs.closures.query import SessionMap
 
     make(Workspace(tmp_path), NEAR)
     points = SessionPoints(SessionMap(Workspace(tmp_path).session("town")), "voxels", "map", (10.0, -1e9, 14.0, 1e9))

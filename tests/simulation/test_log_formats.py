@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.errors import LogError
 from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session

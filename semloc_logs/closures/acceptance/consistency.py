@@ -14,11 +14,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.closures.acceptance import AGREEMENT, Agreement, may_be_right, precise, reason, shipped
-from semloc_logs.closures.closing import Alignment
-from semloc_logs.closures.lookalike import lookalike
-from semloc_logs.closures.placing import ARM, DRIFT, FAR, Placed, asked_roads, features_of, pairs_of, place, strays
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.acceptance.ambiguity import lookalike
+from semloc_logs.closures.acceptance.calibration import AGREEMENT, Agreement, may_be_right, precise, reason, shipped
+from semloc_logs.closures.acceptance.placements import ARM, DRIFT, FAR, Placed, asked_roads, features_of, pairs_of, place, strays
+from semloc_logs.closures.matching import Alignment
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL, Settings
 

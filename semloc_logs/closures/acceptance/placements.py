@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import own_values, shipped, unrivalled
-from semloc_logs.closures.closing import Alignment
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.acceptance.calibration import own_values, shipped, unrivalled
+from semloc_logs.closures.matching import Alignment
+from semloc_logs.closures.query import SessionMap
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance import AGREEMENT
-from semloc_logs.closures.closing import Alignment
-from semloc_logs.closures.queries import SessionMap
+from semloc_logs.closures.acceptance.calibration import AGREEMENT
+from semloc_logs.closures.matching import Alignment
+from semloc_logs.closures.query import SessionMap
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.store import pose_columns

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.placing import ARM, DRIFT, FAR, Pairs, Placed, strays
+from semloc_logs.closures.acceptance.placements import ARM, DRIFT, FAR, Pairs, Placed, strays
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL
 

@@ -25,9 +25,9 @@ from semloc_logs.alignment.verify import (
     search_hypotheses,
     structure_scores,
 )
-from semloc_logs.closures.acceptance import CLOSE, HOPELESS, Agreement, own_values, shipped
+from semloc_logs.closures.acceptance.calibration import CLOSE, HOPELESS, Agreement, own_values, shipped
 from semloc_logs.closures.database import Database, open_database
-from semloc_logs.closures.queries import SessionMap, build_query
+from semloc_logs.closures.query import SessionMap, build_query
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.numerics.transforms import apply, inverse, turned_about_z
 from semloc_logs.settings import STREET_VOXEL
@@ -73,7 +73,7 @@ class CloseTask:
 class Alignment:
     """A verified hypothesis with everything that is reported; ``accepted`` or with a ``reason``.
 
-    ``probability`` is that of the alignment alone until :func:`semloc_logs.closures.agreement.decide` has compared all queries.
+    ``probability`` is that of the alignment alone until :func:`semloc_logs.closures.acceptance.consistency.decide` has compared all queries.
     """
 
     query_session: str
