@@ -18,7 +18,7 @@ from towns import Place, Town, collect, short_towns
 import semloc_logs.closures
 from semloc_logs.engines.engine import single_threaded
 from semloc_logs.evaluation.calibration import calibration_json, fit, read_judged, recall_at, reliability
-from semloc_logs.evaluation.reliability_picture import draw_reliability
+from semloc_logs.pictures.reliability_diagram import draw_reliability
 
 LATER = ("summer", "autumn", "snow")
 TOWNS = (

@@ -34,8 +34,8 @@ def command(
     Example:  semloc show -w work --query tuesday --at 95 -o closure.png
     """
     from semloc_logs.errors import WorkspaceError
-    from semloc_logs.evaluation.closure_picture import draw_views
-    from semloc_logs.evaluation.closure_view import Wanted, choose, closing_settings, closure_view, drawn
+    from semloc_logs.pictures.closure_sheet import draw_views
+    from semloc_logs.pictures.closure_view import Wanted, choose, closing_settings, closure_view, drawn
     from semloc_logs.workspace import Workspace
 
     if closure is not None and (query is not None or at is not None):

@@ -19,7 +19,6 @@ import semloc_logs
 from semloc_logs.closures.acceptance.consistency import decide
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures, unique_closures, write_closures, write_rejected
 from semloc_logs.closures.matching import Alignment, CloseTask, close_queries
-from semloc_logs.closures.picture import draw_closures
 from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.engines import Engine, Serial
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError
@@ -37,6 +36,7 @@ from semloc_logs.logs.annotation.annotate import (
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.numerics.transforms import transform
+from semloc_logs.pictures.closures_picture import draw_closures
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.submap_descriptors import DescribeTask, variants_for
 from semloc_logs.tables.table import read_json, read_metadata, replacing_folder, write_json

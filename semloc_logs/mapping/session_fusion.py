@@ -28,12 +28,12 @@ from semloc_logs.mapping.selection import road_distance, submap_ranges
 from semloc_logs.mapping.up_direction import ground_height
 from semloc_logs.numerics.prefetch import ahead
 from semloc_logs.numerics.transforms import apply
+from semloc_logs.pictures.map_picture import Caption, draw_map
 from semloc_logs.settings import STREET_VOXEL, Fusion, Settings
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import replacing_folder, write_json, write_table
 from semloc_logs.voxels.carve import Carver
 from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map
-from semloc_logs.voxels.picture import Caption, draw_map
 from semloc_logs.voxels.store import Keyframe, blocks_path, keep_keyframes, pose_columns, write_blocks, write_voxels
 from semloc_logs.workspace import SessionFolder
 

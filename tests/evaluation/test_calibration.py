@@ -24,8 +24,8 @@ from semloc_logs.evaluation.calibration import (
     recall_at,
     reliability,
 )
-from semloc_logs.evaluation.reliability_picture import draw_reliability
 from semloc_logs.numerics.transforms import inverse, yaw_transform
+from semloc_logs.pictures.reliability_diagram import draw_reliability
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.store import pose_columns

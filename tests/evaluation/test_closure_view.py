@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from semloc_logs.alignment.verify import Query, Target
 from semloc_logs.cli.main import program
 from semloc_logs.errors import WorkspaceError
-from semloc_logs.evaluation.closure_picture import draw_views
-from semloc_logs.evaluation.closure_view import Choice, ClosureView, Match, Wanted, choose, drawn
 from semloc_logs.numerics.transforms import yaw_transform
+from semloc_logs.pictures.closure_sheet import draw_views
+from semloc_logs.pictures.closure_view import Choice, ClosureView, Match, Wanted, choose, drawn
 from semloc_logs.settings import Settings
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table

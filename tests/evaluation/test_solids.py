@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semloc_logs.evaluation.solids import Solid, View, draw_solids, top_view
 from semloc_logs.numerics.transforms import yaw_transform
+from semloc_logs.pictures.solids import Solid, View, draw_solids, top_view
 
 RED, BLUE = np.array([[200, 0, 0]], np.uint8), np.array([[0, 0, 200]], np.uint8)
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.pictures.map_picture import LARGE, Canvas, Caption, colour_table, draw_map
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
-from semloc_logs.voxels.picture import LARGE, Canvas, Caption, colour_table, draw_map
 
 
 def write(folder: Path, ijk: NDArray[np.integer], label: NDArray[np.integer]) -> Path:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from semloc_logs.labels.space import GROUND, UNLABELLED, cityscapes
+from semloc_logs.pictures.lettering import Sheet
 from semloc_logs.tables.table import read_table, replacing_file
 from semloc_logs.voxels.keys import BLOCK
-from semloc_logs.voxels.lettering import Sheet
 
 SMALL, LARGE = 1400, 3600  # pixels along the longer edge: small maps are enlarged to the first, large ones reduced to the second
 TRACK, START = (214, 39, 40), (20, 120, 50)

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.overlap import FREE_BIT, look_up
-from semloc_logs.evaluation.closure_view import ClosureView
-from semloc_logs.evaluation.completion_picture import colours, render
-from semloc_logs.evaluation.solids import Solid, View, draw_solids, top_view
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.numerics.transforms import apply
+from semloc_logs.pictures.closure_view import ClosureView
+from semloc_logs.pictures.completion_picture import colours, render
+from semloc_logs.pictures.lettering import FONT, INK, SOFT, Sheet
+from semloc_logs.pictures.map_picture import GEOMETRY_NAMES
+from semloc_logs.pictures.solids import Solid, View, draw_solids, top_view
 from semloc_logs.subvolumes.cut import SIZE
 from semloc_logs.tables.table import replacing_file
-from semloc_logs.voxels.lettering import FONT, INK, SOFT, Sheet
-from semloc_logs.voxels.picture import GEOMETRY_NAMES
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
