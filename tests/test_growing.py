@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from semloc_logs.engines.growing import Growing
+from semloc_logs.engines.streamed import Growing
 
 
 def test_the_first_result_is_there_before_the_last() -> None:

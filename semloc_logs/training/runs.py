@@ -15,7 +15,7 @@ import torch
 
 import semloc_logs
 from semloc_logs.engines import Engine
-from semloc_logs.engines.growing import Growing
+from semloc_logs.engines.streamed import Growing
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings, Training
 from semloc_logs.subvolumes.describe import load_encoder

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import SemlocError, WorkspaceError
 from semloc_logs.exports import POINT_FORMATS, Selection, export
-from semloc_logs.exports import formats as formats_module
-from semloc_logs.exports.clouds import SessionPoints
+from semloc_logs.exports import point_formats as formats_module
+from semloc_logs.exports.map_points import SessionPoints
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.tables import contracts

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import semloc_logs
 from semloc_logs.errors import SemlocError, WorkspaceError
-from semloc_logs.exports.clouds import SessionPoints
+from semloc_logs.exports.map_points import SessionPoints
 from semloc_logs.labels.space import BUILDING, GROUND, UNLABELLED, VEGETATION, cityscapes
 
 U8 = NDArray[np.uint8]
