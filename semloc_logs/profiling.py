@@ -192,7 +192,7 @@ def memory_curve(lengths: Sequence[int], settings: Settings) -> Figures:
 
     The road goes on (new places), or is driven there and back (the same places again). SemlocError when fusing fails.
     """
-    from semloc_logs.simulation.long_drive import LAP_M, Lap
+    from semloc_logs.simulation.output.long_drive import LAP_M, Lap
 
     figures: Figures = {}
     lap = Lap()

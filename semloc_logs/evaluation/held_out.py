@@ -23,15 +23,15 @@ from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.evaluation.places import HEADINGS, Place, Street, asked_place, map_place, read_street, write_street
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 from semloc_logs.settings import Settings
-from semloc_logs.simulation.camera import CAMERAS, camera_points
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.ground import Ground
-from semloc_logs.simulation.lidar import MODELS, full_sweep
-from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path
-from semloc_logs.simulation.street import build_street, street_ground
-from semloc_logs.simulation.traffic import Traffic, random_traffic
-from semloc_logs.simulation.trajectory import poses_along, smooth_line
-from semloc_logs.simulation.world import Scene
+from semloc_logs.simulation.drives.traffic import Traffic, random_traffic
+from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
+from semloc_logs.simulation.meshes.world import Scene
+from semloc_logs.simulation.sensors.camera import CAMERAS, camera_points
+from semloc_logs.simulation.sensors.lidar import MODELS, full_sweep
+from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path
+from semloc_logs.simulation.town.street import build_street, street_ground
+from semloc_logs.simulation.town.terrain import Ground
 from semloc_logs.tables.table import read_metadata
 from semloc_logs.voxels.grid import BlockMap, Fuser
 

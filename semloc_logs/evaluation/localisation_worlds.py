@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.network import left_of
-from semloc_logs.simulation.objects import resample
+from semloc_logs.simulation.meshes.objects import resample
 from semloc_logs.simulation.sessions import Sensor, Session, write_sessions
-from semloc_logs.simulation.survey import drive_network, opposite_lane
+from semloc_logs.simulation.town.road_network import left_of
+from semloc_logs.simulation.town.survey import drive_network, opposite_lane
 from semloc_logs.tables.table import replacing_folder
 
 F64 = NDArray[np.float64]

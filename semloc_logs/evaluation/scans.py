@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
-from semloc_logs.simulation.world import F64, Scene
+from semloc_logs.simulation.meshes.world import F64, Scene
 
 SWEEP_POINTS = 120_000
 DEPTH_SHAPE = 480, 640
@@ -30,10 +30,10 @@ def street_sweeps(count: int = 12, points: int = SWEEP_POINTS, seed: int = 8) ->
 
     Their mean range is about 10 m, as that of real sweeps, and 98 % or more of the points are within 50 m.
     """
-    from semloc_logs.simulation.lidar import MODELS, full_sweep
-    from semloc_logs.simulation.network import grid_network, lane_path, random_route
-    from semloc_logs.simulation.street import build_street, street_ground
-    from semloc_logs.simulation.trajectory import poses_along, smooth_line
+    from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
+    from semloc_logs.simulation.sensors.lidar import MODELS, full_sweep
+    from semloc_logs.simulation.town.road_network import grid_network, lane_path, random_route
+    from semloc_logs.simulation.town.street import build_street, street_ground
 
     rng = np.random.default_rng(seed)
     network = grid_network(rng, 2, 3, 85.0)
@@ -51,11 +51,11 @@ def street_sweeps(count: int = 12, points: int = SWEEP_POINTS, seed: int = 8) ->
 
 def town_sweeps(seed: int, count: int = 3) -> list[Scan]:
     """Whole sweeps of a simulated sensor of 64 beams, ``count`` of them 35 m apart, through the town of a seed with its traffic."""
-    from semloc_logs.simulation.lidar import MODELS, full_sweep
-    from semloc_logs.simulation.network import grid_network, lane_path, random_route
-    from semloc_logs.simulation.street import build_street, street_ground
-    from semloc_logs.simulation.traffic import random_traffic
-    from semloc_logs.simulation.trajectory import poses_along, smooth_line
+    from semloc_logs.simulation.drives.traffic import random_traffic
+    from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
+    from semloc_logs.simulation.sensors.lidar import MODELS, full_sweep
+    from semloc_logs.simulation.town.road_network import grid_network, lane_path, random_route
+    from semloc_logs.simulation.town.street import build_street, street_ground
 
     rng = np.random.default_rng([seed, 43])
     network = grid_network(rng, 2, 3, 85.0)
@@ -100,7 +100,7 @@ def depth_images(count: int = 6, shape: tuple[int, int] = DEPTH_SHAPE, seed: int
 
 def _room() -> Scene:
     """Four walls, floor, ceiling and some furniture."""
-    from semloc_logs.simulation.world import MeshBuilder, box
+    from semloc_logs.simulation.meshes.world import MeshBuilder, box
 
     room = MeshBuilder(lambda x, y: np.zeros_like(x))
     for size, place in (

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path
+from semloc_logs.simulation.drives.trajectory import smooth_line
 from semloc_logs.simulation.sessions import Sensor, Session, write_sessions
-from semloc_logs.simulation.trajectory import smooth_line
+from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path
 
 
 def simulate_demo(directory: Path | str, seed: int = 0) -> list[Path]:

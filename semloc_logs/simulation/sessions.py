@@ -11,20 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from semloc_logs.errors import SemlocError, SettingsError
-from semloc_logs.simulation.camera import CAMERAS
-from semloc_logs.simulation.camera_drive import CameraShot, simulate_cameras
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.drive import DriveFrame, simulate_drive
-from semloc_logs.simulation.lidar import MODELS
-from semloc_logs.simulation.log import FORMATS, write_session, write_truth
-from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, random_route, repeating_network
-from semloc_logs.simulation.objects import resample
-from semloc_logs.simulation.street import build_street, street_ground
-from semloc_logs.simulation.survey import drive_network, opposite_lane, read_drive
-from semloc_logs.simulation.traffic import random_traffic
-from semloc_logs.simulation.trajectory import drive, smooth_line
-from semloc_logs.simulation.vehicle_sensors import VehicleSensors
-from semloc_logs.simulation.world import F64
+from semloc_logs.simulation.drives.camera_drive import CameraShot, simulate_cameras
+from semloc_logs.simulation.drives.drive import DriveFrame, simulate_drive
+from semloc_logs.simulation.drives.traffic import random_traffic
+from semloc_logs.simulation.drives.trajectory import drive, smooth_line
+from semloc_logs.simulation.drives.vehicle_sensors import VehicleSensors
+from semloc_logs.simulation.meshes.objects import resample
+from semloc_logs.simulation.meshes.world import F64
+from semloc_logs.simulation.output.drive_log import FORMATS, write_session, write_truth
+from semloc_logs.simulation.sensors.camera import CAMERAS
+from semloc_logs.simulation.sensors.lidar import MODELS
+from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path, random_route, repeating_network
+from semloc_logs.simulation.town.street import build_street, street_ground
+from semloc_logs.simulation.town.survey import drive_network, opposite_lane, read_drive
 
 _BLOCK = 85.0  # m between crossings
 _START_NS = 1_760_000_000_000_000_000
@@ -157,7 +157,7 @@ def write_sessions(
 ) -> Path:
     """Simulate and write the sessions, their trajectories (.tum) and, last of all, truth.json; its path.
 
-    ``format`` as in :func:`semloc_logs.simulation.log.write_session`.
+    ``format`` as in :func:`semloc_logs.simulation.output.drive_log.write_session`.
     """
     if sensor.name not in (*MODELS, *CAMERAS):
         raise SettingsError(f"there is no simulated sensor {sensor.name!r}: choose one of {', '.join((*MODELS, *CAMERAS))}")

@@ -15,19 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.numerics.transforms import apply
-from semloc_logs.simulation.camera import CAMERAS, CameraModel, camera_points
 from semloc_logs.simulation.conditions import SEASONS, Condition
-from semloc_logs.simulation.forest import build_forest
-from semloc_logs.simulation.hall import build_hall, hall_walk
-from semloc_logs.simulation.label_errors import corrupt_labels
-from semloc_logs.simulation.lidar import full_sweep
-from semloc_logs.simulation.lidar_models import MODELS, LidarModel
-from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route
-from semloc_logs.simulation.room import build_room, room_walk
-from semloc_logs.simulation.street import build_street, street_ground
-from semloc_logs.simulation.traffic import Traffic, random_traffic
-from semloc_logs.simulation.trajectory import poses_along, smooth_line
-from semloc_logs.simulation.world import F64, Scene, World
+from semloc_logs.simulation.drives.traffic import Traffic, random_traffic
+from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
+from semloc_logs.simulation.meshes.world import F64, Scene, World
+from semloc_logs.simulation.sensors.camera import CAMERAS, CameraModel, camera_points
+from semloc_logs.simulation.sensors.label_errors import corrupt_labels
+from semloc_logs.simulation.sensors.lidar import full_sweep
+from semloc_logs.simulation.sensors.lidar_models import MODELS, LidarModel
+from semloc_logs.simulation.town.forest import build_forest
+from semloc_logs.simulation.town.hall import build_hall, hall_walk
+from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path, path_network, random_route
+from semloc_logs.simulation.town.room import build_room, room_walk
+from semloc_logs.simulation.town.street import build_street, street_ground
 
 RAYS = 60_000  # a sweep at most
 RANGE = 60.0  # m

@@ -28,9 +28,9 @@ from semloc_logs.evaluation.recall import (
 from semloc_logs.evaluation.retrieval_benchmark import RetrievalChoice, densely, retrieval_benchmark
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import Settings
-from semloc_logs.simulation.network import RoadNetwork, path_network
-from semloc_logs.simulation.traffic import Traffic
-from semloc_logs.simulation.world import MeshBuilder, Scene, box
+from semloc_logs.simulation.drives.traffic import Traffic
+from semloc_logs.simulation.meshes.world import MeshBuilder, Scene, box
+from semloc_logs.simulation.town.road_network import RoadNetwork, path_network
 from semloc_logs.subvolumes.describe import Described
 
 SETTINGS = densely(Settings()).resolved()

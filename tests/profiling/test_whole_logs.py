@@ -9,7 +9,7 @@ from semloc_logs.errors import SemlocError
 from semloc_logs.logs.session.session import open_session
 from semloc_logs.profiling import _PARTS, peak_memory, profile_fuse
 from semloc_logs.settings import Settings
-from semloc_logs.simulation.long_drive import Lap
+from semloc_logs.simulation.output.long_drive import Lap
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semloc_logs.simulation.camera import (
+from semloc_logs.simulation.meshes.world import POLE, ROAD, WALL, MeshBuilder, Scene, box
+from semloc_logs.simulation.sensors.camera import (
     CAMERAS,
     base_T_camera,
     camera_points,
@@ -11,7 +12,6 @@ from semloc_logs.simulation.camera import (
     first_hits,
     pixel_rays,
 )
-from semloc_logs.simulation.world import POLE, ROAD, WALL, MeshBuilder, Scene, box
 
 STEREO = CAMERAS["stereo"]
 

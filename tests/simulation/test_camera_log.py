@@ -10,11 +10,11 @@ from semloc_logs.frames import PosedCloud
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import apply
-from semloc_logs.simulation.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
-from semloc_logs.simulation.camera_drive import SKY, simulate_cameras, wrong_label_image
-from semloc_logs.simulation.log import FORMATS, write_session
-from semloc_logs.simulation.trajectory import Trajectory
-from semloc_logs.simulation.world import BUILDING, POLE, ROAD, UNLABELLED, WALL, MeshBuilder, Scene, World, box
+from semloc_logs.simulation.drives.camera_drive import SKY, simulate_cameras, wrong_label_image
+from semloc_logs.simulation.drives.trajectory import Trajectory
+from semloc_logs.simulation.meshes.world import BUILDING, POLE, ROAD, UNLABELLED, WALL, MeshBuilder, Scene, World, box
+from semloc_logs.simulation.output.drive_log import FORMATS, write_session
+from semloc_logs.simulation.sensors.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
 
 SECOND = 10**9
 

@@ -3,13 +3,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.simulation.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.images import Painter
-from semloc_logs.simulation.noise import octaves
-from semloc_logs.simulation.street import build_street
-from semloc_logs.simulation.surfaces import road_plan, surfaces
-from semloc_logs.simulation.world import BUILDING, ROAD, MeshBuilder, Scene, World, box
+from semloc_logs.simulation.meshes.world import BUILDING, ROAD, MeshBuilder, Scene, World, box
+from semloc_logs.simulation.sensors.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
+from semloc_logs.simulation.sensors.noise import octaves
+from semloc_logs.simulation.sensors.rendered_images import Painter
+from semloc_logs.simulation.sensors.surface_colours import road_plan, surfaces
+from semloc_logs.simulation.town.street import build_street
 
 U8 = NDArray[np.uint8]
 STEREO = CAMERAS["stereo"]

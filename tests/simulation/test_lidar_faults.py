@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from semloc_logs.numerics.transforms import yaw_transform
-from semloc_logs.simulation.echoes import beyond_edges, is_heard, is_pane, mixed_ranges, reflectance
-from semloc_logs.simulation.label_errors import CONFUSIONS, corrupt_labels
-from semloc_logs.simulation.lidar import MODELS, full_sweep
-from semloc_logs.simulation.lidar_models import beam_directions, is_blocked
-from semloc_logs.simulation.world import BUILDING, CAR, ROAD, VEGETATION, WALL, MeshBuilder, Scene, box
+from semloc_logs.simulation.meshes.world import BUILDING, CAR, ROAD, VEGETATION, WALL, MeshBuilder, Scene, box
+from semloc_logs.simulation.sensors.echoes import beyond_edges, is_heard, is_pane, mixed_ranges, reflectance
+from semloc_logs.simulation.sensors.label_errors import CONFUSIONS, corrupt_labels
+from semloc_logs.simulation.sensors.lidar import MODELS, full_sweep
+from semloc_logs.simulation.sensors.lidar_models import beam_directions, is_blocked
 
 PERFECT = replace(MODELS["hdl64"], noise=0.0, beam_bias=0.0, pointing_deg=0.0, divergence=0.0, lift=(), blocked=())
 

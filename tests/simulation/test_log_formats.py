@@ -14,13 +14,13 @@ from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import Settings
-from semloc_logs.simulation.drive import simulate_drive
-from semloc_logs.simulation.lidar import MODELS
-from semloc_logs.simulation.log import FORMATS, write_session
+from semloc_logs.simulation.drives.drive import simulate_drive
+from semloc_logs.simulation.drives.trajectory import drive, smooth_line
+from semloc_logs.simulation.drives.vehicle_sensors import VehicleSensors
+from semloc_logs.simulation.meshes.world import BUILDING, ROAD, MeshBuilder, World, box
+from semloc_logs.simulation.output.drive_log import FORMATS, write_session
+from semloc_logs.simulation.sensors.lidar import MODELS
 from semloc_logs.simulation.sessions import simulate_sessions
-from semloc_logs.simulation.trajectory import drive, smooth_line
-from semloc_logs.simulation.vehicle_sensors import VehicleSensors
-from semloc_logs.simulation.world import BUILDING, ROAD, MeshBuilder, World, box
 from semloc_logs.voxels.store import Keyframe, read_keyframe
 from semloc_logs.workspace import Workspace
 

@@ -11,15 +11,13 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from semloc_logs.simulation import landmarks, objects
-from semloc_logs.simulation.buildings import building
-from semloc_logs.simulation.fences import FENCES
-from semloc_logs.simulation.furniture import CLUTTER, POLES
-from semloc_logs.simulation.network import grid_network
-from semloc_logs.simulation.shapes import Parts, Rng, boxes, loft, snow_cover, tubes
-from semloc_logs.simulation.street import build_street
-from semloc_logs.simulation.trees import SPECIES
-from semloc_logs.simulation.world import (
+from semloc_logs.simulation.meshes import landmarks, objects
+from semloc_logs.simulation.meshes.buildings import building
+from semloc_logs.simulation.meshes.fences import FENCES
+from semloc_logs.simulation.meshes.furniture import CLUTTER, POLES
+from semloc_logs.simulation.meshes.shapes import Parts, Rng, boxes, loft, snow_cover, tubes
+from semloc_logs.simulation.meshes.trees import SPECIES
+from semloc_logs.simulation.meshes.world import (
     BICYCLE,
     BUILDING,
     BUS,
@@ -39,6 +37,8 @@ from semloc_logs.simulation.world import (
     Mesh,
     box,
 )
+from semloc_logs.simulation.town.road_network import grid_network
+from semloc_logs.simulation.town.street import build_street
 
 SEEDS = range(8)
 Span = tuple[float, float]
@@ -193,7 +193,7 @@ def test_bare_bushes_and_hedges_use_as_much_of_the_stream() -> None:
 
 
 def test_rays_pass_partly_through_a_crown() -> None:
-    from semloc_logs.simulation.world import MeshBuilder, Scene
+    from semloc_logs.simulation.meshes.world import MeshBuilder, Scene
 
     passed = []
     for seed in SEEDS:

@@ -17,12 +17,12 @@ from semloc_logs.errors import LogError, SemlocError, SettingsError
 from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.numerics.transforms import apply, interpolate, inverse, transform
 from semloc_logs.simulation.demo import simulate_demo
-from semloc_logs.simulation.drive import DriveFrame, mounting, simulate_drive
-from semloc_logs.simulation.lidar import MODELS
-from semloc_logs.simulation.log import write_session, write_truth
+from semloc_logs.simulation.drives.drive import DriveFrame, mounting, simulate_drive
+from semloc_logs.simulation.drives.trajectory import Trajectory, drive, smooth_line
+from semloc_logs.simulation.meshes.world import ROAD, WALL, MeshBuilder, World, box
+from semloc_logs.simulation.output.drive_log import write_session, write_truth
+from semloc_logs.simulation.sensors.lidar import MODELS
 from semloc_logs.simulation.sessions import simulate_sessions
-from semloc_logs.simulation.trajectory import Trajectory, drive, smooth_line
-from semloc_logs.simulation.world import ROAD, WALL, MeshBuilder, World, box
 
 START = 1_760_000_000_123_456_789
 

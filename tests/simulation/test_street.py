@@ -10,12 +10,25 @@ import pytest
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.simulation.conditions import Condition
-from semloc_logs.simulation.hall import build_hall, hall_walk
-from semloc_logs.simulation.network import RoadNetwork, grid_network, lane_path, path_network, random_route, repeating_network
-from semloc_logs.simulation.street import build_street, street_ground
-from semloc_logs.simulation.traffic import pavement, random_traffic
-from semloc_logs.simulation.trajectory import drifting_odometry, drive, poses_along, smooth_line
-from semloc_logs.simulation.world import BUILDING, CAR, FENCE, PERSON, POLE, ROAD, SIDEWALK, TERRAIN, TRAFFIC_SIGN, VEGETATION, Scene, World
+from semloc_logs.simulation.drives.traffic import pavement, random_traffic
+from semloc_logs.simulation.drives.trajectory import drifting_odometry, drive, poses_along, smooth_line
+from semloc_logs.simulation.meshes.world import (
+    BUILDING,
+    CAR,
+    FENCE,
+    PERSON,
+    POLE,
+    ROAD,
+    SIDEWALK,
+    TERRAIN,
+    TRAFFIC_SIGN,
+    VEGETATION,
+    Scene,
+    World,
+)
+from semloc_logs.simulation.town.hall import build_hall, hall_walk
+from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path, path_network, random_route, repeating_network
+from semloc_logs.simulation.town.street import build_street, street_ground
 
 
 @pytest.fixture(scope="module")

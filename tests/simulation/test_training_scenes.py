@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from semloc_logs.numerics.transforms import apply
-from semloc_logs.simulation.camera import CameraModel
-from semloc_logs.simulation.lidar_models import MODELS
+from semloc_logs.simulation.sensors.camera import CameraModel
+from semloc_logs.simulation.sensors.lidar_models import MODELS
 from semloc_logs.training.training_scenes import _rig, training_scene
 
 

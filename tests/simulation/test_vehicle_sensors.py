@@ -7,9 +7,9 @@ import pytest
 
 from semloc_logs.logs.poses.navsat import LocalFrame
 from semloc_logs.numerics.transforms import inverse
-from semloc_logs.simulation.trajectory import Trajectory, drifting_odometry, drive, smooth_line
-from semloc_logs.simulation.vehicle_sensors import ANTENNA, DATUM, GRAVITY, VehicleSensors, fixes, geodetic, inertial
-from semloc_logs.simulation.world import F64
+from semloc_logs.simulation.drives.trajectory import Trajectory, drifting_odometry, drive, smooth_line
+from semloc_logs.simulation.drives.vehicle_sensors import ANTENNA, DATUM, GRAVITY, VehicleSensors, fixes, geodetic, inertial
+from semloc_logs.simulation.meshes.world import F64
 
 PERFECT = VehicleSensors(force_noise=0.0, force_bias=0.0, rate_noise=0.0, rate_bias=0.0)
 

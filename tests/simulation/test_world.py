@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.errors import SemlocError
-from semloc_logs.simulation.world import (
+from semloc_logs.simulation.meshes.world import (
     Mesh,
     MeshBuilder,
     Scene,
