@@ -105,8 +105,8 @@ def command(
         raise click.UsageError(f"{name} needs at least one log.")
     with console.progress():
         if name == "retrieval":
-            from semloc_logs.evaluation.retrieval_benchmark import RetrievalChoice, retrieval_benchmark
-            from semloc_logs.profiling import real_streets
+            from semloc_logs.benchmarks.descriptors.retrieval import RetrievalChoice, retrieval_benchmark
+            from semloc_logs.benchmarks.whole_logs import real_streets
 
             variants = ("semantic", "geometric") if variant == "both" else (variant,)
             real = real_streets(logs, truth, settings) if truth is not None else None
@@ -115,15 +115,15 @@ def command(
                 RetrievalChoice(variants, weights, database, queries or 2000, work), peers, settings, real, console.note
             )
         elif name == "completion":
-            from semloc_logs.evaluation.completion import completion_benchmark
+            from semloc_logs.benchmarks.descriptors.completion import completion_benchmark
 
             figures, rows = completion_benchmark(variant, settings, weights, work, picture, console.note), []
         elif name == "scaling":
-            from semloc_logs.evaluation.search_scaling import scaling_benchmark
+            from semloc_logs.benchmarks.speed.search_scaling import scaling_benchmark
 
             figures, rows = scaling_benchmark(settings, work, console.note), []
         elif name == "localisation":
-            from semloc_logs.profiling import localisation
+            from semloc_logs.benchmarks.whole_logs import localisation
 
             figures, rows = localisation(work, queries or 40, peers, settings, console.note), []
         else:
@@ -146,38 +146,38 @@ def _measure(
 ) -> tuple[dict[str, dict[str, Any]], Rows]:
     """The figures of benchmark ``name`` and, where it profiles, the functions that took most time."""
     if name == "pipeline":
-        from semloc_logs.profiling import profile_pipeline
+        from semloc_logs.benchmarks.whole_logs import profile_pipeline
 
         return profile_pipeline(logs, settings)
     if name == "fuse":
-        from semloc_logs.profiling import profile_fuse
+        from semloc_logs.benchmarks.whole_logs import profile_fuse
 
         return profile_fuse(logs, settings)
     if name == "memory":
-        from semloc_logs.profiling import memory_curve
+        from semloc_logs.benchmarks.whole_logs import memory_curve
 
         return memory_curve(lengths, settings), []
     if name == "words" and truth is not None:
-        from semloc_logs.profiling import word_recalls
+        from semloc_logs.benchmarks.whole_logs import word_recalls
 
         return word_recalls(logs, truth, settings), []
     if name == "labels":
-        from semloc_logs.evaluation.labelling import measure_labels
+        from semloc_logs.benchmarks.labels.label_quality import measure_labels
 
         return measure_labels(logs, settings), []
     if name == "realism":
-        from semloc_logs.evaluation.realism import measure_realism
+        from semloc_logs.benchmarks.labels.realism import measure_realism
 
         return measure_realism(logs, settings), []
     if name == "fusion":
-        from semloc_logs.evaluation.fusion_speed import fusion_speed
+        from semloc_logs.benchmarks.speed.fusion_speed import fusion_speed
 
         return fusion_speed(settings, logs, peers), []
     if name == "search":
-        from semloc_logs.evaluation.search_speed import search_speed
+        from semloc_logs.benchmarks.speed.search_speed import search_speed
 
         return search_speed(settings, peers=peers), []
-    from semloc_logs.evaluation.benchmarks import run_benchmark
+    from semloc_logs.benchmarks.speed.suite import run_benchmark
 
     return run_benchmark(name, settings), []
 

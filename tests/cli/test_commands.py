@@ -380,7 +380,7 @@ def test_vocabulary_needs_a_variant(tmp_path: Path) -> None:
 
 def test_benchmark_prints_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     figures = {"messages": {"ours": 400.0, "unit": "MB/s", "peer": 200.0}, "clouds": {"ours": 2.5, "unit": "ms"}}
-    monkeypatch.setattr("semloc_logs.evaluation.benchmarks.BENCHMARKS", {"reading": lambda _: figures})
+    monkeypatch.setattr("semloc_logs.benchmarks.speed.suite.BENCHMARKS", {"reading": lambda _: figures})
     assert json.loads(semloc("benchmark", "reading", "--json").stdout) == figures
     assert "200" in semloc("benchmark", "reading").stdout
     done = semloc("benchmark", "nothing")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from semloc_logs.evaluation.encoder_speed import encode, macs, one_by_one, watch
+from semloc_logs.benchmarks.speed.encoder_speed import encode, macs, one_by_one, watch
 from semloc_logs.subvolumes.cut import WIDE
 from semloc_logs.subvolumes.describe import random_encoder
 from semloc_logs.subvolumes.network import Encoder

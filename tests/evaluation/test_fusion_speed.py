@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semloc_logs.benchmarks.peers import peer_process
+from semloc_logs.benchmarks.peers.peer_process import Peer, runner, write_scans
+from semloc_logs.benchmarks.speed.fusion_speed import Case, clock_rate, measure, walk_all
+from semloc_logs.benchmarks.speed.scans import Scan, depth_images, log_sweeps, street_sweeps
 from semloc_logs.errors import LogError, SemlocError, SettingsError
-from semloc_logs.evaluation import peers
-from semloc_logs.evaluation.fusion_speed import Case, clock_rate, measure, walk_all
-from semloc_logs.evaluation.peers import Peer, runner, write_scans
-from semloc_logs.evaluation.scans import Scan, depth_images, log_sweeps, street_sweeps
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Settings
 
@@ -95,7 +95,7 @@ def test_log_without_clouds_is_refused(tmp_path: Path) -> None:
 def test_ours_and_peers_are_measured_in_turn(scans: list[Scan], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     script = tmp_path / "fake_runner.py"
     script.write_text(FAKE)
-    monkeypatch.setattr(peers, "runner", lambda name: script)
+    monkeypatch.setattr(peer_process, "runner", lambda name: script)
     figures = measure(Case("depth", scans, 0.05, 8.0, 2, "a small image"), Settings().resolved(), {"fake": sys.executable})
     assert figures["depth_ms"]["fake"] == 5.0
     assert figures["depth_cpu_ms"]["fake"] == 4.0
@@ -108,7 +108,7 @@ def test_ours_and_peers_are_measured_in_turn(scans: list[Scan], monkeypatch: pyt
 def test_peer_that_fails_is_named_with_what_it_said(scans: list[Scan], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     script = tmp_path / "broken_runner.py"
     script.write_text("import this_is_not_installed")
-    monkeypatch.setattr(peers, "runner", lambda name: script)
+    monkeypatch.setattr(peer_process, "runner", lambda name: script)
     write_scans(tmp_path, scans)
     with Peer("broken", sys.executable, tmp_path, 0.05, 8.0, 1) as peer, pytest.raises(SemlocError, match=r"broken.*this_is_not_installed"):
         peer.round()
@@ -117,7 +117,7 @@ def test_peer_that_fails_is_named_with_what_it_said(scans: list[Scan], monkeypat
 def test_peer_without_python_or_script_is_wrong_usage(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="no peer 'nobody'"):
         runner("nobody")
-    monkeypatch.setattr(peers, "runner", lambda name: tmp_path / "x.py")
+    monkeypatch.setattr(peer_process, "runner", lambda name: tmp_path / "x.py")
     with pytest.raises(SettingsError, match="cannot be started"):
         Peer("x", str(tmp_path / "no-python"), tmp_path, 0.3, 50.0, 1)
 

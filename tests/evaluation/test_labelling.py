@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semloc_logs.benchmarks.labels.label_quality import confusion, intersection_over_union, measure_labels
 from semloc_logs.errors import SemlocError
-from semloc_logs.evaluation.labelling import confusion, intersection_over_union, measure_labels
 from semloc_logs.settings import Settings
 
 KITTI = ("kitti00_000052", "kitti00_000088", "kitti00_000850", "kitti00_004501")

@@ -11,13 +11,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from semloc_logs.benchmarks.localisation.answers import Answer, World, figures_of, recall_at_full_precision
+from semloc_logs.benchmarks.localisation.city import CROSSING, OPPOSITE, SEED, UNSEEN, WorldDrive, world_path
+from semloc_logs.benchmarks.localisation.our_method import OURS, grid_hypotheses, link_workspace, settings_of, sweep_words
+from semloc_logs.benchmarks.localisation.peer_methods import cloud_frame, database_keyframes
+from semloc_logs.benchmarks.peers import peer_process
+from semloc_logs.benchmarks.peers.scan_context import nearest_contexts, scan_context
 from semloc_logs.errors import SemlocError, SettingsError
-from semloc_logs.evaluation import peers
-from semloc_logs.evaluation.localisation import Answer, World, figures_of, recall_at_full_precision
-from semloc_logs.evaluation.localisation_ours import OURS, grid_hypotheses, link_workspace, settings_of, sweep_words
-from semloc_logs.evaluation.localisation_peers import cloud_frame, database_keyframes
-from semloc_logs.evaluation.localisation_worlds import CROSSING, OPPOSITE, SEED, UNSEEN, WorldDrive, world_path
-from semloc_logs.evaluation.scan_context import nearest_contexts, scan_context
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import load
 from semloc_logs.subvolumes.cut import turned_map
@@ -187,19 +187,19 @@ def test_cloud_frames_are_level_and_spaced() -> None:
 
 def test_a_peer_that_fails_or_is_not_there_is_an_error_of_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = tmp_path / "x_runner.py"
-    monkeypatch.setattr(peers, "runner", lambda name: script)
+    monkeypatch.setattr(peer_process, "runner", lambda name: script)
     script.write_text("import sys; print(sys.argv[1])")
-    assert peers.run_peer("x", sys.executable, ["said"], 60) == "said\n"
+    assert peer_process.run_peer("x", sys.executable, ["said"], 60) == "said\n"
     script.write_text("raise ValueError('broken')")
     with pytest.raises(SemlocError, match="broken"):
-        peers.run_peer("x", sys.executable, [], 60)
+        peer_process.run_peer("x", sys.executable, [], 60)
     with pytest.raises(SettingsError, match="x=PYTHON"):
-        peers.run_peer("x", str(tmp_path / "none"), [], 60)
+        peer_process.run_peer("x", str(tmp_path / "none"), [], 60)
 
 
 def test_local_maps_ranks_and_warms_up(tmp_path: Path) -> None:
     """The runners' shared part, with a peer whose score is the number of points."""
-    folder = peers.runner("scan_context").parent
+    folder = peer_process.runner("scan_context").parent
     rng = np.random.default_rng(0)
     for name, n in (("a", 5), ("b", 9), ("q", 3)):
         np.save(tmp_path / f"{name}.npy", rng.normal(size=(n, 3)).astype(np.float32))

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from semloc_logs.benchmarks.labels.realism import compare, portrait, total_variation
+from semloc_logs.benchmarks.speed.scans import Scan, town_sweeps
 from semloc_logs.cli.main import program
 from semloc_logs.errors import LogError
-from semloc_logs.evaluation.realism import compare, portrait, total_variation
-from semloc_logs.evaluation.scans import Scan, town_sweeps
 from semloc_logs.settings import Settings
 
 FUSION = Settings().resolved().fusion
@@ -85,7 +85,7 @@ def test_simulated_sweeps_have_as_many_points_as_real_ones() -> None:
 
 @pytest.mark.skipif(not KITTI.exists(), reason="the folder shared/ with real logs is not there")
 def test_the_command_compares_with_a_real_log(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("semloc_logs.evaluation.realism.town_sweeps", lambda seed, sweeps: [street()] if seed == 0 else [])
+    monkeypatch.setattr("semloc_logs.benchmarks.labels.realism.town_sweeps", lambda seed, sweeps: [street()] if seed == 0 else [])
     result = CliRunner().invoke(program, ["benchmark", "realism", str(KITTI), "--json"])
     assert result.exit_code == 0
     figures = json.loads(result.stdout)

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from semloc_logs.errors import SemlocError, SettingsError, WorkspaceError
-from semloc_logs.evaluation import held_out as module
-from semloc_logs.evaluation import retrieval_benchmark as benchmark
-from semloc_logs.evaluation.fpfh import fpfh_describes
-from semloc_logs.evaluation.held_out import SCENARIOS, Extent, HeldOut, held_out
-from semloc_logs.evaluation.places import Place, Street, read_street, write_street
-from semloc_logs.evaluation.recall import (
+from semloc_logs.benchmarks.descriptors import held_out as module
+from semloc_logs.benchmarks.descriptors import retrieval as benchmark
+from semloc_logs.benchmarks.descriptors.held_out import SCENARIOS, Extent, HeldOut, held_out
+from semloc_logs.benchmarks.descriptors.places import Place, Street, read_street, write_street
+from semloc_logs.benchmarks.descriptors.recall import (
     DATABASES,
     NoEncoder,
     Words,
@@ -25,7 +23,9 @@ from semloc_logs.evaluation.recall import (
     retrieval_recall,
     true_radius,
 )
-from semloc_logs.evaluation.retrieval_benchmark import RetrievalChoice, densely, retrieval_benchmark
+from semloc_logs.benchmarks.descriptors.retrieval import RetrievalChoice, densely, retrieval_benchmark
+from semloc_logs.benchmarks.peers.fpfh import fpfh_describes
+from semloc_logs.errors import SemlocError, SettingsError, WorkspaceError
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.drives.traffic import Traffic

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from semloc_logs.benchmarks.speed import search_scaling as module
+from semloc_logs.benchmarks.speed.search_speed import draw
 from semloc_logs.errors import SettingsError
-from semloc_logs.evaluation import search_scaling as module
-from semloc_logs.evaluation.search_speed import draw
 from semloc_logs.settings import Settings
 from semloc_logs.words.vocabulary import train_vocabulary
 

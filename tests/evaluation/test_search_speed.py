@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
+from semloc_logs.benchmarks.speed import search_speed as module
 from semloc_logs.errors import SettingsError
-from semloc_logs.evaluation import search_speed as module
 from semloc_logs.settings import Settings
 from semloc_logs.words.vocabulary import train_vocabulary
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.overlap import pose_matrix, tau, yaw_between
 from semloc_logs.alignment.surface import surface_of
 from semloc_logs.alignment.verify import FINE_RADII, coarse_fit, escaped, fine_fit, same_place, search_hypotheses, structure_scores
-from semloc_logs.evaluation.verification_speed import TRUTH, Scene, scene
+from semloc_logs.benchmarks.speed.verification_speed import TRUTH, Scene, scene
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semloc_logs.benchmarks.whole_logs import _PARTS, peak_memory, profile_fuse
 from semloc_logs.errors import SemlocError
 from semloc_logs.logs.session.session import open_session
-from semloc_logs.profiling import _PARTS, peak_memory, profile_fuse
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.output.long_drive import Lap
 

@@ -20,12 +20,12 @@ import torch
 
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.verify import Query
+from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
+from semloc_logs.benchmarks.localisation.city import DATABASE, WorldDrive
 from semloc_logs.closures import matching
 from semloc_logs.closures.acceptance.consistency import decide
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.query import SessionMap, query_keyframes
-from semloc_logs.evaluation.localisation import Answer, World, read_world
-from semloc_logs.evaluation.localisation_worlds import DATABASE, WorldDrive
 from semloc_logs.settings import STREET_VOXEL, Settings
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.benchmarks.descriptors.held_out import HeldOut, held_out
+from semloc_logs.benchmarks.descriptors.recall import Describe, count_subvolumes, network_describes, true_radius
+from semloc_logs.benchmarks.speed.search_speed import timed
 from semloc_logs.errors import SettingsError
-from semloc_logs.evaluation.held_out import HeldOut, held_out
-from semloc_logs.evaluation.recall import Describe, count_subvolumes, network_describes, true_radius
-from semloc_logs.evaluation.search_speed import timed
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import load_encoder

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from semloc_logs.evaluation.peers import run_peer
-from semloc_logs.evaluation.places import Place
-from semloc_logs.evaluation.recall import Describe
+from semloc_logs.benchmarks.descriptors.places import Place
+from semloc_logs.benchmarks.descriptors.recall import Describe
+from semloc_logs.benchmarks.peers.peer_process import run_peer
 from semloc_logs.subvolumes.cut import SIZE
 from semloc_logs.subvolumes.describe import Described
 from semloc_logs.training.pairs import occupied

@@ -79,29 +79,29 @@ def reading(settings: Settings) -> Figures:
 
 
 def fusion(settings: Settings) -> Figures:
-    """Sweeps and depth images into the semantic map, free space carved; see :mod:`semloc_logs.evaluation.fusion_speed`."""
-    from semloc_logs.evaluation.fusion_speed import fusion_speed
+    """Sweeps and depth images into the semantic map, free space carved; see :mod:`semloc_logs.benchmarks.speed.fusion_speed`."""
+    from semloc_logs.benchmarks.speed.fusion_speed import fusion_speed
 
     return fusion_speed(settings)
 
 
 def encoder(settings: Settings) -> Figures:
-    """Descriptors of a map, densely and one by one; see :mod:`semloc_logs.evaluation.encoder_speed`."""
-    from semloc_logs.evaluation.encoder_speed import encoder_speed
+    """Descriptors of a map, densely and one by one; see :mod:`semloc_logs.benchmarks.speed.encoder_speed`."""
+    from semloc_logs.benchmarks.speed.encoder_speed import encoder_speed
 
     return encoder_speed(settings)
 
 
 def search(settings: Settings) -> Figures:
-    """Words looked up; see :mod:`semloc_logs.evaluation.search_speed`."""
-    from semloc_logs.evaluation.search_speed import search_speed
+    """Words looked up; see :mod:`semloc_logs.benchmarks.speed.search_speed`."""
+    from semloc_logs.benchmarks.speed.search_speed import search_speed
 
     return search_speed(settings)
 
 
 def verification(settings: Settings) -> Figures:
-    """Hypotheses searched, fitted and judged; see :mod:`semloc_logs.evaluation.verification_speed`."""
-    from semloc_logs.evaluation.verification_speed import verification_speed
+    """Hypotheses searched, fitted and judged; see :mod:`semloc_logs.benchmarks.speed.verification_speed`."""
+    from semloc_logs.benchmarks.speed.verification_speed import verification_speed
 
     return verification_speed(settings)
 

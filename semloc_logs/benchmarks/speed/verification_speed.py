@@ -11,7 +11,7 @@ from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.overlap import pose_matrix, tau
 from semloc_logs.alignment.surface import surface_of
 from semloc_logs.alignment.verify import Query, Target, coarse_fit, fine_fit, search_hypotheses
-from semloc_logs.evaluation.search_speed import timed
+from semloc_logs.benchmarks.speed.search_speed import timed
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import BlockMap, Fuser

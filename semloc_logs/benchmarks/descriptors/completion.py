@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from semloc_logs.evaluation.held_out import simulation_version
+from semloc_logs.benchmarks.descriptors.held_out import simulation_version
 from semloc_logs.pictures.completion_picture import draw_completions
 from semloc_logs.settings import Settings, Training
 from semloc_logs.subvolumes.cut import CLASSES, SIZE, code_table

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs import simulation
+from semloc_logs.benchmarks.descriptors.places import HEADINGS, Place, Street, asked_place, map_place, read_street, write_street
 from semloc_logs.errors import SettingsError, WorkspaceError
-from semloc_logs.evaluation.places import HEADINGS, Place, Street, asked_place, map_place, read_street, write_street
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.conditions import Condition

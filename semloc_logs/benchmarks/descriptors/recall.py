@@ -1,6 +1,6 @@
 """Are descriptors found again? The share of query subvolumes whose true place is among the nearest descriptors of a database.
 
-What is asked: :mod:`semloc_logs.evaluation.held_out`. Whatever describes a place can be measured: the network, trained or not, or a
+What is asked: :mod:`semloc_logs.benchmarks.descriptors.held_out`. Whatever describes a place can be measured: the network, trained or not, or a
 descriptor of a peer.
 """
 
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from semloc_logs.evaluation.held_out import HeldOut
-from semloc_logs.evaluation.places import Place
+from semloc_logs.benchmarks.descriptors.held_out import HeldOut
+from semloc_logs.benchmarks.descriptors.places import Place
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import MARGIN, SIZE

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.benchmarks.descriptors.places import Place, Street, asked_place, map_place
 from semloc_logs.closures.query import SessionMap, build_query, query_keyframes, query_members
-from semloc_logs.evaluation.places import Place, Street, asked_place, map_place
 from semloc_logs.evaluation.truth import TrueTrack
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Settings

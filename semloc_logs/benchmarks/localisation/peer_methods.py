@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
+from semloc_logs.benchmarks.localisation.city import WorldDrive
+from semloc_logs.benchmarks.peers.peer_process import run_peer
+from semloc_logs.benchmarks.peers.scan_context import nearest_contexts, scan_context
 from semloc_logs.closures.query import SessionMap, query_members
 from semloc_logs.errors import SemlocError
-from semloc_logs.evaluation.localisation import Answer, World, read_world
-from semloc_logs.evaluation.localisation_worlds import WorldDrive
-from semloc_logs.evaluation.peers import run_peer
-from semloc_logs.evaluation.scan_context import nearest_contexts, scan_context
 from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Settings

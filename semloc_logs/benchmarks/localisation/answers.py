@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.benchmarks.localisation.city import CROSSING, DATABASE, OPPOSITE, UNSEEN, WorldDrive
 from semloc_logs.closures.query import SessionMap, query_keyframes
-from semloc_logs.evaluation.localisation_worlds import CROSSING, DATABASE, OPPOSITE, UNSEEN, WorldDrive
 from semloc_logs.evaluation.truth import read_tum
 from semloc_logs.numerics.transforms import inverse, rotation_angle
 from semloc_logs.settings import Settings

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from semloc_logs.benchmarks.descriptors.held_out import HeldOut, held_out
+from semloc_logs.benchmarks.descriptors.places import Place, Street
+from semloc_logs.benchmarks.descriptors.recall import NoEncoder, count_subvolumes, network_describes, recalls, retrieval_recall
+from semloc_logs.benchmarks.peers.fpfh import fpfh_describes
 from semloc_logs.errors import SettingsError
-from semloc_logs.evaluation.fpfh import fpfh_describes
-from semloc_logs.evaluation.held_out import HeldOut, held_out
-from semloc_logs.evaluation.places import Place, Street
-from semloc_logs.evaluation.recall import NoEncoder, count_subvolumes, network_describes, recalls, retrieval_recall
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
 

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 import semloc_logs
+from semloc_logs.benchmarks.speed.scans import Scan
 from semloc_logs.errors import SemlocError, SettingsError
-from semloc_logs.evaluation.scans import Scan
 
 _ANSWER_SECONDS = 600.0
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")

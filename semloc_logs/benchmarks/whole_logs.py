@@ -16,12 +16,12 @@ from unittest.mock import patch
 
 import numpy as np
 
+from semloc_logs.benchmarks.descriptors.places import Street
+from semloc_logs.benchmarks.descriptors.word_matches import real_street, true_queries, word_recall
+from semloc_logs.benchmarks.localisation.localisation import Localisation
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SemlocError
-from semloc_logs.evaluation.localisation_benchmark import Localisation
-from semloc_logs.evaluation.places import Street
-from semloc_logs.evaluation.retrieval import real_street, true_queries, word_recall
 from semloc_logs.evaluation.truth import read_truth
 from semloc_logs.logs.session.session import open_session
 from semloc_logs.settings import Settings
@@ -268,7 +268,7 @@ def word_recalls(logs: Sequence[Path], truth: Path, settings: Settings) -> Figur
 
 def real_streets(logs: Sequence[Path], truth: Path, settings: Settings) -> dict[str, Street]:
     """For `semloc benchmark retrieval`: what the first log's queries and the second one's map are, with the log's labels and with those
-    from geometry, by the names of :data:`semloc_logs.evaluation.retrieval_benchmark.REAL`."""
+    from geometry, by the names of :data:`semloc_logs.benchmarks.descriptors.retrieval.REAL`."""
     settings = settings.resolved()
     out: dict[str, Street] = {}
     for source, names in (("auto", ("real_log", "real_geometric")), ("geometry", ("real_geometry_labels",))):

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import semloc_logs
+from semloc_logs.benchmarks.descriptors.held_out import simulation_version
+from semloc_logs.benchmarks.localisation.answers import UNITS, Answer, figures_of, read_world
+from semloc_logs.benchmarks.localisation.city import CONDITIONS, DATABASE, SENSORS, UNSEEN, WorldDrive, simulate_drive_log, world_drives
+from semloc_logs.benchmarks.localisation.our_method import OURS, WHOLE, OurSystem, OurTask, link_workspace, settings_of, write_random
+from semloc_logs.benchmarks.localisation.peer_methods import PEERS, PeerSystem, PeerTask
+from semloc_logs.benchmarks.peers.peer_process import runner
 from semloc_logs.errors import SettingsError
-from semloc_logs.evaluation.held_out import simulation_version
-from semloc_logs.evaluation.localisation import UNITS, Answer, figures_of, read_world
-from semloc_logs.evaluation.localisation_ours import OURS, WHOLE, OurSystem, OurTask, link_workspace, settings_of, write_random
-from semloc_logs.evaluation.localisation_peers import PEERS, PeerSystem, PeerTask
-from semloc_logs.evaluation.localisation_worlds import CONDITIONS, DATABASE, SENSORS, UNSEEN, WorldDrive, simulate_drive_log, world_drives
-from semloc_logs.evaluation.peers import runner
 from semloc_logs.settings import Settings
 from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
