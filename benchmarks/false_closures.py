@@ -30,7 +30,7 @@ from semloc_logs.engines.engine import single_threaded
 from semloc_logs.evaluation.calibration import SURE, answers, decided_by, read_judged, recall_at
 from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
 from semloc_logs.settings import load
-from semloc_logs.stages import close, describe, fuse, session_name
+from semloc_logs.stages.pipeline import close, describe, fuse, session_name
 from semloc_logs.tables.table import read_metadata
 from semloc_logs.workspace import Workspace
 

@@ -15,7 +15,7 @@ from semloc_logs.engines import make_engine
 from semloc_logs.evaluation.calibration import judge_town, read_judged
 from semloc_logs.settings import load
 from semloc_logs.simulation.sessions import simulate_sessions
-from semloc_logs.stages import close, describe, fuse
+from semloc_logs.stages.pipeline import close, describe, fuse
 from semloc_logs.tables.table import read_metadata
 from semloc_logs.workspace import Workspace
 

@@ -46,7 +46,7 @@ def command(
     chosen = [m for m, given in (("copy", output is not None), ("in-place", in_place), ("sidecar", sidecar is not None)) if given]
     if len(chosen) != 1:
         raise click.UsageError("Give exactly one of -o OUT.mcap, --in-place and --sidecar OUT.mcap.")
-    from semloc_logs.stages import annotate
+    from semloc_logs.stages.pipeline import annotate
     from semloc_logs.workspace import Workspace
 
     made = annotate(log, Workspace(work), settings, output=output or sidecar, mode=chosen[0], overwrite=overwrite, session=session)

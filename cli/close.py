@@ -38,7 +38,7 @@ def command(
     Example:  semloc close -w work --query tuesday --target monday --query-every 5
     """
     from semloc_logs.closures.closure_tables import read_closures
-    from semloc_logs.stages import close
+    from semloc_logs.stages.pipeline import close
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

@@ -31,7 +31,7 @@ def command(output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, 
     """
     from semloc_logs.evaluation.truth import evaluate_closures
     from semloc_logs.simulation.demo import simulate_demo
-    from semloc_logs.stages import run
+    from semloc_logs.stages.pipeline import run
     from semloc_logs.workspace import Workspace
 
     settings = settings.model_copy(update={"query": settings.query.model_copy(update={"every": QUERY_EVERY})})

@@ -25,7 +25,7 @@ def command(sessions: tuple[str, ...], work: Path, overwrite: bool, as_json: boo
     \b
     Example:  semloc describe -w work monday tuesday
     """
-    from semloc_logs.stages import describe
+    from semloc_logs.stages.pipeline import describe
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

@@ -39,7 +39,7 @@ def command(
     \b
     Example:  semloc fuse monday_0.mcap monday_1.mcap -w work --session monday
     """
-    from semloc_logs.stages import fuse, session_name
+    from semloc_logs.stages.pipeline import fuse, session_name
     from semloc_logs.workspace import Workspace
 
     name = checked_name(session or session_name(logs[0]))

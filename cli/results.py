@@ -11,7 +11,7 @@ import click
 from .console import console
 
 if TYPE_CHECKING:
-    from semloc_logs.stages import Report
+    from semloc_logs.stages.pipeline import Report
     from semloc_logs.workspace import Workspace
 
 SHOWN = 20  # rows of a table; files have them all
@@ -19,7 +19,7 @@ SHOWN = 20  # rows of a table; files have them all
 
 def session_logs(logs: Iterable[Path]) -> dict[str, Sequence[Path]]:
     """Each log is a session; UsageError when two have the same name."""
-    from semloc_logs.stages import session_name
+    from semloc_logs.stages.pipeline import session_name
 
     out: dict[str, Sequence[Path]] = {}
     for log in logs:

@@ -50,7 +50,7 @@ def command(
     """
     sessions = session_logs(logs)
     given = poses.by_session(sessions)
-    from semloc_logs.stages import run
+    from semloc_logs.stages.pipeline import run
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

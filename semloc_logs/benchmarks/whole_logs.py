@@ -25,7 +25,7 @@ from semloc_logs.errors import SemlocError
 from semloc_logs.evaluation.truth import read_truth
 from semloc_logs.logs.session.session import open_session
 from semloc_logs.settings import Settings
-from semloc_logs.stages import describe, fuse, run, session_name
+from semloc_logs.stages.pipeline import describe, fuse, run, session_name
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.tables.table import read_metadata

@@ -12,10 +12,10 @@ import yaml
 from click.testing import CliRunner, Result
 from mcap.writer import Writer
 
-from semloc_logs import stages
 from semloc_logs.cli.main import program
 from semloc_logs.logs.annotation.annotate import AnnotateReport
-from semloc_logs.stages import Report
+from semloc_logs.stages import pipeline
+from semloc_logs.stages.pipeline import Report
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
 from semloc_logs.training.runs import Packed
@@ -55,8 +55,8 @@ def called(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str, Re
             seen.update(zip(names, args, strict=False), **options)
             return answer
 
-        monkeypatch.setattr(stages, f"_original_{stage}", getattr(stages, stage), raising=False)
-        monkeypatch.setattr(stages, stage, stand_in)
+        monkeypatch.setattr(pipeline, f"_original_{stage}", getattr(stages, stage), raising=False)
+        monkeypatch.setattr(pipeline, stage, stand_in)
         return seen
 
     _write_closures(Workspace(tmp_path / "work"))
@@ -309,7 +309,7 @@ def test_commands_that_open_a_log_repair_it_first(tmp_path: Path, monkeypatch: p
         repaired.append(path)
         return False
 
-    for module in ("semloc_logs.logs.annotation.annotate", "semloc_logs.stages"):
+    for module in ("semloc_logs.logs.annotation.annotate", "semloc_logs.stages.pipeline"):
         monkeypatch.setattr(f"{module}.recover", recover)
     log = _log(tmp_path / "a.mcap")
     done = semloc(*(a.format(log=log, work=tmp_path / "w") for a in args))

@@ -245,7 +245,7 @@ def test_which_session_a_trajectory_belongs_to(tmp_path: Path, monkeypatch: pyte
         seen.update(args[-1])
         raise SystemExit(9)
 
-    monkeypatch.setattr("semloc_logs.stages.run", run)
+    monkeypatch.setattr("semloc_logs.stages.pipeline.run", run)
     logs = ("run", tmp_path / "a.mcap", tmp_path / "b.bag", "-w", tmp_path / "w")
     assert semloc(*logs, "--poses", "x.tum").exit_code == 2
     assert semloc(*logs, "--poses", "c=x.tum").exit_code == 2

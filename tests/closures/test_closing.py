@@ -16,7 +16,7 @@ from semloc_logs.engines import make_engine
 from semloc_logs.evaluation.truth import Evaluation, Judged, evaluate_closures
 from semloc_logs.settings import load
 from semloc_logs.simulation.sessions import simulate_sessions
-from semloc_logs.stages import run
+from semloc_logs.stages.pipeline import run
 from semloc_logs.workspace import Workspace
 
 POSES = ("/odometry", "/gnss", "/imu")
