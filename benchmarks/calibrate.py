@@ -1,4 +1,4 @@
-"""Make semloc_logs/closures/calibration.json again, from towns that no training has seen.
+"""Make semloc_logs/closures/acceptance/calibration.json again, from towns that no training has seen.
 
     python benchmarks/calibrate.py collect DIR [--drives FOLDER] [--only TOWN]... [--jobs N]    simulate, ask, judge; resumes
     python benchmarks/calibrate.py fit DIR [--install]                                          fit and report; seconds

@@ -1,38 +1,46 @@
 """One import direction, read from the source: a module imports only what stands before it in the story."""
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+# rooms in the order of the story; a room imports only what stands above it
 ORDER = [
     "errors",
     "schemas",
-    "bits",
-    "geometry",
     "settings",
-    "contracts",
+    "workspace",
+    "numerics",
     "tables",
     "frames",
-    "workspace",
     "logs",
     "labels",
     "voxels",
+    "mapping",
     "subvolumes",
     "words",
     "alignment",
     "closures",
-    "simulation",
-    "evaluation",
+    "pictures",
     "exports",
     "engines",
-    "learning",
     "stages",
-    "profiling",
+    "simulation",
+    "training",
+    "evaluation",
+    "benchmarks",
 ]
-# the words are learned from descriptors, and a submap's words are written in one task: words may look at subvolumes, not the reverse
+# sub-rooms and modules of a room that stands in an order of its own; what is not named stands last
+INNER_ORDER = {
+    "logs": ["log", "problems", "roles", "messages", "containers", "poses", "sensors", "session", "annotation"],
+    "simulation": ["conditions", "meshes", "town", "sensors", "drives", "output", "sessions", "demo"],
+    "closures": ["query", "acceptance", "database", "matching", "closure_tables"],
+    "benchmarks": ["peers", "descriptors", "labels", "localisation", "speed"],
+}
 SOURCES = sorted((ROOT / "semloc_logs").rglob("*.py"))
 CLI = sorted((ROOT / "cli").rglob("*.py"))
 
@@ -51,18 +59,37 @@ def _noun(path: Path) -> str:
     return relative.parts[0].removesuffix(".py")
 
 
+def _place(parts: Sequence[str]) -> tuple[int, int]:
+    """Where a module stands, by the parts of its name below the package: in the order of rooms, and within its room."""
+    room, *rest = parts
+    inner = INNER_ORDER.get(room, [])
+    return ORDER.index(room), inner.index(rest[0]) if rest and rest[0] in inner else len(inner)
+
+
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_module_imports_only_what_stands_before_it(path: Path) -> None:
-    here = _noun(path)
-    if here == "__init__":
+    here = path.relative_to(ROOT / "semloc_logs").with_suffix("").parts
+    if here == ("__init__",):
         assert not [m for m, _ in _imports(path) if m.startswith("semloc_logs")]
         return
     for module, level in _imports(path):
         assert level == 0, f"{path} imports relatively"
-        parts = module.split(".")
-        if parts[0] == "semloc_logs" and len(parts) > 1:
-            assert parts[1] in ORDER, f"{path} imports {module}, which has no place in the order"
-            assert ORDER.index(parts[1]) <= ORDER.index(here), f"{path} imports {module}, which stands behind it"
+        package, *parts = module.split(".")
+        if package == "semloc_logs" and parts:
+            assert parts[0] in ORDER, f"{path} imports {module}, which has no place in the order"
+            assert _place(parts) <= _place(here), f"{path} imports {module}, which stands behind it"
+
+
+@pytest.mark.parametrize("room", sorted(INNER_ORDER))
+def test_the_order_within_a_room_names_what_is_there(room: str) -> None:
+    there = {p.stem if p.suffix else p.name for p in (ROOT / "semloc_logs" / room).iterdir()}
+    assert set(INNER_ORDER[room]) <= there
+
+
+def test_modules_do_not_import_each_other_in_circles() -> None:
+    names = {".".join(("semloc_logs", *p.relative_to(ROOT / "semloc_logs").with_suffix("").parts)): p for p in SOURCES}
+    graph = {name: {m for m, _ in _imports(path) if m in names} for name, path in names.items()}
+    assert tuple(TopologicalSorter(graph).static_order())
 
 
 def test_every_module_has_a_place() -> None:

@@ -1,1 +1,1 @@
-"""benchmarks."""
+"""What `semloc benchmark` runs, one folder a subject."""

@@ -1,1 +1,1 @@
-"""mapping."""
+"""Log -> session map: keyframes, levelling, ground, submaps (paper 3.1)."""

@@ -1,1 +1,1 @@
-"""pictures."""
+"""Everything that is drawn: maps, closures, completed subvolumes, reliability diagrams."""

@@ -1,1 +1,1 @@
-"""stages."""
+"""The stages of the pipeline: each reads files of the one before and writes its own."""

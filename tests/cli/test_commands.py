@@ -51,11 +51,11 @@ def called(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str, Re
         seen: dict[str, Any] = {}
 
         def stand_in(*args: Any, **options: Any) -> Any:
-            names = getattr(stages, f"_original_{stage}").__code__.co_varnames
+            names = getattr(pipeline, f"_original_{stage}").__code__.co_varnames
             seen.update(zip(names, args, strict=False), **options)
             return answer
 
-        monkeypatch.setattr(pipeline, f"_original_{stage}", getattr(stages, stage), raising=False)
+        monkeypatch.setattr(pipeline, f"_original_{stage}", getattr(pipeline, stage), raising=False)
         monkeypatch.setattr(pipeline, stage, stand_in)
         return seen
 

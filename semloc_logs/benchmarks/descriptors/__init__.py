@@ -1,1 +1,1 @@
-"""descriptors."""
+"""How well descriptors complete and are found again."""

@@ -1,1 +1,1 @@
-"""labels."""
+"""Classes from geometry and simulated sweeps against labelled logs."""

@@ -1,1 +1,1 @@
-"""localisation."""
+"""Whole localisation beside its peers in an unseen simulated city."""

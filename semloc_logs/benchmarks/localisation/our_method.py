@@ -114,9 +114,9 @@ class OurTask:
         if self.system.hypotheses == "words":
             return nullcontext()
         if self.system.hypotheses == "sweep":
-            return patch.object(closing, "match_words", sweep_words)
+            return patch.object(matching, "match_words", sweep_words)
         most = self.settings.closures.hypotheses if self.system.hypotheses == "some" else None
-        return patch.object(closing, "find_hypotheses", partial(grid_hypotheses, most=most))
+        return patch.object(matching, "find_hypotheses", partial(grid_hypotheses, most=most))
 
     def _ask(self, database: Database, world: World, keyframe: int) -> tuple[float, list[matching.Alignment]]:
         begin = time.perf_counter()

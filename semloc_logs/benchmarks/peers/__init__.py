@@ -1,1 +1,1 @@
-"""peers."""
+"""Other systems, each run in an environment of its own."""

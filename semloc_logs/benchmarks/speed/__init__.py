@@ -1,1 +1,1 @@
-"""speed."""
+"""Figures of speed: reading, fusion, encoder, search, verification."""

@@ -1,1 +1,1 @@
-"""acceptance."""
+"""Which alignments are loop closures: probability, consistency, ambiguity."""

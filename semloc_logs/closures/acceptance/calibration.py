@@ -154,7 +154,7 @@ class Model:
 @cache
 def shipped() -> Model:
     """The calibration in the package; ``benchmarks/calibrate.py`` makes it."""
-    content = json.loads(files("semloc_logs.closures").joinpath("calibration.json").read_text())
+    content = json.loads(files("semloc_logs.closures.acceptance").joinpath("calibration.json").read_text())
     return Model(
         Calibration.from_json(content["alone"], FEATURES),
         Calibration.from_json(content["near"], TOGETHER),

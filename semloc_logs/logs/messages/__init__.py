@@ -1,1 +1,1 @@
-"""messages."""
+"""Messages -> frames: one small converter a message type."""

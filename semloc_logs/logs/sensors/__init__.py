@@ -1,1 +1,1 @@
-"""sensors."""
+"""Sweeps, depth images and stereo pairs -> points."""

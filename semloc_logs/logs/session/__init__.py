@@ -1,1 +1,1 @@
-"""session."""
+"""One or several logs read once, as clouds with poses in bounded memory."""

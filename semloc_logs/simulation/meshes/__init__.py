@@ -1,1 +1,1 @@
-"""meshes."""
+"""Triangle meshes of what stands in a town."""

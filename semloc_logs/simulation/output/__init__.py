@@ -1,1 +1,1 @@
-"""output."""
+"""Simulated drives as logs."""

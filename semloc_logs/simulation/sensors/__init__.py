@@ -1,1 +1,1 @@
-"""sensors."""
+"""What LIDARs and cameras measure in a world."""

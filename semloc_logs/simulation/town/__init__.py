@@ -1,1 +1,1 @@
-"""town."""
+"""Roads, ground, plots and rooms: worlds put together from meshes."""
