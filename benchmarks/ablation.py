@@ -1,9 +1,11 @@
-"""What each change to the paper's network is worth: the same shards, the same processor time, one row a variant (paper 3.2, 4.5).
+"""What each change to the paper's network is worth: the same shards, the same processor time, one
+row a variant (paper 3.2, 4.5).
 
-    python benchmarks/ablation.py SHARDS WORK --minutes 5 [--only NAME]...
+python benchmarks/ablation.py SHARDS WORK --minutes 5 [--only NAME]...
 
-SHARDS is a folder of packed pairs (`semloc train` keeps them beside its checkpoint). Each row trains for so many minutes of processor
-time on one core, with a learning rate that ends in that time, and prints a JSON line; finished rows are not trained again.
+SHARDS is a folder of packed pairs (`semloc train` keeps them beside its checkpoint). Each row
+trains for so many minutes of processor time on one core, with a learning rate that ends in that
+time, and prints a JSON line; finished rows are not trained again.
 """
 
 from __future__ import annotations
@@ -23,7 +25,16 @@ from torch.nn import functional as F
 
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.cut import CLASSES, SIZE
-from semloc_logs.subvolumes.network import CHANNELS, Completion, Decoder, Encoder, Turning, channels_last, halve, latent_mean
+from semloc_logs.subvolumes.network import (
+    CHANNELS,
+    Completion,
+    Decoder,
+    Encoder,
+    Turning,
+    channels_last,
+    halve,
+    latent_mean,
+)
 from semloc_logs.training.checkpoints import save_weights
 from semloc_logs.training.completion_scores import completion_scores
 from semloc_logs.training.network_training import Progress, train
@@ -39,7 +50,8 @@ class Row:
     adam: bool = True
     norm: bool = False
     turning: bool = True  # layers that turn with their input
-    patch: bool = True  # the first block maps 2x2x2 embedded voxels at once; else convolves one-hot voxels
+    # the first block maps 2x2x2 embedded voxels at once; else convolves one-hot voxels
+    patch: bool = True
     wide: bool = True  # with a margin, fully convolutional, nine subvolumes of a pair
     contrastive: float = 10.0
     reconstruction: float = 10.0
@@ -47,7 +59,14 @@ class Row:
     batch: int = 12
 
 
-PAPER = {"adam": False, "turning": False, "patch": False, "wide": False, "contrastive": 0.0, "batch": 32}
+PAPER = {
+    "adam": False,
+    "turning": False,
+    "patch": False,
+    "wide": False,
+    "contrastive": 0.0,
+    "batch": 32,
+}
 ROWS = {
     "all": Row(),
     "paper": Row(**PAPER),
@@ -69,10 +88,13 @@ ROWS = {
 class _Fixed(nn.Module):
     """A layer as any other: filters that do not turn."""
 
-    def __init__(self, inputs: int, outputs: int, size: tuple[int, int, int], *, group_in: bool = True) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, size: tuple[int, int, int], *, group_in: bool = True
+    ) -> None:
         super().__init__()
         layer = nn.Conv3d(inputs, outputs, size)
-        self.weight, self.bias = layer.weight, layer.bias
+        self.weight = layer.weight
+        self.bias = layer.bias
 
     def filters(self) -> tuple[Tensor, Tensor | None]:
         return self.weight, self.bias
@@ -88,15 +110,23 @@ class _Ablated(Encoder):
         if not row.patch:
             self.first = layer(CLASSES[variant] + 3, CHANNELS[0], (3, 3, 3), group_in=False)
             self.embedding.weight.requires_grad_(False)
-        self.norms = nn.ModuleList(nn.BatchNorm3d(c) if row.norm else nn.Identity() for c in CHANNELS)
+        self.norms = nn.ModuleList(
+            nn.BatchNorm3d(c) if row.norm else nn.Identity() for c in CHANNELS
+        )
 
     def first_block(self, codes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         if self.row.patch:
             return super().first_block(codes, weight, bias)
-        reduced = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else torch.float32
+        reduced = (
+            torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else torch.float32
+        )
         inputs = CLASSES[self.variant] + 3
         voxels = F.one_hot(codes.long(), inputs).to(reduced).permute(0, 4, 1, 2, 3)
-        return halve(F.conv3d(voxels, weight.reshape(-1, 3, 3, 3, inputs).permute(0, 4, 1, 2, 3), bias, padding=1))
+        return halve(
+            F.conv3d(
+                voxels, weight.reshape(-1, 3, 3, 3, inputs).permute(0, 4, 1, 2, 3), bias, padding=1
+            )
+        )
 
     def forward(self, codes: Tensor) -> Tensor:
         if self.row.wide:
@@ -134,13 +164,23 @@ def _optimiser(row: Row) -> Callable[[Completion], torch.optim.Optimizer]:
     return lambda model: torch.optim.Adadelta(model.parameters(), lr=1.0, rho=0.95, eps=1e-8)
 
 
-def run(name: str, shards: list[Path], work: Path, minutes: float, variant: str, seed: int) -> dict[str, Any]:
+def run(
+    name: str, shards: list[Path], work: Path, minutes: float, variant: str, seed: int
+) -> dict[str, Any]:
     """Train one row and measure it."""
     row = ROWS[name]
 
     def training(steps: int) -> Any:
-        options = {"batch": row.batch, "samples": steps * row.batch * 9, "latent": row.latent, "seed": seed}
-        options |= {"contrastive_weight": row.contrastive, "reconstruction_weight": row.reconstruction}
+        options = {
+            "batch": row.batch,
+            "samples": steps * row.batch * 9,
+            "latent": row.latent,
+            "seed": seed,
+        }
+        options |= {
+            "contrastive_weight": row.contrastive,
+            "reconstruction_weight": row.reconstruction,
+        }
         return Settings().training.model_copy(update=options)
 
     def network(variant: str, latent: int) -> Completion:
@@ -154,11 +194,24 @@ def run(name: str, shards: list[Path], work: Path, minutes: float, variant: str,
         def tick(_: Progress) -> None:
             clock.append(time.process_time())
 
-        train(variant, shards[:-HELD_OUT], training(20), stem.with_suffix(".trial"), tick, network=network, optimiser_of=_optimiser(row))
+        train(
+            variant,
+            shards[:-HELD_OUT],
+            training(20),
+            stem.with_suffix(".trial"),
+            tick,
+            network=network,
+            optimiser_of=_optimiser(row),
+        )
         pace.write_text(str(max(50, int(60 * minutes / np.mean(np.diff(clock[4:]))))))
     steps = int(pace.read_text())
     model = train(
-        variant, shards[:-HELD_OUT], training(steps), stem.with_suffix(".checkpoint"), network=network, optimiser_of=_optimiser(row)
+        variant,
+        shards[:-HELD_OUT],
+        training(steps),
+        stem.with_suffix(".checkpoint"),
+        network=network,
+        optimiser_of=_optimiser(row),
     )
     assert model is not None
     model.eval()
@@ -167,7 +220,15 @@ def run(name: str, shards: list[Path], work: Path, minutes: float, variant: str,
     seen = steps * row.batch * (9 if row.wide else 1)
     scores = completion_scores(model, pairs)  # type: ignore[arg-type]
     save_weights(stem.with_suffix(".safetensors"), model, {"row": name})
-    return {"row": name, "variant": variant, "minutes": minutes, "seed": seed, "steps": steps, "subvolumes": seen, **scores}
+    return {
+        "row": name,
+        "variant": variant,
+        "minutes": minutes,
+        "seed": seed,
+        "steps": steps,
+        "subvolumes": seen,
+        **scores,
+    }
 
 
 def main() -> None:
@@ -183,7 +244,12 @@ def main() -> None:
     options.work.mkdir(parents=True, exist_ok=True)
     shards = sorted(options.shards.glob("*.parquet"))
     for name in options.only or ROWS:
-        print(json.dumps(run(name, shards, options.work, options.minutes, options.variant, options.seed)), flush=True)
+        print(
+            json.dumps(
+                run(name, shards, options.work, options.minutes, options.variant, options.seed)
+            ),
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""Make semloc_logs/closures/acceptance/calibration.json again, from towns that no training has seen.
+"""Make semloc_logs/closures/acceptance/calibration.json again, from towns that no training has
+seen.
 
     python benchmarks/calibrate.py collect DIR [--drives FOLDER] [--only TOWN]... [--jobs N]    simulate, ask, judge; resumes
     python benchmarks/calibrate.py fit DIR [--install]                                          fit and report; seconds
 
-Collecting writes DIR/TOWN/judged.parquet, all alignments of a town with their features and errors; fitting reads these alone. It writes
-DIR/calibration.json and DIR/reliability.png; --install also replaces the calibration of the package.
+Collecting writes DIR/TOWN/judged.parquet, all alignments of a town with their features and errors;
+fitting reads these alone. It writes DIR/calibration.json and DIR/reliability.png; --install also
+replaces the calibration of the package.
 """
 
 from __future__ import annotations
@@ -17,7 +19,13 @@ from towns import Place, Town, collect, short_towns
 
 import semloc_logs.closures
 from semloc_logs.engines.engine import single_threaded
-from semloc_logs.evaluation.calibration import calibration_json, fit, read_judged, recall_at, reliability
+from semloc_logs.evaluation.calibration import (
+    calibration_json,
+    fit,
+    read_judged,
+    recall_at,
+    reliability,
+)
 from semloc_logs.pictures.reliability_diagram import draw_reliability
 
 LATER = ("summer", "autumn", "snow")
@@ -28,11 +36,28 @@ TOWNS = (
     Town("sparse", 4, ("vlp16",), noise=0.12, seasons=LATER, drift=0.015),
     Town("repeating-geometry", 5, ("hdl64",), "geometry", repeating=True),
     Town("stereo", 6, ("stereo",), noise=0.12),
-    Town("there-and-back", 7, ("hdl64",), noise=0.08, trajectory="00", start=300.0, seasons=("summer", "snow"), length=160.0),
+    Town(
+        "there-and-back",
+        7,
+        ("hdl64",),
+        noise=0.08,
+        trajectory="00",
+        start=300.0,
+        seasons=("summer", "snow"),
+        length=160.0,
+    ),
     Town("mixed", 8, ("depth", "hdl32"), noise=0.08, sessions=2),
     Town("repeating-sparse", 9, ("vlp16",), noise=0.12, repeating=True, drift=0.015),
     Town("uniform", 10, ("hdl32",), "uniform"),
-    Town("there-and-back-geometry", 11, ("hdl32",), "geometry", trajectory="05", start=200.0, length=160.0),
+    Town(
+        "there-and-back-geometry",
+        11,
+        ("hdl32",),
+        "geometry",
+        trajectory="05",
+        start=200.0,
+        length=160.0,
+    ),
     Town("stereo-lidar", 12, ("stereo", "vlp32"), noise=0.12, sessions=2),
     Town("repeating-uniform", 13, ("vlp32",), "uniform", repeating=True),
     Town("repeating-stereo", 14, ("stereo", "hdl32"), "geometry", repeating=True, sessions=2),
@@ -45,7 +70,11 @@ TOWNS = (
 def ask(args: argparse.Namespace) -> None:
     """Simulate, fuse, describe, ask and judge the towns that have no table yet."""
     single_threaded()
-    collect(Place(args.dir, args.drives), [town for town in TOWNS if not args.only or town.name in args.only], args.jobs)
+    collect(
+        Place(args.dir, args.drives),
+        [town for town in TOWNS if not args.only or town.name in args.only],
+        args.jobs,
+    )
 
 
 def report(args: argparse.Namespace) -> None:
@@ -73,11 +102,17 @@ def report(args: argparse.Namespace) -> None:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     commands = parser.add_subparsers(required=True)
     first = commands.add_parser("collect")
     first.add_argument("dir", type=Path)
-    first.add_argument("--drives", type=Path, help="folder of kitti_00.txt and kitti_05.txt; without it their towns are left out")
+    first.add_argument(
+        "--drives",
+        type=Path,
+        help="folder of kitti_00.txt and kitti_05.txt; without it their towns are left out",
+    )
     first.add_argument("--only", action="append", metavar="TOWN")
     first.add_argument("--jobs", type=int, default=1)
     first.set_defaults(run=ask)

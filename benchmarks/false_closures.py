@@ -1,13 +1,15 @@
-"""False closures at the defaults: thousands of queries in towns that look alike, and all pairs of recorded logs.
+"""False closures at the defaults: thousands of queries in towns that look alike, and all pairs of
+recorded logs.
 
     python benchmarks/false_closures.py towns DIR [--queries 5000] [--drives FOLDER] [--jobs N]     simulate, ask, judge; resumes
     python benchmarks/false_closures.py logs DIR LOGS [--small NAME]... [--jobs N]
 
-Two of three towns are cities whose blocks are copies of one another. Then come towns of cameras, most of them driven there and back along
-recorded drives, where these are in FOLDER. Their tables DIR/TOWN/judged.parquet hold features, so after a new
-calibration the same command counts again without asking again. LOGS is a folder of logs, with *_truth.json for those whose truth is known
-(those of one file are of one place; a closure between logs of different places is false). Each pair is asked with the labels of the log,
-with those from geometry and without any.
+Two of three towns are cities whose blocks are copies of one another. Then come towns of cameras,
+most of them driven there and back along recorded drives, where these are in FOLDER. Their tables
+DIR/TOWN/judged.parquet hold features, so after a new calibration the same command counts again
+without asking again. LOGS is a folder of logs, with *_truth.json for those whose truth is known
+(those of one file are of one place; a closure between logs of different places is false). Each pair
+is asked with the labels of the log, with those from geometry and without any.
 """
 
 from __future__ import annotations
@@ -37,14 +39,49 @@ from semloc_logs.workspace import Workspace
 FIRST, MOST = 30, 60  # numbers of the towns: calibration has those before
 CAMERAS = (  # stereo cameras there and back along recorded drives see the other sides of things
     Town("camera-back-00", 16, ("stereo",), noise=0.12, trajectory="00", start=700.0, length=240.0),
-    Town("camera-back-05", 17, ("stereo",), "geometry", noise=0.12, trajectory="05", start=500.0, length=240.0),
-    Town("camera-back-06", 66, ("stereo",), "geometry", noise=0.1, trajectory="06", start=300.0, length=240.0),
+    Town(
+        "camera-back-05",
+        17,
+        ("stereo",),
+        "geometry",
+        noise=0.12,
+        trajectory="05",
+        start=500.0,
+        length=240.0,
+    ),
+    Town(
+        "camera-back-06",
+        66,
+        ("stereo",),
+        "geometry",
+        noise=0.1,
+        trajectory="06",
+        start=300.0,
+        length=240.0,
+    ),
     Town("camera-back-07", 67, ("stereo",), noise=0.1, trajectory="07", length=240.0),
     Town("camera-back-09", 69, ("stereo",), noise=0.1, trajectory="09", start=400.0, length=240.0),
     Town("camera-1", 81, ("stereo",), noise=0.1, sessions=4, length=200.0),
-    Town("camera-back-05-far", 82, ("stereo",), noise=0.1, trajectory="05", start=1200.0, length=240.0),
+    Town(
+        "camera-back-05-far",
+        82,
+        ("stereo",),
+        noise=0.1,
+        trajectory="05",
+        start=1200.0,
+        length=240.0,
+    ),
     Town("camera-2", 83, ("stereo",), "geometry", noise=0.1, sessions=4, length=200.0),
-    Town("camera-back-00-far", 84, ("stereo",), "geometry", noise=0.1, trajectory="00", start=1900.0, length=240.0),
+    Town(
+        "camera-back-00-far",
+        84,
+        ("stereo",),
+        "geometry",
+        noise=0.1,
+        trajectory="00",
+        start=1900.0,
+        length=240.0,
+    ),
     Town("camera-lidar", 85, ("stereo", "hdl32"), noise=0.1, sessions=2, length=200.0),
     Town("camera-depth-lidar", 86, ("depth", "vlp32"), noise=0.1, sessions=2, length=200.0),
 )
@@ -55,12 +92,18 @@ SMALL = ("room_*", "euroc_*")
 def ask_towns(args: argparse.Namespace) -> None:
     """Ask, then count under the calibration of the package."""
     place = Place(args.dir, args.drives)
-    paths = collect(place, short_towns(FIRST, MOST), args.jobs, args.queries) + collect(place, CAMERAS, args.jobs)
+    paths = collect(place, short_towns(FIRST, MOST), args.jobs, args.queries) + collect(
+        place, CAMERAS, args.jobs
+    )
     judged = read_judged(paths)
     p = decided_by(shipped(), judged)
     print(f"{sum(read_metadata(path)['queries'] for path in paths)} queries in {len(paths)} towns")
     cameras = np.array([town.startswith("camera") for town in judged.town], bool)
-    kinds = {"ordinary towns": ~judged.copies & ~cameras, "cities of copies": judged.copies, "towns of cameras": cameras}
+    kinds = {
+        "ordinary towns": ~judged.copies & ~cameras,
+        "cities of copies": judged.copies,
+        "towns of cameras": cameras,
+    }
     for name, rows in ((n, r) for n, r in kinds.items() if r.any()):
         for line in recall_at(judged.part(rows), p[rows]):
             print(f"  {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
@@ -77,26 +120,38 @@ def ask_towns(args: argparse.Namespace) -> None:
 
 def logs_of(folder: Path) -> list[Path]:
     """Every log of a folder."""
-    return sorted(p for p in folder.iterdir() if p.suffix in (".mcap", ".bag", ".db3") or (p / "metadata.yaml").exists())
+    return sorted(
+        p
+        for p in folder.iterdir()
+        if p.suffix in (".mcap", ".bag", ".db3") or (p / "metadata.yaml").exists()
+    )
 
 
 def ask_logs(args: argparse.Namespace) -> None:
-    """Every log against every other one, by label source: at 0.30 m voxels all of them, at 0.05 m the small ones."""
+    """Every log against every other one, by label source: at 0.30 m voxels all of them, at 0.05 m
+    the small ones.
+    """
     engine = make_engine("processes", args.jobs)
     every = logs_of(args.logs)
-    small = [log for log in every if any(fnmatch.fnmatch(log.name, name) for name in args.small or SMALL)]
+    small = [
+        log for log in every if any(fnmatch.fnmatch(log.name, name) for name in args.small or SMALL)
+    ]
     wrong = 0
     for source in SOURCES:
         for voxel, logs in ((0.30, every), (0.05, small)):
             if len(logs) > 1:
                 work = Workspace(args.dir / f"{source}-{voxel:g}")
-                ask_pairs(work, logs, {"labels.source": source, "fusion.voxel_size": str(voxel)}, engine)
+                ask_pairs(
+                    work, logs, {"labels.source": source, "fusion.voxel_size": str(voxel)}, engine
+                )
                 wrong += count_pairs(work, args.logs, f"{source}, {voxel:g} m")
     engine.close()
     print(f"{wrong} false closures")
 
 
-def ask_pairs(work: Workspace, logs: list[Path], assignments: dict[str, str], engine: Engine) -> None:
+def ask_pairs(
+    work: Workspace, logs: list[Path], assignments: dict[str, str], engine: Engine
+) -> None:
     """Fuse, describe and close; a log that cannot be fused is named and left out."""
     settings = load(assignments=assignments).resolved()
 
@@ -128,17 +183,26 @@ def count_pairs(work: Workspace, logs: Path, title: str) -> int:
         false = sum(j.correct is False for j in judged)
         errors = [j.error_m for j in judged if j.error_m is not None]
         wrong += false
-        figures = f"error median {np.median(errors):.3f} m, worst {max(errors):.3f} m" if errors else "truth unknown"
+        figures = (
+            f"error median {np.median(errors):.3f} m, worst {max(errors):.3f} m"
+            if errors
+            else "truth unknown"
+        )
         print(f"  {query} in {target}: {len(rows)} closures, {false} false, {figures}")
     return wrong
 
 
-def places(logs: Path, sessions: Mapping[str, SessionMap]) -> tuple[dict[str, Path], dict[str, TrueTrack]]:
+def places(
+    logs: Path, sessions: Mapping[str, SessionMap]
+) -> tuple[dict[str, Path], dict[str, TrueTrack]]:
     """The truth file that knows each session, which stands for its place, and the true tracks."""
     place: dict[str, Path] = {}
     tracks: dict[str, TrueTrack] = {}
     for truth in sorted(logs.glob("*_truth.json")):
-        if any(Path(name).stem in sessions or name in sessions for name in json.loads(truth.read_text())):
+        if any(
+            Path(name).stem in sessions or name in sessions
+            for name in json.loads(truth.read_text())
+        ):
             found = read_truth(truth, sessions)
             place |= dict.fromkeys(found, truth)
             tracks |= found
@@ -148,17 +212,26 @@ def places(logs: Path, sessions: Mapping[str, SessionMap]) -> tuple[dict[str, Pa
 def main() -> None:
     """The command line."""
     single_threaded()
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     commands = parser.add_subparsers(required=True)
     first = commands.add_parser("towns")
     first.add_argument("dir", type=Path)
     first.add_argument("--queries", type=int, default=5000)
-    first.add_argument("--drives", type=Path, help="folder of kitti_00.txt and others: towns along these as well")
+    first.add_argument(
+        "--drives", type=Path, help="folder of kitti_00.txt and others: towns along these as well"
+    )
     first.set_defaults(run=ask_towns)
     second = commands.add_parser("logs")
     second.add_argument("dir", type=Path)
     second.add_argument("logs", type=Path)
-    second.add_argument("--small", action="append", metavar="NAME", help="logs also asked at 0.05 m voxels; default room_* and euroc_*")
+    second.add_argument(
+        "--small",
+        action="append",
+        metavar="NAME",
+        help="logs also asked at 0.05 m voxels; default room_* and euroc_*",
+    )
     second.set_defaults(run=ask_logs)
     for command in (first, second):
         command.add_argument("--jobs", type=int, default=2)

@@ -1,8 +1,10 @@
-"""Fuzzes the message decoders and the containers: python benchmarks/fuzz.py [--seed N] [--minutes M] [--only decoders|layouts|logs].
+"""Fuzzes the message decoders and the containers: python benchmarks/fuzz.py [--seed N] [--minutes
+M] [--only decoders|layouts|logs].
 
-Valid messages of every type that can be decoded, in cdr, ros1, protobuf and json, and small valid logs are damaged; the same seed gives the
-same inputs. What comes out must be frames or a LogError, in seconds. Anything else, and any warning of numpy, is kept in a folder with
-the command that repeats it; exit code 1 when there is such a finding.
+Valid messages of every type that can be decoded, in cdr, ros1, protobuf and json, and small valid
+logs are damaged; the same seed gives the same inputs. What comes out must be frames or a LogError,
+in seconds. Anything else, and any warning of numpy, is kept in a folder with the command that
+repeats it; exit code 1 when there is such a finding.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problems
 
-LIMIT_S = {"decoders": 2.0, "layouts": 2.0, "logs": 10.0}  # of processor time; a log's twenty definitions take one of them
+# of processor time; a log's twenty definitions take one of them
+LIMIT_S = {"decoders": 2.0, "layouts": 2.0, "logs": 10.0}
 MEMORY = 2 << 30
 
 
@@ -43,7 +46,8 @@ def _alarm(_: int, __: FrameType | None) -> None:
     raise TooSlowError
 
 
-_decoders: dict[int, tuple[Decoder, Problems]] = {}  # by definition: to parse those takes longer than to decode
+# by definition: to parse those takes longer than to decode
+_decoders: dict[int, tuple[Decoder, Problems]] = {}
 
 
 def decode(message: Message, *, is_known: bool = False) -> None:
@@ -81,7 +85,9 @@ def read(files: dict[str, bytes]) -> None:
 
 
 def one(seed: int, only: str | None) -> tuple[str, float, Callable[[], None], Any]:
-    """What the input of ``seed`` is called, how many seconds it may take, what tries it, and the input itself."""
+    """What the input of ``seed`` is called, how many seconds it may take, what tries it, and the
+    input itself.
+    """
     rng = random.Random(seed)
     kind = only or rng.choices(["decoders", "layouts", "logs"], [50, 30, 1])[0]
     if kind == "decoders":
@@ -91,24 +97,38 @@ def one(seed: int, only: str | None) -> tuple[str, float, Callable[[], None], An
         if not is_known:
             definition = message.definition
             text = damage(rng, definition.text) if definition.text else b""
-            message = message._replace(definition=type(definition)(definition.name, definition.encoding, text))
+            message = message._replace(
+                definition=type(definition)(definition.name, definition.encoding, text)
+            )
         return name, LIMIT_S[kind], lambda: decode(message, is_known=is_known), message
     if kind == "layouts":
         message = layout(rng)
-        return f"layout {message.encoding}", LIMIT_S[kind], lambda: decode(message, is_known=True), message
+        return (
+            f"layout {message.encoding}",
+            LIMIT_S[kind],
+            lambda: decode(message, is_known=True),
+            message,
+        )
     name, files = rng.choice(logs())
-    files = {part: damage(rng, content) if rng.random() < 0.8 else content for part, content in files.items()}
+    files = {
+        part: damage(rng, content) if rng.random() < 0.8 else content
+        for part, content in files.items()
+    }
     return name, LIMIT_S[kind], lambda: read(files), files
 
 
 def main() -> int:
     """Runs for the time asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0, help="the first input; each further one has the next number")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="the first input; each further one has the next number"
+    )
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--count", type=int, default=None, help="inputs instead of minutes")
     parser.add_argument("--only", choices=["decoders", "layouts", "logs"])
-    parser.add_argument("--keep", type=Path, default=Path("fuzz-findings"), help="folder for findings")
+    parser.add_argument(
+        "--keep", type=Path, default=Path("fuzz-findings"), help="folder for findings"
+    )
     options = parser.parse_args()
     warnings.simplefilter("error")
     messages(), logs()  # before memory is limited
@@ -117,9 +137,15 @@ def main() -> int:
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
     end = time.monotonic() + 60 * options.minutes
     found: Counter[str] = Counter()
-    slowest, largest, seed = (0.0, ""), (0.0, ""), options.seed
+    slowest = (0.0, "")
+    largest = (0.0, "")
+    seed = options.seed
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    while (seed < options.seed + options.count) if options.count is not None else (time.monotonic() < end):
+    while (
+        (seed < options.seed + options.count)
+        if options.count is not None
+        else (time.monotonic() < end)
+    ):
         name, limit_s, attempt, content = one(seed, options.only)
         signal.setitimer(signal.ITIMER_PROF, limit_s)
         start = time.process_time()
@@ -132,7 +158,10 @@ def main() -> int:
             found[key] += 1
             if found[key] == 1:
                 options.keep.mkdir(exist_ok=True)
-                text = "".join(traceback.format_exception(error)) + f"\n--seed {seed} --count 1 --only {options.only}\n{content!r}\n"
+                text = (
+                    "".join(traceback.format_exception(error))
+                    + f"\n--seed {seed} --count 1 --only {options.only}\n{content!r}\n"
+                )
                 (options.keep / f"{seed}.txt").write_text(text)
                 print(f"seed {seed}: {key}: {str(error)[:200]}", flush=True)
         finally:

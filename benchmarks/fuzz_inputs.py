@@ -1,4 +1,6 @@
-"""Inputs of the fuzzer: a valid message of every type that can be decoded, in every encoding; small logs; and ways to damage them."""
+"""Inputs of the fuzzer: a valid message of every type that can be decoded, in every encoding; small
+logs; and ways to damage them.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from semloc_logs.logs.log import Definition, Message
 from semloc_logs.logs.messages.decode import CONVERTERS
 
-ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
 _LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
 _LIVOX = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
 for _store in (ROS2, ROS1):
@@ -48,13 +51,20 @@ ROS1.register({"tf/msg/tfMessage": ROS2.fielddefs["tf2_msgs/msg/TFMessage"]})
 _PNG16 = bytes(cv2.imencode(".png", np.arange(64, dtype=np.uint16).reshape(8, 8) * 300)[1])
 _JPEG = bytes(cv2.imencode(".jpg", np.arange(768, dtype=np.uint8).reshape(16, 16, 3))[1])
 _RVL = struct.pack("<iffIII", 0, 100.0, 1.0, 3, 2, 0x60000000)
-_PICTURES = [("png", _PNG16), ("jpeg", _JPEG), ("32FC1; compressedDepth", _RVL[:12] + _PNG16), ("16UC1; compressedDepth rvl", _RVL)]
+_PICTURES = [
+    ("png", _PNG16),
+    ("jpeg", _JPEG),
+    ("32FC1; compressedDepth", _RVL[:12] + _PNG16),
+    ("16UC1; compressedDepth rvl", _RVL),
+]
 
 
 def _ros(store: Any, name: str, **values: Any) -> Any:
     """A message whose values are small but not empty."""
     fields = store.fielddefs[name][1]
-    return store.types[name](**{f: values[f] if f in values else _value(store, kind) for f, kind in fields})
+    return store.types[name](
+        **{f: values[f] if f in values else _value(store, kind) for f, kind in fields}
+    )
 
 
 def _value(store: Any, field: Any) -> Any:
@@ -65,7 +75,10 @@ def _value(store: Any, field: Any) -> Any:
         return "frame" if content[0] == "string" else False if content[0] == "bool" else 1
     (inner, what), length = content
     if inner == Nodetype.BASE and what[0] != "string":
-        return np.ones(length or 5, {"float64": "f8", "float32": "f4", "byte": "u1", "bool": "?"}.get(what[0], what[0]))
+        return np.ones(
+            length or 5,
+            {"float64": "f8", "float32": "f4", "byte": "u1", "bool": "?"}.get(what[0], what[0]),
+        )
     return [_value(store, (inner, what)) for _ in range(length or 2)]
 
 
@@ -75,9 +88,24 @@ def _ros_messages(store: Any) -> Iterator[tuple[str, Any]]:
             continue
         if name.endswith("/PointCloud2"):
             field = store.types["sensor_msgs/msg/PointField"]
-            fields = [field(name=n, offset=4 * k, datatype=d, count=1) for k, (n, d) in enumerate(zip("xyzt", (7, 7, 7, 6), strict=True))]
+            fields = [
+                field(name=n, offset=4 * k, datatype=d, count=1)
+                for k, (n, d) in enumerate(zip("xyzt", (7, 7, 7, 6), strict=True))
+            ]
             data = np.arange(96, dtype=np.uint8)
-            yield "/points", _ros(store, name, height=2, width=3, fields=fields, point_step=16, row_step=48, data=data)
+            yield (
+                "/points",
+                _ros(
+                    store,
+                    name,
+                    height=2,
+                    width=3,
+                    fields=fields,
+                    point_step=16,
+                    row_step=48,
+                    data=data,
+                ),
+            )
         elif name.endswith("/Image"):
             for topic, encoding, size in (
                 ("/image", "rgb8", 3),
@@ -86,11 +114,19 @@ def _ros_messages(store: Any) -> Iterator[tuple[str, Any]]:
                 ("/bayer", "bayer_rggb8", 1),
             ):
                 data = np.arange(16 * size, dtype=np.uint8)
-                yield topic, _ros(store, name, height=4, width=4, step=4 * size, encoding=encoding, data=data)
+                yield (
+                    topic,
+                    _ros(
+                        store, name, height=4, width=4, step=4 * size, encoding=encoding, data=data
+                    ),
+                )
         elif name.endswith("/CompressedImage"):
             for format_, content in _PICTURES:
                 topic = "/depth/compressedDepth" if "Depth" in format_ else "/image/compressed"
-                yield topic, _ros(store, name, format=format_, data=np.frombuffer(content, np.uint8))
+                yield (
+                    topic,
+                    _ros(store, name, format=format_, data=np.frombuffer(content, np.uint8)),
+                )
         elif name.endswith("/CustomMsg"):
             points = [_ros(store, name.replace("CustomMsg", "CustomPoint")) for _ in range(4)]
             yield "/livox", _ros(store, name, points=points)
@@ -104,11 +140,17 @@ def _foxglove() -> Iterator[Any]:
     for k, (name, kind) in enumerate(zip("xyzt", (7, 7, 7, 5), strict=True)):
         cloud.fields.add(name=name, offset=4 * k, type=kind)
     yield cloud
-    yield RawImage_pb2.RawImage(width=4, height=4, step=12, encoding="rgb8", data=bytes(48), frame_id="c")
-    yield RawImage_pb2.RawImage(width=4, height=4, step=8, encoding="16UC1", data=bytes(32), frame_id="c")
+    yield RawImage_pb2.RawImage(
+        width=4, height=4, step=12, encoding="rgb8", data=bytes(48), frame_id="c"
+    )
+    yield RawImage_pb2.RawImage(
+        width=4, height=4, step=8, encoding="16UC1", data=bytes(32), frame_id="c"
+    )
     for format_, content in _PICTURES[:2]:
         yield CompressedImage_pb2.CompressedImage(format=format_, data=content, frame_id="c")
-    yield CameraCalibration_pb2.CameraCalibration(width=4, height=4, K=[9, 0, 2, 0, 9, 2, 0, 0, 1], D=[0.1] * 5, P=[1] * 12, R=[1] * 9)
+    yield CameraCalibration_pb2.CameraCalibration(
+        width=4, height=4, K=[9, 0, 2, 0, 9, 2, 0, 0, 1], D=[0.1] * 5, P=[1] * 12, R=[1] * 9
+    )
     pose = PoseInFrame_pb2.PoseInFrame(frame_id="odom")
     pose.pose.position.x, pose.pose.orientation.w = 1, 1
     yield pose
@@ -144,15 +186,27 @@ def messages() -> list[tuple[str, Message]]:
     for encoding, store, language in (("cdr", ROS2, "ros2msg"), ("ros1", ROS1, "ros1msg")):
         for topic, m in _ros_messages(store):
             name = m.__msgtype__
-            data = bytes(store.serialize_cdr(m, name) if encoding == "cdr" else store.serialize_ros1(m, name))
-            text = store.generate_msgdef(name, ros_version=2 if encoding == "cdr" else 1)[0].encode()
+            data = bytes(
+                store.serialize_cdr(m, name) if encoding == "cdr" else store.serialize_ros1(m, name)
+            )
+            text = store.generate_msgdef(name, ros_version=2 if encoding == "cdr" else 1)[
+                0
+            ].encode()
             definitions = (_NOTHING, Definition(name, language, text))
-            found += [(f"{encoding} {name}", Message(topic, name, encoding, 1, data, d)) for d in definitions]
+            found += [
+                (f"{encoding} {name}", Message(topic, name, encoding, 1, data, d))
+                for d in definitions
+            ]
     for m in _foxglove():
         m.timestamp.FromNanoseconds(5) if "timestamp" in m.DESCRIPTOR.fields_by_name else None
         name = m.DESCRIPTOR.full_name
         definition = Definition(name, "protobuf", build_file_descriptor_set(m).SerializeToString())
-        found.append((f"protobuf {name}", Message("/t", name, "protobuf", 1, m.SerializeToString(), definition)))
+        found.append(
+            (
+                f"protobuf {name}",
+                Message("/t", name, "protobuf", 1, m.SerializeToString(), definition),
+            )
+        )
         text = json.dumps(_as_json(m)).encode()
         found.append((f"json {name}", Message("/t", name, "json", 1, text, _NOTHING)))
     return found
@@ -171,8 +225,17 @@ def logs() -> list[tuple[str, dict[str, bytes]]]:
                 for k, (_, m) in enumerate(messages()):
                     if m.encoding == "ros1":
                         continue
-                    schema = writer.register_schema(m.type, m.definition.encoding, m.definition.text) if m.definition.text else 0
-                    writer.add_message(writer.register_channel(f"{m.topic}{k}", m.encoding, schema), k, bytes(m.data), k)
+                    schema = (
+                        writer.register_schema(m.type, m.definition.encoding, m.definition.text)
+                        if m.definition.text
+                        else 0
+                    )
+                    writer.add_message(
+                        writer.register_channel(f"{m.topic}{k}", m.encoding, schema),
+                        k,
+                        bytes(m.data),
+                        k,
+                    )
                 writer.finish()
             out.append((f"mcap {compression.name}", {"x.mcap": path.read_bytes()}))
         for bag_compression in (None, *Writer1.CompressionFormat):
@@ -241,9 +304,24 @@ def damage(rng: random.Random, content: bytes) -> bytes:
 
 
 def layout(rng: random.Random) -> Message:
-    """A PointCloud2 with any fields, steps and sizes, nearly always beyond reason, and nearly always complete."""
+    """A PointCloud2 with any fields, steps and sizes, nearly always beyond reason, and nearly
+    always complete.
+    """
     store, encoding = rng.choice([(ROS2, "cdr"), (ROS1, "ros1")])
-    names = ["x", "y", "z", "t", "time", "timestamp", "ring", "label", "X", "", "offset_time", "a" * 300]
+    names = [
+        "x",
+        "y",
+        "z",
+        "t",
+        "time",
+        "timestamp",
+        "ring",
+        "label",
+        "X",
+        "",
+        "offset_time",
+        "a" * 300,
+    ]
     field = store.types["sensor_msgs/msg/PointField"]
     numbers = [0, 1, 3, 4, 8, 12, 16, 17, 24, 48, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1]
     fields = [
@@ -258,16 +336,30 @@ def layout(rng: random.Random) -> Message:
     if rng.random() < 0.7:
         kinds = [rng.choice((7, 8)) for _ in range(3)]
         fields[:0] = [
-            field(name=n, offset=rng.choice((0, 4, 8, 9, 12, 16)), datatype=k, count=1) for n, k in zip("xyz", kinds, strict=True)
+            field(name=n, offset=rng.choice((0, 4, 8, 9, 12, 16)), datatype=k, count=1)
+            for n, k in zip("xyz", kinds, strict=True)
         ]
-    step, width, height = rng.choice(numbers), rng.choice(numbers[:9] if rng.random() < 0.8 else numbers), rng.choice(numbers[:5])
+    step = rng.choice(numbers)
+    width = rng.choice(numbers[:9] if rng.random() < 0.8 else numbers)
+    height = rng.choice(numbers[:5])
     row = rng.choice([step * width % 2**32, *numbers])
     size = rng.choice([step * width * height, row * height, *numbers[:11]])
     data = np.frombuffer(rng.randbytes(min(size, 70_000)), np.uint8)
-    stamp = store.types["builtin_interfaces/msg/Time"](sec=rng.choice([0, 1, 1_700_000_000, 2**31 - 1]), nanosec=rng.choice(numbers))
+    stamp = store.types["builtin_interfaces/msg/Time"](
+        sec=rng.choice([0, 1, 1_700_000_000, 2**31 - 1]), nanosec=rng.choice(numbers)
+    )
     header = _ros(store, "std_msgs/msg/Header", stamp=stamp)
-    given = {"height": height, "width": width, "fields": fields, "is_bigendian": rng.random() < 0.3, "point_step": step, "row_step": row}
+    given = {
+        "height": height,
+        "width": width,
+        "fields": fields,
+        "is_bigendian": rng.random() < 0.3,
+        "point_step": step,
+        "row_step": row,
+    }
     name = "sensor_msgs/msg/PointCloud2"
     m = _ros(store, name, header=header, data=data, is_dense=rng.random() < 0.5, **given)
-    content = bytes(store.serialize_cdr(m, name) if encoding == "cdr" else store.serialize_ros1(m, name))
+    content = bytes(
+        store.serialize_cdr(m, name) if encoding == "cdr" else store.serialize_ros1(m, name)
+    )
     return Message("/points", name, encoding, 1, content, _NOTHING)

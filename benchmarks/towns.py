@@ -1,4 +1,6 @@
-"""Simulated towns that no training has seen, as workspaces of a folder: simulated, fused, described and asked, each step once."""
+"""Simulated towns that no training has seen, as workspaces of a folder: simulated, fused, described
+and asked, each step once.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,11 @@ FIRST_SEED = 200  # training has the seeds below
 
 @dataclass(frozen=True, slots=True)
 class Town:
-    """A town of ``seed``, driven ``sessions`` times about ``length`` metres with each of the ``sensors``.
+    """A town of ``seed``, driven ``sessions`` times about ``length`` metres with each of the
+    ``sensors``.
 
-    ``trajectory``: number of a recorded drive that the streets lie along, driven there and back. ``labels`` is the source of the classes.
+    ``trajectory``: number of a recorded drive that the streets lie along, driven there and back.
+    ``labels`` is the source of the classes.
     """
 
     name: str
@@ -45,9 +49,11 @@ class Town:
 
 
 def short_towns(first: int, count: int) -> list[Town]:
-    """Short-driven towns by number, so that many streets of each are never seen by the other drives; two of three are cities of copied
-    blocks, and their names begin with ``repeating``."""
-    sensors, labels = ("hdl32", "hdl64", "vlp16", "hdl32", "stereo"), ("auto", "geometry", "auto", "uniform")
+    """Short-driven towns by number, so that many streets of each are never seen by the other
+    drives; two of three are cities of copied blocks, and their names begin with ``repeating``.
+    """
+    sensors = ("hdl32", "hdl64", "vlp16", "hdl32", "stereo")
+    labels = ("auto", "geometry", "auto", "uniform")
     return [
         Town(
             f"{'repeating' if k % 3 else 'plain'}-{k:02d}",
@@ -78,18 +84,29 @@ class Place:
         return (self.drives or Path()) / f"kitti_{town.trajectory}.txt"
 
     def _part(self, town: Town) -> Path:
-        """The driven part of a recorded drive as a file: streets along all of it would take minutes to build."""
+        """The driven part of a recorded drive as a file: streets along all of it would take minutes
+        to build.
+        """
         lines = self._drive(town).read_text().splitlines()
         at = np.array([[float(word) for word in line.split()] for line in lines])[:, [3, 11]]
-        away = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))]) - town.start
+        away = (
+            np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
+            - town.start
+        )
         part = self.folder / town.name / "drive.txt"
         part.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text("".join(f"{line}\n" for line, m in zip(lines, away, strict=True) if 0 <= m <= town.length))
+        part.write_text(
+            "".join(
+                f"{line}\n" for line, m in zip(lines, away, strict=True) if 0 <= m <= town.length
+            )
+        )
         return part
 
     def simulate(self, town: Town) -> dict[str, Path]:
         """Logs by session name, with truth.json for all of them; what is there already is kept."""
-        home, logs, truth = self.folder / town.name, {}, {}
+        home = self.folder / town.name
+        logs = {}
+        truth = {}
         for sensor in town.sensors:
             place = home / sensor
             if not (place / "truth.json").exists():
@@ -115,10 +132,15 @@ class Place:
         return logs
 
     def ask(self, town: Town) -> Workspace:
-        """The town's workspace with the alignments of every session with every session; all are kept as rejected, with their features."""
-        work, engine = Workspace(self.folder / town.name / "work"), make_engine("serial")
+        """The town's workspace with the alignments of every session with every session; all are
+        kept as rejected, with their features.
+        """
+        work = Workspace(self.folder / town.name / "work")
+        engine = make_engine("serial")
         logs = self.simulate(town)
-        settings = load(assignments={"labels.source": town.labels, "closures.min_probability": "1"}).resolved()
+        settings = load(
+            assignments={"labels.source": town.labels, "closures.min_probability": "1"}
+        ).resolved()
         fuse({name: [log] for name, log in logs.items()}, work, settings, {}, engine, _silent)
         describe(work, [], settings, engine, _silent)
         close(work, [], [], settings, engine, _silent)
@@ -139,23 +161,34 @@ class TownTask:
 
 def judged_table(task: TownTask) -> tuple[Path, float]:
     """DIR/TOWN/judged.parquet, made unless it is there, and the seconds that took."""
-    start, table = time.perf_counter(), task.place.folder / task.town.name / "judged.parquet"
+    start = time.perf_counter()
+    table = task.place.folder / task.town.name / "judged.parquet"
     if not table.exists():
         work = task.place.ask(task.town)
         judge_town(work, table.with_name("truth.json"), task.town.name, table)
     return table, time.perf_counter() - start
 
 
-def collect(place: Place, towns: Sequence[Town], jobs: int, queries: float = math.inf) -> list[Path]:
-    """Tables of the towns that can be built, one town a process, until ``queries`` have been asked; those there are kept."""
-    mine, tables, asked = [town for town in towns if place.has(town)], [], 0
+def collect(
+    place: Place, towns: Sequence[Town], jobs: int, queries: float = math.inf
+) -> list[Path]:
+    """Tables of the towns that can be built, one town a process, until ``queries`` have been asked;
+    those there are kept.
+    """
+    mine = [town for town in towns if place.has(town)]
+    tables = []
+    asked = 0
     engine = make_engine("processes", jobs)
     print(f"{len(mine)} towns at most, {jobs} at a time", flush=True)
-    for number, (table, seconds) in enumerate(engine.map(judged_table, [TownTask(place, town) for town in mine]), 1):
+    for number, (table, seconds) in enumerate(
+        engine.map(judged_table, [TownTask(place, town) for town in mine]), 1
+    ):
         judged = read_judged([table])
         asked += int(read_metadata(table)["queries"])
         tables.append(table)
-        figures = f"{len(judged)} alignments, {int(judged.right.sum())} right, {asked} queries so far"
+        figures = (
+            f"{len(judged)} alignments, {int(judged.right.sum())} right, {asked} queries so far"
+        )
         print(f"{number}: {table.parent.name}: {figures}, {seconds:.0f} s", flush=True)
         if asked >= queries:
             break

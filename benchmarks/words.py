@@ -1,8 +1,10 @@
-"""What the vocabulary costs: `python benchmarks/words.py SHARDS [--variant semantic] [--pairs 300]`, from packed pairs (`semloc train`).
+"""What the vocabulary costs: `python benchmarks/words.py SHARDS [--variant semantic] [--pairs
+300]`, from packed pairs (`semloc train`).
 
-Of the shards the last fifth is searched: its complete, shifted views are the database, with as many distractors from other shards, and its
-incomplete views ask. *partner*: share of queries with the same place, seen completely, among the five nearest; *exact*: share of the five
-nearest by descriptor that are found. Trained on the first half of the shards. Takes some minutes on one core.
+Of the shards the last fifth is searched: its complete, shifted views are the database, with as many
+distractors from other shards, and its incomplete views ask. *partner*: share of queries with the
+same place, seen completely, among the five nearest; *exact*: share of the five nearest by
+descriptor that are found. Trained on the first half of the shards. Takes some minutes on one core.
 """
 
 import argparse
@@ -43,27 +45,40 @@ def top(matches, n):
 
 def scores(found, exact, partner):
     """Shares found of partners and of the exact five."""
-    return (found == partner[:, None]).any(1).mean(), np.mean([len(np.intersect1d(a, b)) / 5 for a, b in zip(found, exact, strict=True)])
+    return (found == partner[:, None]).any(1).mean(), np.mean(
+        [len(np.intersect1d(a, b)) / 5 for a, b in zip(found, exact, strict=True)]
+    )
 
 
 def main():
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("shards", type=Path)
     arguments.add_argument("--variant", default="semantic", choices=("semantic", "geometric"))
-    arguments.add_argument("--pairs", type=int, default=300, help="pairs of each shard, nine descriptors each")
+    arguments.add_argument(
+        "--pairs", type=int, default=300, help="pairs of each shard, nine descriptors each"
+    )
     arguments.add_argument("--weights", type=Path)
     a = arguments.parse_args()
-    shards, encoder = sorted(a.shards.glob("*.parquet")), load_encoder(a.variant, a.weights)
+    shards = sorted(a.shards.glob("*.parquet"))
+    encoder = load_encoder(a.variant, a.weights)
     held = len(shards) - len(shards) // 5
     sample = shard_descriptors(shards[: held // 2 + 1], encoder, a.pairs)
     views = [read_shard(s) for s in shards[held:]]
     database = np.concatenate([described(v[2][: a.pairs], encoder) for v in views])
     asked = np.concatenate([described(v[0][: a.pairs], encoder) for v in views])
     partner = np.random.default_rng(0).choice(len(asked), min(QUERIES, len(asked)), replace=False)
-    queries, others = asked[partner], shard_descriptors(shards[held // 2 + 1 : held], encoder, a.pairs).astype(np.float32)
+    queries = asked[partner]
+    others = shard_descriptors(shards[held // 2 + 1 : held], encoder, a.pairs).astype(np.float32)
     database = np.concatenate([database, others])
-    exact = np.concatenate([np.argsort(-(queries[i : i + 250] @ database.T), 1)[:, :5] for i in range(0, len(queries), 250)])
-    print(f"{len(sample)} descriptors to train on, {len(database)} searched, {len(queries)} queries")
+    exact = np.concatenate(
+        [
+            np.argsort(-(queries[i : i + 250] @ database.T), 1)[:, :5]
+            for i in range(0, len(queries), 250)
+        ]
+    )
+    print(
+        f"{len(sample)} descriptors to train on, {len(database)} searched, {len(queries)} queries"
+    )
     print(f"exact: partner {scores(exact, exact, partner)[0]:.3f}")
     shortlist = index_module.SHORTLIST
     for children in (16, 256):
@@ -82,7 +97,9 @@ def main():
                 found = top(index.search(queries, 5, probes, np.ones(1, bool)), len(queries))
                 ms = 1e3 * (time.process_time() - start)
                 partners, same = scores(found, exact, partner)
-                print(f"  probes {probes:2d}, shortlist {size:2d}: partner {partners:.3f}, exact {same:.3f}, {ms:.0f} ms")
+                print(
+                    f"  probes {probes:2d}, shortlist {size:2d}: partner {partners:.3f}, exact {same:.3f}, {ms:.0f} ms"
+                )
 
 
 if __name__ == "__main__":

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import Command, console_options, json_option, overwrite_option, path_option, settings_options, work_option
+from .options import (
+    Command,
+    console_options,
+    json_option,
+    overwrite_option,
+    path_option,
+    settings_options,
+    work_option,
+)
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Settings
@@ -18,9 +26,15 @@ if TYPE_CHECKING:
 @click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
 @work_option
 @path_option("-o", "--output", help="Write a copy of the log with the results to this MCAP file.")
-@click.option("--in-place", is_flag=True, help="Write the results into the log itself (MCAP only); crash-safe.")
+@click.option(
+    "--in-place",
+    is_flag=True,
+    help="Write the results into the log itself (MCAP only); crash-safe.",
+)
 @path_option("--sidecar", help="Write an MCAP file with the results only.")
-@click.option("--session", metavar="NAME", help="Session of the log; default: its file stem or folder name.")
+@click.option(
+    "--session", metavar="NAME", help="Session of the log; default: its file stem or folder name."
+)
 @overwrite_option
 @json_option
 @settings_options
@@ -36,23 +50,45 @@ def command(
     as_json: bool,
     settings: Settings,
 ) -> int:
-    """Closures -> channels of the log, in its own encoding: /semloc/loop_closures, /semloc/pose and /semloc/markers.
+    """Closures -> channels of the log, in its own encoding: /semloc/loop_closures, /semloc/pose and
+    /semloc/markers.
 
-    Give exactly one of -o, --in-place and --sidecar. The recorded messages stay as they are; a second run replaces the earlier results.
+    Give exactly one of -o, --in-place and --sidecar. The recorded messages stay as they are; a
+    second run replaces the earlier results.
 
     \b
     Example:  semloc annotate monday.mcap -w work -o monday.semloc.mcap
     """
-    chosen = [m for m, given in (("copy", output is not None), ("in-place", in_place), ("sidecar", sidecar is not None)) if given]
+    chosen = [
+        m
+        for m, given in (
+            ("copy", output is not None),
+            ("in-place", in_place),
+            ("sidecar", sidecar is not None),
+        )
+        if given
+    ]
     if len(chosen) != 1:
-        raise click.UsageError("Give exactly one of -o OUT.mcap, --in-place and --sidecar OUT.mcap.")
+        raise click.UsageError(
+            "Give exactly one of -o OUT.mcap, --in-place and --sidecar OUT.mcap."
+        )
     from semloc_logs.stages.pipeline import annotate
     from semloc_logs.workspace import Workspace
 
-    made = annotate(log, Workspace(work), settings, output=output or sidecar, mode=chosen[0], overwrite=overwrite, session=session)
+    made = annotate(
+        log,
+        Workspace(work),
+        settings,
+        output=output or sidecar,
+        mode=chosen[0],
+        overwrite=overwrite,
+        session=session,
+    )
     if as_json:
         console.result_json({k: getattr(made, k) for k in made.__dataclass_fields__})
     else:
         replaced = ", earlier results replaced" if made.replaced else ""
-        console.result(f"{made.path}: {made.closures} closures in {made.messages} messages, {made.bytes_written} bytes{replaced}")
+        console.result(
+            f"{made.path}: {made.closures} closures in {made.messages} messages, {made.bytes_written} bytes{replaced}"
+        )
     return 0

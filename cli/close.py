@@ -17,8 +17,20 @@ if TYPE_CHECKING:
 
 @click.command(cls=Command)
 @work_option
-@click.option("--query", "queries", metavar="SESSION", multiple=True, help="Session that asks; repeatable; default: all.")
-@click.option("--target", "targets", metavar="SESSION", multiple=True, help="Session that is asked; repeatable; default: all.")
+@click.option(
+    "--query",
+    "queries",
+    metavar="SESSION",
+    multiple=True,
+    help="Session that asks; repeatable; default: all.",
+)
+@click.option(
+    "--target",
+    "targets",
+    metavar="SESSION",
+    multiple=True,
+    help="Session that is asked; repeatable; default: all.",
+)
 @click.option("--no-self", is_flag=True, help="Do not look for revisits within a session.")
 @query_options
 @stage_options
@@ -32,7 +44,8 @@ def command(
     engine: EngineChoice,
     settings: Settings,
 ) -> int:
-    """Words -> loop closures: every session asks all others, and itself apart from what is near in time; writes closures.parquet.
+    """Words -> loop closures: every session asks all others, and itself apart from what is near in
+    time; writes closures.parquet.
 
     \b
     Example:  semloc close -w work --query tuesday --target monday --query-every 5
@@ -43,9 +56,13 @@ def command(
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(workspace.sessions())) as opened:
-        report = close(workspace, queries, targets, settings, opened, console.note, not no_self, overwrite)
+        report = close(
+            workspace, queries, targets, settings, opened, console.note, not no_self, overwrite
+        )
     if as_json:
-        console.result_json(report_json(report, work) | {"closures": read_closures(workspace.closures)})
+        console.result_json(
+            report_json(report, work) | {"closures": read_closures(workspace.closures)}
+        )
     else:
         show_closures(workspace)
     return finish(report)

@@ -1,4 +1,6 @@
-"""Where words go: results to stdout, everything else to stderr, as text for people or as a line of JSON each."""
+"""Where words go: results to stdout, everything else to stderr, as text for people or as a line of
+JSON each.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ class Console:
         click.echo(json.dumps(_finite(content), indent=1, default=str))
 
     def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-        """A table for people; columns whose names end in a bracketed unit or '#' are aligned to the right."""
+        """A table for people; columns whose names end in a bracketed unit or '#' are aligned to the
+        right.
+        """
         from rich.box import SIMPLE_HEAD
         from rich.console import Console as Screen
         from rich.table import Table
@@ -53,21 +57,29 @@ class Console:
         drawn = Table(title=title or None, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
         for name in columns:
             is_number = name.endswith((")", "#"))
-            drawn.add_column(name.removesuffix("#"), justify="right" if is_number else "left", overflow="fold")
+            drawn.add_column(
+                name.removesuffix("#"), justify="right" if is_number else "left", overflow="fold"
+            )
         for row in rows:
             drawn.add_row(*(Text("-" if x is None else str(x)) for x in row))
-        Screen(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False).print(drawn)
+        Screen(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False).print(
+            drawn
+        )
 
     # -- stderr
 
     def note(self, message: str) -> None:
-        """What is going on; a message with 'N of M' or 'read N' in it is progress and may be left out."""
+        """What is going on; a message with 'N of M' or 'read N' in it is progress and may be left
+        out.
+        """
         if self.verbosity < 0:
             return
         counted = _COUNTED.search(message)
         if counted and self._bar is not None and self._task is not None:
             total = int(counted[2]) if counted[2] else None
-            self._bar.update(self._task, description=message, completed=int(counted[1] or 0), total=total)
+            self._bar.update(
+                self._task, description=message, completed=int(counted[1] or 0), total=total
+            )
             return
         if (
             counted
@@ -91,7 +103,14 @@ class Console:
     def _say(self, level: str, message: str) -> None:
         if self.log_format == "json":
             click.echo(
-                json.dumps({"time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "level": level, "message": message}), err=True
+                json.dumps(
+                    {
+                        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+                        "level": level,
+                        "message": message,
+                    }
+                ),
+                err=True,
             )
             return
         text = message if level == "info" else f"{level.capitalize()}: {message}"

@@ -20,11 +20,19 @@ QUERY_EVERY = 20.0  # m; a demonstration need not ask every two metres
 
 @click.command(cls=Command)
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Folder of the logs and the workspace."
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("demo"),
+    show_default=True,
+    help="Folder of the logs and the workspace.",
 )
 @stage_options
-def command(output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, settings: Settings) -> int:
-    """Everything once: two drives round a simulated block on two days, their maps, closures, the truth, and an annotated log to look at.
+def command(
+    output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, settings: Settings
+) -> int:
+    """Everything once: two drives round a simulated block on two days, their maps, closures, the
+    truth, and an annotated log to look at.
 
     \b
     Example:  semloc demo -o /tmp/demo
@@ -34,14 +42,20 @@ def command(output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, 
     from semloc_logs.stages.pipeline import run
     from semloc_logs.workspace import Workspace
 
-    settings = settings.model_copy(update={"query": settings.query.model_copy(update={"every": QUERY_EVERY})})
-    logs, truth, workspace = [output / "monday.mcap", output / "tuesday.bag"], output / "truth.json", Workspace(output / "work")
+    settings = settings.model_copy(
+        update={"query": settings.query.model_copy(update={"every": QUERY_EVERY})}
+    )
+    logs = [output / "monday.mcap", output / "tuesday.bag"]
+    truth = output / "truth.json"
+    workspace = Workspace(output / "work")
     with console.progress():
         if overwrite or not truth.exists():
             console.note(f"Simulating two drives in {output}")
             simulate_demo(output)
         with engine.open(len(logs)) as opened:
-            report = run(session_logs(logs), workspace, settings, {}, opened, console.note, "copy", overwrite)
+            report = run(
+                session_logs(logs), workspace, settings, {}, opened, console.note, "copy", overwrite
+            )
     result = evaluate_closures(workspace, truth, settings)
     if as_json:
         console.result_json(report_json(report, workspace.path) | {"evaluation": result.to_json()})
@@ -52,5 +66,7 @@ def command(output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, 
         console.result(f"Annotated log: {path}")
     if workspace.picture.exists():
         console.result(f"Picture:       {workspace.picture}")
-    console.result(", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in report.seconds.items()))
+    console.result(
+        ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in report.seconds.items())
+    )
     return finish(report)

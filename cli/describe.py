@@ -19,8 +19,16 @@ if TYPE_CHECKING:
 @click.argument("sessions", metavar="[SESSION...]", nargs=-1)
 @work_option
 @stage_options
-def command(sessions: tuple[str, ...], work: Path, overwrite: bool, as_json: bool, engine: EngineChoice, settings: Settings) -> int:
-    """Maps -> semantic words: every occupied subvolume of the sessions' submaps (all sessions by default) becomes a word and a 64-bit code.
+def command(
+    sessions: tuple[str, ...],
+    work: Path,
+    overwrite: bool,
+    as_json: bool,
+    engine: EngineChoice,
+    settings: Settings,
+) -> int:
+    """Maps -> semantic words: every occupied subvolume of the sessions' submaps (all sessions by
+    default) becomes a word and a 64-bit code.
 
     \b
     Example:  semloc describe -w work monday tuesday

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import Command, console_options, json_option, path_option, query_options, settings_options, work_option
+from .options import (
+    Command,
+    console_options,
+    json_option,
+    path_option,
+    query_options,
+    settings_options,
+    work_option,
+)
 from .results import SHOWN
 
 if TYPE_CHECKING:
@@ -18,7 +26,11 @@ if TYPE_CHECKING:
 
 @click.command(cls=Command)
 @work_option
-@path_option("--truth", required=True, help="Truth file (JSON): SESSION_FILE -> T_common_session (4x4) or trajectory (a TUM file).")
+@path_option(
+    "--truth",
+    required=True,
+    help="Truth file (JSON): SESSION_FILE -> T_common_session (4x4) or trajectory (a TUM file).",
+)
 @click.option("--no-self", is_flag=True, help="Leave revisits within a session out of the recall.")
 @query_options
 @json_option
@@ -41,7 +53,9 @@ def command(work: Path, truth: Path, no_self: bool, as_json: bool, settings: Set
     else:
         show_evaluation(result)
     if result.unjudged:
-        console.warn(f"{result.unjudged} closures have an end whose true pose {truth} does not say: they are neither correct nor false.")
+        console.warn(
+            f"{result.unjudged} closures have an end whose true pose {truth} does not say: they are neither correct nor false."
+        )
     return 0
 
 
@@ -67,6 +81,10 @@ def show_evaluation(result: Evaluation) -> None:
         console.result(f"... and {len(rows) - SHOWN} more.")
     console.result(f"{result.closures} closures: {result.correct} correct, {result.false} false")
     if result.median_error_m is not None:
-        console.result(f"Median error {result.median_error_m:.3f} m, {result.median_error_deg:.2f} deg")
+        console.result(
+            f"Median error {result.median_error_m:.3f} m, {result.median_error_deg:.2f} deg"
+        )
     if result.recall is not None:
-        console.result(f"Recall {result.recall:.3f}: {result.answered} of {result.possible} queries with a revisit within 5 m")
+        console.result(
+            f"Recall {result.recall:.3f}: {result.answered} of {result.possible} queries with a revisit within 5 m"
+        )

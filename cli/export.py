@@ -23,13 +23,23 @@ POINTS = ("ply", "pcd", "las", "laz", "xyz")
     required=True,
     help="Poses, a pose graph with closures, or points.",
 )
-@click.option("--what", type=click.Choice(["voxels", "keyframes"]), help="Points: occupied voxels (default) or the keyframes' points.")
+@click.option(
+    "--what",
+    type=click.Choice(["voxels", "keyframes"]),
+    help="Points: occupied voxels (default) or the keyframes' points.",
+)
 @click.option(
     "--frame",
     type=click.Choice(["session", "map"]),
     help="Points are in the session frame of the log's poses (default), or in the level map frame that starts at the first keyframe.",
 )
-@click.option("--bounds", type=float, nargs=4, metavar="XMIN YMIN XMAX YMAX", help="Only points within this box of that frame (m).")
+@click.option(
+    "--bounds",
+    type=float,
+    nargs=4,
+    metavar="XMIN YMIN XMAX YMAX",
+    help="Only points within this box of that frame (m).",
+)
 @path_option("-o", "--output", help="Folder of the files; default: WORK/export.")
 @json_option
 @console_options
@@ -43,18 +53,24 @@ def command(
     output: Path | None,
     as_json: bool,
 ) -> int:
-    """Sessions for other programs: poses of the base frame (tum, kitti), a pose graph with the closures (g2o), points (ply, pcd, las,
-    laz, xyz) with their classes.
+    """Sessions for other programs: poses of the base frame (tum, kitti), a pose graph with the
+    closures (g2o), points (ply, pcd, las, laz, xyz) with their classes.
 
-    Poses and points are in the session frame of the log's pose stream, metres; points also in the level map frame.
+    Poses and points are in the session frame of the log's pose stream, metres; points also in the
+    level map frame.
 
     \b
     Example:  semloc export -w work --format las --bounds -50 -50 50 50
     """
     if form not in POINTS and (what or frame or bounds):
-        raise click.UsageError(f"--what, --frame and --bounds choose points; {form} has none. Formats with points: {', '.join(POINTS)}.")
+        raise click.UsageError(
+            f"--what, --frame and --bounds choose points; {form} has none. Formats with points: {', '.join(POINTS)}."
+        )
     if bounds and not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
-        raise click.BadParameter("the box is empty: give XMIN YMIN XMAX YMAX with XMIN < XMAX and YMIN < YMAX", param_hint="--bounds")
+        raise click.BadParameter(
+            "the box is empty: give XMIN YMIN XMAX YMAX with XMIN < XMAX and YMIN < YMAX",
+            param_hint="--bounds",
+        )
     from semloc_logs.exports import Selection, export
     from semloc_logs.workspace import Workspace
 

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import Command, EngineChoice, PoseChoice, logs_argument, reading_options, stage_options, work_option
+from .options import (
+    Command,
+    EngineChoice,
+    PoseChoice,
+    logs_argument,
+    reading_options,
+    stage_options,
+    work_option,
+)
 from .results import checked_name, finish, report_json, show_report
 
 if TYPE_CHECKING:
@@ -18,7 +26,11 @@ if TYPE_CHECKING:
 @click.command(cls=Command)
 @logs_argument
 @work_option
-@click.option("--session", metavar="NAME", help="Name of the session; default: the first log's file stem or folder name.")
+@click.option(
+    "--session",
+    metavar="NAME",
+    help="Name of the session; default: the first log's file stem or folder name.",
+)
 @reading_options
 @stage_options
 def command(
@@ -32,9 +44,11 @@ def command(
     engine: EngineChoice,
     settings: Settings,
 ) -> int:
-    """Logs -> the semantic map of one session: keyframes, submaps, voxels, trajectory. Several logs are one session, recorded back to back.
+    """Logs -> the semantic map of one session: keyframes, submaps, voxels, trajectory. Several logs
+    are one session, recorded back to back.
 
-    Nothing is done again that is there for the same content, settings and version. Lengths are metres.
+    Nothing is done again that is there for the same content, settings and version. Lengths are
+    metres.
 
     \b
     Example:  semloc fuse monday_0.mcap monday_1.mcap -w work --session monday
@@ -45,7 +59,9 @@ def command(
     name = checked_name(session or session_name(logs[0]))
     given = poses.by_session([name])
     with console.progress(), engine.open(1) as opened:
-        report = fuse({name: logs}, Workspace(work), settings, topics, opened, console.note, overwrite, given)
+        report = fuse(
+            {name: logs}, Workspace(work), settings, topics, opened, console.note, overwrite, given
+        )
     if as_json:
         console.result_json(report_json(report, work))
     else:

@@ -15,9 +15,11 @@ from .options import Command, console_options, json_option, work_option
 @json_option
 @console_options
 def command(work: Path, as_json: bool) -> int:
-    """Bring the index of the words up to date and say what it holds. 'semloc close' does the first by itself.
+    """Bring the index of the words up to date and say what it holds. 'semloc close' does the first
+    by itself.
 
-    Files are read in full and damaged ones are built again. To remove a session, delete WORK/sessions/SESSION.
+    Files are read in full and damaged ones are built again. To remove a session, delete
+    WORK/sessions/SESSION.
 
     \b
     Example:  semloc index -w work
@@ -30,7 +32,10 @@ def command(work: Path, as_json: bool) -> int:
         console.result_json({"work": str(work), "variants": held})
         return 0
     for variant, content in held.items():
-        rows = [(s["file"], f"{s['words']}", f"{s['bytes'] / 1e6:.1f}", ", ".join(s["sessions"])) for s in content["segments"]]
+        rows = [
+            (s["file"], f"{s['words']}", f"{s['bytes'] / 1e6:.1f}", ", ".join(s["sessions"]))
+            for s in content["segments"]
+        ]
         console.table(f"{variant} words", ("segment", "words#", "MB#", "sessions"), rows)
         if content["changed"]:
             console.note(f"{variant} words: {content['changed']}")

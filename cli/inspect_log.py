@@ -17,9 +17,11 @@ from .options import Command, console_options, json_option, logs_argument, topic
 @json_option
 @console_options
 def command(logs: tuple[Path, ...], topics: dict[str, str], as_json: bool) -> int:
-    """What is in a log: streams with their roles, calibration, pose coverage, time range, and what stands in the way of using it.
+    """What is in a log: streams with their roles, calibration, pose coverage, time range, and what
+    stands in the way of using it.
 
-    LOG is an .mcap, .bag or .db3 file, a ROS 2 bag folder or its metadata.yaml. Exit code 3 says that some of the log cannot be read.
+    LOG is an .mcap, .bag or .db3 file, a ROS 2 bag folder or its metadata.yaml. Exit code 3 says
+    that some of the log cannot be read.
 
     \b
     Example:  semloc inspect drive.mcap --json | jq .problems
@@ -53,16 +55,26 @@ def command(logs: tuple[Path, ...], topics: dict[str, str], as_json: bool) -> in
 
 
 def _show(content: dict[str, Any]) -> None:
-    console.result(f"{content['path']}: {content['format']}, {content['encoding'] or 'no messages'}, {content['duration_s']} s")
-    console.table("", ("topic", "type", "role", "messages#"), [(s["topic"], s["type"], s["role"], s["count"]) for s in content["streams"]])
+    console.result(
+        f"{content['path']}: {content['format']}, {content['encoding'] or 'no messages'}, {content['duration_s']} s"
+    )
+    console.table(
+        "",
+        ("topic", "type", "role", "messages#"),
+        [(s["topic"], s["type"], s["role"], s["count"]) for s in content["streams"]],
+    )
     if content["base_frame"]:
-        console.result(f"Base frame {content['base_frame']!r}, poses in {content['session_frame']!r}")
+        console.result(
+            f"Base frame {content['base_frame']!r}, poses in {content['session_frame']!r}"
+        )
     for name, value in content["poses"].items():
         if value not in (None, [], {}):
             console.result(f"  poses, {name}: {value}")
     for topic, sensor in content["sensors"].items():
         facts = ", ".join(f"{k} {v}" for k, v in sensor.items() if k != "base_T_sensor")
-        console.result(f"  {topic}: {facts}{'' if sensor['base_T_sensor'] else ', no transform to the base frame'}")
+        console.result(
+            f"  {topic}: {facts}{'' if sensor['base_T_sensor'] else ', no transform to the base frame'}"
+        )
     for sentence in content["problems"]:
         console.result(f"- {sentence}")
     console.result("")

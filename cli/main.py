@@ -1,6 +1,7 @@
 """The `semloc` program: commands loaded when called, errors as one sentence and an exit code.
 
-Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but some input was skipped; 130 and 143 interrupted.
+Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but some input was skipped; 130 and 143
+interrupted.
 """
 
 from __future__ import annotations
@@ -61,7 +62,9 @@ class Program(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, says) for name, (_, says) in COMMANDS.items()])
 
-    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **__: Any) -> NoReturn:
+    def main(
+        self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **__: Any
+    ) -> NoReturn:
         """Run and exit with the code that DESIGN promises."""
         from semloc_logs.engines.engine import single_threaded
 
@@ -83,7 +86,9 @@ class Program(click.Group):
             code = super().main(args, prog_name or "semloc", standalone_mode=False)
             return code if isinstance(code, int) else 0
         except click.exceptions.Abort:
-            console.error("Interrupted; finished work is kept, run the same command again to go on.")
+            console.error(
+                "Interrupted; finished work is kept, run the same command again to go on."
+            )
             return 128 + signal.SIGINT
         except Terminated:
             console.error("Terminated; finished work is kept, run the same command again to go on.")
@@ -103,7 +108,9 @@ class Program(click.Group):
         except OSError as problem:
             _explain(problem)
             where = problem.filename or "A file"
-            console.error(f"{where} cannot be read or written ({problem.strerror or problem}): check the path, permissions and disk space.")
+            console.error(
+                f"{where} cannot be read or written ({problem.strerror or problem}): check the path, permissions and disk space."
+            )
             return 1
         except MemoryError as problem:
             _explain(problem)
@@ -114,7 +121,9 @@ class Program(click.Group):
             frames = traceback.extract_tb(problem.__traceback__)
             where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
             detail = " ".join(str(problem).split())[:200]
-            console.error(f"Unexpected {type(problem).__name__}{where} ({detail}): run again with -v for the traceback and report it.")
+            console.error(
+                f"Unexpected {type(problem).__name__}{where} ({detail}): run again with -v for the traceback and report it."
+            )
             return 1
 
 
@@ -135,7 +144,8 @@ def _terminate(number: int, _: object) -> NoReturn:
 )
 @click.version_option(__version__, prog_name="semloc")
 def program() -> None:
-    """Where has a drive been before? Semantic loop closures from recorded drive logs (.mcap, .bag, .db3, ROS 2 bag folders).
+    """Where has a drive been before? Semantic loop closures from recorded drive logs (.mcap, .bag,
+    .db3, ROS 2 bag folders).
 
     \b
     semloc demo                              everything once, on two simulated sessions

@@ -36,7 +36,9 @@ FLAGS = {  # options that are short for a setting
 
 
 class Command(click.Command):
-    """A command that answers --dump-config before it asks for the arguments that it needs otherwise."""
+    """A command that answers --dump-config before it asks for the arguments that it needs
+    otherwise.
+    """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if "--dump-config" in args and any(p.name == "dump_config" for p in self.params):
@@ -54,10 +56,14 @@ def path_option(*names: str, help: str, required: bool = False) -> Callable[[Fun
     return click.option(*names, type=click.Path(path_type=Path), required=required, help=help)
 
 
-logs_argument = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+logs_argument = click.argument(
+    "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
 work_option = path_option("-w", "--work", required=True, help="Workspace folder.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-overwrite_option = click.option("--overwrite", is_flag=True, help="Do finished work again; replace existing outputs.")
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Do finished work again; replace existing outputs."
+)
 
 
 def _set_verbosity(_: click.Context, parameter: click.Parameter, count: int) -> None:
@@ -74,10 +80,20 @@ def console_options(function: Function) -> Function:
     eager: dict[str, Any] = {"expose_value": False, "is_eager": True}
     for decorate in (
         click.option(
-            "-q", "--quiet", count=True, callback=_set_verbosity, help="No notes and no progress; warnings and errors only.", **eager
+            "-q",
+            "--quiet",
+            count=True,
+            callback=_set_verbosity,
+            help="No notes and no progress; warnings and errors only.",
+            **eager,
         ),
         click.option(
-            "-v", "--verbose", count=True, callback=_set_verbosity, help="All notes, and the traceback of an unexpected error.", **eager
+            "-v",
+            "--verbose",
+            count=True,
+            callback=_set_verbosity,
+            help="All notes, and the traceback of an unexpected error.",
+            **eager,
         ),
         click.option(
             "--log-format",
@@ -114,7 +130,9 @@ topic_option = click.option(
 
 
 def settings_options(function: Function) -> Function:
-    """--config, --set and --dump-config; the command gets ``settings``, lengths filled in from the voxel size."""
+    """--config, --set and --dump-config; the command gets ``settings``, lengths filled in from the
+    voxel size.
+    """
 
     @click.option("--config", type=click.Path(path_type=Path), help="YAML file of settings.")
     @click.option(
@@ -142,7 +160,8 @@ def _settings(options: Mapping[str, Any]) -> Settings:
     given = {key: options[flag] for flag, key in FLAGS.items() if options.get(flag) is not None}
     # the values of --set are YAML, in which a path may mean something else
     assignments |= {
-        key: json.dumps(str(value), ensure_ascii=False) if isinstance(value, Path) else str(value) for key, value in given.items()
+        key: json.dumps(str(value), ensure_ascii=False) if isinstance(value, Path) else str(value)
+        for key, value in given.items()
     }
     if options.get("seg_model") is not None:
         assignments.setdefault("labels.source", "onnx")
@@ -164,13 +183,22 @@ def _explained(settings: Settings) -> str:
 def _yaml_value(value: object) -> str:
     import yaml
 
-    return str(yaml.safe_dump(value, default_flow_style=True, width=1000)).removesuffix("...\n").strip()
+    return (
+        str(yaml.safe_dump(value, default_flow_style=True, width=1000))
+        .removesuffix("...\n")
+        .strip()
+    )
 
 
 def label_options(function: Function) -> Function:
     """--seg-model and --seg-spec."""
     for decorate in (
-        click.option("--seg-spec", type=click.Path(path_type=Path), metavar="SPEC", help="YAML file: what the model takes and gives."),
+        click.option(
+            "--seg-spec",
+            type=click.Path(path_type=Path),
+            metavar="SPEC",
+            help="YAML file: what the model takes and gives.",
+        ),
         click.option(
             "--seg-model",
             type=click.Path(path_type=Path),
@@ -224,11 +252,16 @@ class PoseChoice:
         from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 
         names = list(sessions)
-        files, times = _by_session("--poses", names, self.files), _by_session("--pose-times", names, self.times)
+        files = _by_session("--poses", names, self.files)
+        times = _by_session("--pose-times", names, self.times)
         without = [name for name in times if name not in files]
         if without or (self.frame and not files):
-            raise click.UsageError(f"{'--pose-times' if without else '--pose-frame'} says something about --poses FILE: give that, too.")
-        return {name: TrajectoryFile(file, times.get(name), self.frame) for name, file in files.items()}
+            raise click.UsageError(
+                f"{'--pose-times' if without else '--pose-frame'} says something about --poses FILE: give that, too."
+            )
+        return {
+            name: TrajectoryFile(file, times.get(name), self.frame) for name, file in files.items()
+        }
 
 
 def _by_session(option: str, names: list[str], values: Iterable[str]) -> dict[str, Path]:
@@ -236,9 +269,12 @@ def _by_session(option: str, names: list[str], values: Iterable[str]) -> dict[st
     for value in values:
         name, equals, rest = value.partition("=")
         if not (equals and name in names):
-            name, rest = names[0], value
+            name = names[0]
+            rest = value
             if len(names) > 1:
-                raise click.UsageError(f"{option} {value}: say which session it belongs to with SESSION=FILE ({', '.join(names)}).")
+                raise click.UsageError(
+                    f"{option} {value}: say which session it belongs to with SESSION=FILE ({', '.join(names)})."
+                )
         if name in out:
             raise click.UsageError(f"{option} is given twice for session '{name}'.")
         out[name] = Path(rest)
@@ -246,7 +282,9 @@ def _by_session(option: str, names: list[str], values: Iterable[str]) -> dict[st
 
 
 def pose_options(function: Function) -> Function:
-    """Poses from elsewhere than a stream of the log; the command gets ``poses``, a PoseChoice, and the setting of --odometry."""
+    """Poses from elsewhere than a stream of the log; the command gets ``poses``, a PoseChoice, and
+    the setting of --odometry.
+    """
 
     @click.option(
         "--odometry",
@@ -260,10 +298,26 @@ def pose_options(function: Function) -> Function:
         multiple=True,
         help="Trajectory (TUM or KITTI) instead of the log's own poses; SESSION= for each of several logs.",
     )
-    @click.option("--pose-times", metavar="[SESSION=]FILE", multiple=True, help="Times of KITTI poses, one in seconds a line.")
-    @click.option("--pose-frame", metavar="FRAME", default="", help="Frame that the poses of --poses are of; default: the base frame.")
+    @click.option(
+        "--pose-times",
+        metavar="[SESSION=]FILE",
+        multiple=True,
+        help="Times of KITTI poses, one in seconds a line.",
+    )
+    @click.option(
+        "--pose-frame",
+        metavar="FRAME",
+        default="",
+        help="Frame that the poses of --poses are of; default: the base frame.",
+    )
     @functools.wraps(function)
-    def with_poses(*args: Any, pose_files: tuple[str, ...], pose_times: tuple[str, ...], pose_frame: str, **options: Any) -> Any:
+    def with_poses(
+        *args: Any,
+        pose_files: tuple[str, ...],
+        pose_times: tuple[str, ...],
+        pose_frame: str,
+        **options: Any,
+    ) -> Any:
         return function(*args, poses=PoseChoice(pose_files, pose_times, pose_frame), **options)
 
     return with_poses
@@ -283,7 +337,9 @@ class EngineChoice:
 
     @contextmanager
     def open(self, tasks: int) -> Iterator[Engine]:
-        """The engine for so many sessions or scenes; its workers end with the block, at once if the block fails."""
+        """The engine for so many sessions or scenes; its workers end with the block, at once if the
+        block fails.
+        """
         from semloc_logs.engines import make_engine
         from semloc_logs.engines.engine import cores
 
@@ -306,7 +362,12 @@ def engine_options(function: Function) -> Function:
         type=click.Choice(["serial", "processes"]),
         help="Where work runs; default: processes for several sessions on several cores.",
     )
-    @click.option("--jobs", type=click.IntRange(1, 1024), metavar="N", help="Worker processes; default: the cores of this machine.")
+    @click.option(
+        "--jobs",
+        type=click.IntRange(1, 1024),
+        metavar="N",
+        help="Worker processes; default: the cores of this machine.",
+    )
     @functools.wraps(function)
     def with_engine(*args: Any, engine_name: str | None, jobs: int | None, **options: Any) -> Any:
         return function(*args, engine=EngineChoice(engine_name, jobs), **options)
@@ -315,7 +376,15 @@ def engine_options(function: Function) -> Function:
 
 
 def stage_options(function: Function) -> Function:
-    """What every stage over a workspace is asked: --overwrite, --json, the engine, settings and the console."""
-    for decorate in (console_options, settings_options, engine_options, json_option, overwrite_option):
+    """What every stage over a workspace is asked: --overwrite, --json, the engine, settings and the
+    console.
+    """
+    for decorate in (
+        console_options,
+        settings_options,
+        engine_options,
+        json_option,
+        overwrite_option,
+    ):
         function = decorate(function)
     return function

@@ -50,7 +50,12 @@ def finish(*reports: Report) -> int:
 def report_json(report: Report, work: Path) -> dict[str, Any]:
     """A stage's report as --json prints it."""
     keys = ("done", "kept", "skipped", "failed")
-    return {"work": str(work), **{k: getattr(report, k) for k in keys}, "seconds": report.seconds, "closures": report.closures}
+    return {
+        "work": str(work),
+        **{k: getattr(report, k) for k in keys},
+        "seconds": report.seconds,
+        "closures": report.closures,
+    }
 
 
 def show_report(verb: str, report: Report) -> None:
@@ -84,10 +89,21 @@ def show_closures(work: Workspace) -> None:
             )
         )
     if rows:
-        columns = ("query", "stamp (s)", "target", "stamp (s)", "apart (m)", "yaw (deg)", "overlap#", "probability#")
+        columns = (
+            "query",
+            "stamp (s)",
+            "target",
+            "stamp (s)",
+            "apart (m)",
+            "yaw (deg)",
+            "overlap#",
+            "probability#",
+        )
         console.table("", columns, drawn)
     if len(rows) > SHOWN:
         console.result(f"... and {len(rows) - SHOWN} more.")
-    console.result(f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in {work.rejected}")
+    console.result(
+        f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in {work.rejected}"
+    )
     if work.picture.exists():
         console.result(f"Picture: {work.picture}")

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import Command, EngineChoice, PoseChoice, logs_argument, query_options, reading_options, stage_options, work_option
+from .options import (
+    Command,
+    EngineChoice,
+    PoseChoice,
+    logs_argument,
+    query_options,
+    reading_options,
+    stage_options,
+    work_option,
+)
 from .results import finish, report_json, session_logs, show_closures
 
 if TYPE_CHECKING:
@@ -40,10 +49,11 @@ def command(
     engine: EngineChoice,
     settings: Settings,
 ) -> int:
-    """Logs -> loop closures, all of it: fuse, describe, close and, if asked for, annotate. Each LOG is a session.
+    """Logs -> loop closures, all of it: fuse, describe, close and, if asked for, annotate. Each LOG
+    is a session.
 
-    Can be interrupted and run again: finished work is kept. A log that cannot be read is named, the others are done, and the exit
-    code is 3.
+    Can be interrupted and run again: finished work is kept. A log that cannot be read is named, the
+    others are done, and the exit code is 3.
 
     \b
     Example:  semloc run monday.mcap tuesday.bag -w work --annotate copy
@@ -55,12 +65,24 @@ def command(
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(sessions)) as opened:
-        report = run(sessions, workspace, settings, topics, opened, console.note, annotation, overwrite, given)
+        report = run(
+            sessions,
+            workspace,
+            settings,
+            topics,
+            opened,
+            console.note,
+            annotation,
+            overwrite,
+            given,
+        )
     if as_json:
         console.result_json(report_json(report, work))
     else:
         show_closures(workspace)
         if annotation in ("copy", "sidecar"):
             console.result(f"Annotated logs: {workspace.annotated}")
-        console.result(", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in report.seconds.items()))
+        console.result(
+            ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in report.seconds.items())
+        )
     return finish(report)

@@ -7,35 +7,71 @@ from pathlib import Path
 import click
 
 from .console import console
-from .options import Command, console_options, json_option, overwrite_option, path_option, work_option
+from .options import (
+    Command,
+    console_options,
+    json_option,
+    overwrite_option,
+    path_option,
+    work_option,
+)
 
 
 @click.command(cls=Command)
 @work_option
 @click.option("--query", metavar="SESSION", help="Only what this session asked.")
 @click.option(
-    "--at", type=float, metavar="SECONDS", help="The query nearest to this time, as 'semloc close' prints it or since the start (s)."
+    "--at",
+    type=float,
+    metavar="SECONDS",
+    help="The query nearest to this time, as 'semloc close' prints it or since the start (s).",
 )
-@click.option("--closure", type=int, metavar="N", help="Closure N, counted from 1 as 'semloc close' lists them.")
-@click.option("--count", type=click.IntRange(0, 20), default=2, show_default=True, help="So many of the best closures.")
+@click.option(
+    "--closure",
+    type=int,
+    metavar="N",
+    help="Closure N, counted from 1 as 'semloc close' lists them.",
+)
+@click.option(
+    "--count",
+    type=click.IntRange(0, 20),
+    default=2,
+    show_default=True,
+    help="So many of the best closures.",
+)
 @path_option("-o", "--output", required=True, help="PNG file.")
 @overwrite_option
 @json_option
 @console_options
 def command(
-    work: Path, query: str | None, at: float | None, closure: int | None, count: int, output: Path, overwrite: bool, as_json: bool
+    work: Path,
+    query: str | None,
+    at: float | None,
+    closure: int | None,
+    count: int,
+    output: Path,
+    overwrite: bool,
+    as_json: bool,
 ) -> int:
-    """A picture of closures: the query's voxels in the colours of their classes laid over the pale map, before and after the
-    alignment, what the map says of each voxel, and subvolumes whose words matched, as seen and as the network completes them.
+    """A picture of closures: the query's voxels in the colours of their classes laid over the pale
+    map, before and after the alignment, what the map says of each voxel, and subvolumes whose words
+    matched, as seen and as the network completes them.
 
-    Without --at or --closure: the best closures of different pairs of sessions, and the best hypothesis that was rejected.
+    Without --at or --closure: the best closures of different pairs of sessions, and the best
+    hypothesis that was rejected.
 
     \b
     Example:  semloc show -w work --query tuesday --at 95 -o closure.png
     """
     from semloc_logs.errors import WorkspaceError
     from semloc_logs.pictures.closure_sheet import draw_views
-    from semloc_logs.pictures.closure_view import Wanted, choose, closing_settings, closure_view, drawn
+    from semloc_logs.pictures.closure_view import (
+        Wanted,
+        choose,
+        closing_settings,
+        closure_view,
+        drawn,
+    )
     from semloc_logs.workspace import Workspace
 
     if closure is not None and (query is not None or at is not None):
@@ -53,7 +89,10 @@ def command(
         for view in views:
             row = view.choice.row
             said = "closure" if view.choice.accepted else f"rejected ({view.choice.reason})"
-            ends = (f"{row[f'{end}_session']} at {row[f'{end}_stamp_ns'] / 1e9:.1f} s" for end in ("query", "target"))
+            ends = (
+                f"{row[f'{end}_session']} at {row[f'{end}_stamp_ns'] / 1e9:.1f} s"
+                for end in ("query", "target")
+            )
             console.result(f"{' in '.join(ends)}: {said}, probability {row['probability']:.4f}")
         console.result(f"Picture: {output}")
     return 0

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import Command, EngineChoice, console_options, engine_options, json_option, path_option, settings_options
+from .options import (
+    Command,
+    EngineChoice,
+    console_options,
+    engine_options,
+    json_option,
+    path_option,
+    settings_options,
+)
 
 if TYPE_CHECKING:
     from semloc_logs.engines import Engine
@@ -28,13 +36,37 @@ if TYPE_CHECKING:
     help="Network with classes, without, or both.",
 )
 @path_option("-o", "--output", required=True, help="Folder of the weights.")
-@path_option("-w", "--work", help="Train on the fused sessions of this workspace instead of simulated scenes.")
+@path_option(
+    "-w",
+    "--work",
+    help="Train on the fused sessions of this workspace instead of simulated scenes.",
+)
 @click.option("--scenes", type=int, metavar="N", help="Simulated scenes; default: training.scenes.")
-@click.option("--samples", type=int, metavar="N", help="Subvolumes seen in training; default: training.samples.")
-@path_option("--checkpoint", help="Folder of checkpoints and packed pairs; default: OUTPUT/checkpoint.")
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True, help="Where the network trains.")
-@click.option("--minutes", type=click.FloatRange(min=0, min_open=True), help="Stop after so many minutes with a checkpoint to go on from.")
-@path_option("--snapshots", help="Folder for the weights after 1/32, 1/16, ... 1/2 of the samples: a learning curve.")
+@click.option(
+    "--samples",
+    type=int,
+    metavar="N",
+    help="Subvolumes seen in training; default: training.samples.",
+)
+@path_option(
+    "--checkpoint", help="Folder of checkpoints and packed pairs; default: OUTPUT/checkpoint."
+)
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="Where the network trains.",
+)
+@click.option(
+    "--minutes",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Stop after so many minutes with a checkpoint to go on from.",
+)
+@path_option(
+    "--snapshots",
+    help="Folder for the weights after 1/32, 1/16, ... 1/2 of the samples: a learning curve.",
+)
 @json_option
 @engine_options
 @settings_options
@@ -51,11 +83,13 @@ def command(
     engine: EngineChoice,
     settings: Settings,
 ) -> int:
-    """Learn the descriptor, self-supervised: an encoder-decoder completes what few frames saw to what all frames saw.
+    """Learn the descriptor, self-supervised: an encoder-decoder completes what few frames saw to
+    what all frames saw.
 
-    Two scenes (or stretches of road) are held out and measured at the end. Scenes are simulated by --jobs processes while the network
-    trains. Can be interrupted, or limited by --minutes (exit code 3): the same command goes on from the checkpoint. Use the result with
-    --set descriptor.weights=FILE, and train a vocabulary for it.
+    Two scenes (or stretches of road) are held out and measured at the end. Scenes are simulated by
+    --jobs processes while the network trains. Can be interrupted, or limited by --minutes (exit
+    code 3): the same command goes on from the checkpoint. Use the result with --set
+    descriptor.weights=FILE, and train a vocabulary for it.
 
     \b
     Example:  semloc train --variant semantic -o weights --scenes 60 --samples 250000
@@ -74,30 +108,53 @@ def command(
         for name in ("semantic", "geometric") if variant == "both" else (variant,):
             weights = output / f"{name}.safetensors"
             where = folder / f"{name}.safetensors"
-            shards = packed_shards(folder, work, settings, opened, samples_after(steps_done(where), settings.training))
+            shards = packed_shards(
+                folder, work, settings, opened, samples_after(steps_done(where), settings.training)
+            )
             with closing(shards):
                 found = learn_descriptor(
-                    name, shards, settings, where, weights, console.note, device=chosen, deadline=deadline, snapshots=snapshots
+                    name,
+                    shards,
+                    settings,
+                    where,
+                    weights,
+                    console.note,
+                    device=chosen,
+                    deadline=deadline,
+                    snapshots=snapshots,
                 )
             if found is None:
                 opened.stop()  # scenes that are being made are made again
-                console.warn(f"{minutes:g} minutes are over and {where} is written: the same command goes on from there.")
+                console.warn(
+                    f"{minutes:g} minutes are over and {where} is written: the same command goes on from there."
+                )
                 return 3
             scores[name] = found
             console.note(f"{weights} written")
     if as_json:
-        console.result_json({name: {"weights": str(output / f"{name}.safetensors"), **found} for name, found in scores.items()})
+        console.result_json(
+            {
+                name: {"weights": str(output / f"{name}.safetensors"), **found}
+                for name, found in scores.items()
+            }
+        )
     else:
         figures = sorted({figure for found in scores.values() for figure in found})
-        rows = [(figure, *(f"{found[figure]:.4f}" for found in scores.values())) for figure in figures]
+        rows = [
+            (figure, *(f"{found[figure]:.4f}" for found in scores.values())) for figure in figures
+        ]
         console.table("On two held-out scenes", ("figure", *(f"{name}#" for name in scores)), rows)
         for name in scores:
             console.result(str(output / f"{name}.safetensors"))
     return 0
 
 
-def packed_shards(folder: Path, work: Path | None, settings: Settings, engine: Engine, samples: int = 0) -> Packed:
-    """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes; ``samples`` have been seen of them."""
+def packed_shards(
+    folder: Path, work: Path | None, settings: Settings, engine: Engine, samples: int = 0
+) -> Packed:
+    """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes;
+    ``samples`` have been seen of them.
+    """
     from semloc_logs.training.runs import session_shards, simulated_shards
     from semloc_logs.workspace import Workspace
 

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
-from .options import Command, EngineChoice, console_options, engine_options, json_option, path_option, settings_options
+from .options import (
+    Command,
+    EngineChoice,
+    console_options,
+    engine_options,
+    json_option,
+    path_option,
+    settings_options,
+)
 from .train import packed_shards
 
 if TYPE_CHECKING:
@@ -17,14 +25,31 @@ if TYPE_CHECKING:
 
 @click.command(cls=Command)
 @click.option(
-    "--variant", type=click.Choice(["semantic", "geometric", "both"]), required=True, help="Network whose descriptors are clustered."
+    "--variant",
+    type=click.Choice(["semantic", "geometric", "both"]),
+    required=True,
+    help="Network whose descriptors are clustered.",
 )
-@path_option("-o", "--output", required=True, help="File of the vocabulary (.safetensors); of both: folder of the two files.")
-@path_option("-w", "--work", help="Use the fused sessions of this workspace instead of simulated scenes.")
+@path_option(
+    "-o",
+    "--output",
+    required=True,
+    help="File of the vocabulary (.safetensors); of both: folder of the two files.",
+)
+@path_option(
+    "-w", "--work", help="Use the fused sessions of this workspace instead of simulated scenes."
+)
 @path_option("--shards", help="Use the packed pairs (.parquet) of this folder instead.")
-@path_option("--checkpoint", help="Folder of packed pairs, such as that of 'semloc train'; default: beside the output.")
+@path_option(
+    "--checkpoint",
+    help="Folder of packed pairs, such as that of 'semloc train'; default: beside the output.",
+)
 @click.option("--scenes", type=int, metavar="N", help="Simulated scenes; default: training.scenes.")
-@click.option("--pairs", type=click.IntRange(1), help="Pairs of each scene, nine descriptors each; default: all.")
+@click.option(
+    "--pairs",
+    type=click.IntRange(1),
+    help="Pairs of each scene, nine descriptors each; default: all.",
+)
 @json_option
 @engine_options
 @settings_options
@@ -40,10 +65,12 @@ def command(
     engine: EngineChoice,
     settings: Settings,
 ) -> int:
-    """Learn the words: descriptors of subvolumes are clustered, and each cluster gets thresholds for 64-bit codes.
+    """Learn the words: descriptors of subvolumes are clustered, and each cluster gets thresholds
+    for 64-bit codes.
 
-    A vocabulary belongs to the weights that it was made with (--set descriptor.weights=FILE; the shipped ones by default). Use it
-    with --set descriptor.vocabulary=FILE. Half a million descriptors (60 scenes) give 2^16 words; fewer are possible.
+    A vocabulary belongs to the weights that it was made with (--set descriptor.weights=FILE; the
+    shipped ones by default). Use it with --set descriptor.vocabulary=FILE. Half a million
+    descriptors (60 scenes) give 2^16 words; fewer are possible.
 
     \b
     Example:  semloc vocabulary --variant semantic -o words.safetensors -w work
@@ -53,7 +80,9 @@ def command(
     from semloc_logs.training.runs import given_shards, learn_vocabulary, use_threads
 
     if variant == "both" and settings.descriptor.weights is not None:
-        raise click.UsageError("descriptor.weights are those of one variant: name it with --variant.")
+        raise click.UsageError(
+            "descriptor.weights are those of one variant: name it with --variant."
+        )
     if shards is not None and work is not None:
         raise click.UsageError("--shards and --work are alternatives.")
     with console.progress():
@@ -61,8 +90,14 @@ def command(
             packed = given_shards(shards)
         else:
             with engine.open(settings.training.scenes) as opened:
-                packed = packed_shards(checkpoint or output.parent / "checkpoint", work, settings, opened).every
-        files = {v: output / f"{v}.safetensors" for v in ("semantic", "geometric")} if variant == "both" else {variant: output}
+                packed = packed_shards(
+                    checkpoint or output.parent / "checkpoint", work, settings, opened
+                ).every
+        files = (
+            {v: output / f"{v}.safetensors" for v in ("semantic", "geometric")}
+            if variant == "both"
+            else {variant: output}
+        )
         use_threads(engine.jobs or cores())
         made = {}
         for name, file in files.items():
@@ -75,5 +110,7 @@ def command(
         console.result_json(made if variant == "both" else made[variant])
     else:
         for said in made.values():
-            console.result(f"{said['vocabulary']}: from {said['descriptors']} descriptors of {said['shards']} scenes")
+            console.result(
+                f"{said['vocabulary']}: from {said['descriptors']} descriptors of {said['shards']} scenes"
+            )
     return 0

@@ -10,4 +10,8 @@ def read_text(name: str) -> str:
 
 def names(folder: str, suffix: str) -> list[str]:
     """Stems of the files in ``folder`` that end in ``suffix``, sorted."""
-    return sorted(f.name.removesuffix(suffix) for f in files(__name__).joinpath(folder).iterdir() if f.name.endswith(suffix))
+    return sorted(
+        f.name.removesuffix(suffix)
+        for f in files(__name__).joinpath(folder).iterdir()
+        if f.name.endswith(suffix)
+    )

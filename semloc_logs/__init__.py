@@ -12,4 +12,6 @@ except PackageNotFoundError:
     __version__ = "0+unknown"
 
 if find_spec("semloc_logs.schemas") is None:
-    raise ImportError("semloc_logs was imported from a bare checkout: install it first (make install, or pip install -e .)")
+    raise ImportError(
+        "semloc_logs was imported from a bare checkout: install it first (make install, or pip install -e .)"
+    )

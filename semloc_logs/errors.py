@@ -1,4 +1,5 @@
-"""Every error of the package: one sentence that says what, where (file, topic, offset or time) and what to do.
+"""Every error of the package: one sentence that says what, where (file, topic, offset or time) and
+what to do.
 
 Only :mod:`semloc_logs.cli` turns them into exit codes.
 """
@@ -13,7 +14,9 @@ class LogError(SemlocError):
 
 
 class RoleError(SemlocError):
-    """The streams of a log do not say which topic plays which role; the sentence lists the flags that solve it."""
+    """The streams of a log do not say which topic plays which role; the sentence lists the flags
+    that solve it.
+    """
 
 
 class SettingsError(SemlocError):

@@ -1,6 +1,8 @@
-"""What a log is made of once decoded: small frozen types, stamps in integer nanoseconds, lengths in metres.
+"""What a log is made of once decoded: small frozen types, stamps in integer nanoseconds, lengths in
+metres.
 
-``stamp_ns`` is the sensor time of the message header, ``log_time_ns`` the receive time of the log. Arrays are never written to.
+``stamp_ns`` is the sensor time of the message header, ``log_time_ns`` the receive time of the log.
+Arrays are never written to.
 """
 
 from __future__ import annotations
@@ -26,9 +28,11 @@ class Header:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarFrame:
-    """One sweep. ``points`` (n, 3) in the sensor frame; rows with NaN, infinity or exactly zero are already gone.
+    """One sweep. ``points`` (n, 3) in the sensor frame; rows with NaN, infinity or exactly zero are
+    already gone.
 
-    ``lost`` counts those that were not finite in a cloud that calls itself dense; ``remark`` is a key of what is to be said of it.
+    ``lost`` counts those that were not finite in a cloud that calls itself dense; ``remark`` is a
+    key of what is to be said of it.
     """
 
     header: Header
@@ -59,7 +63,9 @@ class DepthFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A CameraInfo or CameraCalibration: ``K`` (3, 3), ``P`` (3, 4), ``R`` (3, 3), distortion ``D`` of ``model``."""
+    """A CameraInfo or CameraCalibration: ``K`` (3, 3), ``P`` (3, 4), ``R`` (3, 3), distortion ``D``
+    of ``model``.
+    """
 
     header: Header
     width: int
@@ -73,7 +79,9 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSample:
-    """``frame_T_child`` (4, 4): pose of ``child_frame_id`` in ``header.frame_id``; child is "" for PoseStamped."""
+    """``frame_T_child`` (4, 4): pose of ``child_frame_id`` in ``header.frame_id``; child is "" for
+    PoseStamped.
+    """
 
     header: Header
     child_frame_id: str
@@ -94,7 +102,8 @@ class TransformSample:
 class ImuSample:
     """Specific force in m/s^2 and angular rate in rad/s, in the IMU frame.
 
-    ``orientation`` is the quaternion xyzw of the IMU frame in east, north, up (REP 103, 105); None when the IMU does not report one.
+    ``orientation`` is the quaternion xyzw of the IMU frame in east, north, up (REP 103, 105); None
+    when the IMU does not report one.
     """
 
     header: Header
@@ -119,24 +128,38 @@ class NavSatSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelNames:
-    """What the ids of a label topic mean: the ``names`` of classes by id, or the name of a label ``space``."""
+    """What the ids of a label topic mean: the ``names`` of classes by id, or the name of a label
+    ``space``.
+    """
 
     header: Header
     space: str = ""
     names: dict[int, str] = field(default_factory=dict)
 
 
-Frame = LidarFrame | ImageFrame | DepthFrame | Camera | PoseSample | TransformSample | ImuSample | NavSatSample | LabelNames
+Frame = (
+    LidarFrame
+    | ImageFrame
+    | DepthFrame
+    | Camera
+    | PoseSample
+    | TransformSample
+    | ImuSample
+    | NavSatSample
+    | LabelNames
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedCloud:
     """Labelled or unlabelled points of one sensor at one time in the base frame: what fusion eats.
 
-    ``points`` (n, 3) float32 and ``origin`` (3,), the sensor's centre, in the base frame; ``label`` (n,) ids as recorded or None;
-    ``session_T_base`` (4, 4) or None in a log without poses; ``sigma`` (n,) standard deviation of the measured range along the ray in
-    metres, None where it is small beside a voxel (LIDAR). ``extra`` names the ``label_topic`` of labels that come from pictures, and
-    says ``label_form`` = colours where they are packed colours (logs/depth.py) instead of ids.
+    ``points`` (n, 3) float32 and ``origin`` (3,), the sensor's centre, in the base frame; ``label``
+    (n,) ids as recorded or None; ``session_T_base`` (4, 4) or None in a log without poses;
+    ``sigma`` (n,) standard deviation of the measured range along the ray in metres, None where it
+    is small beside a voxel (LIDAR). ``extra`` names the ``label_topic`` of labels that come from
+    pictures, and says ``label_form`` = colours where they are packed colours (logs/depth.py)
+    instead of ids.
     """
 
     header: Header

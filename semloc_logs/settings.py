@@ -1,7 +1,9 @@
-"""All settings with their defaults beside them: defaults < YAML file < environment (``SEMLOC_FUSION__VOXEL_SIZE``) < flags.
+"""All settings with their defaults beside them: defaults < YAML file < environment
+(``SEMLOC_FUSION__VOXEL_SIZE``) < flags.
 
-Unknown keys are refused at every level, by name. Lengths that are ``None`` follow the voxel size (0.30 m is the paper's street
-scale; a room at 0.05 m is a street in miniature) and are filled in by :meth:`Settings.resolved`, the only place that does so.
+Unknown keys are refused at every level, by name. Lengths that are ``None`` follow the voxel size
+(0.30 m is the paper's street scale; a room at 0.05 m is a street in miniature) and are filled in by
+:meth:`Settings.resolved`, the only place that does so.
 """
 
 from __future__ import annotations
@@ -32,33 +34,60 @@ class Fusion(_Section):
     """Keyframes, submaps and the voxel map (paper 3.1)."""
 
     voxel_size: float = Field(0.30, gt=0.005, le=5.0, description="edge of a voxel (m)")
-    min_range: float | None = Field(None, ge=0, description="points nearer than this to the sensor are dropped (m); default 3 voxels")
-    max_range: float | None = Field(
-        None, gt=0, description="points farther than this are not fused, only carved (m); default 50 m at 0.30 m voxels"
+    min_range: float | None = Field(
+        None,
+        ge=0,
+        description="points nearer than this to the sensor are dropped (m); default 3 voxels",
     )
-    keyframe_distance: float | None = Field(None, ge=0, description="a frame becomes a keyframe after this travel (m); default 2 voxels")
+    max_range: float | None = Field(
+        None,
+        gt=0,
+        description="points farther than this are not fused, only carved (m); default 50 m at 0.30 m voxels",
+    )
+    keyframe_distance: float | None = Field(
+        None, ge=0, description="a frame becomes a keyframe after this travel (m); default 2 voxels"
+    )
     keyframe_angle: float = Field(0.175, gt=0, description="or after this turn (rad)")
     keyframe_resolution: float | None = Field(
-        None, gt=0, description="keyframes keep one point a cell of this size (m); default a third of a voxel"
+        None,
+        gt=0,
+        description="keyframes keep one point a cell of this size (m); default a third of a voxel",
     )
-    submap_length: float | None = Field(None, gt=0, description="length of road in a submap (m); default 100 m at 0.30 m voxels")
-    submap_overlap: float = Field(0.25, ge=0.0, lt=1.0, description="share of a submap that the next one repeats")
+    submap_length: float | None = Field(
+        None, gt=0, description="length of road in a submap (m); default 100 m at 0.30 m voxels"
+    )
+    submap_overlap: float = Field(
+        0.25, ge=0.0, lt=1.0, description="share of a submap that the next one repeats"
+    )
     depth_noise: float = Field(
-        0.0019, ge=0, le=1, description="standard deviation of a depth image: 0.0012 m + this (1/m) times (z - 0.4 m)^2; structured light"
+        0.0019,
+        ge=0,
+        le=1,
+        description="standard deviation of a depth image: 0.0012 m + this (1/m) times (z - 0.4 m)^2; structured light",
     )
-    disparity_noise: float = Field(0.2, gt=0, le=10, description="standard deviation of a stereo pair's disparity (px)")
-    hit: float = Field(0.85, ge=0.05, le=6, description="log-odds added to a voxel that a ray ends in")
-    miss: float = Field(0.40, ge=0.05, le=6, description="log-odds taken from a voxel that a ray passes")
+    disparity_noise: float = Field(
+        0.2, gt=0, le=10, description="standard deviation of a stereo pair's disparity (px)"
+    )
+    hit: float = Field(
+        0.85, ge=0.05, le=6, description="log-odds added to a voxel that a ray ends in"
+    )
+    miss: float = Field(
+        0.40, ge=0.05, le=6, description="log-odds taken from a voxel that a ray passes"
+    )
     odometry: Literal["none", "lidar"] = Field(
-        "none", description="lidar: poses from LIDAR odometry (KISS-ICP, the extra 'odometry') instead of those of the log"
+        "none",
+        description="lidar: poses from LIDAR odometry (KISS-ICP, the extra 'odometry') instead of those of the log",
     )
-    clamp: tuple[float, float] = Field((-2.0, 3.5), description="bounds of the log-odds (OctoMap), within +-6")
+    clamp: tuple[float, float] = Field(
+        (-2.0, 3.5), description="bounds of the log-odds (OctoMap), within +-6"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Fusion:
         if not -6 <= self.clamp[0] < 0 < self.clamp[1] <= 6:  # kept as int8 in units of 1/20
             raise ValueError("clamp needs a bound in [-6, 0) and one in (0, 6]")
-        if self.max_range is not None and self.max_range > MOST_VOXELS * self.voxel_size:  # a sweep is carved in a dense grid
+        # a sweep is carved in a dense grid
+        if self.max_range is not None and self.max_range > MOST_VOXELS * self.voxel_size:
             raise ValueError(f"max_range reaches more than {MOST_VOXELS} voxels")
         return self
 
@@ -66,17 +95,30 @@ class Fusion(_Section):
 class Labels(_Section):
     """Where the classes come from (paper 3.1); always recorded in session.json and in every table."""
 
-    source: LabelSource = Field("auto", description="auto: labels of the log if it has any, else geometry; uniform: one class")
+    source: LabelSource = Field(
+        "auto",
+        description="auto: labels of the log if it has any, else geometry; uniform: one class",
+    )
     space: str | None = Field(
         None,
         description="label space of the log's ids, shipped (schemas/label_spaces) or a YAML file; default: as the log says, else guessed",
     )
-    model: Path | None = Field(None, description="ONNX model that labels the camera pictures, for source onnx")
-    spec: Path | None = Field(None, description="YAML file that says what the model takes and gives")
+    model: Path | None = Field(
+        None, description="ONNX model that labels the camera pictures, for source onnx"
+    )
+    spec: Path | None = Field(
+        None, description="YAML file that says what the model takes and gives"
+    )
     threads: int = Field(1, ge=1, le=64, description="threads of the model in each job")
-    erode: int = Field(2, ge=0, le=50, description="pixels beside the border of two labels in a picture that label nothing")
+    erode: int = Field(
+        2,
+        ge=0,
+        le=50,
+        description="pixels beside the border of two labels in a picture that label nothing",
+    )
     unseen: Literal["unlabelled", "geometry"] = Field(
-        "unlabelled", description="what points get that no picture shows, where labels come from pictures"
+        "unlabelled",
+        description="what points get that no picture shows, where labels come from pictures",
     )
 
 
@@ -87,25 +129,53 @@ class Descriptor(_Section):
         "auto", description="auto: semantic where labels come from a log, else geometric"
     )
     headings: int = Field(
-        20, ge=4, multiple_of=4, description="yaw hypotheses about gravity: maps are described in a quarter of them, the rest is free"
+        20,
+        ge=4,
+        multiple_of=4,
+        description="yaw hypotheses about gravity: maps are described in a quarter of them, the rest is free",
     )
-    stride: Literal[4, 8] = Field(8, description="database subvolumes every so many voxels in x and y (4 or 8)")
-    query_stride: Literal[4, 8] = Field(8, description="query subvolumes every so many voxels in x and y (4 or 8)")
-    reach: float | None = Field(None, description="database subvolumes lie this near to the road (m); default 30 m at 0.30 m voxels")
-    min_occupied: int = Field(40, ge=1, description="subvolumes with fewer occupied voxels are not described")
-    weights: Path | None = Field(None, description="safetensors file instead of the shipped weights")
-    vocabulary: Path | None = Field(None, description="safetensors file instead of the shipped vocabulary")
+    stride: Literal[4, 8] = Field(
+        8, description="database subvolumes every so many voxels in x and y (4 or 8)"
+    )
+    query_stride: Literal[4, 8] = Field(
+        8, description="query subvolumes every so many voxels in x and y (4 or 8)"
+    )
+    reach: float | None = Field(
+        None,
+        description="database subvolumes lie this near to the road (m); default 30 m at 0.30 m voxels",
+    )
+    min_occupied: int = Field(
+        40, ge=1, description="subvolumes with fewer occupied voxels are not described"
+    )
+    weights: Path | None = Field(
+        None, description="safetensors file instead of the shipped weights"
+    )
+    vocabulary: Path | None = Field(
+        None, description="safetensors file instead of the shipped vocabulary"
+    )
 
 
 class Query(_Section):
     """What is asked of the database."""
 
-    frames: int = Field(5, ge=1, description="keyframes fused into a query, as many before its own as after it; acc. of the paper is 5")
-    length: float | None = Field(None, gt=0, description="or all keyframes of this stretch of road (m), at most twice fusion.submap_length")
-    every: float | None = Field(None, gt=0, description="distance between queries (m); default 2 m at 0.30 m voxels")
+    frames: int = Field(
+        5,
+        ge=1,
+        description="keyframes fused into a query, as many before its own as after it; acc. of the paper is 5",
+    )
+    length: float | None = Field(
+        None,
+        gt=0,
+        description="or all keyframes of this stretch of road (m), at most twice fusion.submap_length",
+    )
+    every: float | None = Field(
+        None, gt=0, description="distance between queries (m); default 2 m at 0.30 m voxels"
+    )
     every_angle: float = Field(0.349, gt=0, description="or turn between queries (rad)")
     radius: float | None = Field(
-        None, gt=0, description="a query map has what is this near to its keyframes (m); default 24 m at 0.30 m voxels"
+        None,
+        gt=0,
+        description="a query map has what is this near to its keyframes (m); default 24 m at 0.30 m voxels",
     )
 
 
@@ -113,37 +183,75 @@ class Closures(_Section):
     """From word matches to accepted closures (paper 3.4, 3.5)."""
 
     neighbours: int = Field(5, ge=1, description="nearest database words of each query word (K)")
-    probes: int = Field(8, ge=1, description="nearest vocabulary cells searched for each query word")
+    probes: int = Field(
+        8, ge=1, description="nearest vocabulary cells searched for each query word"
+    )
     hypotheses: int = Field(96, ge=1, description="pooled hypotheses of a query that are verified")
-    places: int = Field(16, ge=1, description="submaps, of all sessions, that a query is verified in: those whose words agree best")
+    places: int = Field(
+        16,
+        ge=1,
+        description="submaps, of all sessions, that a query is verified in: those whose words agree best",
+    )
     kappa: float = Field(10.0, gt=0, description="kappa of the paper in voxels (3 m at 0.30 m)")
-    min_probability: float = Field(0.99, ge=0.0, le=1.0, description="closures below this are rejected")
-    exclude_seconds: float = Field(30.0, ge=0, description="within a session, keyframes nearer in time than this are no revisit")
-    exclude_distance: float | None = Field(None, ge=0, description="nor nearer along the road than this (m); default 50 m at 0.30 m voxels")
-    rejected_per_query: int = Field(3, ge=0, description="best rejected hypotheses of a query that are reported")
+    min_probability: float = Field(
+        0.99, ge=0.0, le=1.0, description="closures below this are rejected"
+    )
+    exclude_seconds: float = Field(
+        30.0,
+        ge=0,
+        description="within a session, keyframes nearer in time than this are no revisit",
+    )
+    exclude_distance: float | None = Field(
+        None,
+        ge=0,
+        description="nor nearer along the road than this (m); default 50 m at 0.30 m voxels",
+    )
+    rejected_per_query: int = Field(
+        3, ge=0, description="best rejected hypotheses of a query that are reported"
+    )
 
 
 class Training(_Section):
     """The encoder-decoder's training (supplement 1)."""
 
     samples: int = Field(250_000, ge=32, description="subvolumes seen, nine of each cut pair")
-    scenes: int = Field(60, ge=1, description="simulated scenes that pairs are cut from, when no session is given")
+    scenes: int = Field(
+        60, ge=1, description="simulated scenes that pairs are cut from, when no session is given"
+    )
     batch: int = Field(12, ge=2, description="pairs of a step")
     latent: int = Field(256, ge=8, le=1024, description="numbers of a descriptor")
-    dropout: float = Field(0.10, ge=0, lt=1, description="share of the input's voxels that are dropped to unobserved")
-    reconstruction_weight: float = Field(10.0, description="weight of the reconstruction loss against the prior's")
+    dropout: float = Field(
+        0.10, ge=0, lt=1, description="share of the input's voxels that are dropped to unobserved"
+    )
+    reconstruction_weight: float = Field(
+        10.0, description="weight of the reconstruction loss against the prior's"
+    )
     occupied_weight: float = Field(10.0, description="weight of occupied voxels within it")
-    contrastive_weight: float = Field(10.0, ge=0, description="weight of the contrastive term beside completion; 0 is the paper")
-    shift: float = Field(0.6, ge=0, description="random shift of the contrastive view, largest per axis (m at 0.30 m voxels)")
-    turn: float = Field(0.175, ge=0, description="random turn of the contrastive view, largest (rad)")
-    tilt: float = Field(0.006, ge=0, description="standard deviation of the incomplete view's vertical, per axis (rad)")
+    contrastive_weight: float = Field(
+        10.0, ge=0, description="weight of the contrastive term beside completion; 0 is the paper"
+    )
+    shift: float = Field(
+        0.6,
+        ge=0,
+        description="random shift of the contrastive view, largest per axis (m at 0.30 m voxels)",
+    )
+    turn: float = Field(
+        0.175, ge=0, description="random turn of the contrastive view, largest (rad)"
+    )
+    tilt: float = Field(
+        0.006,
+        ge=0,
+        description="standard deviation of the incomplete view's vertical, per axis (rad)",
+    )
     seed: int = 0
 
 
 class Settings(BaseSettings):
     """The whole configuration; see each section."""
 
-    model_config = SettingsConfigDict(extra="forbid", frozen=True, env_prefix="SEMLOC_", env_nested_delimiter="__")
+    model_config = SettingsConfigDict(
+        extra="forbid", frozen=True, env_prefix="SEMLOC_", env_nested_delimiter="__"
+    )
 
     fusion: Fusion = Fusion()
     labels: Labels = Labels()
@@ -161,7 +269,9 @@ class Settings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        return (init_settings,)  # files, environment and flags are merged by load(), so that each level can be refused by name
+        # files, environment and flags are merged by load(), so that each level can be refused by
+        # name
+        return (init_settings,)
 
     def resolved(self) -> Settings:
         """The same settings with every ``None`` length filled in from the voxel size."""
@@ -220,12 +330,21 @@ def _from_yaml(text: str) -> Any:
     """ValueError for what is no YAML; the values of tags and dates raise many other types."""
     try:
         return yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as problem:
+    except (
+        yaml.YAMLError,
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        RecursionError,
+    ) as problem:
         raise ValueError(" ".join(str(problem).split())[:200].rstrip(".")) from None
 
 
 def read_yaml(path: Path, what: str) -> Any:
-    """The content of the YAML file ``path``. SettingsError, which calls it ``what``, when it cannot be read or is larger than 1 MiB."""
+    """The content of the YAML file ``path``. SettingsError, which calls it ``what``, when it cannot
+    be read or is larger than 1 MiB.
+    """
     try:
         with path.open("rb") as file:
             content = file.read(_MOST_BYTES + 1)
@@ -236,8 +355,13 @@ def read_yaml(path: Path, what: str) -> Any:
         raise SettingsError(f"{what} {path} cannot be read as YAML: {problem}.") from None
 
 
-def load(file: Path | None = None, assignments: Mapping[str, str] | None = None, environment: Mapping[str, str] | None = None) -> Settings:
-    """Settings from defaults < ``file`` (YAML) < ``environment`` < ``assignments`` (``key.path`` -> YAML value).
+def load(
+    file: Path | None = None,
+    assignments: Mapping[str, str] | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> Settings:
+    """Settings from defaults < ``file`` (YAML) < ``environment`` < ``assignments`` (``key.path`` ->
+    YAML value).
 
     Raises SettingsError naming the key when it is unknown or its value impossible.
     """
@@ -245,8 +369,11 @@ def load(file: Path | None = None, assignments: Mapping[str, str] | None = None,
     if file is not None:
         content = read_yaml(file, "Settings file")
         if content is not None and not isinstance(content, dict):
-            raise SettingsError(f"Settings file {file} does not hold a mapping of sections such as 'fusion:'.")
-        merged = {str(k): {} if v is None else v for k, v in (content or {}).items()}  # a section may be empty
+            raise SettingsError(
+                f"Settings file {file} does not hold a mapping of sections such as 'fusion:'."
+            )
+        # a section may be empty
+        merged = {str(k): {} if v is None else v for k, v in (content or {}).items()}
     for name, value in (environment or {}).items():
         if name.startswith("SEMLOC_") and "__" in name:
             _assign(merged, name[len("SEMLOC_") :].lower().replace("__", "."), value)
@@ -258,8 +385,12 @@ def load(file: Path | None = None, assignments: Mapping[str, str] | None = None,
         first = problem.errors()[0]
         key = ".".join(str(p) for p in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise SettingsError(f"Unknown setting '{key}': 'semloc run --dump-config' prints every key.") from None
-        raise SettingsError(f"Setting '{key}' cannot be {first.get('input')!r}: {first['msg']}.") from None
+            raise SettingsError(
+                f"Unknown setting '{key}': 'semloc run --dump-config' prints every key."
+            ) from None
+        raise SettingsError(
+            f"Setting '{key}' cannot be {first.get('input')!r}: {first['msg']}."
+        ) from None
 
 
 def _assign(tree: dict[str, Any], key: str, value: str) -> None:

@@ -68,7 +68,9 @@ class Workspace:
 
     def sessions(self) -> list[SessionFolder]:
         """Sessions that were fused, by name."""
-        return [SessionFolder(p.parent) for p in sorted((self.path / "sessions").glob("*/session.json"))]
+        return [
+            SessionFolder(p.parent) for p in sorted((self.path / "sessions").glob("*/session.json"))
+        ]
 
     @property
     def closures(self) -> Path:

@@ -1,4 +1,6 @@
-"""For all tests: the installed package instead of the checkout, and the folder of real logs beside the checkout."""
+"""For all tests: the installed package instead of the checkout, and the folder of real logs beside
+the checkout.
+"""
 
 import sys
 from pathlib import Path
@@ -6,7 +8,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-# `python -m pytest` in the repository root would find the checkout's semloc_logs, which has no cli and no schemas inside
+# `python -m pytest` in the repository root would find the checkout's semloc_logs, which has no cli
+# and no schemas inside
 sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != ROOT]
 
 

@@ -11,7 +11,11 @@ from semloc_logs.cli.main import COMMANDS, program
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = [text for language, text in re.findall(r"```(\w*)\n(.*?)```", README, re.DOTALL) if language == "sh"]
+BLOCKS = [
+    text
+    for language, text in re.findall(r"```(\w*)\n(.*?)```", README, re.DOTALL)
+    if language == "sh"
+]
 SHOWN = re.findall(r"^semloc ([a-z]+)(.*)$", "\n".join(BLOCKS), re.MULTILINE)
 
 
@@ -28,7 +32,11 @@ def test_readme_shows_commands() -> None:
 @pytest.mark.parametrize(("name", "rest"), SHOWN)
 def test_commands_and_options_of_the_readme_exist(name: str, rest: str) -> None:
     assert name in COMMANDS
-    known = {option for parameter in _command(name).params for option in (*parameter.opts, *parameter.secondary_opts)}
+    known = {
+        option
+        for parameter in _command(name).params
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
     given = {word.split("=")[0] for word in rest.split("#")[0].split() if word.startswith("-")}
     assert given <= known | {"--help"}, f"semloc {name} has no {given - known}"
 

@@ -22,7 +22,11 @@ F64 = NDArray[np.float64]
 number = st.floats(-100, 100)
 vector = st.tuples(number, number, number).map(np.array)
 direction = vector.filter(lambda v: np.linalg.norm(v) > 1e-3)
-quaternion = st.tuples(number, number, number, number).map(np.array).filter(lambda q: np.linalg.norm(q) > 1e-3)
+quaternion = (
+    st.tuples(number, number, number, number)
+    .map(np.array)
+    .filter(lambda q: np.linalg.norm(q) > 1e-3)
+)
 
 
 def by_formula(q: F64) -> F64:
@@ -57,7 +61,9 @@ def test_transforms_from_quaternions_and_back(t: F64, q: F64) -> None:
 
 def test_a_quarter_turn_by_hand() -> None:
     T = transform(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 2.0, 2.0]))  # 90 degrees about z
-    np.testing.assert_allclose(apply(T, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 5.0]])), [[1, 3, 3], [0, 2, 8]], atol=1e-15)
+    np.testing.assert_allclose(
+        apply(T, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 5.0]])), [[1, 3, 3], [0, 2, 8]], atol=1e-15
+    )
     np.testing.assert_allclose(T, yaw_transform(np.pi / 2, (1.0, 2.0, 3.0)), atol=1e-15)
     assert apply(T, np.zeros((0, 3), np.float32)).shape == (0, 3)
     assert rotation_angle(T[:3, :3]) == pytest.approx(np.pi / 2)
@@ -74,11 +80,15 @@ def test_angles_are_exact_near_zero_and_near_a_half_turn(angle: float) -> None:
 @settings(deadline=None)
 def test_the_rotation_between_two_directions(a: F64, b: F64) -> None:
     R = rotation_between(a, b)
-    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    a = a / np.linalg.norm(a)
+    b = b / np.linalg.norm(b)
     np.testing.assert_allclose(R @ a, b, atol=1e-7)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) > 0
-    assert rotation_angle(R) == pytest.approx(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b), abs=1e-6)  # and no more than that
+    # and no more than that
+    assert rotation_angle(R) == pytest.approx(
+        np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b), abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("axis", np.eye(3).tolist())
@@ -91,11 +101,30 @@ def test_the_rotation_between_opposite_directions(axis: list[float]) -> None:
 def test_interpolation_of_stamps_since_1970() -> None:
     start = 1_700_000_000_123_456_789
     stamps = start + np.array([0, 1_000_000_000, 3_000_000_000])
-    poses = np.array([yaw_transform(0.0), yaw_transform(0.4, (1.0, 0.0, 0.0)), yaw_transform(0.4, (1.0, 4.0, 0.0))])
-    at = start + np.array([-5, 0, 250_000_000, 250_000_001, 1_000_000_000, 2_000_000_000, 3_000_000_000, 9_000_000_000])
+    poses = np.array(
+        [
+            yaw_transform(0.0),
+            yaw_transform(0.4, (1.0, 0.0, 0.0)),
+            yaw_transform(0.4, (1.0, 4.0, 0.0)),
+        ]
+    )
+    at = start + np.array(
+        [
+            -5,
+            0,
+            250_000_000,
+            250_000_001,
+            1_000_000_000,
+            2_000_000_000,
+            3_000_000_000,
+            9_000_000_000,
+        ]
+    )
     found = interpolate(stamps, poses, at)
     np.testing.assert_allclose(found[:, 0, 3], [0, 0, 0.25, 0.250000001, 1, 1, 1, 1], atol=1e-12)
     np.testing.assert_allclose(found[:, 1, 3], [0, 0, 0, 0, 0, 2, 4, 4], atol=1e-12)
     yaw = np.arctan2(found[:, 1, 0], found[:, 0, 0])
     np.testing.assert_allclose(yaw, [0, 0, 0.1, 0.1000000004, 0.4, 0.4, 0.4, 0.4], atol=1e-12)
-    np.testing.assert_allclose(interpolate(stamps[:1], poses[1:2], at), np.repeat(poses[1:2], len(at), 0))
+    np.testing.assert_allclose(
+        interpolate(stamps[:1], poses[1:2], at), np.repeat(poses[1:2], len(at), 0)
+    )

@@ -1,4 +1,6 @@
-"""One import direction, read from the source: a module imports only what stands before it in the story."""
+"""One import direction, read from the source: a module imports only what stands before it in the
+story.
+"""
 
 import ast
 from collections.abc import Iterator, Sequence
@@ -36,8 +38,27 @@ ORDER = [
 ]
 # sub-rooms and modules of a room that stands in an order of its own; what is not named stands last
 INNER_ORDER = {
-    "logs": ["log", "problems", "roles", "messages", "containers", "poses", "sensors", "session", "annotation"],
-    "simulation": ["conditions", "meshes", "town", "sensors", "drives", "output", "sessions", "demo"],
+    "logs": [
+        "log",
+        "problems",
+        "roles",
+        "messages",
+        "containers",
+        "poses",
+        "sensors",
+        "session",
+        "annotation",
+    ],
+    "simulation": [
+        "conditions",
+        "meshes",
+        "town",
+        "sensors",
+        "drives",
+        "output",
+        "sessions",
+        "demo",
+    ],
     "closures": ["query", "acceptance", "database", "matching", "closure_tables"],
     "benchmarks": ["peers", "descriptors", "labels", "localisation", "speed"],
 }
@@ -60,7 +81,9 @@ def _noun(path: Path) -> str:
 
 
 def _place(parts: Sequence[str]) -> tuple[int, int]:
-    """Where a module stands, by the parts of its name below the package: in the order of rooms, and within its room."""
+    """Where a module stands, by the parts of its name below the package: in the order of rooms, and
+    within its room.
+    """
     room, *rest = parts
     inner = INNER_ORDER.get(room, [])
     return ORDER.index(room), inner.index(rest[0]) if rest and rest[0] in inner else len(inner)
@@ -87,7 +110,10 @@ def test_the_order_within_a_room_names_what_is_there(room: str) -> None:
 
 
 def test_modules_do_not_import_each_other_in_circles() -> None:
-    names = {".".join(("semloc_logs", *p.relative_to(ROOT / "semloc_logs").with_suffix("").parts)): p for p in SOURCES}
+    names = {
+        ".".join(("semloc_logs", *p.relative_to(ROOT / "semloc_logs").with_suffix("").parts)): p
+        for p in SOURCES
+    }
     graph = {name: {m for m, _ in _imports(path) if m in names} for name, path in names.items()}
     assert tuple(TopologicalSorter(graph).static_order())
 
@@ -96,28 +122,64 @@ def test_every_module_has_a_place() -> None:
     assert {_noun(p) for p in SOURCES} - {"__init__"} <= set(ORDER)
 
 
-@pytest.mark.parametrize("path", [*SOURCES, *CLI, *sorted((ROOT / "tests").rglob("*.py"))], ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "path",
+    [*SOURCES, *CLI, *sorted((ROOT / "tests").rglob("*.py"))],
+    ids=lambda p: str(p.relative_to(ROOT)),
+)
 def test_nobody_imports_the_checkouts_cli(path: Path) -> None:
-    assert not [m for m, level in _imports(path) if level == 0 and m.split(".")[0] in ("cli", "schemas")]
+    assert not [
+        m for m, level in _imports(path) if level == 0 and m.split(".")[0] in ("cli", "schemas")
+    ]
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_only_the_cli_prints_or_exits(path: Path) -> None:
-    calls = [node.func for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
-    assert not [c for c in calls if isinstance(c, ast.Name) and c.id in ("print", "input", "exit", "quit", "breakpoint")]
+    calls = [
+        node.func
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+    ]
     assert not [
-        c for c in calls if isinstance(c, ast.Attribute) and c.attr == "exit" and isinstance(c.value, ast.Name) and c.value.id == "sys"
+        c
+        for c in calls
+        if isinstance(c, ast.Name) and c.id in ("print", "input", "exit", "quit", "breakpoint")
+    ]
+    assert not [
+        c
+        for c in calls
+        if isinstance(c, ast.Attribute)
+        and c.attr == "exit"
+        and isinstance(c.value, ast.Name)
+        and c.value.id == "sys"
     ]
 
 
 @pytest.mark.parametrize("path", CLI, ids=lambda p: p.name)
 def test_cli_imports_its_siblings_relatively_and_nothing_heavy(path: Path) -> None:
     light = {"semloc_logs", "semloc_logs.errors"}
-    at_import = [n for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.Import | ast.ImportFrom)]
+    at_import = [
+        n
+        for n in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(n, ast.Import | ast.ImportFrom)
+    ]
     for node in at_import:
-        names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module or ""]
+        names = (
+            [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module or ""]
+        )
         if isinstance(node, ast.ImportFrom) and node.level:
             continue
         for name in names:
-            assert name in light or not name.startswith("semloc_logs"), f"{path.name} imports {name} before it is needed"
-            assert name.split(".")[0] not in {"torch", "numba", "pyarrow", "scipy", "cv2", "pydantic", "numpy", "rich"}
+            assert name in light or not name.startswith("semloc_logs"), (
+                f"{path.name} imports {name} before it is needed"
+            )
+            assert name.split(".")[0] not in {
+                "torch",
+                "numba",
+                "pyarrow",
+                "scipy",
+                "cv2",
+                "pydantic",
+                "numpy",
+                "rich",
+            }

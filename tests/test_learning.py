@@ -33,7 +33,8 @@ def _settings(**training: Any) -> Settings:
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
     """Four shards of six pairs each: a floor, and walls at random places."""
-    folder, rng = tmp_path_factory.mktemp("shards"), np.random.default_rng(0)
+    folder = tmp_path_factory.mktemp("shards")
+    rng = np.random.default_rng(0)
     paths = []
     for n in range(4):
         pairs = []
@@ -54,9 +55,13 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
 
 
 def test_a_descriptor_is_learned_measured_and_described(shards: list[Path], tmp_path: Path) -> None:
-    settings, notes = _settings(samples=54, batch=2, seed=5), list[str]()
-    output, checkpoint = tmp_path / "geometric.safetensors", tmp_path / "checkpoint.safetensors"
-    scores = learn_descriptor("geometric", Packed(shards[:2], shards[2:]), settings, checkpoint, output, notes.append)
+    settings = _settings(samples=54, batch=2, seed=5)
+    notes = list[str]()
+    output = tmp_path / "geometric.safetensors"
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    scores = learn_descriptor(
+        "geometric", Packed(shards[:2], shards[2:]), settings, checkpoint, output, notes.append
+    )
     assert scores is not None
     assert {"accuracy", "recall5"} <= set(scores)
     assert all(0 <= s <= 1 for s in scores.values())
@@ -64,27 +69,49 @@ def test_a_descriptor_is_learned_measured_and_described(shards: list[Path], tmp_
     with safe_open(output, "pt") as handle:
         card = handle.metadata()
     assert json.loads(card["scores"]) == pytest.approx(scores)
-    assert (card["variant"], card["samples"], card["seed"], card["shards"]) == ("geometric", "54", "5", "2")
-    # the finished checkpoint is not trained again, and gives the same network
-    first, notes = load_file(output), []
-    assert learn_descriptor("geometric", Packed(shards[:2], shards[2:]), settings, checkpoint, output, notes.append) == pytest.approx(
-        scores
+    assert (card["variant"], card["samples"], card["seed"], card["shards"]) == (
+        "geometric",
+        "54",
+        "5",
+        "2",
     )
+    # the finished checkpoint is not trained again, and gives the same network
+    first = load_file(output)
+    notes = []
+    assert learn_descriptor(
+        "geometric", Packed(shards[:2], shards[2:]), settings, checkpoint, output, notes.append
+    ) == pytest.approx(scores)
     assert notes == []
     assert all(torch.equal(tensor, first[name]) for name, tensor in load_file(output).items())
 
 
 def test_two_scenes_are_too_few(shards: list[Path], tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="at least 3"):
-        learn_descriptor("geometric", Packed(shards[:2], []), _settings(), tmp_path / "c", tmp_path / "w", lambda _: None)
+        learn_descriptor(
+            "geometric",
+            Packed(shards[:2], []),
+            _settings(),
+            tmp_path / "c",
+            tmp_path / "w",
+            lambda _: None,
+        )
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_vocabulary_belongs_to_its_weights(shards: list[Path], tmp_path: Path) -> None:
     settings = _settings(samples=36, batch=2)
     weights = tmp_path / "geometric.safetensors"
-    learn_descriptor("geometric", Packed(shards[:2], shards[2:]), settings, tmp_path / "c.safetensors", weights, lambda _: None)
-    own = settings.model_copy(update={"descriptor": settings.descriptor.model_copy(update={"weights": weights})})
+    learn_descriptor(
+        "geometric",
+        Packed(shards[:2], shards[2:]),
+        settings,
+        tmp_path / "c.safetensors",
+        weights,
+        lambda _: None,
+    )
+    own = settings.model_copy(
+        update={"descriptor": settings.descriptor.model_copy(update={"weights": weights})}
+    )
     output = tmp_path / "words.safetensors"
     # 24 pairs of nine descriptors are fewer than 256: three times the same shards are enough
     with pytest.raises(SettingsError, match="256"):
@@ -106,7 +133,9 @@ def _session(folder: SessionFolder, n: int, posed: bool = True) -> list[np.ndarr
     for pose in poses:
         x = pose[0, 3] + rng.uniform(-15, 15, 3000)
         ground = np.stack([x, rng.uniform(-6, 6, 3000), np.zeros(3000)], 1)
-        walls = np.stack([x, np.where(rng.random(3000) < 0.5, -6.0, 6.0), rng.uniform(0, 5, 3000)], 1)
+        walls = np.stack(
+            [x, np.where(rng.random(3000) < 0.5, -6.0, 6.0), rng.uniform(0, 5, 3000)], 1
+        )
         clouds.append((np.concatenate([ground, walls]) - pose[:3, 3]).astype(np.float32))
     label = np.repeat([0, 2], 3000).astype(np.uint8)
     stamps = (np.arange(n) * 10**9).tolist()
@@ -127,7 +156,11 @@ def _session(folder: SessionFolder, n: int, posed: bool = True) -> list[np.ndarr
     }
     write_table(folder.frames, contracts.table("frames", frames), METADATA)
     folder.keyframes.mkdir()
-    list(keep_keyframes(folder.keyframes, stamps, (Keyframe(cloud, label) for cloud in clouds), METADATA))
+    list(
+        keep_keyframes(
+            folder.keyframes, stamps, (Keyframe(cloud, label) for cloud in clouds), METADATA
+        )
+    )
     write_json(folder.session_json, {"posed": posed})
     return clouds
 
@@ -159,7 +192,9 @@ def test_sessions_become_shards_of_pairs_once(tmp_path: Path) -> None:
     folder = SessionFolder(tmp_path / "sessions/drive")
     _session(folder, 12)
     settings = load().resolved()
-    (shard,) = session_shards(tmp_path / "shards", [folder], settings, make_engine("serial"), lambda _: None).every
+    (shard,) = session_shards(
+        tmp_path / "shards", [folder], settings, make_engine("serial"), lambda _: None
+    ).every
     part, whole, other = read_shard(shard)
     assert len(part) == len(whole) == len(other) > 20
     assert {0, 2, 254} <= set(np.unique(whole).tolist())
@@ -167,7 +202,9 @@ def test_sessions_become_shards_of_pairs_once(tmp_path: Path) -> None:
     session_shards(tmp_path / "shards", [folder], settings, make_engine("serial"), lambda _: None)
     assert shard.stat().st_mtime_ns == written
     other_voxels = load(assignments={"fusion.voxel_size": "0.2"}).resolved()
-    assert session_shards(tmp_path / "shards", [folder], other_voxels, make_engine("serial"), lambda _: None).every != [shard]
+    assert session_shards(
+        tmp_path / "shards", [folder], other_voxels, make_engine("serial"), lambda _: None
+    ).every != [shard]
 
 
 def test_sessions_without_poses_teach_nothing(tmp_path: Path) -> None:
@@ -175,4 +212,6 @@ def test_sessions_without_poses_teach_nothing(tmp_path: Path) -> None:
     _session(folder, 12, posed=False)
     assert session_frames(folder) == []
     with pytest.raises(SettingsError, match="poses"):
-        session_shards(tmp_path / "shards", [folder], load().resolved(), make_engine("serial"), lambda _: None)
+        session_shards(
+            tmp_path / "shards", [folder], load().resolved(), make_engine("serial"), lambda _: None
+        )

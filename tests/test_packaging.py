@@ -15,7 +15,10 @@ MAPPED = {"semloc_logs.cli": "cli", "semloc_logs.schemas": "schemas"}
 
 def _folders() -> set[str]:
     """Packages as the folders say."""
-    found = {".".join(p.parent.relative_to(ROOT).parts) for p in (ROOT / "semloc_logs").rglob("__init__.py")}
+    found = {
+        ".".join(p.parent.relative_to(ROOT).parts)
+        for p in (ROOT / "semloc_logs").rglob("__init__.py")
+    }
     return found | set(MAPPED)
 
 
@@ -26,7 +29,9 @@ def test_packages_listed_are_the_folders() -> None:
 
 
 def test_every_folder_with_modules_is_a_package() -> None:
-    folders = {p.parent for top in ("semloc_logs", "cli", "schemas") for p in (ROOT / top).rglob("*.py")}
+    folders = {
+        p.parent for top in ("semloc_logs", "cli", "schemas") for p in (ROOT / top).rglob("*.py")
+    }
     assert not [f for f in folders if not (f / "__init__.py").exists()]
 
 
@@ -43,8 +48,24 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
     for name in ("semloc_logs", "cli", "schemas"):
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc"))
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index", "-w", str(folder), "."]
+        shutil.copytree(
+            ROOT / name,
+            source / name,
+            ignore=shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc"),
+        )
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "-w",
+        str(folder),
+        ".",
+    ]
     done = subprocess.run(command, cwd=source, capture_output=True, text=True, timeout=55)
     assert done.returncode == 0, done.stderr
     return zipfile.ZipFile(next(folder.glob("*.whl")))
@@ -61,7 +82,15 @@ def test_wheel_has_every_module_and_data_file(wheel: zipfile.ZipFile) -> None:
     for name in ("semloc_logs", "cli", "schemas"):
         inside = "semloc_logs" if name == "semloc_logs" else f"semloc_logs/{name}"
         for path in (ROOT / name).rglob("*"):
-            kept = path.is_file() and path.suffix in {".py", ".json", ".yaml", ".msg", ".proto", ".safetensors", ".typed"}
+            kept = path.is_file() and path.suffix in {
+                ".py",
+                ".json",
+                ".yaml",
+                ".msg",
+                ".proto",
+                ".safetensors",
+                ".typed",
+            }
             if kept and "__pycache__" not in path.parts:
                 wanted.add(f"{inside}/{path.relative_to(ROOT / name).as_posix()}")
     assert not wanted - set(wheel.namelist())
@@ -77,7 +106,9 @@ def test_schemas_are_readable_from_the_wheel(wheel: zipfile.ZipFile, tmp_path: P
     wheel.extractall(tmp_path)
     program = "import semloc_logs.schemas as s; print(s.__file__, len(s.read_text('parquet/closures.json')), *s.names('parquet', '.json'))"
     command = [sys.executable, "-P", "-c", program]
-    done = subprocess.run(command, cwd=tmp_path, env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True)
+    done = subprocess.run(
+        command, cwd=tmp_path, env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     where, size, *names = done.stdout.split()
     assert Path(where) == tmp_path / "semloc_logs/schemas/__init__.py"

@@ -17,7 +17,12 @@ def file(tmp_path: Path) -> Path:
 
 
 def test_defaults_file_environment_assignments_in_this_order(file: Path) -> None:
-    environment = {"SEMLOC_FUSION__HIT": "0.8", "SEMLOC_FUSION__MISS": "0.35", "PATH": "/bin", "SEMLOC_HOME": "x"}
+    environment = {
+        "SEMLOC_FUSION__HIT": "0.8",
+        "SEMLOC_FUSION__MISS": "0.35",
+        "PATH": "/bin",
+        "SEMLOC_HOME": "x",
+    }
     found = load(file, {"fusion.miss": "0.45", "labels.source": "uniform"}, environment)
     f = found.fusion
     assert (f.clamp, f.voxel_size, f.hit, f.miss) == ((-2.0, 3.5), 0.2, 0.8, 0.45)
@@ -110,7 +115,17 @@ def test_impossible_values_are_refused_by_name(key: str, value: str) -> None:
         load(assignments={key: value})
 
 
-@pytest.mark.parametrize("content", [b"fusion: [", b"\xff\xfe\x00", b"- a\n- b\n", b"just text", b"fusion: 2001-99-99", b"[" * 5000])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"fusion: [",
+        b"\xff\xfe\x00",
+        b"- a\n- b\n",
+        b"just text",
+        b"fusion: 2001-99-99",
+        b"[" * 5000,
+    ],
+)
 def test_files_that_are_no_settings_are_refused_by_name(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "odd.yaml"
     path.write_bytes(content)
@@ -135,20 +150,27 @@ def test_empty_files_and_sections_are_the_defaults(text: str, tmp_path: Path) ->
 
 def test_dump_and_load(tmp_path: Path) -> None:
     path = tmp_path / "dumped.yaml"
-    changed = {"fusion.voxel_size": "0.05", "fusion.clamp": "[-1, 2]", "descriptor.weights": "a/b.safetensors", "query.length": "12.5"}
+    changed = {
+        "fusion.voxel_size": "0.05",
+        "fusion.clamp": "[-1, 2]",
+        "descriptor.weights": "a/b.safetensors",
+        "query.length": "12.5",
+    }
     for settings in (Settings(), load(assignments=changed), load(assignments=changed).resolved()):
         path.write_text(settings.dump())
         assert load(path) == settings
 
 
 def test_lengths_follow_the_voxel_size() -> None:
-    street, room = Settings().resolved(), load(assignments={"fusion.voxel_size": "0.05"}).resolved()
+    street = Settings().resolved()
+    room = load(assignments={"fusion.voxel_size": "0.05"}).resolved()
     assert street.fusion.max_range == 50
     assert street.query.every == 2
     assert street.closures.exclude_distance == 50
     for section in ("fusion", "query", "closures"):
         for name in type(getattr(street, section)).model_fields:
-            wide, small = getattr(getattr(street, section), name), getattr(getattr(room, section), name)
+            wide = getattr(getattr(street, section), name)
+            small = getattr(getattr(room, section), name)
             before = getattr(getattr(Settings(), section), name)
             if before is None and name != "length":
                 assert small == pytest.approx(wide / 6), name
@@ -156,12 +178,15 @@ def test_lengths_follow_the_voxel_size() -> None:
                 assert small == wide == before, name
     assert room.query.length is None  # not asked for: a query has query.frames keyframes
     assert room.resolved() == room
-    kept = load(assignments={"fusion.voxel_size": "0.05", "fusion.max_range": "20", "fusion.min_range": "0"}).resolved()
+    kept = load(
+        assignments={"fusion.voxel_size": "0.05", "fusion.max_range": "20", "fusion.min_range": "0"}
+    ).resolved()
     assert (kept.fusion.max_range, kept.fusion.min_range) == (20, 0)
 
 
 def test_fingerprints_are_of_the_named_sections_only() -> None:
-    a, b = Settings(), load(assignments={"query.frames": "7"})
+    a = Settings()
+    b = load(assignments={"query.frames": "7"})
     assert a.fingerprint("fusion", "labels") == b.fingerprint("fusion", "labels")
     assert a.fingerprint("fusion", "query") != b.fingerprint("fusion", "query")
     assert a.fingerprint("fusion") == load().fingerprint("fusion")

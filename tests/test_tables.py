@@ -15,7 +15,15 @@ import pytest
 from semloc_logs.errors import ContractError, WorkspaceError
 from semloc_logs.schemas import read_text
 from semloc_logs.tables import contracts
-from semloc_logs.tables.table import read_json, read_metadata, read_table, replacing_file, replacing_folder, write_json, write_table
+from semloc_logs.tables.table import (
+    read_json,
+    read_metadata,
+    read_table,
+    replacing_file,
+    replacing_folder,
+    write_json,
+    write_table,
+)
 
 
 def leftovers(folder: Path) -> list[str]:
@@ -104,7 +112,9 @@ while True:
 
 @pytest.mark.parametrize("wait", [0.02, 0.11])
 def test_a_kill_leaves_old_or_new_but_never_half(wait: float, tmp_path: Path) -> None:
-    process = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE
+    )
     assert process.stdout is not None
     assert process.stdout.readline() == b"ready\n"
     while not (tmp_path / "folder").exists():
@@ -155,11 +165,20 @@ def test_tables_come_back_with_their_metadata(rows: int, tmp_path: Path) -> None
 
 def test_writing_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        write_table(tmp_path / name, contracts.table("words", columns(1000)), {"z": 1, "a": {"d": 1, "c": 2}}, ("submap",))
+        write_table(
+            tmp_path / name,
+            contracts.table("words", columns(1000)),
+            {"z": 1, "a": {"d": 1, "c": 2}},
+            ("submap",),
+        )
         write_json(tmp_path / f"{name}.json", {"z": 1, "a": [1.5, None]})
     write_json(tmp_path / "c.json", {"a": [1.5, None], "z": 1})
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes() == (tmp_path / "c.json").read_bytes()
+    assert (
+        (tmp_path / "a.json").read_bytes()
+        == (tmp_path / "b.json").read_bytes()
+        == (tmp_path / "c.json").read_bytes()
+    )
     assert read_json(tmp_path / "a.json") == {"a": [1.5, None], "z": 1}
 
 
@@ -186,7 +205,16 @@ def test_missing_and_damaged_files_are_refused_by_name(tmp_path: Path) -> None:
 
 
 def test_every_contract_is_a_schema() -> None:
-    assert set(contracts.tables()) >= {"blocks", "closures", "frames", "keyframes", "rejected", "trajectory", "voxels", "words"}
+    assert set(contracts.tables()) >= {
+        "blocks",
+        "closures",
+        "frames",
+        "keyframes",
+        "rejected",
+        "trajectory",
+        "voxels",
+        "words",
+    }
     for name in contracts.tables():
         assert contracts.contract(name)["version"] == 1
         assert len(contracts.schema(name).names) == len(set(contracts.schema(name).names))
@@ -194,12 +222,16 @@ def test_every_contract_is_a_schema() -> None:
 
 
 def test_the_columns_of_closures_are_those_promised() -> None:
-    names = "query_session target_session query_stamp_ns target_stamp_ns t_x t_y t_z q_x q_y q_z q_w "
+    names = (
+        "query_session target_session query_stamp_ns target_stamp_ns t_x t_y t_z q_x q_y q_z q_w "
+    )
     names += "covariance overlap probability inliers words"
     schema = contracts.schema("closures")
     assert schema.names == names.split()
     assert schema.field("covariance").type == pa.list_(pa.float64(), 36)
-    assert [str(schema.field(n).type) for n in ("query_stamp_ns", "t_x", "probability", "inliers")] == [
+    assert [
+        str(schema.field(n).type) for n in ("query_stamp_ns", "t_x", "probability", "inliers")
+    ] == [
         "int64",
         "double",
         "double",
@@ -209,7 +241,14 @@ def test_the_columns_of_closures_are_those_promised() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"extra": [1, 2, 3]}, {"word": None}, {"word": [1, 2]}, {"word": [1, 2, 70000]}, {"word": [1, -1, 2]}, {"x": ["a", "b", "c"]}],
+    [
+        {"extra": [1, 2, 3]},
+        {"word": None},
+        {"word": [1, 2]},
+        {"word": [1, 2, 70000]},
+        {"word": [1, -1, 2]},
+        {"x": ["a", "b", "c"]},
+    ],
 )
 def test_columns_that_break_the_contract_are_refused(change: dict[str, object]) -> None:
     broken = columns() | change

@@ -1,7 +1,8 @@
-"""FAISS binary indices for `semloc benchmark search`: FOLDER with codes.npy, queries.npy (uint64) and truth.npy; JSON out.
+"""FAISS binary indices for `semloc benchmark search`: FOLDER with codes.npy, queries.npy (uint64)
+and truth.npy; JSON out.
 
-Needs faiss-cpu and numpy only. Of each index: least and median processor milliseconds of all look-ups of the five nearest, and the share
-of queries whose truth is among them.
+Needs faiss-cpu and numpy only. Of each index: least and median processor milliseconds of all
+look-ups of the five nearest, and the share of queries whose truth is among them.
 """
 
 import json
@@ -25,7 +26,10 @@ def measure(index, queries, truth, repeats):
 
 def main():
     faiss.omp_set_num_threads(1)
-    codes, queries = (np.load(Path(sys.argv[1]) / f"{n}.npy").view(np.uint8).reshape(-1, 8) for n in ("codes", "queries"))
+    codes, queries = (
+        np.load(Path(sys.argv[1]) / f"{n}.npy").view(np.uint8).reshape(-1, 8)
+        for n in ("codes", "queries")
+    )
     truth = np.load(Path(sys.argv[1]) / "truth.npy")
     out = {}
     flat = faiss.IndexBinaryFlat(64)

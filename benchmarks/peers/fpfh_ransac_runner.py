@@ -1,7 +1,9 @@
-"""FPFH + RANSAC + ICP (Open3D) for `semloc benchmark localisation`: JOB; the steps of Open3D's tutorial on global registration.
+"""FPFH + RANSAC + ICP (Open3D) for `semloc benchmark localisation`: JOB; the steps of Open3D's
+tutorial on global registration.
 
-Voxels of 0.8 m, normals in 2, features in 5, correspondences in 1.5 voxels, 20,000 iterations where the tutorial has 100,000;
-point-to-plane ICP within 0.4 voxels. The score is RANSAC's fitness. Needs open3d and numpy.
+Voxels of 0.8 m, normals in 2, features in 5, correspondences in 1.5 voxels, 20,000 iterations where
+the tutorial has 100,000; point-to-plane ICP within 0.4 voxels. The score is RANSAC's fitness. Needs
+open3d and numpy.
 """
 
 import sys
@@ -23,17 +25,32 @@ def prepare(points):
     for part in (fine, cloud):
         part.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=2 * VOXEL, max_nn=30))
         part.orient_normals_towards_camera_location(np.array([0.0, 0.0, 2.0]))
-    return fine, cloud, R.compute_fpfh_feature(cloud, o3d.geometry.KDTreeSearchParamHybrid(radius=5 * VOXEL, max_nn=100))
+    return (
+        fine,
+        cloud,
+        R.compute_fpfh_feature(
+            cloud, o3d.geometry.KDTreeSearchParamHybrid(radius=5 * VOXEL, max_nn=100)
+        ),
+    )
 
 
 def register(database, query, yaw):
     near = 1.5 * VOXEL
-    checks = [R.CorrespondenceCheckerBasedOnEdgeLength(0.9), R.CorrespondenceCheckerBasedOnDistance(near)]
+    checks = [
+        R.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+        R.CorrespondenceCheckerBasedOnDistance(near),
+    ]
     found = R.registration_ransac_based_on_feature_matching(
         query[1], database[1], query[2], database[2], True, near, R.TransformationEstimationPointToPoint(False), 3, checks,
         R.RANSACConvergenceCriteria(20_000, 0.999),
     )  # fmt: skip
-    better = R.registration_icp(query[0], database[0], 0.4 * VOXEL, found.transformation, R.TransformationEstimationPointToPlane())
+    better = R.registration_icp(
+        query[0],
+        database[0],
+        0.4 * VOXEL,
+        found.transformation,
+        R.TransformationEstimationPointToPlane(),
+    )
     return found.fitness, better.transformation
 
 

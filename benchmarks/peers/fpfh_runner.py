@@ -1,8 +1,10 @@
-"""FPFH (Open3D) for `semloc benchmark retrieval`: FOLDER RADIUS CELL; features of the points nearest to given centres.
+"""FPFH (Open3D) for `semloc benchmark retrieval`: FOLDER RADIUS CELL; features of the points
+nearest to given centres.
 
-For every K with points_K.npy ((n, 3), metres), track_K.npy ((k, 3), where the sensor was) and centres_K.npy ((m, 3)) it writes
-features_K.npy ((m, 33) float32). Normals are those of all points within a metre, seen from the sensor's nearest place; features come
-from the points thinned to cells of CELL metres (0: all of them) within RADIUS. Needs open3d and numpy only.
+For every K with points_K.npy ((n, 3), metres), track_K.npy ((k, 3), where the sensor was) and
+centres_K.npy ((m, 3)) it writes features_K.npy ((m, 33) float32). Normals are those of all points
+within a metre, seen from the sensor's nearest place; features come from the points thinned to cells
+of CELL metres (0: all of them) within RADIUS. Needs open3d and numpy only.
 """
 
 import os
@@ -19,7 +21,8 @@ def features(points, track, centres, radius, cell):
     if cell > 0:
         cloud = cloud.voxel_down_sample(cell)
     places = o3d.geometry.KDTreeFlann(o3d.geometry.PointCloud(o3d.utility.Vector3dVector(track)))
-    kept, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    kept = np.asarray(cloud.points)
+    normals = np.asarray(cloud.normals)
     sensor = track[[places.search_knn_vector_3d(p, 1)[1][0] for p in kept]]
     away = np.einsum("nd,nd->n", normals, sensor - kept) < 0
     normals[away] *= -1
@@ -33,10 +36,15 @@ def features(points, track, centres, radius, cell):
 
 
 def main():
-    folder, radius, cell = Path(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
+    folder = Path(sys.argv[1])
+    radius = float(sys.argv[2])
+    cell = float(sys.argv[3])
     for path in sorted(folder.glob("points_*.npy")):
         key = path.stem.removeprefix("points_")
-        points, track, centres = (np.load(folder / f"{name}_{key}.npy").astype(float) for name in ("points", "track", "centres"))
+        points, track, centres = (
+            np.load(folder / f"{name}_{key}.npy").astype(float)
+            for name in ("points", "track", "centres")
+        )
         part = folder / f"part_{key}.npy"
         np.save(part, features(points, track, centres, radius, cell))
         os.replace(part, folder / f"features_{key}.npy")

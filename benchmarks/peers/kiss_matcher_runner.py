@@ -1,4 +1,5 @@
-"""KISS-Matcher for `semloc benchmark localisation`: JOB. Voxels of 0.5 m; the score is the number of final inliers.
+"""KISS-Matcher for `semloc benchmark localisation`: JOB. Voxels of 0.5 m; the score is the number
+of final inliers.
 
 Needs kiss-matcher and numpy.
 """

@@ -1,8 +1,10 @@
-"""What the runners of `semloc benchmark localisation` share: a job of local maps in, ranked poses out. Needs numpy only.
+"""What the runners of `semloc benchmark localisation` share: a job of local maps in, ranked poses
+out. Needs numpy only.
 
-FOLDER/NAME.npy are clouds (n, 3), float32, metres, in level frames with x along the drive. A runner gets the path of a job,
-{"folder", "database": [NAME], "queries": [{"cloud": NAME, "candidates": [[number, yaw]]}]}, and prints one line of JSON,
-{"build_s", "queries": [{"seconds", "found": [[number, score, 16 numbers of database_T_query]]}]}, best first.
+FOLDER/NAME.npy are clouds (n, 3), float32, metres, in level frames with x along the drive. A runner
+gets the path of a job, {"folder", "database": [NAME], "queries": [{"cloud": NAME, "candidates":
+[[number, yaw]]}]}, and prints one line of JSON, {"build_s", "queries": [{"seconds", "found":
+[[number, score, 16 numbers of database_T_query]]}]}, best first.
 """
 
 import json
@@ -27,7 +29,9 @@ def thinned(points, cell):
 
 
 def run(build, answer):
-    """``build(clouds)`` makes a database of clouds, ``answer(database, cloud, candidates)`` gives (number, score, pose)s."""
+    """``build(clouds)`` makes a database of clouds, ``answer(database, cloud, candidates)`` gives
+    (number, score, pose)s.
+    """
     job = json.loads(Path(sys.argv[1]).read_text())
 
     def load(name):
@@ -43,12 +47,19 @@ def run(build, answer):
         seconds = time.perf_counter() - begin
         if number:  # the first one warms up
             ranked = sorted(found, key=lambda f: -f[1])[:5]
-            out["queries"].append({"seconds": seconds, "found": [[int(k), float(s), np.ravel(T).tolist()] for k, s, T in ranked]})
+            out["queries"].append(
+                {
+                    "seconds": seconds,
+                    "found": [[int(k), float(s), np.ravel(T).tolist()] for k, s, T in ranked],
+                }
+            )
     print(json.dumps(out))
 
 
 def run_pairs(prepare, register):
-    """Candidates one by one: ``register(database_part, query_part, yaw)`` gives score and pose of what ``prepare(cloud)`` made."""
+    """Candidates one by one: ``register(database_part, query_part, yaw)`` gives score and pose of
+    what ``prepare(cloud)`` made.
+    """
 
     def build(clouds):
         return [prepare(cloud) for cloud in clouds]

@@ -1,7 +1,8 @@
-"""MapClosures for `semloc benchmark localisation`: JOB; its own settings, refined on the points as KISS-SLAM does, here by generalised ICP.
+"""MapClosures for `semloc benchmark localisation`: JOB; its own settings, refined on the points as
+KISS-SLAM does, here by generalised ICP.
 
-Every query is put into its database too: what it finds among them is left out. The score is the number of inliers. Needs map-closures,
-small-gicp and numpy.
+Every query is put into its database too: what it finds among them is left out. The score is the
+number of inliers. Needs map-closures, small-gicp and numpy.
 """
 
 import sys
@@ -19,19 +20,26 @@ REFINED = 3
 
 
 def prepare(cloud):
-    return small_gicp.preprocess_points(cloud, downsampling_resolution=0.5, num_neighbors=20, num_threads=1)
+    return small_gicp.preprocess_points(
+        cloud, downsampling_resolution=0.5, num_neighbors=20, num_threads=1
+    )
 
 
 class Database:
     def __init__(self, clouds):
-        self.closer, self.parts = MapClosures(), []
+        self.closer = MapClosures()
+        self.parts = []
         for k, cloud in enumerate(clouds):
             self.closer.get_best_closure(APART * k, cloud)
             self.parts.append(prepare(cloud))
         self.next = APART * (len(self.parts) + 1)
 
     def answer(self, cloud, _):
-        found = [c for c in self.closer.get_closures(self.next, cloud) if c.source_id < APART * len(self.parts)]
+        found = [
+            c
+            for c in self.closer.get_closures(self.next, cloud)
+            if c.source_id < APART * len(self.parts)
+        ]
         self.next += APART
         found.sort(key=lambda c: -c.number_of_inliers)
         query = prepare(cloud) if found else None
@@ -42,7 +50,14 @@ class Database:
         database = self.parts[number]
         pose = np.linalg.inv(closure.pose)
         for reach in (2.0, 1.0):
-            fit = small_gicp.align(database[0], query[0], database[1], pose, max_correspondence_distance=reach, num_threads=1)
+            fit = small_gicp.align(
+                database[0],
+                query[0],
+                database[1],
+                pose,
+                max_correspondence_distance=reach,
+                num_threads=1,
+            )
             pose = fit.T_target_source
         return number, closure.number_of_inliers, pose
 

@@ -14,7 +14,9 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """``target_T_query`` as (yaw, x, y, z), radians and metres, in submap ``group``, with the word matches that voted for it."""
+    """``target_T_query`` as (yaw, x, y, z), radians and metres, in submap ``group``, with the word
+    matches that voted for it.
+    """
 
     group: int
     pose: tuple[float, float, float, float]
@@ -22,11 +24,14 @@ class Hypothesis:
     weight: float
 
 
-def pool(group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, cell: float, most: int) -> list[Hypothesis]:
+def pool(
+    group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, cell: float, most: int
+) -> list[Hypothesis]:
     """The ``most`` heaviest cells of (submap, yaw, translation) space.
 
-    Each match gives one hypothesis: ``yaw`` (n,) one of the search's headings, ``translation`` (n, 3). Votes are counted in cells of
-    ``cell`` metres, once as they lie and once moved by half a cell, so that no true pose is split at a border in both.
+    Each match gives one hypothesis: ``yaw`` (n,) one of the search's headings, ``translation`` (n,
+    3). Votes are counted in cells of ``cell`` metres, once as they lie and once moved by half a
+    cell, so that no true pose is split at a border in both.
     """
     if not len(group):
         return []
@@ -45,20 +50,30 @@ def pool(group: NDArray[np.integer], yaw: F64, translation: F64, weight: F64, ce
         total = np.add.reduceat(weight[order], start)
         count = np.diff(np.r_[start, len(order)])
         best = np.lexsort((start, -total))[:most]
-        mean = np.add.reduceat(translation[order] * weight[order, None], start)[best] / total[best, None]
+        mean = (
+            np.add.reduceat(translation[order] * weight[order, None], start)[best]
+            / total[best, None]
+        )
         first = order[start[best]]
         parts.append((group[first], np.c_[yaw[first], mean], count[best], total[best]))
     groups, poses, votes, weights = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((*poses.T[::-1], groups, -weights))
-    kept = order[first_apart(groups[order], poses[order], cell / 4, most)]  # a cell found twice is one hypothesis
+    # a cell found twice is one hypothesis
+    kept = order[first_apart(groups[order], poses[order], cell / 4, most)]
     columns = (groups[kept], map(tuple, poses[kept].tolist()), votes[kept], weights[kept])
-    return [Hypothesis(int(g), pose, int(n), float(w)) for g, pose, n, w in zip(*columns, strict=True)]
+    return [
+        Hypothesis(int(g), pose, int(n), float(w)) for g, pose, n, w in zip(*columns, strict=True)
+    ]
 
 
 @njit(cache=True, nogil=True)
-def first_apart(groups: NDArray[np.int64], poses: F64, distance: float, most: int) -> NDArray[np.int64]:
-    """Numbers of the first ``most`` of ``poses`` (n, 4) as (yaw, x, y, z) in submaps ``groups`` (n,) that are not beside an earlier one of
-    the same submap: within ``distance`` metres along each axis, and 0.05 rad."""
+def first_apart(
+    groups: NDArray[np.int64], poses: F64, distance: float, most: int
+) -> NDArray[np.int64]:
+    """Numbers of the first ``most`` of ``poses`` (n, 4) as (yaw, x, y, z) in submaps ``groups``
+    (n,) that are not beside an earlier one of the same submap: within ``distance`` metres along
+    each axis, and 0.05 rad.
+    """
     kept = np.empty(len(groups), np.int64)
     count = 0
     for i in range(len(groups)):
@@ -79,7 +94,9 @@ def first_apart(groups: NDArray[np.int64], poses: F64, distance: float, most: in
 
 
 def of_best_groups(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
-    """Those in the ``most`` submaps that have the heaviest ones; of equals the submap with the lesser number."""
+    """Those in the ``most`` submaps that have the heaviest ones; of equals the submap with the
+    lesser number.
+    """
     heaviest: dict[int, float] = {}
     for h in hypotheses:
         heaviest[h.group] = max(heaviest.get(h.group, 0.0), h.weight)

@@ -20,10 +20,12 @@ LONGEST_TURN = 0.2  # of one step, radians
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """``target_T_query``; ``inliers`` share and ``count`` of query points within the last radius; ``rmse`` of their plane distances (m);
-    ``information`` (6, 6), of (translation, rotation) as left increments about the query's centre ``centre`` in the target frame,
-    in units of 1 / (plane distance noise)^2; ``pull`` (2, 6): the right side of its equations if all uncertain points of the query, or of
-    the target, were a standard deviation too far."""
+    """``target_T_query``; ``inliers`` share and ``count`` of query points within the last radius;
+    ``rmse`` of their plane distances (m); ``information`` (6, 6), of (translation, rotation) as
+    left increments about the query's centre ``centre`` in the target frame, in units of 1 / (plane
+    distance noise)^2; ``pull`` (2, 6): the right side of its equations if all uncertain points of
+    the query, or of the target, were a standard deviation too far.
+    """
 
     target_T_query: F64
     inliers: float
@@ -36,7 +38,9 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Correspondences within ``radius`` metres, at most ``iterations`` times, with every ``stride``-th query point."""
+    """Correspondences within ``radius`` metres, at most ``iterations`` times, with every
+    ``stride``-th query point.
+    """
 
     radius: float
     iterations: int
@@ -54,12 +58,17 @@ def align(
 ) -> Fit:
     """Refine ``target_T_query`` for ``query`` points (n, 3) step by step.
 
-    Gauss-Newton on the distances to the target's tangent planes (point distances where the surface is not planar), Cauchy weights. A
-    step of no iterations moves nothing: the fit is that of the given transform. ``spread`` (n, 3) is one standard deviation of each
-    point along its ray, in metres; a point weighs as much as ``noise`` (m), that of planes, leaves it across the plane. The start holds the
-    middle of the query as ``hold`` of its points on planes would; it may turn about it.
+    Gauss-Newton on the distances to the target's tangent planes (point distances where the surface
+    is not planar), Cauchy weights. A step of no iterations moves nothing: the fit is that of the
+    given transform. ``spread`` (n, 3) is one standard deviation of each point along its ray, in
+    metres; a point weighs as much as ``noise`` (m), that of planes, leaves it across the plane. The
+    start holds the middle of the query as ``hold`` of its points on planes would; it may turn about
+    it.
     """
-    radii, iterations, strides = (np.array([getattr(step, name) for step in steps]) for name in ("radius", "iterations", "stride"))
+    radii, iterations, strides = (
+        np.array([getattr(step, name) for step in steps])
+        for name in ("radius", "iterations", "stride")
+    )
     points = np.ascontiguousarray(query, float)
     T, centre, used, count, squared, information, pull = _align(
         points,
@@ -77,26 +86,43 @@ def align(
 
 @njit(cache=True, nogil=True)
 def _align(
-    query: F64, spread: F64, surface: Arrays, start: F64, steps: tuple[F64, I64, I64], noise: float, hold: float
+    query: F64,
+    spread: F64,
+    surface: Arrays,
+    start: F64,
+    steps: tuple[F64, I64, I64],
+    noise: float,
+    hold: float,
 ) -> tuple[F64, F64, int, int, float, F64, F64]:
-    """The transform, the centre of the points, how many were used and how many met a surface, their squares, information and pull."""
-    T, centre, count, used, squared = start, start[:3, 3].copy(), 0, 0, 0.0
-    information, pull = np.zeros((6, 6)), np.zeros((2, 6))
+    """The transform, the centre of the points, how many were used and how many met a surface, their
+    squares, information and pull.
+    """
+    T = start
+    centre = start[:3, 3].copy()
+    count = 0
+    used = 0
+    squared = 0.0
+    information = np.zeros((6, 6))
+    pull = np.zeros((2, 6))
     query_centre = np.zeros(3)
     for n in range(len(query) if hold > 0 else 0):
         for k in range(3):
             query_centre[k] += query[n, k] / len(query)
     radii, iterations, strides = steps
     for step in range(len(radii)):
-        radius, last = radii[step], step == len(radii) - 1
+        radius = radii[step]
+        last = step == len(radii) - 1
         some = query[:: strides[step]]
-        moved, ray = np.empty((len(some), 3)), np.zeros((len(some) if len(spread) else 0, 3))
+        moved = np.empty((len(some), 3))
+        ray = np.zeros((len(some) if len(spread) else 0, 3))
         used = len(some)
         for _ in range(max(iterations[step], 1)):
             centre[:] = 0.0
             for n in range(used):
                 for k in range(3):
-                    moved[n, k] = T[k, 0] * some[n, 0] + T[k, 1] * some[n, 1] + T[k, 2] * some[n, 2] + T[k, 3]
+                    moved[n, k] = (
+                        T[k, 0] * some[n, 0] + T[k, 1] * some[n, 1] + T[k, 2] * some[n, 2] + T[k, 3]
+                    )
                     centre[k] += moved[n, k] / used
             for n in range(len(ray)):
                 s = spread[n * strides[step]]
@@ -108,7 +134,9 @@ def _align(
                 return T, centre if used else T[:3, 3].copy(), used, count, 0.0, information, pull
             look_at(surface, index)
             kernel = (KERNEL * radius) ** 2
-            squared, information, pull, H, g = _normal_equations(moved, ray, index, surface, centre, kernel, noise)
+            squared, information, pull, H, g = _normal_equations(
+                moved, ray, index, surface, centre, kernel, noise
+            )
             if iterations[step] == 0:
                 break
             for k in range(3):
@@ -132,7 +160,9 @@ def _align(
 
 @njit(cache=True, nogil=True)
 def _moved(T: F64, centre: F64, move: F64) -> F64:
-    """``T`` (4, 4) turned about ``centre`` (3,) by the rotation vector ``move[3:]`` and moved by ``move[:3]``."""
+    """``T`` (4, 4) turned about ``centre`` (3,) by the rotation vector ``move[3:]`` and moved by
+    ``move[:3]``.
+    """
     w = move[3:]
     angle = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
     K = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
@@ -149,11 +179,19 @@ def _moved(T: F64, centre: F64, move: F64) -> F64:
 def _normal_equations(
     moved: F64, ray: F64, index: I64, surface: Arrays, centre: F64, kernel: float, noise: float
 ) -> tuple[float, F64, F64, F64, F64]:
-    """Sum of the squared plane distances, those of uncertain points (``ray`` (n, 3) or (0, 3); variance ``noise`` without) for as much as
-    they count; information (6, 6) and pull (2, 6) of the planes alone; normal equations (6, 6), (6,) of planes and points."""
+    """Sum of the squared plane distances, those of uncertain points (``ray`` (n, 3) or (0, 3);
+    variance ``noise`` without) for as much as they count; information (6, 6) and pull (2, 6) of the
+    planes alone; normal equations (6, 6), (6,) of planes and points.
+    """
     points, normals, planar, _, spread = surface
-    information, H, g, pull = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros((2, 6))
-    squared, J, o, a = 0.0, np.empty(6), np.empty(3), np.empty(3)
+    information = np.zeros((6, 6))
+    H = np.zeros((6, 6))
+    g = np.zeros(6)
+    pull = np.zeros((2, 6))
+    squared = 0.0
+    J = np.empty(6)
+    o = np.empty(3)
+    a = np.empty(3)
     for n in range(len(moved)):
         i = index[n]
         if i < 0:
@@ -162,7 +200,11 @@ def _normal_equations(
             a[k] = moved[n, k] - centre[k]
             o[k] = moved[n, k] - points[i, k]
             J[k] = normals[i, k]
-        J[3], J[4], J[5] = a[1] * J[2] - a[2] * J[1], a[2] * J[0] - a[0] * J[2], a[0] * J[1] - a[1] * J[0]
+        J[3], J[4], J[5] = (
+            a[1] * J[2] - a[2] * J[1],
+            a[2] * J[0] - a[0] * J[2],
+            a[0] * J[1] - a[1] * J[0],
+        )
         r = o[0] * J[0] + o[1] * J[1] + o[2] * J[2]
         across = along = off = off_target = 0.0
         if len(ray):
@@ -184,7 +226,12 @@ def _normal_equations(
         if planar[i] < 1.0:
             # points that are not on planes (poles, leaves) hold what planes leave free, weakly
             certain = noise / (noise + along)
-            weight = (1 - planar[i]) * LOOSE * certain / (1 + (o[0] * o[0] + o[1] * o[1] + o[2] * o[2]) / (kernel + along))
+            weight = (
+                (1 - planar[i])
+                * LOOSE
+                * certain
+                / (1 + (o[0] * o[0] + o[1] * o[1] + o[2] * o[2]) / (kernel + along))
+            )
             _add_point(H, g, a, o, weight)
     for k in range(6):
         for m in range(k):
@@ -195,7 +242,9 @@ def _normal_equations(
 
 @njit(cache=True, nogil=True)
 def _add_point(H: F64, g: F64, a: F64, o: F64, weight: float) -> None:
-    """Add weight * J^T J, above the diagonal, and weight * J^T o of the point distance ``o`` at arm ``a``, J = [I, -[a]x]."""
+    """Add weight * J^T J, above the diagonal, and weight * J^T o of the point distance ``o`` at arm
+    ``a``, J = [I, -[a]x].
+    """
     for k in range(3):
         H[k, k] += weight
         g[k] += weight * o[k]

@@ -1,4 +1,6 @@
-"""The target of an alignment on points: a grid of cells to find the nearest point in, and tangent planes made when they are first met."""
+"""The target of an alignment on points: a grid of cells to find the nearest point in, and tangent
+planes made when they are first met.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +22,20 @@ SCATTERED, LINEAR = 0.3, 0.9  # planes are less than this
 THICK, LEAST_FLAT = 0.5, 8  # of slabs of uncertain points, and how many make one
 
 
-# A grid of cells: their edge (m), where it begins (3,), how many there are along each axis (3,), and ``start``: points ``start[c]`` to
-# ``start[c + 1]`` lie in cell c. A plain tuple, which compiled functions hand on for nothing.
+# A grid of cells: their edge (m), where it begins (3,), how many there are along each axis (3,),
+# and ``start``: points ``start[c]`` to ``start[c + 1]`` lie in cell c. A plain tuple, which
+# compiled functions hand on for nothing.
 Cells = tuple[float, F64, I64, I32]
 Arrays = tuple[F64, F64, F64, Cells, F64]  # of a surface, in the order of its fields
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Target ``points`` (n, 3) ordered by the ``cells`` they lie in. ``normals`` (n, 3) are unit vectors and ``planar`` (n,) is 1 where the
-    surroundings are a plane, 0 where not, -1 where nobody has asked yet. ``spread`` (n, 3) is one standard deviation of the points
-    along their rays, metres, of a flattened surface; (0, 3) else."""
+    """Target ``points`` (n, 3) ordered by the ``cells`` they lie in. ``normals`` (n, 3) are unit
+    vectors and ``planar`` (n,) is 1 where the surroundings are a plane, 0 where not, -1 where
+    nobody has asked yet. ``spread`` (n, 3) is one standard deviation of the points along their
+    rays, metres, of a flattened surface; (0, 3) else.
+    """
 
     points: F64
     normals: F64
@@ -45,32 +50,46 @@ class Surface:
 
     @property
     def sigma(self) -> float:
-        """Median standard deviation of the points along their rays, metres; 0 of a surface that is not flattened."""
+        """Median standard deviation of the points along their rays, metres; 0 of a surface that is
+        not flattened.
+        """
         return float(np.median(np.linalg.norm(self.spread, axis=1))) if len(self.spread) else 0.0
 
 
 def surface_of(points: NDArray[np.floating], cell: float) -> Surface:
-    """A surface of ``points`` (n, 3), best of some points in each of the occupied cells of ``cell`` metres."""
+    """A surface of ``points`` (n, 3), best of some points in each of the occupied cells of ``cell``
+    metres.
+    """
     p = np.ascontiguousarray(points, float)
     order, cells = _in_cells(p, cell)
     return Surface(p[order], np.zeros_like(p), np.full(len(p), -1.0), cells)
 
 
 def flattened_surface(points: F64, spread: F64, kept: I64, radius: float, noise: float) -> Surface:
-    """A surface through the middle of what ``points`` (n, 3) with ``spread`` (n, 3), a standard deviation along their rays, saw of a wall.
+    """A surface through the middle of what ``points`` (n, 3) with ``spread`` (n, 3), a standard
+    deviation along their rays, saw of a wall.
 
-    Points of a camera lie in a slab as thick as their ranges are uncertain, in which the nearest one is near whatever the alignment: so
-    the points ``kept`` (m,) move onto the plane of those within ``radius`` metres, each of weight 1 / (noise^2 + sigma^2) (moving least
-    squares: Alexa et al., Computing and Rendering Point Set Surfaces, TVCG 2003, with planes).
+    Points of a camera lie in a slab as thick as their ranges are uncertain, in which the nearest
+    one is near whatever the alignment: so the points ``kept`` (m,) move onto the plane of those
+    within ``radius`` metres, each of weight 1 / (noise^2 + sigma^2) (moving least squares: Alexa et
+    al., Computing and Rendering Point Set Surfaces, TVCG 2003, with planes).
     """
     (order, cells), sigma = _in_cells(points, radius), np.linalg.norm(spread, axis=1)
     moved, normals, planar = _flattened(points[order], sigma[order], cells, points[kept], noise)
     order, cells = _in_cells(moved, radius)
-    return Surface(moved[order], normals[order], planar[order], cells, np.ascontiguousarray(spread[kept][order]))
+    return Surface(
+        moved[order],
+        normals[order],
+        planar[order],
+        cells,
+        np.ascontiguousarray(spread[kept][order]),
+    )
 
 
 def _in_cells(points: F64, edge: float) -> tuple[I64, Cells]:
-    """The order of points (n, 3) by cells of ``edge`` metres, those of one cell as they came, and the cells."""
+    """The order of points (n, 3) by cells of ``edge`` metres, those of one cell as they came, and
+    the cells.
+    """
     order, low, shape, start = _sorted(points, edge)
     return order, (float(edge), low, shape, start)
 
@@ -78,7 +97,9 @@ def _in_cells(points: F64, edge: float) -> tuple[I64, Cells]:
 @njit(cache=True, nogil=True)
 def _sorted(points: F64, cell: float) -> tuple[I64, F64, I64, I32]:
     """The order of points (n, 3) by their cells, and ``low``, ``shape`` and ``start`` of these."""
-    low, high, shape = np.full(3, np.inf), np.full(3, -np.inf), np.ones(3, np.int64)
+    low = np.full(3, np.inf)
+    high = np.full(3, -np.inf)
+    shape = np.ones(3, np.int64)
     for n in range(len(points)):
         for k in range(3):
             low[k], high[k] = min(low[k], points[n, k]), max(high[k], points[n, k])
@@ -86,14 +107,18 @@ def _sorted(points: F64, cell: float) -> tuple[I64, F64, I64, I32]:
         low[:] = high[:] = 0.0
     for k in range(3):
         shape[k] += int(np.floor((high[k] - low[k]) / cell))
-    at, start = np.empty(len(points), np.int64), np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int32)
+    at = np.empty(len(points), np.int64)
+    start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int32)
     for n in range(len(points)):
-        x, y, z = (points[n, 0] - low[0]) / cell, (points[n, 1] - low[1]) / cell, (points[n, 2] - low[2]) / cell
+        x = (points[n, 0] - low[0]) / cell
+        y = (points[n, 1] - low[1]) / cell
+        z = (points[n, 2] - low[2]) / cell
         at[n] = (int(np.floor(x)) * shape[1] + int(np.floor(y))) * shape[2] + int(np.floor(z))
         start[at[n] + 1] += 1
     for c in range(1, len(start)):
         start[c] += start[c - 1]
-    order, free = np.empty(len(points), np.int64), start.copy()
+    order = np.empty(len(points), np.int64)
+    free = start.copy()
     for n in range(len(points)):
         order[free[at[n]]] = n
         free[at[n]] += 1
@@ -102,9 +127,12 @@ def _sorted(points: F64, cell: float) -> tuple[I64, F64, I64, I32]:
 
 @njit(cache=True, nogil=True)
 def _column(cells: Cells, x: int, y: int, low: int, high: int) -> tuple[int, int]:
-    """The points of cells ``low`` to ``high``, both included, of column (x, y); none of a column beside the grid."""
+    """The points of cells ``low`` to ``high``, both included, of column (x, y); none of a column
+    beside the grid.
+    """
     _, _, shape, start = cells
-    low, high = max(low, 0), min(high, shape[2] - 1)
+    low = max(low, 0)
+    high = min(high, shape[2] - 1)
     if low > high or x < 0 or y < 0 or x >= shape[0] or y >= shape[1]:
         return 0, 0
     column = (x * shape[1] + y) * shape[2]
@@ -112,24 +140,38 @@ def _column(cells: Cells, x: int, y: int, low: int, high: int) -> tuple[int, int
 
 
 @njit(cache=True, nogil=True)
-def _flattened(around: F64, sigma: F64, cells: Cells, points: F64, noise: float) -> tuple[F64, F64, F64]:
-    """Each of ``points`` (m, 3) on the plane of those ``around`` it, a cell's edge at most, the plane's normal, and whether it is one."""
+def _flattened(
+    around: F64, sigma: F64, cells: Cells, points: F64, noise: float
+) -> tuple[F64, F64, F64]:
+    """Each of ``points`` (m, 3) on the plane of those ``around`` it, a cell's edge at most, the
+    plane's normal, and whether it is one.
+    """
     radius, low, _, _ = cells
-    moved, normals, planar = points.copy(), np.zeros((len(points), 3)), np.zeros(len(points))
-    mean, a, values, vectors = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    moved = points.copy()
+    normals = np.zeros((len(points), 3))
+    planar = np.zeros(len(points))
+    mean = np.empty(3)
+    a = np.empty((3, 3))
+    values = np.empty(3)
+    vectors = np.empty((3, 3))
     for n in range(len(points)):
         p = points[n]
-        x, y, z = int(np.floor((p[0] - low[0]) / radius)), int(np.floor((p[1] - low[1]) / radius)), int(np.floor((p[2] - low[2]) / radius))
+        x = int(np.floor((p[0] - low[0]) / radius))
+        y = int(np.floor((p[1] - low[1]) / radius))
+        z = int(np.floor((p[2] - low[2]) / radius))
         mean[:], a[:], total, count = 0.0, 0.0, 0.0, 0
         for dx in range(-1, 2):
             for dy in range(-1, 2):
                 first, end = _column(cells, x + dx, y + dy, z - 1, z + 1)
                 for i in range(first, end):
-                    o0, o1, o2 = around[i, 0] - p[0], around[i, 1] - p[1], around[i, 2] - p[2]
+                    o0 = around[i, 0] - p[0]
+                    o1 = around[i, 1] - p[1]
+                    o2 = around[i, 2] - p[2]
                     if o0 * o0 + o1 * o1 + o2 * o2 > radius * radius:
                         continue
                     w = 1.0 / (noise * noise + sigma[i] * sigma[i])
-                    total, count = total + w, count + 1
+                    total = total + w
+                    count = count + 1
                     mean[0] += w * o0
                     mean[1] += w * o1
                     mean[2] += w * o2
@@ -147,7 +189,9 @@ def _flattened(around: F64, sigma: F64, cells: Cells, points: F64, noise: float)
             for m in range(3):
                 a[k, m] = a[k, m] / total - mean[k] * mean[m]
         eigen(a, values, vectors)
-        s0, s1, s2 = np.sqrt(max(values[0], 0.0)), np.sqrt(max(values[1], 0.0)), np.sqrt(max(values[2], 0.0)) + 1e-9
+        s0 = np.sqrt(max(values[0], 0.0))
+        s1 = np.sqrt(max(values[1], 0.0))
+        s2 = np.sqrt(max(values[2], 0.0)) + 1e-9
         off = mean[0] * vectors[0, 0] + mean[1] * vectors[1, 0] + mean[2] * vectors[2, 0]
         for k in range(3):
             normals[n, k] = vectors[k, 0]
@@ -158,7 +202,9 @@ def _flattened(around: F64, sigma: F64, cells: Cells, points: F64, noise: float)
 
 @njit(cache=True, nogil=True)
 def _gap(offset: int, inside: float, cell: float) -> float:
-    """Distance along an axis from a point at ``inside`` (0..1) of its cell to the cell ``offset`` away."""
+    """Distance along an axis from a point at ``inside`` (0..1) of its cell to the cell ``offset``
+    away.
+    """
     if offset > 0:
         return (offset - inside) * cell
     return (inside - offset - 1) * cell if offset < 0 else 0.0
@@ -168,7 +214,8 @@ def _gap(offset: int, inside: float, cell: float) -> float:
 def look_at(surface: Arrays, index: I64) -> None:
     """Make the tangent planes of the points ``index`` (m,) that have none yet; -1 is no point."""
     points, normals, planar, cells, _ = surface
-    wanted, count = np.empty(len(index), np.int64), 0
+    wanted = np.empty(len(index), np.int64)
+    count = 0
     for i in index:
         if i >= 0 and planar[i] < 0:
             planar[i] = 0.0  # so that it is taken once
@@ -184,19 +231,30 @@ def look_at(surface: Arrays, index: I64) -> None:
 
 @njit(cache=True, nogil=True)
 def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
-    """Number (m,) of the surface's point nearest to each of ``query`` (m, 3), -1 where none is nearer than ``radius``."""
+    """Number (m,) of the surface's point nearest to each of ``query`` (m, 3), -1 where none is
+    nearer than ``radius``.
+    """
     points, _, _, cells, _ = surface
     cell, low, _, _ = cells
     found = np.full(len(query), -1, np.int64)
     rings = int(np.ceil(radius / cell))
     for n in range(len(query)):
-        px, py, pz = query[n, 0], query[n, 1], query[n, 2]
-        gx, gy, gz = (px - low[0]) / cell, (py - low[1]) / cell, (pz - low[2]) / cell
-        x, y, z = int(np.floor(gx)), int(np.floor(gy)), int(np.floor(gz))
-        fx, fy = gx - x, gy - y
+        px = query[n, 0]
+        py = query[n, 1]
+        pz = query[n, 2]
+        gx = (px - low[0]) / cell
+        gy = (py - low[1]) / cell
+        gz = (pz - low[2]) / cell
+        x = int(np.floor(gx))
+        y = int(np.floor(gy))
+        z = int(np.floor(gz))
+        fx = gx - x
+        fy = gy - y
         margin = min(fx, 1 - fx, fy, 1 - fy)
-        best, at = radius * radius, -1
-        best, at = _nearer(points, _column(cells, x, y, z, z), px, py, pz, best, at)  # most lie there: the others are soon too far
+        best = radius * radius
+        at = -1
+        # most lie there: the others are soon too far
+        best, at = _nearer(points, _column(cells, x, y, z, z), px, py, pz, best, at)
         for ring in range(rings + 1):
             for dx in range(-ring, ring + 1):
                 ax = _gap(dx, fx, cell) ** 2
@@ -208,7 +266,9 @@ def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
                     if rest <= 0:
                         continue
                     up = np.sqrt(rest) / cell
-                    column = _column(cells, x + dx, y + dy, int(np.floor(gz - up)), int(np.floor(gz + up)))
+                    column = _column(
+                        cells, x + dx, y + dy, int(np.floor(gz - up)), int(np.floor(gz + up))
+                    )
                     best, at = _nearer(points, column, px, py, pz, best, at)
             if ((ring + margin) * cell) ** 2 >= best:
                 break
@@ -217,8 +277,12 @@ def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
 
 
 @njit(cache=True, nogil=True)
-def _nearer(points: F64, column: tuple[int, int], x: float, y: float, z: float, best: float, at: int) -> tuple[float, int]:
-    """Squared distance and number of the nearest point to (x, y, z), of those in ``column`` and the one ``at`` that is ``best`` so far."""
+def _nearer(
+    points: F64, column: tuple[int, int], x: float, y: float, z: float, best: float, at: int
+) -> tuple[float, int]:
+    """Squared distance and number of the nearest point to (x, y, z), of those in ``column`` and the
+    one ``at`` that is ``best`` so far.
+    """
     for i in range(column[0], column[1]):
         d = (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2 + (points[i, 2] - z) ** 2
         if d < best:
@@ -228,15 +292,23 @@ def _nearer(points: F64, column: tuple[int, int], x: float, y: float, z: float, 
 
 @njit(cache=True, nogil=True)
 def _around(points: F64, cells: Cells, wanted: I64) -> I64:
-    """The nearest points (m, NEIGHBOURS) of the points ``wanted``, themselves among them, -1 where there are fewer in RINGS cells."""
+    """The nearest points (m, NEIGHBOURS) of the points ``wanted``, themselves among them, -1 where
+    there are fewer in RINGS cells.
+    """
     cell, low, _, _ = cells
     found = np.full((len(wanted), NEIGHBOURS), -1, np.int64)
     distance = np.empty(NEIGHBOURS)
     for n in range(len(wanted)):
         p = points[wanted[n]]
-        gx, gy, gz = (p[0] - low[0]) / cell, (p[1] - low[1]) / cell, (p[2] - low[2]) / cell
-        x, y, z = int(np.floor(gx)), int(np.floor(gy)), int(np.floor(gz))
-        gx, gy, gz = gx - x, gy - y, gz - z
+        gx = (p[0] - low[0]) / cell
+        gy = (p[1] - low[1]) / cell
+        gz = (p[2] - low[2]) / cell
+        x = int(np.floor(gx))
+        y = int(np.floor(gy))
+        z = int(np.floor(gz))
+        gx = gx - x
+        gy = gy - y
+        gz = gz - z
         margin = min(gx, 1 - gx, gy, 1 - gy, gz, 1 - gz)
         distance[:] = np.inf
         for ring in range(RINGS + 1):
@@ -255,7 +327,9 @@ def _around(points: F64, cells: Cells, wanted: I64) -> I64:
 
 @njit(cache=True, nogil=True)
 def _take(points: F64, p: F64, first: int, end: int, distance: F64, found: I64) -> None:
-    """Insert points ``first`` to ``end`` into the list of the nearest, ascending by squared ``distance``."""
+    """Insert points ``first`` to ``end`` into the list of the nearest, ascending by squared
+    ``distance``.
+    """
     for i in range(first, end):
         d = (points[i, 0] - p[0]) ** 2 + (points[i, 1] - p[1]) ** 2 + (points[i, 2] - p[2]) ** 2
         if d < distance[-1]:

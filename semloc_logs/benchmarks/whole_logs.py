@@ -1,4 +1,6 @@
-"""Figures of whole logs: where the time of `semloc run` and `semloc fuse` goes, how memory grows, and what the words are worth."""
+"""Figures of whole logs: where the time of `semloc run` and `semloc fuse` goes, how memory grows,
+and what the words are worth.
+"""
 
 from __future__ import annotations
 
@@ -37,14 +39,23 @@ from semloc_logs.workspace import Workspace
 Figures = dict[str, dict[str, float | str]]
 Rows = list[tuple[float, int, str]]
 
-# parts of fusing: the functions whose time they are, and the one whose time within them is not theirs
+# parts of fusing: the functions whose time they are, and the one whose time within them is not
+# theirs
 _PARTS: dict[str, tuple[tuple[str, ...], str]] = {
     "fingerprint": (("annotate.py content_fingerprint",), ""),
     "read": (("session.py clouds",), ""),
     "thin": (("selection.py thin",), ""),
     "scratch files": (("keyframes.py _save", "keyframes.py load"), ""),
     "direction of gravity": (("levelling.py level",), ""),
-    "ground": (("gravity.py ground_height", "surface.py ground_surface", "ground.py add", "ground.py finish"), ""),
+    "ground": (
+        (
+            "gravity.py ground_height",
+            "surface.py ground_surface",
+            "ground.py add",
+            "ground.py finish",
+        ),
+        "",
+    ),
     "labels": (("labeller.py labels", "labeller.py take"), ""),
     "keyframes written": (("store.py keep_keyframes",), "fusing.py _labelled"),
     "integrate": (("grid.py take", "carve.py marks"), ""),
@@ -55,33 +66,50 @@ _PARTS: dict[str, tuple[tuple[str, ...], str]] = {
 }
 
 
-def profile_pipeline(logs: Sequence[Path], settings: Settings, functions: int = 12) -> tuple[Figures, Rows]:
+def profile_pipeline(
+    logs: Sequence[Path], settings: Settings, functions: int = 12
+) -> tuple[Figures, Rows]:
     """Run the pipeline on ``logs`` in this process in a fresh workspace.
 
-    Returns the figures (seconds of each stage, seconds a query, peak resident memory in MB) and, for the ``functions`` that took most
-    time themselves, seconds, calls and where they are. The profiler adds some percent to code that calls many small functions.
+    Returns the figures (seconds of each stage, seconds a query, peak resident memory in MB) and,
+    for the ``functions`` that took most time themselves, seconds, calls and where they are. The
+    profiler adds some percent to code that calls many small functions.
     """
     with tempfile.TemporaryDirectory(prefix="semloc-profile-") as folder:
         work = Workspace(Path(folder))
         profiler = cProfile.Profile()
         report = profiler.runcall(
-            run, {session_name(log): [log] for log in logs}, work, settings, {}, make_engine("serial"), lambda _: None
+            run,
+            {session_name(log): [log] for log in logs},
+            work,
+            settings,
+            {},
+            make_engine("serial"),
+            lambda _: None,
         )
         queries = int(read_metadata(work.closures)["queries"])
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform.startswith("linux") else 1024**2)
-    figures: Figures = {f"{stage}": {"ours": seconds, "unit": "s"} for stage, seconds in report.seconds.items()}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
+        1024 if sys.platform.startswith("linux") else 1024**2
+    )
+    figures: Figures = {
+        f"{stage}": {"ours": seconds, "unit": "s"} for stage, seconds in report.seconds.items()
+    }
     figures["query"] = {"ours": report.seconds["close"] / max(queries, 1), "unit": "s a query"}
     figures["memory"] = {"ours": round(peak, 1), "unit": "MB peak"}
     figures["closures"] = {"ours": float(report.closures), "unit": ""}
     return figures, _busiest(_stats(profiler), functions)
 
 
-def profile_fuse(logs: Sequence[Path], settings: Settings, rounds: int = 3, functions: int = 12) -> tuple[Figures, Rows]:
-    """`semloc fuse` of ``logs`` (one session) beside what it cannot do without: reading all clouds, and integrating all keyframes once.
+def profile_fuse(
+    logs: Sequence[Path], settings: Settings, rounds: int = 3, functions: int = 12
+) -> tuple[Figures, Rows]:
+    """`semloc fuse` of ``logs`` (one session) beside what it cannot do without: reading all clouds,
+    and integrating all keyframes once.
 
-    ``rounds`` times in turn each: wall-clock seconds, median and least, and processor seconds, median. ``ratio`` is whole / (reading +
-    integrating). The parts come from one more run, in one thread and under the profiler, which adds some percent, as do the returned
-    ``functions``, those that took most time themselves.
+    ``rounds`` times in turn each: wall-clock seconds, median and least, and processor seconds,
+    median. ``ratio`` is whole / (reading + integrating). The parts come from one more run, in one
+    thread and under the profiler, which adds some percent, as do the returned ``functions``, those
+    that took most time themselves.
     """
     settings = settings.resolved()
     fusion = settings.fusion
@@ -94,7 +122,12 @@ def profile_fuse(logs: Sequence[Path], settings: Settings, rounds: int = 3, func
         return work
 
     def reading() -> int:
-        session = open_session([*logs], {}, min_range=fusion.min_range or 0.0, max_range=2.0 * (fusion.max_range or 50.0))
+        session = open_session(
+            [*logs],
+            {},
+            min_range=fusion.min_range or 0.0,
+            max_range=2.0 * (fusion.max_range or 50.0),
+        )
         try:
             return sum(1 for _ in session.clouds())
         finally:
@@ -129,12 +162,18 @@ def profile_fuse(logs: Sequence[Path], settings: Settings, rounds: int = 3, func
         for name, taken in times.items()
     }
     figures: Figures = {name: {**seconds, "unit": "s"} for name, seconds in value.items()}
-    ratio = {kind: value["whole"][kind] / (value["reading"][kind] + value["integrating"][kind]) for kind in value["whole"]}
+    ratio = {
+        kind: value["whole"][kind] / (value["reading"][kind] + value["integrating"][kind])
+        for kind in value["whole"]
+    }
     figures["ratio"] = {**ratio, "unit": "whole / (reading + integrating)"}
     figures["clouds"] = {"ours": float(clouds), "unit": ""}
     figures["keyframes"] = {"ours": float(keyframes), "unit": ""}
     parts = _parts(stats)
-    figures |= {f"part: {part}": {"ours": seconds, "unit": "s, under the profiler"} for part, seconds in parts.items()}
+    figures |= {
+        f"part: {part}": {"ours": seconds, "unit": "s, under the profiler"}
+        for part, seconds in parts.items()
+    }
     return figures, _busiest(stats, functions)
 
 
@@ -149,8 +188,11 @@ def _since(start: tuple[float, float]) -> tuple[float, float]:
 
 
 def _integrating(session: SessionMap, settings: Settings) -> tuple[float, float]:
-    """Seconds (wall clock, processor) of Fuser.add for every keyframe once, a new map every submap length of road."""
-    length, taken = settings.fusion.submap_length or 100.0, np.zeros(2)
+    """Seconds (wall clock, processor) of Fuser.add for every keyframe once, a new map every submap
+    length of road.
+    """
+    length = settings.fusion.submap_length or 100.0
+    taken = np.zeros(2)
     begun = np.floor(np.asarray(session.frames["distance"].to_numpy()) / length)
     fuser = Fuser(settings.fusion)
     for k, pose in enumerate(session.map_T_base):
@@ -164,16 +206,25 @@ def _integrating(session: SessionMap, settings: Settings) -> tuple[float, float]
     return float(taken[0]), float(taken[1])
 
 
-def _stats(profiler: cProfile.Profile) -> dict[tuple[str, int, str], tuple[int, int, float, float, object]]:
+def _stats(
+    profiler: cProfile.Profile,
+) -> dict[tuple[str, int, str], tuple[int, int, float, float, object]]:
     return pstats.Stats(profiler).stats  # type: ignore[attr-defined,no-any-return]
 
 
-def _busiest(stats: dict[tuple[str, int, str], tuple[int, int, float, float, object]], functions: int) -> Rows:
+def _busiest(
+    stats: dict[tuple[str, int, str], tuple[int, int, float, float, object]], functions: int
+) -> Rows:
     """Own seconds, calls and place of the functions that took most time themselves."""
-    return sorted(((own, calls, _place(where)) for where, (_, calls, own, _, _) in stats.items()), reverse=True)[:functions]
+    return sorted(
+        ((own, calls, _place(where)) for where, (_, calls, own, _, _) in stats.items()),
+        reverse=True,
+    )[:functions]
 
 
-def _parts(stats: dict[tuple[str, int, str], tuple[int, int, float, float, object]]) -> dict[str, float]:
+def _parts(
+    stats: dict[tuple[str, int, str], tuple[int, int, float, float, object]],
+) -> dict[str, float]:
     """Seconds of the parts of fusing; ``rest`` is what no part names."""
     total: dict[str, float] = {}
     for (path, _, name), (_, _, _, cumulative, _) in stats.items():
@@ -183,14 +234,17 @@ def _parts(stats: dict[tuple[str, int, str], tuple[int, int, float, float, objec
     for part, (functions, without) in _PARTS.items():
         if any(f in total for f in functions):
             parts[part] = sum(total.get(f, 0.0) for f in functions) - total.get(without, 0.0)
-    parts["rest"] = max(0.0, total.get("stages.py fuse", 0.0) - sum(parts.values()))  # thinning for gravity counts twice
+    # thinning for gravity counts twice
+    parts["rest"] = max(0.0, total.get("stages.py fuse", 0.0) - sum(parts.values()))
     return parts
 
 
 def memory_curve(lengths: Sequence[int], settings: Settings) -> Figures:
-    """Peak resident memory of `semloc fuse`, in a process of its own, for a drive of 250 m and its multiples ``lengths``.
+    """Peak resident memory of `semloc fuse`, in a process of its own, for a drive of 250 m and its
+    multiples ``lengths``.
 
-    The road goes on (new places), or is driven there and back (the same places again). SemlocError when fusing fails.
+    The road goes on (new places), or is driven there and back (the same places again). SemlocError
+    when fusing fails.
     """
     from semloc_logs.simulation.output.long_drive import LAP_M, Lap
 
@@ -202,7 +256,15 @@ def memory_curve(lengths: Sequence[int], settings: Settings) -> Figures:
             for laps in lengths:
                 log = Path(folder) / "drive.mcap"
                 sweeps = lap.write(log, laps, onwards=onwards)
-                command = ["fuse", str(log), "-w", str(Path(folder) / "work"), "--config", str(Path(folder) / "settings.yaml"), "-q"]
+                command = [
+                    "fuse",
+                    str(log),
+                    "-w",
+                    str(Path(folder) / "work"),
+                    "--config",
+                    str(Path(folder) / "settings.yaml"),
+                    "-q",
+                ]
                 start = time.perf_counter()
                 peak = peak_memory([*command, "--overwrite"])
                 figures[f"{laps}x, {'new places' if onwards else 'the same again'}"] = {
@@ -225,7 +287,9 @@ sys.exit(code)
 
 def peak_memory(arguments: Sequence[str]) -> float:
     """Peak resident memory (MB) of `semloc` with ``arguments``. SemlocError when it fails."""
-    done = subprocess.run([sys.executable, "-c", _LAUNCH, *arguments], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", _LAUNCH, *arguments], capture_output=True, text=True, check=False
+    )
     if done.returncode not in (0, 3):
         raise SemlocError(f"semloc {' '.join(arguments)} failed: {done.stderr.strip()}")
     return int(done.stdout.split()[-1]) / (1024 if sys.platform.startswith("linux") else 1024**2)
@@ -237,10 +301,12 @@ def _place(where: tuple[str, int, str]) -> str:
 
 
 def word_recalls(logs: Sequence[Path], truth: Path, settings: Settings) -> Figures:
-    """Recall at 5 of word matches within 1.5 m between two logs whose true alignment is known: trained weights beside random ones.
+    """Recall at 5 of word matches within 1.5 m between two logs whose true alignment is known:
+    trained weights beside random ones.
 
-    Every query of the second log is put to the map of the first one, in the search's heading nearest to the true one; queries farther
-    than 10 m from the first log's road do not count. ``random`` is the mean over three seeds, with a vocabulary of their own.
+    Every query of the second log is put to the map of the first one, in the search's heading
+    nearest to the true one; queries farther than 10 m from the first log's road do not count.
+    ``random`` is the mean over three seeds, with a vocabulary of their own.
     """
     with tempfile.TemporaryDirectory(prefix="semloc-words-") as folder:
         work = Workspace(Path(folder))
@@ -253,26 +319,51 @@ def word_recalls(logs: Sequence[Path], truth: Path, settings: Settings) -> Figur
         pairs = true_queries(query, target, tracks, settings)
         figures: Figures = {}
         for variant in ("semantic", "geometric"):
-            trained = load_encoder(variant, settings.descriptor.weights), load_vocabulary(variant, settings.descriptor.vocabulary)
-            random: list[tuple[Encoder, Vocabulary | None]] = [(random_encoder(variant, seed), None) for seed in range(3)]
-            rows: dict[str, list[tuple[Encoder, Vocabulary | None]]] = {"ours": [trained], "random weights": random}
+            trained = (
+                load_encoder(variant, settings.descriptor.weights),
+                load_vocabulary(variant, settings.descriptor.vocabulary),
+            )
+            random: list[tuple[Encoder, Vocabulary | None]] = [
+                (random_encoder(variant, seed), None) for seed in range(3)
+            ]
+            rows: dict[str, list[tuple[Encoder, Vocabulary | None]]] = {
+                "ours": [trained],
+                "random weights": random,
+            }
             found = {
-                who: [word_recall(query, k, target, T, settings, e, words) for e, words in networks for k, T in pairs]
+                who: [
+                    word_recall(query, k, target, T, settings, e, words)
+                    for e, words in networks
+                    for k, T in pairs
+                ]
                 for who, networks in rows.items()
             }
             for how in ("exact", "coded"):
-                row: dict[str, float | str] = {who: float(np.mean([getattr(r, how) for r in rs])) for who, rs in found.items() if rs}
-                figures[f"{variant}, {'by descriptor' if how == 'exact' else 'by word and code'}"] = row | {"unit": "recall at 5"}
+                row: dict[str, float | str] = {
+                    who: float(np.mean([getattr(r, how) for r in rs]))
+                    for who, rs in found.items()
+                    if rs
+                }
+                figures[
+                    f"{variant}, {'by descriptor' if how == 'exact' else 'by word and code'}"
+                ] = row | {"unit": "recall at 5"}
         return figures
 
 
 def real_streets(logs: Sequence[Path], truth: Path, settings: Settings) -> dict[str, Street]:
-    """For `semloc benchmark retrieval`: what the first log's queries and the second one's map are, with the log's labels and with those
-    from geometry, by the names of :data:`semloc_logs.benchmarks.descriptors.retrieval.REAL`."""
+    """For `semloc benchmark retrieval`: what the first log's queries and the second one's map are,
+    with the log's labels and with those from geometry, by the names of
+    :data:`semloc_logs.benchmarks.descriptors.retrieval.REAL`.
+    """
     settings = settings.resolved()
     out: dict[str, Street] = {}
-    for source, names in (("auto", ("real_log", "real_geometric")), ("geometry", ("real_geometry_labels",))):
-        labelled = settings.model_copy(update={"labels": settings.labels.model_copy(update={"source": source})})
+    for source, names in (
+        ("auto", ("real_log", "real_geometric")),
+        ("geometry", ("real_geometry_labels",)),
+    ):
+        labelled = settings.model_copy(
+            update={"labels": settings.labels.model_copy(update={"source": source})}
+        )
         with tempfile.TemporaryDirectory(prefix="semloc-real-") as folder:
             work = Workspace(Path(folder))
             sessions = {session_name(log): [log] for log in logs}
@@ -291,17 +382,40 @@ class _Prepare:
         self._engine = engine
 
     def fuse(self, logs: Mapping[str, Path], work: Workspace, settings: Settings) -> None:
-        fuse({name: [log] for name, log in logs.items()}, work, settings, {}, self._engine, lambda _: None)
+        fuse(
+            {name: [log] for name, log in logs.items()},
+            work,
+            settings,
+            {},
+            self._engine,
+            lambda _: None,
+        )
 
     def describe(self, work: Workspace, names: Sequence[str], settings: Settings) -> None:
         describe(work, names, settings, self._engine, lambda _: None)
 
 
-def localisation(work: Path | None, queries: int, peers: Mapping[str, str], settings: Settings, note: Callable[[str], None]) -> Figures:
-    """Whole localisation beside ``peers`` (runner -> Python), ``queries`` for each condition, on all cores; kept in ``work``."""
+def localisation(
+    work: Path | None,
+    queries: int,
+    peers: Mapping[str, str],
+    settings: Settings,
+    note: Callable[[str], None],
+) -> Figures:
+    """Whole localisation beside ``peers`` (runner -> Python), ``queries`` for each condition, on
+    all cores; kept in ``work``.
+    """
     engine = make_engine("processes")
     with tempfile.TemporaryDirectory(prefix="semloc-localisation-") as folder:
         try:
-            return Localisation(work or Path(folder), queries, peers, settings.resolved(), engine, _Prepare(engine), note).figures()
+            return Localisation(
+                work or Path(folder),
+                queries,
+                peers,
+                settings.resolved(),
+                engine,
+                _Prepare(engine),
+                note,
+            ).figures()
         finally:
             engine.close()

@@ -72,13 +72,19 @@ class SessionMap:
         WorkspaceError when the session was fused before this was written down.
         """
         if "view_x" not in self.frames.column_names:
-            raise WorkspaceError(f"{self.folder.frames} is of an earlier version: fuse session {self.folder.name} again with --overwrite.")
+            raise WorkspaceError(
+                f"{self.folder.frames} is of an earlier version: fuse session {self.folder.name} again with --overwrite."
+            )
         at = np.stack([self.frames[f"view_{c}"].to_numpy() for c in "xyz"], 1).astype(float)
-        return np.asarray(np.einsum("nij,nj->ni", self.map_T_base[:, :3, :3], at) + self.map_T_base[:, :3, 3])
+        return np.asarray(
+            np.einsum("nij,nj->ni", self.map_T_base[:, :3, :3], at) + self.map_T_base[:, :3, 3]
+        )
 
     @cached_property
     def keyframe(self) -> Callable[[int], Keyframe]:
-        """What a keyframe saw; that of the last ones is kept, since neighbouring queries share keyframes."""
+        """What a keyframe saw; that of the last ones is kept, since neighbouring queries share
+        keyframes.
+        """
         return lru_cache(maxsize=KEPT)(partial(read_keyframe, self.folder.keyframes))
 
     @property
@@ -100,10 +106,13 @@ class SessionMap:
 
 
 def query_keyframes(session: SessionMap, settings: Settings) -> list[int]:
-    """Keyframes that ask: every ``query.every`` metres or ``query.every_angle`` of turning; all of them in a log without poses."""
+    """Keyframes that ask: every ``query.every`` metres or ``query.every_angle`` of turning; all of
+    them in a log without poses.
+    """
     if not session.posed:
         return list(range(len(session.stamps_ns)))
-    every, angle = settings.query.every or 2.0, settings.query.every_angle
+    every = settings.query.every or 2.0
+    angle = settings.query.every_angle
     chosen: list[int] = []
     for i, pose in enumerate(session.map_T_base):
         if chosen:
@@ -115,9 +124,11 @@ def query_keyframes(session: SessionMap, settings: Settings) -> list[int]:
 
 
 def query_members(session: SessionMap, keyframe: int, settings: Settings) -> list[int]:
-    """The keyframes fused into the query of ``keyframe``: ``query.frames`` around it, or all within ``query.length`` of road.
+    """The keyframes fused into the query of ``keyframe``: ``query.frames`` around it, or all within
+    ``query.length`` of road.
 
-    Poses may jump, between logs or where positions come back: what lies beyond the query's radius is no part of the place.
+    Poses may jump, between logs or where positions come back: what lies beyond the query's radius
+    is no part of the place.
     """
     n = len(session.stamps_ns)
     if not session.posed:
@@ -131,7 +142,8 @@ def query_members(session: SessionMap, keyframe: int, settings: Settings) -> lis
 
 
 def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple[Query, F64]:
-    """The query map in a level frame whose origin is the base at ``keyframe``, and the level ``query_T_base`` (4, 4) of it.
+    """The query map in a level frame whose origin is the base at ``keyframe``, and the level
+    ``query_T_base`` (4, 4) of it.
 
     The frame keeps the map's axes: only the origin moves, so voxels stay small numbers.
     """
@@ -140,12 +152,16 @@ def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple
     query_T_map[:3, 3] = -session.map_T_base[keyframe][:3, 3]
     poses = query_T_map @ session.map_T_base
     radius = settings.query.radius or 24.0
-    fuser, clouds, spreads = Fuser(settings.fusion), [], []
+    fuser = Fuser(settings.fusion)
+    clouds = []
+    spreads = []
     for i in members:
         frame = session.keyframe(i).near(session.origins[i], radius)
         fuser.add(frame.points, frame.label, session.origins[i], frame.sigma, poses[i])
         clouds.append(apply(poses[i], frame.points))
         spreads.append(frame.spread(session.origins[i]) @ poses[i][:3, :3].T)
-    v, points, spread = settings.fusion.voxel_size, np.concatenate(clouds), np.concatenate(spreads)
+    v = settings.fusion.voxel_size
+    points = np.concatenate(clouds)
+    spread = np.concatenate(spreads)
     kept = thin_points(points, v / 2, spread)
     return Query(fuser.finish(), points[kept], v, spread[kept]), poses[keyframe]

@@ -23,7 +23,9 @@ class Engine(Protocol):
 
     jobs: int
 
-    def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]: ...
+    def map(
+        self, function: Callable[[Task], Result], tasks: Iterable[Task]
+    ) -> Iterator[Result]: ...
 
     def close(self) -> None:
         """Release the workers once their tasks are done."""
@@ -48,7 +50,9 @@ class Serial:
 
 
 class Processes:
-    """``jobs`` worker processes (spawned, so that threads of the parent cannot hurt them), one thread each."""
+    """``jobs`` worker processes (spawned, so that threads of the parent cannot hurt them), one
+    thread each.
+    """
 
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs
@@ -80,7 +84,8 @@ class Processes:
     def stop(self) -> None:
         """End the workers now: they unwind, so that temporary files go, and leave."""
         if self._pool is not None:
-            for worker in list((getattr(self._pool, "_processes", None) or {}).values()):  # public as terminate_workers() from 3.14 on
+            # public as terminate_workers() from 3.14 on
+            for worker in list((getattr(self._pool, "_processes", None) or {}).values()):
                 worker.terminate()
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
@@ -90,7 +95,9 @@ ENGINES = ("serial", "processes")
 
 
 def make_engine(name: str, jobs: int | None = None) -> Engine:
-    """The engine called ``name`` with ``jobs`` workers (default: the cores that this process may use)."""
+    """The engine called ``name`` with ``jobs`` workers (default: the cores that this process may
+    use).
+    """
     if name == "serial":
         return Serial()
     if name == "processes":
@@ -105,16 +112,25 @@ def cores() -> int:
 
 
 def single_threaded() -> None:
-    """One thread for each numerical library, unless the environment says otherwise; to be called before any of them is loaded.
+    """One thread for each numerical library, unless the environment says otherwise; to be called
+    before any of them is loaded.
 
-    Cores are used by processes: many small matrix products lose time by waking threads, and sums keep their order.
+    Cores are used by processes: many small matrix products lose time by waking threads, and sums
+    keep their order.
     """
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    for variable in (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NUMBA_NUM_THREADS",
+    ):
         os.environ.setdefault(variable, "1")
 
 
 def _prepare_worker() -> None:
-    """A worker leaves when told to (SIGTERM) or when its parent is gone, and leaves Ctrl-C to the parent."""
+    """A worker leaves when told to (SIGTERM) or when its parent is gone, and leaves Ctrl-C to the
+    parent.
+    """
     single_threaded()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)

@@ -1,4 +1,6 @@
-"""Results of an engine as a sequence that grows while it is read: work on the first ones begins before the last ones are there."""
+"""Results of an engine as a sequence that grows while it is read: work on the first ones begins
+before the last ones are there.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,9 @@ Result = TypeVar("Result")
 class Growing(Sequence[Result], Generic[Result]):
     """``total`` results, of which a thread takes those from number ``first`` on from ``results``.
 
-    ``[i]`` waits for the i-th and raises what has gone wrong before it. With ``ahead`` no more than so many results are taken beyond the
-    last one that was wanted so far. Raises IndexError for a result before ``first``.
+    ``[i]`` waits for the i-th and raises what has gone wrong before it. With ``ahead`` no more than
+    so many results are taken beyond the last one that was wanted so far. Raises IndexError for a
+    result before ``first``.
     """
 
     def __init__(
@@ -34,7 +37,9 @@ class Growing(Sequence[Result], Generic[Result]):
 
     def _may_take(self) -> bool:
         count = self._first + len(self._there)
-        return self._ahead is None or count < self._wanted + self._ahead or self._failure is not None
+        return (
+            self._ahead is None or count < self._wanted + self._ahead or self._failure is not None
+        )
 
     def _take(self, results: Iterable[Result], on_result: Callable[[int], None]) -> None:
         try:

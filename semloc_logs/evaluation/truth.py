@@ -1,4 +1,6 @@
-"""Closures against the truth: which are right, how far off, and how many of the revisits were found (DESIGN: closures.parquet)."""
+"""Closures against the truth: which are right, how far off, and how many of the revisits were found
+(DESIGN: closures.parquet).
+"""
 
 from __future__ import annotations
 
@@ -41,13 +43,17 @@ class TrueTrack:
         """Poses (m, 4, 4) and whether they are known (m,)."""
         if not len(self.stamps_ns):
             return np.tile(np.eye(4), (len(stamps_ns), 1, 1)), np.zeros(len(stamps_ns), bool)
-        known = (stamps_ns >= self.stamps_ns[0] - SLACK_NS) & (stamps_ns <= self.stamps_ns[-1] + SLACK_NS)
+        known = (stamps_ns >= self.stamps_ns[0] - SLACK_NS) & (
+            stamps_ns <= self.stamps_ns[-1] + SLACK_NS
+        )
         return interpolate(self.stamps_ns, self.common_T_base, stamps_ns), known
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """One closure; without errors, and neither correct nor false, when the truth does not know an end."""
+    """One closure; without errors, and neither correct nor false, when the truth does not know an
+    end.
+    """
 
     query_session: str
     target_session: str
@@ -61,7 +67,9 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """The figures: medians over all judged closures; ``recall`` = ``answered`` / ``possible`` queries, None without possible ones."""
+    """The figures: medians over all judged closures; ``recall`` = ``answered`` / ``possible``
+    queries, None without possible ones.
+    """
 
     rows: list[Judged]
     queries: int
@@ -110,7 +118,9 @@ class Evaluation:
             "possible",
             "answered",
         )
-        return {name: getattr(self, name) for name in figures} | {"rows": [asdict(r) for r in self.rows]}
+        return {name: getattr(self, name) for name in figures} | {
+            "rows": [asdict(r) for r in self.rows]
+        }
 
 
 def _median(values: Iterable[float | None]) -> float | None:
@@ -118,12 +128,16 @@ def _median(values: Iterable[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def evaluate_closures(work: Workspace, truth: Path, settings: Settings, *, self_closures: bool = True) -> Evaluation:
-    """The closures of a workspace against the file ``truth``; queries are counted with the settings that the closures were made with.
+def evaluate_closures(
+    work: Workspace, truth: Path, settings: Settings, *, self_closures: bool = True
+) -> Evaluation:
+    """The closures of a workspace against the file ``truth``; queries are counted with the settings
+    that the closures were made with.
 
-    A query is possible when a keyframe of another session, or one of its own that is not excluded as near in time or along the road, truly
-    lies within 5 m. It is answered when a correct closure has it at either end: a closure found from both ends is reported once.
-    Raises TruthError when the truth file is missing or wrong, WorkspaceError without closures.
+    A query is possible when a keyframe of another session, or one of its own that is not excluded
+    as near in time or along the road, truly lies within 5 m. It is answered when a correct closure
+    has it at either end: a closure found from both ends is reported once. Raises TruthError when
+    the truth file is missing or wrong, WorkspaceError without closures.
     """
     settings = _settings_of(work, settings.resolved())
     sessions = {f.name: SessionMap(f) for f in work.sessions()}
@@ -139,23 +153,36 @@ def _settings_of(work: Workspace, settings: Settings) -> Settings:
     if not isinstance(recorded, dict):
         return settings
     try:
-        update = {"query": Query.model_validate(recorded["query"]), "closures": Closures.model_validate(recorded["closures"])}
+        update = {
+            "query": Query.model_validate(recorded["query"]),
+            "closures": Closures.model_validate(recorded["closures"]),
+        }
     except (KeyError, ValueError):
-        raise WorkspaceError(f"{work.closures} was made by another version: run 'semloc close -w {work.path} --overwrite'.") from None
+        raise WorkspaceError(
+            f"{work.closures} was made by another version: run 'semloc close -w {work.path} --overwrite'."
+        ) from None
     return settings.model_copy(update=update)
 
 
 def judge_closure(row: Mapping[str, Any], tracks: Mapping[str, TrueTrack]) -> Judged:
     """A row of closures.parquet or rejected.parquet against the true tracks of its sessions."""
-    ends = [_pose(tracks.get(row[f"{end}_session"]), row[f"{end}_stamp_ns"]) for end in ("query", "target")]
+    ends = [
+        _pose(tracks.get(row[f"{end}_session"]), row[f"{end}_stamp_ns"])
+        for end in ("query", "target")
+    ]
     error_m = error_deg = correct = None
     if ends[0] is not None and ends[1] is not None:
-        found = transform(np.array([row[f"t_{c}"] for c in "xyz"]), np.array([row[f"q_{c}"] for c in "xyzw"]))
+        found = transform(
+            np.array([row[f"t_{c}"] for c in "xyz"]), np.array([row[f"q_{c}"] for c in "xyzw"])
+        )
         rest = inverse(inverse(ends[1]) @ ends[0]) @ found
-        error_m, error_deg = float(np.linalg.norm(rest[:3, 3])), float(np.degrees(rotation_angle(rest[:3, :3])))
+        error_m = float(np.linalg.norm(rest[:3, 3]))
+        error_deg = float(np.degrees(rotation_angle(rest[:3, :3])))
         correct = error_m <= CORRECT_M and error_deg <= CORRECT_DEG
     names = ("query_session", "target_session", "query_stamp_ns", "target_stamp_ns", "probability")
-    return Judged(**{n: row[n] for n in names}, error_m=error_m, error_deg=error_deg, correct=correct)
+    return Judged(
+        **{n: row[n] for n in names}, error_m=error_m, error_deg=error_deg, correct=correct
+    )
 
 
 def _pose(track: TrueTrack | None, stamp_ns: int) -> F64 | None:
@@ -169,9 +196,15 @@ def _pose(track: TrueTrack | None, stamp_ns: int) -> F64 | None:
 
 
 def _count_queries(
-    sessions: Mapping[str, SessionMap], tracks: Mapping[str, TrueTrack], rows: list[Judged], settings: Settings, self_closures: bool
+    sessions: Mapping[str, SessionMap],
+    tracks: Mapping[str, TrueTrack],
+    rows: list[Judged],
+    settings: Settings,
+    self_closures: bool,
 ) -> tuple[int, int, int]:
-    """Queries of known true pose, those of them that are possible, and those of the latter that are answered."""
+    """Queries of known true pose, those of them that are possible, and those of the latter that are
+    answered.
+    """
     positions: dict[str, F64] = {}
     known: dict[str, NDArray[np.bool_]] = {}
     for name, track in tracks.items():
@@ -187,15 +220,27 @@ def _count_queries(
                 continue
             counts[0] += 1
             here = positions[name][k]
-            others = any(tree.query(here)[0] <= REVISIT_M for other, tree in trees.items() if other != name)
-            if not (others or (self_closures and _revisits_itself(mine, positions[name], known[name], k, settings.closures))):
+            others = any(
+                tree.query(here)[0] <= REVISIT_M for other, tree in trees.items() if other != name
+            )
+            if not (
+                others
+                or (
+                    self_closures
+                    and _revisits_itself(mine, positions[name], known[name], k, settings.closures)
+                )
+            ):
                 continue
             counts[1] += 1
-            counts[2] += _is_answered(positions[name], k, right.get(name, []), settings.query.every or 2.0)
+            counts[2] += _is_answered(
+                positions[name], k, right.get(name, []), settings.query.every or 2.0
+            )
     return counts[0], counts[1], counts[2]
 
 
-def _correct_ends(sessions: Mapping[str, SessionMap], rows: list[Judged]) -> dict[str, list[tuple[int, bool]]]:
+def _correct_ends(
+    sessions: Mapping[str, SessionMap], rows: list[Judged]
+) -> dict[str, list[tuple[int, bool]]]:
     """Keyframes at the ends of correct closures by session, and whether they were the query."""
     out: dict[str, list[tuple[int, bool]]] = {}
     for row in rows:
@@ -209,17 +254,32 @@ def _correct_ends(sessions: Mapping[str, SessionMap], rows: list[Judged]) -> dic
     return out
 
 
-def _is_answered(positions: F64, keyframe: int, ends: list[tuple[int, bool]], spacing: float) -> bool:
-    """As the query itself, or as the target of a closure found from the other end, within one query spacing."""
-    return any(k == keyframe if is_query else float(np.linalg.norm(positions[k] - positions[keyframe])) < spacing for k, is_query in ends)
+def _is_answered(
+    positions: F64, keyframe: int, ends: list[tuple[int, bool]], spacing: float
+) -> bool:
+    """As the query itself, or as the target of a closure found from the other end, within one query
+    spacing.
+    """
+    return any(
+        k == keyframe
+        if is_query
+        else float(np.linalg.norm(positions[k] - positions[keyframe])) < spacing
+        for k, is_query in ends
+    )
 
 
-def _revisits_itself(session: SessionMap, positions: F64, known: NDArray[np.bool_], keyframe: int, closures: Closures) -> bool:
+def _revisits_itself(
+    session: SessionMap, positions: F64, known: NDArray[np.bool_], keyframe: int, closures: Closures
+) -> bool:
     if not session.posed:
         return False
     near = known & (np.linalg.norm(positions - positions[keyframe], axis=1) <= REVISIT_M)
-    later = np.abs(session.stamps_ns - session.stamps_ns[keyframe]) >= closures.exclude_seconds * 1e9
-    farther = np.abs(session.distance - session.distance[keyframe]) >= (closures.exclude_distance or 0.0)
+    later = (
+        np.abs(session.stamps_ns - session.stamps_ns[keyframe]) >= closures.exclude_seconds * 1e9
+    )
+    farther = np.abs(session.distance - session.distance[keyframe]) >= (
+        closures.exclude_distance or 0.0
+    )
     return bool((near & later & farther).any())
 
 
@@ -227,15 +287,21 @@ def _revisits_itself(session: SessionMap, positions: F64, known: NDArray[np.bool
 
 
 def read_truth(path: Path, sessions: Mapping[str, SessionMap]) -> dict[str, TrueTrack]:
-    """The true tracks of those ``sessions`` that the file knows. Raises TruthError when it is missing or wrong, or knows none."""
+    """The true tracks of those ``sessions`` that the file knows. Raises TruthError when it is
+    missing or wrong, or knows none.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:
         raise TruthError(
             f"Truth file {path} cannot be read as JSON ({problem}): give a file that maps a log's name to its truth."
         ) from None
-    if not isinstance(content, dict) or not all(isinstance(entry, dict) for entry in content.values()):
-        raise TruthError(f"Truth file {path} does not map each log's name to an object with 'T_common_session' or 'trajectory'.")
+    if not isinstance(content, dict) or not all(
+        isinstance(entry, dict) for entry in content.values()
+    ):
+        raise TruthError(
+            f"Truth file {path} does not map each log's name to an object with 'T_common_session' or 'trajectory'."
+        )
     tracks = {}
     for file, entry in content.items():
         name = next((n for n in (file, Path(file).stem) if n in sessions), None)
@@ -256,7 +322,9 @@ def _track(path: Path, file: str, entry: Mapping[str, Any], session: SessionMap)
         if common_T_session.shape != (4, 4) or not np.isfinite(common_T_session).all():
             raise ValueError
         R = common_T_session[:3, :3]
-        if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or not np.allclose(common_T_session[3], (0, 0, 0, 1)):
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or not np.allclose(
+            common_T_session[3], (0, 0, 0, 1)
+        ):
             raise ValueError
     except (KeyError, ValueError, TypeError):
         raise TruthError(
@@ -267,7 +335,8 @@ def _track(path: Path, file: str, entry: Mapping[str, Any], session: SessionMap)
 
 
 def read_tum(path: Path) -> TrueTrack:
-    """A TUM file: seconds, position (m) and quaternion xyzw on each line; stamps exact to the nanosecond.
+    """A TUM file: seconds, position (m) and quaternion xyzw on each line; stamps exact to the
+    nanosecond.
 
     Raises TruthError when it is missing, or a line does not say this.
     """
@@ -281,8 +350,14 @@ def read_tum(path: Path) -> TrueTrack:
         if not words or words[0].startswith("#"):
             continue
         try:
-            stamp_ns, values = int(Decimal(words[0]) * 10**9), [float(w) for w in words[1:8]]
-            if len(values) != 7 or not np.isfinite(values).all() or not np.linalg.norm(values[3:]) > 1e-6 or abs(stamp_ns) >= 2**63:
+            stamp_ns = int(Decimal(words[0]) * 10**9)
+            values = [float(w) for w in words[1:8]]
+            if (
+                len(values) != 7
+                or not np.isfinite(values).all()
+                or not np.linalg.norm(values[3:]) > 1e-6
+                or abs(stamp_ns) >= 2**63
+            ):
                 raise ValueError
         except (ValueError, OverflowError, InvalidOperation):
             raise TruthError(

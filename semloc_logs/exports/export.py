@@ -1,4 +1,6 @@
-"""Sessions and closures in other programs' formats: poses (TUM, KITTI), a pose graph (g2o), points (PLY, PCD, LAS, LAZ, XYZ)."""
+"""Sessions and closures in other programs' formats: poses (TUM, KITTI), a pose graph (g2o), points
+(PLY, PCD, LAS, LAZ, XYZ).
+"""
 
 from __future__ import annotations
 
@@ -30,19 +32,28 @@ FORMATS = ("tum", "kitti", "g2o", *POINT_FORMATS)
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which points: the map's ``voxels`` or those of the ``keyframes``, in which frame, and within which bounds of it (m) if any."""
+    """Which points: the map's ``voxels`` or those of the ``keyframes``, in which frame, and within
+    which bounds of it (m) if any.
+    """
 
     what: Literal["voxels", "keyframes"] = "voxels"
     frame: Literal["session", "map"] = "session"
     bounds: Bounds | None = None
 
 
-def export(work: Workspace, names: Sequence[str], form: str, output: Path, selection: Selection | None = None) -> list[Path]:
+def export(
+    work: Workspace,
+    names: Sequence[str],
+    form: str,
+    output: Path,
+    selection: Selection | None = None,
+) -> list[Path]:
     """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
 
-    ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``: one pose graph of all; the point
-    formats: ``selection``, by default the centres of all occupied voxels in the session frame. Raises WorkspaceError when a session
-    is not there or does not fit the format, SemlocError when a library is missing.
+    ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``:
+    one pose graph of all; the point formats: ``selection``, by default the centres of all occupied
+    voxels in the session frame. Raises WorkspaceError when a session is not there or does not fit
+    the format, SemlocError when a library is missing.
     """
     known = {f.name: SessionMap(f) for f in work.sessions()}
     missing = [n for n in names if n not in known]
@@ -75,17 +86,24 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def tum(session: SessionMap) -> bytes:
-    """Seconds, position (m), quaternion xyzw of the base frame in the session frame: the whole trajectory."""
+    """Seconds, position (m), quaternion xyzw of the base frame in the session frame: the whole
+    trajectory.
+    """
     table = read_table(session.folder.trajectory)
     t, q = translation_quaternion(poses_of(table))
     lines = [
-        f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{x:.12g}" for x in (*position, *quaternion))
+        f"{stamp // 10**9}.{stamp % 10**9:09d} "
+        + " ".join(f"{x:.12g}" for x in (*position, *quaternion))
         for stamp, position, quaternion in zip(table["stamp_ns"].to_pylist(), t, q, strict=True)
     ]
     return "".join(f"{line}\n" for line in lines).encode()
 
 
 def kitti(session: SessionMap) -> bytes:
-    """Twelve numbers a line: the upper 3 x 4 of ``session_T_base`` of each pose of the trajectory, row-major."""
+    """Twelve numbers a line: the upper 3 x 4 of ``session_T_base`` of each pose of the trajectory,
+    row-major.
+    """
     poses = poses_of(read_table(session.folder.trajectory))
-    return "".join(" ".join(f"{x:.12g}" for x in pose[:3].ravel()) + "\n" for pose in poses).encode()
+    return "".join(
+        " ".join(f"{x:.12g}" for x in pose[:3].ravel()) + "\n" for pose in poses
+    ).encode()

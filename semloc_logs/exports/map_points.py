@@ -1,4 +1,6 @@
-"""The points of a session, batch by batch: its occupied voxels or its keyframes' points, in the session's or the map's frame."""
+"""The points of a session, batch by batch: its occupied voxels or its keyframes' points, in the
+session's or the map's frame.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,15 @@ from semloc_logs.voxels.store import read_keyframe
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
-Bounds = tuple[float, float, float, float]  # x from, y from, x to, y to; metres, the upper ones excluded
+# x from, y from, x to, y to; metres, the upper ones excluded
+Bounds = tuple[float, float, float, float]
 
 
 @dataclass(eq=False)
 class SessionPoints:
-    """Points of one session. ``what`` is "voxels" (centres) or "keyframes", ``frame`` "session" or "map"; ``bounds`` are in that frame."""
+    """Points of one session. ``what`` is "voxels" (centres) or "keyframes", ``frame`` "session" or
+    "map"; ``bounds`` are in that frame.
+    """
 
     session: SessionMap
     what: str
@@ -36,7 +41,9 @@ class SessionPoints:
 
     def __post_init__(self) -> None:
         if self.what == "keyframes" and not self.session.posed:
-            raise WorkspaceError(f"Session {self.session.folder.name} has no poses, so its keyframes have no place in one cloud.")
+            raise WorkspaceError(
+                f"Session {self.session.folder.name} has no poses, so its keyframes have no place in one cloud."
+            )
 
     @property
     def voxel_size(self) -> float:
@@ -46,7 +53,11 @@ class SessionPoints:
     @cached_property
     def frame_T_map(self) -> F64:
         """(4, 4)."""
-        return np.eye(4) if self.frame == "map" else np.array(self.session.json["session_T_map"], float)
+        return (
+            np.eye(4)
+            if self.frame == "map"
+            else np.array(self.session.json["session_T_map"], float)
+        )
 
     @property
     def day(self) -> date:
@@ -84,9 +95,11 @@ class SessionPoints:
             placed = apply(self.frame_T_map, points)
             if self.bounds is not None:
                 x0, y0, x1, y1 = self.bounds
-                x, y = placed[:, 0], placed[:, 1]
+                x = placed[:, 0]
+                y = placed[:, 1]
                 keep = (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
-                placed, label = placed[keep], label[keep]
+                placed = placed[keep]
+                label = label[keep]
             if len(label):
                 yield placed, label
 
@@ -111,7 +124,10 @@ class SessionPoints:
         ranges = [group.column(k).statistics for k in range(3)]
         if self.bounds is None or any(r is None or not r.has_min_max for r in ranges):
             return True
-        corners = apply(self.frame_T_map, (np.array(list(product(*((r.min, r.max) for r in ranges)))) + 0.5) * self.voxel_size)
+        corners = apply(
+            self.frame_T_map,
+            (np.array(list(product(*((r.min, r.max) for r in ranges)))) + 0.5) * self.voxel_size,
+        )
         (low_x, low_y), (high_x, high_y) = corners[:, :2].min(0), corners[:, :2].max(0)
         x0, y0, x1, y1 = self.bounds
         return bool(low_x < x1 and high_x >= x0 and low_y < y1 and high_y >= y0)
@@ -130,4 +146,6 @@ def _open(path: Path) -> pq.ParquetFile:
 
 
 def _damaged(path: Path, problem: Exception) -> WorkspaceError:
-    return WorkspaceError(f"{path} cannot be read ({str(problem).splitlines()[0]}): run 'semloc fuse' with --overwrite.")
+    return WorkspaceError(
+        f"{path} cannot be read ({str(problem).splitlines()[0]}): run 'semloc fuse' with --overwrite."
+    )

@@ -1,4 +1,6 @@
-"""Point clouds as files: PLY, PCD, LAS and LAZ, XYZ text. Written batch by batch, so memory does not grow with the map."""
+"""Point clouds as files: PLY, PCD, LAS and LAZ, XYZ text. Written batch by batch, so memory does
+not grow with the map.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +30,10 @@ def class_colours() -> U8:
 
 
 def asprs_classes() -> U8:
-    """ASPRS standard classes (256,) of train ids (LAS 1.4 R15, table 17): 2 ground (road, sidewalk, terrain), 5 high vegetation,
-    6 building, 1 unclassified where unlabelled; other classes have no number of their own and get 64 + train id, which the
-    standard leaves to users."""
+    """ASPRS standard classes (256,) of train ids (LAS 1.4 R15, table 17): 2 ground (road, sidewalk,
+    terrain), 5 high vegetation, 6 building, 1 unclassified where unlabelled; other classes have no
+    number of their own and get 64 + train id, which the standard leaves to users.
+    """
     table = np.full(256, 1, np.uint8)
     known = np.arange(len(cityscapes().names))
     table[known] = 64 + known
@@ -39,11 +42,23 @@ def asprs_classes() -> U8:
 
 
 def write_ply(path: Path, points: SessionPoints) -> None:
-    """Binary PLY: x y z (m; double where float would be too coarse), red green blue, label (train id)."""
+    """Binary PLY: x y z (m; double where float would be too coarse), red green blue, label (train
+    id).
+    """
     real, size = ("float", "<f4") if points.fits_float32 else ("double", "<f8")
-    fields = np.dtype([*((c, size) for c in "xyz"), *((c, "u1") for c in ("red", "green", "blue", "label"))])
-    kinds = {**dict.fromkeys("xyz", real), **dict.fromkeys(("red", "green", "blue", "label"), "uchar")}
-    head = ["ply", "format binary_little_endian 1.0", f"comment {_says(points)}", f"element vertex {points.count()}"]
+    fields = np.dtype(
+        [*((c, size) for c in "xyz"), *((c, "u1") for c in ("red", "green", "blue", "label"))]
+    )
+    kinds = {
+        **dict.fromkeys("xyz", real),
+        **dict.fromkeys(("red", "green", "blue", "label"), "uchar"),
+    }
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {_says(points)}",
+        f"element vertex {points.count()}",
+    ]
     head += [f"property {kind} {name}" for name, kind in kinds.items()]
     colours = class_colours()
 
@@ -59,9 +74,11 @@ def write_ply(path: Path, points: SessionPoints) -> None:
 
 
 def write_pcd(path: Path, points: SessionPoints) -> None:
-    """Binary PCD v0.7 as PCL's PointXYZRGBL has it: x y z (m), label (train id, uint32), rgb (0x00RRGGBB in the bits of a float).
+    """Binary PCD v0.7 as PCL's PointXYZRGBL has it: x y z (m), label (train id, uint32), rgb
+    (0x00RRGGBB in the bits of a float).
 
-    Raises WorkspaceError where 32-bit coordinates, the only ones that PCL's points have, would be too coarse.
+    Raises WorkspaceError where 32-bit coordinates, the only ones that PCL's points have, would be
+    too coarse.
     """
     if not points.fits_float32:
         raise WorkspaceError(
@@ -96,25 +113,33 @@ DATA binary
 
 
 def write_las(path: Path, points: SessionPoints) -> None:
-    """LAS 1.4, point format 7 (LAZ where ``path`` ends in .laz): coordinates to the millimetre, RGB, ASPRS classes, and the train id
-    in the extra dimension ``train_id`` (255 unlabelled).
+    """LAS 1.4, point format 7 (LAZ where ``path`` ends in .laz): coordinates to the millimetre,
+    RGB, ASPRS classes, and the train id in the extra dimension ``train_id`` (255 unlabelled).
 
     Raises SemlocError when laspy, or lazrs for LAZ, is not installed.
     """
     laspy = _laspy(path.suffix == ".laz")
     header = laspy.LasHeader(point_format=7, version="1.4")
-    header.add_extra_dim(laspy.ExtraBytesParams(name="train_id", type=np.uint8, description="Cityscapes, 255 unlabelled"))
-    header.scales, header.offsets = np.full(3, LAS_SCALE), points.origin
+    header.add_extra_dim(
+        laspy.ExtraBytesParams(
+            name="train_id", type=np.uint8, description="Cityscapes, 255 unlabelled"
+        )
+    )
+    header.scales = np.full(3, LAS_SCALE)
+    header.offsets = points.origin
     header.creation_date = points.day  # not today's: the same map gives the same file
     header.generating_software = f"semloc_logs {semloc_logs.__version__}"[:32]
-    header.global_encoding.wkt = True  # as point formats from 6 on ask; without a record of it the frame is a local one
-    colours, classes = class_colours().astype(np.uint16) * 257, asprs_classes()
+    # as point formats from 6 on ask; without a record of it the frame is a local one
+    header.global_encoding.wkt = True
+    colours = class_colours().astype(np.uint16) * 257
+    classes = asprs_classes()
     with laspy.open(path, mode="w", header=header, do_compress=path.suffix == ".laz") as file:
         for xyz, label in _joined(points.batches()):
             out = laspy.ScaleAwarePointRecord.zeros(len(label), header=header)
             out.x, out.y, out.z = xyz.T
             out.red, out.green, out.blue = colours[label].T
-            out.classification, out.train_id = classes[label], label
+            out.classification = classes[label]
+            out.train_id = label
             out.return_number[:] = out.number_of_returns[:] = 1
             file.write_points(out)
 
@@ -127,11 +152,15 @@ def _laspy(compressed: bool) -> Any:
             import lazrs  # noqa: F401
     except ImportError as problem:
         form = "LAZ" if compressed else "LAS"
-        raise SemlocError(f"{form} needs the package {problem.name}, which is not installed: run pip install 'semloc_logs[las]'.") from None
+        raise SemlocError(
+            f"{form} needs the package {problem.name}, which is not installed: run pip install 'semloc_logs[las]'."
+        ) from None
     return laspy
 
 
-def _joined(batches: Iterator[tuple[NDArray[np.float64], U8]]) -> Iterator[tuple[NDArray[np.float64], U8]]:
+def _joined(
+    batches: Iterator[tuple[NDArray[np.float64], U8]],
+) -> Iterator[tuple[NDArray[np.float64], U8]]:
     """Small batches put together to about LAS_ROWS."""
     held: list[tuple[NDArray[np.float64], U8]] = []
     for batch in batches:
@@ -152,14 +181,16 @@ def write_xyz(path: Path, points: SessionPoints) -> None:
     with path.open("wb") as file:
         for xyz, label in points.batches():
             rounded = np.round(xyz, 4) + 0.0  # no -0
-            csv.write_csv(pa.table({**dict(zip("xyz", rounded.T.copy(), strict=True)), "label": label}), file, options)
+            csv.write_csv(
+                pa.table({**dict(zip("xyz", rounded.T.copy(), strict=True)), "label": label}),
+                file,
+                options,
+            )
 
 
 def _says(points: SessionPoints) -> str:
     name = " ".join(points.session.folder.name.split())
-    return (
-        f"semloc_logs {semloc_logs.__version__}: {points.what} of session {name}, {points.frame} frame, metres, label = Cityscapes train id"
-    )
+    return f"semloc_logs {semloc_logs.__version__}: {points.what} of session {name}, {points.frame} frame, metres, label = Cityscapes train id"
 
 
 def _binary(path: Path, head: str, rows: Iterator[NDArray[Any]], count: int) -> None:
@@ -171,4 +202,6 @@ def _binary(path: Path, head: str, rows: Iterator[NDArray[Any]], count: int) -> 
             file.write(batch.tobytes())
             written += len(batch)
     if written != count:
-        raise WorkspaceError(f"The map changed while it was exported ({written} points instead of {count}): export it again.")
+        raise WorkspaceError(
+            f"The map changed while it was exported ({written} points instead of {count}): export it again."
+        )

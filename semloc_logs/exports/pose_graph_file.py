@@ -11,32 +11,45 @@ from semloc_logs.numerics.transforms import inverse, transform, translation_quat
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
-ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD = (0.02, 0.01), (0.002, 0.002)  # fixed part, and part per metre of road
+# fixed part, and part per metre of road
+ODOMETRY_SIGMA_M = (0.02, 0.01)
+ODOMETRY_SIGMA_RAD = (0.002, 0.002)
 
 
 def pose_graph(sessions: dict[str, SessionMap], work: Workspace) -> str:
-    """g2o text: keyframes as vertices (each session in its own map frame), odometry between neighbours, closures of closures.parquet.
+    """g2o text: keyframes as vertices (each session in its own map frame), odometry between
+    neighbours, closures of closures.parquet.
 
-    Information is of (x y z, rotation vector in radians) in the axes of the edge's second vertex, as GTSAM and Ceres read it. Odometry
-    has no covariance in a workspace; it is given 2 cm + 1 % of the road and 2 mrad + 2 mrad/m.
+    Information is of (x y z, rotation vector in radians) in the axes of the edge's second vertex,
+    as GTSAM and Ceres read it. Odometry has no covariance in a workspace; it is given 2 cm + 1 % of
+    the road and 2 mrad + 2 mrad/m.
     """
     lines: list[str] = []
     first: dict[str, int] = {}
     for name, session in sessions.items():
         first[name] = sum(len(s.stamps_ns) for s in list(sessions.values())[: len(first)])
-        lines.append(f"# {name}: vertices {first[name]} .. {first[name] + len(session.stamps_ns) - 1}")
-        lines += [f"VERTEX_SE3:QUAT {first[name] + i} {_pose_text(pose)}" for i, pose in enumerate(session.map_T_base)]
+        lines.append(
+            f"# {name}: vertices {first[name]} .. {first[name] + len(session.stamps_ns) - 1}"
+        )
+        lines += [
+            f"VERTEX_SE3:QUAT {first[name] + i} {_pose_text(pose)}"
+            for i, pose in enumerate(session.map_T_base)
+        ]
     for name, session in sessions.items():
         if session.posed:
             lines += _odometry(first[name], session.map_T_base)
     for row in read_closures(work.closures) if work.closures.exists() else []:
         if row["query_session"] in sessions and row["target_session"] in sessions:
             query, target = (
-                first[row[f"{end}_session"]] + keyframe_at(sessions[row[f"{end}_session"]], row[f"{end}_stamp_ns"])
+                first[row[f"{end}_session"]]
+                + keyframe_at(sessions[row[f"{end}_session"]], row[f"{end}_stamp_ns"])
                 for end in ("query", "target")
             )
-            target_T_query = transform(np.array([row[f"t_{c}"] for c in "xyz"]), np.array([row[f"q_{c}"] for c in "xyzw"]))
-            turn = np.kron(np.eye(2), target_T_query[:3, :3].T)  # from the target's axes into the query's
+            target_T_query = transform(
+                np.array([row[f"t_{c}"] for c in "xyz"]), np.array([row[f"q_{c}"] for c in "xyzw"])
+            )
+            # from the target's axes into the query's
+            turn = np.kron(np.eye(2), target_T_query[:3, :3].T)
             covariance = turn @ np.array(row["covariance"]).reshape(6, 6) @ turn.T
             lines.append(_edge(target, query, target_T_query, covariance))
     return "\n".join(lines) + "\n"

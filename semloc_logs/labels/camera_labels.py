@@ -1,4 +1,6 @@
-"""Pictures of a session's cameras, kept until the clouds of their time come, and painted onto those."""
+"""Pictures of a session's cameras, kept until the clouds of their time come, and painted onto
+those.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from semloc_logs.labels.space import UNPAINTED
 from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import inverse
 
-POSED_TOLERANCE_NS = 250_000_000  # between picture and cloud, where poses take out the motion between them
+# between picture and cloud, where poses take out the motion between them
+POSED_TOLERANCE_NS = 250_000_000
 UNPOSED_TOLERANCE_NS = 50_000_000  # and where nothing does: half a period at 10 Hz
 _MOST_BYTES = 512 << 20  # of pictures that wait for their clouds
 CAMERA_SHIFT = 24  # painted labels have the number of their camera in the upper bits
@@ -25,7 +28,9 @@ CAMERA_SHIFT = 24  # painted labels have the number of their camera in the upper
 
 @dataclass(slots=True, eq=False)
 class _Camera:
-    """One topic's pictures that wait, its projector, the newest label image, and how much it has painted."""
+    """One topic's pictures that wait, its projector, the newest label image, and how much it has
+    painted.
+    """
 
     number: int
     waiting: deque[ImageFrame] = field(default_factory=deque)
@@ -36,14 +41,22 @@ class _Camera:
 
 
 class Pictures:
-    """Paints the pictures of ``topics`` onto clouds; ``label_of`` makes the labels (h, w) of a picture, at most 24 bits or UNPAINTED.
+    """Paints the pictures of ``topics`` onto clouds; ``label_of`` makes the labels (h, w) of a
+    picture, at most 24 bits or UNPAINTED.
 
     The number of the camera stands above them, and DOUBTFUL above that (labels/painting.py).
 
-    ``erode``: pixels next to where two labels meet that do not count. ``notes`` are sentences about pictures that cannot be used.
+    ``erode``: pixels next to where two labels meet that do not count. ``notes`` are sentences about
+    pictures that cannot be used.
     """
 
-    def __init__(self, session: Session, topics: tuple[str, ...], label_of: Callable[[ImageFrame], U32], erode: int) -> None:
+    def __init__(
+        self,
+        session: Session,
+        topics: tuple[str, ...],
+        label_of: Callable[[ImageFrame], U32],
+        erode: int,
+    ) -> None:
         self.topics = topics[:127]
         self.notes: dict[str, None] = {}
         self.seen = self.painted = self.inside = 0  # points
@@ -60,8 +73,12 @@ class Pictures:
             self._bytes -= fullest.waiting.popleft().image.nbytes
 
     def labels(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> U32 | None:
-        """Labels of ``cloud.points[keep]`` with the camera's number above them, UNPAINTED where no camera sees; None without a picture."""
-        out, inside, viewpoint = np.full(len(keep), UNPAINTED, np.uint32), np.zeros(len(keep), bool), None
+        """Labels of ``cloud.points[keep]`` with the camera's number above them, UNPAINTED where no
+        camera sees; None without a picture.
+        """
+        out = np.full(len(keep), UNPAINTED, np.uint32)
+        inside = np.zeros(len(keep), bool)
+        viewpoint = None
         for topic, camera in self._cameras.items():
             self._forget(camera, cloud.header.stamp_ns)
             found = self._picture(topic, camera, cloud)
@@ -70,11 +87,20 @@ class Pictures:
             picture, camera_T_base, projector = found
             viewpoint = viewpoint or Viewpoint(cloud.origin, self._axis(cloud))
             if camera.newest is None or camera.newest[0] != picture.header.stamp_ns:
-                camera.newest = picture.header.stamp_ns, without_borders(self._label_of(picture), self._erode)
+                camera.newest = (
+                    picture.header.stamp_ns,
+                    without_borders(self._label_of(picture), self._erode),
+                )
                 camera.pictures += 1
             open_ = np.flatnonzero(out == UNPAINTED)
-            got, got_inside = paint(cloud.points, keep[open_], viewpoint, camera.newest[1], camera_T_base, projector)
-            out[open_] = np.where(got == UNPAINTED, np.uint32(UNPAINTED), got | np.uint32(camera.number << CAMERA_SHIFT))
+            got, got_inside = paint(
+                cloud.points, keep[open_], viewpoint, camera.newest[1], camera_T_base, projector
+            )
+            out[open_] = np.where(
+                got == UNPAINTED,
+                np.uint32(UNPAINTED),
+                got | np.uint32(camera.number << CAMERA_SHIFT),
+            )
             inside[open_] |= got_inside
             camera.points += int((got != UNPAINTED).sum())
         if viewpoint is None:
@@ -85,12 +111,23 @@ class Pictures:
         return out
 
     def to_json(self) -> dict[str, object]:
-        """Points of keyframes with a picture, of which in a picture, of which painted; and by camera."""
-        cameras = {topic: {"pictures": c.pictures, "points": c.points} for topic, c in self._cameras.items()}
-        return {"points": {"seen": self.seen, "in_a_picture": self.inside, "painted": self.painted}, "cameras": cameras}
+        """Points of keyframes with a picture, of which in a picture, of which painted; and by
+        camera.
+        """
+        cameras = {
+            topic: {"pictures": c.pictures, "points": c.points}
+            for topic, c in self._cameras.items()
+        }
+        return {
+            "points": {"seen": self.seen, "in_a_picture": self.inside, "painted": self.painted},
+            "cameras": cameras,
+        }
 
     def _forget(self, camera: _Camera, stamp_ns: int) -> None:
-        while len(camera.waiting) > 1 and camera.waiting[1].header.stamp_ns < stamp_ns - 4 * POSED_TOLERANCE_NS:
+        while (
+            len(camera.waiting) > 1
+            and camera.waiting[1].header.stamp_ns < stamp_ns - 4 * POSED_TOLERANCE_NS
+        ):
             self._bytes -= camera.waiting.popleft().image.nbytes
 
     def _axis(self, cloud: PosedCloud) -> F64:
@@ -98,17 +135,28 @@ class Pictures:
         base_T_sensor = self._session.base_T(cloud.header.frame_id, cloud.header.stamp_ns)
         if base_T_sensor is None:
             return np.array([0.0, 0.0, 1.0])
-        return base_T_sensor[:3, 2] if cloud.header.topic in self._session.roles.lidar else -base_T_sensor[:3, 1]
+        return (
+            base_T_sensor[:3, 2]
+            if cloud.header.topic in self._session.roles.lidar
+            else -base_T_sensor[:3, 1]
+        )
 
-    def _picture(self, topic: str, camera: _Camera, cloud: PosedCloud) -> tuple[ImageFrame, F64, Projector] | None:
-        """The picture nearest in time to a cloud, ``camera_T_base`` (4, 4) from the cloud's base frame, and the projector."""
-        stamp_ns, posed = cloud.header.stamp_ns, cloud.session_T_base is not None
+    def _picture(
+        self, topic: str, camera: _Camera, cloud: PosedCloud
+    ) -> tuple[ImageFrame, F64, Projector] | None:
+        """The picture nearest in time to a cloud, ``camera_T_base`` (4, 4) from the cloud's base
+        frame, and the projector.
+        """
+        stamp_ns = cloud.header.stamp_ns
+        posed = cloud.session_T_base is not None
         tolerance = POSED_TOLERANCE_NS if posed else UNPOSED_TOLERANCE_NS
         near = [p for p in camera.waiting if abs(p.header.stamp_ns - stamp_ns) <= tolerance]
         calibration = self._session.cameras.get(topic)
         if calibration is None:
             if near:
-                self.notes.setdefault(f"{topic} has no CameraInfo: its pictures give no labels; name one with --topic camera_info=TOPIC.")
+                self.notes.setdefault(
+                    f"{topic} has no CameraInfo: its pictures give no labels; name one with --topic camera_info=TOPIC."
+                )
             return None
         for picture in sorted(near, key=lambda p: abs(p.header.stamp_ns - stamp_ns)):
             moved = np.eye(4)
@@ -126,10 +174,14 @@ class Pictures:
                 )
                 return None
             projector = self._projector(topic, camera, calibration, picture.image.shape)
-            return None if projector is None else (picture, inverse(base_T_camera) @ moved, projector)
+            return (
+                None if projector is None else (picture, inverse(base_T_camera) @ moved, projector)
+            )
         return None
 
-    def _projector(self, topic: str, camera: _Camera, calibration: Camera, shape: tuple[int, ...]) -> Projector | None:
+    def _projector(
+        self, topic: str, camera: _Camera, calibration: Camera, shape: tuple[int, ...]
+    ) -> Projector | None:
         known = camera.known
         if known is not None and known[0] is calibration and known[1] == shape:
             return known[2]

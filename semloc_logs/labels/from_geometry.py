@@ -1,8 +1,9 @@
-"""Classes from geometry alone: ground, wall-like, vegetation-like, pole-like, by local shape and height above the ground.
+"""Classes from geometry alone: ground, wall-like, vegetation-like, pole-like, by local shape and
+height above the ground.
 
-What stands on the ground is cut into voxels of the map's size; the surroundings of each voxel decide (:func:`_class_of`), and then the
-majority of its neighbours. Vehicles and whatever else is neither stay unlabelled. All lengths are at street scale (0.30 m voxels) and
-follow ``scale``.
+What stands on the ground is cut into voxels of the map's size; the surroundings of each voxel
+decide (:func:`_class_of`), and then the majority of its neighbours. Vehicles and whatever else is
+neither stay unlabelled. All lengths are at street scale (0.30 m voxels) and follow ``scale``.
 """
 
 from __future__ import annotations
@@ -20,18 +21,27 @@ U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
 
 VOXEL = 0.30  # (m)
-ON_GROUND, LEAST_ON_GROUND = 0.10, 0.04  # points lower than this are ground; a small scale does not make sensors better (m)
-TALL, LOW = 1.8, 2.3  # what reaches higher is no car; objects that may be vehicles are cut off here (m)
+# points lower than this are ground; a small scale does not make sensors better (m)
+ON_GROUND, LEAST_ON_GROUND = 0.10, 0.04
+# what reaches higher is no car; objects that may be vehicles are cut off here (m)
+TALL, LOW = 1.8, 2.3
 
 
-def classify(points: NDArray[np.floating], origin: NDArray[np.floating], scale: float = 1.0, ground: GroundSurface | None = None) -> U8:
-    """Class (n,) of level ``points`` (n, 3), z up, of a sensor at ``origin`` (3,); 255 where the shape says nothing.
+def classify(
+    points: NDArray[np.floating],
+    origin: NDArray[np.floating],
+    scale: float = 1.0,
+    ground: GroundSurface | None = None,
+) -> U8:
+    """Class (n,) of level ``points`` (n, 3), z up, of a sensor at ``origin`` (3,); 255 where the
+    shape says nothing.
 
-    ``scale`` is the voxel size over 0.30 m: a room is a street in miniature. ``ground`` saves finding the ground again. Points beyond
-    120 m of the sensor (at street scale) stay unlabelled.
+    ``scale`` is the voxel size over 0.30 m: a room is a street in miniature. ``ground`` saves
+    finding the ground again. Points beyond 120 m of the sensor (at street scale) stay unlabelled.
     """
     label = np.full(len(points), UNLABELLED, np.uint8)
-    p, o = np.asarray(points, np.float64), np.asarray(origin, np.float64)
+    p = np.asarray(points, np.float64)
+    o = np.asarray(origin, np.float64)
     near = np.flatnonzero((np.abs(p - o) <= REACH * scale).all(1))
     if not len(near):
         return label
@@ -58,9 +68,12 @@ def _standing_classes(points: F64, height: F64, scale: float) -> U8:
 def _class_of(voxels: Voxels, s: VoxelShapes, height: F64, scale: float) -> U8:
     """Class (m,) of ``voxels`` at ``height`` (m,), each by its own surroundings."""
     h = height / scale
-    top, extent = h + s.up / scale, (s.up + s.down) / scale + VOXEL
+    top = h + s.up / scale
+    extent = (s.up + s.down) / scale + VOXEL
     tall = top > TALL
-    length, width, highest = (a / scale for a in objects(voxels, (top < LOW) & (h < LOW), height, VOXEL * scale))
+    length, width, highest = (
+        a / scale for a in objects(voxels, (top < LOW) & (h < LOW), height, VOXEL * scale)
+    )
     vehicle = (width > 0.9) & (width < 4.0) & (length < 6.5) & (highest > 0.9)
     wall = ((s.wide_disorder < 0.06) | (s.wide_tilt < 0.12)) & (s.wide_disorder < 0.12)
     out = np.full(len(h), UNLABELLED, np.uint8)
@@ -68,7 +81,8 @@ def _class_of(voxels: Voxels, s: VoxelShapes, height: F64, scale: float) -> U8:
     out[tall & wall] = BUILDING
     out[~tall & ~vehicle & (s.tilt < 0.05) & (s.disorder < 0.02)] = BUILDING  # low walls and fences
     out[~tall & ~vehicle & (s.wide_disorder > 0.06)] = VEGETATION
-    out[~tall & (s.wide_tilt > 0.6) & (h < 0.45) & (s.rough > 0.025 * scale)] = VEGETATION  # high grass, beds
+    # high grass, beds
+    out[~tall & (s.wide_tilt > 0.6) & (h < 0.45) & (s.rough > 0.025 * scale)] = VEGETATION
     out[(s.tilt > 0.8) & (s.disorder < 0.05) & (h > 2)] = BUILDING  # roofs and ceilings
     thin = (s.thick < 0.12 * scale) & (s.long > 0.25 * scale) & (extent > 1.0)
     out[thin & (s.crown < 4) & (s.beside < 8) & (top > 1.3)] = POLE
@@ -77,7 +91,9 @@ def _class_of(voxels: Voxels, s: VoxelShapes, height: F64, scale: float) -> U8:
 
 @njit(cache=True, nogil=True)
 def _majority(ijk: I64, label: U8, start: I64, nx: int, ny: int) -> U8:
-    """The class (m,) that most of a voxel and its 26 neighbours have; its own counts twice and wins a tie."""
+    """The class (m,) that most of a voxel and its 26 neighbours have; its own counts twice and wins
+    a tie.
+    """
     out = label.copy()
     votes = np.zeros(256, np.int64)
     for k in range(len(ijk)):

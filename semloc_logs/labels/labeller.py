@@ -1,4 +1,6 @@
-"""The classes of one session, from whatever source: what the log's points or pictures say, the user's model, or geometry."""
+"""The classes of one session, from whatever source: what the log's points or pictures say, the
+user's model, or geometry.
+"""
 
 from __future__ import annotations
 
@@ -67,8 +69,9 @@ class _Topic:
 
 
 class Labeller:
-    """Gives the points of every keyframe their classes. During the pass over the log :meth:`take` each keyframe, with
-    :attr:`on_image` and :attr:`images` for the session's pass; :meth:`conclude` after it; then ask for :meth:`labels`.
+    """Gives the points of every keyframe their classes. During the pass over the log :meth:`take`
+    each keyframe, with :attr:`on_image` and :attr:`images` for the session's pass; :meth:`conclude`
+    after it; then ask for :meth:`labels`.
 
     LogError and SettingsError when the source that the settings demand cannot be had.
     """
@@ -77,7 +80,8 @@ class Labeller:
         self.source = settings.source
         self._settings, self._session = settings, session
         self._topics: dict[str, _Topic] = {}
-        self._keyframes: list[tuple[str, str]] = []  # topic and form of the labels: ids, colours, painted or ""
+        # topic and form of the labels: ids, colours, painted or ""
+        self._keyframes: list[tuple[str, str]] = []
         self._model: Segmenter | None = None
         self._pictures: Pictures | None = None
         if settings.space is not None:
@@ -115,20 +119,32 @@ class Labeller:
             if t.space is None or self.source != "log":
                 continue
             if t.said_by == "guess":
-                said.append(f"The labels of {topic} are taken as {t.space.name} by their looks; --set labels.space=NAME says otherwise.")
+                said.append(
+                    f"The labels of {topic} are taken as {t.space.name} by their looks; --set labels.space=NAME says otherwise."
+                )
             if t.space.unknown and t.said_by == "log":
-                said.append(f"Classes of {topic} that mean nothing here are unlabelled: {_some(t.space.unknown)}.")
+                said.append(
+                    f"Classes of {topic} that mean nothing here are unlabelled: {_some(t.space.unknown)}."
+                )
             if t.strange:
-                names = [f"({c >> 16}, {c >> 8 & 255}, {c & 255})" for c in sorted(t.strange, key=lambda c: (-t.strange[c], c))]
+                names = [
+                    f"({c >> 16}, {c >> 8 & 255}, {c & 255})"
+                    for c in sorted(t.strange, key=lambda c: (-t.strange[c], c))
+                ]
                 total = sum(t.strange.values())
-                said.append(f"{total} points have colours of {topic} that {t.space.name} does not have and are unlabelled: {_some(names)}.")
+                said.append(
+                    f"{total} points have colours of {topic} that {t.space.name} does not have and are unlabelled: {_some(names)}."
+                )
         return said
 
     def take(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> U32 | None:
-        """Labels of ``cloud.points[keep]`` as recorded or painted, to be kept for :meth:`labels`; of every keyframe in turn."""
+        """Labels of ``cloud.points[keep]`` as recorded or painted, to be kept for :meth:`labels`;
+        of every keyframe in turn.
+        """
         ids, topic, form = None, "", ""
         if cloud.label is not None and self.source in ("auto", "log"):
-            ids, form = cloud.label[keep], cloud.extra.get("label_form", "ids")
+            ids = cloud.label[keep]
+            form = cloud.extra.get("label_form", "ids")
             topic = cloud.extra.get("label_topic", cloud.header.topic)
             self._topics.setdefault(topic, _Topic()).see(ids, form == "colours")
         elif self._pictures is not None:
@@ -137,7 +153,9 @@ class Labeller:
             if ids is not None and self.source != "onnx":
                 for number, name in enumerate(self.images):
                     own = ids[_of_camera(ids, number)] & np.uint32(_LOW)
-                    self._topics.setdefault(name, _Topic()).see(own, self._topics.setdefault(name, _Topic()).is_coloured)
+                    self._topics.setdefault(name, _Topic()).see(
+                        own, self._topics.setdefault(name, _Topic()).is_coloured
+                    )
         self._keyframes.append((topic, form))
         return ids
 
@@ -153,7 +171,9 @@ class Labeller:
             return
         if self.source not in ("auto", "log"):
             return
-        has_labels = any(form for _, form in self._keyframes) and any(not t.is_empty() for t in self._topics.values())
+        has_labels = any(form for _, form in self._keyframes) and any(
+            not t.is_empty() for t in self._topics.values()
+        )
         if not has_labels and self.source == "log":
             raise LogError(
                 f"{self._session.name} has no labels (a 'label' field of the points or a label image): use --set labels.source=geometry."
@@ -171,9 +191,11 @@ class Labeller:
         scale: float,
         ground: GroundSurface | None = None,
     ) -> U8:
-        """Classes (n,) of the level ``points`` (n, 3) of a keyframe seen from ``origin`` (3,), from what :meth:`take` gave.
+        """Classes (n,) of the level ``points`` (n, 3) of a keyframe seen from ``origin`` (3,), from
+        what :meth:`take` gave.
 
-        ``scale`` is the voxel size over 0.30 m; ``ground`` saves finding the ground below the points again.
+        ``scale`` is the voxel size over 0.30 m; ``ground`` saves finding the ground below the
+        points again.
         """
         if self.source == "geometry":
             return classify(points, origin, scale, ground)
@@ -191,7 +213,8 @@ class Labeller:
                 else self._train_ids(name, ids[own] & np.uint32(_LOW))
             )
         out[out == SKY] = UNLABELLED  # what gave a return is no sky
-        # a car's class on what is seen through its windows; a road has no windows, and is always behind a nearer piece of itself
+        # a car's class on what is seen through its windows; a road has no windows, and is always
+        # behind a nearer piece of itself
         out[(ids & DOUBTFUL > 0) & np.isin(out, THINGS)] = UNLABELLED
         if self._settings.unseen == "geometry":
             unseen = ids == UNPAINTED
@@ -199,7 +222,9 @@ class Labeller:
         return out
 
     def to_json(self) -> dict[str, Any]:
-        """What the labels are from, for session.json: the source, the label space of each topic and who said so, what was painted."""
+        """What the labels are from, for session.json: the source, the label space of each topic and
+        who said so, what was painted.
+        """
         spaces = {
             name: {"space": t.space.name, "said_by": t.said_by, "colours": t.is_coloured}
             for name, t in sorted(self._topics.items())
@@ -253,4 +278,6 @@ def _of_camera(ids: U32, number: int) -> NDArray[np.bool_]:
 
 def _some(names: Any, most: int = 8) -> str:
     listed = [str(n)[:40] for n in names]
-    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
+    return ", ".join(listed[:most]) + (
+        f" and {len(listed) - most} more" if len(listed) > most else ""
+    )

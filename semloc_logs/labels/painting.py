@@ -1,12 +1,16 @@
-"""Label images -> labels of points that another sensor measured from elsewhere, where the camera can see them.
+"""Label images -> labels of points that another sensor measured from elsewhere, where the camera
+can see them.
 
-A LIDAR beside a camera looks past the edges of near things at what is hidden from the camera, and its points are sparse: through the
-gaps between the points of a near thing, a plain depth test lets the hidden points take the near thing's class. So the surfaces that the
-LIDAR saw are drawn into a depth image without gaps: in columns of equal azimuth, as seen from the LIDAR, each point is joined with the
-next one above it that continues the same surface, and this strip is as wide as a column. A point is hidden where a strip is much nearer.
+A LIDAR beside a camera looks past the edges of near things at what is hidden from the camera, and
+its points are sparse: through the gaps between the points of a near thing, a plain depth test lets
+the hidden points take the near thing's class. So the surfaces that the LIDAR saw are drawn into a
+depth image without gaps: in columns of equal azimuth, as seen from the LIDAR, each point is joined
+with the next one above it that continues the same surface, and this strip is as wide as a column. A
+point is hidden where a strip is much nearer.
 
-A LIDAR also looks through the windows of cars, and gets nothing back from black paint: there is no surface where the picture has one. A
-point that lies behind a near surface of the very label that it would get, and beside it by less than a thing's size, is marked DOUBTFUL.
+A LIDAR also looks through the windows of cars, and gets nothing back from black paint: there is no
+surface where the picture has one. A point that lies behind a near surface of the very label that it
+would get, and beside it by less than a thing's size, is marked DOUBTFUL.
 """
 
 from __future__ import annotations
@@ -33,7 +37,8 @@ _NEARER = 0.25  # what hides a point is nearer by so much (m),
 _NEARER_SHARE = 0.04  # and by this share of the distance
 DOUBTFUL = 1 << 31  # set in a label that may be that of something nearer
 _THING = 0.8  # m, half the size of what has windows
-_REACH = (np.radians(6.0), np.radians(3.0), np.radians(1.5))  # around a point, for near surfaces of which _THING is as large as that
+# around a point, for near surfaces of which _THING is as large as that
+_REACH = (np.radians(6.0), np.radians(3.0), np.radians(1.5))
 _BEHIND = 3.0  # m, so that the side of a truck is not behind its own rear
 _MOST_LABELS = 40  # of a picture that are looked at: more are noise
 
@@ -42,27 +47,41 @@ U32 = NDArray[np.uint32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Viewpoint:
-    """Where points were measured from: ``origin`` (3,) of the sensor in their frame, and ``axis`` (3,), a unit vector, about which
-    its azimuth is counted."""
+    """Where points were measured from: ``origin`` (3,) of the sensor in their frame, and ``axis``
+    (3,), a unit vector, about which its azimuth is counted.
+    """
 
     origin: NDArray[np.floating]
     axis: NDArray[np.floating]
 
     def columns(self, points: F32) -> tuple[NDArray[np.int32], F32, F32]:
-        """Column of equal azimuth, elevation (rad) and distance (m) of ``points`` (n, 3), each (n,)."""
+        """Column of equal azimuth, elevation (rad) and distance (m) of ``points`` (n, 3), each
+        (n,).
+        """
         rays = points - np.asarray(self.origin, np.float32)
         side = np.cross(self.axis, (1.0, 0.0, 0.0) if abs(self.axis[0]) < 0.9 else (0.0, 1.0, 0.0))
         side /= np.linalg.norm(side)
-        x, y, z = np.einsum("ij,nj->in", np.stack([side, np.cross(self.axis, side), self.axis]).astype(np.float32), rays)
+        x, y, z = np.einsum(
+            "ij,nj->in",
+            np.stack([side, np.cross(self.axis, side), self.axis]).astype(np.float32),
+            rays,
+        )
         flat = np.hypot(x, y)
-        return np.floor(np.arctan2(y, x) / COLUMN).astype(np.int32), np.arctan2(z, flat), np.hypot(flat, z)
+        return (
+            np.floor(np.arctan2(y, x) / COLUMN).astype(np.int32),
+            np.arctan2(z, flat),
+            np.hypot(flat, z),
+        )
 
 
-def nearest_depth(points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, projector: Projector) -> tuple[F32, float]:
-    """Depth (m along the optical axis) of the nearest surface in each cell of the picture, infinite where there is none, and the edge
-    of a cell in pixels.
+def nearest_depth(
+    points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, projector: Projector
+) -> tuple[F32, float]:
+    """Depth (m along the optical axis) of the nearest surface in each cell of the picture, infinite
+    where there is none, and the edge of a cell in pixels.
 
-    ``camera`` and ``pixels`` are where all the ``points`` (n, 3) of a cloud lie in the camera's frame and in its picture.
+    ``camera`` and ``pixels`` are where all the ``points`` (n, 3) of a cloud lie in the camera's
+    frame and in its picture.
     """
     cell = max(1.0, float(round(projector.focal * _CELL)))
     shape = int(np.ceil(projector.height / cell)), int(np.ceil(projector.width / cell))
@@ -70,7 +89,10 @@ def nearest_depth(points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, p
     near = np.flatnonzero(np.isfinite(pixels[:, 0]))
     column, elevation, distance = viewpoint.columns(points[near])
     order = np.lexsort((elevation, column))
-    near, column, elevation, distance = near[order], column[order], elevation[order], distance[order]
+    near = near[order]
+    column = column[order]
+    elevation = elevation[order]
+    distance = distance[order]
     z = camera[near, 2].astype(float)
     # off the axis a picture is stretched by the square of the ray's length over its depth
     stretch = np.linalg.norm(camera[near], axis=1) / z
@@ -104,9 +126,17 @@ def _draw(
 
 
 @njit(cache=True, nogil=True)
-def _continues(distance: NDArray[np.floating], column: NDArray[np.integer], elevation: NDArray[np.floating], i: int, step: int) -> int:
-    """The next point of another ring, upwards or downwards, that is on the same surface as point ``i``; _ENDS where the next ring sees
-    something much farther or nothing, and _STEPS where it sees something else."""
+def _continues(
+    distance: NDArray[np.floating],
+    column: NDArray[np.integer],
+    elevation: NDArray[np.floating],
+    i: int,
+    step: int,
+) -> int:
+    """The next point of another ring, upwards or downwards, that is on the same surface as point
+    ``i``; _ENDS where the next ring sees something much farther or nothing, and _STEPS where it
+    sees something else.
+    """
     ends = _ENDS
     for k in range(1, _LOOK_AHEAD + 1):
         j = i + step * k
@@ -126,11 +156,21 @@ def _continues(distance: NDArray[np.floating], column: NDArray[np.integer], elev
 
 
 @njit(cache=True, nogil=True)
-def _strip(depth: NDArray[np.floating], a: F64, b: F64, z_a: float, z_b: float, half_a: float, half_b: float) -> None:
-    """Joins two points: in each row of cells the farthest depth that the line has there, which is linear in 1 / z; in each column where
-    the line lies rather than stands."""
+def _strip(
+    depth: NDArray[np.floating],
+    a: F64,
+    b: F64,
+    z_a: float,
+    z_b: float,
+    half_a: float,
+    half_b: float,
+) -> None:
+    """Joins two points: in each row of cells the farthest depth that the line has there, which is
+    linear in 1 / z; in each column where the line lies rather than stands.
+    """
     main = 1 if abs(b[1] - a[1]) >= abs(b[0] - a[0]) else 0
-    first, last = int(np.floor(min(a[main], b[main]))), int(np.floor(max(a[main], b[main])))
+    first = int(np.floor(min(a[main], b[main])))
+    last = int(np.floor(max(a[main], b[main])))
     if last == first:
         return
     for line in range(max(first, 0), min(last, depth.shape[1 - main] - 1) + 1):
@@ -144,11 +184,14 @@ def _strip(depth: NDArray[np.floating], a: F64, b: F64, z_a: float, z_b: float, 
 
 
 @njit(cache=True, nogil=True)
-def _line(depth: NDArray[np.floating], main: int, line: int, centre: float, half: float, z: float) -> None:
+def _line(
+    depth: NDArray[np.floating], main: int, line: int, centre: float, half: float, z: float
+) -> None:
     """Cells of one row (``main`` 1) or column (0) around ``centre`` are no farther than ``z``."""
     if line < 0 or line >= depth.shape[1 - main]:
         return
-    first, last = int(np.floor(centre - half)), int(np.floor(centre + half))
+    first = int(np.floor(centre - half))
+    last = int(np.floor(centre + half))
     for across in range(max(first, 0), min(last, depth.shape[main] - 1) + 1):
         row, column = (line, across) if main == 1 else (across, line)
         if z < depth[row, column]:
@@ -156,19 +199,27 @@ def _line(depth: NDArray[np.floating], main: int, line: int, centre: float, half
 
 
 def paint(
-    points: F32, wanted: NDArray[np.integer], viewpoint: Viewpoint, labels: U32, camera_T_base: F64, projector: Projector
+    points: F32,
+    wanted: NDArray[np.integer],
+    viewpoint: Viewpoint,
+    labels: U32,
+    camera_T_base: F64,
+    projector: Projector,
 ) -> tuple[U32, NDArray[np.bool_]]:
-    """Labels (m,) of ``points[wanted]`` in the base frame from the picture ``labels`` (h, w), and which points are in the picture at all.
+    """Labels (m,) of ``points[wanted]`` in the base frame from the picture ``labels`` (h, w), and
+    which points are in the picture at all.
 
-    ``points`` (n, 3) are all that the sensor at ``viewpoint`` measured: they hide each other. UNPAINTED where the picture does not show
-    the point: outside of it, or hidden. DOUBTFUL is added to labels that may be those of something nearer.
+    ``points`` (n, 3) are all that the sensor at ``viewpoint`` measured: they hide each other.
+    UNPAINTED where the picture does not show the point: outside of it, or hidden. DOUBTFUL is added
+    to labels that may be those of something nearer.
     """
     out = np.full(len(wanted), UNPAINTED, np.uint32)
     camera = in_base(camera_T_base, points)
     pixels, front = projector.pixels(camera)
     pixels[~(front & projector.near(pixels, 0.1))] = np.nan
     depth, cell = nearest_depth(points, camera, pixels, viewpoint, projector)
-    camera, pixels = camera[wanted], pixels[wanted]
+    camera = camera[wanted]
+    pixels = pixels[wanted]
     inside = projector.inside(pixels)
     column, row = np.floor((pixels[inside] + 0.5) / cell).astype(int).T
     z = camera[inside, 2]
@@ -178,27 +229,47 @@ def paint(
     out[at] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
     known = at[out[at] != UNPAINTED]
     column, row = np.floor((pixels[known] + 0.5) / cell).astype(int).T
-    doubtful = _behind_its_own(depth, cell, labels, out[known], row, column, camera[known, 2], projector.focal)
+    doubtful = _behind_its_own(
+        depth, cell, labels, out[known], row, column, camera[known, 2], projector.focal
+    )
     out[known[doubtful]] |= np.uint32(DOUBTFUL)
     return out, inside
 
 
 def _behind_its_own(
-    depth: F32, cell: float, labels: U32, own: U32, row: NDArray[np.intp], column: NDArray[np.intp], z: F32, focal: float
+    depth: F32,
+    cell: float,
+    labels: U32,
+    own: U32,
+    row: NDArray[np.intp],
+    column: NDArray[np.intp],
+    z: F32,
+    focal: float,
 ) -> NDArray[np.bool_]:
-    """Which points (n,) with the labels ``own`` at cells (``row``, ``column``) have a much nearer surface of the same label beside them."""
+    """Which points (n,) with the labels ``own`` at cells (``row``, ``column``) have a much nearer
+    surface of the same label beside them.
+    """
     out = np.zeros(len(own), bool)
     half = int(cell) // 2
     coarse = labels[half :: int(cell), half :: int(cell)]
-    coarse = np.pad(coarse, [(0, max(0, n - m)) for n, m in zip(depth.shape, coarse.shape, strict=True)], "edge")
+    coarse = np.pad(
+        coarse, [(0, max(0, n - m)) for n, m in zip(depth.shape, coarse.shape, strict=True)], "edge"
+    )
     values, counts = np.unique(own, return_counts=True)
     for label in values[np.argsort(-counts, kind="stable")][:_MOST_LABELS]:
         mine = np.flatnonzero(own == label)
-        surface = np.where(coarse[: depth.shape[0], : depth.shape[1]] == label, depth, np.float32(np.inf))
+        surface = np.where(
+            coarse[: depth.shape[0], : depth.shape[1]] == label, depth, np.float32(np.inf)
+        )
         for reach in _REACH:
             near = np.where(surface < _THING / np.tan(reach), surface, np.float32(1e9))
             size = 2 * int(focal * reach / cell) + 1
-            around = cv2.erode(near, np.ones((size, size), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=1e9)
+            around = cv2.erode(
+                near,
+                np.ones((size, size), np.uint8),
+                borderType=cv2.BORDER_CONSTANT,
+                borderValue=1e9,
+            )
             out[mine] |= np.asarray(around)[row[mine], column[mine]] * 1.1 + _BEHIND < z[mine]
     return out
 
@@ -215,5 +286,7 @@ def without_borders(labels: U32, width: int) -> U32:
         a |= changed.astype(np.uint8)
         b |= changed.astype(np.uint8)
     if width > 1:
-        border = np.asarray(cv2.dilate(border, np.ones((2 * width - 1, 2 * width - 1), np.uint8)), np.uint8)
+        border = np.asarray(
+            cv2.dilate(border, np.ones((2 * width - 1, 2 * width - 1), np.uint8)), np.uint8
+        )
     return np.where(border > 0, np.uint32(UNPAINTED), labels)

@@ -11,21 +11,29 @@ from semloc_logs.frames import F64, Camera
 
 _NEAREST = 0.1  # m along the optical axis: nearer points are not projected
 _STEEPEST = np.radians(85)
-_MARGIN = 1.25  # points so much further from the middle than the picture's corner still are projected
+# points so much further from the middle than the picture's corner still are projected
+_MARGIN = 1.25
 
 
 class Projector:
-    """Projects points of a camera's optical frame (x right, y down, z forward) into its pictures of ``height`` x ``width`` pixels.
+    """Projects points of a camera's optical frame (x right, y down, z forward) into its pictures of
+    ``height`` x ``width`` pixels.
 
-    ``rectified``: the picture is undistorted, so R and P hold, not K and D. A picture that was scaled as a whole is allowed for.
-    LogError when the calibration cannot be used.
+    ``rectified``: the picture is undistorted, so R and P hold, not K and D. A picture that was
+    scaled as a whole is allowed for. LogError when the calibration cannot be used.
     """
 
     def __init__(self, camera: Camera, height: int, width: int, *, rectified: bool = False) -> None:
         where = f"CameraInfo {camera.header.topic}"
-        matrix, self._distortion, self._rotation = camera.K.copy(), np.atleast_1d(np.asarray(camera.D, float)), np.eye(3)
+        matrix, self._distortion, self._rotation = (
+            camera.K.copy(),
+            np.atleast_1d(np.asarray(camera.D, float)),
+            np.eye(3),
+        )
         if (rectified and camera.P[0, 0] > 0) or matrix[0, 0] <= 0:
-            matrix, self._distortion, self._rotation = camera.P[:, :3].copy(), np.zeros(0), camera.R
+            matrix = camera.P[:, :3].copy()
+            self._distortion = np.zeros(0)
+            self._rotation = camera.R
         scale = np.array([width / (camera.width or width), height / (camera.height or height)])
         if abs(scale[0] / scale[1] - 1) > 0.02:
             raise LogError(
@@ -36,28 +44,47 @@ class Projector:
         matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
         matrix[:2, :2] *= scale[:, None]
         if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-            raise LogError(f"{where} has no focal length: the camera is not calibrated; name another with --topic camera_info=TOPIC.")
-        self.height, self.width, self.focal, self._matrix = height, width, float(matrix[0, 0]), matrix
-        name, count = camera.model.lower(), len(self._distortion)
+            raise LogError(
+                f"{where} has no focal length: the camera is not calibrated; name another with --topic camera_info=TOPIC."
+            )
+        self.height, self.width, self.focal, self._matrix = (
+            height,
+            width,
+            float(matrix[0, 0]),
+            matrix,
+        )
+        name = camera.model.lower()
+        count = len(self._distortion)
         self._fisheye = name in ("equidistant", "kannala_brandt", "fisheye") and count == 4
-        is_polynomial = name in ("plumb_bob", "rational_polynomial", "thin_prism", "") and count in (4, 5, 8, 12, 14)
+        is_polynomial = name in (
+            "plumb_bob",
+            "rational_polynomial",
+            "thin_prism",
+            "",
+        ) and count in (4, 5, 8, 12, 14)
         if np.any(self._distortion) and not (self._fisheye or is_polynomial):
             raise LogError(
                 f"{where} has the distortion model '{camera.model[:40]}' with {count} coefficients, which is not supported: "
                 f"record rectified pictures, or name another calibration with --topic camera_info=TOPIC."
             )
-        corners = np.array([[u, v] for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)]) - matrix[:2, 2]
+        corners = (
+            np.array([[u, v] for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
+            - matrix[:2, 2]
+        )
         corner = float(np.hypot(corners[:, 0] / matrix[0, 0], corners[:, 1] / matrix[1, 1]).max())
         self._widest = _widest(self._distortion, self._fisheye, _MARGIN * corner)
 
     def pixels(self, points: NDArray[np.floating]) -> tuple[F64, NDArray[np.bool_]]:
-        """Pixel coordinates (n, 2) of ``points`` (n, 3) and which of them are in front of the camera and near its field of view.
+        """Pixel coordinates (n, 2) of ``points`` (n, 3) and which of them are in front of the
+        camera and near its field of view.
 
         The others have no pixel coordinates (NaN).
         """
         p = points if np.array_equal(self._rotation, np.eye(3)) else points @ self._rotation.T
-        out, front = np.full((len(p), 2), np.nan), p[:, 2] > _NEAREST
-        # a distortion polynomial turns back far outside of the picture and would fold the surroundings into it
+        out = np.full((len(p), 2), np.nan)
+        front = p[:, 2] > _NEAREST
+        # a distortion polynomial turns back far outside of the picture and would fold the
+        # surroundings into it
         steepest = np.tan(self._widest)
         front &= np.square(p[:, 0]) + np.square(p[:, 1]) <= np.square(p[:, 2] * steepest)
         at = np.flatnonzero(front)
@@ -71,7 +98,9 @@ class Projector:
             out[at, 1] = m[1, 1] * rays[:, 1] + m[1, 2]
         else:
             project = cv2.fisheye.projectPoints if self._fisheye else cv2.projectPoints
-            found = project(rays[:, None], np.zeros((1, 3)), np.zeros((1, 3)), self._matrix, self._distortion)[0]
+            found = project(
+                rays[:, None], np.zeros((1, 3)), np.zeros((1, 3)), self._matrix, self._distortion
+            )[0]
             out[at] = np.asarray(found, float).reshape(-1, 2)
         return out, front
 
@@ -81,12 +110,22 @@ class Projector:
 
     def near(self, pixels: F64, margin: float) -> NDArray[np.bool_]:
         """Which of ``pixels`` (n, 2) lie in the picture or beside it within this share of its size."""
-        u, v, x, y = pixels[:, 0], pixels[:, 1], margin * self.width, margin * self.height
-        return np.asarray((u >= -0.5 - x) & (u < self.width - 0.5 + x) & (v >= -0.5 - y) & (v < self.height - 0.5 + y))
+        u = pixels[:, 0]
+        v = pixels[:, 1]
+        x = margin * self.width
+        y = margin * self.height
+        return np.asarray(
+            (u >= -0.5 - x)
+            & (u < self.width - 0.5 + x)
+            & (v >= -0.5 - y)
+            & (v < self.height - 0.5 + y)
+        )
 
 
 def _widest(distortion: F64, fisheye: bool, corner: float) -> float:
-    """Angle from the optical axis (rad) up to which the distorted radius grows, and does not exceed ``corner`` (at focal length 1)."""
+    """Angle from the optical axis (rad) up to which the distorted radius grows, and does not exceed
+    ``corner`` (at focal length 1).
+    """
     angle = np.linspace(0, _STEEPEST, 2000)
     k = np.zeros(14)
     k[: len(distortion)] = distortion
@@ -95,6 +134,10 @@ def _widest(distortion: F64, fisheye: bool, corner: float) -> float:
     else:
         r2 = np.tan(angle) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
-            radius = np.sqrt(r2) * (1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3) / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
+            radius = (
+                np.sqrt(r2)
+                * (1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3)
+                / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
+            )
     beyond = np.flatnonzero(~(np.diff(radius) > 0) | (radius[:-1] > corner))
     return float(angle[beyond[0]] if len(beyond) else _STEEPEST)

@@ -1,6 +1,7 @@
 """The user's ONNX model: camera picture -> Cityscapes train ids of its pixels.
 
-It runs in onnxruntime (the extra ``onnx``) or, where that is not installed, in OpenCV, in as many threads as ``labels.threads`` says.
+It runs in onnxruntime (the extra ``onnx``) or, where that is not installed, in OpenCV, in as many
+threads as ``labels.threads`` says.
 """
 
 from __future__ import annotations
@@ -23,13 +24,17 @@ Net = Callable[[NDArray[Any]], NDArray[Any]]  # a batch of one picture -> the ou
 
 
 def fingerprint(settings: Labels) -> str:
-    """Hashes of the files that ``settings`` name: model, spec, label spaces; "" without any. SettingsError if one is missing."""
+    """Hashes of the files that ``settings`` name: model, spec, label spaces; "" without any.
+    SettingsError if one is missing.
+    """
     paths = []
     if settings.source == "onnx":
         model, spec = _named(settings)
         paths = [model, spec]
         named = read_spec(spec).space or ""
-        paths += [p for p in (spec.parent / named, Path(named)) if is_file_name(named) and p.is_file()]
+        paths += [
+            p for p in (spec.parent / named, Path(named)) if is_file_name(named) and p.is_file()
+        ]
     if settings.space is not None and is_file_name(settings.space):
         read_space(settings.space)
         paths.append(Path(settings.space))
@@ -41,29 +46,40 @@ def _digest(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()[:16]
     except OSError as error:
-        raise SettingsError(f"The file {path} cannot be read ({error.strerror or error}): name another.") from None
+        raise SettingsError(
+            f"The file {path} cannot be read ({error.strerror or error}): name another."
+        ) from None
 
 
 def _named(settings: Labels) -> tuple[Path, Path]:
     if settings.model is None or settings.spec is None:
-        raise SettingsError("labels.source=onnx needs a model and its spec: give --seg-model MODEL.onnx --seg-spec SPEC.yaml.")
+        raise SettingsError(
+            "labels.source=onnx needs a model and its spec: give --seg-model MODEL.onnx --seg-spec SPEC.yaml."
+        )
     return settings.model, settings.spec
 
 
 class Segmenter:
-    """A model with its spec. :meth:`train_ids` is a function of the picture alone: the same picture gives the same labels."""
+    """A model with its spec. :meth:`train_ids` is a function of the picture alone: the same picture
+    gives the same labels.
+    """
 
-    def __init__(self, net: Net, runtime: str, spec: Spec, spec_path: Path, model_path: Path) -> None:
+    def __init__(
+        self, net: Net, runtime: str, spec: Spec, spec_path: Path, model_path: Path
+    ) -> None:
         self._net, self._runtime, self._spec, self._path = net, runtime, spec, model_path
         self._space = spec.label_space(spec_path)
         ignored = spec.ignored(self._space)
         ids = np.arange(max(self._space.targets, default=0) + 1)
-        self._table = np.append(self._space.train_ids(ids), np.uint8(UNLABELLED))  # the last for what a model itself leaves out
+        # the last for what a model itself leaves out
+        self._table = np.append(self._space.train_ids(ids), np.uint8(UNLABELLED))
         self._table[sorted(ignored)] = UNLABELLED
 
     @classmethod
     def open(cls, settings: Labels) -> Segmenter:
-        """The model that ``labels.model`` and ``labels.spec`` name. SettingsError when one of them is missing or cannot be used."""
+        """The model that ``labels.model`` and ``labels.spec`` name. SettingsError when one of them
+        is missing or cannot be used.
+        """
         model_path, spec_path = _named(settings)
         spec = read_spec(spec_path)
         if not model_path.is_file():
@@ -73,13 +89,23 @@ class Segmenter:
 
     def to_json(self) -> dict[str, Any]:
         """For session.json."""
-        return {"path": str(self._path), "runtime": self._runtime, "space": self._space.name, "unknown_classes": list(self._space.unknown)}
+        return {
+            "path": str(self._path),
+            "runtime": self._runtime,
+            "space": self._space.name,
+            "unknown_classes": list(self._space.unknown),
+        }
 
     def train_ids(self, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> U32:
-        """Train ids (h, w) of a picture (h, w) or (h, w, 3) RGB; UNPAINTED where the spec crops it off."""
+        """Train ids (h, w) of a picture (h, w) or (h, w, 3) RGB; UNPAINTED where the spec crops it
+        off.
+        """
         spec = self._spec.input
         height, width = picture.shape[:2]
-        top, bottom, left, right = (round(share * size) for share, size in zip(spec.crop, (height, height, width, width), strict=True))
+        top, bottom, left, right = (
+            round(share * size)
+            for share, size in zip(spec.crop, (height, height, width, width), strict=True)
+        )
         inner = _eight_bits(picture)[top : height - bottom, left : width - right]
         if not inner.size:
             return np.full((height, width), UNPAINTED, np.uint32)
@@ -93,50 +119,76 @@ class Segmenter:
         ]
         out = np.full((height, width), UNPAINTED, np.uint32)
         out[top : height - bottom, left : width - right] = cv2.resize(
-            self._table[part], (inner.shape[1], inner.shape[0]), interpolation=cv2.INTER_NEAREST_EXACT
+            self._table[part],
+            (inner.shape[1], inner.shape[0]),
+            interpolation=cv2.INTER_NEAREST_EXACT,
         )
         return out
 
     def _batch(self, picture: U8) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
-        """The input of the model, and the share of it that is the picture: first and last of rows and of columns."""
+        """The input of the model, and the share of it that is the picture: first and last of rows
+        and of columns.
+        """
         spec = self._spec.input
         rows, columns = spec.size
         box = (0.0, 1.0, 0.0, 1.0)
         if spec.resize == "letterbox":
             factor = min(rows / picture.shape[0], columns / picture.shape[1])
-            inner_rows, inner_columns = max(round(picture.shape[0] * factor), 1), max(round(picture.shape[1] * factor), 1)
-            y, x = (rows - inner_rows) // 2, (columns - inner_columns) // 2
+            inner_rows = max(round(picture.shape[0] * factor), 1)
+            inner_columns = max(round(picture.shape[1] * factor), 1)
+            y = (rows - inner_rows) // 2
+            x = (columns - inner_columns) // 2
             canvas = np.zeros((rows, columns, 3), np.uint8)
-            canvas[y : y + inner_rows, x : x + inner_columns] = _resized(picture, inner_rows, inner_columns)
-            picture, box = canvas, (y / rows, (y + inner_rows) / rows, x / columns, (x + inner_columns) / columns)
+            canvas[y : y + inner_rows, x : x + inner_columns] = _resized(
+                picture, inner_rows, inner_columns
+            )
+            picture = canvas
+            box = (y / rows, (y + inner_rows) / rows, x / columns, (x + inner_columns) / columns)
         else:
             picture = _resized(picture, rows, columns)
         if spec.colours == "BGR":
             picture = picture[..., ::-1]
         values: NDArray[Any] = picture
         if spec.type == "float32":
-            values = (picture * np.float32(spec.scale) - np.asarray(spec.mean, np.float32)) / np.asarray(spec.std, np.float32)
+            values = (
+                picture * np.float32(spec.scale) - np.asarray(spec.mean, np.float32)
+            ) / np.asarray(spec.std, np.float32)
         values = values.transpose(2, 0, 1) if spec.layout == "NCHW" else values
         return np.ascontiguousarray(values[None]), box
 
     def _ids(self, output: NDArray[Any]) -> NDArray[np.intp]:
-        """Class ids (rows, columns) of what the model gave. SettingsError when it is not of the form that the spec says."""
-        spec, given = self._spec.output, " x ".join(map(str, output.shape))
-        image = output.reshape([n for n in output.shape if n != 1] or [1]) if output.ndim > 3 or spec.kind == "ids" else output
+        """Class ids (rows, columns) of what the model gave. SettingsError when it is not of the
+        form that the spec says.
+        """
+        spec = self._spec.output
+        given = " x ".join(map(str, output.shape))
+        image = (
+            output.reshape([n for n in output.shape if n != 1] or [1])
+            if output.ndim > 3 or spec.kind == "ids"
+            else output
+        )
         if not output.size or output.dtype.kind not in "biuf":
-            raise SettingsError(f"Model {self._path} gives {given} values of type {output.dtype}: output.name may be that of another.")
+            raise SettingsError(
+                f"Model {self._path} gives {given} values of type {output.dtype}: output.name may be that of another."
+            )
         classes = len(self._table) - 1
         if spec.kind == "ids":
             if image.ndim != 2:
-                raise SettingsError(f"Model {self._path} gives {given} values, which is no picture of ids: output.kind may be 'logits'.")
+                raise SettingsError(
+                    f"Model {self._path} gives {given} values, which is no picture of ids: output.kind may be 'logits'."
+                )
             ids: NDArray[np.intp] = np.rint(image).astype(np.intp)
             left_out = (ids == -1) | ((ids == UNLABELLED) & (classes <= UNLABELLED))
             strange = ids[((ids < 0) | (ids >= classes)) & ~left_out]
             if len(strange):
-                raise SettingsError(f"Model {self._path} gives the class {strange[0]}, but {self._space.name} ends at {classes - 1}.")
+                raise SettingsError(
+                    f"Model {self._path} gives the class {strange[0]}, but {self._space.name} ends at {classes - 1}."
+                )
             return np.where(left_out, classes, ids)
         if image.ndim != 3 or (image.shape[0] == 1 and classes > 1):
-            raise SettingsError(f"Model {self._path} gives {given} values, not classes x rows x columns: output.kind may be 'ids'.")
+            raise SettingsError(
+                f"Model {self._path} gives {given} values, not classes x rows x columns: output.kind may be 'ids'."
+            )
         axis = 0 if spec.layout == "CHW" else 2
         if image.shape[axis] != classes:
             raise SettingsError(
@@ -149,7 +201,11 @@ class Segmenter:
 
 def _eight_bits(picture: NDArray[np.uint8] | NDArray[np.uint16]) -> U8:
     """(h, w, 3), of grey three times the same."""
-    eight = (picture >> 8).astype(np.uint8) if picture.dtype == np.uint16 else picture.astype(np.uint8, copy=False)
+    eight = (
+        (picture >> 8).astype(np.uint8)
+        if picture.dtype == np.uint16
+        else picture.astype(np.uint8, copy=False)
+    )
     return np.repeat(eight[..., None], 3, axis=2) if eight.ndim == 2 else eight
 
 
@@ -157,7 +213,11 @@ def _resized(picture: U8, rows: int, columns: int) -> U8:
     if picture.shape[:2] == (rows, columns):
         return picture
     shrinks = rows * columns < picture.shape[0] * picture.shape[1]
-    resized = cv2.resize(np.ascontiguousarray(picture), (columns, rows), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    resized = cv2.resize(
+        np.ascontiguousarray(picture),
+        (columns, rows),
+        interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR,
+    )
     return np.asarray(resized, np.uint8)
 
 
@@ -166,7 +226,9 @@ def _load(path: Path, spec: Spec, threads: int) -> tuple[Net, str]:
         import onnxruntime
     except ImportError:
         return _load_cv2(path, spec, threads), f"opencv {cv2.__version__}"
-    return _load_onnxruntime(onnxruntime, path, spec, threads), f"onnxruntime {onnxruntime.__version__}"
+    return _load_onnxruntime(
+        onnxruntime, path, spec, threads
+    ), f"onnxruntime {onnxruntime.__version__}"
 
 
 def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, threads: int) -> Net:
@@ -178,20 +240,27 @@ def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, threads: int) -> Net
         session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the runtime raises many types, and the file may be anything
         raise SettingsError(f"Model {path} cannot be read as ONNX: {_short(error)}.") from None
-    inputs, outputs = {i.name: i for i in session.get_inputs()}, [o.name for o in session.get_outputs()]
+    inputs = {i.name: i for i in session.get_inputs()}
+    outputs = [o.name for o in session.get_outputs()]
     name = spec.input.name or (next(iter(inputs)) if len(inputs) == 1 else "")
     if name not in inputs:
-        raise SettingsError(f"Model {path} has no input '{name}': name one of {', '.join(inputs)} as input.name in its spec.")
+        raise SettingsError(
+            f"Model {path} has no input '{name}': name one of {', '.join(inputs)} as input.name in its spec."
+        )
     output = spec.output.name or outputs[0]
     if output not in outputs:
-        raise SettingsError(f"Model {path} has no output '{output}': name one of {', '.join(outputs)} as output.name in its spec.")
+        raise SettingsError(
+            f"Model {path} has no output '{output}': name one of {', '.join(outputs)} as output.name in its spec."
+        )
     _check_shape(path, spec, inputs[name].shape, inputs[name].type)
 
     def run(batch: NDArray[Any]) -> NDArray[Any]:
         try:
             return np.asarray(session.run([output], {name: batch})[0])
         except Exception as error:
-            raise SettingsError(f"Model {path} fails on an input of {' x '.join(map(str, batch.shape))}: {_short(error)}.") from None
+            raise SettingsError(
+                f"Model {path} fails on an input of {' x '.join(map(str, batch.shape))}: {_short(error)}."
+            ) from None
 
     return run
 
@@ -199,7 +268,9 @@ def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, threads: int) -> Net
 def _check_shape(path: Path, spec: Spec, shape: list[Any], type_: str) -> None:
     rows, columns = spec.input.size
     wanted = [1, 3, rows, columns] if spec.input.layout == "NCHW" else [1, rows, columns, 3]
-    fits = len(shape) == 4 and all(not isinstance(s, int) or s < 1 or s == w for s, w in zip(shape, wanted, strict=True))
+    fits = len(shape) == 4 and all(
+        not isinstance(s, int) or s < 1 or s == w for s, w in zip(shape, wanted, strict=True)
+    )
     if not fits:
         raise SettingsError(
             f"Model {path} takes an input of {' x '.join(map(str, shape))}, but its spec says {' x '.join(map(str, wanted))} "
@@ -207,7 +278,9 @@ def _check_shape(path: Path, spec: Spec, shape: list[Any], type_: str) -> None:
         )
     types = {"tensor(float)": "float32", "tensor(uint8)": "uint8"}
     if types.get(type_) != spec.input.type:
-        raise SettingsError(f"Model {path} takes {type_}, but its spec says input.type {spec.input.type}.")
+        raise SettingsError(
+            f"Model {path} takes {type_}, but its spec says input.type {spec.input.type}."
+        )
 
 
 def _load_cv2(path: Path, spec: Spec, threads: int) -> Net:

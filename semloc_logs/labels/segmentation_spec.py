@@ -25,11 +25,16 @@ class Input(_Part):
     colours: Literal["RGB", "BGR"] = Field("RGB", description="order of the channels")
     type: Literal["float32", "uint8"] = "float32"
     scale: float = Field(1 / 255, description="factor of the pixels, 0 to 255, before mean and std")
-    mean: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="in the order of the channels")
+    mean: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="in the order of the channels"
+    )
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    resize: Literal["stretch", "letterbox"] = Field("stretch", description="letterbox keeps the aspect ratio and fills with black")
+    resize: Literal["stretch", "letterbox"] = Field(
+        "stretch", description="letterbox keeps the aspect ratio and fills with black"
+    )
     crop: tuple[float, float, float, float] = Field(
-        (0.0, 0.0, 0.0, 0.0), description="shares of the picture cut off first: top, bottom, left, right (a bonnet); they get no label"
+        (0.0, 0.0, 0.0, 0.0),
+        description="shares of the picture cut off first: top, bottom, left, right (a bonnet); they get no label",
     )
 
     @model_validator(mode="after")
@@ -45,7 +50,9 @@ class Input(_Part):
 
 
 class Output(_Part):
-    """What the model gives: ``logits`` or probabilities for each class and pixel, or the class ``ids``."""
+    """What the model gives: ``logits`` or probabilities for each class and pixel, or the class
+    ``ids``.
+    """
 
     name: str | None = Field(None, description="name of the output; default: the first")
     kind: Literal["logits", "ids"] = "logits"
@@ -53,13 +60,17 @@ class Output(_Part):
 
 
 class Spec(_Part):
-    """The whole file. Classes are those of a label ``space`` (a name or a YAML file) or a list ``classes`` of names, by id."""
+    """The whole file. Classes are those of a label ``space`` (a name or a YAML file) or a list
+    ``classes`` of names, by id.
+    """
 
     input: Input
     output: Output = Output()
     space: str | None = None
     classes: tuple[str, ...] | None = None
-    ignore: tuple[str | int, ...] = Field((), description="classes, by name or id, that become unlabelled")
+    ignore: tuple[str | int, ...] = Field(
+        (), description="classes, by name or id, that become unlabelled"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Spec:
@@ -68,7 +79,9 @@ class Spec(_Part):
         return self
 
     def label_space(self, where: Path) -> LabelSpace:
-        """What the ids of the model mean; a YAML file of a space lies relative to the spec file ``where``."""
+        """What the ids of the model mean; a YAML file of a space lies relative to the spec file
+        ``where``.
+        """
         if self.classes is not None:
             return space_of_names(dict(enumerate(self.classes)), str(where))
         name = self.space or ""
@@ -79,19 +92,29 @@ class Spec(_Part):
         """Ids that become unlabelled. SettingsError for a class that is not there."""
         ids = set[int]()
         for wanted in self.ignore:
-            found = {i for i, n in space.names.items() if i == wanted or (isinstance(wanted, str) and plain(n) == plain(wanted))}
+            found = {
+                i
+                for i, n in space.names.items()
+                if i == wanted or (isinstance(wanted, str) and plain(n) == plain(wanted))
+            }
             if not found:
-                raise SettingsError(f"The spec of the model ignores '{wanted}', which is no class of {space.name}.")
+                raise SettingsError(
+                    f"The spec of the model ignores '{wanted}', which is no class of {space.name}."
+                )
             ids |= found
         return ids
 
 
 def read_spec(path: Path) -> Spec:
-    """The spec file ``path``. SettingsError that names the key when it is unknown or its value impossible."""
+    """The spec file ``path``. SettingsError that names the key when it is unknown or its value
+    impossible.
+    """
     content = read_yaml(path, "Spec")
     try:
         return Spec.model_validate(content)
     except ValidationError as problem:
         first = problem.errors()[0]
         key = ".".join(str(p) for p in first["loc"])
-        raise SettingsError(f"Spec {path}: {f'{key}: ' if key else ''}{first['msg'].removeprefix('Value error, ')}.") from None
+        raise SettingsError(
+            f"Spec {path}: {f'{key}: ' if key else ''}{first['msg'].removeprefix('Value error, ')}."
+        ) from None

@@ -22,7 +22,8 @@ UNPAINTED = 0xFFFFFFFF  # instead of an id: nothing was seen there
 SKY = 10
 ROAD, SIDEWALK, BUILDING, POLE, VEGETATION, TERRAIN = 0, 1, 2, 5, 8, 9
 GROUND = (ROAD, SIDEWALK, TERRAIN)
-THINGS = (POLE, 6, 7, *range(11, 19))  # poles, traffic lights and signs, people, vehicles: not larger than some metres
+# poles, traffic lights and signs, people, vehicles: not larger than some metres
+THINGS = (POLE, 6, 7, *range(11, 19))
 _HIGHEST_ID = 0xFFFF
 
 U8 = NDArray[np.uint8]
@@ -31,7 +32,9 @@ U32 = NDArray[np.uint32]
 
 @dataclass(frozen=True, slots=True)
 class Cityscapes:
-    """The label space of every map: names and RGB colours by train id, which are dynamic, and the coarse set (id -> index)."""
+    """The label space of every map: names and RGB colours by train id, which are dynamic, and the
+    coarse set (id -> index).
+    """
 
     names: tuple[str, ...]
     colours: U8
@@ -42,8 +45,9 @@ class Cityscapes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelSpace:
-    """What the ids of a log mean: ``names`` and ``targets`` (Cityscapes train ids, 255 unlabelled) by id, RGB ``colours`` where they
-    are known, ``dynamic`` ids. An id is what is left of the recorded number under ``mask``. ``unknown`` are names that mean nothing here.
+    """What the ids of a log mean: ``names`` and ``targets`` (Cityscapes train ids, 255 unlabelled)
+    by id, RGB ``colours`` where they are known, ``dynamic`` ids. An id is what is left of the
+    recorded number under ``mask``. ``unknown`` are names that mean nothing here.
     """
 
     name: str
@@ -64,11 +68,15 @@ class LabelSpace:
         return out
 
     def train_ids_of_colours(self, packed: U32) -> tuple[U8, dict[int, int]]:
-        """Train ids of colours ``packed`` as by :func:`semloc_logs.logs.sensors.depth.label_ids`; and how often which colour is not in the palette.
+        """Train ids of colours ``packed`` as by :func:`semloc_logs.logs.sensors.depth.label_ids`;
+        and how often which colour is not in the palette.
 
         Black means unlabelled where a palette does not use it.
         """
-        palette = {0: UNLABELLED} | {c[0] << 16 | c[1] << 8 | c[2]: self.targets[i] for i, c in reversed(list(self.colours.items()))}
+        palette = {0: UNLABELLED} | {
+            c[0] << 16 | c[1] << 8 | c[2]: self.targets[i]
+            for i, c in reversed(list(self.colours.items()))
+        }
         keys = np.array(sorted(palette), np.uint32)
         targets = np.array([palette[int(k)] for k in keys], np.uint8)
         flat = np.asarray(packed, np.uint32).reshape(-1)
@@ -76,7 +84,9 @@ class LabelSpace:
         known = keys[at] == flat
         strange, counts = np.unique(flat[~known & (flat != UNPAINTED)], return_counts=True)
         out = np.where(known, targets[at], UNLABELLED).astype(np.uint8)
-        return out.reshape(np.shape(packed)), dict(zip(strange.tolist(), counts.tolist(), strict=True))
+        return out.reshape(np.shape(packed)), dict(
+            zip(strange.tolist(), counts.tolist(), strict=True)
+        )
 
 
 @cache
@@ -106,11 +116,15 @@ def is_file_name(name: str) -> bool:
 
 
 def read_space(name: str) -> LabelSpace:
-    """The shipped space ``name``, or that of the YAML file ``name``. SettingsError for an unknown name and for a file that is none."""
+    """The shipped space ``name``, or that of the YAML file ``name``. SettingsError for an unknown
+    name and for a file that is none.
+    """
     if name in spaces():
         return _shipped(name)
     if not is_file_name(name):
-        raise SettingsError(f"Unknown label space '{name}': there are {', '.join(spaces())}; or name a YAML file.")
+        raise SettingsError(
+            f"Unknown label space '{name}': there are {', '.join(spaces())}; or name a YAML file."
+        )
     return _parse(read_yaml(Path(name), "Label space"), name, trains_by_name())
 
 
@@ -123,13 +137,23 @@ def _shipped(name: str) -> LabelSpace:
 def _parse(content: Any, where: str, by_name: Mapping[str, int]) -> LabelSpace:
     """A space from its YAML form; a class without ``to`` is mapped by its name."""
     try:
-        classes, mask = content["classes"], int(content.get("mask", 0xFFFFFFFF))
-        rows = {int(i): row if isinstance(row, dict) else {"name": row} for i, row in classes.items()}
+        classes = content["classes"]
+        mask = int(content.get("mask", 0xFFFFFFFF))
+        rows = {
+            int(i): row if isinstance(row, dict) else {"name": row} for i, row in classes.items()
+        }
     except (TypeError, KeyError, ValueError, AttributeError, OverflowError):
-        raise SettingsError(f"Label space {where} has no 'classes' of the form 'ID: {{name: NAME, to: CITYSCAPES_CLASS}}'.") from None
+        raise SettingsError(
+            f"Label space {where} has no 'classes' of the form 'ID: {{name: NAME, to: CITYSCAPES_CLASS}}'."
+        ) from None
     if not 0 <= mask <= 0xFFFFFFFF:
-        raise SettingsError(f"Label space {where} has the mask {mask:#x}: it has to be within 32 bits.")
-    found, targets, colours, unknown = dict[int, str](), dict[int, int](), dict[int, tuple[int, int, int]](), list[str]()
+        raise SettingsError(
+            f"Label space {where} has the mask {mask:#x}: it has to be within 32 bits."
+        )
+    found = dict[int, str]()
+    targets = dict[int, int]()
+    colours = dict[int, tuple[int, int, int]]()
+    unknown = list[str]()
     for i, row in rows.items():
         if not 0 <= i <= _HIGHEST_ID:
             raise SettingsError(f"Label space {where} has the id {i}: ids are 0 to {_HIGHEST_ID}.")
@@ -140,8 +164,14 @@ def _parse(content: Any, where: str, by_name: Mapping[str, int]) -> LabelSpace:
             unknown.append(found[i])
         if row.get("colour") is not None:
             colours[i] = _colour(row["colour"], where, i)
-    dynamic = frozenset(i for i, row in rows.items() if row.get("dynamic") or (targets[i] < 19 and cityscapes().dynamic[targets[i]]))
-    return LabelSpace(str(content.get("name", where)), found, targets, colours, dynamic, mask, tuple(unknown))
+    dynamic = frozenset(
+        i
+        for i, row in rows.items()
+        if row.get("dynamic") or (targets[i] < 19 and cityscapes().dynamic[targets[i]])
+    )
+    return LabelSpace(
+        str(content.get("name", where)), found, targets, colours, dynamic, mask, tuple(unknown)
+    )
 
 
 def _target(value: Any, where: str, i: int) -> int:
@@ -152,13 +182,21 @@ def _target(value: Any, where: str, i: int) -> int:
         return own.index(value)
     if type(value) is int and 0 <= value < len(own):
         return value
-    raise SettingsError(f"Label space {where} maps {i} to {str(value)[:40]!r}, which is no class of Cityscapes: {', '.join(own)}, or null.")
+    raise SettingsError(
+        f"Label space {where} maps {i} to {str(value)[:40]!r}, which is no class of Cityscapes: {', '.join(own)}, or null."
+    )
 
 
 def _colour(value: Any, where: str, i: int) -> tuple[int, int, int]:
-    if isinstance(value, list) and len(value) == 3 and all(type(v) is int and 0 <= v <= 255 for v in value):
+    if (
+        isinstance(value, list)
+        and len(value) == 3
+        and all(type(v) is int and 0 <= v <= 255 for v in value)
+    ):
         return value[0], value[1], value[2]
-    raise SettingsError(f"Label space {where} gives {i} the colour {str(value)[:40]!r}: it has to be [red, green, blue], each 0 to 255.")
+    raise SettingsError(
+        f"Label space {where} gives {i} the colour {str(value)[:40]!r}: it has to be [red, green, blue], each 0 to 255."
+    )
 
 
 # -- by name
@@ -171,24 +209,32 @@ def plain(name: str) -> str:
 
 @cache
 def trains_by_name() -> Mapping[str, int]:
-    """Train ids by :func:`plain` name: the classes, their synonyms (schemas/label_names.yaml), the names of the shipped spaces."""
+    """Train ids by :func:`plain` name: the classes, their synonyms (schemas/label_names.yaml), the
+    names of the shipped spaces.
+    """
     own = cityscapes().names
     known = {plain(n): i for i, n in enumerate(own)}
     for name, others in yaml.safe_load(read_text("label_names.yaml")).items():
         for other in (name, *others):
             known.setdefault(plain(other), own.index(name) if name in own else UNLABELLED)
-    shipped = [(plain(n), s.targets[i]) for s in map(_shipped, spaces()) for i, n in s.names.items()]
-    for n, target in sorted(shipped, key=lambda row: row[1] == UNLABELLED):  # a space that knows the class before one that leaves it out
+    shipped = [
+        (plain(n), s.targets[i]) for s in map(_shipped, spaces()) for i, n in s.names.items()
+    ]
+    # a space that knows the class before one that leaves it out
+    for n, target in sorted(shipped, key=lambda row: row[1] == UNLABELLED):
         known.setdefault(n, target)
     return known
 
 
 def space_of_names(classes: Mapping[int, str], name: str) -> LabelSpace:
-    """The space of a list of class names; of a path such as ``construction--flat--road`` the last part that is known counts.
+    """The space of a list of class names; of a path such as ``construction--flat--road`` the last
+    part that is known counts.
 
-    Ids below 0 or above 65535, which only a damaged log gives, have no meaning and are among the unknown.
+    Ids below 0 or above 65535, which only a damaged log gives, have no meaning and are among the
+    unknown.
     """
-    targets, unknown = dict[int, int](), list[str]()
+    targets = dict[int, int]()
+    unknown = list[str]()
     for i, given in classes.items():
         if not 0 <= i <= _HIGHEST_ID:
             unknown.append(given)
@@ -206,25 +252,36 @@ def space_of_names(classes: Mapping[int, str], name: str) -> LabelSpace:
 
 
 def to_cityscapes(ids: NDArray[np.integer], space: str) -> U8:
-    """Train ids (n,) of the ids of a log; 255 where the space does not map them. Raises SettingsError for an unknown space."""
+    """Train ids (n,) of the ids of a log; 255 where the space does not map them. Raises
+    SettingsError for an unknown space.
+    """
     return read_space(space).train_ids(ids)
 
 
 def guess_space(ids: NDArray[np.integer]) -> str:
-    """The label space that a log's ids look like: SemanticKITTI has ids above 18 and instances, Cityscapes none but 255."""
+    """The label space that a log's ids look like: SemanticKITTI has ids above 18 and instances,
+    Cityscapes none but 255.
+    """
     every = np.unique(np.asarray(ids, np.int64))
-    low, instances = set((every & 0xFFFF).tolist()) - {UNLABELLED}, bool((every > 0xFFFF).any())
+    low = set((every & 0xFFFF).tolist()) - {UNLABELLED}
+    instances = bool((every > 0xFFFF).any())
     if not instances and max(low, default=0) <= 18:
         return "cityscapes"
-    # the full ids of Cityscapes end at 33, and most of those that occur on a street are no ids of SemanticKITTI
+    # the full ids of Cityscapes end at 33, and most of those that occur on a street are no ids of
+    # SemanticKITTI
     full = not instances and max(low) <= 33 and len(low - set(_shipped("semantickitti").names)) > 1
     return "cityscapes_ids" if full else "semantickitti"
 
 
 def guess_palette(colours: Mapping[int, int]) -> str | None:
-    """The shipped space whose palette knows most pixels of the packed ``colours`` (colour -> count); None if none knows half of them."""
+    """The shipped space whose palette knows most pixels of the packed ``colours`` (colour ->
+    count); None if none knows half of them.
+    """
     total = sum(n for colour, n in colours.items() if colour)
-    ranked = sorted(spaces(), key=lambda name: (-_pixels_known(name, colours), not name.startswith("cityscapes"), name))
+    ranked = sorted(
+        spaces(),
+        key=lambda name: (-_pixels_known(name, colours), not name.startswith("cityscapes"), name),
+    )
     return ranked[0] if total and 2 * _pixels_known(ranked[0], colours) >= total else None
 
 

@@ -1,9 +1,10 @@
 """The ground below a sweep: a height for each cell of a level grid, grown outwards from the sensor.
 
-Echoes that come by way of a window or a puddle lie metres below the street, and parked cars, hedges and fronts of houses hide it. The
-ground, however, is continuous: from cell to cell it rises or falls by little. So it starts with the height that most cells below the
-sensor have and is followed outwards; what is far below the height that the neighbours promise is an echo, what is far above it is
-something that stands on the ground.
+Echoes that come by way of a window or a puddle lie metres below the street, and parked cars, hedges
+and fronts of houses hide it. The ground, however, is continuous: from cell to cell it rises or
+falls by little. So it starts with the height that most cells below the sensor have and is followed
+outwards; what is far below the height that the neighbours promise is an echo, what is far above it
+is something that stands on the ground.
 """
 
 from __future__ import annotations
@@ -18,17 +19,21 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
 CELL = 1.0  # of the grid, at street scale (m)
-REACH = 120.0  # points farther than this from the sensor, in x, y or z, are left out, at street scale (m)
+# points farther than this from the sensor, in x, y or z, are left out, at street scale (m)
+REACH = 120.0
 SEED_RANGE = 15.0  # cells that say how high the ground is below the sensor (m)
-STEP, WIDENING, MOST_GAP = 0.25, 0.12, 4.0  # m from one cell to the next, and what each unseen cell between adds to it
+# m from one cell to the next, and what each unseen cell between adds to it
+STEP, WIDENING, MOST_GAP = 0.25, 0.12, 4.0
 LAYER = 0.12  # points this near to the lowest of a cell are ground (m)
 ROUNDS = 16  # of relaxation, two for each way through the grid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundSurface:
-    """Heights ``z`` (nx, ny) at the centres of cells of ``cell`` metres, the grid's corner at ``low`` (2,); ``gap`` (nx, ny) is the way
-    to the nearest cell where the ground was seen, in cells, 0 where it was seen itself."""
+    """Heights ``z`` (nx, ny) at the centres of cells of ``cell`` metres, the grid's corner at
+    ``low`` (2,); ``gap`` (nx, ny) is the way to the nearest cell where the ground was seen, in
+    cells, 0 where it was seen itself.
+    """
 
     low: F64
     cell: float
@@ -41,21 +46,29 @@ class GroundSurface:
         return np.stack(np.meshgrid(x, y, indexing="ij"), -1)
 
     def height_at(self, xy: NDArray[np.floating]) -> F64:
-        """Height (n,) of the ground at ``xy`` (n, 2), bilinear between cells, that of the border outside."""
+        """Height (n,) of the ground at ``xy`` (n, 2), bilinear between cells, that of the border
+        outside.
+        """
         at = np.ascontiguousarray(xy, np.float64)
         return np.asarray(_bilinear(self.z, (at - self.low) / self.cell - 0.5))
 
 
-def ground_surface(points: NDArray[np.floating], origin: NDArray[np.floating], scale: float = 1.0) -> GroundSurface:
-    """The ground below level ``points`` (n, 3), z up, seen from ``origin`` (3,); ``scale`` is the voxel size over 0.30 m.
+def ground_surface(
+    points: NDArray[np.floating], origin: NDArray[np.floating], scale: float = 1.0
+) -> GroundSurface:
+    """The ground below level ``points`` (n, 3), z up, seen from ``origin`` (3,); ``scale`` is the
+    voxel size over 0.30 m.
 
     Points beyond 120 m (at 0.30 m voxels) of the origin in any axis do not count.
     """
-    cell, o = CELL * scale, np.asarray(origin, np.float64)
+    cell = CELL * scale
+    o = np.asarray(origin, np.float64)
     p = np.ascontiguousarray(points, np.float64).reshape(-1, 3)
     p = p[(np.abs(p - o) <= REACH * scale).all(1)]
     if not len(p):
-        return GroundSurface(o[:2] - cell, cell, np.full((2, 2), o[2] - 1.7 * scale), np.full((2, 2), np.inf))
+        return GroundSurface(
+            o[:2] - cell, cell, np.full((2, 2), o[2] - 1.7 * scale), np.full((2, 2), np.inf)
+        )
     low = p[:, :2].min(0) - cell
     nx, ny = (np.floor((p[:, :2].max(0) - low) / cell) + 2).astype(int).tolist()
     start, order = _cells(p, low, cell, nx, ny)
@@ -65,18 +78,30 @@ def ground_surface(points: NDArray[np.floating], origin: NDArray[np.floating], s
     seed = _seed(lowest, away, float(o[2]), scale)
     if seed is None:
         seed = float(np.percentile(p[:, 2], 2))
-    z, gap = _grow(p[:, 2].copy(), start, order, nx, ny, np.argsort(away, kind="stable"), seed, scale)
-    return GroundSurface(low, cell, _relax(z, gap, nx, ny, scale).reshape(nx, ny), gap.reshape(nx, ny))
+    z, gap = _grow(
+        p[:, 2].copy(), start, order, nx, ny, np.argsort(away, kind="stable"), seed, scale
+    )
+    return GroundSurface(
+        low, cell, _relax(z, gap, nx, ny, scale).reshape(nx, ny), gap.reshape(nx, ny)
+    )
 
 
 def _seed(lowest: F64, away: F64, origin_z: float, scale: float) -> float | None:
-    """The height that most cells near the sensor have as their lowest point, below the sensor; None if there is none there."""
-    near = lowest[(away < SEED_RANGE * scale) & (lowest < origin_z - 0.3 * scale) & (lowest > origin_z - 5 * scale)]
+    """The height that most cells near the sensor have as their lowest point, below the sensor; None
+    if there is none there.
+    """
+    near = lowest[
+        (away < SEED_RANGE * scale)
+        & (lowest < origin_z - 0.3 * scale)
+        & (lowest > origin_z - 5 * scale)
+    ]
     if not len(near):
         return None
     bins = np.round(near / (0.1 * scale)).astype(np.int64)
     bins -= bins.min()
-    count = np.convolve(np.bincount(bins), [1, 2, 1], "same") if bins.max() > 1 else np.bincount(bins)
+    count = (
+        np.convolve(np.bincount(bins), [1, 2, 1], "same") if bins.max() > 1 else np.bincount(bins)
+    )
     return float(np.median(near[np.abs(bins - int(np.argmax(count))) <= 1]))
 
 
@@ -111,8 +136,11 @@ def _lowest(z: F64, start: I32, order: I32) -> F64:
 
 @njit(cache=True, nogil=True)
 def _promise(z: F64, gap: F64, a: int, nx: int, ny: int) -> tuple[float, float]:
-    """What the visited cells within two cells of ``a`` say of its height, and how far it is from the nearest seen one (-1: nothing)."""
-    i, j = a // ny, a % ny
+    """What the visited cells within two cells of ``a`` say of its height, and how far it is from
+    the nearest seen one (-1: nothing).
+    """
+    i = a // ny
+    j = a % ny
     weight, height, nearest = 0.0, 0.0, -1.0
     for u in range(max(i - 2, 0), min(i + 3, nx)):
         for v in range(max(j - 2, 0), min(j + 3, ny)):
@@ -128,9 +156,19 @@ def _promise(z: F64, gap: F64, a: int, nx: int, ny: int) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def _grow(height: F64, start: I32, order: I32, nx: int, ny: int, sequence: NDArray[np.int64], seed: float, scale: float) -> tuple[F64, F64]:
+def _grow(
+    height: F64,
+    start: I32,
+    order: I32,
+    nx: int,
+    ny: int,
+    sequence: NDArray[np.int64],
+    seed: float,
+    scale: float,
+) -> tuple[F64, F64]:
     """Height and gap of all cells, visited in ``sequence``; the first ones lie at ``seed``."""
-    z, gap = np.empty(nx * ny), np.full(nx * ny, -1.0)
+    z = np.empty(nx * ny)
+    gap = np.full(nx * ny, -1.0)
     for a in sequence:
         promised, away = _promise(z, gap, a, nx, ny)
         if away < 0:
@@ -155,12 +193,15 @@ def _grow(height: F64, start: I32, order: I32, nx: int, ny: int, sequence: NDArr
 
 @njit(cache=True, nogil=True)
 def _relax(z: F64, gap: F64, nx: int, ny: int, scale: float) -> F64:
-    """A membrane through the seen heights, that those above it pull on less: robust least squares by Gauss-Seidel steps."""
+    """A membrane through the seen heights, that those above it pull on less: robust least squares
+    by Gauss-Seidel steps.
+    """
     s = z.copy()
     for r in range(ROUNDS):
         for q in range(nx * ny):
             a = q if r % 2 == 0 else nx * ny - 1 - q
-            i, j = a // ny, a % ny
+            i = a // ny
+            j = a % ny
             total, count = 0.0, 0
             if i > 0:
                 total += s[a - ny]
@@ -189,7 +230,11 @@ def _bilinear(z: F64, at: F64) -> F64:
     for k in range(len(at)):
         u = min(max(at[k, 0], 0.0), z.shape[0] - 1.0)
         v = min(max(at[k, 1], 0.0), z.shape[1] - 1.0)
-        i, j = min(int(u), z.shape[0] - 2), min(int(v), z.shape[1] - 2)
-        a, b = u - i, v - j
-        out[k] = (1 - a) * ((1 - b) * z[i, j] + b * z[i, j + 1]) + a * ((1 - b) * z[i + 1, j] + b * z[i + 1, j + 1])
+        i = min(int(u), z.shape[0] - 2)
+        j = min(int(v), z.shape[1] - 2)
+        a = u - i
+        b = v - j
+        out[k] = (1 - a) * ((1 - b) * z[i, j] + b * z[i, j + 1]) + a * (
+            (1 - b) * z[i + 1, j] + b * z[i + 1, j + 1]
+        )
     return out

@@ -1,6 +1,8 @@
-"""Shape of the surroundings of voxels: spread and normals of their points, the columns that they stand in, and the objects they belong to.
+"""Shape of the surroundings of voxels: spread and normals of their points, the columns that they
+stand in, and the objects they belong to.
 
-Points are summed up in voxels first, so that a neighbourhood is a sum over a few voxels and not over its points.
+Points are summed up in voxels first, so that a neighbourhood is a sum over a few voxels and not
+over its points.
 """
 
 from __future__ import annotations
@@ -17,7 +19,9 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 B = NDArray[np.bool_]
 
-NO_TILT, NO_ORDER = 1 / 3, 1 / 3  # of surroundings without normals: as if they pointed everywhere
+# of surroundings without normals: as if they pointed everywhere
+NO_TILT = 1 / 3
+NO_ORDER = 1 / 3
 MOST_GAP = 3  # empty voxels within one column
 LEAST = 5  # points that a normal is taken from: three always lie in a plane
 CROWN = 16  # voxels; how far above it something may spread over a trunk
@@ -25,8 +29,9 @@ CROWN = 16  # voxels; how far above it something may spread over a trunk
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Voxels:
-    """Occupied voxels (m, 3) from a corner at zero, in columns and from low to high; ``of_point`` (n,); column a = i * ny + j holds voxels
-    start[a] .. start[a + 1]."""
+    """Occupied voxels (m, 3) from a corner at zero, in columns and from low to high; ``of_point``
+    (n,); column a = i * ny + j holds voxels start[a] .. start[a + 1].
+    """
 
     ijk: I64
     of_point: I64
@@ -38,12 +43,14 @@ class Voxels:
 class VoxelShapes:
     """One entry for each occupied voxel (m,); lengths in metres.
 
-    ``rough``: standard deviation of the points of 3^3 voxels along their normal. ``tilt`` and ``wide_tilt``: mean squared vertical part of
-    the normals of 5^3 and 9^3 voxels (0: upright surfaces only, 1: level ones only); ``disorder`` and ``wide_disorder``: smallest
-    eigenvalue of these normals' second moments (0: planes that share a line, 1/3: no order at all). ``thick`` and ``long``: standard
-    deviation of the points of the 3 x 3 columns within four voxels, horizontally where it is greatest, and vertically.
-    ``up``, ``down``: how far these columns go on without a gap of a metre. ``beside``: number of voxels at 2 and 3 voxels from them, two up
-    and two down. ``crown``: number of voxels beside and 3 to 16 voxels above.
+    ``rough``: standard deviation of the points of 3^3 voxels along their normal. ``tilt`` and
+    ``wide_tilt``: mean squared vertical part of the normals of 5^3 and 9^3 voxels (0: upright
+    surfaces only, 1: level ones only); ``disorder`` and ``wide_disorder``: smallest eigenvalue of
+    these normals' second moments (0: planes that share a line, 1/3: no order at all). ``thick`` and
+    ``long``: standard deviation of the points of the 3 x 3 columns within four voxels, horizontally
+    where it is greatest, and vertically. ``up``, ``down``: how far these columns go on without a
+    gap of a metre. ``beside``: number of voxels at 2 and 3 voxels from them, two up and two down.
+    ``crown``: number of voxels beside and 3 to 16 voxels above.
     """
 
     rough: F64
@@ -60,26 +67,45 @@ class VoxelShapes:
 
 
 def voxelise(points: F64, size: float) -> Voxels:
-    """Voxels of ``size`` metres that ``points`` (n, 3), n > 0, occupy; memory goes with the area that they cover."""
+    """Voxels of ``size`` metres that ``points`` (n, 3), n > 0, occupy; memory goes with the area
+    that they cover.
+    """
     ijk = np.floor(points / size).astype(np.int64)
     ijk -= ijk.min(0)
     nx, ny, nz = (ijk.max(0) + 1).tolist()
     key, of_point = np.unique((ijk[:, 0] * ny + ijk[:, 1]) * nz + ijk[:, 2], return_inverse=True)
     column = key // nz
     start = np.r_[0, np.cumsum(np.bincount(column, minlength=nx * ny))]
-    return Voxels(np.stack([column // ny, column % ny, key % nz], 1), of_point.reshape(-1), (nx, ny), start)
+    return Voxels(
+        np.stack([column // ny, column % ny, key % nz], 1), of_point.reshape(-1), (nx, ny), start
+    )
 
 
 def voxel_shapes(points: F64, voxels: Voxels, size: float) -> VoxelShapes:
-    """Shapes of the surroundings of each of ``voxels`` of ``size`` metres made from ``points`` (n, 3)."""
+    """Shapes of the surroundings of each of ``voxels`` of ``size`` metres made from ``points`` (n,
+    3).
+    """
     nx, ny = voxels.shape
     moments = _moments(points - points.mean(0), voxels.of_point, len(voxels.ijk))
     rough, normal = _normals(voxels.ijk, moments, voxels.start, nx, ny)
     values, counts = _surroundings(voxels.ijk, moments, normal, voxels.start, nx, ny)
     up, down = _columns(voxels.ijk, voxels.start, nx, ny)
     tilt, disorder, wide_tilt, wide_disorder, thick, long = values.T
-    metres_up, metres_down = size * up.astype(np.float64), size * down.astype(np.float64)
-    return VoxelShapes(rough, tilt, disorder, wide_tilt, wide_disorder, thick, long, metres_up, metres_down, counts[:, 0], counts[:, 1])
+    metres_up = size * up.astype(np.float64)
+    metres_down = size * down.astype(np.float64)
+    return VoxelShapes(
+        rough,
+        tilt,
+        disorder,
+        wide_tilt,
+        wide_disorder,
+        thick,
+        long,
+        metres_up,
+        metres_down,
+        counts[:, 0],
+        counts[:, 1],
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -104,10 +130,16 @@ def _moments(p: F64, of_point: I64, m: int) -> F64:
 
 @njit(cache=True, nogil=True)
 def _normals(ijk: I64, moments: F64, start: I64, nx: int, ny: int) -> tuple[F64, F64]:
-    """Least standard deviation (m,) of the points of 3^3 voxels and its direction (m, 3), zero where the points are too few."""
+    """Least standard deviation (m,) of the points of 3^3 voxels and its direction (m, 3), zero
+    where the points are too few.
+    """
     m = len(ijk)
-    rough, normal = np.empty(m), np.empty((m, 3))
-    total, a, values, vectors = np.empty(10), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    rough = np.empty(m)
+    normal = np.empty((m, 3))
+    total = np.empty(10)
+    a = np.empty((3, 3))
+    values = np.empty(3)
+    vectors = np.empty((3, 3))
     for k in range(m):
         i, j, z = ijk[k]
         total[:] = 0.0
@@ -130,15 +162,25 @@ def _normals(ijk: I64, moments: F64, start: I64, nx: int, ny: int) -> tuple[F64,
 
 
 @njit(cache=True, nogil=True)
-def _surroundings(ijk: I64, moments: F64, normal: F64, start: I64, nx: int, ny: int) -> tuple[F64, I64]:
-    """tilt, disorder, wide tilt, wide disorder, thickness, length (m, 6); voxels beside and in the crown (m, 2)."""
+def _surroundings(
+    ijk: I64, moments: F64, normal: F64, start: I64, nx: int, ny: int
+) -> tuple[F64, I64]:
+    """tilt, disorder, wide tilt, wide disorder, thickness, length (m, 6); voxels beside and in the
+    crown (m, 2).
+    """
     m = len(ijk)
-    out, counts = np.empty((m, 6)), np.zeros((m, 2), np.int64)
-    outer, near, wide, tall = np.empty((m, 7)), np.empty(7), np.empty(7), np.empty(10)
+    out = np.empty((m, 6))
+    counts = np.zeros((m, 2), np.int64)
+    outer = np.empty((m, 7))
+    near = np.empty(7)
+    wide = np.empty(7)
+    tall = np.empty(10)
     for k in range(m):
         x, y, z = normal[k]
         outer[k] = np.array((x * x, x * y, x * z, y * y, y * z, z * z, x * x + y * y + z * z))
-    a, values, vectors = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    a = np.empty((3, 3))
+    values = np.empty(3)
+    vectors = np.empty((3, 3))
     for k in range(m):
         i, j, z = ijk[k]
         near[:], wide[:], tall[:] = 0.0, 0.0, 0.0
@@ -169,7 +211,9 @@ def _surroundings(ijk: I64, moments: F64, normal: F64, start: I64, nx: int, ny: 
 
 @njit(cache=True, nogil=True)
 def _order(total: F64, a: F64, values: F64, vectors: F64) -> tuple[float, float]:
-    """Mean squared vertical part of summed normals, and the smallest eigenvalue of their second moments."""
+    """Mean squared vertical part of summed normals, and the smallest eigenvalue of their second
+    moments.
+    """
     if total[6] < 1e-9:
         return NO_TILT, NO_ORDER
     t = 0
@@ -186,8 +230,13 @@ def _order(total: F64, a: F64, values: F64, vectors: F64) -> tuple[float, float]
 def _thickness(total: F64) -> tuple[float, float]:
     """Standard deviations of summed points: horizontally along the longer axis, and vertically."""
     n = total[0]
-    x, y, z = total[1] / n, total[2] / n, total[3] / n
-    xx, xy, yy, zz = total[4] / n - x * x, total[5] / n - x * y, total[7] / n - y * y, total[9] / n - z * z
+    x = total[1] / n
+    y = total[2] / n
+    z = total[3] / n
+    xx = total[4] / n - x * x
+    xy = total[5] / n - x * y
+    yy = total[7] / n - y * y
+    zz = total[9] / n - z * z
     longer = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
     return np.sqrt(max(longer, 0.0)), np.sqrt(max(zz, 0.0))
 
@@ -196,7 +245,8 @@ def _thickness(total: F64) -> tuple[float, float]:
 def _columns(ijk: I64, start: I64, nx: int, ny: int) -> tuple[I64, I64]:
     """Voxels that the 3 x 3 columns around each voxel go on up and down."""
     m = len(ijk)
-    up, down = np.zeros(m, np.int64), np.zeros(m, np.int64)
+    up = np.zeros(m, np.int64)
+    down = np.zeros(m, np.int64)
     height = ijk[:, 2].max() + 1
     taken = np.zeros(height, np.bool_)
     before = -1
@@ -206,13 +256,18 @@ def _columns(ijk: I64, start: I64, nx: int, ny: int) -> tuple[I64, I64]:
             before = i * ny + j
             taken[:] = False
             for u in range(max(i - 1, 0), min(i + 2, nx)):
-                for q in range(start[u * ny + max(j - 1, 0)], start[u * ny + min(j + 1, ny - 1) + 1]):
+                for q in range(
+                    start[u * ny + max(j - 1, 0)], start[u * ny + min(j + 1, ny - 1) + 1]
+                ):
                     taken[ijk[q, 2]] = True
         for direction in (1, -1):
-            t, reached, gap = z + direction, 0, 0
+            t = z + direction
+            reached = 0
+            gap = 0
             while 0 <= t < height and gap <= MOST_GAP:
                 if taken[t]:
-                    reached, gap = abs(t - z), 0
+                    reached = abs(t - z)
+                    gap = 0
                 else:
                     gap += 1
                 t += direction
@@ -224,16 +279,18 @@ def _columns(ijk: I64, start: I64, nx: int, ny: int) -> tuple[I64, I64]:
 
 
 def objects(voxels: Voxels, member: B, height: F64, size: float) -> tuple[F64, F64, F64]:
-    """Length, width and top (m,) of the object that each ``member`` voxel (m,) belongs to, seen from above; zeros for the others.
+    """Length, width and top (m,) of the object that each ``member`` voxel (m,) belongs to, seen
+    from above; zeros for the others.
 
-    Objects are columns of members that touch, also by their corners. Length and width are those of a rectangle with the same second
-    moments; the top is the greatest ``height`` (m,). Metres.
+    Objects are columns of members that touch, also by their corners. Length and width are those of
+    a rectangle with the same second moments; the top is the greatest ``height`` (m,). Metres.
     """
     number, count = _label(voxels.ijk, voxels.start, *voxels.shape, member)
     xy = voxels.ijk[:, :2].astype(np.float64)
     n = np.maximum(np.bincount(number, minlength=count), 1)
     mean = [np.bincount(number, xy[:, k], count) / n for k in range(2)]
-    dx, dy = xy[:, 0] - mean[0][number], xy[:, 1] - mean[1][number]
+    dx = xy[:, 0] - mean[0][number]
+    dy = xy[:, 1] - mean[1][number]
     xx, xy_, yy = (np.bincount(number, v, count) / n for v in (dx * dx, dx * dy, dy * dy))
     root = np.sqrt(0.25 * (xx - yy) ** 2 + xy_**2)
     axes = [size * np.sqrt(12 * np.maximum(0.5 * (xx + yy) + s * root, 0.0) + 1.0) for s in (1, -1)]
@@ -256,9 +313,12 @@ def _label(ijk: I64, start: I64, nx: int, ny: int, member: B) -> tuple[I64, int]
         number[first], stack[0], size = count, first, 1
         while size:
             size -= 1
-            i, j = ijk[stack[size], 0], ijk[stack[size], 1]
+            i = ijk[stack[size], 0]
+            j = ijk[stack[size], 1]
             for u in range(max(i - 1, 0), min(i + 2, nx)):
-                for q in range(start[u * ny + max(j - 1, 0)], start[u * ny + min(j + 1, ny - 1) + 1]):
+                for q in range(
+                    start[u * ny + max(j - 1, 0)], start[u * ny + min(j + 1, ny - 1) + 1]
+                ):
                     if member[q] and not number[q]:
                         number[q], stack[size] = count, q
                         size += 1

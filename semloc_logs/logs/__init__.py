@@ -1,1 +1,3 @@
-"""Log -> typed frames, and results -> channels of a log: the only code that knows containers and messages."""
+"""Log -> typed frames, and results -> channels of a log: the only code that knows containers and
+messages.
+"""

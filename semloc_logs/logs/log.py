@@ -1,4 +1,6 @@
-"""A recorded log whatever its container: its streams, its messages in log-time order, and the frames that they decode to."""
+"""A recorded log whatever its container: its streams, its messages in log-time order, and the
+frames that they decode to.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,10 @@ from semloc_logs.frames import Frame
 class Stream:
     """One topic of one message type.
 
-    ``type`` is spelled as in ROS 2 (``sensor_msgs/msg/PointCloud2``) for ROS logs of both generations, ``foxglove.PointCloud`` for
-    Foxglove's protobuf and JSON messages, "" when unknown. ``encoding`` is that of the messages: ``cdr``, ``ros1``, ``protobuf``,
-    ``json`` or whatever the log claims. ``count`` is the number of messages that can be read.
+    ``type`` is spelled as in ROS 2 (``sensor_msgs/msg/PointCloud2``) for ROS logs of both
+    generations, ``foxglove.PointCloud`` for Foxglove's protobuf and JSON messages, "" when unknown.
+    ``encoding`` is that of the messages: ``cdr``, ``ros1``, ``protobuf``, ``json`` or whatever the
+    log claims. ``count`` is the number of messages that can be read.
     """
 
     topic: str
@@ -27,7 +30,9 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """How the messages of a stream are laid out: ``text`` in the schema language ``encoding``; both empty when the log has none."""
+    """How the messages of a stream are laid out: ``text`` in the schema language ``encoding``; both
+    empty when the log has none.
+    """
 
     name: str
     encoding: str  # ros2msg, ros2idl, ros1msg, protobuf (a FileDescriptorSet), jsonschema
@@ -58,7 +63,9 @@ class Log(Protocol):
 
     @property
     def encoding(self) -> str:
-        """``ros2``, ``ros1``, ``protobuf`` or ``json``: what most streams are recorded in; "" when there are none."""
+        """``ros2``, ``ros1``, ``protobuf`` or ``json``: what most streams are recorded in; "" when
+        there are none.
+        """
 
     @property
     def start_ns(self) -> int | None:
@@ -85,7 +92,8 @@ class Log(Protocol):
     def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
         """The frames of ``topics`` in log-time order; a message may yield several, or none.
 
-        A message that cannot be decoded is skipped, counted, and named once per topic in ``problems``.
+        A message that cannot be decoded is skipped, counted, and named once per topic in
+        ``problems``.
         """
 
     def close(self) -> None:

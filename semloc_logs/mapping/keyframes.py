@@ -1,4 +1,6 @@
-"""The pass over a log: which clouds become keyframes, thinned and kept on disk until gravity and the meaning of labels are known."""
+"""The pass over a log: which clouds become keyframes, thinned and kept on disk until gravity and
+the meaning of labels are known.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,10 @@ MOST_NORMALS = 20  # keyframes whose normals say where up is
 
 @dataclass(slots=True, eq=False)
 class Collected:
-    """Keyframe by keyframe: ``headers``, ``poses`` session_T_base (4, 4) or None, and ``origins`` (3,) of the sensor in the base frame;
-    their points, thinned to one a ``cell`` (m), are in files of the folder ``scratch``."""
+    """Keyframe by keyframe: ``headers``, ``poses`` session_T_base (4, 4) or None, and ``origins``
+    (3,) of the sensor in the base frame; their points, thinned to one a ``cell`` (m), are in files
+    of the folder ``scratch``.
+    """
 
     scratch: Path
     cell: float
@@ -41,7 +45,9 @@ class Collected:
         return len(self.headers)
 
     def add(self, cloud: PosedCloud, kept: NDArray[np.int64], label: U32 | None = None) -> None:
-        """A keyframe: the points ``kept`` (m,) of ``cloud``, and their labels (m,) as recorded, if any."""
+        """A keyframe: the points ``kept`` (m,) of ``cloud``, and their labels (m,) as recorded, if
+        any.
+        """
         number = len(self)
         self._save(number, "points", cloud.points[kept])
         self._save(number, "label", label)
@@ -51,18 +57,22 @@ class Collected:
         self.origins.append(cloud.origin)
 
     def load(self, keyframe: int) -> tuple[F32, U32 | None, F32 | None]:
-        """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of their range, where there are any.
+        """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of
+        their range, where there are any.
 
         WorkspaceError when somebody removed them, as a second ``fuse`` of the same session would.
         """
         points = self._load(keyframe, "points")
         if points is None:
-            raise WorkspaceError(f"{self.scratch} was removed meanwhile: fuse a session in one process at a time.")
+            raise WorkspaceError(
+                f"{self.scratch} was removed meanwhile: fuse a session in one process at a time."
+            )
         return points, self._load(keyframe, "label"), self._load(keyframe, "sigma")
 
     def normals(self, most: int = MOST_NORMALS) -> list[tuple[int, F64, F64]]:
-        """Of ``most`` keyframes, evenly spread: number, unit normals (m, 3) of surfaces in the session frame, or in the base frame
-        without poses, and their weights (m,)."""
+        """Of ``most`` keyframes, evenly spread: number, unit normals (m, 3) of surfaces in the
+        session frame, or in the base frame without poses, and their weights (m,).
+        """
         out = []
         for i in np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64)).tolist():
             points, _, sigma = self.load(i)
@@ -81,12 +91,24 @@ class Collected:
         return np.load(path, allow_pickle=False) if path.exists() else None
 
 
-def collect(session: Session, labeller: Labeller, fusion: Fusion, scratch: Path, on_progress: Callable[[str], None]) -> Collected:
-    """Read the log once: thinned points of its keyframes go to files of ``scratch``, what is small stays in memory."""
-    collected, selector = Collected(scratch, fusion.keyframe_resolution or 0.1), KeyframeSelector(fusion)
+def collect(
+    session: Session,
+    labeller: Labeller,
+    fusion: Fusion,
+    scratch: Path,
+    on_progress: Callable[[str], None],
+) -> Collected:
+    """Read the log once: thinned points of its keyframes go to files of ``scratch``, what is small
+    stays in memory.
+    """
+    collected = Collected(scratch, fusion.keyframe_resolution or 0.1)
+    selector = KeyframeSelector(fusion)
     clouds = session.clouds(labeller.on_image, labeller.images)
-    # pictures come through the labeller in the same pass: they must not overtake the clouds that they are painted on
-    with closing(ahead(clouds) if labeller.on_image is None else (cloud for cloud in clouds)) as coming:
+    # pictures come through the labeller in the same pass: they must not overtake the clouds that
+    # they are painted on
+    with closing(
+        ahead(clouds) if labeller.on_image is None else (cloud for cloud in clouds)
+    ) as coming:
         for cloud in coming:
             if selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
                 kept = thin(cloud.points, collected.cell)

@@ -1,4 +1,6 @@
-"""The gravity-aligned map frame of a session, from the IMU or from the floors and walls that its keyframes show."""
+"""The gravity-aligned map frame of a session, from the IMU or from the floors and walls that its
+keyframes show.
+"""
 
 from __future__ import annotations
 
@@ -13,37 +15,49 @@ from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.numerics.transforms import inverse, rotation_between
 
 F64 = NDArray[np.float64]
-REACH = 3_000_000  # voxels; of the tables that are indexed by place the coarse one of the ground ends first (voxels/keys.py)
+# voxels; of the tables that are indexed by place the coarse one of the ground ends first
+# (voxels/keys.py)
+REACH = 3_000_000
 UP = np.array([0.0, 0.0, 1.0])
 
 
 def level(session: Session, collected: Collected) -> tuple[F64, F64]:
     """``session_T_map`` (4, 4) and ``map_T_base`` (n, 4, 4) of every keyframe.
 
-    The map is level and has its origin at the first keyframe, because poses may be in UTM and voxels, words and surfaces want small
-    numbers. In a log without poses each keyframe is levelled by itself and the map is the session.
+    The map is level and has its origin at the first keyframe, because poses may be in UTM and
+    voxels, words and surfaces want small numbers. In a log without poses each keyframe is levelled
+    by itself and the map is the session.
     """
-    optical = session.base_frame.endswith("_optical") or session.base_frame in {c.header.frame_id for c in session.cameras.values()}
+    optical = session.base_frame.endswith("_optical") or session.base_frame in {
+        c.header.frame_id for c in session.cameras.values()
+    }
     up_in_base = np.array([0.0, -1.0, 0.0]) if optical else UP
     known = [p for p in collected.poses if p is not None]
     if not known:
         return np.eye(4), _each_level(collected, up_in_base)
     prior = session.imu_up_in_session()
     if prior is None:
-        # a vehicle's frames follow REP 103, and so does its odometry; a camera's world may be any of its frames
+        # a vehicle's frames follow REP 103, and so does its odometry; a camera's world may be any
+        # of its frames
         prior = (np.array([p[:3, :3] for p in known]) @ up_in_base).mean(0) if optical else UP
     normals = collected.normals()
     session_T_map = np.eye(4)
     session_T_map[:3, :3] = rotation_between(
-        UP, find_up(np.concatenate([k[1] for k in normals]), np.concatenate([k[2] for k in normals]), prior)
+        UP,
+        find_up(
+            np.concatenate([k[1] for k in normals]), np.concatenate([k[2] for k in normals]), prior
+        ),
     )
     session_T_map[:3, 3] = known[0][:3, 3]
     return session_T_map, inverse(session_T_map) @ np.array(known)
 
 
 def check_reach(session: Session, collected: Collected, voxel_size: float) -> None:
-    """LogError where the poses leave the space that voxels have numbers for, 3 million of them from the first keyframe."""
-    reach, first = REACH * voxel_size, None
+    """LogError where the poses leave the space that voxels have numbers for, 3 million of them from
+    the first keyframe.
+    """
+    reach = REACH * voxel_size
+    first = None
     for header, pose in zip(collected.headers, collected.poses, strict=True):
         if pose is None:
             continue
@@ -58,8 +72,13 @@ def check_reach(session: Session, collected: Collected, voxel_size: float) -> No
 
 
 def _each_level(collected: Collected, up_in_base: F64) -> F64:
-    """Level poses (n, 4, 4) of keyframes without poses, by the nearest keyframe whose direction of gravity was found."""
-    found = {number: find_up(normals, weights, up_in_base) for number, normals, weights in collected.normals()}
+    """Level poses (n, 4, 4) of keyframes without poses, by the nearest keyframe whose direction of
+    gravity was found.
+    """
+    found = {
+        number: find_up(normals, weights, up_in_base)
+        for number, normals, weights in collected.normals()
+    }
     keys = np.array(sorted(found))
     poses = np.tile(np.eye(4), (len(collected), 1, 1))
     for i in range(len(collected)):

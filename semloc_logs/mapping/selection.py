@@ -23,14 +23,15 @@ def _first_in_cells(points: NDArray[np.float32], cell: np.float32) -> NDArray[np
     size = 1024
     while size < 2 * len(points):
         size *= 2
-    keys, filled = np.empty(size, np.int64), np.zeros(size, np.bool_)
-    kept, count, last = np.empty(len(points), np.int64), 0, np.int64(-1)
+    keys = np.empty(size, np.int64)
+    filled = np.zeros(size, np.bool_)
+    kept = np.empty(len(points), np.int64)
+    count = 0
+    last = np.int64(-1)
     for i in range(len(points)):
-        x, y, z = (
-            np.int64(np.floor(points[i, 0] / cell)),
-            np.int64(np.floor(points[i, 1] / cell)),
-            np.int64(np.floor(points[i, 2] / cell)),
-        )
+        x = np.int64(np.floor(points[i, 0] / cell))
+        y = np.int64(np.floor(points[i, 1] / cell))
+        z = np.int64(np.floor(points[i, 2] / cell))
         key = (x << 42) + (y << 21) + z
         if count and key == last:
             continue
@@ -46,7 +47,9 @@ def _first_in_cells(points: NDArray[np.float32], cell: np.float32) -> NDArray[np
 
 
 class KeyframeSelector:
-    """Says of each frame of a stream in turn whether it has moved or turned enough since the stream's last keyframe."""
+    """Says of each frame of a stream in turn whether it has moved or turned enough since the
+    stream's last keyframe.
+    """
 
     def __init__(self, fusion: Fusion) -> None:
         self._distance = fusion.keyframe_distance or 0.0
@@ -61,7 +64,10 @@ class KeyframeSelector:
                 near = stamp_ns - last_stamp < UNPOSED_SPACING_NS
             else:
                 moved = inverse(last) @ session_T_base
-                near = float(np.linalg.norm(moved[:3, 3])) < self._distance and rotation_angle(moved[:3, :3]) < self._angle
+                near = (
+                    float(np.linalg.norm(moved[:3, 3])) < self._distance
+                    and rotation_angle(moved[:3, :3]) < self._angle
+                )
             if near:
                 return False
         self._last[topic] = (stamp_ns, session_T_base)
@@ -72,30 +78,41 @@ def road_distance(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distance (n,) travelled from the first of poses (n, 4, 4), metres."""
     if not len(poses):
         return np.zeros(0)
-    return np.asarray(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+    return np.asarray(
+        np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))]
+    )
 
 
-def submap_ranges(distance: NDArray[np.float64], length: float, overlap: float) -> list[tuple[int, int]]:
-    """Ranges [first, last) of keyframes whose road ``distance`` (n,) lies in stretches of ``length``, each overlapping the next.
+def submap_ranges(
+    distance: NDArray[np.float64], length: float, overlap: float
+) -> list[tuple[int, int]]:
+    """Ranges [first, last) of keyframes whose road ``distance`` (n,) lies in stretches of
+    ``length``, each overlapping the next.
 
     The last stretch is pulled back to full length, so that no submap is a short remnant.
     """
     if not len(distance):
         return []
-    total, step = float(distance[-1]), length * (1.0 - overlap)
+    total = float(distance[-1])
+    step = length * (1.0 - overlap)
     slack = 1e-9 * max(total, 1.0)  # (total - length) + length may round to less than total
 
     def held(start: float) -> tuple[int, int]:
         ends = start - slack, start + length + slack
-        return int(np.searchsorted(distance, ends[0])), int(np.searchsorted(distance, ends[1], side="right"))
+        return int(np.searchsorted(distance, ends[0])), int(
+            np.searchsorted(distance, ends[1], side="right")
+        )
 
-    ranges, k = dict[tuple[int, int], None](), 0
+    ranges = dict[tuple[int, int], None]()
+    k = 0
     while k * step < total - length:
         first, last = held(k * step)
         if first < last:
             ranges[first, last] = None
-        # stretches up to where a keyframe leaves or comes are the same, or hold none: where poses jump these are very many
-        leaves, comes = distance[first] / step, (distance[last] - length) / step if last < len(distance) else np.inf
+        # stretches up to where a keyframe leaves or comes are the same, or hold none: where poses
+        # jump these are very many
+        leaves = distance[first] / step
+        comes = (distance[last] - length) / step if last < len(distance) else np.inf
         k = max(k + 1, int(min(leaves, comes)) - 1)
     ranges[held(max(total - length, 0.0))] = None
     return list(ranges)

@@ -1,4 +1,6 @@
-"""Fusing one session: log -> keyframes, submaps and the session map (paper 3.1). One pass over the log, bounded memory."""
+"""Fusing one session: log -> keyframes, submaps and the session map (paper 3.1). One pass over the
+log, bounded memory.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,14 @@ from semloc_logs.tables import contracts
 from semloc_logs.tables.table import replacing_folder, write_json, write_table
 from semloc_logs.voxels.carve import Carver
 from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map
-from semloc_logs.voxels.store import Keyframe, blocks_path, keep_keyframes, pose_columns, write_blocks, write_voxels
+from semloc_logs.voxels.store import (
+    Keyframe,
+    blocks_path,
+    keep_keyframes,
+    pose_columns,
+    write_blocks,
+    write_voxels,
+)
 from semloc_logs.workspace import SessionFolder
 
 VIEW = 24.0  # m at voxels of 0.30 m: as far as a query looks
@@ -54,10 +63,13 @@ class FuseTask:
     poses: TrajectoryFile | None = None
 
 
-def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+def fuse_session(
+    task: FuseTask, on_progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Any]:
     """Write every table, map.png and, last, session.json; returns the latter.
 
-    Raises LogError when the log has nothing to fuse, RoleError when its streams leave open what to use.
+    Raises LogError when the log has nothing to fuse, RoleError when its streams leave open what to
+    use.
     """
     fusion = task.settings.fusion
     session = open_session(
@@ -74,7 +86,9 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
             labeller = Labeller(task.settings.labels, session)
             collected = collect(session, labeller, fusion, scratch, on_progress)
             if not len(collected):
-                raise LogError(f"{session.name} gave no usable points: {'; '.join(session.problems) or 'its sensor streams are empty'}")
+                raise LogError(
+                    f"{session.name} gave no usable points: {'; '.join(session.problems) or 'its sensor streams are empty'}"
+                )
             check_reach(session, collected, fusion.voxel_size)
             labeller.conclude()
             session_T_map, poses = level(session, collected)
@@ -112,7 +126,9 @@ def fuse_session(task: FuseTask, on_progress: Callable[[str], None] = lambda _: 
 
 @contextmanager
 def _scratch(folder: SessionFolder) -> Iterator[Path]:
-    """A folder for the keyframes of the pass, beside the results: temporary folders of the system may be memory."""
+    """A folder for the keyframes of the pass, beside the results: temporary folders of the system
+    may be memory.
+    """
     folder.path.mkdir(parents=True, exist_ok=True)
     for stale in folder.path.glob(".scratch.*"):  # of a run that was killed
         shutil.rmtree(stale, ignore_errors=True)
@@ -122,8 +138,9 @@ def _scratch(folder: SessionFolder) -> Iterator[Path]:
 
 @dataclass(slots=True, eq=False)
 class _Fused:
-    """The second half: labelled keyframes, submaps, the session map, as a chain of iterators that holds a few keyframes and the
-    submaps that are being driven through."""
+    """The second half: labelled keyframes, submaps, the session map, as a chain of iterators that
+    holds a few keyframes and the submaps that are being driven through.
+    """
 
     task: FuseTask
     collected: Collected
@@ -137,19 +154,29 @@ class _Fused:
     submaps: list[dict[str, Any]] = field(default_factory=list)
 
     def write(self) -> dict[str, Any]:
-        """Write every table but the trajectory, and the picture; returns what session.json says of them."""
-        folder, fusion, n = self.task.folder, self.task.settings.fusion, len(self.collected)
+        """Write every table but the trajectory, and the picture; returns what session.json says of
+        them.
+        """
+        folder = self.task.folder
+        fusion = self.task.settings.fusion
+        n = len(self.collected)
         posed = self.collected.poses[0] is not None
         distance = road_distance(self.poses) if posed else np.zeros(n)
         # without poses there is no map: the keyframes only ask
-        ranges = submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap) if posed else []
+        ranges = (
+            submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap)
+            if posed
+            else []
+        )
         stamps = [h.stamp_ns for h in self.collected.headers]
         ground = GroundMapper(fusion.voxel_size / STREET_VOXEL)
         with (
             replacing_folder(folder.keyframes) as keyframes,
             replacing_folder(folder.blocks) as blocks,
             # whatever happens, the other threads end before their folders are renamed or removed
-            closing(ahead(keep_keyframes(keyframes, stamps, self._labelled(ground), self.metadata))) as kept,
+            closing(
+                ahead(keep_keyframes(keyframes, stamps, self._labelled(ground), self.metadata))
+            ) as kept,
             closing(ahead(self._kept_submaps(blocks, kept, ranges), depth=1)) as submaps,
         ):
             voxels = write_voxels(folder.voxels, submaps, self.metadata, fusion.clamp)
@@ -174,7 +201,12 @@ class _Fused:
         write_table(folder.frames, contracts.table("frames", frames), self.metadata, ("keyframe",))
         write_ground(folder.ground, ground.finish(), self.metadata)
         caption = Caption(folder.name, self.labeller.source, fusion.voxel_size)
-        draw_map(folder.voxels, self.poses[:, :3, 3] if posed else np.zeros((0, 3)), caption, folder.picture)
+        draw_map(
+            folder.voxels,
+            self.poses[:, :3, 3] if posed else np.zeros((0, 3)),
+            caption,
+            folder.picture,
+        )
         return {"posed": posed, "keyframes": n, "submaps": self.submaps, "voxels": voxels}
 
     def _labelled(self, ground: GroundMapper) -> Iterator[Keyframe]:
@@ -182,10 +214,15 @@ class _Fused:
         scale = self.task.settings.fusion.voxel_size / STREET_VOXEL
         for i, pose in enumerate(self.poses):
             points, ids, sigma = self.collected.load(i)
-            level_points, origin = apply(pose, points), apply(pose, self.collected.origins[i][None])[0]
+            level_points = apply(pose, points)
+            origin = apply(pose, self.collected.origins[i][None])[0]
             self.grounds.append(ground_height(level_points, origin, scale))
             is_mapped = self.collected.poses[i] is not None and ground.wants(origin)
-            surface = ground_surface(level_points, origin, scale) if is_mapped or self.labeller.source == "geometry" else None
+            surface = (
+                ground_surface(level_points, origin, scale)
+                if is_mapped or self.labeller.source == "geometry"
+                else None
+            )
             if is_mapped and surface is not None:
                 ground.add(surface, origin)
             label = self.labeller.labels(i, level_points, origin, ids, scale, surface)
@@ -196,38 +233,62 @@ class _Fused:
                 self.on_progress(f"labelled {i + 1} of {len(self.poses)} keyframes")
             yield Keyframe(points[keep], label[keep], None if sigma is None else sigma[keep])
 
-    def _kept_submaps(self, folder: Path, keyframes: Iterable[Keyframe], ranges: list[tuple[int, int]]) -> Iterator[BlockMap]:
+    def _kept_submaps(
+        self, folder: Path, keyframes: Iterable[Keyframe], ranges: list[tuple[int, int]]
+    ) -> Iterator[BlockMap]:
         """Every submap, once it is written to ``folder``."""
-        for i, blocks in enumerate(fuse_ranges(keyframes, ranges, self.poses, self.collected.origins, self.task.settings.fusion)):
+        for i, blocks in enumerate(
+            fuse_ranges(
+                keyframes, ranges, self.poses, self.collected.origins, self.task.settings.fusion
+            )
+        ):
             write_blocks(blocks_path(folder, i), blocks, {**self.metadata, "submap": i})
             first, last = ranges[i]
             ground = float(np.median(self.grounds[first:last]))
-            self.submaps.append({"id": i, "first": first, "last": last - 1, "ground_z": ground, "blocks": len(blocks.keys)})
+            self.submaps.append(
+                {
+                    "id": i,
+                    "first": first,
+                    "last": last - 1,
+                    "ground_z": ground,
+                    "blocks": len(blocks.keys),
+                }
+            )
             self.on_progress(f"fused submap {i + 1} of {len(ranges)}")
             yield blocks
 
 
 def _view(points: NDArray[np.floating], origin: NDArray[np.floating], radius: float) -> F64:
-    """Mean (3,) of the points within ``radius`` metres of the sensor, its centre where there are none."""
+    """Mean (3,) of the points within ``radius`` metres of the sensor, its centre where there are
+    none.
+    """
     near = points[np.linalg.norm(points - origin, axis=1) < radius]
     return np.asarray(near.mean(0, dtype=float) if len(near) else origin, float)
 
 
 def fuse_ranges(
-    keyframes: Iterable[Keyframe], ranges: list[tuple[int, int]], poses: F64, origins: Sequence[NDArray[np.floating]], fusion: Fusion
+    keyframes: Iterable[Keyframe],
+    ranges: list[tuple[int, int]],
+    poses: F64,
+    origins: Sequence[NDArray[np.floating]],
+    fusion: Fusion,
 ) -> Iterator[BlockMap]:
-    """The map of each of ``ranges`` [first, last) of ``keyframes``, which come one by one; both bounds never decrease.
+    """The map of each of ``ranges`` [first, last) of ``keyframes``, which come one by one; both
+    bounds never decrease.
 
     Only the ranges that hold the current keyframe are in memory: the others are not begun, or done.
     """
-    carver, active = Carver(fusion), dict[int, Fuser]()
+    carver = Carver(fusion)
+    active = dict[int, Fuser]()
     begun = 0
     for i, keyframe in enumerate(keyframes):
         while begun < len(ranges) and ranges[begun][0] <= i:
             active[begun] = Fuser(fusion)
             begun += 1
         if active:
-            marks = carver.marks(keyframe.points, keyframe.label, origins[i], keyframe.sigma, poses[i])
+            marks = carver.marks(
+                keyframe.points, keyframe.label, origins[i], keyframe.sigma, poses[i]
+            )
             for fuser in active.values():
                 fuser.take(marks)
         for number in [n for n in active if ranges[n][1] == i + 1]:

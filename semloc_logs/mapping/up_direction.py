@@ -1,4 +1,6 @@
-"""Which way is up: the direction that the map's own floors and walls agree on, near a prior (IMU or frame convention)."""
+"""Which way is up: the direction that the map's own floors and walls agree on, near a prior (IMU or
+frame convention).
+"""
 
 from __future__ import annotations
 
@@ -11,19 +13,28 @@ from semloc_logs.numerics.local_shape import shape
 
 F64 = NDArray[np.float64]
 MOST_POINTS = 12_000  # of a keyframe that normals are taken from
-FINENESS = 25.0  # so many cells lie one behind the other within the median range, where the points are as dense as that
+# so many cells lie one behind the other within the median range, where the points are as dense as
+# that
+FINENESS = 25.0
 PLUMB = 5.0  # a wall's word against a floor's: houses are built plumb, streets follow the land
 
 
-def surface_normals(points: NDArray[np.float32], origin: NDArray[np.floating], cell: float, noise: float = 0.0) -> tuple[F64, F64]:
+def surface_normals(
+    points: NDArray[np.float32], origin: NDArray[np.floating], cell: float, noise: float = 0.0
+) -> tuple[F64, F64]:
     """Unit normals (m, 3) of flat places among ``points`` (n, 3) and their weights (m,).
 
-    The points are thinned to cells of ``cell`` metres, to smaller ones in a room that is small for its voxels, and to larger ones where
-    there are too many or where ``noise``, the standard deviation of their ranges (m), would turn the normals.
+    The points are thinned to cells of ``cell`` metres, to smaller ones in a room that is small for
+    its voxels, and to larger ones where there are too many or where ``noise``, the standard
+    deviation of their ranges (m), would turn the normals.
     """
     if not len(points):
         return np.zeros((0, 3)), np.zeros(0)
-    cell = max(min(cell, float(np.median(np.linalg.norm(points - origin, axis=1))) / FINENESS), 2 * noise, 1e-3)
+    cell = max(
+        min(cell, float(np.median(np.linalg.norm(points - origin, axis=1))) / FINENESS),
+        2 * noise,
+        1e-3,
+    )
     some = points[thin(points, cell)]
     while len(some) > MOST_POINTS:
         cell *= max(1.05, float(np.sqrt(len(some) / MOST_POINTS)))
@@ -34,28 +45,39 @@ def surface_normals(points: NDArray[np.float32], origin: NDArray[np.floating], c
     return s.normal[keep].astype(float), weight[keep]
 
 
-def find_up(normals: NDArray[np.floating], weights: NDArray[np.floating], prior: F64, within: float = 0.7) -> F64:
-    """The unit direction within ``within`` radians of ``prior`` that most horizontal surfaces have as their normal.
+def find_up(
+    normals: NDArray[np.floating], weights: NDArray[np.floating], prior: F64, within: float = 0.7
+) -> F64:
+    """The unit direction within ``within`` radians of ``prior`` that most horizontal surfaces have
+    as their normal.
 
-    ``normals`` (n, 3) of unit length, any sign, with ``weights`` (n,). Walls count too: their normals are perpendicular to it.
-    The sum of both over candidates taken from the normals is maximised, then the optimum is refined to the least-squares direction
-    of the surfaces within 10, 5, 3 and 2 degrees. The prior is returned when there is nothing to see.
+    ``normals`` (n, 3) of unit length, any sign, with ``weights`` (n,). Walls count too: their
+    normals are perpendicular to it. The sum of both over candidates taken from the normals is
+    maximised, then the optimum is refined to the least-squares direction of the surfaces within 10,
+    5, 3 and 2 degrees. The prior is returned when there is nothing to see.
     """
     prior = np.asarray(prior, float) / np.linalg.norm(prior)
-    n, w = np.asarray(normals, float), np.asarray(weights, float)
+    n = np.asarray(normals, float)
+    w = np.asarray(weights, float)
     flip = np.where(n @ prior < 0, -1.0, 1.0)
     n = n * flip[:, None]
     near = np.flatnonzero((n @ prior > np.cos(within)) & (w > 0))
     if len(near) < 50:
         return prior
     rng = np.random.default_rng(0)
-    candidates = np.concatenate([n[rng.choice(near, min(500, len(near)), replace=False, p=w[near] / w[near].sum())], prior[None]])
+    candidates = np.concatenate(
+        [
+            n[rng.choice(near, min(500, len(near)), replace=False, p=w[near] / w[near].sum())],
+            prior[None],
+        ]
+    )
     some = rng.choice(len(n), min(8000, len(n)), replace=False)
     up = candidates[int(np.argmax([_agreement(n[some] @ c, w[some]) for c in candidates]))]
     for degrees in (10.0, 5.0, 3.0, 2.0, 2.0, 2.0):
         sine = np.sin(np.radians(degrees))
         dot = n @ up
-        floor, wall = np.abs(dot) > np.cos(np.radians(degrees)), np.abs(dot) < sine
+        floor = np.abs(dot) > np.cos(np.radians(degrees))
+        wall = np.abs(dot) < sine
         a = (n[floor] * w[floor, None]).T @ n[floor] - PLUMB * (n[wall] * w[wall, None]).T @ n[wall]
         vector = np.linalg.eigh(a)[1][:, -1]
         up = vector if vector @ prior > 0 else -vector
@@ -63,15 +85,23 @@ def find_up(normals: NDArray[np.floating], weights: NDArray[np.floating], prior:
 
 
 def _agreement(dot: F64, weight: F64) -> float:
-    """How much weight lies within about 3 degrees of horizontal, and half as much of what is vertical."""
+    """How much weight lies within about 3 degrees of horizontal, and half as much of what is
+    vertical.
+    """
     wide = 2 * 0.05**2
-    return float((weight * (np.exp(-(1 - np.abs(dot)) * 2 / wide) + 0.5 * np.exp(-(dot**2) / wide))).sum())
+    return float(
+        (weight * (np.exp(-(1 - np.abs(dot)) * 2 / wide) + 0.5 * np.exp(-(dot**2) / wide))).sum()
+    )
 
 
-def ground_height(level_points: NDArray[np.floating], origin: NDArray[np.floating], scale: float = 1.0) -> float:
-    """Height of the ground below a sensor at ``origin`` (3,) from points (n, 3) in a level frame, metres.
+def ground_height(
+    level_points: NDArray[np.floating], origin: NDArray[np.floating], scale: float = 1.0
+) -> float:
+    """Height of the ground below a sensor at ``origin`` (3,) from points (n, 3) in a level frame,
+    metres.
 
-    The mode of the heights of what is at least 0.3 m below the sensor and within 15 m, else the lowest 2 %.
+    The mode of the heights of what is at least 0.3 m below the sensor and within 15 m, else the
+    lowest 2 %.
     """
     z = _heights_near(np.ascontiguousarray(level_points), np.asarray(origin, float), 15 * scale)
     if not len(z):
@@ -89,7 +119,8 @@ def ground_height(level_points: NDArray[np.floating], origin: NDArray[np.floatin
 @njit(cache=True, nogil=True)
 def _heights_near(points: F64, origin: F64, radius: float) -> F64:
     """Heights of the points (n, 3) within ``radius`` of ``origin`` (3,) on the level."""
-    out, count = np.empty(len(points)), 0
+    out = np.empty(len(points))
+    count = 0
     for i in range(len(points)):
         if (points[i, 0] - origin[0]) ** 2 + (points[i, 1] - origin[1]) ** 2 < radius * radius:
             out[count] = points[i, 2]

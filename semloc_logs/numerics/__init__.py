@@ -1,1 +1,3 @@
-"""Rigid transforms, bits, small matrices and local shape: arithmetic that knows nothing of logs or maps."""
+"""Rigid transforms, bits, small matrices and local shape: arithmetic that knows nothing of logs or
+maps.
+"""

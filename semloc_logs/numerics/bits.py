@@ -1,4 +1,6 @@
-"""Instructions of the processor that count and find bits, where it has them, for compiled functions."""
+"""Instructions of the processor that count and find bits, where it has them, for compiled
+functions.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,15 @@ from numba.extending import intrinsic
 
 
 def _count_bits(_: Any, x: Any) -> Any:
-    return types.int64(types.uint64), lambda context, builder, signature, arguments: builder.ctpop(arguments[0])
+    return types.int64(types.uint64), lambda context, builder, signature, arguments: builder.ctpop(
+        arguments[0]
+    )
 
 
 def _first_bit(_: Any, x: Any) -> Any:
     def instruction(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], context.get_constant(types.boolean, True))  # never asked about 0
+        # never asked about 0
+        return builder.cttz(arguments[0], context.get_constant(types.boolean, True))
 
     return types.int64(types.uint64), instruction
 

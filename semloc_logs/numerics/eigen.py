@@ -7,20 +7,25 @@ from numba import njit
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
-SWEEPS = 12  # of Jacobi rotations; four are enough for double precision, more cost nothing once it has converged
+# of Jacobi rotations; four are enough for double precision, more cost nothing once it has converged
+SWEEPS = 12
 
 
 @njit(cache=True, nogil=True, inline="never")
 def eigen(a: F64, values: F64, vectors: F64) -> None:
-    """Eigenvalues (3,), ascending, and unit eigenvectors (3, 3), in columns, of the symmetric ``a`` (3, 3), which is overwritten.
+    """Eigenvalues (3,), ascending, and unit eigenvectors (3, 3), in columns, of the symmetric ``a``
+    (3, 3), which is overwritten.
 
-    Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, 8.5): as accurate for nearly equal eigenvalues as for others.
+    Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, 8.5): as accurate for nearly
+    equal eigenvalues as for others.
     """
     for i in range(3):
         for j in range(3):
             vectors[i, j] = 1.0 if i == j else 0.0
     for _ in range(SWEEPS):
-        if abs(a[0, 1]) + abs(a[0, 2]) + abs(a[1, 2]) <= 1e-15 * (abs(a[0, 0]) + abs(a[1, 1]) + abs(a[2, 2])):
+        if abs(a[0, 1]) + abs(a[0, 2]) + abs(a[1, 2]) <= 1e-15 * (
+            abs(a[0, 0]) + abs(a[1, 1]) + abs(a[2, 2])
+        ):
             break
         for p in range(2):
             for q in range(p + 1, 3):
@@ -33,13 +38,16 @@ def eigen(a: F64, values: F64, vectors: F64) -> None:
                 c = 1.0 / np.sqrt(t * t + 1.0)
                 s = t * c
                 for k in range(3):
-                    x, y = a[k, p], a[k, q]
+                    x = a[k, p]
+                    y = a[k, q]
                     a[k, p], a[k, q] = c * x - s * y, s * x + c * y
                 for k in range(3):
-                    x, y = a[p, k], a[q, k]
+                    x = a[p, k]
+                    y = a[q, k]
                     a[p, k], a[q, k] = c * x - s * y, s * x + c * y
                 for k in range(3):
-                    x, y = vectors[k, p], vectors[k, q]
+                    x = vectors[k, p]
+                    y = vectors[k, q]
                     vectors[k, p], vectors[k, q] = c * x - s * y, s * x + c * y
     for k in range(3):
         values[k] = a[k, k]

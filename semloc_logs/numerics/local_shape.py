@@ -17,8 +17,10 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """For each point (n,): unit ``normal`` (n, 3) and ``direction`` (n, 3) of least and of greatest extent (signs arbitrary), and
-    ``linear``, ``planar``, ``scattered`` in [0, 1], which add up to one."""
+    """For each point (n,): unit ``normal`` (n, 3) and ``direction`` (n, 3) of least and of greatest
+    extent (signs arbitrary), and ``linear``, ``planar``, ``scattered`` in [0, 1], which add up to
+    one.
+    """
 
     normal: F32
     direction: F32
@@ -28,25 +30,39 @@ class Shape:
 
 
 def shape(points: NDArray[np.floating], neighbours: int = 16, radius: float = np.inf) -> Shape:
-    """Shape of ``points`` (n, 3) from up to ``neighbours`` nearest points within ``radius`` metres; all scattered below 4 points."""
+    """Shape of ``points`` (n, 3) from up to ``neighbours`` nearest points within ``radius`` metres;
+    all scattered below 4 points.
+    """
     n = len(points)
     if n < 4:
         up = np.tile(np.array([0, 0, 1], np.float32), (n, 1))
         zero = np.zeros(n, np.float32)
         return Shape(up, up, zero, zero, zero + 1)
     p = np.ascontiguousarray(points, np.float64)
-    distance, index = cKDTree(p).query(p, k=min(neighbours, n), distance_upper_bound=radius, workers=1)
+    distance, index = cKDTree(p).query(
+        p, k=min(neighbours, n), distance_upper_bound=radius, workers=1
+    )
     return Shape(*shapes_of(p, np.arange(n), np.where(np.isfinite(distance), index, -1)))
 
 
 @njit(cache=True, nogil=True)
-def shapes_of(p: F64, at: NDArray[np.int64], index: NDArray[np.int64]) -> tuple[F32, F32, F32, F32, F32]:
-    """The columns of :class:`Shape` at the points ``p`` number ``at`` (n,) from the points ``index`` (n, k) around each, -1 where there
-    is none."""
+def shapes_of(
+    p: F64, at: NDArray[np.int64], index: NDArray[np.int64]
+) -> tuple[F32, F32, F32, F32, F32]:
+    """The columns of :class:`Shape` at the points ``p`` number ``at`` (n,) from the points
+    ``index`` (n, k) around each, -1 where there is none.
+    """
     n = len(index)
-    normal, direction = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
-    linear, planar, scattered = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    mean, d, values, a, vectors = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    normal = np.empty((n, 3), np.float32)
+    direction = np.empty((n, 3), np.float32)
+    linear = np.empty(n, np.float32)
+    planar = np.empty(n, np.float32)
+    scattered = np.empty(n, np.float32)
+    mean = np.empty(3)
+    d = np.empty(3)
+    values = np.empty(3)
+    a = np.empty((3, 3))
+    vectors = np.empty((3, 3))
     for i in range(n):
         here = at[i]
         mean[:] = 0.0
@@ -67,7 +83,9 @@ def shapes_of(p: F64, at: NDArray[np.int64], index: NDArray[np.int64]) -> tuple[
                         a[k, m] += d[k] * d[m]
         a /= max(count, 1)
         eigen(a, values, vectors)
-        s0, s1, s2 = (np.sqrt(max(values[0], 0.0)) + 1e-9, np.sqrt(max(values[1], 0.0)) + 1e-9, np.sqrt(max(values[2], 0.0)) + 1e-9)
+        s0 = np.sqrt(max(values[0], 0.0)) + 1e-9
+        s1 = np.sqrt(max(values[1], 0.0)) + 1e-9
+        s2 = np.sqrt(max(values[2], 0.0)) + 1e-9
         for k in range(3):
             normal[i, k] = vectors[k, 0]
             direction[i, k] = vectors[k, 2]

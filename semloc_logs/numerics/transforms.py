@@ -1,4 +1,5 @@
-"""Rigid transforms as 4x4 float64 matrices named ``target_T_source``; quaternions are xyzw, angles radians.
+"""Rigid transforms as 4x4 float64 matrices named ``target_T_source``; quaternions are xyzw, angles
+radians.
 
 ``p_target = target_T_source @ p_source``. Arrays of transforms have shape (n, 4, 4).
 """
@@ -13,8 +14,11 @@ Array = NDArray[np.float64]
 
 
 def transform(translation: Array, quaternion_xyzw: Array) -> Array:
-    """4x4 matrices from translations (..., 3) in metres and quaternions (..., 4) xyzw of any positive length."""
-    t, q = np.asarray(translation, float), np.asarray(quaternion_xyzw, float)
+    """4x4 matrices from translations (..., 3) in metres and quaternions (..., 4) xyzw of any
+    positive length.
+    """
+    t = np.asarray(translation, float)
+    q = np.asarray(quaternion_xyzw, float)
     out = np.zeros((*t.shape[:-1], 4, 4))
     out[..., :3, :3] = Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*t.shape[:-1], 3, 3)
     out[..., :3, 3] = t
@@ -23,7 +27,9 @@ def transform(translation: Array, quaternion_xyzw: Array) -> Array:
 
 
 def translation_quaternion(target_T_source: Array) -> tuple[Array, Array]:
-    """Translations (..., 3) and unit quaternions (..., 4) xyzw with w >= 0 of 4x4 matrices (..., 4, 4)."""
+    """Translations (..., 3) and unit quaternions (..., 4) xyzw with w >= 0 of 4x4 matrices (..., 4,
+    4).
+    """
     m = np.asarray(target_T_source, float)
     q = Rotation.from_matrix(m[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
     return m[..., :3, 3].copy(), q.reshape(*m.shape[:-2], 4)
@@ -45,10 +51,13 @@ def apply(target_T_source: Array, points: NDArray[np.floating]) -> Array:
     return np.asarray(points, float) @ target_T_source[:3, :3].T + target_T_source[:3, 3]
 
 
-def yaw_transform(yaw: float, translation: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Array:
+def yaw_transform(
+    yaw: float, translation: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Array:
     """Rotation by ``yaw`` about +z, then translation."""
     out = np.eye(4)
-    c, s = np.cos(yaw), np.sin(yaw)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     out[:2, :2] = [[c, -s], [s, c]]
     out[:3, 3] = translation
     return out
@@ -56,12 +65,17 @@ def yaw_transform(yaw: float, translation: Array | tuple[float, float, float] = 
 
 def turned_about_z(points: Array, yaw: Array) -> Array:
     """Points (n, 3), each turned about +z by its own of ``yaw`` (n,)."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1], points[:, 2]], 1)
+    c = np.cos(yaw)
+    s = np.sin(yaw)
+    return np.stack(
+        [c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1], points[:, 2]], 1
+    )
 
 
 def exp_se3(t: Array, rotation_vector: Array) -> Array:
-    """Left increment of a transform: translation ``t`` and ``Exp(rotation_vector)`` side by side (not the se(3) exponential)."""
+    """Left increment of a transform: translation ``t`` and ``Exp(rotation_vector)`` side by side
+    (not the se(3) exponential).
+    """
     out = np.eye(4)
     out[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
     out[:3, 3] = t
@@ -75,9 +89,11 @@ def rotation_angle(rotation: Array) -> float:
 
 def rotation_between(source: Array, target: Array) -> Array:
     """The smallest 3x3 rotation that turns the direction ``source`` into the direction ``target``."""
-    a, b = source / np.linalg.norm(source), target / np.linalg.norm(target)
+    a = source / np.linalg.norm(source)
+    b = target / np.linalg.norm(target)
     axis = np.cross(a, b)
-    sine, cosine = np.linalg.norm(axis), float(a @ b)
+    sine = np.linalg.norm(axis)
+    cosine = float(a @ b)
     if sine < 1e-12:
         if cosine > 0:
             return np.eye(3)
@@ -88,7 +104,8 @@ def rotation_between(source: Array, target: Array) -> Array:
 
 
 def interpolate(stamps_ns: NDArray[np.int64], poses: Array, at_ns: NDArray[np.int64]) -> Array:
-    """Poses (n, 4, 4) at strictly increasing ``stamps_ns`` interpolated on SO(3) x R^3 at ``at_ns`` (m,).
+    """Poses (n, 4, 4) at strictly increasing ``stamps_ns`` interpolated on SO(3) x R^3 at ``at_ns``
+    (m,).
 
     Times outside the range take the nearest end; the caller decides what is a gap.
     """
@@ -97,7 +114,8 @@ def interpolate(stamps_ns: NDArray[np.int64], poses: Array, at_ns: NDArray[np.in
         return np.repeat(poses, len(at), axis=0)
     # seconds from the first stamp: nanoseconds since 1970 do not fit float64
     base = np.asarray(stamps_ns[0], np.int64)
-    s, a = (stamps_ns - base) * 1e-9, (at - base) * 1e-9
+    s = (stamps_ns - base) * 1e-9
+    a = (at - base) * 1e-9
     out = np.zeros((len(at), 4, 4))
     out[:, :3, :3] = Slerp(s, Rotation.from_matrix(poses[:, :3, :3]))(a).as_matrix()
     for k in range(3):

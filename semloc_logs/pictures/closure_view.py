@@ -1,4 +1,6 @@
-"""What there is to see of a closure or a rejected hypothesis: the query, the map it was laid on, and subvolumes that matched."""
+"""What there is to see of a closure or a rejected hypothesis: the query, the map it was laid on,
+and subvolumes that matched.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ TURNED = np.radians(15.0)  # and by how much it may be turned against it
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Row ``row`` of closures.parquet or, if there is a ``reason``, of rejected.parquet; ``target_T_query`` (4, 4) is its pose."""
+    """Row ``row`` of closures.parquet or, if there is a ``reason``, of rejected.parquet;
+    ``target_T_query`` (4, 4) is its pose.
+    """
 
     row: dict[str, Any]
     target_T_query: F64
@@ -50,13 +54,19 @@ class Choice:
     @property
     def covariance(self) -> F64 | None:
         """(6, 6) of an accepted closure."""
-        return np.array(self.row["covariance"], float).reshape(6, 6) if "covariance" in self.row else None
+        return (
+            np.array(self.row["covariance"], float).reshape(6, 6)
+            if "covariance" in self.row
+            else None
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """States (32, 32, 32) of a subvolume of the query, turned into the target's axes, as the network completes it, and of the
-    target's nearest word; ``distance`` of the words in bits, and the target's centre in its map, metres."""
+    """States (32, 32, 32) of a subvolume of the query, turned into the target's axes, as the
+    network completes it, and of the target's nearest word; ``distance`` of the words in bits, and
+    the target's centre in its map, metres.
+    """
 
     query: U8
     completion: U8
@@ -67,9 +77,11 @@ class Match:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosureView:
-    """A query in the map of its target: ``map_T_query`` (4, 4) as aligned, ``before`` as it would lie without an alignment.
+    """A query in the map of its target: ``map_T_query`` (4, 4) as aligned, ``before`` as it would
+    lie without an alignment.
 
-    ``roads`` are the positions (n, 3) of the target's and the query's keyframes, the latter in the query's frame.
+    ``roads`` are the positions (n, 3) of the target's and the query's keyframes, the latter in the
+    query's frame.
     """
 
     choice: Choice
@@ -86,8 +98,10 @@ class ClosureView:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What to show: closure ``number`` (from 1 on, in the order of closures.parquet); or the answer to the query of ``session`` nearest to
-    ``at`` seconds, of the log or since its first keyframe; or the ``count`` best closures and the best rejected hypothesis."""
+    """What to show: closure ``number`` (from 1 on, in the order of closures.parquet); or the answer
+    to the query of ``session`` nearest to ``at`` seconds, of the log or since its first keyframe;
+    or the ``count`` best closures and the best rejected hypothesis.
+    """
 
     session: str | None = None
     at: float | None = None
@@ -96,35 +110,58 @@ class Wanted:
 
 
 def choose(work: Workspace, wanted: Wanted) -> list[Choice]:
-    """The rows to show. The best closures are those of different pairs of sessions first, and the rejected hypothesis is one of a query
-    without a closure, if there is any. WorkspaceError when there is nothing to show."""
-    accepted, rejected = _choices(work, work.closures), _choices(work, work.rejected)
+    """The rows to show. The best closures are those of different pairs of sessions first, and the
+    rejected hypothesis is one of a query without a closure, if there is any. WorkspaceError when
+    there is nothing to show.
+    """
+    accepted = _choices(work, work.closures)
+    rejected = _choices(work, work.rejected)
     if wanted.number is not None:
         if not 1 <= wanted.number <= len(accepted):
-            raise WorkspaceError(f"{work.closures} has {len(accepted)} closures, and no closure {wanted.number}: give a number from 1 on.")
+            raise WorkspaceError(
+                f"{work.closures} has {len(accepted)} closures, and no closure {wanted.number}: give a number from 1 on."
+            )
         return [accepted[wanted.number - 1]]
     if wanted.session is not None:
-        accepted, rejected = ([c for c in rows if c.row["query_session"] == wanted.session] for rows in (accepted, rejected))
+        accepted, rejected = (
+            [c for c in rows if c.row["query_session"] == wanted.session]
+            for rows in (accepted, rejected)
+        )
     if wanted.at is not None:
         found = _at(work, accepted + rejected, wanted.at)
     else:
         answered = {(c.row["query_session"], c.row["query_stamp_ns"]) for c in accepted}
-        silent = [c for c in rejected if (c.row["query_session"], c.row["query_stamp_ns"]) not in answered]
+        silent = [
+            c for c in rejected if (c.row["query_session"], c.row["query_stamp_ns"]) not in answered
+        ]
         found = _varied(_best_first(accepted), wanted.count) + _best_first(silent or rejected)[:1]
     if not found:
         whose = f" of session '{wanted.session}'" if wanted.session else ""
-        raise WorkspaceError(f"{work.path} has neither a closure nor a rejected hypothesis{whose}: name another session, or close again.")
+        raise WorkspaceError(
+            f"{work.path} has neither a closure nor a rejected hypothesis{whose}: name another session, or close again."
+        )
     return found
 
 
 def _choices(work: Workspace, path: Path) -> list[Choice]:
     if not path.exists():
         raise WorkspaceError(f"{path} does not exist: run 'semloc close -w {work.path}' first.")
-    return [Choice(row, T) for row, T in zip(read_closures(path), poses_of(read_table(path)), strict=True)]
+    return [
+        Choice(row, T)
+        for row, T in zip(read_closures(path), poses_of(read_table(path)), strict=True)
+    ]
 
 
 def _best_first(choices: Sequence[Choice]) -> list[Choice]:
-    return sorted(choices, key=lambda c: (-c.row["probability"], -c.row["overlap"], c.row["query_session"], c.row["query_stamp_ns"]))
+    return sorted(
+        choices,
+        key=lambda c: (
+            -c.row["probability"],
+            -c.row["overlap"],
+            c.row["query_session"],
+            c.row["query_stamp_ns"],
+        ),
+    )
 
 
 def _at(work: Workspace, choices: Sequence[Choice], seconds: float) -> list[Choice]:
@@ -154,14 +191,23 @@ def closing_settings(work: Workspace) -> Settings:
     try:
         return Settings.model_validate(read_metadata(work.closures)["settings"]).resolved()
     except (KeyError, ValueError):
-        raise WorkspaceError(f"{work.closures} does not say how it was made: run 'semloc close -w {work.path} --overwrite'.") from None
+        raise WorkspaceError(
+            f"{work.closures} does not say how it was made: run 'semloc close -w {work.path} --overwrite'."
+        ) from None
 
 
-def closure_view(work: Workspace, choice: Choice, settings: Settings, most_matches: int = 3) -> ClosureView:
-    """All that a picture of ``choice`` needs; ``settings`` are those that the closures were found with."""
+def closure_view(
+    work: Workspace, choice: Choice, settings: Settings, most_matches: int = 3
+) -> ClosureView:
+    """All that a picture of ``choice`` needs; ``settings`` are those that the closures were found
+    with.
+    """
     row = choice.row
-    session, target = (SessionMap(work.session(row[f"{end}_session"])) for end in ("query", "target"))
-    asking, asked = keyframe_at(session, row["query_stamp_ns"]), keyframe_at(target, row["target_stamp_ns"])
+    session, target = (
+        SessionMap(work.session(row[f"{end}_session"])) for end in ("query", "target")
+    )
+    asking = keyframe_at(session, row["query_stamp_ns"])
+    asked = keyframe_at(target, row["target_stamp_ns"])
     database = Database(work, (row["target_session"],), settings).asked_by(session, asking)
     query, query_T_base = build_query(session, asking, settings)
     map_T_target = target.map_T_base[asked]
@@ -171,7 +217,8 @@ def closure_view(work: Workspace, choice: Choice, settings: Settings, most_match
     if session.folder.name == target.folder.name:
         before[:3, 3] = session.map_T_base[asking, :3, 3]  # as odometry says
     else:
-        before = map_T_target @ inverse(query_T_base)  # as if the query had been at the target's keyframe
+        # as if the query had been at the target's keyframe
+        before = map_T_target @ inverse(query_T_base)
     members = query_members(session, asking, settings)
     road = session.map_T_base[members, :3, 3] - session.map_T_base[asking, :3, 3]
     ground = float(session.ground_z[asking] - session.map_T_base[asking, 2, 3])
@@ -190,7 +237,9 @@ def closure_view(work: Workspace, choice: Choice, settings: Settings, most_match
 
 
 def drawn(view: ClosureView) -> dict[str, Any]:
-    """What a picture of the view shows, as JSON has it: the row, ``accepted``, and the word matches."""
+    """What a picture of the view shows, as JSON has it: the row, ``accepted``, and the word
+    matches.
+    """
     matches = [{"bits": m.distance, "target_position_m": list(m.centre)} for m in view.matches]
     return {**view.choice.row, "accepted": view.choice.accepted, "matches": matches}
 
@@ -205,20 +254,33 @@ def _group(database: Database, keyframe: int) -> int:
     return max(range(len(database.places)), key=off)
 
 
-def _matches(database: Database, session: SessionMap, query: Query, ground: float, map_T_query: F64, group: int, most: int) -> list[Match]:
+def _matches(
+    database: Database,
+    session: SessionMap,
+    query: Query,
+    ground: float,
+    map_T_query: F64,
+    group: int,
+    most: int,
+) -> list[Match]:
     """Word matches that agree with the alignment, nearest first, none beside another."""
-    settings, v = database.settings, database.settings.fusion.voxel_size
+    settings = database.settings
+    v = database.settings.fusion.voxel_size
     places = allowed_places(database, session)
     if not places or not most:
         return []
-    variant, allowed = next(iter(places.items()))  # a single target session is asked with one kind of words
+    # a single target session is asked with one kind of words
+    variant, allowed = next(iter(places.items()))
     d, m = match_words(database, variant, allowed, query, ground)
     aligned = float(np.arctan2(map_T_query[1, 0], map_T_query[0, 0]))
-    laid = turned_about_z(d.centre.astype(float), np.full(len(d.centre), aligned))  # voxels, in the map's axes
+    # voxels, in the map's axes
+    laid = turned_about_z(d.centre.astype(float), np.full(len(d.centre), aligned))
     off = np.abs(m.centre - laid[m.query] * v - map_T_query[:3, 3]).max(1)
     turned = np.abs(np.mod(m.yaw - aligned + np.pi, 2 * np.pi) - np.pi)
     keep = (m.group == group) & (off < AGREES * v) & (turned < TURNED)
-    distance, asking, centre = m.distance[keep], m.query[keep], m.centre[keep]
+    distance = m.distance[keep]
+    asking = m.query[keep]
+    centre = m.centre[keep]
     chosen: list[int] = []
     for i in np.argsort(distance, kind="stable").tolist():
         if all(np.abs(laid[asking[i], :2] - laid[asking[o], :2]).max() >= APART for o in chosen):
@@ -232,18 +294,28 @@ def _matches(database: Database, session: SessionMap, query: Query, ground: floa
     corners = np.round(laid[asking[chosen]]).astype(int) - corner - SIZE // 2
     given = np.stack([_cut(box, c, SIZE // 2) for c in corners])
     blocks = database.target(group).blocks
-    theirs = np.stack([blocks.dense(np.round(c / v).astype(int) - SIZE // 2, (SIZE, SIZE, SIZE)) for c in centres])
+    theirs = np.stack(
+        [blocks.dense(np.round(c / v).astype(int) - SIZE // 2, (SIZE, SIZE, SIZE)) for c in centres]
+    )
     said = completed(load_completion(variant, settings.descriptor.weights), (given, theirs, given))
     inner = given[:, SIZE // 2 : -SIZE // 2, SIZE // 2 : -SIZE // 2]
     completions = states_of(said.said, said.classes)
     return [
-        Match(inner[i], completions[i], theirs[i], int(distance[k]), (float(c[0]), float(c[1]), float(c[2])))
+        Match(
+            inner[i],
+            completions[i],
+            theirs[i],
+            int(distance[k]),
+            (float(c[0]), float(c[1]), float(c[2])),
+        )
         for i, (k, c) in enumerate(zip(chosen, centres, strict=True))
     ]
 
 
 def _turned(query: Query, yaw: float) -> tuple[U8, NDArray[np.int64]]:
-    """States (x, y, z) of the whole query turned by ``yaw`` (rad) about the vertical through its origin, and the corner voxel (3,)."""
+    """States (x, y, z) of the whole query turned by ``yaw`` (rad) about the vertical through its
+    origin, and the corner voxel (3,).
+    """
     low, high = query.blocks.bounds()
     state = query.blocks.dense(low, tuple((high - low).tolist()))
     half = query.reach + SIZE // 2
@@ -253,7 +325,9 @@ def _turned(query: Query, yaw: float) -> tuple[U8, NDArray[np.int64]]:
 
 
 def _cut(box: U8, corner: NDArray[np.integer], margin: int) -> U8:
-    """States of the subvolume at ``corner`` of ``box`` with a ``margin`` in x and y, unobserved outside."""
+    """States of the subvolume at ``corner`` of ``box`` with a ``margin`` in x and y, unobserved
+    outside.
+    """
     pad = SIZE + margin
     padded = np.pad(box, pad, constant_values=UNOBSERVED_STATE)
     x, y, z = (corner + pad).tolist()

@@ -1,4 +1,6 @@
-"""Subvolumes to look at, as in figure 3 of the paper: rows of input, output and truth as boxes seen from above and aside."""
+"""Subvolumes to look at, as in figure 3 of the paper: rows of input, output and truth as boxes seen
+from above and aside.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def colours() -> U8:
 
 
 def render(state: U8) -> U8:
-    """RGB picture of the occupied voxels of ``state`` (x, y, z) as boxes: isometric, seen from +x, +y and above."""
+    """RGB picture of the occupied voxels of ``state`` (x, y, z) as boxes: isometric, seen from +x,
+    +y and above.
+    """
     filled = (state != FREE_STATE) & (state != UNOBSERVED_STATE)
     nx, ny, nz = state.shape
     width, height = (int(EDGE * n) + 4 for n in ((nx + ny) * 0.866, (nx + ny) * 0.5 + nz))
@@ -61,16 +65,22 @@ def _pixels(points: F64, nx: int, ny: int, nz: int) -> NDArray[np.int32]:
 
 
 def draw_completions(path: Path, title: str, given: U8, said: U8, truth: U8) -> None:
-    """PNG with a row for each subvolume: voxel states (n, 32, 32, 32) of the input, the output and the truth; classes in a legend.
+    """PNG with a row for each subvolume: voxel states (n, 32, 32, 32) of the input, the output and
+    the truth; classes in a legend.
 
-    What the truth did not observe is left out of the output too: nothing is known to compare it with.
+    What the truth did not observe is left out of the output too: nothing is known to compare it
+    with.
     """
     shown = np.where(truth == UNOBSERVED_STATE, UNOBSERVED_STATE, said)
-    rows = [np.hstack([render(view[k]) for view in (given, shown, truth)]) for k in range(len(truth))]
+    rows = [
+        np.hstack([render(view[k]) for view in (given, shown, truth)]) for k in range(len(truth))
+    ]
     body = np.vstack(rows) if rows else np.full((10, 900, 3), 255, np.uint8)
     head = np.full((70, body.shape[1], 3), 255, np.uint8)
     for k, name in enumerate(("input", f"output, {title}", "truth")):
-        cv2.putText(head, name, (k * body.shape[1] // 3 + 20, 48), LETTERS, 1.2, INK, 2, cv2.LINE_AA)
+        cv2.putText(
+            head, name, (k * body.shape[1] // 3 + 20, 48), LETTERS, 1.2, INK, 2, cv2.LINE_AA
+        )
     image = np.vstack([head, body, _legend(np.concatenate([given, shown, truth]), body.shape[1])])
     with replacing_file(path) as temporary:
         _, data = cv2.imencode(".png", np.ascontiguousarray(image[:, :, ::-1]))
@@ -86,8 +96,17 @@ def _legend(states: U8, width: int) -> U8:
     columns = max(1, width // 300)
     image = np.full((20 + 50 * -(-max(len(present), 1) // columns), width, 3), 255, np.uint8)
     for n, label in enumerate(present):
-        x, y = 20 + 300 * (n % columns), 10 + 50 * (n // columns)
-        cv2.rectangle(image, (x, y), (x + 30, y + 30), tuple(colours()[label].astype(float).tolist()), -1)
-        name = names[label] if label < len(names) else "occupied" if label == UNLABELLED else str(label)
+        x = 20 + 300 * (n % columns)
+        y = 10 + 50 * (n // columns)
+        cv2.rectangle(
+            image, (x, y), (x + 30, y + 30), tuple(colours()[label].astype(float).tolist()), -1
+        )
+        name = (
+            names[label]
+            if label < len(names)
+            else "occupied"
+            if label == UNLABELLED
+            else str(label)
+        )
         cv2.putText(image, name, (x + 42, y + 25), LETTERS, 0.8, INK, 1, cv2.LINE_AA)
     return image

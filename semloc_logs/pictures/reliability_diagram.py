@@ -1,4 +1,6 @@
-"""The reliability diagram of a calibration: how often alignments are right against how probable they were said to be."""
+"""The reliability diagram of a calibration: how often alignments are right against how probable
+they were said to be.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from semloc_logs.tables.table import replacing_file
 
 SIZE, MARGIN = 720, 80  # px
 COLOURS = ((120, 120, 120), (214, 120, 20), (20, 90, 200))  # RGB
-INK, GRID = (40, 40, 40), (225, 225, 225)
+INK = (40, 40, 40)
+GRID = (225, 225, 225)
 LETTERS = cv2.FONT_HERSHEY_SIMPLEX
 TICKS = (0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999)
 
@@ -25,9 +28,11 @@ def _pixel(p: float) -> float:
 
 
 def draw_reliability(path: Path, curves: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
-    """PNG with one line for each of the ``curves``, of bins with ``said``, ``right`` and ``alignments``; axes are log-odds.
+    """PNG with one line for each of the ``curves``, of bins with ``said``, ``right`` and
+    ``alignments``; axes are log-odds.
 
-    The vertical strokes are one standard deviation of a binomial share (Agresti and Coull, 1998, with two added to either side).
+    The vertical strokes are one standard deviation of a binomial share (Agresti and Coull, 1998,
+    with two added to either side).
     """
     image = np.full((SIZE + 2 * MARGIN, SIZE + 2 * MARGIN, 3), 255, np.uint8)
 
@@ -38,21 +43,70 @@ def draw_reliability(path: Path, curves: Mapping[str, Sequence[Mapping[str, floa
         cv2.line(image, at(tick, 0), at(tick, 1), GRID, 1)
         cv2.line(image, at(0, tick), at(1, tick), GRID, 1)
         x, y = at(tick, tick)
-        cv2.putText(image, f"{tick:g}", (x - 20, MARGIN + SIZE + 25), LETTERS, 0.5, INK, 1, cv2.LINE_AA)
+        cv2.putText(
+            image, f"{tick:g}", (x - 20, MARGIN + SIZE + 25), LETTERS, 0.5, INK, 1, cv2.LINE_AA
+        )
         cv2.putText(image, f"{tick:g}", (MARGIN - 55, y + 5), LETTERS, 0.5, INK, 1, cv2.LINE_AA)
     cv2.line(image, at(0, 0), at(1, 1), INK, 1, cv2.LINE_AA)
     for number, ((name, bins), colour) in enumerate(zip(curves.items(), COLOURS, strict=False)):
         points = [at(b["said"], b["right"]) for b in bins]
-        cv2.polylines(image, [np.array(points, np.int32).reshape(-1, 1, 2)], False, colour, 2, cv2.LINE_AA)
+        cv2.polylines(
+            image, [np.array(points, np.int32).reshape(-1, 1, 2)], False, colour, 2, cv2.LINE_AA
+        )
         for b, point in zip(bins, points, strict=True):
             n = b["alignments"] + 4
             share = (b["right"] * b["alignments"] + 2) / n
             spread = float(np.sqrt(share * (1 - share) / n))
-            cv2.line(image, at(b["said"], share - spread), at(b["said"], share + spread), colour, 1, cv2.LINE_AA)
+            cv2.line(
+                image,
+                at(b["said"], share - spread),
+                at(b["said"], share + spread),
+                colour,
+                1,
+                cv2.LINE_AA,
+            )
             cv2.circle(image, point, 5, colour, -1, cv2.LINE_AA)
-            cv2.putText(image, f"{b['alignments']:.0f}", (point[0] + 8, point[1] + 14), LETTERS, 0.4, colour, 1, cv2.LINE_AA)
-        cv2.putText(image, name, (MARGIN + 15, MARGIN + 25 + 25 * number), LETTERS, 0.65, colour, 2, cv2.LINE_AA)
-    cv2.putText(image, "probability said", (MARGIN + SIZE // 2 - 70, SIZE + 2 * MARGIN - 20), LETTERS, 0.65, INK, 1, cv2.LINE_AA)
-    cv2.putText(image, "share right; numbers: alignments", (15, MARGIN - 30), LETTERS, 0.65, INK, 1, cv2.LINE_AA)
+            cv2.putText(
+                image,
+                f"{b['alignments']:.0f}",
+                (point[0] + 8, point[1] + 14),
+                LETTERS,
+                0.4,
+                colour,
+                1,
+                cv2.LINE_AA,
+            )
+        cv2.putText(
+            image,
+            name,
+            (MARGIN + 15, MARGIN + 25 + 25 * number),
+            LETTERS,
+            0.65,
+            colour,
+            2,
+            cv2.LINE_AA,
+        )
+    cv2.putText(
+        image,
+        "probability said",
+        (MARGIN + SIZE // 2 - 70, SIZE + 2 * MARGIN - 20),
+        LETTERS,
+        0.65,
+        INK,
+        1,
+        cv2.LINE_AA,
+    )
+    cv2.putText(
+        image,
+        "share right; numbers: alignments",
+        (15, MARGIN - 30),
+        LETTERS,
+        0.65,
+        INK,
+        1,
+        cv2.LINE_AA,
+    )
     with replacing_file(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", np.ascontiguousarray(image[:, :, ::-1]))[1].tobytes())
+        temporary.write_bytes(
+            cv2.imencode(".png", np.ascontiguousarray(image[:, :, ::-1]))[1].tobytes()
+        )

@@ -1,4 +1,6 @@
-"""Voxels drawn as lit cubes in parallel projection, without a screen: sorted by depth, faces that look away left out."""
+"""Voxels drawn as lit cubes in parallel projection, without a screen: sorted by depth, faces that
+look away left out.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solid:
-    """Voxels ``ijk`` (n, 3) of a grid with edge ``size`` (m) and RGB colours (n, 3); ``map_T_grid`` (4, 4) lays the grid into the map."""
+    """Voxels ``ijk`` (n, 3) of a grid with edge ``size`` (m) and RGB colours (n, 3); ``map_T_grid``
+    (4, 4) lays the grid into the map.
+    """
 
     ijk: NDArray[np.int32]
     rgb: U8
@@ -37,8 +41,9 @@ class Solid:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Seen from direction ``azimuth``, ``elevation`` (rad) onto the point ``at`` (x, y, z); a picture of ``width`` x ``height`` pixels
-    that are ``metres`` wide."""
+    """Seen from direction ``azimuth``, ``elevation`` (rad) onto the point ``at`` (x, y, z); a
+    picture of ``width`` x ``height`` pixels that are ``metres`` wide.
+    """
 
     azimuth: float
     elevation: float
@@ -50,15 +55,25 @@ class View:
     @property
     def axes(self) -> F64:
         """Unit vectors (3, 3) in the map: to the right, up, towards the viewer."""
-        c, s = np.cos(self.azimuth), np.sin(self.azimuth)
-        towards = np.array([c * np.cos(self.elevation), s * np.cos(self.elevation), np.sin(self.elevation)])
+        c = np.cos(self.azimuth)
+        s = np.sin(self.azimuth)
+        towards = np.array(
+            [c * np.cos(self.elevation), s * np.cos(self.elevation), np.sin(self.elevation)]
+        )
         right = np.array([-s, c, 0.0])
         return np.stack([right, np.cross(towards, right), towards])
 
     def pixels(self, points: F64) -> F64:
         """Pixels (n, 2) and, as a third column, metres towards the viewer of ``points`` (n, 3)."""
         seen = (np.asarray(points, float).reshape(-1, 3) - self.at) @ self.axes.T
-        return np.stack([self.width / 2 + seen[:, 0] / self.metres, self.height / 2 - seen[:, 1] / self.metres, seen[:, 2]], 1)
+        return np.stack(
+            [
+                self.width / 2 + seen[:, 0] / self.metres,
+                self.height / 2 - seen[:, 1] / self.metres,
+                seen[:, 2],
+            ],
+            1,
+        )
 
 
 def top_view(at: tuple[float, float, float], width: int, height: int, metres: float) -> View:
@@ -68,7 +83,14 @@ def top_view(at: tuple[float, float, float], width: int, height: int, metres: fl
 
 def draw_solids(solids: Sequence[Solid], view: View) -> U8:
     """RGB picture (height, width, 3), white where there is nothing."""
-    large = View(view.azimuth, view.elevation, view.at, view.width * SHARPER, view.height * SHARPER, view.metres / SHARPER)
+    large = View(
+        view.azimuth,
+        view.elevation,
+        view.at,
+        view.width * SHARPER,
+        view.height * SHARPER,
+        view.metres / SHARPER,
+    )
     image = np.full((large.height, large.width, 3), 255, np.uint8)
     depth = np.full((large.height, large.width), -np.inf, np.float32)  # metres towards the viewer
     parts = [p for solid in solids for p in _faces(solid, large)]
@@ -80,18 +102,24 @@ def draw_solids(solids: Sequence[Solid], view: View) -> U8:
             mine = order[first : first + AT_ONCE]
             _paint(image, depth, (centre[mine], edges[mine], rgb[mine]), steps)
     image = _with_edges(image, depth, 2 * max((s.size for s in solids), default=1.0))
-    return np.asarray(cv2.resize(image, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(
+        cv2.resize(image, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8
+    )
 
 
 def _faces(solid: Solid, view: View) -> list[tuple[F64, F64, F64]]:
-    """For each side of the voxels that shows: centres (n, 3) in pixels and depth, edges (n, 2, 2) in pixels, shaded colours (n, 3)."""
+    """For each side of the voxels that shows: centres (n, 3) in pixels and depth, edges (n, 2, 2)
+    in pixels, shaded colours (n, 3).
+    """
     out: list[tuple[F64, F64, F64]] = []
     if not len(solid.ijk):
         return out
-    low, span = solid.ijk.min(0) - 1, np.ptp(solid.ijk, axis=0) + 3
+    low = solid.ijk.min(0) - 1
+    span = np.ptp(solid.ijk, axis=0) + 3
     filled = np.zeros(span, bool)
     filled[tuple((solid.ijk - low).T)] = True
-    rotation, middle = solid.map_T_grid[:3, :3], view.pixels(solid.centres)
+    rotation = solid.map_T_grid[:3, :3]
+    middle = view.pixels(solid.centres)
     level = np.array([np.cos(view.azimuth), np.sin(view.azimuth), 0.0])
     light = LIGHT / np.linalg.norm(LIGHT) @ np.stack([view.axes[0], level, [0.0, 0.0, 1.0]])
     for axis in AXES:
@@ -103,7 +131,13 @@ def _faces(solid: Solid, view: View) -> list[tuple[F64, F64, F64]]:
         off = (normal * solid.size / 2) @ view.axes.T / [view.metres, -view.metres, 1]
         bright = 0.58 + 0.5 * max(0.0, float(normal @ light))
         n = int(shows.sum())
-        out.append((middle[shows] + off, np.broadcast_to(edges, (n, 2, 2)), np.minimum(solid.rgb[shows] * bright, 255)))
+        out.append(
+            (
+                middle[shows] + off,
+                np.broadcast_to(edges, (n, 2, 2)),
+                np.minimum(solid.rgb[shows] * bright, 255),
+            )
+        )
     return out
 
 
@@ -112,7 +146,8 @@ def _paint(image: U8, depth: NDArray[np.float32], faces: tuple[F64, F64, F64], s
     centre, edges, rgb = faces
     a, b = (g.ravel() for g in np.meshgrid(*[np.linspace(-0.5, 0.5, steps)] * 2))
     xy = centre[:, None, :2] + a[:, None] * edges[:, None, 0] + b[:, None] * edges[:, None, 1]
-    x, y = np.floor(xy[..., 0]).astype(np.int64), np.floor(xy[..., 1]).astype(np.int64)
+    x = np.floor(xy[..., 0]).astype(np.int64)
+    y = np.floor(xy[..., 1]).astype(np.int64)
     inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
     face, _ = np.nonzero(inside)  # of equal indices the last assignment stays: the nearest face
     at = y[inside] * image.shape[1] + x[inside]
@@ -121,7 +156,9 @@ def _paint(image: U8, depth: NDArray[np.float32], faces: tuple[F64, F64, F64], s
 
 
 def _with_edges(image: U8, depth: NDArray[np.float32], reach: float) -> U8:
-    """Darker where something nearer stands beside: eye-dome lighting (Boucheny 2009), up to ``reach`` metres of difference."""
+    """Darker where something nearer stands beside: eye-dome lighting (Boucheny 2009), up to
+    ``reach`` metres of difference.
+    """
     padded = np.pad(depth, SHARPER, mode="edge")
     shade = np.zeros(depth.shape, np.float32)
     height, width = depth.shape
@@ -129,6 +166,10 @@ def _with_edges(image: U8, depth: NDArray[np.float32], reach: float) -> U8:
     for dy, dx in offsets:
         beside = padded[dy * SHARPER : dy * SHARPER + height, dx * SHARPER : dx * SHARPER + width]
         with np.errstate(invalid="ignore"):
-            shade += np.clip(np.nan_to_num(beside - depth, nan=0.0, posinf=0.0, neginf=0.0) / reach, 0, 1)
+            shade += np.clip(
+                np.nan_to_num(beside - depth, nan=0.0, posinf=0.0, neginf=0.0) / reach, 0, 1
+            )
     dark = 1 - SHADOW * np.minimum(shade / 3, 1)
-    return np.asarray(np.where(np.isfinite(depth)[..., None], image * dark[..., None], 255), np.uint8)
+    return np.asarray(
+        np.where(np.isfinite(depth)[..., None], image * dark[..., None], 255), np.uint8
+    )

@@ -1,4 +1,6 @@
-"""The two short sessions of `semloc demo`: once round a block, and on another day half round it the other way, then back."""
+"""The two short sessions of `semloc demo`: once round a block, and on another day half round it the
+other way, then back.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, 
 
 
 def simulate_demo(directory: Path | str, seed: int = 0) -> list[Path]:
-    """Write ``monday.mcap`` and ``tuesday.bag``, drives of about a minute through one street loop, with their truth; all files written."""
+    """Write ``monday.mcap`` and ``tuesday.bag``, drives of about a minute through one street loop,
+    with their truth; all files written.
+    """
     network = grid_network(np.random.default_rng([seed, 71]), 2, 2, 62.0)
     around = _loop(network)
     monday = [*around, around[0]]
@@ -23,9 +27,22 @@ def simulate_demo(directory: Path | str, seed: int = 0) -> list[Path]:
         Session("monday.mcap", smooth_line(lane_path(network, monday)), Condition(0)),
         Session("tuesday.bag", smooth_line(lane_path(network, half)), Condition(1)),
     ]
-    truth = write_sessions(directory, network, sessions, seed=seed, sensor=Sensor("hdl32", rate_hz=1.6, columns=1100), overwrite=True)
+    truth = write_sessions(
+        directory,
+        network,
+        sessions,
+        seed=seed,
+        sensor=Sensor("hdl32", rate_hz=1.6, columns=1100),
+        overwrite=True,
+    )
     folder = Path(directory)
-    return [folder / "monday.mcap", folder / "tuesday.bag", folder / "monday.tum", folder / "tuesday.tum", truth]
+    return [
+        folder / "monday.mcap",
+        folder / "tuesday.bag",
+        folder / "monday.tum",
+        folder / "tuesday.tum",
+        truth,
+    ]
 
 
 def _loop(network: RoadNetwork) -> list[tuple[int, bool]]:

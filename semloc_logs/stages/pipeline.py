@@ -1,6 +1,8 @@
-"""The pipeline on one screen: fuse, describe, close, annotate, run. Each stage reads files of the one before and writes its own.
+"""The pipeline on one screen: fuse, describe, close, annotate, run. Each stage reads files of the
+one before and writes its own.
 
-A stage is done when its outputs are there for the same inputs, settings and version; then it is not done again.
+A stage is done when its outputs are there for the same inputs, settings and version; then it is not
+done again.
 """
 
 from __future__ import annotations
@@ -17,7 +19,13 @@ import numpy as np
 
 import semloc_logs
 from semloc_logs.closures.acceptance.consistency import decide
-from semloc_logs.closures.closure_tables import keyframe_at, read_closures, unique_closures, write_closures, write_rejected
+from semloc_logs.closures.closure_tables import (
+    keyframe_at,
+    read_closures,
+    unique_closures,
+    write_closures,
+    write_rejected,
+)
 from semloc_logs.closures.matching import Alignment, CloseTask, close_queries
 from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.engines import Engine, Serial
@@ -51,7 +59,9 @@ QUERIES_A_TASK = 4
 
 @dataclass(slots=True)
 class Report:
-    """What a stage did: seconds, what was done and what was found done, and sentences about input that was skipped."""
+    """What a stage did: seconds, what was done and what was found done, and sentences about input
+    that was skipped.
+    """
 
     done: list[str] = field(default_factory=list)
     kept: list[str] = field(default_factory=list)
@@ -73,7 +83,8 @@ def _hash(*parts: str) -> str:
     return hashlib.sha256("\n".join((semloc_logs.__version__, *parts)).encode()).hexdigest()[:16]
 
 
-# -- fuse ------------------------------------------------------------------------------------------------------------------------
+# -- fuse
+# ------------------------------------------------------------------------------------------------------------------------
 
 
 def fuse(
@@ -86,11 +97,13 @@ def fuse(
     overwrite: bool = False,
     poses: Mapping[str, TrajectoryFile] | None = None,
 ) -> Report:
-    """Logs -> keyframes, submaps and map of each session. A session that fails is named in ``failed``; the others go on.
+    """Logs -> keyframes, submaps and map of each session. A session that fails is named in
+    ``failed``; the others go on.
 
     ``poses``: files of poses by session, instead of those of its logs.
     """
-    report, tasks = Report(), []
+    report = Report()
+    tasks = []
     label_files = label_fingerprint(settings.labels)
     for name, logs in sessions.items():
         for log in logs:
@@ -99,12 +112,26 @@ def fuse(
         inputs = [content_fingerprint(log) for log in logs]
         trajectory = (poses or {}).get(name)
         inputs += [f"poses {trajectory.fingerprint()}"] if trajectory else []
-        fingerprint = _hash(settings.fingerprint("fusion", "labels"), label_files, repr(sorted(topics.items())), *inputs)
+        fingerprint = _hash(
+            settings.fingerprint("fusion", "labels"),
+            label_files,
+            repr(sorted(topics.items())),
+            *inputs,
+        )
         if not overwrite and _fingerprint(folder.session_json) == fingerprint:
             report.kept.append(name)
             report.skipped += read_json(folder.session_json)["skipped"]
         else:
-            tasks.append(FuseTask(tuple(Path(log).absolute() for log in logs), folder, settings, dict(topics), fingerprint, trajectory))
+            tasks.append(
+                FuseTask(
+                    tuple(Path(log).absolute() for log in logs),
+                    folder,
+                    settings,
+                    dict(topics),
+                    fingerprint,
+                    trajectory,
+                )
+            )
     # only a task in this process can say how far it is
     fuse_one = partial(_fuse_one, note=note) if isinstance(engine, Serial) else _fuse_one
     for task, outcome in zip(tasks, engine.map(fuse_one, tasks), strict=True):
@@ -141,10 +168,18 @@ def _fingerprint(path: Path) -> str | None:
         return None
 
 
-# -- describe --------------------------------------------------------------------------------------------------------------------
+# -- describe
+# --------------------------------------------------------------------------------------------------------------------
 
 
-def describe(work: Workspace, names: Sequence[str], settings: Settings, engine: Engine, note: Note, overwrite: bool = False) -> Report:
+def describe(
+    work: Workspace,
+    names: Sequence[str],
+    settings: Settings,
+    engine: Engine,
+    note: Note,
+    overwrite: bool = False,
+) -> Report:
     """Maps -> semantic words, for the sessions ``names`` (all if empty)."""
     report = Report()
     folders = _sessions(work, names)
@@ -158,24 +193,53 @@ def describe(work: Workspace, names: Sequence[str], settings: Settings, engine: 
                 f"Session {folder.name} was fused with voxels of {voxel_settings} m, the settings say {settings.fusion.voxel_size} m: "
                 f"give --set fusion.voxel_size={voxel_settings}, or fuse it again."
             )
-        fingerprint = _hash(session["fingerprint"], settings.fingerprint("descriptor"), _weights(settings), *variants)
+        fingerprint = _hash(
+            session["fingerprint"],
+            settings.fingerprint("descriptor"),
+            _weights(settings),
+            *variants,
+        )
         if not overwrite and _fingerprint(folder.words_json) == fingerprint:
             report.kept.append(folder.name)
             continue
         folder.words_json.unlink(missing_ok=True)
-        keys = ("schema_version", "voxel_size", "session_T_map", "label_space", "label_source", "version")
+        keys = (
+            "schema_version",
+            "voxel_size",
+            "session_T_map",
+            "label_space",
+            "label_source",
+            "version",
+        )
         metadata = {k: session[k] for k in keys}
         road = SessionMap(folder).road
         with replacing_folder(folder.words) as output:
             tasks = [
-                DescribeTask(folder, s["id"], s["ground_z"], road(s), variants, blocks_path(output, s["id"]), metadata, settings)
+                DescribeTask(
+                    folder,
+                    s["id"],
+                    s["ground_z"],
+                    road(s),
+                    variants,
+                    blocks_path(output, s["id"]),
+                    metadata,
+                    settings,
+                )
                 for s in session["submaps"]
             ]
             words = sum(engine.map(index_submap, tasks))
             if not tasks:
                 write_words(blocks_path(output, 0), 0, [], metadata)
         used = settings.model_dump(mode="json", include={"descriptor"})
-        write_json(folder.words_json, {"fingerprint": fingerprint, "words": words, "variants": list(variants), "settings": used})
+        write_json(
+            folder.words_json,
+            {
+                "fingerprint": fingerprint,
+                "words": words,
+                "variants": list(variants),
+                "settings": used,
+            },
+        )
         report.done.append(folder.name)
         note(f"{folder.name}: {words} words")
     return report
@@ -183,7 +247,9 @@ def describe(work: Workspace, names: Sequence[str], settings: Settings, engine: 
 
 def _weights(settings: Settings) -> str:
     """Fingerprint of weights and vocabulary given as files; the shipped ones belong to the version."""
-    paths = [p for p in (settings.descriptor.weights, settings.descriptor.vocabulary) if p is not None]
+    paths = [
+        p for p in (settings.descriptor.weights, settings.descriptor.vocabulary) if p is not None
+    ]
     return _hash(*(hashlib.sha256(p.read_bytes()).hexdigest() for p in paths if p.is_file()))
 
 
@@ -198,7 +264,8 @@ def _sessions(work: Workspace, names: Sequence[str]) -> list[SessionFolder]:
     return [known[n] for n in names] if names else list(known.values())
 
 
-# -- close -----------------------------------------------------------------------------------------------------------------------
+# -- close
+# -----------------------------------------------------------------------------------------------------------------------
 
 
 def close(
@@ -211,20 +278,29 @@ def close(
     self_closures: bool = True,
     overwrite: bool = False,
 ) -> Report:
-    """Words -> closures.parquet and rejected.parquet: every session of ``queries`` against all of ``targets`` (all if empty)."""
-    asking, asked = _sessions(work, queries), _sessions(work, targets)
+    """Words -> closures.parquet and rejected.parquet: every session of ``queries`` against all of
+    ``targets`` (all if empty).
+    """
+    asking = _sessions(work, queries)
+    asked = _sessions(work, targets)
     maps = {f.name: SessionMap(f) for f in (*asking, *asked)}
     variants: set[str] = set()
     sources = [str(m.json["label_source"]) for m in maps.values()]
     for name, m in maps.items():
         wanted = set(variants_for(str(m.json["label_source"]), sources, settings))
         variants |= wanted
-        if not m.folder.words_json.exists() or not wanted <= set(read_json(m.folder.words_json)["variants"]):
-            raise WorkspaceError(f"Session {name} lacks {' and '.join(sorted(wanted))} words: run 'semloc describe -w {work.path}' first.")
+        if not m.folder.words_json.exists() or not wanted <= set(
+            read_json(m.folder.words_json)["variants"]
+        ):
+            raise WorkspaceError(
+                f"Session {name} lacks {' and '.join(sorted(wanted))} words: run 'semloc describe -w {work.path}' first."
+            )
         _ = m.views  # a session of an earlier version is refused before its queries are asked
     inputs = [f"{f.name} {_fingerprint(f.words_json)}" for f in (*asking, *asked)]
     sections = ("fusion", "labels", "descriptor", "query", "closures")
-    fingerprint = _hash(settings.fingerprint(*sections), str(self_closures), repr(len(asking)), *inputs)
+    fingerprint = _hash(
+        settings.fingerprint(*sections), str(self_closures), repr(len(asking)), *inputs
+    )
     report = Report()
     if (
         not overwrite
@@ -243,15 +319,24 @@ def close(
     for folder in asking:
         others = tuple(sorted(f.name for f in asked if self_closures or f.name != folder.name))
         keyframes = query_keyframes(maps[folder.name], settings)
-        chunks = [tuple(keyframes[i : i + QUERIES_A_TASK]) for i in range(0, len(keyframes), QUERIES_A_TASK)]
-        tasks += [CloseTask(work.path.absolute(), folder.name, chunk, others, settings.model_dump_json()) for chunk in chunks]
+        chunks = [
+            tuple(keyframes[i : i + QUERIES_A_TASK])
+            for i in range(0, len(keyframes), QUERIES_A_TASK)
+        ]
+        tasks += [
+            CloseTask(work.path.absolute(), folder.name, chunk, others, settings.model_dump_json())
+            for chunk in chunks
+        ]
     found: list[Alignment] = []
     least = settings.closures.min_probability
-    total, asked_queries = sum(len(t.keyframes) for t in tasks), 0
+    total = sum(len(t.keyframes) for t in tasks)
+    asked_queries = 0
     for task, results in zip(tasks, engine.map(close_queries, tasks), strict=True):
         asked_queries += len(task.keyframes)
         found += [a for result in results for a in result]
-        note(f"query {asked_queries} of {total}: {sum(a.probability >= least for a in found)} probable places")
+        note(
+            f"query {asked_queries} of {total}: {sum(a.probability >= least for a in found)} probable places"
+        )
     found = decide(found, maps, settings)
     road = {name: m.distance for name, m in maps.items()}
     closures = unique_closures([a for a in found if a.accepted], road, settings.query.every or 2.0)
@@ -273,23 +358,40 @@ def close(
     return report
 
 
-# -- annotate --------------------------------------------------------------------------------------------------------------------
+# -- annotate
+# --------------------------------------------------------------------------------------------------------------------
 
 
 def annotate(
-    log: Path, work: Workspace, settings: Settings, *, output: Path | None, mode: str, overwrite: bool = False, session: str | None = None
+    log: Path,
+    work: Workspace,
+    settings: Settings,
+    *,
+    output: Path | None,
+    mode: str,
+    overwrite: bool = False,
+    session: str | None = None,
 ) -> AnnotateReport:
-    """Closures that the log takes part in -> channels. ``mode`` is copy, in-place or sidecar; all but in-place need ``output``."""
+    """Closures that the log takes part in -> channels. ``mode`` is copy, in-place or sidecar; all
+    but in-place need ``output``.
+    """
     recover(log)
     name = session or session_name(log)
     folder = _sessions(work, [name])[0]
     mine = SessionMap(folder)
-    rows = [r for r in read_closures(work.closures) if name in (r["query_session"], r["target_session"])]
+    rows = [
+        r for r in read_closures(work.closures) if name in (r["query_session"], r["target_session"])
+    ]
     records = [_record(work, mine, name, row) for row in rows]
     times = dict(zip(mine.stamps_ns.tolist(), mine.frames["log_time_ns"].to_pylist(), strict=True))
-    notes = {"version": semloc_logs.__version__, "settings": settings.fingerprint("fusion", "labels", "descriptor", "query", "closures")}
+    notes = {
+        "version": semloc_logs.__version__,
+        "settings": settings.fingerprint("fusion", "labels", "descriptor", "query", "closures"),
+    }
     notes["fusion.voxel_size"] = str(settings.fusion.voxel_size)
-    results = Results(records, name, notes, times, frame_id=str(mine.json.get("session_frame") or "") or None)
+    results = Results(
+        records, name, notes, times, frame_id=str(mine.json.get("session_frame") or "") or None
+    )
     if mode == "in-place":
         return annotate_in_place(log, results)
     if output is None:
@@ -299,18 +401,30 @@ def annotate(
 
 
 def _record(work: Workspace, mine: SessionMap, name: str, row: dict[str, Any]) -> ClosureRecord:
-    """A closure with what the channels need beside the row: poses in the frames of the pose streams."""
+    """A closure with what the channels need beside the row: poses in the frames of the pose
+    streams.
+    """
     target = SessionMap(work.session(row["target_session"]))
     target_end = keyframe_at(target, row["target_stamp_ns"])
-    target_T_query = transform(np.array([row["t_x"], row["t_y"], row["t_z"]]), np.array([row["q_x"], row["q_y"], row["q_z"], row["q_w"]]))
-    session_T_query = np.array(target.json["session_T_map"]) @ target.map_T_base[target_end] @ target_T_query
-    own_end = keyframe_at(mine, row["query_stamp_ns"] if row["query_session"] == name else row["target_stamp_ns"])
+    target_T_query = transform(
+        np.array([row["t_x"], row["t_y"], row["t_z"]]),
+        np.array([row["q_x"], row["q_y"], row["q_z"], row["q_w"]]),
+    )
+    session_T_query = (
+        np.array(target.json["session_T_map"]) @ target.map_T_base[target_end] @ target_T_query
+    )
+    own_end = keyframe_at(
+        mine, row["query_stamp_ns"] if row["query_session"] == name else row["target_stamp_ns"]
+    )
     position = (np.array(mine.json["session_T_map"]) @ mine.map_T_base[own_end])[:3, 3]
     is_query = row["query_session"] == name
-    return ClosureRecord.from_row(row, session_T_query=session_T_query if is_query else None, session_position=position)
+    return ClosureRecord.from_row(
+        row, session_T_query=session_T_query if is_query else None, session_position=position
+    )
 
 
-# -- run -------------------------------------------------------------------------------------------------------------------------
+# -- run
+# -------------------------------------------------------------------------------------------------------------------------
 
 
 def run(
@@ -324,7 +438,9 @@ def run(
     overwrite: bool = False,
     poses: Mapping[str, TrajectoryFile] | None = None,
 ) -> Report:
-    """All of it: each log is a session. Resumable; ``annotation`` is none, copy, sidecar or in-place; ``poses`` as in :func:`fuse`."""
+    """All of it: each log is a session. Resumable; ``annotation`` is none, copy, sidecar or
+    in-place; ``poses`` as in :func:`fuse`.
+    """
     settings = settings.resolved()
     total = Report()
     clock = time.perf_counter()
@@ -332,7 +448,9 @@ def run(
     def add(stage: str, part: Report) -> None:
         nonlocal clock
         for key in ("done", "kept", "skipped", "failed"):
-            getattr(total, key).extend(f"{stage} {x}" if key in ("done", "kept") else x for x in getattr(part, key))
+            getattr(total, key).extend(
+                f"{stage} {x}" if key in ("done", "kept") else x for x in getattr(part, key)
+            )
         total.closures = part.closures
         total.seconds[stage] = round(time.perf_counter() - clock, 3)
         clock = time.perf_counter()
@@ -348,9 +466,18 @@ def run(
                 output = (
                     None
                     if annotation == "in-place"
-                    else work.annotated / f"{name if log.is_dir() else log.stem}{'.semloc' if annotation == 'sidecar' else ''}.mcap"
+                    else work.annotated
+                    / f"{name if log.is_dir() else log.stem}{'.semloc' if annotation == 'sidecar' else ''}.mcap"
                 )
-                made = annotate(log, work, settings, output=output, mode=annotation, overwrite=True, session=name)
+                made = annotate(
+                    log,
+                    work,
+                    settings,
+                    output=output,
+                    mode=annotation,
+                    overwrite=True,
+                    session=name,
+                )
                 note(f"{name}: {made.messages} messages in {made.path}")
         total.seconds["annotate"] = round(time.perf_counter() - clock, 3)
     write_json(

@@ -1,1 +1,3 @@
-"""Cutting and turning subvolumes; the encoder-decoder and its training (paper 3.2). torch is imported here only."""
+"""Cutting and turning subvolumes; the encoder-decoder and its training (paper 3.2). torch is
+imported here only.
+"""

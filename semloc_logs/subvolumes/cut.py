@@ -1,7 +1,9 @@
-"""Cutting and turning subvolumes: voxel states -> network codes, whole maps turned by a heading, single subvolumes for training.
+"""Cutting and turning subvolumes: voxel states -> network codes, whole maps turned by a heading,
+single subvolumes for training.
 
-A subvolume is 32^3 voxels. The encoder sees a margin of 8 voxels around it in x and y, which is its receptive field, so that the
-descriptors of a whole map can be computed at once and equal those of single subvolumes to rounding.
+A subvolume is 32^3 voxels. The encoder sees a margin of 8 voxels around it in x and y, which is its
+receptive field, so that the descriptors of a whole map can be computed at once and equal those of
+single subvolumes to rounding.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ U8 = NDArray[np.uint8]
 
 
 def code_table(variant: str) -> U8:
-    """Voxel state (0..255) -> network code: 0..L-1 classes, L free, L + 1 unobserved, L + 2 occupied of unknown class.
+    """Voxel state (0..255) -> network code: 0..L-1 classes, L free, L + 1 unobserved, L + 2
+    occupied of unknown class.
 
     ``geometric`` knows a single class (the paper's uniform semantics).
     """
@@ -41,10 +44,15 @@ def code_table(variant: str) -> U8:
 
 
 @njit(cache=True, nogil=True)
-def turn(state: U8, low: NDArray[np.int64], yaw: float, centre: NDArray[np.float64], out: U8) -> None:
-    """Fill ``out`` (x, y, z) with the box of the same centre turned: the voxel at offset d from the middle of ``out`` shows the
-    map's voxel at ``centre`` + R(yaw) d (all in voxels, map coordinates), unobserved outside ``state``, whose corner is ``low``."""
-    c, s = np.cos(yaw), np.sin(yaw)
+def turn(
+    state: U8, low: NDArray[np.int64], yaw: float, centre: NDArray[np.float64], out: U8
+) -> None:
+    """Fill ``out`` (x, y, z) with the box of the same centre turned: the voxel at offset d from the
+    middle of ``out`` shows the map's voxel at ``centre`` + R(yaw) d (all in voxels, map
+    coordinates), unobserved outside ``state``, whose corner is ``low``.
+    """
+    c = np.cos(yaw)
+    s = np.sin(yaw)
     nx, ny, nz = out.shape
     z0 = int(np.floor(centre[2] - nz / 2.0 + 0.5)) - low[2]
     for i in range(nx):
@@ -63,7 +71,8 @@ def turn(state: U8, low: NDArray[np.int64], yaw: float, centre: NDArray[np.float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turned:
-    """A map that was turned by -``yaw`` about z: ``state`` (x, y, z) whose corner is voxel ``low`` (3,) of the turned map.
+    """A map that was turned by -``yaw`` about z: ``state`` (x, y, z) whose corner is voxel ``low``
+    (3,) of the turned map.
 
     The axis stands at ``middle`` (2,), voxels of the map.
     """
@@ -75,7 +84,8 @@ class Turned:
 
     @property
     def _map_R_turned(self) -> NDArray[np.float64]:
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        c = np.cos(self.yaw)
+        s = np.sin(self.yaw)
         return np.array([[c, -s], [s, c]])
 
     def from_map(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -90,14 +100,19 @@ class Turned:
 
 
 def turned_map(state: U8, low: NDArray[np.integer], yaw: float) -> Turned:
-    """The box ``state`` whose corner is voxel ``low`` as a query at heading ``yaw`` sees it, with room for all of it.
+    """The box ``state`` whose corner is voxel ``low`` as a query at heading ``yaw`` sees it, with
+    room for all of it.
 
-    Corner and axis are multiples of 8 voxels: what is described of a map that is not turned stays on its grid.
+    Corner and axis are multiples of 8 voxels: what is described of a map that is not turned stays
+    on its grid.
     """
     shape = np.array(state.shape)
     middle = np.round((np.asarray(low) + shape / 2)[:2] / GRID) * GRID
-    c, s = abs(np.cos(yaw)), abs(np.sin(yaw))
-    half = np.ceil(np.array([[c, s], [s, c]]) @ (shape[:2] / 2 + GRID) / GRID).astype(np.int64) * GRID
+    c = abs(np.cos(yaw))
+    s = abs(np.sin(yaw))
+    half = (
+        np.ceil(np.array([[c, s], [s, c]]) @ (shape[:2] / 2 + GRID) / GRID).astype(np.int64) * GRID
+    )
     box = np.empty((2 * half[0], 2 * half[1], shape[2]), np.uint8)
     turn(state, np.asarray(low, np.int64), yaw, np.array([*middle, low[2] + shape[2] / 2]), box)
     return Turned(box, np.array([-half[0], -half[1], low[2]], np.int64), middle, yaw)

@@ -1,9 +1,11 @@
-"""The paper's variational encoder-decoder (3.2, supplement 1), written so that it can be run over a whole map at once.
+"""The paper's variational encoder-decoder (3.2, supplement 1), written so that it can be run over a
+whole map at once.
 
-Labels enter through a learned embedding (an occupied, free or unobserved voxel is a table look-up, not a vector of L + 2 numbers), and
-the first block maps 2x2x2 voxels at once. Two blocks of 3x3x3 convolution, 2x2x2 max-pooling and ReLU follow, then a fully connected layer
-written as a convolution. The descriptor is the mean mu of the latent code, scaled to unit length. There is no batch normalisation, as in
-the paper: beside the contrastive term it costs a third of the recall.
+Labels enter through a learned embedding (an occupied, free or unobserved voxel is a table look-up,
+not a vector of L + 2 numbers), and the first block maps 2x2x2 voxels at once. Two blocks of 3x3x3
+convolution, 2x2x2 max-pooling and ReLU follow, then a fully connected layer written as a
+convolution. The descriptor is the mean mu of the latent code, scaled to unit length. There is no
+batch normalisation, as in the paper: beside the contrastive term it costs a third of the recall.
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ CHANNELS = (16, 32, 64)
 
 
 class _LookUp(torch.autograd.Function):
-    """``F.embedding`` for a few codes and many voxels: its own backward pass scatters row by row and takes five times as long."""
+    """``F.embedding`` for a few codes and many voxels: its own backward pass scatters row by row
+    and takes five times as long.
+    """
 
     @staticmethod
     def forward(ctx: Any, codes: Tensor, weight: Tensor) -> Tensor:
@@ -41,13 +45,19 @@ class _LookUp(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor]:
         (codes,) = ctx.saved_tensors
-        flat, grad = codes.reshape(-1), grads[0].reshape(-1, grads[0].shape[-1])
-        columns = [torch.bincount(flat, grad[:, c].float(), minlength=ctx.rows) for c in range(grad.shape[1])]
+        flat = codes.reshape(-1)
+        grad = grads[0].reshape(-1, grads[0].shape[-1])
+        columns = [
+            torch.bincount(flat, grad[:, c].float(), minlength=ctx.rows)
+            for c in range(grad.shape[1])
+        ]
         return None, torch.stack(columns, 1).to(grad.dtype)
 
 
 def halve(x: Tensor) -> Tensor:
-    """2x2x2 max-pooling; without gradients as three maxima, which take half the time of the library's kernel in bf16."""
+    """2x2x2 max-pooling; without gradients as three maxima, which take half the time of the
+    library's kernel in bf16.
+    """
     if torch.is_grad_enabled() and x.requires_grad:
         return F.max_pool3d(x, 2)
     x = torch.maximum(x[:, :, ::2], x[:, :, 1::2])
@@ -56,22 +66,31 @@ def halve(x: Tensor) -> Tensor:
 
 
 def in_eights(volume: Tensor) -> Tensor:
-    """Voxels (b, x, y, z) -> (b, x / 2, y / 2, z / 2, 8), the eight voxels of each cell of twice the size side by side."""
+    """Voxels (b, x, y, z) -> (b, x / 2, y / 2, z / 2, 8), the eight voxels of each cell of twice
+    the size side by side.
+    """
     b, x, y, z = volume.shape
-    return volume.reshape(b, x // 2, 2, y // 2, 2, z // 2, 2).permute(0, 1, 3, 5, 2, 4, 6).flatten(4)
+    return (
+        volume.reshape(b, x // 2, 2, y // 2, 2, z // 2, 2).permute(0, 1, 3, 5, 2, 4, 6).flatten(4)
+    )
 
 
 def from_eights(cells: Tensor) -> Tensor:
     """The reverse of :func:`in_eights`."""
     b, x, y, z, _ = cells.shape
-    return cells.reshape(b, x, y, z, 2, 2, 2).permute(0, 1, 4, 2, 5, 3, 6).reshape(b, 2 * x, 2 * y, 2 * z)
+    return (
+        cells.reshape(b, x, y, z, 2, 2, 2)
+        .permute(0, 1, 4, 2, 5, 3, 6)
+        .reshape(b, 2 * x, 2 * y, 2 * z)
+    )
 
 
 def _turned(base: Tensor, group_in: bool) -> Tensor:
-    """Filters (4 * out, 4 * in or in, x, y, z) of a layer that turns with its input, from ``base`` (out, [4,] in, x, y, z).
+    """Filters (4 * out, 4 * in or in, x, y, z) of a layer that turns with its input, from ``base``
+    (out, [4,] in, x, y, z).
 
-    Output channel r * out + i is filter i turned by r quarter turns about z, which also turns what it expects of its input's channels
-    (Cohen and Welling 2016, the group p4).
+    Output channel r * out + i is filter i turned by r quarter turns about z, which also turns what
+    it expects of its input's channels (Cohen and Welling 2016, the group p4).
     """
     turns = []
     for r in range(4):
@@ -81,9 +100,13 @@ def _turned(base: Tensor, group_in: bool) -> Tensor:
 
 
 class Turning(nn.Module):
-    """The parameters of one layer of the encoder: ``base`` filters for one heading and a ``bias`` that all headings share."""
+    """The parameters of one layer of the encoder: ``base`` filters for one heading and a ``bias``
+    that all headings share.
+    """
 
-    def __init__(self, inputs: int, outputs: int, size: tuple[int, int, int], *, group_in: bool = True) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, size: tuple[int, int, int], *, group_in: bool = True
+    ) -> None:
         super().__init__()
         self.group_in = group_in
         shape = (outputs // 4, 4, inputs // 4) if group_in else (outputs // 4, inputs)
@@ -98,8 +121,10 @@ class Turning(nn.Module):
 
 @njit(cache=True, nogil=True)
 def look_up_cells(codes: U8, table: F32, bias: F32, usual: int, out: F32) -> None:
-    """ReLU(bias + the rows of ``table`` (8, codes, channels) of the 2x2x2 ``codes`` (b, x, y, z) of each cell) into ``out`` (b, x / 2,
-    y / 2, z / 2, channels); cells that hold nothing but the ``usual`` code are made once."""
+    """ReLU(bias + the rows of ``table`` (8, codes, channels) of the 2x2x2 ``codes`` (b, x, y, z) of
+    each cell) into ``out`` (b, x / 2, y / 2, z / 2, channels); cells that hold nothing but the
+    ``usual`` code are made once.
+    """
     n = len(bias)
     of_usual = bias.copy()
     for k in range(8):
@@ -111,7 +136,8 @@ def look_up_cells(codes: U8, table: F32, bias: F32, usual: int, out: F32) -> Non
         for i in range(out.shape[1]):
             for j in range(out.shape[2]):
                 for m in range(out.shape[3]):
-                    cell, same = codes[b, 2 * i : 2 * i + 2, 2 * j : 2 * j + 2, 2 * m : 2 * m + 2], True
+                    cell = codes[b, 2 * i : 2 * i + 2, 2 * j : 2 * j + 2, 2 * m : 2 * m + 2]
+                    same = True
                     for k in range(8):
                         same &= cell[k >> 2, (k >> 1) & 1, k & 1] == usual
                     if same:
@@ -127,13 +153,17 @@ def look_up_cells(codes: U8, table: F32, bias: F32, usual: int, out: F32) -> Non
 
 
 class Encoder(nn.Module):
-    """Codes (b, x, y, 32) uint8 with a margin of 8 voxels in x and y -> mu (b, latent, (x - 40) / 8, (y - 40) / 8).
+    """Codes (b, x, y, 32) uint8 with a margin of 8 voxels in x and y -> mu (b, latent, (x - 40) /
+    8, (y - 40) / 8).
 
-    Output (i, j) describes the subvolume whose corner is voxel (8 + 8 i, 8 + 8 j, 0). A map turned by a quarter about z has the same
-    descriptors but for the order of their numbers (``describe.quarter_turns``). Another ``layer`` is for comparison.
+    Output (i, j) describes the subvolume whose corner is voxel (8 + 8 i, 8 + 8 j, 0). A map turned
+    by a quarter about z has the same descriptors but for the order of their numbers
+    (``describe.quarter_turns``). Another ``layer`` is for comparison.
     """
 
-    def __init__(self, variant: str, latent: int = LATENT, layer: Callable[..., Any] = Turning) -> None:
+    def __init__(
+        self, variant: str, latent: int = LATENT, layer: Callable[..., Any] = Turning
+    ) -> None:
         super().__init__()
         self.variant, self.latent = variant, latent
         self.embedding = nn.Embedding(CLASSES[variant] + 3, EMBEDDING)
@@ -146,49 +176,80 @@ class Encoder(nn.Module):
 
     def train(self, mode: bool = True) -> Encoder:
         """As of any module; what was kept of the old weights is forgotten."""
-        self._kept, self._table = [], None
+        self._kept = []
+        self._table = None
         return super().train(mode)
 
     def _layers(self) -> list[tuple[Tensor, Tensor]]:
-        """Weights and biases of all layers as the kernels want them, made once where they do not change."""
+        """Weights and biases of all layers as the kernels want them, made once where they do not
+        change.
+        """
         if self._kept:
             return self._kept
         first, *rest = (layer.filters() for layer in (self.first, *self.blocks, self.mean))
         layers = [(first[0].permute(0, 2, 3, 4, 1).flatten(1), first[1])]
         layers += [(w.contiguous(memory_format=torch.channels_last_3d), b) for w, b in rest[:-1]]
-        w, b = rest[-1]  # the four layers of z as channels: four times as fast as in three dimensions
-        layers.append((w.permute(0, 4, 1, 2, 3).flatten(1, 2).contiguous(memory_format=torch.channels_last), b))
+        # the four layers of z as channels: four times as fast as in three dimensions
+        w, b = rest[-1]
+        layers.append(
+            (
+                w.permute(0, 4, 1, 2, 3)
+                .flatten(1, 2)
+                .contiguous(memory_format=torch.channels_last),
+                b,
+            )
+        )
         if not self.training and not torch.is_grad_enabled():
             self._kept = layers
         return layers
 
     def first_block(self, codes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Codes -> (b, 16, x / 2, y / 2, 16): one linear map of the embeddings of each 2x2x2 voxels, at a fraction of the cost of the
-        paper's block, which convolves at full resolution."""
+        """Codes -> (b, 16, x / 2, y / 2, 16): one linear map of the embeddings of each 2x2x2
+        voxels, at a fraction of the cost of the paper's block, which convolves at full resolution.
+        """
         device = codes.device.type
-        reduced = torch.is_autocast_enabled(device)  # looked up in the precision of the convolutions: no copy of the volume
-        table = self.embedding.weight.to(torch.get_autocast_dtype(device)) if reduced else self.embedding.weight
+        # looked up in the precision of the convolutions: no copy of the volume
+        reduced = torch.is_autocast_enabled(device)
+        table = (
+            self.embedding.weight.to(torch.get_autocast_dtype(device))
+            if reduced
+            else self.embedding.weight
+        )
         cells = in_eights(codes).int()
-        looked_up: Tensor = F.embedding(cells, table) if codes.is_cuda else _LookUp.apply(cells, table)  # type: ignore[no-untyped-call]
+        if codes.is_cuda:
+            looked_up: Tensor = F.embedding(cells, table)
+        else:
+            looked_up = _LookUp.apply(cells, table)  # type: ignore[no-untyped-call]
         x = F.linear(looked_up.flatten(4), weight, bias)
         return x.permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
 
     def _looked_up(self, codes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """The first block and its ReLU as a sum of eight rows of a table: what a voxel of each code adds to the cell it lies in."""
+        """The first block and its ReLU as a sum of eight rows of a table: what a voxel of each code
+        adds to the cell it lies in.
+        """
         if self._table is None:
-            table = torch.einsum("ce,oke->kco", self.embedding.weight, weight.reshape(-1, 8, EMBEDDING))
+            table = torch.einsum(
+                "ce,oke->kco", self.embedding.weight, weight.reshape(-1, 8, EMBEDDING)
+            )
             self._table = np.ascontiguousarray(table.float().numpy())
         b, x, y, z = codes.shape
         out = np.empty((b, x // 2, y // 2, z // 2, len(bias)), np.float32)
-        look_up_cells(codes.numpy(), self._table, bias.float().numpy(), CLASSES[self.variant] + 1, out)
+        look_up_cells(
+            codes.numpy(), self._table, bias.float().numpy(), CLASSES[self.variant] + 1, out
+        )
         return torch.from_numpy(out).permute(0, 4, 1, 2, 3)
 
     def forward(self, codes: Tensor) -> Tensor:
         first, *blocks, mean = self._layers()
         describing = not (self.training or torch.is_grad_enabled() or codes.is_cuda)
-        x = self._looked_up(codes, *first) if describing else F.relu(self.first_block(codes, *first))
+        x = (
+            self._looked_up(codes, *first)
+            if describing
+            else F.relu(self.first_block(codes, *first))
+        )
         for weight, bias in blocks:
-            x = F.relu(halve(F.conv3d(x, weight, bias, padding=1)))  # ReLU before pooling, as in the paper, would cost eight times as much
+            # ReLU before pooling, as in the paper, would cost eight times as much
+            x = F.relu(halve(F.conv3d(x, weight, bias, padding=1)))
         return latent_mean(x[:, :, 1:-1, 1:-1], *mean)  # the pooled margin has served
 
 
@@ -199,9 +260,11 @@ def latent_mean(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 class Decoder(nn.Module):
-    """Latent code (b, latent) -> logits (L + 2, 8, b, 16, 16, 16) of a subvolume :func:`in_eights`, the eight moved to the front.
+    """Latent code (b, latent) -> logits (L + 2, 8, b, 16, 16, 16) of a subvolume :func:`in_eights`,
+    the eight moved to the front.
 
-    Upsampling by repetition and convolution as in the paper, but the last step says the 2x2x2 voxels of each cell at once.
+    Upsampling by repetition and convolution as in the paper, but the last step says the 2x2x2
+    voxels of each cell at once.
     """
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
@@ -211,10 +274,17 @@ class Decoder(nn.Module):
         self.last = nn.Linear(32, 8 * (CLASSES[variant] + 2))
 
     def forward(self, code: Tensor) -> Tensor:
-        x = torch.tanh(self.start(code)).reshape(-1, 24, 4, 4, 4).contiguous(memory_format=torch.channels_last_3d)
+        x = (
+            torch.tanh(self.start(code))
+            .reshape(-1, 24, 4, 4, 4)
+            .contiguous(memory_format=torch.channels_last_3d)
+        )
         for block in self.blocks:
-            x = F.relu(block(x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4)))
-        # classes first: a softmax over columns is vectorised, one over rows of twenty numbers is not
+            x = F.relu(
+                block(x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4))
+            )
+        # classes first: a softmax over columns is vectorised, one over rows of twenty numbers is
+        # not
         cells = x.permute(1, 0, 2, 3, 4).flatten(1)
         logits = torch.addmm(self.last.bias[:, None], self.last.weight, cells)
         return logits.reshape(-1, 8, x.shape[0], *x.shape[2:])
@@ -243,12 +313,16 @@ class Completion(nn.Module):
         channels_last(self)
 
     def complete(self, codes: Tensor) -> Tensor:
-        """Logits (b, L + 2, 32, 32, 32) of the completed middle subvolumes of ``codes`` (b, 64, 64, 32), as the training weighed voxels."""
+        """Logits (b, L + 2, 32, 32, 32) of the completed middle subvolumes of ``codes`` (b, 64, 64,
+        32), as the training weighed voxels.
+        """
         return as_volumes(self(codes, None)[0])
 
     def forward(self, codes: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits of the completed middle subvolume as the decoder gives them, mu (b, latent, 3, 3) of all and log-variance (b, latent) of
-        the middle one of ``codes`` (b, 64, 64, 32); without ``noise`` (b, latent) the mean is decoded."""
+        """Logits of the completed middle subvolume as the decoder gives them, mu (b, latent, 3, 3)
+        of all and log-variance (b, latent) of the middle one of ``codes`` (b, 64, 64, 32); without
+        ``noise`` (b, latent) the mean is decoded.
+        """
         every = self.encoder(codes)
         mu = every[:, :, every.shape[2] // 2, every.shape[3] // 2]
         log_variance = self.encoder.log_variance(torch.tanh(mu)).clamp(-8.0, 4.0)

@@ -43,7 +43,8 @@ def describe_submap(
     settings: Settings,
     yaws: Sequence[float] = (0.0,),
 ) -> list[Described]:
-    """Centres (voxels) and descriptors of every described subvolume of a submap, near the keyframes' positions ``road`` (m, 2), metres.
+    """Centres (voxels) and descriptors of every described subvolume of a submap, near the
+    keyframes' positions ``road`` (m, 2), metres.
 
     One set for each of ``yaws``, as a query at that heading sees the submap.
     """
@@ -51,24 +52,31 @@ def describe_submap(
     low, high = blocks.bounds()
     state = blocks.dense(low, tuple((high - low).tolist()))
     d = settings.descriptor
-    v, reach = settings.fusion.voxel_size, d.reach or np.inf
+    v = settings.fusion.voxel_size
+    reach = d.reach or np.inf
     out = []
     for turned in (turned_map(state, low, yaw) for yaw in yaws):
         near = turned.from_map(road / v) * v
-        found = describe_map(turned.state, turned.low, ground_z, v, encoder, d.stride, d.min_occupied, near, reach)
+        found = describe_map(
+            turned.state, turned.low, ground_z, v, encoder, d.stride, d.min_occupied, near, reach
+        )
         out.append(Described(turned.to_map(found.centre), found.descriptor))
     return out
 
 
 def known_headings(settings: Settings) -> list[float]:
     """The yaws that maps are described at, within a quarter turn (rad)."""
-    return [2 * np.pi * k / settings.descriptor.headings for k in range(settings.descriptor.headings // 4)]
+    return [
+        2 * np.pi * k / settings.descriptor.headings
+        for k in range(settings.descriptor.headings // 4)
+    ]
 
 
 def variants_for(label_source: str, others: Iterable[str], settings: Settings) -> tuple[str, ...]:
     """Networks that describe a session among ``others`` (their label sources).
 
-    Semantic where classes come from a log or a model, geometric elsewhere, and both where it must be comparable with either kind.
+    Semantic where classes come from a log or a model, geometric elsewhere, and both where it must
+    be comparable with either kind.
     """
     if settings.descriptor.variant != "auto":
         return (settings.descriptor.variant,)

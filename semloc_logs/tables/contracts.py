@@ -24,7 +24,15 @@ _TYPES = {
     "fixed_size_binary[4096]": pa.binary(4096),
     "list<cell,label,count>": pa.list_(
         pa.field(
-            "item", pa.struct([pa.field("cell", pa.uint16()), pa.field("label", pa.uint8()), pa.field("count", pa.uint32())]), nullable=True
+            "item",
+            pa.struct(
+                [
+                    pa.field("cell", pa.uint16()),
+                    pa.field("label", pa.uint8()),
+                    pa.field("count", pa.uint32()),
+                ]
+            ),
+            nullable=True,
         )
     ),
     "fixed_size_list<double>[36]": pa.list_(pa.float64(), 36),
@@ -34,7 +42,9 @@ _TYPES = {
 @cache
 def schema(name: str) -> pa.Schema:
     """Columns and types of the table ``name``."""
-    return pa.schema([pa.field(c["name"], _TYPES[c["type"]], nullable=False) for c in contract(name)["columns"]])
+    return pa.schema(
+        [pa.field(c["name"], _TYPES[c["type"]], nullable=False) for c in contract(name)["columns"]]
+    )
 
 
 @cache
@@ -53,8 +63,12 @@ def table(name: str, columns: dict[str, Any]) -> pa.Table:
     """A table of the contract ``name`` from its columns; ContractError when they differ from it."""
     wanted = schema(name)
     if set(columns) != set(wanted.names):
-        raise ContractError(f"Table '{name}' needs the columns {', '.join(wanted.names)}, not {', '.join(columns)}.")
+        raise ContractError(
+            f"Table '{name}' needs the columns {', '.join(wanted.names)}, not {', '.join(columns)}."
+        )
     try:
         return pa.table([pa.array(columns[f.name], f.type) for f in wanted], schema=wanted)
     except (pa.ArrowException, OverflowError) as problem:
-        raise ContractError(f"Table '{name}' cannot hold these columns: {str(problem).splitlines()[0]}.") from None
+        raise ContractError(
+            f"Table '{name}' cannot hold these columns: {str(problem).splitlines()[0]}."
+        ) from None

@@ -1,4 +1,6 @@
-"""Parquet tables that appear complete or not at all: written under a temporary name, read back, renamed."""
+"""Parquet tables that appear complete or not at all: written under a temporary name, read back,
+renamed.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def fsync_folder(folder: Path) -> None:
 
 @contextmanager
 def replacing_file(path: Path, suffix: str = ".tmp") -> Iterator[Path]:
-    """A temporary path beside ``path``, ending in ``suffix``; it is renamed onto ``path`` when the block ends well, else removed."""
+    """A temporary path beside ``path``, ending in ``suffix``; it is renamed onto ``path`` when the
+    block ends well, else removed.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{suffix}")
     try:
@@ -51,7 +55,8 @@ def replacing_file(path: Path, suffix: str = ".tmp") -> Iterator[Path]:
 def replacing_folder(path: Path) -> Iterator[Path]:
     """A temporary folder beside ``path`` that takes its place, synced, when the block ends well.
 
-    Two renames do it, so a reader in between, or after a kill in between, finds no folder; never half of one.
+    Two renames do it, so a reader in between, or after a kill in between, finds no folder; never
+    half of one.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     for stale in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):  # of a run that was killed
@@ -88,22 +93,41 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text())
     except (OSError, ValueError) as problem:
-        raise WorkspaceError(f"{path} cannot be read ({problem}): run the stage that writes it again.") from None
+        raise WorkspaceError(
+            f"{path} cannot be read ({problem}): run the stage that writes it again."
+        ) from None
     if not isinstance(content, dict):
-        raise WorkspaceError(f"{path} does not hold a JSON object: run the stage that writes it again.")
+        raise WorkspaceError(
+            f"{path} does not hold a JSON object: run the stage that writes it again."
+        )
     return content
 
 
-def write_table(path: Path, table: pa.Table, metadata: dict[str, Any], sorting: tuple[str, ...] = (), row_group: int = ROW_GROUP) -> None:
-    """Write ``table``, in groups of ``row_group`` rows, with the JSON ``semloc`` key in its metadata; rows are read back and counted
-    before the rename."""
+def write_table(
+    path: Path,
+    table: pa.Table,
+    metadata: dict[str, Any],
+    sorting: tuple[str, ...] = (),
+    row_group: int = ROW_GROUP,
+) -> None:
+    """Write ``table``, in groups of ``row_group`` rows, with the JSON ``semloc`` key in its
+    metadata; rows are read back and counted before the rename.
+    """
     table = table.replace_schema_metadata({"semloc": json.dumps(metadata, sort_keys=True)})
     columns = [pq.SortingColumn(table.schema.get_field_index(name)) for name in sorting]
     with replacing_file(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd", row_group_size=row_group, sorting_columns=columns or None)
+        pq.write_table(
+            table,
+            temporary,
+            compression="zstd",
+            row_group_size=row_group,
+            sorting_columns=columns or None,
+        )
         found = pq.read_metadata(temporary).num_rows
         if found != table.num_rows:
-            raise ContractError(f"{path}: {found} rows were written of {table.num_rows}; is the disk full?")
+            raise ContractError(
+                f"{path}: {found} rows were written of {table.num_rows}; is the disk full?"
+            )
 
 
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
@@ -122,5 +146,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
         found = pq.read_schema(path).metadata or {}
         content: dict[str, Any] = json.loads(found[b"semloc"])
     except (OSError, KeyError, ValueError, pa.ArrowException) as problem:
-        raise WorkspaceError(f"{path} has no semloc metadata ({problem}): run the stage that writes it with --overwrite.") from None
+        raise WorkspaceError(
+            f"{path} has no semloc metadata ({problem}): run the stage that writes it with --overwrite."
+        ) from None
     return content

@@ -1,1 +1,3 @@
-"""Learning the descriptor and its words, from simulated scenes or from sessions of one's own (paper 3.2, supplement 1)."""
+"""Learning the descriptor and its words, from simulated scenes or from sessions of one's own (paper
+3.2, supplement 1).
+"""

@@ -1,4 +1,6 @@
-"""Checkpoints of a training: network, optimiser and step in one safetensors file; and finished weights, written and read."""
+"""Checkpoints of a training: network, optimiser and step in one safetensors file; and finished
+weights, written and read.
+"""
 
 from __future__ import annotations
 
@@ -22,18 +24,31 @@ from semloc_logs.training.schedule import plateau_end, steps_of
 Network = TypeVar("Network", bound=nn.Module)
 
 
-def save_checkpoint(path: Path, model: Completion, optimiser: torch.optim.Optimizer, training: Training, step: int) -> None:
+def save_checkpoint(
+    path: Path, model: Completion, optimiser: torch.optim.Optimizer, training: Training, step: int
+) -> None:
     """What :func:`resume` needs to go on after ``step`` steps."""
     tensors = {f"model.{k}": v.contiguous() for k, v in model.state_dict().items()}
     for i, p in enumerate(model.parameters()):
-        tensors |= {f"optimiser.{i}.{k}": v.contiguous() for k, v in optimiser.state.get(p, {}).items() if isinstance(v, Tensor)}
-    note = {"step": str(step), "training": training.model_dump_json(), "variant": model.encoder.variant}
+        tensors |= {
+            f"optimiser.{i}.{k}": v.contiguous()
+            for k, v in optimiser.state.get(p, {}).items()
+            if isinstance(v, Tensor)
+        }
+    note = {
+        "step": str(step),
+        "training": training.model_dump_json(),
+        "variant": model.encoder.variant,
+    }
     with replacing_file(path) as temporary:
         save_file(tensors, temporary, metadata=note)
 
 
-def resume(path: Path, model: Completion, optimiser: torch.optim.Optimizer, training: Training) -> int:
-    """Put ``model`` and ``optimiser`` back to where the checkpoint was written; the number of steps done.
+def resume(
+    path: Path, model: Completion, optimiser: torch.optim.Optimizer, training: Training
+) -> int:
+    """Put ``model`` and ``optimiser`` back to where the checkpoint was written; the number of steps
+    done.
 
     Raises WorkspaceError when the file is damaged, or of another training or network.
     """
@@ -43,17 +58,27 @@ def resume(path: Path, model: Completion, optimiser: torch.optim.Optimizer, trai
         tensors = load_file(path)
         step = int(note["step"])
         same_network = note.get("variant", model.encoder.variant) == model.encoder.variant
-        same = same_network and _goes_on(json.loads(note["training"]), training.model_dump(mode="json"), step)
+        same = same_network and _goes_on(
+            json.loads(note["training"]), training.model_dump(mode="json"), step
+        )
     except (OSError, SafetensorError, KeyError, ValueError) as problem:
-        raise WorkspaceError(f"Checkpoint {path} cannot be read ({problem}): remove it to start over.") from None
+        raise WorkspaceError(
+            f"Checkpoint {path} cannot be read ({problem}): remove it to start over."
+        ) from None
     if not same:
-        raise WorkspaceError(f"Checkpoint {path} is of a training with other settings: remove it to start over.")
+        raise WorkspaceError(
+            f"Checkpoint {path} is of a training with other settings: remove it to start over."
+        )
     try:
         model.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
     except RuntimeError:
-        raise WorkspaceError(f"Checkpoint {path} is of another network: remove it to start over.") from None
+        raise WorkspaceError(
+            f"Checkpoint {path} is of another network: remove it to start over."
+        ) from None
     for i, p in enumerate(model.parameters()):
-        state = {k.split(".", 2)[2]: v for k, v in tensors.items() if k.startswith(f"optimiser.{i}.")}
+        state = {
+            k.split(".", 2)[2]: v for k, v in tensors.items() if k.startswith(f"optimiser.{i}.")
+        }
         if state:
             # counters stay where they are, moments go where the parameters live
             optimiser.state[p] = {k: v if k == "step" else v.to(p.device) for k, v in state.items()}
@@ -61,7 +86,9 @@ def resume(path: Path, model: Completion, optimiser: torch.optim.Optimizer, trai
 
 
 def steps_done(path: Path) -> int:
-    """Steps of the training whose checkpoint is at ``path``; 0 where there is none that can be read."""
+    """Steps of the training whose checkpoint is at ``path``; 0 where there is none that can be
+    read.
+    """
     try:
         with safe_open(path, "pt") as handle:
             return int((handle.metadata() or {})["step"])
@@ -75,7 +102,9 @@ def _goes_on(before: dict[str, Any], now: dict[str, Any], step: int) -> bool:
     Before the rate falls it does not matter how many samples are to be seen in all.
     """
     lengths = ("samples", "scenes")
-    if {k: v for k, v in before.items() if k not in lengths} != {k: v for k, v in now.items() if k not in lengths}:
+    if {k: v for k, v in before.items() if k not in lengths} != {
+        k: v for k, v in now.items() if k not in lengths
+    }:
         return False
     steps = min(steps_of(Training.model_validate(settings)) for settings in (before, now))
     return before["samples"] == now["samples"] or step <= plateau_end(steps)
@@ -83,24 +112,36 @@ def _goes_on(before: dict[str, Any], now: dict[str, Any], step: int) -> bool:
 
 def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
     """The network in bf16 with a model card in the file's metadata."""
-    tensors = {k: v.to("cpu", torch.bfloat16).contiguous() for k, v in model.state_dict().items() if v.is_floating_point()}
+    tensors = {
+        k: v.to("cpu", torch.bfloat16).contiguous()
+        for k, v in model.state_dict().items()
+        if v.is_floating_point()
+    }
     with replacing_file(path) as temporary:
         save_file(tensors, temporary, metadata={**card, "variant": model.encoder.variant})
 
 
-def load_weights(build: Callable[[str, int], Network], part: str, variant: str, weights: Path | None = None) -> Network:
-    """The network that ``build(variant, latent)`` makes, with the shipped weights of ``variant`` or those of a file.
+def load_weights(
+    build: Callable[[str, int], Network], part: str, variant: str, weights: Path | None = None
+) -> Network:
+    """The network that ``build(variant, latent)`` makes, with the shipped weights of ``variant`` or
+    those of a file.
 
-    ``part`` is ``encoder.`` for the encoder alone, empty for all. Raises SettingsError when the file does not hold them.
+    ``part`` is ``encoder.`` for the encoder alone, empty for all. Raises SettingsError when the
+    file does not hold them.
     """
     try:
         if weights is not None:
             tensors = load_file(weights)
         else:
-            with as_file(files("semloc_logs.subvolumes") / "weights" / f"{variant}.safetensors") as path:
+            with as_file(
+                files("semloc_logs.subvolumes") / "weights" / f"{variant}.safetensors"
+            ) as path:
                 tensors = load_file(path)
         network = build(variant, len(tensors["encoder.log_variance.bias"]))
-        network.load_state_dict({k.removeprefix(part): v.float() for k, v in tensors.items() if k.startswith(part)})
+        network.load_state_dict(
+            {k.removeprefix(part): v.float() for k, v in tensors.items() if k.startswith(part)}
+        )
     except (OSError, SafetensorError, KeyError, RuntimeError) as problem:
         said = str(problem).splitlines()[0]
         raise SettingsError(

@@ -1,4 +1,6 @@
-"""How well the network completes subvolumes: what counts, and the scores on a held-out shard (paper 3.2 and 4.3)."""
+"""How well the network completes subvolumes: what counts, and the scores on a held-out shard (paper
+3.2 and 4.3).
+"""
 
 from __future__ import annotations
 
@@ -15,18 +17,22 @@ U8 = NDArray[np.uint8]
 
 @torch.inference_mode()
 def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, float]:
-    """How well the subvolumes of a held-out shard are completed, beside the trivial answers, and found again.
+    """How well the subvolumes of a held-out shard are completed, beside the trivial answers, and
+    found again.
 
-    ``accuracy``: share of the complete map's observed voxels with the right label (the paper's figure); ``iou``: mean over the
-    classes that occur; ``unobserved_accuracy``: over voxels that the input did not observe; ``all_free``, ``copy_input``: accuracy
-    of the two trivial answers; ``recall5``: share of incomplete subvolumes with their partner among the five nearest.
+    ``accuracy``: share of the complete map's observed voxels with the right label (the paper's
+    figure); ``iou``: mean over the classes that occur; ``unobserved_accuracy``: over voxels that
+    the input did not observe; ``all_free``, ``copy_input``: accuracy of the two trivial answers;
+    ``recall5``: share of incomplete subvolumes with their partner among the five nearest.
     """
     model.eval()
     variant = model.encoder.variant
-    table, classes = code_table(variant), CLASSES[variant]
+    table = code_table(variant)
+    classes = CLASSES[variant]
     confusion = np.zeros((classes + 1, classes + 1), np.int64)
     right = seen = free = copied = hidden = hidden_right = 0
-    ours, theirs = [], []
+    ours = []
+    theirs = []
     for i in range(0, len(pairs[0]), 32):
         part, whole, other = (a[i : i + 32] for a in pairs)
         codes = torch.from_numpy(table[part])
@@ -34,7 +40,9 @@ def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, 
         ours.append(descriptors(mu[:, :, 1:2, 1:2]))
         theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 1:2, 1:2]))
         said = as_volumes(logits)[:, : classes + 1].argmax(1).numpy()
-        target, known = (t.numpy() for t in targets(torch.from_numpy(whole), torch.from_numpy(table), classes))
+        target, known = (
+            t.numpy() for t in targets(torch.from_numpy(whole), torch.from_numpy(table), classes)
+        )
         given = table[part[:, 16:-16, 16:-16]]
         seen += int(known.sum())
         right += int((known & (said == target)).sum())

@@ -16,11 +16,16 @@ from semloc_logs.training.pairs import read_shard
 
 @torch.inference_mode()
 def shard_descriptors(
-    shards: Sequence[Path], encoder: Encoder, pairs_per_shard: int | None = None, note: Callable[[str], None] | None = None
+    shards: Sequence[Path],
+    encoder: Encoder,
+    pairs_per_shard: int | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> NDArray[np.float16]:
-    """Unit descriptors (n, N), nine of the complete view of each of the first pairs (of all without ``pairs_per_shard``).
+    """Unit descriptors (n, N), nine of the complete view of each of the first pairs (of all without
+    ``pairs_per_shard``).
 
-    One shard is in memory at a time; what is kept has half precision, which is finer than what a vocabulary rounds to.
+    One shard is in memory at a time; what is kept has half precision, which is finer than what a
+    vocabulary rounds to.
     """
     table = code_table(encoder.variant)
     out = []

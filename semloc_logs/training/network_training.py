@@ -1,8 +1,10 @@
-"""Training of the encoder-decoder on packed pairs (paper 3.2 and 4.3, supplement 1), on a CPU or a GPU, resumable from a checkpoint.
+"""Training of the encoder-decoder on packed pairs (paper 3.2 and 4.3, supplement 1), on a CPU or a
+GPU, resumable from a checkpoint.
 
-Beside the paper's completion loss a contrastive term (InfoNCE over the batch) pulls the descriptor of an incomplete subvolume towards
-that of the complete one seen a little shifted and turned, which is what the database holds; ``training.contrastive_weight=0`` is the
-paper. Adam replaces ADADELTA because the shipped runs see few samples.
+Beside the paper's completion loss a contrastive term (InfoNCE over the batch) pulls the descriptor
+of an incomplete subvolume towards that of the complete one seen a little shifted and turned, which
+is what the database holds; ``training.contrastive_weight=0`` is the paper. Adam replaces ADADELTA
+because the shipped runs see few samples.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ MIN_OCCUPIED = 40
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Of one step: samples seen so far, losses, share of the batch's incomplete subvolumes whose partner is nearest."""
+    """Of one step: samples seen so far, losses, share of the batch's incomplete subvolumes whose
+    partner is nearest.
+    """
 
     samples: int
     loss: float
@@ -45,13 +49,19 @@ class Progress:
 
 
 def _seen(part: Tensor) -> Tensor:
-    """Which of the 3 x 3 subvolumes of each wide one hold enough occupied voxels to be described, flat (b * 9,)."""
-    columns = ((part != FREE_STATE) & (part != UNOBSERVED_STATE)).sum(3, dtype=torch.float32)[:, None, 8:-8, 8:-8]
+    """Which of the 3 x 3 subvolumes of each wide one hold enough occupied voxels to be described,
+    flat (b * 9,).
+    """
+    columns = ((part != FREE_STATE) & (part != UNOBSERVED_STATE)).sum(3, dtype=torch.float32)[
+        :, None, 8:-8, 8:-8
+    ]
     return (F.avg_pool2d(columns, 32, stride=8) * 32**2).round().flatten() >= MIN_OCCUPIED
 
 
 def targets(complete: Tensor, table: Tensor, classes: int) -> tuple[Tensor, Tensor]:
-    """Class indices of the complete subvolumes and which voxels count: unobserved ones and occupied ones of unknown class do not."""
+    """Class indices of the complete subvolumes and which voxels count: unobserved ones and occupied
+    ones of unknown class do not.
+    """
     codes = table[complete.long()]
     known = codes <= classes
     return torch.where(known, codes, 0).long(), known
@@ -65,27 +75,42 @@ class _Losses:
     matched: float
 
 
-def _losses(model: Completion, batch: Batch, noise: Tensor, table: Tensor, training: Training) -> _Losses:
-    classes, device = CLASSES[model.encoder.variant], noise.device.type
+def _losses(
+    model: Completion, batch: Batch, noise: Tensor, table: Tensor, training: Training
+) -> _Losses:
+    classes = CLASSES[model.encoder.variant]
+    device = noise.device.type
     target, known = targets(in_eights(batch.complete).movedim(-1, 0), table, classes)
     with torch.autocast(device, dtype=torch.bfloat16):
         logits, mu, log_variance = model(table[batch.incomplete.long()], noise)
-        with torch.no_grad():  # the complete view is the goal; a gradient through it too would cost a third more
-            partner = model.encoder(table[batch.other.long()]) if training.contrastive_weight else mu
+        # the complete view is the goal; a gradient through it too would cost a third more
+        with torch.no_grad():
+            partner = (
+                model.encoder(table[batch.other.long()]) if training.contrastive_weight else mu
+            )
     entropy = F.cross_entropy(logits[None], target[None], reduction="none").float()
     weight = torch.where(target < classes, training.occupied_weight, 1.0) * known
     reconstruction = (entropy * weight).sum() / weight.sum().clamp(min=1.0)
-    middle, log_variance = mu[:, :, mu.shape[2] // 2, mu.shape[3] // 2].float(), log_variance.float()
+    middle = mu[:, :, mu.shape[2] // 2, mu.shape[3] // 2].float()
+    log_variance = log_variance.float()
     prior = 0.5 * (middle.square() + log_variance.exp() - 1 - log_variance).mean()
-    contrastive, matched = mu.new_zeros(()), 0.0
+    contrastive = mu.new_zeros(())
+    matched = 0.0
     if training.contrastive_weight:
         seen = _seen(batch.incomplete)
         similarity = descriptors(mu)[seen] @ descriptors(partner)[seen].T / TEMPERATURE
         own = torch.arange(len(similarity), device=similarity.device)
-        if len(own):  # dropout can take the last subvolume that is full enough, and the mean of nothing is NaN
-            contrastive = 0.5 * (F.cross_entropy(similarity, own) + F.cross_entropy(similarity.T, own))
+        # dropout can take the last subvolume that is full enough, and the mean of nothing is NaN
+        if len(own):
+            contrastive = 0.5 * (
+                F.cross_entropy(similarity, own) + F.cross_entropy(similarity.T, own)
+            )
             matched = float((similarity.argmax(1) == own).float().mean())
-    total = training.reconstruction_weight * reconstruction + prior + training.contrastive_weight * contrastive
+    total = (
+        training.reconstruction_weight * reconstruction
+        + prior
+        + training.contrastive_weight * contrastive
+    )
     return _Losses(total, reconstruction, contrastive, matched)
 
 
@@ -107,7 +132,8 @@ def train(
     network: Callable[[str, int], Completion] = Completion,
     optimiser_of: Callable[[Completion], torch.optim.Optimizer] = _adam,
 ) -> Completion | None:
-    """Train from scratch or from ``checkpoint``, which is renewed every ``save_every`` steps; returns the finished network.
+    """Train from scratch or from ``checkpoint``, which is renewed every ``save_every`` steps;
+    returns the finished network.
 
     None, with a checkpoint to go on from, when the clock ``time.monotonic()`` passes ``deadline``.
     ``shards`` may wait in ``[i]`` for scenes that are still being made. The checkpoint at which
@@ -118,7 +144,9 @@ def train(
     Raises SettingsError without shards and WorkspaceError when the checkpoint is of another run.
     """
     if not len(shards):
-        raise SettingsError("There is nothing to train on: give sessions with keyframes, or scenes to simulate.")
+        raise SettingsError(
+            "There is nothing to train on: give sessions with keyframes, or scenes to simulate."
+        )
     torch.manual_seed(training.seed)
     model = network(variant, training.latent).to(device)
     optimiser = optimiser_of(model)
@@ -130,7 +158,8 @@ def train(
     table = torch.from_numpy(code_table(variant)).to(device)
     rate = optimiser.defaults["lr"] * math.sqrt(training.batch / BATCH_OF_RATE)
     model.train()
-    step, coming = done, batches(shards, training, done, steps, device, deadline=deadline)
+    step = done
+    coming = batches(shards, training, done, steps, device, deadline=deadline)
     while step < steps:
         try:
             batch = next(coming)
@@ -140,7 +169,9 @@ def train(
             return None
         for group in optimiser.param_groups:
             group["lr"] = rate * learning_rate(step, steps)
-        normal = np.random.default_rng((training.seed, 2, step)).standard_normal((training.batch, training.latent), np.float32)
+        normal = np.random.default_rng((training.seed, 2, step)).standard_normal(
+            (training.batch, training.latent), np.float32
+        )
         losses = _losses(model, batch, torch.from_numpy(normal).to(device), table, training)
         optimiser.zero_grad(set_to_none=True)
         losses.total.backward()  # type: ignore[no-untyped-call]
@@ -150,10 +181,14 @@ def train(
         if (step + 1) % save_every == 0 or step + 1 == steps or late:
             save_checkpoint(checkpoint, model, optimiser, training, step + 1)
         if step + 1 == plateau_end(steps):
-            save_checkpoint(checkpoint.with_suffix(".plateau.safetensors"), model, optimiser, training, step + 1)
+            save_checkpoint(
+                checkpoint.with_suffix(".plateau.safetensors"), model, optimiser, training, step + 1
+            )
         samples = samples_after(step + 1, training)
         if snapshots and step + 1 in {steps >> k for k in range(1, 6)}:
-            save_weights(snapshots / f"{variant}-{samples:09d}.safetensors", model, {"samples": str(samples)})
+            save_weights(
+                snapshots / f"{variant}-{samples:09d}.safetensors", model, {"samples": str(samples)}
+            )
         on_step(
             Progress(
                 samples,

@@ -1,4 +1,6 @@
-"""Training pairs from fused sessions of one's own: self-supervised, the map of a stretch of road completes its single frames."""
+"""Training pairs from fused sessions of one's own: self-supervised, the map of a stretch of road
+completes its single frames.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from semloc_logs.training.pairs import SceneFrame, cut_pairs, write_shard
 from semloc_logs.voxels.store import poses_of, read_keyframe
 from semloc_logs.workspace import SessionFolder
 
-STRETCH = 60.0  # road in a shard (m at 0.30 m voxels): the dense map of a stretch has to fit into memory
+# road in a shard (m at 0.30 m voxels): the dense map of a stretch has to fit into memory
+STRETCH = 60.0
 MIN_FRAMES = 10
 
 
@@ -30,8 +33,11 @@ class StretchTask:
     settings: Settings  # resolved
 
 
-def session_frames(folder: SessionFolder, first: int = 0, last: int | None = None) -> list[SceneFrame]:
-    """Keyframes ``first`` .. ``last`` - 1 of a fused session (all by default); none of a session without poses, whose frames share no map.
+def session_frames(
+    folder: SessionFolder, first: int = 0, last: int | None = None
+) -> list[SceneFrame]:
+    """Keyframes ``first`` .. ``last`` - 1 of a fused session (all by default); none of a session
+    without poses, whose frames share no map.
 
     Raises WorkspaceError when the session is not there or damaged.
     """
@@ -47,7 +53,9 @@ def session_frames(folder: SessionFolder, first: int = 0, last: int | None = Non
     return out
 
 
-def stretch_tasks(shards: Path, sessions: Sequence[SessionFolder], settings: Settings) -> list[StretchTask]:
+def stretch_tasks(
+    shards: Path, sessions: Sequence[SessionFolder], settings: Settings
+) -> list[StretchTask]:
     """Tasks for every stretch of every session with poses, with shards in the folder ``shards``."""
     length = STRETCH * settings.fusion.voxel_size / STREET_VOXEL
     tasks = []
@@ -57,7 +65,15 @@ def stretch_tasks(shards: Path, sessions: Sequence[SessionFolder], settings: Set
             continue
         for first, last in submap_ranges(table["distance"].to_numpy(), length, 0.0):
             if last - first >= MIN_FRAMES:
-                tasks.append(StretchTask(session, first, last, shards / f"{session.name}-{first:06d}.parquet", settings))
+                tasks.append(
+                    StretchTask(
+                        session,
+                        first,
+                        last,
+                        shards / f"{session.name}-{first:06d}.parquet",
+                        settings,
+                    )
+                )
     return tasks
 
 
@@ -66,5 +82,13 @@ def cut_stretch(task: StretchTask) -> Path:
     if not task.shard.exists():
         settings = task.settings
         rng = np.random.default_rng((settings.training.seed, 4, task.first))
-        write_shard(task.shard, cut_pairs(session_frames(task.folder, task.first, task.last), settings.fusion, settings.training, rng))
+        write_shard(
+            task.shard,
+            cut_pairs(
+                session_frames(task.folder, task.first, task.last),
+                settings.fusion,
+                settings.training,
+                rng,
+            ),
+        )
     return task.shard

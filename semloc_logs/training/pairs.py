@@ -1,8 +1,9 @@
-"""Training pairs: incomplete subvolumes from one frame, five, or 20 m of them beside complete ones from the fused map of all (paper 3.2).
+"""Training pairs: incomplete subvolumes from one frame, five, or 20 m of them beside complete ones
+from the fused map of all (paper 3.2).
 
-A pair is wider than a subvolume: the encoder run over it gives 3 x 3 descriptors, 8 voxels apart, so that each pair brings nine
-examples, eight of them hard. Pairs are packed into Parquet shards, one for each scene, so that training starts, stops and resumes
-without making them again.
+A pair is wider than a subvolume: the encoder run over it gives 3 x 3 descriptors, 8 voxels apart,
+so that each pair brings nine examples, eight of them hard. Pairs are packed into Parquet shards,
+one for each scene, so that training starts, stops and resumes without making them again.
 """
 
 from __future__ import annotations
@@ -26,14 +27,17 @@ from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuse
 U8 = NDArray[np.uint8]
 Pair = tuple[U8, U8, U8]
 PER_FRAME = 12
-REACH, LONG = 30.0, 20.0  # m at 0.30 m voxels: subvolumes are so near to their frame; a long stretch
+# m at 0.30 m voxels: subvolumes are so near to their frame; a long stretch
+REACH, LONG = 30.0, 20.0
 ROW_GROUP = 32  # pairs that are read together
 BROAD = WIDE + 16  # edge of a pair in x and y (voxels)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneFrame:
-    """Points (n, 3) and sensor centre (3,) in the base frame, classes (n,), and the pose of the base in the level map frame."""
+    """Points (n, 3) and sensor centre (3,) in the base frame, classes (n,), and the pose of the
+    base in the level map frame.
+    """
 
     points: NDArray[np.float32]
     origin: NDArray[np.float32]
@@ -68,10 +72,12 @@ def cut_pairs(
     min_occupied: int = 40,
     asked: Sequence[SceneFrame] | None = None,
 ) -> list[Pair]:
-    """(incomplete (64, 64, 32), complete (32, 32, 32), complete seen a little shifted and turned (64, 64, 32)) voxel states.
+    """(incomplete (64, 64, 32), complete (32, 32, 32), complete seen a little shifted and turned
+    (64, 64, 32)) voxel states.
 
-    ``frames`` are fused to the complete map; the incomplete views are of single frames, five in a row, or 20 m of the frames ``asked``, by
-    default the same. The middle subvolume of an incomplete view, at least, has ``min_occupied`` occupied voxels.
+    ``frames`` are fused to the complete map; the incomplete views are of single frames, five in a
+    row, or 20 m of the frames ``asked``, by default the same. The middle subvolume of an incomplete
+    view, at least, has ``min_occupied`` occupied voxels.
     """
     v = fusion.voxel_size
     scale = v / 0.30
@@ -91,30 +97,47 @@ def cut_pairs(
             column = surface[(np.abs(surface[:, :2] - xy) < SIZE / 2).all(1), 2]
             if len(column) < min_occupied:
                 continue
-            # the map's layers are 8 voxels apart: the lowest surface lies anywhere in the lowest eight voxels, or a little above
+            # the map's layers are 8 voxels apart: the lowest surface lies anywhere in the lowest
+            # eight voxels, or a little above
             bottom = np.percentile(column, 5) - rng.uniform(0, 9)
             centre = np.array([*xy, np.floor(bottom) + SIZE / 2])
             yaw = rng.uniform(0, 2 * np.pi)
-            incomplete, other, complete = (np.empty(s, np.uint8) for s in ((BROAD, BROAD, SIZE), (BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE)))
+            incomplete, other, complete = (
+                np.empty(s, np.uint8)
+                for s in ((BROAD, BROAD, SIZE), (BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE))
+            )
             turn(part, part_low, yaw, centre, incomplete)
             if occupied(incomplete[16:-16, 16:-16]).sum() < min_occupied:
                 continue
             turn(whole, whole_low, yaw, centre, complete)
-            shift = training.shift / 0.30 * np.array([*rng.uniform(-1, 1, 2), rng.uniform(-0.8, 0.8)])
-            turn(whole, whole_low, yaw + rng.uniform(-training.turn, training.turn), centre + shift, other)
+            shift = (
+                training.shift / 0.30 * np.array([*rng.uniform(-1, 1, 2), rng.uniform(-0.8, 0.8)])
+            )
+            turn(
+                whole,
+                whole_low,
+                yaw + rng.uniform(-training.turn, training.turn),
+                centre + shift,
+                other,
+            )
             if occupied(other).sum() >= min_occupied:
                 out.append((incomplete, complete, other))
     return out
 
 
-def _stretch(frames: Sequence[SceneFrame], i: int, scale: float, tilt: float, rng: np.random.Generator) -> list[SceneFrame]:
-    """Frame ``i`` alone, with its neighbours, or 20 m of them, their common vertical wrong by ``tilt`` radians."""
+def _stretch(
+    frames: Sequence[SceneFrame], i: int, scale: float, tilt: float, rng: np.random.Generator
+) -> list[SceneFrame]:
+    """Frame ``i`` alone, with its neighbours, or 20 m of them, their common vertical wrong by
+    ``tilt`` radians.
+    """
     kind = rng.random()
     some = list(frames[i : i + 1] if kind < 0.5 else frames[max(0, i - 2) : i + 3])
     here = frames[i].map_T_base[:3, 3]
     if kind > 0.8:
         some = [f for f in frames if np.linalg.norm(f.map_T_base[:3, 3] - here) < LONG / 2 * scale]
-    turned, centred = np.eye(4), np.eye(4)
+    turned = np.eye(4)
+    centred = np.eye(4)
     turned[:3, :3] = Rotation.from_rotvec([*rng.normal(0.0, tilt, 2), 0.0]).as_matrix()
     centred[:3, 3] = here
     around = centred @ turned @ transforms.inverse(centred)
@@ -124,9 +147,17 @@ def _stretch(frames: Sequence[SceneFrame], i: int, scale: float, tilt: float, rn
 def write_shard(path: Path, pairs: Sequence[tuple[U8, U8, U8]]) -> None:
     """One Parquet file with a row for each pair."""
     names = ("incomplete", "complete", "other")
-    columns = {n: pa.array([p[k].tobytes() for p in pairs], pa.binary()) for k, n in enumerate(names)}
+    columns = {
+        n: pa.array([p[k].tobytes() for p in pairs], pa.binary()) for k, n in enumerate(names)
+    }
     with replacing_file(path) as temporary:
-        pq.write_table(pa.table(columns), temporary, compression="zstd", use_dictionary=False, row_group_size=ROW_GROUP)
+        pq.write_table(
+            pa.table(columns),
+            temporary,
+            compression="zstd",
+            use_dictionary=False,
+            row_group_size=ROW_GROUP,
+        )
 
 
 def rows_of(path: Path) -> int:
@@ -135,9 +166,14 @@ def rows_of(path: Path) -> int:
 
 
 def read_shard(path: Path, draw: int | None = None) -> tuple[U8, U8, U8]:
-    """Arrays (n, 64, 64, 32), (n, 32, 32, 32) and (n, 64, 64, 32) of a shard, or of its row group number ``draw`` modulo their count."""
+    """Arrays (n, 64, 64, 32), (n, 32, 32, 32) and (n, 64, 64, 32) of a shard, or of its row group
+    number ``draw`` modulo their count.
+    """
     shard = pq.ParquetFile(path)
     table = shard.read() if draw is None else shard.read_row_group(draw % shard.num_row_groups)
     shapes = ((BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE), (BROAD, BROAD, SIZE))
-    a, b, c = (np.frombuffer(b"".join(table[k].to_pylist()), np.uint8).reshape(-1, *s) for k, s in enumerate(shapes))
+    a, b, c = (
+        np.frombuffer(b"".join(table[k].to_pylist()), np.uint8).reshape(-1, *s)
+        for k, s in enumerate(shapes)
+    )
     return a, b, c

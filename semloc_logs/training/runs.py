@@ -1,4 +1,6 @@
-"""Learning the descriptor and the words, beside the pipeline: shards of pairs -> weights -> vocabulary, all resumable."""
+"""Learning the descriptor and the words, beside the pipeline: shards of pairs -> weights ->
+vocabulary, all resumable.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +36,15 @@ Note = Callable[[str], None]
 HELD_OUT = 2  # shards that only measure
 SCORED = 600  # pairs of each of them
 SCENES_AHEAD = 8  # scenes made before the training needs them
-SCENES_KEPT = 256  # scenes that stay after their use: another variant that is trained in turn needs them, too
+# scenes that stay after their use: another variant that is trained in turn needs them, too
+SCENES_KEPT = 256
 REPORT_SECONDS = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Packed:
-    """Shards of pairs to train on, of which ``train[i]`` may wait until it is there, and those that only measure.
+    """Shards of pairs to train on, of which ``train[i]`` may wait until it is there, and those that
+    only measure.
 
     Shards that ``drop`` names as used, by number, are made again when they are needed again.
     """
@@ -61,17 +65,25 @@ class Packed:
                 shards.close()
 
 
-def simulated_shards(folder: Path, settings: Settings, engine: Engine, note: Note, samples: int = 0) -> Packed:
-    """Pairs from ``training.scenes`` simulated scenes, as a training that has seen ``samples`` samples goes on to need them.
+def simulated_shards(
+    folder: Path, settings: Settings, engine: Engine, note: Note, samples: int = 0
+) -> Packed:
+    """Pairs from ``training.scenes`` simulated scenes, as a training that has seen ``samples``
+    samples goes on to need them.
 
-    They are made in the order in which training uses them, a few ahead of it, while ``engine`` is open; shards that are there for the
-    same settings stay. Those that measure are made when they are read.
+    They are made in the order in which training uses them, a few ahead of it, while ``engine`` is
+    open; shards that are there for the same settings stay. Those that measure are made when they
+    are read.
     """
-    tasks = scene_tasks(_shard_folder(folder, "simulated", settings), settings.training.scenes, settings)
+    tasks = scene_tasks(
+        _shard_folder(folder, "simulated", settings), settings.training.scenes, settings
+    )
     count = len(tasks) - HELD_OUT if len(tasks) > HELD_OUT else len(tasks)
     first = scene_window(samples, count).start
     made = engine.map(make_shard, tasks[first:count])
-    train = Growing(made, count, lambda n: note(f"scene {n} of {count}"), first=first, ahead=SCENES_AHEAD)
+    train = Growing(
+        made, count, lambda n: note(f"scene {n} of {count}"), first=first, ahead=SCENES_AHEAD
+    )
     held_out = Growing(engine.map(make_shard, tasks[count:]), len(tasks) - count, ahead=0)
     kept = first
 
@@ -84,8 +96,12 @@ def simulated_shards(folder: Path, settings: Settings, engine: Engine, note: Not
     return Packed(train, held_out, drop)
 
 
-def session_shards(folder: Path, sessions: Sequence[SessionFolder], settings: Settings, engine: Engine, note: Note) -> Packed:
-    """Pairs from fused sessions with poses, a shard for each stretch of road. Raises SettingsError when there is none."""
+def session_shards(
+    folder: Path, sessions: Sequence[SessionFolder], settings: Settings, engine: Engine, note: Note
+) -> Packed:
+    """Pairs from fused sessions with poses, a shard for each stretch of road. Raises SettingsError
+    when there is none.
+    """
     tasks = stretch_tasks(_shard_folder(folder, "sessions", settings), sessions, settings)
     if not tasks:
         raise SettingsError(
@@ -103,14 +119,18 @@ def given_shards(folder: Path) -> list[Path]:
     """The shards (.parquet) of a folder of packed pairs. Raises SettingsError when there is none."""
     shards = sorted(folder.glob("*.parquet"))
     if not shards:
-        raise SettingsError(f"{folder}: no shards of packed pairs (.parquet); 'semloc train' leaves them below its checkpoint folder.")
+        raise SettingsError(
+            f"{folder}: no shards of packed pairs (.parquet); 'semloc train' leaves them below its checkpoint folder."
+        )
     return shards
 
 
 def _shard_folder(folder: Path, kind: str, settings: Settings) -> Path:
     """Shards of other settings lie in another folder."""
     t = settings.training
-    relevant = settings.model_copy(update={"training": Training(seed=t.seed, shift=t.shift, turn=t.turn, tilt=t.tilt)})
+    relevant = settings.model_copy(
+        update={"training": Training(seed=t.seed, shift=t.shift, turn=t.turn, tilt=t.tilt)}
+    )
     return folder / f"{kind}-{relevant.fingerprint('fusion', 'training')}"
 
 
@@ -128,15 +148,18 @@ def learn_descriptor(
 ) -> dict[str, float] | None:
     """Train ``variant``, measure on the held-out shards, write the weights with a card; the scores.
 
-    Goes on from ``checkpoint`` if it is there. None, with a checkpoint, where ``time.monotonic()`` passed ``deadline`` before the end.
-    Raises SettingsError when there are too few shards to hold any out.
+    Goes on from ``checkpoint`` if it is there. None, with a checkpoint, where ``time.monotonic()``
+    passed ``deadline`` before the end. Raises SettingsError when there are too few shards to hold
+    any out.
     """
     if not len(shards.held_out):
         raise SettingsError(
             f"Training needs at least {HELD_OUT + 1} scenes or stretches of road, not {len(shards.train)}: two of them only measure."
         )
     training = settings.training
-    started, spoke, first = time.monotonic(), 0.0, -1
+    started = time.monotonic()
+    spoke = 0.0
+    first = -1
 
     def tell(step: Progress) -> None:
         nonlocal spoke, first
@@ -148,9 +171,20 @@ def learn_descriptor(
             spoke = now
             rate = (step.samples - first) / max(now - started, 1e-9)
             losses = f"reconstruction {step.reconstruction:.3f}, contrastive {step.contrastive:.3f}, matched {step.matched:.0%}"
-            note(f"{variant}: {min(step.samples, training.samples)} of {training.samples} samples, {rate:.0f} a second, {losses}")
+            note(
+                f"{variant}: {min(step.samples, training.samples)} of {training.samples} samples, {rate:.0f} a second, {losses}"
+            )
 
-    model = train(variant, shards.train, training, checkpoint, tell, device=device, deadline=deadline, snapshots=snapshots)
+    model = train(
+        variant,
+        shards.train,
+        training,
+        checkpoint,
+        tell,
+        device=device,
+        deadline=deadline,
+        snapshots=snapshots,
+    )
     if model is None:
         return None
     held_out = [tuple(part[:SCORED] for part in read_shard(shard)) for shard in shards.held_out]
@@ -161,11 +195,17 @@ def learn_descriptor(
 
 
 def learn_vocabulary(
-    variant: str, shards: Sequence[Path], settings: Settings, output: Path, pairs_per_shard: int | None = None, note: Note = lambda _: None
+    variant: str,
+    shards: Sequence[Path],
+    settings: Settings,
+    output: Path,
+    pairs_per_shard: int | None = None,
+    note: Note = lambda _: None,
 ) -> int:
     """A vocabulary from the descriptors of the shards' complete views; the number of descriptors.
 
-    2^16 words need half a million descriptors or more to lie well; with fewer there are words of few descriptors or of none.
+    2^16 words need half a million descriptors or more to lie well; with fewer there are words of
+    few descriptors or of none.
     """
     threads = torch.get_num_threads()
     encoder = load_encoder(variant, settings.descriptor.weights)
@@ -173,7 +213,11 @@ def learn_vocabulary(
     descriptors = shard_descriptors(shards, encoder, pairs_per_shard, note)
     note(f"{variant}: clustering {len(descriptors)} descriptors")
     vocabulary = train_vocabulary(descriptors, seed=settings.training.seed)
-    save_vocabulary(output, vocabulary, _card(settings, len(shards), variant=variant, descriptors=len(descriptors)))
+    save_vocabulary(
+        output,
+        vocabulary,
+        _card(settings, len(shards), variant=variant, descriptors=len(descriptors)),
+    )
     return len(descriptors)
 
 
@@ -185,15 +229,28 @@ def use_threads(count: int) -> None:
 def _card(settings: Settings, shards: int, **facts: Any) -> dict[str, str]:
     """What a model was made of, as strings for the file's metadata."""
     training = settings.training
-    said = {"version": semloc_logs.__version__, "samples": training.samples, "shards": shards, "seed": training.seed}
-    said |= {"voxel_size": settings.fusion.voxel_size, "training": training.model_dump(mode="json"), **facts}
+    said = {
+        "version": semloc_logs.__version__,
+        "samples": training.samples,
+        "shards": shards,
+        "seed": training.seed,
+    }
+    said |= {
+        "voxel_size": settings.fusion.voxel_size,
+        "training": training.model_dump(mode="json"),
+        **facts,
+    }
     return {k: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for k, v in said.items()}
 
 
 def device_of(name: str) -> str:
-    """``cpu`` or ``cuda`` for ``auto``, ``cpu`` or ``cuda``. Raises SettingsError for a GPU that is not there."""
+    """``cpu`` or ``cuda`` for ``auto``, ``cpu`` or ``cuda``. Raises SettingsError for a GPU that is
+    not there.
+    """
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and not torch.cuda.is_available():
-        raise SettingsError("There is no GPU that torch can use here: train with --device cpu, or install a torch build for this GPU.")
+        raise SettingsError(
+            "There is no GPU that torch can use here: train with --device cpu, or install a torch build for this GPU."
+        )
     return name

@@ -28,7 +28,10 @@ def make_shard(task: SceneTask) -> Path:
         mapped = [scene_frame(f) for f in scene.mapped]
         asked = mapped if scene.asked is scene.mapped else [scene_frame(f) for f in scene.asked]
         rng = np.random.default_rng((task.settings.training.seed, 3, task.seed))
-        write_shard(task.shard, cut_pairs(mapped, task.settings.fusion, task.settings.training, rng, asked=asked))
+        write_shard(
+            task.shard,
+            cut_pairs(mapped, task.settings.fusion, task.settings.training, rng, asked=asked),
+        )
     return task.shard
 
 
@@ -39,4 +42,6 @@ def scene_frame(frame: TrainingFrame) -> SceneFrame:
 
 def scene_tasks(folder: Path, scenes: int, settings: Settings) -> list[SceneTask]:
     """Tasks for ``scenes`` scenes with shards in ``folder``."""
-    return [SceneTask(seed, folder / f"scene-{seed:05d}.parquet", settings) for seed in range(scenes)]
+    return [
+        SceneTask(seed, folder / f"scene-{seed:05d}.parquet", settings) for seed in range(scenes)
+    ]

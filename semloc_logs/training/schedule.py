@@ -11,7 +11,8 @@ WARM_UP = 50  # steps
 DECAY = 0.25  # share of the steps, the last ones, over which the rate falls
 LAST_RATE = 0.02  # of the full rate, at the last step
 FIRST_SCENES = 12  # in use from the first step on
-SAMPLES_A_SCENE = 4000  # a further scene comes into use after so many samples: about as many as its pairs hold
+# a further scene comes into use after so many samples: about as many as its pairs hold
+SAMPLES_A_SCENE = 4000
 WINDOW = 256  # scenes in use at most
 
 
@@ -26,15 +27,19 @@ def samples_after(steps: int, training: Training) -> int:
 
 
 def learning_rate(step: int, steps: int) -> float:
-    """Share of the full rate at ``step`` of ``steps``: a warm-up, a plateau, then a cosine down to ``LAST_RATE`` (Hägele et al. 2024).
+    """Share of the full rate at ``step`` of ``steps``: a warm-up, a plateau, then a cosine down to
+    ``LAST_RATE`` (Hägele et al. 2024).
 
-    The plateau is the same however many steps there are, so a training can be made longer, or ended, after it has begun.
+    The plateau is the same however many steps there are, so a training can be made longer, or
+    ended, after it has begun.
     """
     begin = plateau_end(steps)
     if step < begin:
         return min(1.0, (step + 1) / WARM_UP)
     share = (step - begin) / max(1, steps - begin)
-    return min(1.0, (step + 1) / WARM_UP) * (LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * share)))
+    return min(1.0, (step + 1) / WARM_UP) * (
+        LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * share))
+    )
 
 
 def plateau_end(steps: int) -> int:
@@ -43,6 +48,8 @@ def plateau_end(steps: int) -> int:
 
 
 def scene_window(samples: int, scenes: int) -> range:
-    """Numbers of the scenes in use when ``samples`` samples have been seen, of ``scenes`` there are."""
+    """Numbers of the scenes in use when ``samples`` samples have been seen, of ``scenes`` there
+    are.
+    """
     newest = min(scenes, FIRST_SCENES + samples // SAMPLES_A_SCENE)
     return range(max(0, newest - WINDOW), newest)

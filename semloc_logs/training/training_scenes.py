@@ -1,8 +1,9 @@
 """Labelled clouds through random worlds: the training data of the shipped descriptor network.
 
-Every seed is another place: of twelve, nine are towns, one is a hall, one a forest and one a furnished room. Each is mapped by one drive
-and, in most scenes, queried by a second one: with another sensor, from another lane or in the other direction, in another season, among
-other parked cars. About ten seconds a scene on one core.
+Every seed is another place: of twelve, nine are towns, one is a hall, one a forest and one a
+furnished room. Each is mapped by one drive and, in most scenes, queried by a second one: with
+another sensor, from another lane or in the other direction, in another season, among other parked
+cars. About ten seconds a scene on one core.
 """
 
 from __future__ import annotations
@@ -25,7 +26,13 @@ from semloc_logs.simulation.sensors.lidar import full_sweep
 from semloc_logs.simulation.sensors.lidar_models import MODELS, LidarModel
 from semloc_logs.simulation.town.forest import build_forest
 from semloc_logs.simulation.town.hall import build_hall, hall_walk
-from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path, path_network, random_route
+from semloc_logs.simulation.town.road_network import (
+    RoadNetwork,
+    grid_network,
+    lane_path,
+    path_network,
+    random_route,
+)
 from semloc_logs.simulation.town.room import build_room, room_walk
 from semloc_logs.simulation.town.street import build_street, street_ground
 
@@ -40,8 +47,10 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingFrame:
-    """``points`` (n, 3) and sensor ``origin`` (3,) float32 in the base frame, on the ground under the vehicle, x ahead, z up; ``labels``
-    (n,) Cityscapes train ids, 255 = none, some of them wrong; ``world_T_base`` (4, 4), true; ``sigma`` (n,) along the ray, of cameras."""
+    """``points`` (n, 3) and sensor ``origin`` (3,) float32 in the base frame, on the ground under
+    the vehicle, x ahead, z up; ``labels`` (n,) Cityscapes train ids, 255 = none, some of them
+    wrong; ``world_T_base`` (4, 4), true; ``sigma`` (n,) along the ray, of cameras.
+    """
 
     points: NDArray[np.float32]
     origin: NDArray[np.float32]
@@ -52,7 +61,9 @@ class TrainingFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingScene:
-    """Frames of the drive that maps a place, and of the drive that asks about it; these may be the same frames."""
+    """Frames of the drive that maps a place, and of the drive that asks about it; these may be the
+    same frames.
+    """
 
     mapped: list[TrainingFrame]
     asked: list[TrainingFrame]
@@ -68,7 +79,9 @@ class _Drive:
 
 @dataclass(frozen=True, slots=True)
 class _Rig:
-    """A sensor on a vehicle; a camera is turned to the left by ``yaw`` radians. ``sector``: azimuths that a lidar is limited to."""
+    """A sensor on a vehicle; a camera is turned to the left by ``yaw`` radians. ``sector``:
+    azimuths that a lidar is limited to.
+    """
 
     model: LidarModel | CameraModel
     columns: int = 0
@@ -76,26 +89,43 @@ class _Rig:
     yaw: float = 0.0
     label_noise: float = 0.0
 
-    def frame(self, scene: Scene, pose: F64, rng: Rng, moving: Scene | None, seed: int, number: int) -> TrainingFrame:
+    def frame(
+        self, scene: Scene, pose: F64, rng: Rng, moving: Scene | None, seed: int, number: int
+    ) -> TrainingFrame:
         """What it sees from ``pose`` (4, 4) of the base."""
         if isinstance(self.model, CameraModel):
-            points, origin, labels, sigma = camera_points(scene, pose, rng, self.model, yaw=self.yaw, traffic=moving, step=3)
+            points, origin, labels, sigma = camera_points(
+                scene, pose, rng, self.model, yaw=self.yaw, traffic=moving, step=3
+            )
         else:
             base_T_lidar = np.eye(4)
             base_T_lidar[2, 3] = self.model.height
             lidar = pose @ base_T_lidar
-            turn = full_sweep(scene, lidar, rng, self.model, columns=self.columns, max_range=RANGE, sector=self.sector, traffic=moving)
+            turn = full_sweep(
+                scene,
+                lidar,
+                rng,
+                self.model,
+                columns=self.columns,
+                max_range=RANGE,
+                sector=self.sector,
+                traffic=moving,
+            )
             origin = base_T_lidar[:3, 3].astype(np.float32)
-            points, labels, sigma = turn.points + origin, turn.labels, None
+            points = turn.points + origin
+            labels = turn.labels
+            sigma = None
         wrong = corrupt_labels(apply(pose, points), labels, seed, self.label_noise, frame=number)
         return TrainingFrame(points, origin, wrong, pose, sigma)
 
 
 def training_scene(seed: int, frames: int = 60) -> TrainingScene:
-    """A drive of ``frames`` frames through a random place of the kind that ``KINDS`` gives the seed, and another one there.
+    """A drive of ``frames`` frames through a random place of the kind that ``KINDS`` gives the
+    seed, and another one there.
 
-    The second part of most drives comes back along the first in the other direction or in the same one. Of two scenes in five the
-    mapped frames are also the query frames, as in the paper. The same arguments give the same frames. A room is enlarged by ``ROOM_SCALE``.
+    The second part of most drives comes back along the first in the other direction or in the same
+    one. Of two scenes in five the mapped frames are also the query frames, as in the paper. The
+    same arguments give the same frames. A room is enlarged by ``ROOM_SCALE``.
     """
     rng = np.random.default_rng([seed, 77])
     kind = KINDS.get(seed % 12, "street")
@@ -111,7 +141,9 @@ def training_scene(seed: int, frames: int = 60) -> TrainingScene:
     if asking is None:
         return TrainingScene(mapped, mapped)
     other = rig if rng.random() < 0.4 else _rig(rng, kind)
-    return TrainingScene(mapped, [_enlarged(f, scale) for f in _frames(asking, rng, other, 2 * seed + 1)])
+    return TrainingScene(
+        mapped, [_enlarged(f, scale) for f in _frames(asking, rng, other, 2 * seed + 1)]
+    )
 
 
 def _enlarged(frame: TrainingFrame, scale: float) -> TrainingFrame:
@@ -125,18 +157,27 @@ def _enlarged(frame: TrainingFrame, scale: float) -> TrainingFrame:
 
 
 def _rig(rng: Rng, kind: str) -> _Rig:
-    """A random sensor: in rooms a depth camera four times in five, elsewhere a lidar two times in three, else a camera."""
+    """A random sensor: in rooms a depth camera four times in five, elsewhere a lidar two times in
+    three, else a camera.
+    """
     noise = float(rng.uniform(*LABEL_NOISE))
     if rng.random() < (0.8 if kind == "room" else 0.34):
         camera = CAMERAS["depth" if kind in ("hall", "room") else "stereo"]
         camera = replace(camera, mount_height=camera.mount_height + rng.uniform(-0.3, 0.4))
         yaw = float(rng.choice([0.0, 0.0, math.pi / 2, -math.pi / 2, math.pi]))
         return _Rig(camera, yaw=yaw, label_noise=noise)
-    model = MODELS[str(rng.choice(["hdl64", "hdl64", "hdl32", "vlp32", "vlp16", "vlp16", "rosette", "raster"]))]
+    model = MODELS[
+        str(rng.choice(["hdl64", "hdl64", "hdl32", "vlp32", "vlp16", "vlp16", "rosette", "raster"]))
+    ]
     if kind == "room":
         model = replace(model, height=1.2)
     blind = {"hall": 1.0, "room": 0.3}.get(kind) or float(rng.uniform(1.5, 3.5))
-    model = replace(model, height=model.height + rng.uniform(-0.3, 0.4), noise=rng.uniform(0.01, 0.03), min_range=blind)
+    model = replace(
+        model,
+        height=model.height + rng.uniform(-0.3, 0.4),
+        noise=rng.uniform(0.01, 0.03),
+        min_range=blind,
+    )
     columns = min(int(RAYS * rng.uniform(0.6, 1.0) / len(model.elevations_deg)), model.columns)
     return _Rig(model, columns, (-0.9, 0.9) if rng.random() < 0.1 else None, label_noise=noise)
 
@@ -154,16 +195,21 @@ def _network(rng: Rng, length: float) -> RoadNetwork:
         return grid_network(rng, 2, 2 + int(rng.random() < 0.5), float(rng.uniform(55, 95)))
     turning = np.cumsum(rng.normal(size=12)) * rng.uniform(0.02, 0.2) + rng.uniform(0, 6.3)
     steps = np.column_stack([np.cos(turning), np.sin(turning)]) * (length + 60) / 12
-    return path_network(rng, smooth_line(np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), 12.0))
+    return path_network(
+        rng, smooth_line(np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), 12.0)
+    )
 
 
 def _condition(rng: Rng, number: int) -> Condition:
     season = str(rng.choice(SEASONS, p=[0.55, 0.15, 0.15, 0.15]))
-    works, rebuilt = float(rng.choice([0.0, 0.0, 4.0])), float(rng.choice([0.0, 0.0, 0.08]))
+    works = float(rng.choice([0.0, 0.0, 4.0]))
+    rebuilt = float(rng.choice([0.0, 0.0, 0.08]))
     return Condition(number, season, works, rebuilt)
 
 
-def _street(rng: Rng, seed: int, frames: int, *, forest: bool = False) -> tuple[_Drive, _Drive | None]:
+def _street(
+    rng: Rng, seed: int, frames: int, *, forest: bool = False
+) -> tuple[_Drive, _Drive | None]:
     spacing = float(rng.uniform(1.5, 3.0))
     returning = rng.random() < 0.5
     once = int(np.ceil(frames * 0.6)) if returning else frames
@@ -172,13 +218,16 @@ def _street(rng: Rng, seed: int, frames: int, *, forest: bool = False) -> tuple[
     line = smooth_line(lane_path(network, route))
     back = smooth_line(lane_path(network, [(road, not forwards) for road, forwards in route[::-1]]))
     ground = street_ground(network, seed)
-    start, speed = 12.0, float(rng.uniform(5, 10))
+    start = 12.0
+    speed = float(rng.uniform(5, 10))
 
     def again(count: int) -> F64:
         """Along the first drive once more, the other way round or beside it."""
         if rng.random() < 0.6:
             begin = max(0.0, 0.5 * len(back) - once * spacing - 30)
-            return poses_along(back, begin + spacing * np.arange(count, dtype=np.float64), ground.slope_height, rng)
+            return poses_along(
+                back, begin + spacing * np.arange(count, dtype=np.float64), ground.slope_height, rng
+            )
         beside = line + rng.normal() * 0.7
         at = start + rng.uniform(0, 20) + spacing * np.arange(count, dtype=np.float64)
         return poses_along(beside, at, ground.slope_height, rng)
@@ -186,14 +235,22 @@ def _street(rng: Rng, seed: int, frames: int, *, forest: bool = False) -> tuple[
     def drive(poses: F64, condition: Condition) -> _Drive:
         seconds = np.arange(len(poses), dtype=np.float64) * spacing / speed
         traffic = random_traffic(rng, ground, [line, back], float(rng.choice([0.0, 0.6, 1.5])))
-        world = build_forest(network, seed, condition) if forest else build_street(network, seed, condition)
+        world = (
+            build_forest(network, seed, condition)
+            if forest
+            else build_street(network, seed, condition)
+        )
         return _Drive(world, poses, seconds, traffic)
 
-    poses = poses_along(line, start + spacing * np.arange(once, dtype=np.float64), ground.slope_height, rng)
+    poses = poses_along(
+        line, start + spacing * np.arange(once, dtype=np.float64), ground.slope_height, rng
+    )
     if returning:
         poses = np.concatenate([poses, again(frames - once)])
     mapping = drive(poses, _condition(rng, 0))
-    return mapping, drive(again(min(ASKED, once)), _condition(rng, 1)) if rng.random() < 0.6 else None
+    return mapping, drive(
+        again(min(ASKED, once)), _condition(rng, 1)
+    ) if rng.random() < 0.6 else None
 
 
 def _hall(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
@@ -201,10 +258,18 @@ def _hall(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
     world = build_hall(seed)
 
     def drive(walked: F64, count: int) -> _Drive:
-        poses = poses_along(walked, 1 + 0.7 * np.arange(count, dtype=np.float64), lambda x, y: np.zeros_like(x), rng, shake=0.01)
+        poses = poses_along(
+            walked,
+            1 + 0.7 * np.arange(count, dtype=np.float64),
+            lambda x, y: np.zeros_like(x),
+            rng,
+            shake=0.01,
+        )
         return _Drive(world, poses, np.arange(count, dtype=np.float64), None)
 
-    return drive(line, frames), drive(line[::-1], min(ASKED, frames)) if rng.random() < 0.6 else None
+    return drive(line, frames), drive(
+        line[::-1], min(ASKED, frames)
+    ) if rng.random() < 0.6 else None
 
 
 def _room(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
@@ -217,7 +282,12 @@ def _room(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
         poses = poses_along(along, places, lambda x, y: np.zeros_like(x), rng, shake=0.05)
         nod = np.eye(3)
         pitch = float(rng.uniform(-0.1, 0.5))
-        nod[[0, 0, 2, 2], [0, 2, 0, 2]] = math.cos(pitch), math.sin(pitch), -math.sin(pitch), math.cos(pitch)
+        nod[[0, 0, 2, 2], [0, 2, 0, 2]] = (
+            math.cos(pitch),
+            math.sin(pitch),
+            -math.sin(pitch),
+            math.cos(pitch),
+        )
         poses[:, :3, :3] = poses[:, :3, :3] @ nod
         return _Drive(build_room(seed, condition), poses, np.arange(count, dtype=np.float64), None)
 

@@ -1,7 +1,9 @@
-"""What several submaps say of the same voxels, added up: log-odds of occupied and of free space, and class votes.
+"""What several submaps say of the same voxels, added up: log-odds of occupied and of free space,
+and class votes.
 
-The sum is that of OctoMap (Hornung et al. 2013, equation 4) over maps instead of scans: it is associative and does not depend on an
-order, because it is clamped at the end only. So a voxel that one submap saw occupied and the next one carved free does not survive.
+The sum is that of OctoMap (Hornung et al. 2013, equation 4) over maps instead of scans: it is
+associative and does not depend on an order, because it is clamped at the end only. So a voxel that
+one submap saw occupied and the next one carved free does not survive.
 """
 
 from __future__ import annotations
@@ -27,8 +29,9 @@ Tile = tuple[int, int]
 class Evidence:
     """Sums over any number of submaps, of whole blocks.
 
-    ``keys`` (n,) packed block coordinates, ascending; ``log_odds`` (n, 4096) int32, sums in units of 1/20, 0 where nothing was
-    observed; ``ballots`` (m,) int64, ascending, ``(row * 4096 + cell) * 256 + class``, and ``votes`` (m,) int64 for each.
+    ``keys`` (n,) packed block coordinates, ascending; ``log_odds`` (n, 4096) int32, sums in units
+    of 1/20, 0 where nothing was observed; ``ballots`` (m,) int64, ascending, ``(row * 4096 + cell)
+    * 256 + class``, and ``votes`` (m,) int64 for each.
     """
 
     keys: NDArray[np.int64]
@@ -39,7 +42,9 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Voxels:
-    """Occupied voxels in Morton order: ``ijk`` (n, 3), ``label`` (n,), ``log_odds`` (n,) clamped, in 1/20, ``hits`` (n,) all votes."""
+    """Occupied voxels in Morton order: ``ijk`` (n, 3), ``label`` (n,), ``log_odds`` (n,) clamped,
+    in 1/20, ``hits`` (n,) all votes.
+    """
 
     ijk: NDArray[np.int32]
     label: NDArray[np.uint8]
@@ -48,7 +53,9 @@ class Voxels:
 
 
 def evidence(blocks: BlockMap, tile: int) -> Iterator[tuple[Tile, Evidence]]:
-    """The evidence of one submap, cut into tiles of ``tile`` voxels (a multiple of 16) in x and y, one after the other."""
+    """The evidence of one submap, cut into tiles of ``tile`` voxels (a multiple of 16) in x and y,
+    one after the other.
+    """
     row = blocks.ballots // (CELLS * CLASSES)
     where = unpack(blocks.keys)[:, :2] // (tile // BLOCK)
     for x, y in np.unique(where, axis=0).tolist():
@@ -58,14 +65,18 @@ def evidence(blocks: BlockMap, tile: int) -> Iterator[tuple[Tile, Evidence]]:
         at = np.searchsorted(rows, row)
         mine = (at < len(rows)) & (rows[np.minimum(at, len(rows) - 1)] == row)
         moved = (at[mine] - row[mine]) * (CELLS * CLASSES)
-        yield (x, y), Evidence(blocks.keys[rows], log_odds, blocks.ballots[mine] + moved, blocks.votes[mine])
+        yield (
+            (x, y),
+            Evidence(blocks.keys[rows], log_odds, blocks.ballots[mine] + moved, blocks.votes[mine]),
+        )
 
 
 def merge(a: Evidence, b: Evidence) -> Evidence:
     """The evidence of both: sums, so any order and any grouping of merges gives the same."""
     keys = np.union1d(a.keys, b.keys)
     log_odds = np.zeros((len(keys), CELLS), np.int32)
-    ballots, votes = [], []
+    ballots = []
+    votes = []
     for part in (a, b):
         rows = np.searchsorted(keys, part.keys)
         log_odds[rows] += part.log_odds
@@ -79,14 +90,20 @@ def merge(a: Evidence, b: Evidence) -> Evidence:
 
 
 def resolve(found: Evidence, low: int, high: int) -> Voxels:
-    """The occupied voxels: those whose summed log-odds, clamped to [``low``, ``high``] (1/20), are positive.
+    """The occupied voxels: those whose summed log-odds, clamped to [``low``, ``high``] (1/20), are
+    positive.
 
-    The class has most votes; the lowest id wins a tie, and any known class beats unlabelled. Nobody voted: unlabelled.
+    The class has most votes; the lowest id wins a tie, and any known class beats unlabelled. Nobody
+    voted: unlabelled.
     """
     row, cell = np.nonzero(found.log_odds > 0)
-    ijk = unpack(found.keys)[row] * BLOCK + np.stack([cell // 256, cell // 16 % 16, cell % 16], 1).astype(np.int32)
+    ijk = unpack(found.keys)[row] * BLOCK + np.stack(
+        [cell // 256, cell // 16 % 16, cell % 16], 1
+    ).astype(np.int32)
     order = np.argsort(morton(ijk))
-    ijk, row, cell = ijk[order], row[order], cell[order]
+    ijk = ijk[order]
+    row = row[order]
+    cell = cell[order]
     voters, label, hits = winners(found.ballots, found.votes)
     at = np.searchsorted(voters, row * CELLS + cell)
     at = np.where(np.r_[voters, -1][at] == row * CELLS + cell, at, len(voters))
@@ -95,8 +112,10 @@ def resolve(found: Evidence, low: int, high: int) -> Voxels:
 
 
 class Tiles:
-    """Evidence of a whole session by tile. Only the tiles of the last submap are in memory; the others are in files of ``folder``,
-    whose size is bounded by the ground covered, however often it was covered."""
+    """Evidence of a whole session by tile. Only the tiles of the last submap are in memory; the
+    others are in files of ``folder``, whose size is bounded by the ground covered, however often it
+    was covered.
+    """
 
     def __init__(self, folder: Path, tile: int) -> None:
         self._folder, self._tile = folder, tile

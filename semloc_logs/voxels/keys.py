@@ -1,7 +1,7 @@
 """Voxel and block addresses: packing, Morton order; pure integer arithmetic.
 
-A block is 16^3 voxels. Block coordinates are packed into an int64, 21 bits each, so they reach 2^20 blocks (5,000 km at 0.30 m)
-from the origin.
+A block is 16^3 voxels. Block coordinates are packed into an int64, 21 bits each, so they reach 2^20
+blocks (5,000 km at 0.30 m) from the origin.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ I64 = NDArray[np.int64]
 
 
 def pack(ijk: NDArray[np.integer]) -> I64:
-    """One int64 for each row of integer coordinates (n, 3) within +-2^20; order is that of (x, y, z)."""
+    """One int64 for each row of integer coordinates (n, 3) within +-2^20; order is that of (x, y,
+    z).
+    """
     a = np.asarray(ijk, np.int64) + _BIAS
     return (a[..., 0] << 42) | (a[..., 1] << 21) | a[..., 2]
 
@@ -25,7 +27,9 @@ def pack(ijk: NDArray[np.integer]) -> I64:
 def unpack(key: I64) -> NDArray[np.int32]:
     """Inverse of :func:`pack`: (n, 3) int32."""
     k = np.asarray(key, np.int64)
-    return np.stack([(k >> 42) - _BIAS, ((k >> 21) & _MASK) - _BIAS, (k & _MASK) - _BIAS], axis=-1).astype(np.int32)
+    return np.stack(
+        [(k >> 42) - _BIAS, ((k >> 21) & _MASK) - _BIAS, (k & _MASK) - _BIAS], axis=-1
+    ).astype(np.int32)
 
 
 def _spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -44,4 +48,8 @@ def _spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def morton(ijk: NDArray[np.integer]) -> NDArray[np.uint64]:
     """Morton (Z-order) code of integer coordinates (n, 3) within +-2^20."""
     a = (np.asarray(ijk, np.int64) + _BIAS).astype(np.uint64)
-    return np.asarray(_spread(a[..., 0]) | (_spread(a[..., 1]) << np.uint64(1)) | (_spread(a[..., 2]) << np.uint64(2)))
+    return np.asarray(
+        _spread(a[..., 0])
+        | (_spread(a[..., 1]) << np.uint64(1))
+        | (_spread(a[..., 2]) << np.uint64(2))
+    )

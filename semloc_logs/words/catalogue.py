@@ -1,9 +1,12 @@
-"""Which segments hold which sessions: WORK/index/VARIANT, a cache of words/ that any process may build, and anyone delete.
+"""Which segments hold which sessions: WORK/index/VARIANT, a cache of words/ that any process may
+build, and anyone delete.
 
-There is no list of segments beside the files: a session is served by the largest segment that holds it under the key that its words
-have now. What no segment holds is built from words/; what no session wants any more is passed over and left out of the next merge.
-After building, segments are merged so that each is at least as large as all smaller ones together (Bentley and Saxe 1980): there are
-logarithmically many, and an entry is copied as often. One process at a time builds; the others wait for it and find it done.
+There is no list of segments beside the files: a session is served by the largest segment that holds
+it under the key that its words have now. What no segment holds is built from words/; what no
+session wants any more is passed over and left out of the next merge. After building, segments are
+merged so that each is at least as large as all smaller ones together (Bentley and Saxe 1980): there
+are logarithmically many, and an entry is copied as often. One process at a time builds; the others
+wait for it and find it done.
 """
 
 from __future__ import annotations
@@ -24,7 +27,16 @@ from numpy.typing import NDArray
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.tables.table import read_json, read_table
 from semloc_logs.voxels.store import blocks_path
-from semloc_logs.words.segment import WORDS, Columns, Held, Segment, in_order, open_segment, segment_in_memory, write_segment
+from semloc_logs.words.segment import (
+    WORDS,
+    Columns,
+    Held,
+    Segment,
+    in_order,
+    open_segment,
+    segment_in_memory,
+    write_segment,
+)
 from semloc_logs.workspace import SessionFolder, Workspace
 
 SUFFIX = ".segment"
@@ -52,10 +64,15 @@ class SessionWords:
         for place, submap in enumerate(self.submaps):
             table = read_words(self.folder, submap, variant)
             n = len(table)
-            columns = {"word": table["word"].to_numpy().astype(np.int64), "code": table["code"].to_numpy()}
+            columns = {
+                "word": table["word"].to_numpy().astype(np.int64),
+                "code": table["code"].to_numpy(),
+            }
             columns |= {"place": np.full(n, place, np.uint32), "row": np.arange(n, dtype=np.uint32)}
             columns["centre"] = np.stack([table[c].to_numpy().astype(np.float32) for c in "xyz"], 1)
-            columns["yaw"] = table["yaw"].to_numpy() if "yaw" in table.column_names else np.zeros(n, np.float32)
+            columns["yaw"] = (
+                table["yaw"].to_numpy() if "yaw" in table.column_names else np.zeros(n, np.float32)
+            )
             parts.append(columns)
         return _joined(parts)
 
@@ -64,19 +81,26 @@ def session_words(folder: SessionFolder, variant: str) -> SessionWords | None:
     """The words of a session, None where it was not described in ``variant``."""
     try:
         content = folder.words_json.read_bytes()
-        # the stamp, as words may be written again with the same settings by other weights of the same version
-        key = hashlib.sha256(content + str(folder.words_json.stat().st_mtime_ns).encode()).hexdigest()[:16]
+        # the stamp, as words may be written again with the same settings by other weights of the
+        # same version
+        key = hashlib.sha256(
+            content + str(folder.words_json.stat().st_mtime_ns).encode()
+        ).hexdigest()[:16]
         if variant not in read_json(folder.words_json)["variants"]:
             return None
-        return SessionWords(folder, key, tuple(int(s["id"]) for s in read_json(folder.session_json)["submaps"]))
+        return SessionWords(
+            folder, key, tuple(int(s["id"]) for s in read_json(folder.session_json)["submaps"])
+        )
     except (OSError, WorkspaceError, KeyError):
         return None
 
 
 @dataclass(slots=True, eq=False)
 class Change:
-    """What :func:`segments` did: sessions ``added``, segments ``merged`` into others, files ``dropped`` as damaged or of no use any more;
-    ``unwritten`` says why segments are in memory alone."""
+    """What :func:`segments` did: sessions ``added``, segments ``merged`` into others, files
+    ``dropped`` as damaged or of no use any more; ``unwritten`` says why segments are in memory
+    alone.
+    """
 
     added: int = 0
     merged: int = 0
@@ -84,23 +108,39 @@ class Change:
     unwritten: str = ""
 
     def __str__(self) -> str:
-        parts = [(self.added, "added", "session"), (self.merged, "merged", "segment"), (self.dropped, "removed", "old file")]
+        parts = [
+            (self.added, "added", "session"),
+            (self.merged, "merged", "segment"),
+            (self.dropped, "removed", "old file"),
+        ]
         said = [f"{n} {what}{'' if n == 1 else 's'} {done}" for n, done, what in parts if n]
-        return ", ".join(said + ([f"kept in memory as it cannot be written ({self.unwritten})"] if self.unwritten else []))
+        return ", ".join(
+            said
+            + (
+                [f"kept in memory as it cannot be written ({self.unwritten})"]
+                if self.unwritten
+                else []
+            )
+        )
 
 
-def segments(work: Workspace, variant: str, names: Sequence[str], change: Change | None = None) -> list[tuple[Segment, frozenset[str]]]:
-    """Segments with the sessions ``names`` that each serves; what lacks is built first, and merged with what there is.
+def segments(
+    work: Workspace, variant: str, names: Sequence[str], change: Change | None = None
+) -> list[tuple[Segment, frozenset[str]]]:
+    """Segments with the sessions ``names`` that each serves; what lacks is built first, and merged
+    with what there is.
 
-    Sessions that were described in another variant only are left out. ``change`` is told what was done. Raises WorkspaceError when a
-    session was not described.
+    Sessions that were described in another variant only are left out. ``change`` is told what was
+    done. Raises WorkspaceError when a session was not described.
     """
     change = change or Change()
     folder = work.path / "index" / variant
     words = {f.name: w for f in work.sessions() if (w := session_words(f, variant)) is not None}
     lacking = [n for n in names if not work.session(n).words_json.exists()]
     if lacking:
-        raise WorkspaceError(f"Session {lacking[0]} has no words: run 'semloc describe -w {work.path}' first.")
+        raise WorkspaceError(
+            f"Session {lacking[0]} has no words: run 'semloc describe -w {work.path}' first."
+        )
     names = [n for n in names if n in words]
     found, good = _open_all(folder, variant)
     serving = _serving(found, words)
@@ -114,16 +154,19 @@ def segments(work: Workspace, variant: str, names: Sequence[str], change: Change
 def update(work: Workspace) -> dict[str, dict[str, Any]]:
     """Bring the index of every variant up to date after checking all of its files.
 
-    For each variant what was ``changed``, a sentence, and its ``segments``: ``file``, ``words``, ``bytes``, ``sessions``. Raises
-    WorkspaceError when no session was described.
+    For each variant what was ``changed``, a sentence, and its ``segments``: ``file``, ``words``,
+    ``bytes``, ``sessions``. Raises WorkspaceError when no session was described.
     """
     described = [f for f in work.sessions() if f.words_json.exists()]
     variants = sorted({str(v) for f in described for v in read_json(f.words_json)["variants"]})
     if not variants:
-        raise WorkspaceError(f"{work.path} has no described session: run 'semloc describe -w {work.path}' first.")
+        raise WorkspaceError(
+            f"{work.path} has no described session: run 'semloc describe -w {work.path}' first."
+        )
     out: dict[str, dict[str, Any]] = {}
     for variant in variants:
-        folder, change = work.path / "index" / variant, Change()
+        folder = work.path / "index" / variant
+        change = Change()
         with _locked(folder):
             _remove_damaged(_open_all(folder, variant)[0], variant)
         held = [
@@ -145,7 +188,8 @@ Serving = dict[Segment, frozenset[str]]
 def _open_all(folder: Path, variant: str) -> tuple[list[Segment], bool]:
     """All whole segments, the largest first, and whether there are no other files of segments."""
     for _ in range(ATTEMPTS):
-        out, good = [], True
+        out = []
+        good = True
         try:
             for path in sorted(folder.glob(f"*{SUFFIX}")):
                 try:
@@ -159,11 +203,15 @@ def _open_all(folder: Path, variant: str) -> tuple[list[Segment], bool]:
 
 
 def _serving(found: Sequence[Segment], words: Mapping[str, SessionWords]) -> Serving:
-    """The sessions that each segment serves: each session is served by the first that holds its present words."""
+    """The sessions that each segment serves: each session is served by the first that holds its
+    present words.
+    """
     taken: set[str] = set()
     out: Serving = {}
     for segment in found:
-        mine = {h.name for h in segment.sessions if h.name in words and words[h.name].key == h.key} - taken
+        mine = {
+            h.name for h in segment.sessions if h.name in words and words[h.name].key == h.key
+        } - taken
         taken |= mine
         out[segment] = frozenset(mine)
     return out
@@ -180,7 +228,9 @@ def _wasteful(serving: Serving) -> bool:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """One process at a time, where files can be locked; elsewhere two may build the same files, and the later rename wins."""
+    """One process at a time, where files can be locked; elsewhere two may build the same files, and
+    the later rename wins.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / ".lock").open("w")
@@ -193,15 +243,25 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def _build(folder: Path, variant: str, words: Mapping[str, SessionWords], names: Sequence[str], change: Change) -> Serving:
-    """Add the sessions that no segment serves, merge, and remove the files that are replaced; the caller has the lock."""
+def _build(
+    folder: Path,
+    variant: str,
+    words: Mapping[str, SessionWords],
+    names: Sequence[str],
+    change: Change,
+) -> Serving:
+    """Add the sessions that no segment serves, merge, and remove the files that are replaced; the
+    caller has the lock.
+    """
     for path in folder.glob(f".*{SUFFIX}.*.tmp"):  # of a process that was killed
         path.unlink(missing_ok=True)
     serving = _serving(_open_all(folder, variant)[0], words)
     lacking = sorted(set(names) - set().union(*serving.values()))
     change.added += len(lacking)
     for segment in _new_segments(variant, [words[n] for n in lacking]):
-        serving[_written(folder, variant, segment, change)] = frozenset(h.name for h in segment.sessions)
+        serving[_written(folder, variant, segment, change)] = frozenset(
+            h.name for h in segment.sessions
+        )
     merged: Serving = {}
     for group in _plan(serving):
         if len(group) == 1 and 2 * _live(group[0], serving[group[0]]) >= len(group[0]):
@@ -242,7 +302,9 @@ def _new_segments(variant: str, sessions: Sequence[SessionWords]) -> Iterator[Se
 
 
 def _in_memory(batch: Sequence[tuple[SessionWords, Columns]]) -> Segment:
-    held, parts, places = [], [], 0
+    held = []
+    parts = []
+    places = 0
     for s, columns in batch:
         held.append(Held(s.folder.name, s.key, s.submaps, len(columns["word"])))
         parts.append(columns | {"place": columns["place"] + np.uint32(places)})
@@ -253,13 +315,25 @@ def _in_memory(batch: Sequence[tuple[SessionWords, Columns]]) -> Segment:
 def _joined(parts: Sequence[Columns]) -> Columns:
     if not parts:
         empty = np.zeros(0, np.uint32)
-        return {"word": empty, "code": empty, "place": empty, "row": empty, "centre": np.zeros((0, 3), np.float32), "yaw": empty}
+        return {
+            "word": empty,
+            "code": empty,
+            "place": empty,
+            "row": empty,
+            "centre": np.zeros((0, 3), np.float32),
+            "yaw": empty,
+        }
     return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
 
 
 def _plan(serving: Serving) -> list[list[Segment]]:
-    """Segments to be merged, or alone: of the largest first each is as large as all behind it, or merged with them."""
-    left = sorted((s for s, served in serving.items() if served), key=lambda s: (-_live(s, serving[s]), s.sessions[0].name))
+    """Segments to be merged, or alone: of the largest first each is as large as all behind it, or
+    merged with them.
+    """
+    left = sorted(
+        (s for s, served in serving.items() if served),
+        key=lambda s: (-_live(s, serving[s]), s.sessions[0].name),
+    )
     for i, s in enumerate(left):
         behind = sum(_live(o, serving[o]) for o in left[i + 1 :])
         if i + 1 < len(left) and _live(s, serving[s]) < behind:
@@ -285,11 +359,23 @@ def _written(folder: Path, variant: str, segment: Segment, change: Change) -> Se
 
 
 def _merged(folder: Path, variant: str, group: Serving, change: Change) -> Serving:
-    """One segment of the sessions that a ``group`` of segments serves, or the group where it cannot be written."""
-    sessions = tuple(sorted((h for s, served in group.items() for h in s.sessions if h.name in served), key=lambda h: h.name))
+    """One segment of the sessions that a ``group`` of segments serves, or the group where it cannot
+    be written.
+    """
+    sessions = tuple(
+        sorted(
+            (h for s, served in group.items() for h in s.sessions if h.name in served),
+            key=lambda h: h.name,
+        )
+    )
     path = _path(folder, sessions)
     try:
-        write_segment(path, variant, sessions, merged_blocks(list(group), [_renumbered(s, group[s], sessions) for s in group]))
+        write_segment(
+            path,
+            variant,
+            sessions,
+            merged_blocks(list(group), [_renumbered(s, group[s], sessions) for s in group]),
+        )
         change.merged += len(group)
         return {open_segment(path, variant): frozenset(h.name for h in sessions)}
     except OSError as problem:
@@ -297,14 +383,25 @@ def _merged(folder: Path, variant: str, group: Serving, change: Change) -> Servi
         return group
 
 
-def _renumbered(segment: Segment, served: frozenset[str], sessions: Sequence[Held]) -> NDArray[np.int64]:
-    """The numbers that a segment's places have among those of ``sessions``, -1 for sessions that it does not serve."""
-    numbers = {place: i for i, place in enumerate((h.name, submap) for h in sessions for submap in h.submaps)}
+def _renumbered(
+    segment: Segment, served: frozenset[str], sessions: Sequence[Held]
+) -> NDArray[np.int64]:
+    """The numbers that a segment's places have among those of ``sessions``, -1 for sessions that it
+    does not serve.
+    """
+    numbers = {
+        place: i
+        for i, place in enumerate((h.name, submap) for h in sessions for submap in h.submaps)
+    }
     return segment.numbered(numbers, served)
 
 
-def merged_blocks(group: Sequence[Segment], places: Sequence[NDArray[np.int64]], most: int = 1_000_000) -> Iterator[Columns]:
-    """Sorted blocks of about ``most`` entries of several segments, whose places are numbered anew; -1 leaves out."""
+def merged_blocks(
+    group: Sequence[Segment], places: Sequence[NDArray[np.int64]], most: int = 1_000_000
+) -> Iterator[Columns]:
+    """Sorted blocks of about ``most`` entries of several segments, whose places are numbered anew;
+    -1 leaves out.
+    """
     ends = sum((s.starts.astype(np.int64) for s in group), np.zeros(WORDS + 1, np.int64))
     first = 0
     while first < WORDS:
@@ -314,6 +411,8 @@ def merged_blocks(group: Sequence[Segment], places: Sequence[NDArray[np.int64]],
             block = s.block(first, last)
             block["place"] = number[block["place"]]
             kept = block["place"] >= 0
-            parts.append(block if kept.all() else {name: values[kept] for name, values in block.items()})
+            parts.append(
+                block if kept.all() else {name: values[kept] for name, values in block.items()}
+            )
         yield in_order(_joined(parts))
         first = last

@@ -1,14 +1,17 @@
-"""Inverted lists over the words of many submaps and the search for the nearest codes in them (paper 3.4).
+"""Inverted lists over the words of many submaps and the search for the nearest codes in them (paper
+3.4).
 
-A query looks into the lists of its nearest cells. Where these hold more than a budget of codes, it looks at the words of these cells
-that are nearest to it, as many as hold the budget: so the work of a look-up does not grow with the map beyond that. The codes nearest in
-Hamming distance, with all that are as near as the last, are found by counting bits. Of these the nearest are told by the *asymmetric*
-distance (Gordo et al. 2014): a bit that differs counts as much as the query's projection lies off the cell's threshold, as bits of
-projections close to it mean little. That finds more true neighbours than the Hamming distance alone does, for a few microseconds a
-query; the distance to the centroid of an entry's word adds nothing to it (benchmarks/README.md, Words).
+A query looks into the lists of its nearest cells. Where these hold more than a budget of codes, it
+looks at the words of these cells that are nearest to it, as many as hold the budget: so the work of
+a look-up does not grow with the map beyond that. The codes nearest in Hamming distance, with all
+that are as near as the last, are found by counting bits. Of these the nearest are told by the
+*asymmetric* distance (Gordo et al. 2014): a bit that differs counts as much as the query's
+projection lies off the cell's threshold, as bits of projections close to it mean little. That finds
+more true neighbours than the Hamming distance alone does, for a few microseconds a query; the
+distance to the centroid of an entry's word adds nothing to it (benchmarks/README.md, Words).
 
-What is found does not depend on how words are spread over segments: the budget counts words of all of them, and of equally near
-entries the first by submap and row is nearer.
+What is found does not depend on how words are spread over segments: the budget counts words of all
+of them, and of equally near entries the first by submap and row is nearer.
 """
 
 from __future__ import annotations
@@ -34,17 +37,22 @@ I64 = NDArray[np.int64]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Ranges = tuple[I64, I64, I64, I64]  # of each query: where its ranges start (n + 1,); of each range: first word, last word + 1, probe
+# of each query: where its ranges start (n + 1,); of each range: first word, last word + 1, probe
+Ranges = tuple[I64, I64, I64, I64]
 SHORTLIST = 32  # nearest codes in Hamming distance that are compared asymmetrically
 BUDGET = 32_768  # codes that a look-up compares, and those of one word more
-UNIT = 2.0**19  # distances of descriptors to words are multiples of 1 / UNIT: see :mod:`semloc_logs.words.vocabulary`
+# distances of descriptors to words are multiples of 1 / UNIT: see
+# :mod:`semloc_logs.words.vocabulary`
+UNIT = 2.0**19
 QUERIES = 1024  # that are looked up together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """``query`` (m,) rows of the query, ``group`` (m,) submaps, ``entry`` (m,) rows among the words of the submap, their ``centre`` (m, 3),
-    metres, and ``yaw`` (m,), radians, ``distance`` (m,) Hamming; nearest first for each query, by the asymmetric distance."""
+    """``query`` (m,) rows of the query, ``group`` (m,) submaps, ``entry`` (m,) rows among the words
+    of the submap, their ``centre`` (m, 3), metres, and ``yaw`` (m,), radians, ``distance`` (m,)
+    Hamming; nearest first for each query, by the asymmetric distance.
+    """
 
     query: I32
     group: I64
@@ -56,16 +64,21 @@ class Matches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Allowed:
-    """Words that may answer: of submaps ``groups`` (g,), of some of them certain ``rows`` only, a mask (n,) of the words by number."""
+    """Words that may answer: of submaps ``groups`` (g,), of some of them certain ``rows`` only, a
+    mask (n,) of the words by number.
+    """
 
     groups: Bools
     rows: Mapping[int, Bools] = field(default_factory=dict)
 
     def of(self, group: I64) -> tuple[I64, Bools]:
-        """For each place, whose submap is ``group`` (places,): -2 if none of its words may answer, -1 if all may, else where its rows
-        begin in the masks that are returned one behind the other."""
+        """For each place, whose submap is ``group`` (places,): -2 if none of its words may answer,
+        -1 if all may, else where its rows begin in the masks that are returned one behind the
+        other.
+        """
         open_ = np.where((group >= 0) & self.groups[group], -1, -2).astype(np.int64)
-        masks, length = [np.zeros(0, bool)], 0
+        masks = [np.zeros(0, bool)]
+        length = 0
         for g, mask in self.rows.items():
             open_[(group == g) & (open_ == -1)] = length
             masks.append(mask)
@@ -73,20 +86,26 @@ class Allowed:
         return open_, np.concatenate(masks)
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc"})  # sums of multiples of 1 / UNIT are exact in any order
+# sums of multiples of 1 / UNIT are exact in any order
+@njit(cache=True, nogil=True, fastmath={"reassoc"})
 def _word_distances(projected: F32, cell: int, children: F32, square: F32, out: I32) -> None:
-    """Distance of a query, in units and less its own square, to the words of ``cell`` (k,) into ``out``."""
+    """Distance of a query, in units and less its own square, to the words of ``cell`` (k,) into
+    ``out``.
+    """
     for c in range(children.shape[1]):
         dot = np.float32(0.0)
         for b in range(BITS):
             dot += projected[b] * children[cell, c, b]
-        out[c] = np.int32(min(max((square[cell, c] - 2 * dot) * np.float32(UNIT), -(2.0**29)), 2.0**29))
+        out[c] = np.int32(
+            min(max((square[cell, c] - 2 * dot) * np.float32(UNIT), -(2.0**29)), 2.0**29)
+        )
 
 
 @njit(cache=True, nogil=True)
 def _farthest(distance: I32, weight: I64, budget: int) -> int:
     """The least distance within which there are entries of ``weight`` ``budget`` or more."""
-    low, high = np.int64(distance.min()), np.int64(distance.max())
+    low = np.int64(distance.min())
+    high = np.int64(distance.max())
     while low < high:
         middle = (low + high) >> 1
         total = 0
@@ -100,27 +119,42 @@ def _farthest(distance: I32, weight: I64, budget: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _choose(projected: F32, cells: I32, children: F32, square: F32, live: I64, cell_live: I64, budget: int) -> Ranges:
-    """Ranges of words that each query with ``cells`` (n, p) looks into: its cells, or their nearest words that hold ``budget`` entries.
+def _choose(
+    projected: F32, cells: I32, children: F32, square: F32, live: I64, cell_live: I64, budget: int
+) -> Ranges:
+    """Ranges of words that each query with ``cells`` (n, p) looks into: its cells, or their nearest
+    words that hold ``budget`` entries.
 
     ``live`` (65536,) and ``cell_live`` (256,) are the entries of words and cells.
     """
     n, p = cells.shape
     k = children.shape[1]
     offsets = np.zeros(n + 1, np.int64)
-    distance, weight = np.zeros(p * k, np.int32), np.zeros(p * k, np.int64)
-    first, last, probe, found = np.empty(n * p, np.int64), np.empty(n * p, np.int64), np.empty(n * p, np.int64), 0
+    distance = np.zeros(p * k, np.int32)
+    weight = np.zeros(p * k, np.int64)
+    first = np.empty(n * p, np.int64)
+    last = np.empty(n * p, np.int64)
+    probe = np.empty(n * p, np.int64)
+    found = 0
     for q in range(n):
         if found + p * k > len(first):
             more = np.empty(max(len(first), p * k), np.int64)
-            first, last, probe = np.concatenate((first, more)), np.concatenate((last, more)), np.concatenate((probe, more))
+            first = np.concatenate((first, more))
+            last = np.concatenate((last, more))
+            probe = np.concatenate((probe, more))
         if cell_live[cells[q]].sum() <= budget:
             for j in range(p):
-                first[found], last[found], probe[found] = cells[q, j] * 256, cells[q, j] * 256 + 256, j
+                first[found], last[found], probe[found] = (
+                    cells[q, j] * 256,
+                    cells[q, j] * 256 + 256,
+                    j,
+                )
                 found += 1
         else:
             for j in range(p):
-                _word_distances(projected[q], cells[q, j], children, square, distance[j * k : j * k + k])
+                _word_distances(
+                    projected[q], cells[q, j], children, square, distance[j * k : j * k + k]
+                )
                 weight[j * k : j * k + k] = live[cells[q, j] * 256 : cells[q, j] * 256 + k]
             bound = _farthest(distance, weight, budget)
             for j in range(p):
@@ -150,16 +184,21 @@ class _Lists(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _may_answer(lists: _Lists, entry: int) -> bool:
-    place, row = lists.place[entry], np.int64(lists.row[entry])
+    place = lists.place[entry]
+    row = np.int64(lists.row[entry])
     if place >= len(lists.begin):  # a file may be damaged
         return False
     first = lists.begin[place]
-    return bool(first == -1 or (first >= 0 and first + row < len(lists.rows) and lists.rows[first + row]))
+    return bool(
+        first == -1 or (first >= 0 and first + row < len(lists.rows) and lists.rows[first + row])
+    )
 
 
 @njit(cache=True, nogil=True)
 def _bound(count: I64, within: int, limit: int, size: int) -> int:
-    """The least distance up to ``limit`` within which ``count`` (66,) has ``size`` entries, of which ``within`` are within ``limit``."""
+    """The least distance up to ``limit`` within which ``count`` (66,) has ``size`` entries, of
+    which ``within`` are within ``limit``.
+    """
     while limit > 0 and within - int(count[limit]) >= size:
         within -= int(count[limit])
         limit -= 1
@@ -167,27 +206,48 @@ def _bound(count: I64, within: int, limit: int, size: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _look(codes: U64, ranges: Ranges, q: int, lists: _Lists, size: int, count: I64, limit: int, distance: U8, at: I64) -> tuple[int, int]:
-    """Entries of a segment that query ``q`` with codes (p,) may want: their distances, and positions and probes in ``at`` (2, m).
+def _look(
+    codes: U64,
+    ranges: Ranges,
+    q: int,
+    lists: _Lists,
+    size: int,
+    count: I64,
+    limit: int,
+    distance: U8,
+    at: I64,
+) -> tuple[int, int]:
+    """Entries of a segment that query ``q`` with codes (p,) may want: their distances, and
+    positions and probes in ``at`` (2, m).
 
-    ``count`` (66,) entries were found at each distance up to ``limit``. Returns how many are found now and the new limit, within which
-    there are ``size``; the entries of this segment within it have been added to ``count``.
+    ``count`` (66,) entries were found at each distance up to ``limit``. Returns how many are found
+    now and the new limit, within which there are ``size``; the entries of this segment within it
+    have been added to ``count``.
     """
     offsets, firsts, lasts, probes = ranges
-    n, histogram = 0, count.copy()
-    for r in range(offsets[q], offsets[q + 1]):  # without branches: the compiler makes many at a time
-        code, first, end = codes[probes[r]], int(lists.starts[firsts[r]]), int(lists.starts[lasts[r]])
-        block, into = lists.code[first:end], distance[n : n + end - first]
+    n = 0
+    histogram = count.copy()
+    # without branches: the compiler makes many at a time
+    for r in range(offsets[q], offsets[q + 1]):
+        code = codes[probes[r]]
+        first = int(lists.starts[firsts[r]])
+        end = int(lists.starts[lasts[r]])
+        block = lists.code[first:end]
+        into = distance[n : n + end - first]
         for i in range(len(block)):
             into[i] = np.uint8(popcount(code ^ block[i]))
         n += end - first
     for i in range(n):
         histogram[distance[i]] += 1
-    bound, step = _bound(histogram, int(histogram[: limit + 1].sum()), limit, size), 1
+    bound = _bound(histogram, int(histogram[: limit + 1].sum()), limit, size)
+    step = 1
     while True:
-        found, n, new = 0, 0, count.copy()
+        found = 0
+        n = 0
+        new = count.copy()
         for r in range(offsets[q], offsets[q + 1]):
-            first, end = int(lists.starts[firsts[r]]), int(lists.starts[lasts[r]])
+            first = int(lists.starts[firsts[r]])
+            end = int(lists.starts[lasts[r]])
             into = distance[n : n + end - first]
             for i in range(len(into)):
                 if into[i] <= bound and _may_answer(lists, first + i):
@@ -198,16 +258,20 @@ def _look(codes: U64, ranges: Ranges, q: int, lists: _Lists, size: int, count: I
         within = int(new[: bound + 1].sum())
         if within >= size or bound == limit:
             break
-        bound, step = min(bound + step, limit), 2 * step  # many may not answer: look farther
+        # many may not answer: look farther
+        bound = min(bound + step, limit)
+        step = 2 * step
     count[:] = new
     return found, _bound(new, within, bound, size)
 
 
 @njit(cache=True, nogil=True)
 def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, count: I64, limit: I64) -> I64:
-    """Queries, positions and probes (3, m) of the entries of one segment that may answer and are among the ``size`` nearest so far.
+    """Queries, positions and probes (3, m) of the entries of one segment that may answer and are
+    among the ``size`` nearest so far.
 
-    ``count`` (n, 66) and ``limit`` (n,) are those of :func:`_look` and go on from segment to segment.
+    ``count`` (n, 66) and ``limit`` (n,) are those of :func:`_look` and go on from segment to
+    segment.
     """
     offsets, firsts, lasts, _ = ranges
     most = np.int64(0)
@@ -216,8 +280,10 @@ def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, count: I64, limi
         for r in range(offsets[q], offsets[q + 1]):
             here += np.int64(lists.starts[lasts[r]]) - np.int64(lists.starts[firsts[r]])
         most = max(most, here)
-    distance, at = np.empty(most, np.uint8), np.empty((2, most), np.int64)
-    out, total = np.empty((3, 64 * len(codes) + most), np.int64), 0
+    distance = np.empty(most, np.uint8)
+    at = np.empty((2, most), np.int64)
+    out = np.empty((3, 64 * len(codes) + most), np.int64)
+    total = 0
     for q in range(len(codes)):
         found, limit[q] = _look(codes[q], ranges, q, lists, size, count[q], limit[q], distance, at)
         if total + found > out.shape[1]:
@@ -232,19 +298,26 @@ def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, count: I64, limi
 
 
 @njit(cache=True, nogil=True)
-def _nearest(margin: F32, codes: U64, bound: I64, query: I64, probe: I64, code: U64, key: I64, k: int) -> tuple[I64, I32]:
-    """The k nearest candidates (n, k) of each query, -1 where there are fewer, and their Hamming distances, nearest first.
+def _nearest(
+    margin: F32, codes: U64, bound: I64, query: I64, probe: I64, code: U64, key: I64, k: int
+) -> tuple[I64, I32]:
+    """The k nearest candidates (n, k) of each query, -1 where there are fewer, and their Hamming
+    distances, nearest first.
 
-    ``margin`` (n, p, 64) is how far the query's projections lie off the thresholds of its cells, ``codes`` (n, p) their signs; candidates
-    beyond their query's ``bound`` (n,) are none. Of equally near ones that with the lesser ``key`` is nearer.
+    ``margin`` (n, p, 64) is how far the query's projections lie off the thresholds of its cells,
+    ``codes`` (n, p) their signs; candidates beyond their query's ``bound`` (n,) are none. Of
+    equally near ones that with the lesser ``key`` is nearer.
     """
     n = len(codes)
-    nearest, hamming = np.full((n, k), -1, np.int64), np.zeros((n, k), np.int32)
+    nearest = np.full((n, k), -1, np.int64)
+    hamming = np.zeros((n, k), np.int32)
     best = np.full((n, k), np.inf)
     for i in range(len(query)):
-        q, p = query[i], probe[i]
+        q = query[i]
+        p = probe[i]
         different = codes[q, p] ^ code[i]
-        bits, distance = popcount(different), 0.0
+        bits = popcount(different)
+        distance = 0.0
         if bits > bound[q]:
             continue
         while different and distance <= best[q, k - 1]:
@@ -253,10 +326,18 @@ def _nearest(margin: F32, codes: U64, bound: I64, query: I64, probe: I64, code: 
             different &= different - np.uint64(1)
         j = k
         while j > 0 and (
-            distance < best[q, j - 1] or (distance == best[q, j - 1] and (nearest[q, j - 1] < 0 or key[i] < key[nearest[q, j - 1]]))
+            distance < best[q, j - 1]
+            or (
+                distance == best[q, j - 1]
+                and (nearest[q, j - 1] < 0 or key[i] < key[nearest[q, j - 1]])
+            )
         ):
             if j < k:
-                best[q, j], nearest[q, j], hamming[q, j] = best[q, j - 1], nearest[q, j - 1], hamming[q, j - 1]
+                best[q, j], nearest[q, j], hamming[q, j] = (
+                    best[q, j - 1],
+                    nearest[q, j - 1],
+                    hamming[q, j - 1],
+                )
             j -= 1
         if j < k:
             best[q, j], nearest[q, j], hamming[q, j] = distance, i, bits
@@ -272,14 +353,18 @@ def _count_live(starts: U32, place: U32, inside: Bools, live: I64) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A segment in a search: ``group`` (places,) is the number of the submap at each of its places, -1 for those that take no part."""
+    """A segment in a search: ``group`` (places,) is the number of the submap at each of its places,
+    -1 for those that take no part.
+    """
 
     segment: Segment
     group: I64
 
 
 class Index:
-    """Words of a database in segments. A look-up compares at most ``budget`` codes and those of one word more."""
+    """Words of a database in segments. A look-up compares at most ``budget`` codes and those of one
+    word more.
+    """
 
     def __init__(self, vocabulary: Vocabulary, parts: Sequence[Part], budget: int = BUDGET) -> None:
         self.vocabulary = vocabulary
@@ -295,11 +380,26 @@ class Index:
         self._cell_live = self._live.reshape(256, 256).sum(1)
 
     @classmethod
-    def of_words(cls, vocabulary: Vocabulary, word: NDArray[np.integer], code: U64, group: NDArray[np.integer]) -> Index:
-        """An index in memory of words (n,) and codes (n,) in the submaps ``group`` (n,); ``entry`` of matches are their rows."""
+    def of_words(
+        cls,
+        vocabulary: Vocabulary,
+        word: NDArray[np.integer],
+        code: U64,
+        group: NDArray[np.integer],
+    ) -> Index:
+        """An index in memory of words (n,) and codes (n,) in the submaps ``group`` (n,); ``entry``
+        of matches are their rows.
+        """
         n = len(word)
         groups = np.arange(int(group.max()) + 1 if n else 0)
-        columns = {"word": word, "code": code, "place": group, "row": np.arange(n), "centre": np.zeros((n, 3)), "yaw": np.zeros(n)}
+        columns = {
+            "word": word,
+            "code": code,
+            "place": group,
+            "row": np.arange(n),
+            "centre": np.zeros((n, 3)),
+            "yaw": np.zeros(n),
+        }
         held = Held("", "", tuple(groups.tolist()), n)
         return cls(vocabulary, [Part(segment_in_memory((held,), columns), groups)])
 
@@ -307,12 +407,22 @@ class Index:
         return int(self._live.sum())
 
     def search(self, descriptors: F32, k: int, probes: int, allowed: Allowed) -> Matches:
-        """The ``k`` nearest words of each descriptor (n, N) in its ``probes`` nearest cells among the ``allowed`` ones."""
-        found = [self._search(descriptors[i : i + QUERIES], k, probes, allowed) for i in range(0, len(descriptors), QUERIES)]
+        """The ``k`` nearest words of each descriptor (n, N) in its ``probes`` nearest cells among
+        the ``allowed`` ones.
+        """
+        found = [
+            self._search(descriptors[i : i + QUERIES], k, probes, allowed)
+            for i in range(0, len(descriptors), QUERIES)
+        ]
         if not found:
             found = [self._gather(np.zeros((4, 0), np.int64))]
-        query = np.concatenate([m.query + i * QUERIES for i, m in enumerate(found)]).astype(np.int32)
-        rest = (np.concatenate([getattr(m, name) for m in found]) for name in ("group", "entry", "centre", "yaw", "distance"))
+        query = np.concatenate([m.query + i * QUERIES for i, m in enumerate(found)]).astype(
+            np.int32
+        )
+        rest = (
+            np.concatenate([getattr(m, name) for m in found])
+            for name in ("group", "entry", "centre", "yaw", "distance")
+        )
         return Matches(query, *rest)
 
     def _search(self, descriptors: F32, k: int, probes: int, allowed: Allowed) -> Matches:
@@ -320,8 +430,17 @@ class Index:
         cells = v.nearest_cells(descriptors, probes)
         margin = v.margins(descriptors, cells)
         codes = codes_of(margin)
-        ranges = _choose(grid(v.projected(descriptors)), cells, v.children, self._square, self._live, self._cell_live, self.budget)
-        count, limit = np.zeros((len(codes), BITS + 2), np.int64), np.full(len(codes), BITS)
+        ranges = _choose(
+            grid(v.projected(descriptors)),
+            cells,
+            v.children,
+            self._square,
+            self._live,
+            self._cell_live,
+            self.budget,
+        )
+        count = np.zeros((len(codes), BITS + 2), np.int64)
+        limit = np.full(len(codes), BITS)
         found: list[NDArray[np.int64]] = []
         near: list[tuple[U64, I64]] = []
         for number, p in enumerate(self.parts):
@@ -343,7 +462,10 @@ class Index:
         """Matches of queries, positions, numbers of parts and distances (4, m)."""
         query, position, number, distance = chosen
         m = len(query)
-        group, entry, centre, yaw = np.zeros(m, np.int64), np.zeros(m, np.int64), np.zeros((m, 3)), np.zeros(m)
+        group = np.zeros(m, np.int64)
+        entry = np.zeros(m, np.int64)
+        centre = np.zeros((m, 3))
+        yaw = np.zeros(m)
         for i, p in enumerate(self.parts):
             mine = np.flatnonzero(number == i)
             at = position[mine]

@@ -1,8 +1,10 @@
-"""k-means whose result does not depend on the number of threads, the BLAS or the block size (Lloyd 1982).
+"""k-means whose result does not depend on the number of threads, the BLAS or the block size (Lloyd
+1982).
 
-Points and centroids are multiples of 2^-11 and no longer than 1 (:func:`grid`), so their products are multiples of 2^-22 whose partial
-sums stay below 1 (Cauchy-Schwarz): float32 holds them exactly in whatever order a matrix product adds, and float64 holds the exact sums
-of any number of points that fits into memory.
+Points and centroids are multiples of 2^-11 and no longer than 1 (:func:`grid`), so their products
+are multiples of 2^-22 whose partial sums stay below 1 (Cauchy-Schwarz): float32 holds them exactly
+in whatever order a matrix product adds, and float64 holds the exact sums of any number of points
+that fits into memory.
 """
 
 from __future__ import annotations
@@ -22,10 +24,12 @@ def grid(a: NDArray[np.floating]) -> F32:
 
 
 def nearest_centroids(points: F32, centroids: F32) -> tuple[NDArray[np.int64], F32]:
-    """Row of the nearest of ``centroids`` (k, d) for each of ``points`` (n, d), the first of equals, and the squared
-    distances (n,). Both are multiples of 2^-11."""
+    """Row of the nearest of ``centroids`` (k, d) for each of ``points`` (n, d), the first of
+    equals, and the squared distances (n,). Both are multiples of 2^-11.
+    """
     half = (centroids**2).sum(1) / 2
-    nearest, distance = np.zeros(len(points), np.int64), np.zeros(len(points), np.float32)
+    nearest = np.zeros(len(points), np.int64)
+    distance = np.zeros(len(points), np.float32)
     for i in range(0, len(points), BLOCK):
         block = points[i : i + BLOCK]
         score = half - block @ centroids.T
@@ -35,9 +39,12 @@ def nearest_centroids(points: F32, centroids: F32) -> tuple[NDArray[np.int64], F
 
 
 @njit(cache=True, nogil=True)
-def _sums(points: F32, nearest: NDArray[np.int64], k: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _sums(
+    points: F32, nearest: NDArray[np.int64], k: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Sums (k, d) and counts (k,) of the points of each centroid."""
-    sums, count = np.zeros((k, points.shape[1])), np.zeros(k, np.int64)
+    sums = np.zeros((k, points.shape[1]))
+    count = np.zeros(k, np.int64)
     for i in range(len(points)):
         count[nearest[i]] += 1
         for d in range(points.shape[1]):
@@ -46,9 +53,11 @@ def _sums(points: F32, nearest: NDArray[np.int64], k: int) -> tuple[NDArray[np.f
 
 
 def kmeans(points: NDArray[np.floating], k: int, rng: np.random.Generator, rounds: int) -> F32:
-    """Centroids (k, d) of ``points`` (n, d), n >= k, no longer than 1, by Lloyd's algorithm from distinct random points.
+    """Centroids (k, d) of ``points`` (n, d), n >= k, no longer than 1, by Lloyd's algorithm from
+    distinct random points.
 
-    A centroid without points takes the point farthest from its own. Points and centroids are rounded to multiples of 2^-11.
+    A centroid without points takes the point farthest from its own. Points and centroids are
+    rounded to multiples of 2^-11.
     """
     points = grid(points)
     centroids = points[np.sort(rng.choice(len(points), k, replace=False))].copy()

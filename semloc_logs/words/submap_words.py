@@ -15,7 +15,8 @@ from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
 from semloc_logs.words.vocabulary import load_vocabulary
 
-Part = tuple[str, float, NDArray[np.floating], NDArray[np.uint16], NDArray[np.uint64]]  # variant, yaw, centres (n, 3), words, codes
+# variant, yaw, centres (n, 3), words, codes
+Part = tuple[str, float, NDArray[np.floating], NDArray[np.uint16], NDArray[np.uint64]]
 
 
 def index_submap(task: DescribeTask) -> int:
@@ -25,9 +26,18 @@ def index_submap(task: DescribeTask) -> int:
     for variant in task.variants:
         encoder = load_encoder(variant, task.settings.descriptor.weights)
         vocabulary = load_vocabulary(variant, task.settings.descriptor.vocabulary)
-        headings = describe_submap(task.folder, task.submap, task.ground_z, task.road, encoder, task.settings, yaws)
+        headings = describe_submap(
+            task.folder, task.submap, task.ground_z, task.road, encoder, task.settings, yaws
+        )
         for yaw, described in zip(yaws, headings, strict=True):
-            parts.append((variant, yaw, described.centre * task.settings.fusion.voxel_size, *vocabulary.words(described.descriptor)))
+            parts.append(
+                (
+                    variant,
+                    yaw,
+                    described.centre * task.settings.fusion.voxel_size,
+                    *vocabulary.words(described.descriptor),
+                )
+            )
     return write_words(task.output, task.submap, parts, task.metadata)
 
 
@@ -37,7 +47,9 @@ def write_words(path: Path, submap: int, parts: Sequence[Part], metadata: dict[s
     columns = {
         "submap": np.full(len(centre), submap),
         "variant": [p[0] for p in parts for _ in range(len(p[2]))],
-        "yaw": np.concatenate([np.zeros(0, np.float32), *(np.full(len(p[2]), p[1], np.float32) for p in parts)]),
+        "yaw": np.concatenate(
+            [np.zeros(0, np.float32), *(np.full(len(p[2]), p[1], np.float32) for p in parts)]
+        ),
         **{c: centre[:, k].astype(np.float32) for k, c in enumerate("xyz")},
         "word": np.concatenate([np.zeros(0, np.uint16), *(p[3] for p in parts)]),
         "code": np.concatenate([np.zeros(0, np.uint64), *(p[4] for p in parts)]),

@@ -1,14 +1,18 @@
-"""The semantic vocabulary (paper 3.4): hierarchical k-means over descriptors with a 64-bit Hamming embedding (Jegou et al. 2008).
+"""The semantic vocabulary (paper 3.4): hierarchical k-means over descriptors with a 64-bit Hamming
+embedding (Jegou et al. 2008).
 
-The first level has up to 256 cells in the space of the descriptors, the second up to 256 children of each in the 64 projected
-dimensions that the codes are made of: 2^16 words in 4.3 MB, as the children are stored in steps of 2^-8, one byte a dimension.
+The first level has up to 256 cells in the space of the descriptors, the second up to 256 children
+of each in the 64 projected dimensions that the codes are made of: 2^16 words in 4.3 MB, as the
+children are stored in steps of 2^-8, one byte a dimension.
 
-Thresholds of the code are the medians of each *cell*, so within a cell half of all bits are set. Jegou et al. have them for every word;
-here a word has a handful of descriptors to take a median of, and thresholds at the words' centroids find no more true neighbours than
-thresholds of cells do (benchmarks/README.md, Words), while every word of a cell would need codes of its own of the query.
+Thresholds of the code are the medians of each *cell*, so within a cell half of all bits are set.
+Jegou et al. have them for every word; here a word has a handful of descriptors to take a median of,
+and thresholds at the words' centroids find no more true neighbours than thresholds of cells do
+(benchmarks/README.md, Words), while every word of a cell would need codes of its own of the query.
 
-Descriptors, directions and centroids are multiples of 2^-11 (children of 2^-8), so that words do not depend on the order in which a
-BLAS with so many threads adds: see :mod:`semloc_logs.words.kmeans`.
+Descriptors, directions and centroids are multiples of 2^-11 (children of 2^-8), so that words do
+not depend on the order in which a BLAS with so many threads adds: see
+:mod:`semloc_logs.words.kmeans`.
 """
 
 from __future__ import annotations
@@ -29,15 +33,18 @@ from semloc_logs.tables.table import replacing_file
 from semloc_logs.words.kmeans import BLOCK, grid, kmeans, nearest_centroids
 
 BITS = 64
-CHILD_STEP = 2.0**-8  # of the children's coordinates, which int8 holds up to 127 / 256: three times their spread and more
+# of the children's coordinates, which int8 holds up to 127 / 256: three times their spread and more
+CHILD_STEP = 2.0**-8
 PER_CELL = 256  # descriptors for each cell that the cells are found from
 F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vocabulary:
-    """``cells`` (c, N) unit centroids and ``projection`` (64, N), multiples of 2^-11, ``thresholds`` (c, 64), ``children`` (c, k, 64)
-    centroids, multiples of 2^-8; N is the dimension of the descriptors, 64 or more."""
+    """``cells`` (c, N) unit centroids and ``projection`` (64, N), multiples of 2^-11,
+    ``thresholds`` (c, 64), ``children`` (c, k, 64) centroids, multiples of 2^-8; N is the dimension
+    of the descriptors, 64 or more.
+    """
 
     cells: F32
     projection: F32
@@ -45,7 +52,9 @@ class Vocabulary:
     children: F32
 
     def nearest_cells(self, descriptors: F32, probes: int) -> NDArray[np.int32]:
-        """The ``probes`` nearest cells (n, probes) of descriptors (n, N), nearest first, of equals the first."""
+        """The ``probes`` nearest cells (n, probes) of descriptors (n, N), nearest first, of equals
+        the first.
+        """
         out = np.zeros((len(descriptors), min(probes, len(self.cells))), np.int32)
         for i in range(0, len(descriptors), BLOCK):
             _largest(grid(descriptors[i : i + BLOCK]) @ self.cells.T, out[i : i + BLOCK])
@@ -56,12 +65,18 @@ class Vocabulary:
         return np.asarray(grid(descriptors) @ self.projection.T)
 
     def margins(self, descriptors: F32, cell: NDArray[np.integer]) -> F32:
-        """How far the projections of descriptors (n, N) lie above the thresholds of ``cell`` (n,) or (n, p): (n, 64) or (n, p, 64)."""
-        projected = self.projected(descriptors).reshape(len(descriptors), *[1] * (cell.ndim - 1), BITS)
+        """How far the projections of descriptors (n, N) lie above the thresholds of ``cell`` (n,)
+        or (n, p): (n, 64) or (n, p, 64).
+        """
+        projected = self.projected(descriptors).reshape(
+            len(descriptors), *[1] * (cell.ndim - 1), BITS
+        )
         return np.asarray(projected - self.thresholds[cell])
 
     def codes(self, descriptors: F32, cell: NDArray[np.integer]) -> NDArray[np.uint64]:
-        """64-bit codes of descriptors (n, N) under the thresholds of ``cell`` (n,) or (n, p), in its shape; bit b is projection b."""
+        """64-bit codes of descriptors (n, N) under the thresholds of ``cell`` (n,) or (n, p), in
+        its shape; bit b is projection b.
+        """
         return codes_of(self.margins(descriptors, cell))
 
     def words(self, descriptors: F32) -> tuple[NDArray[np.uint16], NDArray[np.uint64]]:
@@ -75,7 +90,9 @@ class Vocabulary:
         for c in np.flatnonzero(np.diff(starts)):
             mine = order[starts[c] : starts[c + 1]]
             child[mine] = nearest_centroids(projected[mine], self.children[c])[0]
-        return (cell.astype(np.int64) * 256 + child).astype(np.uint16), self.codes(descriptors, cell)
+        return (cell.astype(np.int64) * 256 + child).astype(np.uint16), self.codes(
+            descriptors, cell
+        )
 
 
 def codes_of(margins: F32) -> NDArray[np.uint64]:
@@ -86,7 +103,9 @@ def codes_of(margins: F32) -> NDArray[np.uint64]:
 
 @njit(cache=True, nogil=True)
 def _largest(similarity: F32, out: NDArray[np.int32]) -> None:
-    """Columns of the largest values of each row of ``similarity`` (n, c), largest first, into ``out`` (n, k)."""
+    """Columns of the largest values of each row of ``similarity`` (n, c), largest first, into
+    ``out`` (n, k).
+    """
     k = out.shape[1]
     best = np.empty(k, np.float32)
     for i in range(len(similarity)):
@@ -110,7 +129,9 @@ def _by_cell(cell: NDArray[np.integer], cells: int) -> tuple[NDArray[np.int64], 
 
 
 def _directions(descriptors: F32, cells: F32, rng: np.random.Generator) -> F32:
-    """Principal directions (64, N) of what is left within the cells, rotated at random so that every bit says equally much."""
+    """Principal directions (64, N) of what is left within the cells, rotated at random so that
+    every bit says equally much.
+    """
     rest = (descriptors - cells[nearest_centroids(descriptors, cells)[0]]).astype(np.float64)
     directions = np.linalg.eigh(rest.T @ rest)[1][:, ::-1][:, :BITS]
     # an eigenvector's sign is the library's choice: the largest component is made positive
@@ -119,12 +140,14 @@ def _directions(descriptors: F32, cells: F32, rng: np.random.Generator) -> F32:
     return grid((directions @ (q * np.sign(np.diag(r)))).T)
 
 
-def train_vocabulary(descriptors: NDArray[np.floating], cells: int = 256, children: int = 256, seed: int = 0) -> Vocabulary:
+def train_vocabulary(
+    descriptors: NDArray[np.floating], cells: int = 256, children: int = 256, seed: int = 0
+) -> Vocabulary:
     """A vocabulary of ``cells`` x ``children`` words from unit descriptors (n, N).
 
-    There are at least 64 descriptors to a cell, so fewer than 16,384 give fewer cells; a cell has at most one word for two
-    descriptors, and its last rows repeat the first, which no descriptor is given then. Raises SettingsError below
-    256 descriptors and 64 dimensions.
+    There are at least 64 descriptors to a cell, so fewer than 16,384 give fewer cells; a cell has
+    at most one word for two descriptors, and its last rows repeat the first, which no descriptor is
+    given then. Raises SettingsError below 256 descriptors and 64 dimensions.
     """
     n = len(descriptors)
     if n < 256 or descriptors.shape[1] < BITS:
@@ -137,7 +160,8 @@ def train_vocabulary(descriptors: NDArray[np.floating], cells: int = 256, childr
     centroids = kmeans(some, cells, rng, 15)
     centroids = grid(centroids / np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), 1e-9))
     projection = _directions(some, centroids, rng)
-    cell, projected = np.zeros(n, np.int32), np.zeros((n, BITS), np.float32)
+    cell = np.zeros(n, np.int32)
+    projected = np.zeros((n, BITS), np.float32)
     for i in range(0, n, BLOCK):
         block = grid(descriptors[i : i + BLOCK])
         projected[i : i + BLOCK] = block @ projection.T
@@ -150,10 +174,13 @@ def train_vocabulary(descriptors: NDArray[np.floating], cells: int = 256, childr
         if len(mine) >= 8:
             thresholds[c] = np.median(mine, axis=0)
         if len(mine):
-            k = min(children, max(1, len(mine) // 2))  # single descriptors lie farther from others than their mean does
+            # single descriptors lie farther from others than their mean does
+            k = min(children, max(1, len(mine) // 2))
             kids[c, :k] = kmeans(mine, k, rng, 8)
             kids[c, k:] = kids[c, 0]
-    return Vocabulary(centroids, projection, thresholds, _bytes(kids).astype(np.float32) * np.float32(CHILD_STEP))
+    return Vocabulary(
+        centroids, projection, thresholds, _bytes(kids).astype(np.float32) * np.float32(CHILD_STEP)
+    )
 
 
 def _bytes(children: F32) -> NDArray[np.int8]:
@@ -162,31 +189,54 @@ def _bytes(children: F32) -> NDArray[np.int8]:
 
 def save_vocabulary(path: Path, vocabulary: Vocabulary, card: dict[str, str]) -> None:
     """Safetensors of half precision, the children in bytes; ``card`` says what it was trained on."""
-    # safetensors writes the memory as it lies, whatever the strides say: a transposed array would come back scrambled
-    arrays = {k: np.ascontiguousarray(getattr(vocabulary, k), np.float16) for k in ("cells", "projection", "thresholds")}
+    # safetensors writes the memory as it lies, whatever the strides say: a transposed array would
+    # come back scrambled
+    arrays = {
+        k: np.ascontiguousarray(getattr(vocabulary, k), np.float16)
+        for k in ("cells", "projection", "thresholds")
+    }
     with replacing_file(path) as temporary:
         save_file(arrays | {"children": _bytes(vocabulary.children)}, temporary, metadata=card)
 
 
 @lru_cache(maxsize=8)
 def load_vocabulary(variant: str, path: Path | None = None) -> Vocabulary:
-    """The shipped vocabulary of ``variant``, or that of a file. Raises SettingsError when the file does not hold one."""
+    """The shipped vocabulary of ``variant``, or that of a file. Raises SettingsError when the file
+    does not hold one.
+    """
     try:
         if path is not None:
             arrays = load_file(path)
         else:
-            with as_file(files("semloc_logs.words") / "vocabularies" / f"{variant}.safetensors") as shipped:
+            with as_file(
+                files("semloc_logs.words") / "vocabularies" / f"{variant}.safetensors"
+            ) as shipped:
                 arrays = load_file(shipped)
         if arrays["children"].dtype == np.float16:  # files before there were 2^16 words
             arrays["children"] = _bytes(arrays["children"].astype(np.float32))
-        cells, projection, thresholds, children = (arrays[k] for k in ("cells", "projection", "thresholds", "children"))
-        c, k, n = len(cells), children.shape[1], projection.shape[1]
+        cells, projection, thresholds, children = (
+            arrays[k] for k in ("cells", "projection", "thresholds", "children")
+        )
+        c = len(cells)
+        k = children.shape[1]
+        n = projection.shape[1]
         shapes = (cells.shape, projection.shape, thresholds.shape, children.shape)
-        if shapes != ((c, n), (BITS, n), (c, BITS), (c, k, BITS)) or not (0 < c <= 256 and 0 < k <= 256) or children.dtype != np.int8:
+        if (
+            shapes != ((c, n), (BITS, n), (c, BITS), (c, k, BITS))
+            or not (0 < c <= 256 and 0 < k <= 256)
+            or children.dtype != np.int8
+        ):
             raise ValueError(f"shapes {shapes}, children {children.dtype}")
         if not all(np.isfinite(a).all() for a in (cells, projection, thresholds)):
             raise ValueError("values that are no numbers")
         step = np.float32(CHILD_STEP)
-        return Vocabulary(grid(cells), grid(projection), thresholds.astype(np.float32), children.astype(np.float32) * step)
+        return Vocabulary(
+            grid(cells),
+            grid(projection),
+            thresholds.astype(np.float32),
+            children.astype(np.float32) * step,
+        )
     except (OSError, SafetensorError, KeyError, IndexError, ValueError) as problem:
-        raise SettingsError(f"{path or 'The shipped vocabulary'}: no vocabulary of the {variant} variant ({problem}).") from None
+        raise SettingsError(
+            f"{path or 'The shipped vocabulary'}: no vocabulary of the {variant} variant ({problem})."
+        ) from None

@@ -20,5 +20,14 @@ def test_only_hypotheses_of_one_place_and_heading_are_one() -> None:
     kept = _apart(found, 1.0, 10)
     assert [f[0].pose for f in kept] == [poses[0], poses[1], poses[4]]
     assert len(_apart(found, 1.0, 2)) == 2
-    assert len(_apart([(Hypothesis(g, poses[0], 1, 1.0), np.array(poses[0]), 0.5) for g in (1, 2)], 1.0, 10)) == 2
+    assert (
+        len(
+            _apart(
+                [(Hypothesis(g, poses[0], 1, 1.0), np.array(poses[0]), 0.5) for g in (1, 2)],
+                1.0,
+                10,
+            )
+        )
+        == 2
+    )
     assert _apart([], 1.0, 10) == []

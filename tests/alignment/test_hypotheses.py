@@ -31,7 +31,8 @@ def slow_pool(
 def test_votes_are_those_of_a_dictionary(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = 60
-    group, yaw = rng.integers(0, 3, n), rng.choice([0.0, 0.5, 1.0], n)
+    group = rng.integers(0, 3, n)
+    yaw = rng.choice([0.0, 0.5, 1.0], n)
     t = rng.uniform(-3, 3, (n, 3)) * [1, 1, 0.3]
     weight = rng.uniform(0.1, 1.0, n)
     found = pool(group, yaw, t, weight, 1.2, 500)
@@ -48,7 +49,11 @@ def test_votes_are_those_of_a_dictionary(seed: int) -> None:
     assert weights[0] == pytest.approx(expected[0][0])
     for w, g, y, mean in expected:  # every cell is there, itself or as its twin of the other grid
         assert any(
-            h.group == g and h.pose[0] == y and np.abs(np.array(h.pose[1:]) - mean).max() < 0.3 and h.weight >= w - 1e-9 for h in found
+            h.group == g
+            and h.pose[0] == y
+            and np.abs(np.array(h.pose[1:]) - mean).max() < 0.3
+            and h.weight >= w - 1e-9
+            for h in found
         )
 
 
@@ -56,7 +61,10 @@ def test_the_heaviest_are_kept() -> None:
     group = np.zeros(11, np.int64)
     t = np.array([[0.5, 0.5, 0.5]] * 5 + [[9.5, 0.5, 0.5]] * 4 + [[20.5, 0.5, 0.5]] * 2)
     found = pool(group, np.zeros(11), t, np.ones(11), 2.0, 2)
-    assert [(h.votes, h.weight, h.pose) for h in found] == [(5, 5.0, (0.0, 0.5, 0.5, 0.5)), (4, 4.0, (0.0, 9.5, 0.5, 0.5))]
+    assert [(h.votes, h.weight, h.pose) for h in found] == [
+        (5, 5.0, (0.0, 0.5, 0.5, 0.5)),
+        (4, 4.0, (0.0, 9.5, 0.5, 0.5)),
+    ]
 
 
 def test_a_pose_at_a_cell_border_is_counted_whole() -> None:
@@ -69,7 +77,11 @@ def test_a_pose_at_a_cell_border_is_counted_whole() -> None:
 def test_matches_of_other_submaps_and_headings_do_not_add_up() -> None:
     t = np.full((3, 3), 0.3)
     found = pool(np.array([0, 1, 1]), np.array([0.0, 0.0, 0.5]), t, np.ones(3), 1.0, 10)
-    assert sorted((h.group, h.pose[0], h.votes) for h in found) == [(0, 0.0, 1), (1, 0.0, 1), (1, 0.5, 1)]
+    assert sorted((h.group, h.pose[0], h.votes) for h in found) == [
+        (0, 0.0, 1),
+        (1, 0.0, 1),
+        (1, 0.5, 1),
+    ]
     assert pool(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0), 1.0, 5) == []
 
 

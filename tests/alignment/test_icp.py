@@ -20,7 +20,9 @@ STEPS = tuple(Step(radius, 15) for radius in (1.0, 0.5, 0.2))
 
 
 def room(rng: np.random.Generator, n: int, noise: float = 0.01, corridor: bool = False) -> F64:
-    """Walls, floor and ceiling of a room of 8 x 5 x 3 m with a slanted panel and a pillar; a corridor has two walls and a floor only."""
+    """Walls, floor and ceiling of a room of 8 x 5 x 3 m with a slanted panel and a pillar; a
+    corridor has two walls and a floor only.
+    """
     long = 40.0 if corridor else 8.0
     u, v = rng.uniform(0, 1, (2, n))
     sides = [
@@ -55,7 +57,12 @@ SMALL = exp_se3(np.array([0.15, -0.2, 0.1]), np.array([0.03, -0.02, 0.06]))
 
 
 @pytest.mark.parametrize(
-    "truth", [np.eye(4), yaw_transform(2.5, (3.0, -1.0, 0.5)), exp_se3(np.array([1.0, 2, 3]), np.array([0.3, -0.2, 1.0]))]
+    "truth",
+    [
+        np.eye(4),
+        yaw_transform(2.5, (3.0, -1.0, 0.5)),
+        exp_se3(np.array([1.0, 2, 3]), np.array([0.3, -0.2, 1.0])),
+    ],
 )
 def test_a_known_transform_is_found_to_a_millimetre(truth: F64) -> None:
     found = fit(truth, truth @ SMALL, noise=0.004)
@@ -69,7 +76,8 @@ def test_a_known_transform_is_found_to_a_millimetre(truth: F64) -> None:
 
 def test_forward_and_backward_are_inverse() -> None:
     rng = np.random.default_rng(1)
-    a, b = room(rng, 1200), apply(inverse(yaw_transform(0.7, (1.0, 0.0, 0.0))), room(rng, 1200))
+    a = room(rng, 1200)
+    b = apply(inverse(yaw_transform(0.7, (1.0, 0.0, 0.0))), room(rng, 1200))
     T = yaw_transform(0.7, (1.0, 0.0, 0.0))
     there = align(b, surface_of(a, CELL), T @ SMALL, STEPS).target_T_query
     back = align(a, surface_of(b, CELL), inverse(T @ SMALL), STEPS).target_T_query
@@ -81,12 +89,18 @@ def test_forward_and_backward_are_inverse() -> None:
 def test_far_from_the_origin_the_result_is_the_same() -> None:
     """Rotations act about the query's centre, so coordinates of kilometres do no harm."""
     rng = np.random.default_rng(2)
-    target, query = room(rng, 1200), room(rng, 600)
+    target = room(rng, 1200)
+    query = room(rng, 600)
     shift = yaw_transform(0.0, (30_000.0, -20_000.0, 500.0))
     near = align(query, surface_of(target, CELL), SMALL, STEPS)
     far = align(query, surface_of(apply(shift, target), CELL), shift @ SMALL, STEPS)
     assert error(inverse(shift) @ far.target_T_query, near.target_T_query)[0] < 1e-4
-    both = align(apply(shift, query), surface_of(apply(shift, target), CELL), shift @ SMALL @ inverse(shift), STEPS)
+    both = align(
+        apply(shift, query),
+        surface_of(apply(shift, target), CELL),
+        shift @ SMALL @ inverse(shift),
+        STEPS,
+    )
     assert error(apply_both(shift, both.target_T_query), near.target_T_query)[0] < 1e-4
     np.testing.assert_allclose(far.information, near.information, rtol=0.02, atol=2)
 
@@ -106,20 +120,28 @@ def test_outliers_are_not_followed() -> None:
 
 def test_information_of_point_distances_is_that_of_numerical_differences() -> None:
     rng = np.random.default_rng(0)
-    arm, weight = rng.normal(1, 2, (9, 3)), rng.uniform(0.1, 1, 9)  # not about its mean, so that translation and rotation couple
+    # not about its mean, so that translation and rotation couple
+    arm = rng.normal(1, 2, (9, 3))
+    weight = rng.uniform(0.1, 1, 9)
     expected = np.zeros((6, 6))
     for a, w in zip(arm, weight, strict=True):
         J = np.zeros((3, 6))
         for k in range(6):
             step = 1e-6 * np.eye(6)[k]
-            J[:, k] = (apply(exp_se3(step[:3], step[3:]), a[None])[0] - apply(exp_se3(-step[:3], -step[3:]), a[None])[0]) / 2e-6
+            J[:, k] = (
+                apply(exp_se3(step[:3], step[3:]), a[None])[0]
+                - apply(exp_se3(-step[:3], -step[3:]), a[None])[0]
+            ) / 2e-6
         expected += w * J.T @ J
-    found, g = np.zeros((6, 6)), np.zeros(6)
+    found = np.zeros((6, 6))
+    g = np.zeros(6)
     for a, w in zip(arm, weight, strict=True):
         _add_point(found, g, a, np.array([0.1, -0.3, 0.2]), w)
     np.testing.assert_allclose(np.triu(found), np.triu(expected), atol=1e-6)
     o = np.array([0.1, -0.3, 0.2])
-    np.testing.assert_allclose(g, np.r_[weight.sum() * o, (np.cross(arm, o) * weight[:, None]).sum(0)])
+    np.testing.assert_allclose(
+        g, np.r_[weight.sum() * o, (np.cross(arm, o) * weight[:, None]).sum(0)]
+    )
 
 
 def test_leaves_without_any_plane_hold_an_alignment_too() -> None:
@@ -128,7 +150,12 @@ def test_leaves_without_any_plane_hold_an_alignment_too() -> None:
     target = surface_of(cloud, CELL)
     flat = replace(target, planar=np.zeros(800))
     start = exp_se3(np.array([0.05, -0.04, 0.03]), np.array([0.01, 0.0, -0.02]))
-    assert error(align(cloud[::3], flat, start, (Step(0.5, 30), Step(0.3, 30))).target_T_query, np.eye(4))[0] < 1e-3
+    assert (
+        error(
+            align(cloud[::3], flat, start, (Step(0.5, 30), Step(0.3, 30))).target_T_query, np.eye(4)
+        )[0]
+        < 1e-3
+    )
 
 
 def test_nothing_to_align() -> None:
@@ -139,7 +166,9 @@ def test_nothing_to_align() -> None:
         assert found.rmse == np.inf
         assert not found.information.any()
         np.testing.assert_array_equal(found.target_T_query, SMALL)
-    empty = align(room(np.random.default_rng(0), 100), surface_of(np.zeros((0, 3)), CELL), SMALL, STEPS)
+    empty = align(
+        room(np.random.default_rng(0), 100), surface_of(np.zeros((0, 3)), CELL), SMALL, STEPS
+    )
     assert empty.count == 0
 
 
@@ -147,7 +176,12 @@ def test_covariance_of_a_room_and_of_a_corridor() -> None:
     rng = np.random.default_rng(4)
     for corridor in (False, True):
         target = surface_of(room(rng, 1500, corridor=corridor), CELL)
-        found = align(room(rng, 700, corridor=corridor)[:, :3], target, SMALL if not corridor else exp_se3(np.zeros(3), np.zeros(3)), STEPS)
+        found = align(
+            room(rng, 700, corridor=corridor)[:, :3],
+            target,
+            SMALL if not corridor else exp_se3(np.zeros(3), np.zeros(3)),
+            STEPS,
+        )
         C = covariance_of(found, np.eye(4), np.eye(4), 0.3)
         assert np.linalg.eigvalsh(C).min() > 0
         np.testing.assert_allclose(C, C.T)
@@ -162,20 +196,32 @@ def test_covariance_of_a_room_and_of_a_corridor() -> None:
 
 def test_covariance_says_what_is_not_known() -> None:
     rng = np.random.default_rng(4)
-    found = align(room(rng, 700, corridor=True), surface_of(room(rng, 1500, corridor=True), CELL), np.eye(4), STEPS)
+    found = align(
+        room(rng, 700, corridor=True),
+        surface_of(room(rng, 1500, corridor=True), CELL),
+        np.eye(4),
+        STEPS,
+    )
     assert covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] > 0.3**2
 
 
 def test_covariance_lies_in_the_axes_of_the_target() -> None:
     """A corridor along the map's x is one along -y for a target that looks along the map's y."""
     rng = np.random.default_rng(5)
-    found = align(room(rng, 700, corridor=True), surface_of(room(rng, 1500, corridor=True), CELL), np.eye(4), STEPS)
+    found = align(
+        room(rng, 700, corridor=True),
+        surface_of(room(rng, 1500, corridor=True), CELL),
+        np.eye(4),
+        STEPS,
+    )
     C = covariance_of(found, np.eye(4), yaw_transform(np.pi / 2, (3.0, 2.0, 0.0)), 0.3)
     assert abs(np.linalg.eigh(C[:3, :3])[1][1, -1]) > 0.99
 
 
 def test_covariance_grows_with_the_lever_arm() -> None:
-    """A base frame far from what was aligned is less certain across the arm by angle times distance."""
+    """A base frame far from what was aligned is less certain across the arm by angle times
+    distance.
+    """
     rng = np.random.default_rng(6)
     found = align(room(rng, 700), surface_of(room(rng, 1500), CELL), np.eye(4), STEPS)
     near = covariance_of(found, np.eye(4), np.eye(4), 0.3)
@@ -189,30 +235,44 @@ def test_covariance_grows_with_the_lever_arm() -> None:
 
 
 def test_errors_of_many_fits_stay_within_the_covariance() -> None:
-    """Whitened errors of repeated fits to new samples: not overconfident, and not without any meaning."""
+    """Whitened errors of repeated fits to new samples: not overconfident, and not without any
+    meaning.
+    """
     squared = []
     for seed in range(12):
-        found = fit(np.eye(4), exp_se3(np.array([0.05, 0.02, -0.03]), np.array([0.01, 0.0, 0.02])), seed)
+        found = fit(
+            np.eye(4), exp_se3(np.array([0.05, 0.02, -0.03]), np.array([0.01, 0.0, 0.02])), seed
+        )
         C = covariance_of(found, found.target_T_query, np.eye(4), 0.3)
         e = found.target_T_query[:3, 3]
         squared.append(float(e @ np.linalg.solve(C[:3, :3], e)))
     assert np.mean(squared) < 3  # three degrees of freedom
 
 
-def seen_by_a_camera(rng: np.random.Generator, points: F64, eye: F64, share: float, too_far: float = 0.0) -> tuple[F64, F64]:
-    """Points (n, 3) as a camera at ``eye`` (3,) has them, whose range has a standard deviation of ``share`` of it, and that spread (n, 3);
-    all of them ``too_far`` standard deviations off."""
+def seen_by_a_camera(
+    rng: np.random.Generator, points: F64, eye: F64, share: float, too_far: float = 0.0
+) -> tuple[F64, F64]:
+    """Points (n, 3) as a camera at ``eye`` (3,) has them, whose range has a standard deviation of
+    ``share`` of it, and that spread (n, 3); all of them ``too_far`` standard deviations off.
+    """
     spread = share * (points - eye)
     return points + spread * (rng.normal(size=(len(points), 1)) + too_far), spread
 
 
 def test_uncertain_points_are_aligned_through_the_slab_they_lie_in() -> None:
-    """Two cameras at opposite ends of a hall, ranges wrong by 4 %: the nearest point of a slab is near wherever the query starts, so that a
-    plain fit stays there. Across the hall its long walls tell, along it the ends, of which each camera knows one well."""
-    rng, v = np.random.default_rng(3), 0.3
+    """Two cameras at opposite ends of a hall, ranges wrong by 4 %: the nearest point of a slab is
+    near wherever the query starts, so that a plain fit stays there. Across the hall its long walls
+    tell, along it the ends, of which each camera knows one well.
+    """
+    rng = np.random.default_rng(3)
+    v = 0.3
     start = exp_se3(np.array([0.35, -0.3, 0.0]), np.array([0.0, 0.0, 0.03]))
-    there, there_spread = seen_by_a_camera(rng, room(rng, 6000) * [2, 2, 1], np.array([-6.0, 0.0, 1.5]), 0.04)
-    here, here_spread = seen_by_a_camera(rng, room(rng, 3000) * [2, 2, 1], np.array([6.0, 0.5, 1.5]), 0.04)
+    there, there_spread = seen_by_a_camera(
+        rng, room(rng, 6000) * [2, 2, 1], np.array([-6.0, 0.0, 1.5]), 0.04
+    )
+    here, here_spread = seen_by_a_camera(
+        rng, room(rng, 3000) * [2, 2, 1], np.array([6.0, 0.5, 1.5]), 0.04
+    )
     surface = points_surface(there, there_spread, v)
     assert surface.sigma > 0.25 * v
     query = Query(Fuser(Settings().resolved().fusion).finish(), here, v, here_spread)
@@ -224,21 +284,32 @@ def test_uncertain_points_are_aligned_through_the_slab_they_lie_in() -> None:
 
 
 def test_a_certain_point_weighs_as_many_uncertain_ones_as_it_is_more_certain() -> None:
-    """A wall at x = 0, 40 points on it that are certain, 40 a decimetre behind it that are known to 0.2 m across it; noise 0.1 m:
-    the mean of weights 1 and 1 / (1 + 4)."""
-    grid = np.stack(np.meshgrid(0.0, np.arange(-2, 2, 0.1), np.arange(0, 2, 0.1)), -1).reshape(-1, 3)
+    """A wall at x = 0, 40 points on it that are certain, 40 a decimetre behind it that are known to
+    0.2 m across it; noise 0.1 m: the mean of weights 1 and 1 / (1 + 4).
+    """
+    grid = np.stack(np.meshgrid(0.0, np.arange(-2, 2, 0.1), np.arange(0, 2, 0.1)), -1).reshape(
+        -1, 3
+    )
     rng = np.random.default_rng(0)
     on = np.c_[np.zeros(40), rng.uniform(-1.5, 1.5, 40), rng.uniform(0.2, 1.8, 40)]
-    query, spread = np.r_[on, on + np.array([0.1, 0.0, 0.0])], np.r_[np.zeros((40, 3)), np.tile([0.2, 0.0, 0.0], (40, 1))]
-    wide = (Step(100.0, 15), Step(100.0, 0))  # so wide a kernel takes all as they are; the last step measures what was found
+    query = np.r_[on, on + np.array([0.1, 0.0, 0.0])]
+    spread = np.r_[np.zeros((40, 3)), np.tile([0.2, 0.0, 0.0], (40, 1))]
+    # so wide a kernel takes all as they are; the last step measures what was found
+    wide = (Step(100.0, 15), Step(100.0, 0))
     found = align(query, surface_of(grid, CELL), np.eye(4), wide, spread, 0.1)
     assert found.target_T_query[0, 3] == pytest.approx(-0.1 * 0.2 / 1.2, rel=0.02)
-    assert found.rmse == pytest.approx(np.sqrt((0.1 * 0.2 / 1.2) ** 2 / 2 + 0.2 * (0.1 / 1.2) ** 2 / 2), rel=0.02)
+    assert found.rmse == pytest.approx(
+        np.sqrt((0.1 * 0.2 / 1.2) ** 2 / 2 + 0.2 * (0.1 / 1.2) ** 2 / 2), rel=0.02
+    )
 
 
 def test_a_start_holds_where_little_says_otherwise() -> None:
-    """One wall of 40 points, 0.1 m from where the query starts, against a hold of 40 points: half of the way."""
-    grid = np.stack(np.meshgrid(0.0, np.arange(-2, 2, 0.1), np.arange(0, 2, 0.1)), -1).reshape(-1, 3)
+    """One wall of 40 points, 0.1 m from where the query starts, against a hold of 40 points: half
+    of the way.
+    """
+    grid = np.stack(np.meshgrid(0.0, np.arange(-2, 2, 0.1), np.arange(0, 2, 0.1)), -1).reshape(
+        -1, 3
+    )
     rng = np.random.default_rng(0)
     query = np.c_[np.full(40, 0.1), rng.uniform(-1.5, 1.5, 40), rng.uniform(0.2, 1.8, 40)]
     found = align(query, surface_of(grid, CELL), np.eye(4), (Step(100.0, 15),), hold=40.0)
@@ -246,13 +317,20 @@ def test_a_start_holds_where_little_says_otherwise() -> None:
 
 
 def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
-    """A wall ahead seen with ranges known to 0.1 m: its points average out, what they share does not. Whose ranges they are is all one."""
-    grid = np.stack(np.meshgrid(5.0, np.arange(-4, 4, 0.1), np.arange(0, 4, 0.1)), -1).reshape(-1, 3)
-    query, along = grid[::3], np.array([0.1, 0.0, 0.0])
+    """A wall ahead seen with ranges known to 0.1 m: its points average out, what they share does
+    not. Whose ranges they are is all one.
+    """
+    grid = np.stack(np.meshgrid(5.0, np.arange(-4, 4, 0.1), np.arange(0, 4, 0.1)), -1).reshape(
+        -1, 3
+    )
+    query = grid[::3]
+    along = np.array([0.1, 0.0, 0.0])
     certain = align(query, surface_of(grid, CELL), np.eye(4), STEPS)
     assert not certain.pull.any()
     least = covariance_of(certain, np.eye(4), np.eye(4), 0.3)[0, 0]
-    mapped = flattened_surface(grid, np.tile(along, (len(grid), 1)), np.arange(len(grid)), CELL, 0.05)
+    mapped = flattened_surface(
+        grid, np.tile(along, (len(grid), 1)), np.arange(len(grid)), CELL, 0.05
+    )
     for found in (
         align(query, surface_of(grid, CELL), np.eye(4), STEPS, np.tile(along, (len(query), 1))),
         align(query, mapped, np.eye(4), STEPS),
@@ -261,22 +339,44 @@ def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
         assert np.sqrt(more) == pytest.approx(SYSTEMATIC * 0.1, rel=0.1)
 
 
-def test_what_ranges_of_both_sides_have_in_common_counts_where_they_look_from_opposite_sides() -> None:
-    """The same wall, seen by both with ranges known to 0.1 m: half of the variance is their own, half is common and cancels or adds."""
-    grid = np.stack(np.meshgrid(5.0, np.arange(-4, 4, 0.1), np.arange(0, 4, 0.1)), -1).reshape(-1, 3)
-    query, along = grid[::3], np.array([0.1, 0.0, 0.0])
-    mapped = flattened_surface(grid, np.tile(along, (len(grid), 1)), np.arange(len(grid)), CELL, 0.05)
+def test_what_ranges_of_both_sides_have_in_common_counts_where_they_look_from_opposite_sides() -> (
+    None
+):
+    """The same wall, seen by both with ranges known to 0.1 m: half of the variance is their own,
+    half is common and cancels or adds.
+    """
+    grid = np.stack(np.meshgrid(5.0, np.arange(-4, 4, 0.1), np.arange(0, 4, 0.1)), -1).reshape(
+        -1, 3
+    )
+    query = grid[::3]
+    along = np.array([0.1, 0.0, 0.0])
+    mapped = flattened_surface(
+        grid, np.tile(along, (len(grid), 1)), np.arange(len(grid)), CELL, 0.05
+    )
     same, opposite = (
-        np.sqrt(covariance_of(align(query, mapped, np.eye(4), STEPS, np.tile(ray, (len(query), 1))), np.eye(4), np.eye(4), 0.3)[0, 0])
+        np.sqrt(
+            covariance_of(
+                align(query, mapped, np.eye(4), STEPS, np.tile(ray, (len(query), 1))),
+                np.eye(4),
+                np.eye(4),
+                0.3,
+            )[0, 0]
+        )
         for ray in (along, -along)
     )
     assert same == pytest.approx(SYSTEMATIC * 0.1 * np.sqrt(2 * (1 - COMMON)), rel=0.1)
-    assert opposite == pytest.approx(SYSTEMATIC * 0.1 * np.sqrt(2 * (1 - COMMON) + 4 * COMMON), rel=0.1)
+    assert opposite == pytest.approx(
+        SYSTEMATIC * 0.1 * np.sqrt(2 * (1 - COMMON) + 4 * COMMON), rel=0.1
+    )
 
 
 def test_an_uncertain_wall_of_the_target_weighs_less_than_a_certain_one() -> None:
-    """Two walls face the query, of which the map has the second 0.1 m too far and knows it to 0.2 m; noise 0.1 m: weights 1 and 1 / 5."""
-    side = np.stack(np.meshgrid(0.0, np.arange(-2, 2, 0.1), np.arange(0, 2, 0.1)), -1).reshape(-1, 3)
+    """Two walls face the query, of which the map has the second 0.1 m too far and knows it to 0.2
+    m; noise 0.1 m: weights 1 and 1 / 5.
+    """
+    side = np.stack(np.meshgrid(0.0, np.arange(-2, 2, 0.1), np.arange(0, 2, 0.1)), -1).reshape(
+        -1, 3
+    )
     walls = np.r_[side, side + np.array([10.0, 0.0, 0.0])]
     spread = np.r_[np.zeros_like(side), np.tile([0.2, 0.0, 0.0], (len(side), 1))]
     mapped = walls + np.r_[np.zeros_like(side), np.tile([0.1, 0.0, 0.0], (len(side), 1))]
@@ -286,7 +386,9 @@ def test_an_uncertain_wall_of_the_target_weighs_less_than_a_certain_one() -> Non
 
 
 def test_ranges_pull_no_farther_than_points_hold() -> None:
-    """A corridor whose normals are noisy: what they pretend to know along it is taken off, and what would pull at that with it."""
+    """A corridor whose normals are noisy: what they pretend to know along it is taken off, and what
+    would pull at that with it.
+    """
     rng = np.random.default_rng(5)
     points = room(rng, 700, corridor=True)
     far = 0.1 * points / np.linalg.norm(points, axis=1)[:, None]
@@ -295,11 +397,15 @@ def test_ranges_pull_no_farther_than_points_hold() -> None:
 
 
 def test_a_fit_that_meets_too_little_knows_nothing() -> None:
-    """The first radius reaches the walls, the last one does not: nothing is left of what the first one knew."""
+    """The first radius reaches the walls, the last one does not: nothing is left of what the first
+    one knew.
+    """
     rng = np.random.default_rng(6)
     points = room(rng, 700, noise=0.0)
     off = points + np.array([0.17, 0.17, 0.17]) * rng.choice([-1, 1], (len(points), 1))
-    found = align(off, surface_of(room(rng, 1500, noise=0.0), CELL), np.eye(4), (Step(0.4, 1), Step(0.001, 1)))
+    found = align(
+        off, surface_of(room(rng, 1500, noise=0.0), CELL), np.eye(4), (Step(0.4, 1), Step(0.001, 1))
+    )
     assert (found.inliers, found.rmse) == (0.0, float("inf"))
     assert not found.information.any()
     assert not found.pull.any()

@@ -7,8 +7,25 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.overlap import ANY_BIT, FREE_BIT, build_level, class_bits, look_up, pose_matrix, search, tau, yaw_between
-from semloc_logs.alignment.verify import Query, Target, same_place, search_hypotheses, structure_mask, structure_scores
+from semloc_logs.alignment.overlap import (
+    ANY_BIT,
+    FREE_BIT,
+    build_level,
+    class_bits,
+    look_up,
+    pose_matrix,
+    search,
+    tau,
+    yaw_between,
+)
+from semloc_logs.alignment.verify import (
+    Query,
+    Target,
+    same_place,
+    search_hypotheses,
+    structure_mask,
+    structure_scores,
+)
 from semloc_logs.labels.space import UNLABELLED, cityscapes
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, empty_map
@@ -25,14 +42,18 @@ def block_map(cells: dict[Cell, int]) -> BlockMap:
     blocks: dict[Cell, U8] = {}
     for ijk, value in cells.items():
         block = tuple(c // BLOCK for c in ijk)
-        blocks.setdefault(block, np.full((BLOCK,) * 3, UNOBSERVED_STATE, np.uint8))[tuple(c % BLOCK for c in ijk)] = value
+        blocks.setdefault(block, np.full((BLOCK,) * 3, UNOBSERVED_STATE, np.uint8))[
+            tuple(c % BLOCK for c in ijk)
+        ] = value
     if not blocks:
         return empty_map()
     keys = pack(np.array(list(blocks)))
     state = np.stack(list(blocks.values())).reshape(-1, BLOCK**3)[np.argsort(keys)]
     occupied = (state != FREE_STATE) & (state != UNOBSERVED_STATE)
     nothing = np.zeros(0, np.int64)
-    return BlockMap(np.sort(keys), np.where(occupied, 20, -20).astype(np.int8), state, nothing, nothing)
+    return BlockMap(
+        np.sort(keys), np.where(occupied, 20, -20).astype(np.int8), state, nothing, nothing
+    )
 
 
 def random_cells(seed: int, n: int = 120, low: int = -9, high: int = 11) -> dict[Cell, int]:
@@ -47,7 +68,17 @@ def occupied(state: int) -> bool:
 
 def test_class_bits_by_hand() -> None:
     states = np.array([0, 2, 5, 8, 13, 11, 255, 254, 253], np.uint8)
-    assert class_bits(states, COARSE).tolist() == [64 + 1, 64 + 2, 64 + 4, 64 + 8, 64 + 16, 64 + 32, 64, 0, 0]
+    assert class_bits(states, COARSE).tolist() == [
+        64 + 1,
+        64 + 2,
+        64 + 4,
+        64 + 8,
+        64 + 16,
+        64 + 32,
+        64,
+        0,
+        0,
+    ]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -59,7 +90,9 @@ def test_masks_are_those_of_slow_loops(seed: int) -> None:
     for ijk, state in cells.items():
         if occupied(state):
             for d in np.ndindex(3, 3, 3):
-                expected[tuple(np.array(ijk) - corner + np.array(d) - 1)] |= ANY_BIT | (1 << COARSE[state] if COARSE[state] < 6 else 0)
+                expected[tuple(np.array(ijk) - corner + np.array(d) - 1)] |= ANY_BIT | (
+                    1 << COARSE[state] if COARSE[state] < 6 else 0
+                )
     for ijk, state in cells.items():
         at = tuple(np.array(ijk) - corner)
         if state == FREE_STATE and expected[at] == 0:
@@ -69,13 +102,30 @@ def test_masks_are_those_of_slow_loops(seed: int) -> None:
 
 def test_look_ups_of_points() -> None:
     level = build_level(block_map({(0, 0, 0): 2, (9, 9, 9): 254}), V, COARSE)
-    points = np.array([[0.25, 0.25, 0.25], [-0.25, 0.7, 0.99], [1.01, 0.2, 0.2], [4.75, 4.75, 4.75], [1e6, 0, 0], [-1e6, 0, 0]])
+    points = np.array(
+        [
+            [0.25, 0.25, 0.25],
+            [-0.25, 0.7, 0.99],
+            [1.01, 0.2, 0.2],
+            [4.75, 4.75, 4.75],
+            [1e6, 0, 0],
+            [-1e6, 0, 0],
+        ]
+    )
     assert look_up(level, points).tolist() == [ANY_BIT | 2, ANY_BIT | 2, 0, FREE_BIT, 0, 0]
 
 
-def slow_tau(query: dict[Cell, int], target: dict[Cell, int], T: NDArray[np.float64], kappa: float, coarse: bool) -> tuple[float, int]:
+def slow_tau(
+    query: dict[Cell, int],
+    target: dict[Cell, int],
+    T: NDArray[np.float64],
+    kappa: float,
+    coarse: bool,
+) -> tuple[float, int]:
     """Each occupied query voxel against all observed target voxels."""
-    observed = np.array([c for c, s in target.items() if s != UNOBSERVED_STATE], float).reshape(-1, 3)
+    observed = np.array([c for c, s in target.items() if s != UNOBSERVED_STATE], float).reshape(
+        -1, 3
+    )
     states = [s for s in target.values() if s != UNOBSERVED_STATE]
     aligned = total = 0
     for ijk, state in query.items():
@@ -92,12 +142,25 @@ def slow_tau(query: dict[Cell, int], target: dict[Cell, int], T: NDArray[np.floa
     return aligned / total, aligned
 
 
-@given(st.integers(0, 10_000), st.floats(-3.2, 3.2), st.tuples(*[st.floats(-4, 4)] * 3), st.booleans(), st.sampled_from([0.7, 1.5, 5.0]))
+@given(
+    st.integers(0, 10_000),
+    st.floats(-3.2, 3.2),
+    st.tuples(*[st.floats(-4, 4)] * 3),
+    st.booleans(),
+    st.sampled_from([0.7, 1.5, 5.0]),
+)
 @settings(max_examples=40, deadline=None)
-def test_tau_is_that_of_brute_force(seed: int, yaw: float, t: tuple[float, float, float], coarse: bool, kappa: float) -> None:
-    query, target = random_cells(seed, 40), random_cells(seed + 1, 300)
-    T = yaw_transform(yaw, (t[0] + 1e-7, t[1] + 1e-7, t[2] + 1e-7)) @ exp_se3(np.zeros(3), np.array([0.03, -0.02, 0.0]))
-    found = tau(block_map(query).occupied(), block_map(target), V, T, kappa, COARSE if coarse else None)
+def test_tau_is_that_of_brute_force(
+    seed: int, yaw: float, t: tuple[float, float, float], coarse: bool, kappa: float
+) -> None:
+    query = random_cells(seed, 40)
+    target = random_cells(seed + 1, 300)
+    T = yaw_transform(yaw, (t[0] + 1e-7, t[1] + 1e-7, t[2] + 1e-7)) @ exp_se3(
+        np.zeros(3), np.array([0.03, -0.02, 0.0])
+    )
+    found = tau(
+        block_map(query).occupied(), block_map(target), V, T, kappa, COARSE if coarse else None
+    )
     assert found == pytest.approx(slow_tau(query, target, T, kappa, coarse))
 
 
@@ -106,9 +169,18 @@ def test_tau_of_a_map_with_itself_and_with_nothing() -> None:
     blocks = block_map(cells)
     n = sum(occupied(s) for s in cells.values())
     assert tau(blocks.occupied(), blocks, V, np.eye(4), 3.0) == (1.0, n)
-    shifted = block_map({tuple((np.array(c) + np.array([3, -40, 7])).tolist()): s for c, s in cells.items()})
-    assert tau(blocks.occupied(), shifted, V, yaw_transform(0.0, (3 * V, -40 * V, 7 * V)), 3.0) == (1.0, n)
-    for query, target in ((empty_map(), blocks), (blocks, empty_map()), (block_map({(0, 0, 0): 254}), blocks)):
+    shifted = block_map(
+        {tuple((np.array(c) + np.array([3, -40, 7])).tolist()): s for c, s in cells.items()}
+    )
+    assert tau(blocks.occupied(), shifted, V, yaw_transform(0.0, (3 * V, -40 * V, 7 * V)), 3.0) == (
+        1.0,
+        n,
+    )
+    for query, target in (
+        (empty_map(), blocks),
+        (blocks, empty_map()),
+        (block_map({(0, 0, 0): 254}), blocks),
+    ):
         assert tau(query.occupied(), target, V, np.eye(4), 3.0) == (0.0, 0)
     assert tau(blocks.occupied(), blocks, V, yaw_transform(0.0, (1e5, 0.0, 0.0)), 3.0) == (0.0, 0)
 
@@ -117,10 +189,14 @@ def test_free_space_counts_against_an_alignment_in_tau() -> None:
     """The closest observed voxel decides, not some occupied one within kappa."""
     query = block_map({(0, 0, 0): 2})
     assert tau(query.occupied(), block_map({(2, 0, 0): 2}), V, np.eye(4), 3.0)[0] == 1
-    assert tau(query.occupied(), block_map({(2, 0, 0): 2, (0, 0, 1): 254}), V, np.eye(4), 3.0)[0] == 0
+    assert (
+        tau(query.occupied(), block_map({(2, 0, 0): 2, (0, 0, 1): 254}), V, np.eye(4), 3.0)[0] == 0
+    )
     assert tau(query.occupied(), block_map({(2, 0, 0): 3}), V, np.eye(4), 3.0)[0] == 0
-    assert tau(query.occupied(), block_map({(2, 0, 0): 3}), V, np.eye(4), 3.0, COARSE)[0] == 1  # building and wall are construction
-    assert tau(query.occupied(), block_map({(6, 0, 0): 2}), V, np.eye(4), 3.0)[0] == 0  # at kappa, not below it
+    # building and wall are construction
+    assert tau(query.occupied(), block_map({(2, 0, 0): 3}), V, np.eye(4), 3.0, COARSE)[0] == 1
+    # at kappa, not below it
+    assert tau(query.occupied(), block_map({(6, 0, 0): 2}), V, np.eye(4), 3.0)[0] == 0
 
 
 def town(seed: int = 0) -> dict[Cell, int]:
@@ -146,7 +222,9 @@ def points_of(cells: dict[Cell, int]) -> NDArray[np.float64]:
 
 
 def moved(cells: dict[Cell, int], T: NDArray[np.float64]) -> dict[Cell, int]:
-    """The map seen from the query's frame: voxel centres by inverse(T), dense enough by two samples an axis."""
+    """The map seen from the query's frame: voxel centres by inverse(T), dense enough by two samples
+    an axis.
+    """
     out: dict[Cell, int] = {}
     back = inverse(T)
     for d in np.ndindex(2, 2, 2):
@@ -159,7 +237,8 @@ def moved(cells: dict[Cell, int], T: NDArray[np.float64]) -> dict[Cell, int]:
 @pytest.mark.parametrize("yaw", [0.0, 0.7, -2.4])
 def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
     truth = yaw_transform(yaw, (3.3, -2.1, 0.4))
-    target, query_cells = Target(block_map(town()), V), moved(town(), truth)
+    target = Target(block_map(town()), V)
+    query_cells = moved(town(), truth)
     query = Query(block_map(query_cells), points_of(query_cells), V)
     start = np.array([yaw + 0.12, 3.3 + 1.1, -2.1 - 0.9, 0.4 + 0.4])
     score, pose = search(target.level, query.evidence, start, (-0.12, 0.0, 0.12), 2)
@@ -198,12 +277,23 @@ def test_structure_scores_by_hand() -> None:
     assert structure_scores(query, target, np.eye(4)) == (2 / 4, 4 / 5, 1 / 5, 2)
     bare = Query(block_map({(0, 0, 0): 0}), np.zeros((1, 3)), V)
     assert structure_scores(bare, target, np.eye(4)) == (0.0, 0.0, 0.0, 0)
-    assert structure_mask(np.array([0, 1, 9, 2, 5, 8, 13, 255], np.uint8)).tolist() == [False, False, False, True, True, True, False, True]
+    assert structure_mask(np.array([0, 1, 9, 2, 5, 8, 13, 255], np.uint8)).tolist() == [
+        False,
+        False,
+        False,
+        True,
+        True,
+        True,
+        False,
+        True,
+    ]
 
 
 def test_evidence_of_unlabelled_voxels_asks_for_anything_occupied() -> None:
     query = Query(block_map({(0, 0, 0): UNLABELLED, (3, 0, 0): 2}), np.zeros((1, 3)), V)
-    bits = dict(zip(map(tuple, query.evidence.centres.tolist()), query.evidence.bits.tolist(), strict=True))
+    bits = dict(
+        zip(map(tuple, query.evidence.centres.tolist()), query.evidence.bits.tolist(), strict=True)
+    )
     assert bits == {(0.25, 0.25, 0.25): ANY_BIT, (1.75, 0.25, 0.25): 2}
 
 

@@ -5,14 +5,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semloc_logs.alignment.surface import LEAST_FLAT, NEIGHBOURS, flattened_surface, look_at, nearest_points, surface_of
+from semloc_logs.alignment.surface import (
+    LEAST_FLAT,
+    NEIGHBOURS,
+    flattened_surface,
+    look_at,
+    nearest_points,
+    surface_of,
+)
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.2, 0.5, 1.3]), st.sampled_from([0.1, 0.4, 2.0]))
 @settings(max_examples=30, deadline=None)
 def test_the_nearest_is_that_of_brute_force(seed: int, cell: float, radius: float) -> None:
     rng = np.random.default_rng(seed)
-    points, query = rng.uniform(-2, 2, (150, 3)) + 1e4, rng.uniform(-3, 3, (60, 3)) + 1e4
+    points = rng.uniform(-2, 2, (150, 3)) + 1e4
+    query = rng.uniform(-3, 3, (60, 3)) + 1e4
     surface = surface_of(points, cell)
     assert sorted(map(tuple, surface.points)) == sorted(map(tuple, points))
     found = nearest_points(surface.arrays, query, radius)
@@ -39,8 +47,12 @@ def test_points_with_few_around_are_no_planes() -> None:
     surface = surface_of(np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), 0.3)
     look_at(surface.arrays, np.arange(3))
     assert surface.planar.tolist() == [0, 0, 0]
-    assert nearest_points(surface_of(np.zeros((0, 3)), 0.3).arrays, np.zeros((2, 3)), 1.0).tolist() == [-1, -1]
-    crowd = surface_of(np.random.default_rng(1).uniform(0, 0.2, (5 * NEIGHBOURS, 3)) * np.array([1, 1, 0]), 0.3)
+    assert nearest_points(
+        surface_of(np.zeros((0, 3)), 0.3).arrays, np.zeros((2, 3)), 1.0
+    ).tolist() == [-1, -1]
+    crowd = surface_of(
+        np.random.default_rng(1).uniform(0, 0.2, (5 * NEIGHBOURS, 3)) * np.array([1, 1, 0]), 0.3
+    )
     look_at(crowd.arrays, np.arange(len(crowd.points)))
     assert crowd.planar.mean() == pytest.approx(1, abs=0.3)
 
@@ -48,23 +60,33 @@ def test_points_with_few_around_are_no_planes() -> None:
 @given(st.integers(0, 10_000))
 @settings(max_examples=10, deadline=None)
 def test_flattened_points_lie_on_the_plane_of_a_slow_weighted_fit(seed: int) -> None:
-    """A slanted wall seen in a slab: every kept point lies on the plane of the weighted points around it."""
-    rng, radius, noise = np.random.default_rng(seed), 0.6, 0.05
+    """A slanted wall seen in a slab: every kept point lies on the plane of the weighted points
+    around it.
+    """
+    rng = np.random.default_rng(seed)
+    radius = 0.6
+    noise = 0.05
     points = rng.uniform(-1, 1, (250, 3)) * [1.0, 1.0, 0.1] + 1e3
-    spread, kept = rng.uniform(-0.2, 0.2, points.shape), np.arange(0, 250, 7)
+    spread = rng.uniform(-0.2, 0.2, points.shape)
+    kept = np.arange(0, 250, 7)
     sigma = np.linalg.norm(spread, axis=1)
     surface = flattened_surface(points, spread, kept, radius, noise)
     assert surface.sigma == np.median(sigma[kept])
     expected = []
     for p in points[kept]:
         around = np.linalg.norm(points - p, axis=1) <= radius
-        w, near = 1 / (noise**2 + sigma[around] ** 2), points[around]
+        w = 1 / (noise**2 + sigma[around] ** 2)
+        near = points[around]
         if len(near) < LEAST_FLAT:
             expected.append(p)
             continue
         mean = (w[:, None] * near).sum(0) / w.sum()
-        normal = np.linalg.eigh((w[:, None, None] * (near - mean)[:, :, None] * (near - mean)[:, None]).sum(0))[1][:, 0]
+        normal = np.linalg.eigh(
+            (w[:, None, None] * (near - mean)[:, :, None] * (near - mean)[:, None]).sum(0)
+        )[1][:, 0]
         expected.append(p - normal * ((p - mean) @ normal))
     order = np.lexsort(np.round(surface.points, 6).T)
     wanted = np.array(expected)
-    np.testing.assert_allclose(surface.points[order], wanted[np.lexsort(np.round(wanted, 6).T)], atol=1e-6)
+    np.testing.assert_allclose(
+        surface.points[order], wanted[np.lexsort(np.round(wanted, 6).T)], atol=1e-6
+    )

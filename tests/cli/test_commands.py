@@ -1,4 +1,6 @@
-"""What each command hands to the pipeline and prints of its answer; the stages themselves are stand-ins or hand-made files."""
+"""What each command hands to the pipeline and prints of its answer; the stages themselves are
+stand-ins or hand-made files.
+"""
 
 import json
 import time
@@ -44,7 +46,9 @@ def _write_closures(work: Workspace, count: int = 2) -> None:
 
 
 @pytest.fixture
-def called(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str, Report], dict[str, Any]]:
+def called(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Callable[[str, Report], dict[str, Any]]:
     """Puts a stand-in for a stage; the dict holds the arguments of its call."""
 
     def put(stage: str, answer: Any) -> dict[str, Any]:
@@ -79,14 +83,18 @@ def test_settings_come_from_defaults_then_file_then_environment_then_flags(tmp_p
     assert _dumped()["fusion"]["voxel_size"] == 0.3
     assert _dumped("--config", file)["fusion"]["voxel_size"] == 0.4
     assert _dumped("--config", file, env=environment)["fusion"]["voxel_size"] == 0.5
-    all_of_it = _dumped("--config", file, "--set", "fusion.voxel_size=0.6", "--query-frames", 4, env=environment)
+    all_of_it = _dumped(
+        "--config", file, "--set", "fusion.voxel_size=0.6", "--query-frames", 4, env=environment
+    )
     assert all_of_it["fusion"]["voxel_size"] == 0.6
     assert all_of_it["fusion"]["hit"] == 0.7
     assert all_of_it["query"]["frames"] == 4
     assert all_of_it["query"]["length"] == 11
 
 
-@pytest.mark.parametrize("name", ["model #2.onnx", "a: b.onnx", "[1].onnx", "12", "größe 😀.onnx", "it's \\ so.onnx"])
+@pytest.mark.parametrize(
+    "name", ["model #2.onnx", "a: b.onnx", "[1].onnx", "12", "größe 😀.onnx", "it's \\ so.onnx"]
+)
 def test_a_path_is_taken_as_it_is(name: str) -> None:
     content = yaml.safe_load(semloc("run", "--dump-config", "--seg-model", name).stdout)
     assert content["labels"]["model"] == name
@@ -94,7 +102,14 @@ def test_a_path_is_taken_as_it_is(name: str) -> None:
 
 
 def test_what_dump_config_prints_is_read_back(tmp_path: Path) -> None:
-    first = semloc("run", "--dump-config", "--set", "closures.min_probability=0.5", "--set", "fusion.clamp=[-1, 2]").stdout
+    first = semloc(
+        "run",
+        "--dump-config",
+        "--set",
+        "closures.min_probability=0.5",
+        "--set",
+        "fusion.clamp=[-1, 2]",
+    ).stdout
     (tmp_path / "s.yaml").write_text(first)
     assert semloc("run", "--dump-config", "--config", tmp_path / "s.yaml").stdout == first
 
@@ -110,7 +125,9 @@ def test_what_dump_config_prints_is_read_back(tmp_path: Path) -> None:
         (["--config", "/no/such/file.yaml"], {}, "/no/such/file.yaml"),
     ],
 )
-def test_wrong_settings_are_named_and_2(tmp_path: Path, args: list[str], environment: dict[str, str], names: str) -> None:
+def test_wrong_settings_are_named_and_2(
+    tmp_path: Path, args: list[str], environment: dict[str, str], names: str
+) -> None:
     done = semloc("run", "a.mcap", "-w", tmp_path / "w", *args, env=environment)
     assert done.exit_code == 2
     assert names in done.stderr
@@ -130,10 +147,23 @@ def test_run_makes_each_log_a_session(called: Any, tmp_path: Path) -> None:
     (tmp_path / "tuesday").mkdir()
     logs = (tmp_path / "monday.mcap", tmp_path / "tuesday")
     done = semloc(
-        "run", *logs, "-w", tmp_path / "work", "--topic", "lidar=/points", "--query-frames", 3, "--annotate", "copy", "--overwrite"
+        "run",
+        *logs,
+        "-w",
+        tmp_path / "work",
+        "--topic",
+        "lidar=/points",
+        "--query-frames",
+        3,
+        "--annotate",
+        "copy",
+        "--overwrite",
     )
     assert done.exit_code == 0, done.stderr
-    assert {name: list(paths) for name, paths in seen["sessions"].items()} == {"monday": [logs[0]], "tuesday": [logs[1]]}
+    assert {name: list(paths) for name, paths in seen["sessions"].items()} == {
+        "monday": [logs[0]],
+        "tuesday": [logs[1]],
+    }
     assert seen["topics"] == {"lidar": "/points"}
     assert seen["settings"].query.frames == 3
     assert seen["settings"].fusion.max_range == 50.0  # resolved
@@ -146,7 +176,14 @@ def test_run_makes_each_log_a_session(called: Any, tmp_path: Path) -> None:
 def test_run_prints_its_report_as_json(called: Any, tmp_path: Path) -> None:
     called(
         "run",
-        Report(done=["fuse a"], kept=["describe a"], skipped=["a: lost."], failed=["b is no log."], seconds={"fuse": 1.5}, closures=7),
+        Report(
+            done=["fuse a"],
+            kept=["describe a"],
+            skipped=["a: lost."],
+            failed=["b is no log."],
+            seconds={"fuse": 1.5},
+            closures=7,
+        ),
     )
     done = semloc("run", "a.mcap", "-w", tmp_path / "work", "--json")
     assert done.exit_code == 3
@@ -178,8 +215,15 @@ def test_long_lists_of_closures_are_cut_short(called: Any, tmp_path: Path) -> No
 
 def test_fuse_makes_all_logs_one_session(called: Any, tmp_path: Path) -> None:
     seen = called("fuse", Report(done=["drive"]))
-    assert semloc("fuse", "a_0.mcap", "a_1.mcap", "-w", tmp_path / "work", "--session", "drive").exit_code == 0
-    assert {n: [str(p) for p in logs] for n, logs in seen["sessions"].items()} == {"drive": ["a_0.mcap", "a_1.mcap"]}
+    assert (
+        semloc(
+            "fuse", "a_0.mcap", "a_1.mcap", "-w", tmp_path / "work", "--session", "drive"
+        ).exit_code
+        == 0
+    )
+    assert {n: [str(p) for p in logs] for n, logs in seen["sessions"].items()} == {
+        "drive": ["a_0.mcap", "a_1.mcap"]
+    }
     semloc("fuse", "a_0.mcap", "a_1.mcap", "-w", tmp_path / "work")
     assert list(seen["sessions"]) == ["a_0"]
 
@@ -192,21 +236,43 @@ def test_a_session_needs_a_name_that_is_a_folder(name: str, tmp_path: Path) -> N
 
 
 def test_skipped_input_is_3(called: Any, tmp_path: Path) -> None:
-    called("fuse", Report(done=["a"], skipped=["a.mcap is cut off at byte 100.", "a.mcap is cut off at byte 100."]))
+    called(
+        "fuse",
+        Report(
+            done=["a"], skipped=["a.mcap is cut off at byte 100.", "a.mcap is cut off at byte 100."]
+        ),
+    )
     done = semloc("fuse", "a.mcap", "-w", tmp_path / "work")
     assert done.exit_code == 3
     assert done.stderr == "Warning: a.mcap is cut off at byte 100.\n"
 
 
 def test_describe_and_close_take_sessions(called: Any, tmp_path: Path) -> None:
-    described, closed = called("describe", Report(done=["a"])), called("close", Report(done=["closures"], closures=2))
+    described = called("describe", Report(done=["a"]))
+    closed = called("close", Report(done=["closures"], closures=2))
     assert semloc("describe", "a", "b", "-w", tmp_path / "work").exit_code == 0
     assert described["names"] == ("a", "b")
     done = semloc(
-        "close", "-w", tmp_path / "work", "--query", "a", "--query", "b", "--target", "c", "--no-self", "--query-length", 12.5, "--json"
+        "close",
+        "-w",
+        tmp_path / "work",
+        "--query",
+        "a",
+        "--query",
+        "b",
+        "--target",
+        "c",
+        "--no-self",
+        "--query-length",
+        12.5,
+        "--json",
     )
     assert done.exit_code == 0
-    assert (closed["queries"], closed["targets"], closed["self_closures"]) == (("a", "b"), ("c",), False)
+    assert (closed["queries"], closed["targets"], closed["self_closures"]) == (
+        ("a", "b"),
+        ("c",),
+        False,
+    )
     assert closed["settings"].query.length == 12.5
     assert len(json.loads(done.stdout)["closures"]) == 2
 
@@ -222,7 +288,13 @@ def test_a_workspace_without_sessions_is_1(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "outputs", [[], ["-o", "x.mcap", "--in-place"], ["--in-place", "--sidecar", "x.mcap"], ["-o", "x", "--sidecar", "y"]]
+    "outputs",
+    [
+        [],
+        ["-o", "x.mcap", "--in-place"],
+        ["--in-place", "--sidecar", "x.mcap"],
+        ["-o", "x", "--sidecar", "y"],
+    ],
 )
 def test_annotate_needs_exactly_one_output(outputs: list[str]) -> None:
     done = semloc("annotate", "a.mcap", "-w", "w", *outputs)
@@ -232,13 +304,24 @@ def test_annotate_needs_exactly_one_output(outputs: list[str]) -> None:
 
 @pytest.mark.parametrize(
     ("outputs", "mode", "output"),
-    [(["-o", "x.mcap"], "copy", Path("x.mcap")), (["--in-place"], "in-place", None), (["--sidecar", "y.mcap"], "sidecar", Path("y.mcap"))],
+    [
+        (["-o", "x.mcap"], "copy", Path("x.mcap")),
+        (["--in-place"], "in-place", None),
+        (["--sidecar", "y.mcap"], "sidecar", Path("y.mcap")),
+    ],
 )
-def test_annotate_hands_on_what_was_asked(called: Any, outputs: list[str], mode: str, output: Path | None) -> None:
+def test_annotate_hands_on_what_was_asked(
+    called: Any, outputs: list[str], mode: str, output: Path | None
+) -> None:
     seen = called("annotate", AnnotateReport(Path("x.mcap"), "run", "ros2", 3, 9, 1234, True))
     done = semloc("annotate", "a.mcap", "-w", "w", *outputs, "--session", "other", "--json")
     assert done.exit_code == 0, done.stderr
-    assert (seen["mode"], seen["output"], seen["session"], seen["overwrite"]) == (mode, output, "other", False)
+    assert (seen["mode"], seen["output"], seen["session"], seen["overwrite"]) == (
+        mode,
+        output,
+        "other",
+        False,
+    )
     assert json.loads(done.stdout)["closures"] == 3
 
 
@@ -258,7 +341,8 @@ def _log(path: Path, messages: int = 3) -> Path:
 
 
 def test_inspect_prints_an_object_or_an_array(tmp_path: Path) -> None:
-    a, b = _log(tmp_path / "a.mcap"), _log(tmp_path / "b.mcap", 5)
+    a = _log(tmp_path / "a.mcap")
+    b = _log(tmp_path / "b.mcap", 5)
     one = json.loads(semloc("inspect", a, "--json").stdout)
     assert one["path"] == str(a)
     assert one["format"] == "mcap"
@@ -292,7 +376,12 @@ def test_inspect_goes_on_after_a_bad_log(tmp_path: Path) -> None:
 
 
 def test_inspect_says_3_when_data_are_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lost = {"path": "a.mcap", "skipped": ["/points: 3 messages cannot be read."], "problems": [], "streams": []}
+    lost = {
+        "path": "a.mcap",
+        "skipped": ["/points: 3 messages cannot be read."],
+        "problems": [],
+        "streams": [],
+    }
     monkeypatch.setattr("semloc_logs.logs.session.inspect.inspect_log", lambda *_: lost)
     done = semloc("inspect", "a.mcap", "--json")
     assert done.exit_code == 3
@@ -300,9 +389,16 @@ def test_inspect_says_3_when_data_are_lost(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize(
-    ("args", "code"), [(["inspect", "{log}"], 0), (["fuse", "{log}", "-w", "{work}"], 1), (["run", "{log}", "-w", "{work}"], 1)]
+    ("args", "code"),
+    [
+        (["inspect", "{log}"], 0),
+        (["fuse", "{log}", "-w", "{work}"], 1),
+        (["run", "{log}", "-w", "{work}"], 1),
+    ],
 )
-def test_commands_that_open_a_log_repair_it_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], code: int) -> None:
+def test_commands_that_open_a_log_repair_it_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], code: int
+) -> None:
     repaired: list[Path] = []
 
     def recover(path: Path) -> bool:
@@ -326,7 +422,9 @@ def test_simulate_refuses_the_impossible(tmp_path: Path) -> None:
     assert not (tmp_path / "s").exists()
 
 
-def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_train_holds_two_shards_out_and_prints_scores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     trained: list[tuple[str, int, int]] = []
 
     def learn(
@@ -349,7 +447,8 @@ def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatc
         return {"accuracy": 0.875}
 
     monkeypatch.setattr(
-        "semloc_logs.training.runs.simulated_shards", lambda folder, settings, *_: Packed([Path("s")] * settings.training.scenes, [])
+        "semloc_logs.training.runs.simulated_shards",
+        lambda folder, settings, *_: Packed([Path("s")] * settings.training.scenes, []),
     )
     monkeypatch.setattr("semloc_logs.training.runs.learn_descriptor", learn)
     monkeypatch.setattr("semloc_logs.training.runs.use_threads", lambda _: None)
@@ -358,7 +457,9 @@ def test_train_holds_two_shards_out_and_prints_scores(tmp_path: Path, monkeypatc
     assert done.exit_code == 0, done.stderr
     assert trained == [("semantic", 5, 900), ("geometric", 5, 900)]
     assert json.loads(done.stdout)["semantic"]["accuracy"] == 0.875
-    assert "0.8750" in semloc("train", "-o", tmp_path / "w", "--variant", "semantic", *options).stdout
+    assert (
+        "0.8750" in semloc("train", "-o", tmp_path / "w", "--variant", "semantic", *options).stdout
+    )
     unfinished = semloc("train", "-o", tmp_path / "w", *options, "--minutes", 0.5)
     assert unfinished.exit_code == 3
     assert "goes on from there" in unfinished.stderr
@@ -379,8 +480,13 @@ def test_vocabulary_needs_a_variant(tmp_path: Path) -> None:
 
 
 def test_benchmark_prints_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = {"messages": {"ours": 400.0, "unit": "MB/s", "peer": 200.0}, "clouds": {"ours": 2.5, "unit": "ms"}}
-    monkeypatch.setattr("semloc_logs.benchmarks.speed.suite.BENCHMARKS", {"reading": lambda _: figures})
+    figures = {
+        "messages": {"ours": 400.0, "unit": "MB/s", "peer": 200.0},
+        "clouds": {"ours": 2.5, "unit": "ms"},
+    }
+    monkeypatch.setattr(
+        "semloc_logs.benchmarks.speed.suite.BENCHMARKS", {"reading": lambda _: figures}
+    )
     assert json.loads(semloc("benchmark", "reading", "--json").stdout) == figures
     assert "200" in semloc("benchmark", "reading").stdout
     done = semloc("benchmark", "nothing")

@@ -1,4 +1,6 @@
-"""What `semloc fuse` and `run` say and do about poses that are missing, wrong, or come from elsewhere; small logs, whole programs."""
+"""What `semloc fuse` and `run` say and do about poses that are missing, wrong, or come from
+elsewhere; small logs, whole programs.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,11 @@ def make(kind: str, **fields: Any) -> Any:
 
 def header(seconds: float, frame_id: str) -> Any:
     stamp = EPOCH + round(seconds * S)
-    return make("std_msgs/msg/Header", stamp=make("builtin_interfaces/msg/Time", sec=stamp // S, nanosec=stamp % S), frame_id=frame_id)
+    return make(
+        "std_msgs/msg/Header",
+        stamp=make("builtin_interfaces/msg/Time", sec=stamp // S, nanosec=stamp % S),
+        frame_id=frame_id,
+    )
 
 
 def odometry(seconds: float, x: float) -> Any:
@@ -61,11 +67,16 @@ def odometry(seconds: float, x: float) -> Any:
 def cloud(seconds: float, x: float) -> Any:
     """Ground, two walls, and one across at x = 20, seen from x."""
     rng = np.random.default_rng(round(seconds * 10) + 1000)
-    side = np.c_[rng.uniform(-15, 20, 1200), rng.choice([-4.0, 4.0], 1200), rng.uniform(-1, 3, 1200)]
+    side = np.c_[
+        rng.uniform(-15, 20, 1200), rng.choice([-4.0, 4.0], 1200), rng.uniform(-1, 3, 1200)
+    ]
     ahead = np.c_[np.full(800, 20.0), rng.uniform(-4, 4, 800), rng.uniform(-1, 3, 800)]
     ground = np.c_[rng.uniform(-15, 20, 800), rng.uniform(-4, 4, 800), np.full(800, -1.0)]
     points = (np.concatenate([side, ahead, ground]) - [x, 0, 0]).astype("<f4")
-    fields = [make("sensor_msgs/msg/PointField", name=n, offset=4 * k, datatype=7, count=1) for k, n in enumerate("xyz")]
+    fields = [
+        make("sensor_msgs/msg/PointField", name=n, offset=4 * k, datatype=7, count=1)
+        for k, n in enumerate("xyz")
+    ]
     size = points.nbytes
     return make(
         "sensor_msgs/msg/PointCloud2",
@@ -75,9 +86,14 @@ def cloud(seconds: float, x: float) -> Any:
 
 
 def drive(
-    path: Path, poses: Sequence[tuple[float, float]] = (), sweeps: Sequence[float] = TIMES, stamps: Sequence[float] | None = None
+    path: Path,
+    poses: Sequence[tuple[float, float]] = (),
+    sweeps: Sequence[float] = TIMES,
+    stamps: Sequence[float] | None = None,
 ) -> Path:
-    """A log of odometry (time, x), and of sweeps at the times ``sweeps`` that carry ``stamps``; what is listed later is recorded later."""
+    """A log of odometry (time, x), and of sweeps at the times ``sweeps`` that carry ``stamps``;
+    what is listed later is recorded later.
+    """
     messages: list[tuple[float, str, Any]] = []
     for k, (t, x) in enumerate(poses):
         messages.append((0.1 * k + 0.01, "/odom", odometry(t, x)))
@@ -90,10 +106,14 @@ def drive(
         for seconds, topic, message in sorted(messages, key=lambda m: m[0]):
             kind = message.__msgtype__
             if topic not in channels:
-                schema = writer.register_schema(kind, "ros2msg", STORE.generate_msgdef(kind, ros_version=2)[0].encode())
+                schema = writer.register_schema(
+                    kind, "ros2msg", STORE.generate_msgdef(kind, ros_version=2)[0].encode()
+                )
                 channels[topic] = writer.register_channel(topic, "cdr", schema)
             stamp = EPOCH + round(seconds * S)
-            writer.add_message(channels[topic], stamp, bytes(STORE.serialize_cdr(message, kind)), stamp)
+            writer.add_message(
+                channels[topic], stamp, bytes(STORE.serialize_cdr(message, kind)), stamp
+            )
         writer.finish()  # type: ignore[no-untyped-call]
     return path
 
@@ -122,13 +142,24 @@ def test_a_good_log_is_0(tmp_path: Path) -> None:
     [
         (GOOD[:15], "frames are left out: no pose is known at their time"),
         ([*GOOD[:10], GOOD[9], *GOOD[10:]], "/odom: poses that are 1 repeated were left out."),
-        ([*GOOD[:10], (-5.0, 0.0), (0.35, 0.0), *GOOD[10:]], "/odom: poses that are 2 back in time were left out."),
-        ([*GOOD[:10], (3600.0, 0.0), *GOOD[10:]], "/odom: poses that are 1 far ahead in time were left out."),
-        ([(t, 7.0) for t in TIMES], "/odom gives the same position all the time, but the surroundings move by"),
+        (
+            [*GOOD[:10], (-5.0, 0.0), (0.35, 0.0), *GOOD[10:]],
+            "/odom: poses that are 2 back in time were left out.",
+        ),
+        (
+            [*GOOD[:10], (3600.0, 0.0), *GOOD[10:]],
+            "/odom: poses that are 1 far ahead in time were left out.",
+        ),
+        (
+            [(t, 7.0) for t in TIMES],
+            "/odom gives the same position all the time, but the surroundings move by",
+        ),
     ],
     ids=["stop", "repeat", "back", "ahead", "stand"],
 )
-def test_poses_that_make_no_sense_are_3_and_a_sentence(tmp_path: Path, poses: list[tuple[float, float]], says: str) -> None:
+def test_poses_that_make_no_sense_are_3_and_a_sentence(
+    tmp_path: Path, poses: list[tuple[float, float]], says: str
+) -> None:
     done, session = fuse(drive(tmp_path / "a.mcap", poses))
     assert done.exit_code == 3, done.stderr
     warnings = [line for line in done.stderr.splitlines() if line.startswith("Warning: ")]
@@ -136,15 +167,24 @@ def test_poses_that_make_no_sense_are_3_and_a_sentence(tmp_path: Path, poses: li
     assert any(says in sentence for sentence in session["skipped"])
 
 
-def test_a_failure_half_way_leaves_no_thread_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_half_way_leaves_no_thread_and_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = SessionFolder(tmp_path / "a")
-    settings = load(assignments={"labels.source": "uniform", "fusion.keyframe_distance": "0.05", "fusion.submap_length": "0.2"}).resolved()
+    settings = load(
+        assignments={
+            "labels.source": "uniform",
+            "fusion.keyframe_distance": "0.05",
+            "fusion.submap_length": "0.2",
+        }
+    ).resolved()
 
     def fails(*_: object) -> None:
         raise OSError("no space left on device")
 
     monkeypatch.setattr("semloc_logs.mapping.session_fusion.write_blocks", fails)
-    with pytest.raises(OSError, match="no space") as problem:  # which holds all that it passed through
+    # which holds all that it passed through
+    with pytest.raises(OSError, match="no space") as problem:
         fuse_session(FuseTask((drive(tmp_path / "a.mcap", GOOD),), folder, settings))
     assert problem.value
     assert not [t for t in threading.enumerate() if t.name == "semloc-ahead"]
@@ -152,10 +192,16 @@ def test_a_failure_half_way_leaves_no_thread_and_no_file(tmp_path: Path, monkeyp
 
 
 def test_poses_beyond_what_a_map_reaches_are_1_and_a_sentence(tmp_path: Path) -> None:
-    # odometry at zero until the satellites are found, then in UTM: the northing is more than voxels have numbers for
-    done, session = fuse(drive(tmp_path / "a.mcap", [(t, x + (5.3e6 if t > 0.45 else 0.0)) for t, x in GOOD]))
+    # odometry at zero until the satellites are found, then in UTM: the northing is more than voxels
+    # have numbers for
+    done, session = fuse(
+        drive(tmp_path / "a.mcap", [(t, x + (5.3e6 if t > 0.45 else 0.0)) for t, x in GOOD])
+    )
     assert done.exit_code == 1
-    assert "the poses have come 5300 km from the first at 2023-11-14T22:13:20.500Z, but a map of 0.3 m voxels reaches 900 km" in done.stderr
+    assert (
+        "the poses have come 5300 km from the first at 2023-11-14T22:13:20.500Z, but a map of 0.3 m voxels reaches 900 km"
+        in done.stderr
+    )
     assert not session
     done, _ = fuse(drive(tmp_path / "b.mcap", [(t, x + 5.3e6) for t, x in GOOD]))
     assert done.exit_code == 0, done.stderr
@@ -166,7 +212,9 @@ def test_poses_beyond_what_a_map_reaches_are_1_and_a_sentence(tmp_path: Path) ->
     [([*TIMES[:20], *[t - 10 for t in TIMES[20:]]], 10), ([*TIMES[:10], 3600.0, *TIMES[11:]], 1)],
     ids=["back", "ahead"],
 )
-def test_sweeps_whose_clock_jumps_are_3_and_a_sentence(tmp_path: Path, stamps: list[float], count: int) -> None:
+def test_sweeps_whose_clock_jumps_are_3_and_a_sentence(
+    tmp_path: Path, stamps: list[float], count: int
+) -> None:
     done, session = fuse(drive(tmp_path / "a.mcap", GOOD, stamps=stamps))
     assert done.exit_code == 3, done.stderr
     assert f"/points: {count} of 30 frames are left out: " in done.stderr
@@ -185,13 +233,17 @@ def test_no_poses_is_0_with_a_note(tmp_path: Path) -> None:
 def tum(path: Path, x0: float = 0.0) -> Path:
     path.write_text(
         "# stamp x y z qx qy qz qw\n"
-        + "".join(f"{1_700_000_000 + int(t)}.{round(t * S) % S:09d} {x0 + SPEED * t:.3f} 0 0 0 0 0 1\n" for t in TIMES)
+        + "".join(
+            f"{1_700_000_000 + int(t)}.{round(t * S) % S:09d} {x0 + SPEED * t:.3f} 0 0 0 0 0 1\n"
+            for t in TIMES
+        )
     )
     return path
 
 
 def test_a_trajectory_makes_a_map_and_is_part_of_the_fingerprint(tmp_path: Path) -> None:
-    log, poses = drive(tmp_path / "a.mcap"), tum(tmp_path / "a.tum", 100.0)
+    log = drive(tmp_path / "a.mcap")
+    poses = tum(tmp_path / "a.tum", 100.0)
     done, session = fuse(log, "--poses", poses)
     assert done.exit_code == 0, done.stderr
     assert session["posed"]
@@ -213,7 +265,9 @@ def test_a_trajectory_makes_a_map_and_is_part_of_the_fingerprint(tmp_path: Path)
 
 
 def test_kitti_poses_with_and_without_times(tmp_path: Path) -> None:
-    log, poses, times = drive(tmp_path / "a.mcap"), tmp_path / "00.txt", tmp_path / "times.txt"
+    log = drive(tmp_path / "a.mcap")
+    poses = tmp_path / "00.txt"
+    times = tmp_path / "times.txt"
     poses.write_text("".join(f"1 0 0 {SPEED * t} 0 1 0 0 0 0 1 0\n" for t in TIMES))
     times.write_text("".join(f"{t:.6e}\n" for t in TIMES))
     one, session = fuse(log, "--poses", poses)
@@ -228,7 +282,8 @@ def test_kitti_poses_with_and_without_times(tmp_path: Path) -> None:
 
 
 def test_a_bad_trajectory_is_1_with_file_and_line(tmp_path: Path) -> None:
-    log, poses = drive(tmp_path / "a.mcap"), tmp_path / "a.tum"
+    log = drive(tmp_path / "a.mcap")
+    poses = tmp_path / "a.tum"
     poses.write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0\n")
     done, _ = fuse(log, "--poses", poses)
     assert done.exit_code == 1
@@ -238,7 +293,9 @@ def test_a_bad_trajectory_is_1_with_file_and_line(tmp_path: Path) -> None:
     assert "none.tum cannot be read" in missing.stderr
 
 
-def test_which_session_a_trajectory_belongs_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_which_session_a_trajectory_belongs_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen: dict[str, Any] = {}
 
     def run(*args: Any) -> Any:
@@ -253,14 +310,29 @@ def test_which_session_a_trajectory_belongs_to(tmp_path: Path, monkeypatch: pyte
     assert semloc(*logs, "--pose-times", "a=x.txt").exit_code == 2
     assert semloc(*logs, "--pose-frame", "imu").exit_code == 2
     assert seen == {}
-    assert semloc(*logs, "--poses", "a=x.tum", "--poses", "b=y=z.txt", "--pose-times", "b=t.txt", "--pose-frame", "imu").exit_code == 9
+    assert (
+        semloc(
+            *logs,
+            "--poses",
+            "a=x.tum",
+            "--poses",
+            "b=y=z.txt",
+            "--pose-times",
+            "b=t.txt",
+            "--pose-frame",
+            "imu",
+        ).exit_code
+        == 9
+    )
     assert {n: (str(t.path), t.times and str(t.times), t.frame) for n, t in seen.items()} == {
         "a": ("x.tum", None, "imu"),
         "b": ("y=z.txt", "t.txt", "imu"),
     }
 
 
-def test_odometry_is_a_setting_and_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_odometry_is_a_setting_and_says_what_it_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
     log = drive(tmp_path / "a.mcap")
     for args in (["--odometry", "lidar"], ["--set", "fusion.odometry=lidar"]):

@@ -20,7 +20,18 @@ from semloc_logs.cli.main import COMMANDS, program
 from semloc_logs.cli.options import Command, EngineChoice, console_options
 from semloc_logs.errors import LogError, RoleError, SettingsError, WorkspaceError
 
-HEAVY = ("torch", "numba", "pyarrow", "scipy", "cv2", "pydantic", "numpy", "rich", "rosbags", "mcap")
+HEAVY = (
+    "torch",
+    "numba",
+    "pyarrow",
+    "scipy",
+    "cv2",
+    "pydantic",
+    "numpy",
+    "rich",
+    "rosbags",
+    "mcap",
+)
 
 
 def semloc(*args: str, **options: Any) -> Result:
@@ -46,16 +57,25 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
     return make
 
 
-@pytest.mark.parametrize("args", [["--help"], ["run", "--help"], ["--version"], ["benchmark", "--help"], ["nothing"]])
+@pytest.mark.parametrize(
+    "args", [["--help"], ["run", "--help"], ["--version"], ["benchmark", "--help"], ["nothing"]]
+)
 def test_start_up_imports_nothing_heavy(args: list[str]) -> None:
     code = f"import sys; sys.argv = ['semloc', *{args!r}]\nfrom semloc_logs.cli.main import main\ntry: main()\nexcept SystemExit: pass\n"
     code += f"print('HEAVY', *[m for m in {HEAVY!r} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=30)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=30
+    )
     assert done.stdout.splitlines()[-1] == "HEAVY"
 
 
 def test_help_answers_at_once() -> None:
-    command = [sys.executable, "-P", "-c", "from semloc_logs.cli.main import program; program.main(['--help'])"]
+    command = [
+        sys.executable,
+        "-P",
+        "-c",
+        "from semloc_logs.cli.main import program; program.main(['--help'])",
+    ]
     taken = []
     for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -76,12 +96,20 @@ def test_help_lists_every_command() -> None:
 @pytest.mark.parametrize(
     ("problem", "code", "says"),
     [
-        (LogError("a.mcap is empty; record it again."), 1, "Error: a.mcap is empty; record it again."),
+        (
+            LogError("a.mcap is empty; record it again."),
+            1,
+            "Error: a.mcap is empty; record it again.",
+        ),
         (RoleError("There is no LIDAR."), 1, "Error: There is no LIDAR."),
         (WorkspaceError("work has no session."), 1, "Error: work has no session."),
         (SettingsError("Unknown setting 'x'."), 2, "Error: Unknown setting 'x'."),
         (click.UsageError("Give one."), 2, "Error: Give one."),
-        (PermissionError(13, "Permission denied", "/data/x"), 1, "Error: /data/x cannot be read or written (Permission denied)"),
+        (
+            PermissionError(13, "Permission denied", "/data/x"),
+            1,
+            "Error: /data/x cannot be read or written (Permission denied)",
+        ),
         (OSError(28, "No space left on device"), 1, "No space left on device"),
         (MemoryError(), 1, "Error: There is not enough memory"),
         (ZeroDivisionError("division by zero"), 1, "Error: Unexpected ZeroDivisionError at "),
@@ -89,7 +117,9 @@ def test_help_lists_every_command() -> None:
         (main_module.Terminated(), 143, "Terminated"),
     ],
 )
-def test_every_error_is_one_sentence_and_a_code(failing: Any, problem: BaseException, code: int, says: str) -> None:
+def test_every_error_is_one_sentence_and_a_code(
+    failing: Any, problem: BaseException, code: int, says: str
+) -> None:
     failing(problem)
     done = semloc("run")
     assert done.exit_code == code
@@ -126,7 +156,10 @@ def test_notes_as_json_lines(failing: Any) -> None:
     failing(LogError("It is gone."))
     done = semloc("run", "--log-format", "json")
     lines = [json.loads(line) for line in done.stderr.splitlines()]
-    assert [(line["level"], line["message"]) for line in lines] == [("info", "working"), ("error", "It is gone.")]
+    assert [(line["level"], line["message"]) for line in lines] == [
+        ("info", "working"),
+        ("error", "It is gone."),
+    ]
 
 
 def test_usage_errors_as_json_lines() -> None:
@@ -136,7 +169,14 @@ def test_usage_errors_as_json_lines() -> None:
 
 
 @pytest.mark.parametrize(
-    "args", [["nothing"], ["run"], ["run", "--no-such-option"], ["evaluate", "-w", "x"], ["run", "a.mcap", "-w", "w", "--jobs", "0"]]
+    "args",
+    [
+        ["nothing"],
+        ["run"],
+        ["run", "--no-such-option"],
+        ["evaluate", "-w", "x"],
+        ["run", "a.mcap", "-w", "w", "--jobs", "0"],
+    ],
 )
 def test_wrong_usage_is_2(args: list[str]) -> None:
     done = semloc(*args)
@@ -173,7 +213,14 @@ def test_numbers_that_are_none_are_null_in_json(capsys: pytest.CaptureFixture[st
         ("processes", None, 1, 1, "Processes"),
     ],
 )
-def test_default_engine(monkeypatch: pytest.MonkeyPatch, name: str | None, jobs: int | None, tasks: int, cores: int, kind: str) -> None:
+def test_default_engine(
+    monkeypatch: pytest.MonkeyPatch,
+    name: str | None,
+    jobs: int | None,
+    tasks: int,
+    cores: int,
+    kind: str,
+) -> None:
     monkeypatch.setattr("semloc_logs.engines.engine.cores", lambda: cores)
     with EngineChoice(name, jobs).open(tasks) as engine:
         assert type(engine).__name__ == kind
@@ -208,7 +255,9 @@ if __name__ == "__main__":
 
 
 def _start(folder: Path, engine: str, workers: int) -> tuple[subprocess.Popen[str], list[int]]:
-    """A program whose tasks sleep in a temporary folder inside ``folder``/busy, once they do; and the processes they run in."""
+    """A program whose tasks sleep in a temporary folder inside ``folder``/busy, once they do; and
+    the processes they run in.
+    """
     (folder / "slow.py").write_text(SLOW)
     (folder / "napping.py").write_text(NAPPING)
     (folder / "busy").mkdir()
@@ -225,7 +274,12 @@ def _start(folder: Path, engine: str, workers: int) -> tuple[subprocess.Popen[st
 def _are_gone(pids: list[int]) -> bool:
     deadline = time.monotonic() + 15
     while time.monotonic() < deadline:
-        if not [p for p in pids if Path(f"/proc/{p}").exists() and "Z" not in Path(f"/proc/{p}/stat").read_text().split()[2]]:
+        if not [
+            p
+            for p in pids
+            if Path(f"/proc/{p}").exists()
+            and "Z" not in Path(f"/proc/{p}/stat").read_text().split()[2]
+        ]:
             return True
         time.sleep(0.05)
     return False
@@ -233,7 +287,9 @@ def _are_gone(pids: list[int]) -> bool:
 
 @pytest.mark.parametrize(("engine", "workers"), [("serial", 1), ("processes", 2)])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_an_interrupted_program_cleans_up(tmp_path: Path, engine: str, workers: int, number: signal.Signals, code: int) -> None:
+def test_an_interrupted_program_cleans_up(
+    tmp_path: Path, engine: str, workers: int, number: signal.Signals, code: int
+) -> None:
     started, pids = _start(tmp_path, engine, workers)
     os.killpg(started.pid, number)  # as a terminal does it: workers get it too
     _, said = started.communicate(timeout=30)

@@ -22,7 +22,16 @@ from semloc_logs.closures.acceptance.calibration import (
     unrivalled,
 )
 
-GOOD = Features(structure=0.95, coverage=0.9, contradiction=0.02, fit=0.95, rmse=0.1, distinct=0.2, support=3.0, stiffness=3.0)
+GOOD = Features(
+    structure=0.95,
+    coverage=0.9,
+    contradiction=0.02,
+    fit=0.95,
+    rmse=0.1,
+    distinct=0.2,
+    support=3.0,
+    stiffness=3.0,
+)
 
 
 def alone(features: Features, model: Calibration | None = None) -> float:
@@ -53,7 +62,9 @@ def test_without_neighbours_the_alignment_alone_decides() -> None:
 
 def test_in_streets_that_look_like_others_nothing_is_more_probable_than_a_half() -> None:
     assert decided(alone=0.995, lookalike=0.9) == 0.995 / 2
-    assert decided(alone=0.9999, neighbours=12, agreeing=12.0, far_agreeing=80.0, lookalike=0.9) <= 0.5
+    assert (
+        decided(alone=0.9999, neighbours=12, agreeing=12.0, far_agreeing=80.0, lookalike=0.9) <= 0.5
+    )
 
 
 def test_without_rivals_an_alignment_is_judged_as_if_it_were_the_only_one() -> None:
@@ -82,7 +93,11 @@ def test_what_may_be_right_at_all(change: dict[str, float], possible: bool) -> N
 
 def test_neighbours_add_and_take() -> None:
     several = {"alone": 0.9, "neighbours": 12}
-    assert decided(**several, agreeing=9.0) > decided(**several, agreeing=3.0) > decided(**several, agreeing=3.0, opposing=6.0)
+    assert (
+        decided(**several, agreeing=9.0)
+        > decided(**several, agreeing=3.0)
+        > decided(**several, agreeing=3.0, opposing=6.0)
+    )
     assert decided(alone=0.97, neighbours=12, opposing=10.0) < 0.9
 
 
@@ -107,7 +122,16 @@ def test_probabilities_are_numbers_whatever_the_features(value: float) -> None:
 
 
 def test_the_shipped_calibration_knows_good_from_bad() -> None:
-    bad = Features(structure=0.2, coverage=0.3, contradiction=0.5, fit=0.2, rmse=0.9, distinct=0.98, support=1.0, stiffness=0.5)
+    bad = Features(
+        structure=0.2,
+        coverage=0.3,
+        contradiction=0.5,
+        fit=0.2,
+        rmse=0.9,
+        distinct=0.98,
+        support=1.0,
+        stiffness=0.5,
+    )
     assert alone(GOOD) > 0.95
     assert alone(bad) < 0.01
     for name, worse in (("structure", 0.5), ("contradiction", 0.4), ("distinct", 1.1)):
@@ -139,7 +163,8 @@ def test_reasons_of_the_neighbours() -> None:
 def test_logistic_regression_recovers_known_weights() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(0, 1, (20_000, 3)) * [1, 5, 0.1] + [0, 20, -1]
-    weights, bias = np.array([1.5, -0.4, 10.0]), 17.0
+    weights = np.array([1.5, -0.4, 10.0])
+    bias = 17.0
     right = rng.random(20_000) < 1 / (1 + np.exp(-(x @ weights + bias)))
     assert 0.2 < right.mean() < 0.8
     w, b = fit_logistic(x, right, ridge=1e-3)
@@ -158,12 +183,19 @@ def test_logistic_regression_of_separable_and_of_constant_features_stays_finite(
 
 
 def test_a_place_that_is_not_known_to_a_metre_is_no_closure() -> None:
-    """Within 1 m = one of 1.2 standard deviations of 0.833 m: 68.3 %; in a room of 5 cm voxels the bound is a sixth."""
-    np.testing.assert_allclose(precise(np.array([1 / 1.2, 0.5 / 1.2, 0.0]), 0.30), [0.6827, 0.9545, 1.0], atol=1e-4)
+    """Within 1 m = one of 1.2 standard deviations of 0.833 m: 68.3 %; in a room of 5 cm voxels the
+    bound is a sixth.
+    """
+    np.testing.assert_allclose(
+        precise(np.array([1 / 1.2, 0.5 / 1.2, 0.0]), 0.30), [0.6827, 0.9545, 1.0], atol=1e-4
+    )
     assert precise(1 / 1.2 / 6, 0.05) == pytest.approx(0.6827, abs=1e-4)
     text = reason(GOOD, 0.682, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)
     assert text == "probability 0.682 below 0.99: where in this place is known to 0.80 m only"
-    assert "0.80 m" not in reason(GOOD, 0.3, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)  # nor is it the place
+    # nor is it the place
+    assert "0.80 m" not in reason(GOOD, 0.3, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)
     nearly = reason(GOOD, 0.986, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.29, 0.994)
     assert "known to 0.29 m" in nearly  # the place alone would do
-    assert "look like others" in reason(GOOD, 0.34, 0.99, Agreement(0.999, 12, agreeing=12.0, lookalike=0.9), 0.8, 0.68)
+    assert "look like others" in reason(
+        GOOD, 0.34, 0.99, Agreement(0.999, 12, agreeing=12.0, lookalike=0.9), 0.8, 0.68
+    )

@@ -13,7 +13,18 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Features
 from semloc_logs.closures.acceptance.calibration import AGREEMENT, Agreement
-from semloc_logs.closures.acceptance.consistency import LEAST, MOST_SLACK, NEAR, SLACK, TURN, TURN_DRIFT, _sums, agree, decide, shares
+from semloc_logs.closures.acceptance.consistency import (
+    LEAST,
+    MOST_SLACK,
+    NEAR,
+    SLACK,
+    TURN,
+    TURN_DRIFT,
+    _sums,
+    agree,
+    decide,
+    shares,
+)
 from semloc_logs.closures.acceptance.placements import ARM, DRIFT, FAR, Placed, place, strays
 from semloc_logs.closures.matching import Alignment
 from semloc_logs.closures.query import SessionMap
@@ -35,15 +46,27 @@ def bend(n: int, step: float = 2.0) -> F64:
 
 
 def session(poses: F64, posed: bool = True) -> SessionMap:
-    return cast(SessionMap, SimpleNamespace(map_T_base=poses, distance=2.0 * np.arange(len(poses)), posed=posed))
+    return cast(
+        SessionMap,
+        SimpleNamespace(map_T_base=poses, distance=2.0 * np.arange(len(poses)), posed=posed),
+    )
 
 
 ROAD = bend(60)
 MAPS = {"a": session(ROAD), "b": session(MAP @ ROAD)}
 
 
-def alignment(k: int, alone: float, error: F64 | None = None, query: str = "a", target: str = "b", at: int | None = None) -> Alignment:
-    """Query ``k`` aligned at the true place, or moved by ``error`` in the target's map; or at keyframe ``at`` of the target."""
+def alignment(
+    k: int,
+    alone: float,
+    error: F64 | None = None,
+    query: str = "a",
+    target: str = "b",
+    at: int | None = None,
+) -> Alignment:
+    """Query ``k`` aligned at the true place, or moved by ``error`` in the target's map; or at
+    keyframe ``at`` of the target.
+    """
     at = k if at is None else at
     moved = (np.eye(4) if error is None else error) @ MAPS[target].map_T_base[at]
     return Alignment(
@@ -64,7 +87,9 @@ def alignment(k: int, alone: float, error: F64 | None = None, query: str = "a", 
     )
 
 
-def decided(rows: list[Alignment], maps: dict[str, SessionMap] | None = None) -> dict[tuple[int, int], Alignment]:
+def decided(
+    rows: list[Alignment], maps: dict[str, SessionMap] | None = None
+) -> dict[tuple[int, int], Alignment]:
     out = decide(rows, maps or MAPS, SETTINGS)
     assert len(out) == len(rows)
     return {(a.query_keyframe, a.target_keyframe): a for a in out}
@@ -101,11 +126,16 @@ def test_what_odometry_may_drift_is_no_contradiction(off: float, agrees: bool) -
 def test_a_turned_neighbour_does_not_agree() -> None:
     here = MAP @ ROAD[24]
     turned = here @ yaw_transform(0.4) @ inverse(here)
-    assert decided([alignment(20, 0.9), alignment(24, 0.9, turned)])[20, 20].agreement.opposing == pytest.approx(0.9)
+    assert decided([alignment(20, 0.9), alignment(24, 0.9, turned)])[
+        20, 20
+    ].agreement.opposing == pytest.approx(0.9)
 
 
 def test_neighbours_rescue_a_right_one_and_a_second_choice_that_agrees_is_promoted() -> None:
-    rows = [alignment(k, 0.995) for k in range(20, 31) if k != 25] + [alignment(25, 0.9), alignment(25, 0.95, at=50)]
+    rows = [alignment(k, 0.995) for k in range(20, 31) if k != 25] + [
+        alignment(25, 0.9),
+        alignment(25, 0.95, at=50),
+    ]
     lenient = Settings.model_validate({"closures": {"min_probability": 0.91}}).resolved()
     first, second = (a for a in decide(rows, MAPS, lenient) if a.query_keyframe == 25)
     assert (first.target_keyframe, first.accepted, first.agreement.alone) == (25, True, 0.9)
@@ -124,7 +154,8 @@ def test_of_a_query_one_place_of_each_target_is_accepted() -> None:
     [
         (yaw_transform(0.0, (1.0, 0.0, 0.0)), 6 / 7),
         (yaw_transform(0.0, (1.9, 0.0, 0.0)), 6 / 7),
-        (yaw_transform(0.0, (2.1, 0.0, 0.0)), 1.0),  # neighbours that agree with both are 1 m from either
+        # neighbours that agree with both are 1 m from either
+        (yaw_transform(0.0, (2.1, 0.0, 0.0)), 1.0),
     ],
 )
 def test_of_two_poses_in_a_place_each_has_its_share(beside: F64, share: float) -> None:
@@ -137,11 +168,17 @@ def test_of_two_poses_in_a_place_each_has_its_share(beside: F64, share: float) -
 
 
 def test_neighbours_do_not_choose_among_the_poses_of_a_place() -> None:
-    """Seen from opposite sides a street fits as well a metre further on, and neighbours agree with both."""
+    """Seen from opposite sides a street fits as well a metre further on, and neighbours agree with
+    both.
+    """
     sure = [alignment(k, 0.999) for k in range(20, 31) if k != 25]
     alone = decide([*sure, alignment(25, 0.6)], MAPS, SETTINGS)
     assert [a.accepted for a in alone if a.query_keyframe == 25] == [True]
-    both = decide([*sure, alignment(25, 0.6), alignment(25, 0.2, yaw_transform(0.0, (1.0, 0.0, 0.0)))], MAPS, SETTINGS)
+    both = decide(
+        [*sure, alignment(25, 0.6), alignment(25, 0.2, yaw_transform(0.0, (1.0, 0.0, 0.0)))],
+        MAPS,
+        SETTINGS,
+    )
     reasons = [a.reason for a in both if a.query_keyframe == 25]
     assert len(reasons) == 2
     assert "of the poses in this place it is right with 86%" in reasons[0]
@@ -162,12 +199,21 @@ COPIED = range(20, 40)
 
 
 def in_street(k: int, at: int, query: str = "a", target: str = "b") -> Alignment:
-    here = {"query_session": query, "target_session": target, "target_keyframe": at, "target_stamp_ns": at, "target_T_query": np.eye(4)}
+    here = {
+        "query_session": query,
+        "target_session": target,
+        "target_keyframe": at,
+        "target_stamp_ns": at,
+        "target_T_query": np.eye(4),
+    }
     return dataclasses.replace(alignment(k, 0.999), **here)  # type: ignore[arg-type]
 
 
 def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself() -> None:
-    refuted, right = sorted(decide([in_street(5, 50, target="a"), in_street(5, 5)], STREETS, SETTINGS), key=lambda a: a.target_session)
+    refuted, right = sorted(
+        decide([in_street(5, 50, target="a"), in_street(5, 5)], STREETS, SETTINGS),
+        key=lambda a: a.target_session,
+    )
     assert refuted.probability == 0.0
     assert "odometry" in refuted.reason
     assert right.probability > 0.9
@@ -177,7 +223,8 @@ def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_els
     once = [in_street(k, k, target="c") for k in COPIED]
     assert all(a.accepted and a.agreement.lookalike == 0 for a in decide(once, STREETS, SETTINGS))
     twice = [in_street(k, at) for k in COPIED for at in (k, k + 30)]
-    there, back = [in_street(k, k, "c", "a") for k in COPIED], [in_street(k, k, "b", "c") for k in COPIED]
+    there = [in_street(k, k, "c", "a") for k in COPIED]
+    back = [in_street(k, k, "b", "c") for k in COPIED]
     for a in decide(once + twice + there + back, STREETS, SETTINGS):
         assert a.agreement.lookalike > 0.9
         assert not a.accepted
@@ -192,9 +239,14 @@ def test_two_queries_of_a_street_do_not_make_all_of_it_look_like_others() -> Non
 
 
 @pytest.mark.parametrize(("road", "alike"), [(0.0, True), (2000.0, False)])
-def test_a_second_place_as_far_off_as_the_target_may_have_drifted_is_the_same(road: float, alike: bool) -> None:
+def test_a_second_place_as_far_off_as_the_target_may_have_drifted_is_the_same(
+    road: float, alike: bool
+) -> None:
     """The target drove the street twice; the second time it lies 24 m on, after so much ``road``."""
-    twice = SimpleNamespace(map_T_base=np.tile(STRAIGHT, (2, 1, 1)), distance=np.r_[STREETS["b"].distance, road + STREETS["b"].distance])
+    twice = SimpleNamespace(
+        map_T_base=np.tile(STRAIGHT, (2, 1, 1)),
+        distance=np.r_[STREETS["b"].distance, road + STREETS["b"].distance],
+    )
     rows = [in_street(k, at) for k in COPIED for at in (k, 100 + k + 12)]
     found = decide(rows, {**STREETS, "b": cast(SessionMap, twice)}, SETTINGS)
     assert all((a.agreement.lookalike > 0.9) == alike for a in found)
@@ -226,7 +278,9 @@ def test_second_places_that_do_not_agree_or_lie_in_the_same_view_are_no_copies(a
 
 def test_a_second_place_that_fits_much_worse_is_no_copy() -> None:
     worse = dataclasses.replace(GOOD, distinct=1.5)
-    rows = [in_street(k, k) for k in COPIED] + [dataclasses.replace(in_street(k, k + 30), features=worse) for k in COPIED]
+    rows = [in_street(k, k) for k in COPIED] + [
+        dataclasses.replace(in_street(k, k + 30), features=worse) for k in COPIED
+    ]
     assert all(a.agreement.lookalike == 0 for a in decide(rows, STREETS, SETTINGS))
 
 
@@ -240,12 +294,23 @@ def test_without_odometry_nobody_is_a_neighbour() -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    rows = [alignment(k, float(rng.uniform(0.01, 1)), at=int(rng.integers(60))) for k in range(40) for _ in range(2)]
-    rows += [dataclasses.replace(in_street(k, at), query_session="c") for k in COPIED for at in (k, k + 30)]
+    rows = [
+        alignment(k, float(rng.uniform(0.01, 1)), at=int(rng.integers(60)))
+        for k in range(40)
+        for _ in range(2)
+    ]
+    rows += [
+        dataclasses.replace(in_street(k, at), query_session="c")
+        for k in COPIED
+        for at in (k, k + 30)
+    ]
     shuffled = [rows[k] for k in rng.permutation(len(rows))]
 
     def keys(found: list[Alignment]) -> list[Any]:
-        return [(a.query_keyframe, a.target_keyframe, a.probability, a.agreement, a.reason) for a in found]
+        return [
+            (a.query_keyframe, a.target_keyframe, a.probability, a.agreement, a.reason)
+            for a in found
+        ]
 
     maps = {**STREETS, **MAPS, "b": STREETS["b"]}
     assert keys(decide(rows, maps, SETTINGS)) == keys(decide(shuffled, maps, SETTINGS))
@@ -259,35 +324,46 @@ def test_of_none() -> None:
 
 
 def slow_sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> list[F64]:
-    """For each of the ``probabilities`` (n,) those of other queries' alignments that agree with each and that do not, near it and far
-    from it (4, n).
+    """For each of the ``probabilities`` (n,) those of other queries' alignments that agree with
+    each and that do not, near it and far from it (4, n).
 
-    Of each query the most probable alignment of either kind counts, and as opposing only if it is more probable than an agreeing one.
+    Of each query the most probable alignment of either kind counts, and as opposing only if it is
+    more probable than an agreeing one.
     """
     scale = voxel_size / STREET_VOXEL
     loud = np.max(probabilities, axis=0) >= LEAST
-    voices, said = group.part(loud), [np.where(p >= LEAST, p, 0.0)[loud] for p in probabilities]
+    voices = group.part(loud)
+    said = [np.where(p >= LEAST, p, 0.0)[loud] for p in probabilities]
     out = [np.zeros((4, len(group))) for _ in probabilities]
     for k in range(len(group)):
         along = np.abs(voices.road - group.road[k])
         there = np.flatnonzero((along <= FAR * scale) & (voices.query != group.query[k]))
         if not len(there):
             continue
-        heard, along = voices.part(there), along[there]
+        heard = voices.part(there)
+        along = along[there]
         agrees = slow_agrees(group.part(np.array([k])), heard, along, voxel_size)
         _, first, number = np.unique(heard.query, return_index=True, return_inverse=True)
         near = along[first] <= NEAR * scale
         for sums, p in zip(out, said, strict=True):
-            for_it, against = np.zeros(len(first)), np.zeros(len(first))
+            for_it = np.zeros(len(first))
+            against = np.zeros(len(first))
             np.maximum.at(for_it, number, np.where(agrees, p[there], 0.0))
             np.maximum.at(against, number, np.where(agrees, 0.0, p[there]))
             against[against <= for_it] = 0.0
-            sums[:, k] = [for_it[near].sum(), against[near].sum(), for_it[~near].sum(), against[~near].sum()]
+            sums[:, k] = [
+                for_it[near].sum(),
+                against[near].sum(),
+                for_it[~near].sum(),
+                against[~near].sum(),
+            ]
     return out
 
 
 def slow_agrees(one: Placed, others: Placed, along: F64, voxel_size: float) -> NDArray[np.bool_]:
-    """Whether ``one`` and the odometry predict ``others`` (m), which lie ``along`` metres of road away."""
+    """Whether ``one`` and the odometry predict ``others`` (m), which lie ``along`` metres of road
+    away.
+    """
     predicted = one.target_T_query[0] @ inverse(one.map_T_query[0]) @ others.map_T_query
     off = np.linalg.norm(predicted[:, :3, 3] - others.target_T_query[:, :3, 3], axis=1)
     trace = np.einsum("nij,nij->n", predicted[:, :3, :3], others.target_T_query[:, :3, :3])
@@ -295,19 +371,30 @@ def slow_agrees(one: Placed, others: Placed, along: F64, voxel_size: float) -> N
     sigma = np.hypot(one.sigma[0], others.sigma)
     allowed = np.minimum(SLACK * voxel_size + 2 * sigma, MOST_SLACK * voxel_size)
     drift = DRIFT * (along + np.abs(others.target_road - one.target_road[0])) + ARM * along
-    return np.asarray((off <= allowed + drift) & (turn <= TURN + TURN_DRIFT * along * STREET_VOXEL / voxel_size))
+    return np.asarray(
+        (off <= allowed + drift) & (turn <= TURN + TURN_DRIFT * along * STREET_VOXEL / voxel_size)
+    )
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.3, 0.05]))
 @settings(max_examples=40, deadline=None)
 def test_voices_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
-    """Alignments of a bent road, right, moved, turned or in other places, as many as three of a query, against the slow count."""
+    """Alignments of a bent road, right, moved, turned or in other places, as many as three of a
+    query, against the slow count.
+    """
     rng = np.random.default_rng(seed)
     scale = voxel_size / 0.3
     road = bend(60)
     road[:, :3, 3] *= scale
     query = np.sort(rng.integers(0, 60, 50))
-    error = np.array([yaw_transform(rng.normal(0, 0.05), rng.normal(0, rng.choice([0.1, 1.0, 10.0]) * scale, 3)) for _ in query])
+    error = np.array(
+        [
+            yaw_transform(
+                rng.normal(0, 0.05), rng.normal(0, rng.choice([0.1, 1.0, 10.0]) * scale, 3)
+            )
+            for _ in query
+        ]
+    )
     placed = Placed(
         np.full(50, "a", object),
         np.full(50, "b", object),
@@ -322,5 +409,9 @@ def test_voices_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
         np.ones(50, bool),
     )
     probabilities = placed.alone, placed.unrivalled
-    for found, expected in zip(_sums(placed, probabilities, voxel_size), slow_sums(placed, probabilities, voxel_size), strict=True):
+    for found, expected in zip(
+        _sums(placed, probabilities, voxel_size),
+        slow_sums(placed, probabilities, voxel_size),
+        strict=True,
+    ):
         np.testing.assert_allclose(found, expected, atol=1e-12)

@@ -1,4 +1,6 @@
-"""From logs to closures: a camera of 90 degrees, and a LIDAR log without poses, ask the map of a LIDAR drive."""
+"""From logs to closures: a camera of 90 degrees, and a LIDAR log without poses, ask the map of a
+LIDAR drive.
+"""
 
 from __future__ import annotations
 
@@ -25,15 +27,24 @@ POSES = ("/odometry", "/gnss", "/imu")
 def without(topics: tuple[str, ...], log: Path, output: Path) -> None:
     """A copy of an MCAP file that lacks some topics."""
     with log.open("rb") as source, output.open("wb") as target:
-        writer, channels = Writer(target), dict[int, int]()
+        writer = Writer(target)
+        channels = dict[int, int]()
         writer.start("ros2")
         for schema, channel, message in make_reader(source).iter_messages():
             if channel.topic in topics or schema is None:
                 continue
             if channel.id not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number, channel.metadata)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            writer.add_message(
+                channels[channel.id],
+                message.log_time,
+                message.data,
+                message.publish_time,
+                message.sequence,
+            )
         writer.finish()  # type: ignore[no-untyped-call]
 
 
@@ -43,7 +54,9 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Evaluation]
     folder = tmp_path_factory.mktemp("closing")
     logs = {name: [folder / f"{name}.mcap"] for name in ("map", "camera", "frames")}
     for name, sensor in (("map", "hdl32"), ("camera", "depth")):
-        simulate_sessions(folder / sensor, seed=300, sessions=1, length_m=60.0, sensor=sensor, label_noise=0.05)
+        simulate_sessions(
+            folder / sensor, seed=300, sessions=1, length_m=60.0, sensor=sensor, label_noise=0.05
+        )
         shutil.move(folder / sensor / "session_0.mcap", logs[name][0])
     without(POSES, logs["map"][0], logs["frames"][0])
     settings = load(assignments={"query.every": "4"}).resolved()
@@ -58,10 +71,14 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Evaluation]
 
 def between(evaluation: Evaluation, one: str, other: str) -> list[Judged]:
     """Either may have asked: what is found from both ends is kept once."""
-    return [row for row in evaluation.rows if {row.query_session, row.target_session} == {one, other}]
+    return [
+        row for row in evaluation.rows if {row.query_session, row.target_session} == {one, other}
+    ]
 
 
-def test_a_camera_that_sees_a_quarter_finds_itself_in_the_map_of_a_lidar(evaluation: Evaluation) -> None:
+def test_a_camera_that_sees_a_quarter_finds_itself_in_the_map_of_a_lidar(
+    evaluation: Evaluation,
+) -> None:
     found = between(evaluation, "camera", "map")
     assert len(found) >= 8
     assert np.median([c.error_m for c in found if c.error_m is not None]) < 0.2
@@ -70,9 +87,12 @@ def test_a_camera_that_sees_a_quarter_finds_itself_in_the_map_of_a_lidar(evaluat
 def test_frames_without_poses_find_themselves_one_by_one(evaluation: Evaluation) -> None:
     found = between(evaluation, "frames", "map")
     assert len(found) >= 8
-    assert np.median([c.error_m for c in found if c.error_m is not None]) < 0.5  # their sweeps are as skewed as they were driven
+    # their sweeps are as skewed as they were driven
+    assert np.median([c.error_m for c in found if c.error_m is not None]) < 0.5
 
 
 def test_nothing_else_is_said(evaluation: Evaluation) -> None:
     assert evaluation.correct == evaluation.closures
-    assert not any(row.target_session == "frames" for row in evaluation.rows), "a log without poses has no map"
+    assert not any(row.target_session == "frames" for row in evaluation.rows), (
+        "a log without poses has no map"
+    )

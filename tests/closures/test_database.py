@@ -31,11 +31,14 @@ def drive_session(
     seconds: float = 1.0,
     saw: tuple[tuple[float, float], ...] = ((0.0, 5.0),),
 ) -> SessionMap:
-    """A session along ``road`` (n, 2), a keyframe every ``seconds``, with words at ``words`` (m, 3) of each submap of keyframes.
+    """A session along ``road`` (n, 2), a keyframe every ``seconds``, with words at ``words`` (m, 3)
+    of each submap of keyframes.
 
-    Each keyframe ``saw`` points ahead and to its left, metres, at the height of its number in decimetres.
+    Each keyframe ``saw`` points ahead and to its left, metres, at the height of its number in
+    decimetres.
     """
-    folder, n = work.session(name), len(road)
+    folder = work.session(name)
+    n = len(road)
     folder.keyframes.mkdir(parents=True)
     folder.words.mkdir()
     poses = np.array([yaw_transform(0.0, (x, y, 0.0)) for x, y in road])
@@ -53,7 +56,10 @@ def drive_session(
         **pose_columns(poses),
     }
     write_table(folder.frames, contracts.table("frames", columns), {})
-    clouds = [Keyframe(np.array([[*p, 0.1 * i] for p in saw], np.float32), np.full(len(saw), 2, np.uint8)) for i in range(n)]
+    clouds = [
+        Keyframe(np.array([[*p, 0.1 * i] for p in saw], np.float32), np.full(len(saw), 2, np.uint8))
+        for i in range(n)
+    ]
     list(keep_keyframes(folder.keyframes, range(n), clouds, {}))
     for i, centre in enumerate(words):
         rows = {
@@ -65,14 +71,19 @@ def drive_session(
             "variant": ["semantic"] * len(centre),
         }
         write_table(folder.words / f"submap-{i:05d}.parquet", contracts.table("words", rows), {})
-    json = [{"id": i, "first": a, "last": b - 1, "ground_z": 0.0, "blocks": 1} for i, (a, b) in enumerate(submaps)]
+    json = [
+        {"id": i, "first": a, "last": b - 1, "ground_z": 0.0, "blocks": 1}
+        for i, (a, b) in enumerate(submaps)
+    ]
     write_json(folder.session_json, {"posed": True, "label_source": "log", "submaps": json})
     return SessionMap(folder)
 
 
 @pytest.fixture
 def out_and_back(tmp_path: Path) -> tuple[Database, SessionMap]:
-    """30 keyframes out, and back beside them 4 m to the left, one every 4 m and second; one submap holds both ways."""
+    """30 keyframes out, and back beside them 4 m to the left, one every 4 m and second; one submap
+    holds both ways.
+    """
     x = np.r_[np.arange(30) * 4.0, np.arange(30)[::-1] * 4.0]
     road = np.stack([x, np.repeat([0.0, 4.0], 30)], 1)
     words = np.array([[4.0, 2.0, 1.0], [60.0, 2.0, 1.0], [112.0, 2.0, 1.0]])
@@ -80,10 +91,13 @@ def out_and_back(tmp_path: Path) -> tuple[Database, SessionMap]:
     return Database(Workspace(tmp_path), ("a",), Settings().resolved()), session
 
 
-def test_a_query_sees_its_own_drive_but_for_what_is_near_in_time_and_road(out_and_back: tuple[Database, SessionMap]) -> None:
+def test_a_query_sees_its_own_drive_but_for_what_is_near_in_time_and_road(
+    out_and_back: tuple[Database, SessionMap],
+) -> None:
     database, session = out_and_back
     seen = database.asked_by(session, 59).keyframes(0)
-    # 30 s: keyframes 30 to 59; 50 m of road are fewer; what else lies in the same stretch of 16 voxels goes with them
+    # 30 s: keyframes 30 to 59; 50 m of road are fewer; what else lies in the same stretch of 16
+    # voxels goes with them
     assert seen[0] == 0
     assert 28 <= seen[-1] <= 29
     assert np.array_equal(seen, np.arange(seen[-1] + 1))
@@ -103,7 +117,9 @@ def test_submaps_of_which_nothing_may_be_seen_are_left_out(tmp_path: Path) -> No
     assert database.asked_by(session, 0).seen().tolist() == [False, True, True]
 
 
-def test_a_target_keyframe_is_never_near_the_query_in_time(out_and_back: tuple[Database, SessionMap]) -> None:
+def test_a_target_keyframe_is_never_near_the_query_in_time(
+    out_and_back: tuple[Database, SessionMap],
+) -> None:
     database, session = out_and_back
     for keyframe in range(60):
         view = database.asked_by(session, keyframe)
@@ -112,7 +128,9 @@ def test_a_target_keyframe_is_never_near_the_query_in_time(out_and_back: tuple[D
             assert abs(found - keyframe) >= 30
 
 
-def test_of_two_passes_the_one_that_looks_at_a_place_is_found(out_and_back: tuple[Database, SessionMap]) -> None:
+def test_of_two_passes_the_one_that_looks_at_a_place_is_found(
+    out_and_back: tuple[Database, SessionMap],
+) -> None:
     database, session = out_and_back
     at = session.map_T_base[20, :3, 3]
     found = database.looking_keyframe(0, at + VIEW)
@@ -120,22 +138,31 @@ def test_of_two_passes_the_one_that_looks_at_a_place_is_found(out_and_back: tupl
     assert database.looking_keyframe(0, at + VIEW) != database.nearest_keyframe(0, at + VIEW)
 
 
-def test_the_keyframe_nearest_to_a_place_may_lie_in_the_next_submap_but_is_never_hidden(tmp_path: Path) -> None:
-    road, none = np.stack([np.arange(60) * 4.0, np.zeros(60)], 1), np.zeros((0, 3))
+def test_the_keyframe_nearest_to_a_place_may_lie_in_the_next_submap_but_is_never_hidden(
+    tmp_path: Path,
+) -> None:
+    road = np.stack([np.arange(60) * 4.0, np.zeros(60)], 1)
+    none = np.zeros((0, 3))
     session = drive_session(Workspace(tmp_path), "a", road, [(0, 30), (30, 60)], [none, none])
     database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
     assert database.nearest_keyframe(0, np.array([128.0, 0.0, 0.0])) == 32
     assert database.nearest_keyframe(1, np.array([108.0, 0.0, 0.0])) == 27
-    assert database.nearest_keyframe(0, np.array([200.0, 0.0, 0.0])) == 36  # 28.8 m of road beyond the last one
-    view = database.asked_by(session, 59)  # hides 30 to 59 and what shares a stretch of 4.8 m with them
+    # 28.8 m of road beyond the last one
+    assert database.nearest_keyframe(0, np.array([200.0, 0.0, 0.0])) == 36
+    # hides 30 to 59 and what shares a stretch of 4.8 m with them
+    view = database.asked_by(session, 59)
     assert 28 <= view.nearest_keyframe(0, np.array([128.0, 0.0, 0.0])) < 30
 
 
 def test_beyond_the_end_of_a_drive_a_surface_has_what_was_seen_from_afar(tmp_path: Path) -> None:
     road = np.stack([np.arange(10) * 4.0, np.zeros(10)], 1)
-    drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [np.zeros((0, 3))], saw=((0.0, 5.0), (45.0, 5.0)))
+    drive_session(
+        Workspace(tmp_path), "a", road, [(0, 10)], [np.zeros((0, 3))], saw=((0.0, 5.0), (45.0, 5.0))
+    )
     database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
-    at_the_end, beyond = (database.surface(0, np.array([x, 0.0, 0.0])).points[:, 0].max() for x in (36.0, 70.0))
+    at_the_end, beyond = (
+        database.surface(0, np.array([x, 0.0, 0.0])).points[:, 0].max() for x in (36.0, 70.0)
+    )
     assert at_the_end == 36.0  # of each keyframe what lies within 28.8 m of it
     assert beyond == 36.0 + 45.0
 
@@ -146,16 +173,22 @@ def test_what_looks_all_around_looks_where_it_is() -> None:
     np.testing.assert_allclose(found, [[0.0, 0.0, 0.0], [6.1, 0.0, 0.0]])
 
 
-def test_words_answer_where_the_drive_came_by_at_another_time(out_and_back: tuple[Database, SessionMap]) -> None:
+def test_words_answer_where_the_drive_came_by_at_another_time(
+    out_and_back: tuple[Database, SessionMap],
+) -> None:
     database, session = out_and_back
 
     def answering(keyframe: int) -> list[float]:
         view = database.asked_by(session, keyframe)
         rows = allowed_places(view, session)["semantic"].rows[0]
-        return sorted(read_table(session.folder.words / "submap-00000.parquet")["x"].to_numpy()[rows].tolist())
+        return sorted(
+            read_table(session.folder.words / "submap-00000.parquet")["x"].to_numpy()[rows].tolist()
+        )
 
-    assert answering(59) == [4.0, 60.0, 112.0]  # back at the start: all of the way out is older than 30 s
-    assert answering(45) == [4.0, 60.0]  # half-way back: the turn is recent, and the way out before it is not
+    # back at the start: all of the way out is older than 30 s
+    assert answering(59) == [4.0, 60.0, 112.0]
+    # half-way back: the turn is recent, and the way out before it is not
+    assert answering(45) == [4.0, 60.0]
 
 
 def test_the_map_of_a_submap_that_comes_near_the_query_is_made_without_what_it_may_not_see(
@@ -170,13 +203,16 @@ def test_the_map_of_a_submap_that_comes_near_the_query_is_made_without_what_it_m
 
 def test_a_drive_without_revisits_does_not_answer_itself(tmp_path: Path) -> None:
     road = np.stack([np.arange(20) * 4.0, np.zeros(20)], 1)
-    session = drive_session(Workspace(tmp_path), "a", road, [(0, 20)], [np.array([[40.0, 2.0, 1.0]])])
+    session = drive_session(
+        Workspace(tmp_path), "a", road, [(0, 20)], [np.array([[40.0, 2.0, 1.0]])]
+    )
     view = Database(Workspace(tmp_path), ("a",), Settings().resolved()).asked_by(session, 10)
     assert allowed_places(view, session) == {}
 
 
 def test_other_sessions_answer_whatever_their_time(tmp_path: Path) -> None:
-    work, road = Workspace(tmp_path), np.stack([np.arange(20) * 4.0, np.zeros(20)], 1)
+    work = Workspace(tmp_path)
+    road = np.stack([np.arange(20) * 4.0, np.zeros(20)], 1)
     word = np.array([[40.0, 2.0, 1.0]])
     sessions = {name: drive_session(work, name, road, [(0, 20)], [word]) for name in "ab"}
     view = Database(work, ("a", "b"), Settings().resolved()).asked_by(sessions["a"], 10)
@@ -187,7 +223,11 @@ def test_other_sessions_answer_whatever_their_time(tmp_path: Path) -> None:
 
 def test_a_drive_without_poses_does_not_answer_itself(tmp_path: Path) -> None:
     work = Workspace(tmp_path)
-    session = drive_session(work, "a", np.zeros((100, 2)), [(0, 100)], [np.array([[0.0, 2.0, 1.0]])])
-    write_json(session.folder.session_json, read_json(session.folder.session_json) | {"posed": False})
+    session = drive_session(
+        work, "a", np.zeros((100, 2)), [(0, 100)], [np.array([[0.0, 2.0, 1.0]])]
+    )
+    write_json(
+        session.folder.session_json, read_json(session.folder.session_json) | {"posed": False}
+    )
     view = Database(work, ("a",), Settings().resolved()).asked_by(SessionMap(session.folder), 99)
     assert allowed_places(view, session) == {}

@@ -19,7 +19,12 @@ from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import SessionFolder
 
 
-def session(folder: Path, poses: NDArray[np.float64], clouds: list[NDArray[np.float32]] | None = None, posed: bool = True) -> SessionMap:
+def session(
+    folder: Path,
+    poses: NDArray[np.float64],
+    clouds: list[NDArray[np.float32]] | None = None,
+    posed: bool = True,
+) -> SessionMap:
     """A fused session of these keyframes, with what queries read."""
     n = len(poses)
     clouds = clouds or [np.zeros((1, 3), np.float32)] * n
@@ -32,13 +37,23 @@ def session(folder: Path, poses: NDArray[np.float64], clouds: list[NDArray[np.fl
         "distance": road_distance(poses) if posed else np.zeros(n),
         "ground_z": np.zeros(n),
         "points": [len(c) for c in clouds],
-        **{f"origin_{c}": np.full(n, value) for c, value in zip("xyz", (0.5, 0.0, 1.5), strict=True)},
+        **{
+            f"origin_{c}": np.full(n, value)
+            for c, value in zip("xyz", (0.5, 0.0, 1.5), strict=True)
+        },
         **{f"view_{c}": np.zeros(n) for c in "xyz"},
         **pose_columns(poses),
     }
     write_table(folder / "frames.parquet", contracts.table("frames", frames), {})
     (folder / "keyframes").mkdir()
-    list(keep_keyframes(folder / "keyframes", range(n), [Keyframe(c, np.full(len(c), 2, np.uint8)) for c in clouds], {}))
+    list(
+        keep_keyframes(
+            folder / "keyframes",
+            range(n),
+            [Keyframe(c, np.full(len(c), 2, np.uint8)) for c in clouds],
+            {},
+        )
+    )
     write_json(folder / "session.json", {"posed": posed, "label_source": "log", "submaps": []})
     return SessionMap(SessionFolder(folder))
 
@@ -59,7 +74,9 @@ def test_queries_every_two_metres_and_at_turns(tmp_path: Path) -> None:
     (tmp_path / "turning").mkdir()
     assert query_keyframes(session(tmp_path / "turning", turning), settings()) == [0, 4, 8]
     (tmp_path / "unposed").mkdir()
-    assert query_keyframes(session(tmp_path / "unposed", np.repeat(np.eye(4)[None], 3, 0), posed=False), settings()) == [0, 1, 2]
+    assert query_keyframes(
+        session(tmp_path / "unposed", np.repeat(np.eye(4)[None], 3, 0), posed=False), settings()
+    ) == [0, 1, 2]
 
 
 def test_members_of_a_query(tmp_path: Path) -> None:
@@ -72,11 +89,15 @@ def test_members_of_a_query(tmp_path: Path) -> None:
     assert query_members(s, 6, settings(length=3.0)) == [4, 5, 6, 7, 8]
     assert query_members(s, 0, settings(length=3.0)) == [0, 1, 2]
     (tmp_path / "unposed").mkdir()
-    assert query_members(session(tmp_path / "unposed", straight(3), posed=False), 1, settings()) == [1]
+    assert query_members(
+        session(tmp_path / "unposed", straight(3), posed=False), 1, settings()
+    ) == [1]
 
 
 def test_members_beyond_a_jump_are_left_out(tmp_path: Path) -> None:
-    """Two logs back to back, or positions that came back: a map of both ends would be kilometres wide."""
+    """Two logs back to back, or positions that came back: a map of both ends would be kilometres
+    wide.
+    """
     poses = straight(10)
     poses[5:, 0, 3] += 2000
     s = session(tmp_path, poses)
@@ -87,7 +108,10 @@ def test_members_beyond_a_jump_are_left_out(tmp_path: Path) -> None:
 def test_the_query_map_lies_around_its_keyframe(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     poses = np.array([yaw_transform(0.5, (1000.0 + 0.5 * i, 50.0, 3.0)) for i in range(5)])
-    clouds = [rng.uniform(-40, 40, (400, 3)).astype(np.float32) * np.array([1, 1, 0.1], np.float32) for _ in range(5)]
+    clouds = [
+        rng.uniform(-40, 40, (400, 3)).astype(np.float32) * np.array([1, 1, 0.1], np.float32)
+        for _ in range(5)
+    ]
     s = session(tmp_path, poses, clouds)
     query, query_T_base = build_query(s, 2, settings(radius=20.0))
     np.testing.assert_allclose(query_T_base, yaw_transform(0.5), atol=1e-12)
@@ -101,7 +125,9 @@ def test_the_query_map_lies_around_its_keyframe(tmp_path: Path) -> None:
     distance = np.linalg.norm(query.points[:, None] - every[None], axis=2).min(1)
     assert distance.max() < 1e-5  # nothing but what was seen, thinned
     assert len(query.points) > 0.5 * len(every)
-    assert len(np.unique(np.floor(query.points / 0.15).astype(int), axis=0)) >= 0.99 * len(query.points)
+    assert len(np.unique(np.floor(query.points / 0.15).astype(int), axis=0)) >= 0.99 * len(
+        query.points
+    )
     voxels = {tuple(v) for v in query.blocks.occupied()[0].tolist()}
     assert voxels <= {tuple(v) for v in np.floor(every / 0.3).astype(int).tolist()}
     assert len(voxels) > 0.5 * len(every)
@@ -109,8 +135,12 @@ def test_the_query_map_lies_around_its_keyframe(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("length", "reach"), [(None, 22.0), (20.0, 30.0), (90.0, 65.0)])
 def test_a_long_query_is_whole(tmp_path: Path, length: float | None, reach: float) -> None:
-    """Each keyframe of a drive of 120 m saw a wall 20 m ahead of it; the wall of the last member is in the query's map."""
-    wall = np.stack(np.broadcast_arrays(20.0, np.linspace(-3, 3, 21)[:, None], np.linspace(0.1, 2, 9)), -1).reshape(-1, 3)
+    """Each keyframe of a drive of 120 m saw a wall 20 m ahead of it; the wall of the last member is
+    in the query's map.
+    """
+    wall = np.stack(
+        np.broadcast_arrays(20.0, np.linspace(-3, 3, 21)[:, None], np.linspace(0.1, 2, 9)), -1
+    ).reshape(-1, 3)
     poses = straight(61, 2.0)
     s = session(tmp_path, poses, [wall.astype(np.float32)] * 61)
     query, _ = build_query(s, 30, settings(length=length, frames=3))
@@ -124,12 +154,21 @@ def test_a_query_may_not_be_so_long_that_its_map_has_no_bounds() -> None:
     with pytest.raises(SettingsError, match=r"query\.length"):
         settings(length=201.0)
     with pytest.raises(SettingsError, match=r"33\.|34"):
-        Settings.model_validate({"query": {"length": 34.0}, "fusion": {"voxel_size": 0.05}}).resolved()
+        Settings.model_validate(
+            {"query": {"length": 34.0}, "fusion": {"voxel_size": 0.05}}
+        ).resolved()
 
 
 def test_the_keyframe_at_a_stamp(tmp_path: Path) -> None:
     s = session(tmp_path, straight(5))
-    assert [keyframe_at(s, t) for t in (-5, 0, 10**8, 149_999_999, 150_000_001, 10**12)] == [0, 0, 1, 1, 2, 4]
+    assert [keyframe_at(s, t) for t in (-5, 0, 10**8, 149_999_999, 150_000_001, 10**12)] == [
+        0,
+        0,
+        1,
+        1,
+        2,
+        4,
+    ]
 
 
 def test_a_session_of_an_earlier_version_is_named(tmp_path: Path) -> None:
@@ -137,15 +176,24 @@ def test_a_session_of_an_earlier_version_is_named(tmp_path: Path) -> None:
     np.testing.assert_allclose(s.views, s.map_T_base[:, :3, 3])
     frames = read_table(s.folder.frames)
     write_table(s.folder.frames, frames.drop_columns(["view_x", "view_y", "view_z"]), {})
-    with pytest.raises(WorkspaceError, match=r"frames\.parquet is of an earlier version: fuse session .* again with --overwrite"):
+    with pytest.raises(
+        WorkspaceError,
+        match=r"frames\.parquet is of an earlier version: fuse session .* again with --overwrite",
+    ):
         _ = SessionMap(s.folder).views
 
 
 def test_points_of_a_camera_keep_their_spread(tmp_path: Path) -> None:
-    """A point 4 m ahead of an eye at (0.5, 0, 1.5), known to 0.2 m along its ray, in a keyframe that looks along the map's y."""
+    """A point 4 m ahead of an eye at (0.5, 0, 1.5), known to 0.2 m along its ray, in a keyframe
+    that looks along the map's y.
+    """
     poses = np.array([yaw_transform(np.pi / 2, (3.0, 2.0, 0.0))])
     s = session(tmp_path, poses, [np.array([[4.5, 0.0, 1.5]], np.float32)])
-    cloud = Keyframe(np.array([[4.5, 0.0, 1.5]], np.float32), np.full(1, 2, np.uint8), np.full(1, 0.2, np.float32))
+    cloud = Keyframe(
+        np.array([[4.5, 0.0, 1.5]], np.float32),
+        np.full(1, 2, np.uint8),
+        np.full(1, 0.2, np.float32),
+    )
     list(keep_keyframes(s.folder.keyframes, [0], [cloud], {}))
     query, _ = build_query(s, 0, settings())
     assert query.spread is not None

@@ -9,17 +9,25 @@ import pytest
 
 from semloc_logs.alignment.verify import FEATURES, Features
 from semloc_logs.closures.acceptance.calibration import AGREEMENT, Agreement
-from semloc_logs.closures.closure_tables import read_closures, unique_closures, write_closures, write_rejected
+from semloc_logs.closures.closure_tables import (
+    read_closures,
+    unique_closures,
+    write_closures,
+    write_rejected,
+)
 from semloc_logs.closures.matching import Alignment
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_metadata, read_table
 
 SECOND = 10**9
-ROAD = dict.fromkeys("abc", np.arange(100.0))  # three sessions along the same road, a keyframe every metre
+# three sessions along the same road, a keyframe every metre
+ROAD = dict.fromkeys("abc", np.arange(100.0))
 
 
-def alignment(query: str, i: int, target: str, j: int, probability: float = 0.995, **more: Any) -> Alignment:
+def alignment(
+    query: str, i: int, target: str, j: int, probability: float = 0.995, **more: Any
+) -> Alignment:
     rng = np.random.default_rng(i)
     half = rng.standard_normal((6, 6))
     features = Features(0.9, 0.9, 0.0, 0.9, 0.1, 0.2, 3.0, 3.0)
@@ -49,7 +57,8 @@ def keys(rows: list[Alignment]) -> list[tuple[str, int, str, int]]:
 
 @pytest.mark.parametrize("swap", [False, True])
 def test_of_a_closure_found_from_both_ends_the_more_probable_stays(swap: bool) -> None:
-    one, other = alignment("a", 10, "b", 40, 0.995), alignment("b", 41, "a", 11, 0.999)
+    one = alignment("a", 10, "b", 40, 0.995)
+    other = alignment("b", 41, "a", 11, 0.999)
     rows = [other, one] if swap else [one, other]
     assert keys(unique_closures(rows, ROAD, 2.0)) == [("b", 41, "a", 11)]
 
@@ -62,7 +71,8 @@ def test_of_a_closure_found_from_both_ends_the_more_probable_stays(swap: bool) -
         [("a", 10, "b", 40), ("a", 11, "b", 41)],  # two queries of one session are two closures
         [("a", 10, "b", 40), ("b", 40, "c", 10)],  # other sessions
         [("a", 10, "a", 60), ("a", 12, "a", 62)],
-        [("a", 60, "a", 10), ("a", 60, "a", 12)],  # a drive with itself: both ends lie at one place, but the way between differs
+        # a drive with itself: both ends lie at one place, but the way between differs
+        [("a", 60, "a", 10), ("a", 60, "a", 12)],
     ],
 )
 def test_what_is_not_a_twin_stays(rows: list[tuple[str, int, str, int]]) -> None:
@@ -70,12 +80,21 @@ def test_what_is_not_a_twin_stays(rows: list[tuple[str, int, str, int]]) -> None
 
 
 def test_a_session_that_closes_with_itself() -> None:
-    rows = [alignment("a", 10, "a", 60, 0.993), alignment("a", 60, "a", 10, 0.996), alignment("a", 90, "a", 10)]
+    rows = [
+        alignment("a", 10, "a", 60, 0.993),
+        alignment("a", 60, "a", 10, 0.996),
+        alignment("a", 90, "a", 10),
+    ]
     assert keys(unique_closures(rows, ROAD, 2.0)) == [("a", 60, "a", 10), ("a", 90, "a", 10)]
 
 
 def test_closures_are_sorted_by_session_and_time_whatever_the_order() -> None:
-    rows = [alignment("b", 5, "a", 50), alignment("a", 30, "b", 80), alignment("a", 7, "c", 20), alignment("a", 7, "b", 90)]
+    rows = [
+        alignment("b", 5, "a", 50),
+        alignment("a", 30, "b", 80),
+        alignment("a", 7, "c", 20),
+        alignment("a", 7, "b", 90),
+    ]
     expected = [("a", 7, "b", 90), ("a", 7, "c", 20), ("a", 30, "b", 80), ("b", 5, "a", 50)]
     for order in ([0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]):
         assert keys(unique_closures([rows[i] for i in order], ROAD, 2.0)) == expected
@@ -85,7 +104,9 @@ def test_closures_are_sorted_by_session_and_time_whatever_the_order() -> None:
 def test_many_closures_of_one_pair_of_sessions_take_no_quadratic_time() -> None:
     n = 3000
     road = np.linspace(0.0, 5.0 * n, n, endpoint=False)
-    rows = [alignment("a", i, "b", i, 0.995) for i in range(n)] + [alignment("b", i, "a", i, 0.994) for i in range(n)]
+    rows = [alignment("a", i, "b", i, 0.995) for i in range(n)] + [
+        alignment("b", i, "a", i, 0.994) for i in range(n)
+    ]
     kept = unique_closures(rows, {"a": road, "b": road}, 2.0)
     assert len(kept) == n
     assert {a.query_session for a in kept} == {"a"}
@@ -101,12 +122,21 @@ def test_closures_as_a_table(n: int, tmp_path: Path) -> None:
     found = read_closures(tmp_path / "closures.parquet")
     assert len(found) == n
     for a, row in zip(rows, found, strict=True):
-        assert (row["query_session"], row["target_session"], row["query_stamp_ns"]) == ("a", "b", a.query_stamp_ns)
+        assert (row["query_session"], row["target_session"], row["query_stamp_ns"]) == (
+            "a",
+            "b",
+            a.query_stamp_ns,
+        )
         assert (row["t_x"], row["t_y"], row["t_z"]) == (0.5, 0.25, -0.1)
         assert row["q_z"] == pytest.approx(np.sin(0.05 * a.query_keyframe))
         assert row["q_w"] == pytest.approx(np.cos(0.05 * a.query_keyframe))
         np.testing.assert_array_equal(np.array(row["covariance"]).reshape(6, 6), a.covariance)
-        assert (row["overlap"], row["probability"], row["inliers"], row["words"]) == (0.75, 0.995, a.inliers, a.words)
+        assert (row["overlap"], row["probability"], row["inliers"], row["words"]) == (
+            0.75,
+            0.995,
+            a.inliers,
+            a.words,
+        )
 
 
 @pytest.mark.parametrize("n", [0, 3])
@@ -115,9 +145,14 @@ def test_rejections_as_a_table(n: int, tmp_path: Path) -> None:
     write_rejected(tmp_path / "rejected.parquet", rows, {})
     table = read_table(tmp_path / "rejected.parquet")
     assert table.schema.equals(contracts.schema("rejected"))
-    assert table["reason"].to_pylist() == [f"because {i}" for i in reversed(range(n))]  # the most probable first
+    # the most probable first
+    assert table["reason"].to_pylist() == [f"because {i}" for i in reversed(range(n))]
     for name in FEATURES:
         assert table[name].to_pylist() == [getattr(a.features, name) for a in rows]
     for name in AGREEMENT:
-        assert table[name].to_pylist() == [getattr(rows[0].agreement, name)] * n if n else not table.num_rows
+        assert (
+            table[name].to_pylist() == [getattr(rows[0].agreement, name)] * n
+            if n
+            else not table.num_rows
+        )
     assert table["sigma"].to_pylist() == pytest.approx([a.sigma for a in reversed(rows)])

@@ -60,10 +60,13 @@ def test_results_come_in_the_order_of_the_tasks(engine: Engine, tasks: ModuleTyp
     elsewhere = {pid for _, pid in found} != {os.getpid()}
     assert elsewhere == (engine.jobs > 1)
     assert list(engine.map(tasks.slow_square, [])) == []
-    assert [value for value, _ in engine.map(tasks.slow_square, [5])] == [25]  # the engine can be used again
+    # the engine can be used again
+    assert [value for value, _ in engine.map(tasks.slow_square, [5])] == [25]
 
 
-def test_an_exception_arrives_as_raised_after_what_came_before(engine: Engine, tasks: ModuleType) -> None:
+def test_an_exception_arrives_as_raised_after_what_came_before(
+    engine: Engine, tasks: ModuleType
+) -> None:
     results = engine.map(tasks.picky, range(8))
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(LogError, match=r"^drive\.mcap: task 3 is damaged, remove it$"):

@@ -33,10 +33,14 @@ from semloc_logs.workspace import Workspace
 
 
 def judged(n: int = 1500, seed: int = 0, towns: int = 3) -> Judged:
-    """Queries 2 m apart along straight roads; right alignments lie at the truth, wrong ones anywhere; features tell a little."""
+    """Queries 2 m apart along straight roads; right alignments lie at the truth, wrong ones
+    anywhere; features tell a little.
+    """
     rng = np.random.default_rng(seed)
     right = rng.random(n) < 0.4
-    features = np.tile([0.5, 0.8, 0.05, 0.5, 0.1, 0.8, 3.0, 2.0], (n, 1)) + rng.normal(0, 0.05, (n, 8))
+    features = np.tile([0.5, 0.8, 0.05, 0.5, 0.1, 0.8, 3.0, 2.0], (n, 1)) + rng.normal(
+        0, 0.05, (n, 8)
+    )
     features[:, 0] += np.where(right, 0.12, -0.12) + rng.normal(0, 0.08, n)
     town = np.array([f"t{k % towns}" for k in range(n)], object)
     query = np.arange(n) // towns
@@ -45,11 +49,25 @@ def judged(n: int = 1500, seed: int = 0, towns: int = 3) -> Judged:
     at[~right, :2, 3] += rng.uniform(20, 90, (int((~right).sum()), 2))
     road = np.array(2.0 * query, float)
     a, b = (np.full(n, name, object) for name in ("a", "b"))
-    placed = Placed(a, b, query, road, road.copy(), own, at, np.full(n, 0.02), np.zeros(n), np.zeros(n), np.ones(n, bool))
+    placed = Placed(
+        a,
+        b,
+        query,
+        road,
+        road.copy(),
+        own,
+        at,
+        np.full(n, 0.02),
+        np.zeros(n),
+        np.zeros(n),
+        np.ones(n, bool),
+    )
     return Judged(town, features, placed, right, np.where(right, 0.1, 50.0), np.zeros(n), 0.3)
 
 
-def test_neighbours_find_more_at_the_same_reliability_and_probabilities_mean_what_they_say() -> None:
+def test_neighbours_find_more_at_the_same_reliability_and_probabilities_mean_what_they_say() -> (
+    None
+):
     data = judged()
     fitted = fit(data)
     alone, together = (recall_at(data, p, (0.99,))[0] for p in (fitted.alone, fitted.probability))
@@ -58,24 +76,48 @@ def test_neighbours_find_more_at_the_same_reliability_and_probabilities_mean_wha
     for row in reliability(fitted.probability, data.right, (0.0, 0.2, 0.8, 1.0)):
         assert abs(row["said"] - row["right"]) < max(0.06, 2.5 / np.sqrt(row["alignments"]))
     content = calibration_json(data, fitted)
-    assert (content["towns"], content["alignments"], content["right"]) == (3, 1500, int(data.right.sum()))
+    assert (content["towns"], content["alignments"], content["right"]) == (
+        3,
+        1500,
+        int(data.right.sum()),
+    )
     assert set(content["alone"]["features"]) == set(FEATURES)
-    assert Calibration.from_json(content["together"], TOGETHER).weights[0] == round(fitted.model.together.weights[0], 4)
+    assert Calibration.from_json(content["together"], TOGETHER).weights[0] == round(
+        fitted.model.together.weights[0], 4
+    )
 
 
 def test_copied_blocks_teach_when_to_abstain_and_cost_nothing_elsewhere() -> None:
     data = judged()
     n = 400
-    copy = np.arange(n) % 2 == 1  # of each query the true place and one a block on, that fits as well
+    # of each query the true place and one a block on, that fits as well
+    copy = np.arange(n) % 2 == 1
     query = np.arange(n) % (n // 2) // 2
     own = np.array([yaw_transform(0.0, (2.0 * k, 0.0, 0.0)) for k in query])
     at = own @ np.where(copy[:, None, None], yaw_transform(0.0, (85.0, 0.0, 0.0)), np.eye(4))
     road = np.array(2.0 * query, float)
     a, b = (np.full(n, name, object) for name in ("a", "b"))
-    placed = Placed(a, b, query, road, road + 85.0 * copy, own, at, np.full(n, 0.02), np.zeros(n), np.zeros(n), np.ones(n, bool))
-    features = np.tile([0.75, 0.8, 0.05, 0.5, 0.1, 0.8, 3.0, 2.0], (n, 1)) + np.random.default_rng(1).normal(0, 0.01, (n, 8))
+    placed = Placed(
+        a,
+        b,
+        query,
+        road,
+        road + 85.0 * copy,
+        own,
+        at,
+        np.full(n, 0.02),
+        np.zeros(n),
+        np.zeros(n),
+        np.ones(n, bool),
+    )
+    features = np.tile([0.75, 0.8, 0.05, 0.5, 0.1, 0.8, 3.0, 2.0], (n, 1)) + np.random.default_rng(
+        1
+    ).normal(0, 0.01, (n, 8))
     town = np.where(np.arange(n) < n // 2, "repeating-0", "repeating-1").astype(object)
-    poses = {f.name: np.concatenate([getattr(data.placed, f.name), getattr(placed, f.name)]) for f in fields(Placed)}
+    poses = {
+        f.name: np.concatenate([getattr(data.placed, f.name), getattr(placed, f.name)])
+        for f in fields(Placed)
+    }
     both = Judged(
         np.concatenate([data.town, town]),
         np.concatenate([data.features, features]),
@@ -98,7 +140,8 @@ def test_what_is_said_of_a_town_does_not_depend_on_its_truth() -> None:
     data = judged()
     lied = data.right.copy()
     lied[data.town == "t1"] ^= True
-    before, after = fit(data), fit(replace(data, right=lied))
+    before = fit(data)
+    after = fit(replace(data, right=lied))
     mine = data.town == "t1"
     # tempering looks at all towns; the order within a town is that of the models of the other towns
     order = [np.argsort(f.alone[mine]).tolist() for f in (before, after)]
@@ -109,7 +152,9 @@ def test_weights_of_the_wrong_sign_are_left_out() -> None:
     rng = np.random.default_rng(3)
     x = rng.normal(size=(4000, 3))
     right = rng.random(4000) < 1 / (1 + np.exp(-(1.5 * x[:, 0] - 1.0 * x[:, 1] + 0.3)))
-    assert fit_signed(x, right, (1, -1, 0), np.ones(len(x))).weights == pytest.approx((1.5, -1.0, 0.0), abs=0.15)
+    assert fit_signed(x, right, (1, -1, 0), np.ones(len(x))).weights == pytest.approx(
+        (1.5, -1.0, 0.0), abs=0.15
+    )
     assert fit_signed(x, right, (1, 1, 0), np.ones(len(x))).weights[1:] == (0.0, 0.0)
 
 
@@ -122,28 +167,68 @@ def test_reliability_and_recall_by_hand() -> None:
     ]
     data = judged(4, towns=1)
     placed = replace(data.placed, query=np.array([0, 0, 1, 2]))
-    row = recall_at(replace(data, placed=placed, right=right), np.array([0.9, 0.2, 0.95, 0.1]), (0.5,))[0]
-    assert row == {"threshold": 0.5, "accepted": 2, "false": 1, "possible": 3, "recall": pytest.approx(1 / 3)}
+    row = recall_at(
+        replace(data, placed=placed, right=right), np.array([0.9, 0.2, 0.95, 0.1]), (0.5,)
+    )[0]
+    assert row == {
+        "threshold": 0.5,
+        "accepted": 2,
+        "false": 1,
+        "possible": 3,
+        "recall": pytest.approx(1 / 3),
+    }
 
 
-def test_a_town_is_judged_into_a_table_and_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_town_is_judged_into_a_table_and_read_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     road = np.array([yaw_transform(0.1, (2.0 * k, 1.0, 0.5)) for k in range(5)])
-    map_ = cast(SessionMap, SimpleNamespace(map_T_base=road, distance=2.0 * np.arange(5), stamps_ns=np.arange(5) * 10**9, folder=None))
+    map_ = cast(
+        SessionMap,
+        SimpleNamespace(
+            map_T_base=road,
+            distance=2.0 * np.arange(5),
+            stamps_ns=np.arange(5) * 10**9,
+            folder=None,
+        ),
+    )
     errors = [np.eye(4), yaw_transform(0.0, (2.0, 0, 0)), yaw_transform(0.0, (9.0, 0, 0))]
     found = np.array([inverse(road[2]) @ road[1] @ e for e in errors])
-    text: dict[str, Any] = {"query_session": ["a"] * 3, "target_session": ["b"] * 3, "reason": [""] * 3}
-    numbers = {c["name"]: np.full(3, 0.5) for c in contracts.contract("rejected")["columns"] if c["type"] == "float64"}
+    text: dict[str, Any] = {
+        "query_session": ["a"] * 3,
+        "target_session": ["b"] * 3,
+        "reason": [""] * 3,
+    }
+    numbers = {
+        c["name"]: np.full(3, 0.5)
+        for c in contracts.contract("rejected")["columns"]
+        if c["type"] == "float64"
+    }
     stamps = {"query_stamp_ns": [10**9] * 3, "target_stamp_ns": [2 * 10**9] * 3}
-    columns = numbers | text | stamps | {n: [1] * 3 for n in ("inliers", "words", "neighbours")} | pose_columns(found)
+    columns = (
+        numbers
+        | text
+        | stamps
+        | {n: [1] * 3 for n in ("inliers", "words", "neighbours")}
+        | pose_columns(found)
+    )
     work = Workspace(tmp_path)
     write_table(work.rejected, contracts.table("rejected", columns), {"voxel_size": 0.3})
     for name in "ab":
-        (tmp_path / f"{name}.tum").write_text("".join(f"{k} {2.0 * k} 1 0.5 0 0 {np.sin(0.05)} {np.cos(0.05)}\n" for k in range(5)))
-    (tmp_path / "truth.json").write_text('{"a": {"trajectory": "a.tum"}, "b": {"trajectory": "b.tum"}}')
-    monkeypatch.setattr(Workspace, "sessions", lambda _: [SimpleNamespace(name="a"), SimpleNamespace(name="b")])
+        (tmp_path / f"{name}.tum").write_text(
+            "".join(f"{k} {2.0 * k} 1 0.5 0 0 {np.sin(0.05)} {np.cos(0.05)}\n" for k in range(5))
+        )
+    (tmp_path / "truth.json").write_text(
+        '{"a": {"trajectory": "a.tum"}, "b": {"trajectory": "b.tum"}}'
+    )
+    monkeypatch.setattr(
+        Workspace, "sessions", lambda _: [SimpleNamespace(name="a"), SimpleNamespace(name="b")]
+    )
     monkeypatch.setattr(calibration, "SessionMap", lambda _: map_)
     judge_town(work, tmp_path / "truth.json", "here", tmp_path / "judged.parquet")
-    assert read_table(tmp_path / "judged.parquet")["error_m"].to_pylist() == pytest.approx([0, 2, 9], abs=1e-6)
+    assert read_table(tmp_path / "judged.parquet")["error_m"].to_pylist() == pytest.approx(
+        [0, 2, 9], abs=1e-6
+    )
     back = read_judged([tmp_path / "judged.parquet"] * 2)
     assert back.right.tolist() == [True, False, False] * 2
     assert back.clear.tolist() == [True, False, True] * 2

@@ -22,17 +22,25 @@ from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
 
-Row = tuple[str, str, float, float]  # query session, target session, query stamp in seconds, probability
+# query session, target session, query stamp in seconds, probability
+Row = tuple[str, str, float, float]
 
 
 def _zeros(schema: pa.Schema, rows: int) -> dict[str, Any]:
-    return {f.name: np.zeros(rows, f.type.to_pandas_dtype()) for f in schema if pa.types.is_primitive(f.type)}
+    return {
+        f.name: np.zeros(rows, f.type.to_pandas_dtype())
+        for f in schema
+        if pa.types.is_primitive(f.type)
+    }
 
 
 def tables(folder: Path, accepted: list[Row], rejected: list[Row]) -> Workspace:
     """A workspace with these rows, and sessions whose first keyframe is at 1000 s."""
     work = Workspace(folder)
-    for rows, path, name in ((accepted, work.closures, "closures"), (rejected, work.rejected, "rejected")):
+    for rows, path, name in (
+        (accepted, work.closures, "closures"),
+        (rejected, work.rejected, "rejected"),
+    ):
         schema = contracts.schema(name)
         columns: dict[str, Any] = _zeros(schema, len(rows))
         columns |= {
@@ -43,11 +51,16 @@ def tables(folder: Path, accepted: list[Row], rejected: list[Row]) -> Workspace:
             **pose_columns(np.tile(np.eye(4), (len(rows), 1, 1))),
         }
         columns |= (
-            {"covariance": [np.eye(6).ravel().tolist()] * len(rows)} if name == "closures" else {"reason": ["too little"] * len(rows)}
+            {"covariance": [np.eye(6).ravel().tolist()] * len(rows)}
+            if name == "closures"
+            else {"reason": ["too little"] * len(rows)}
         )
         write_table(path, contracts.table(name, columns), {})
     for session in {r[0] for r in accepted + rejected}:
-        frames = _zeros(contracts.schema("frames"), 1) | {"stamp_ns": [1000 * 10**9], "topic": ["/points"]}
+        frames = _zeros(contracts.schema("frames"), 1) | {
+            "stamp_ns": [1000 * 10**9],
+            "topic": ["/points"],
+        }
         write_table(work.session(session).frames, contracts.table("frames", frames), {})
     return work
 
@@ -63,16 +76,34 @@ def stamps(choices: list[Choice]) -> list[tuple[str, float, bool]]:
     return [(c.row["query_session"], c.row["query_stamp_ns"] / 1e9, c.accepted) for c in choices]
 
 
-def test_the_best_of_each_pair_of_sessions_and_the_best_rejected_without_a_closure(work: Workspace) -> None:
-    assert stamps(choose(work, Wanted())) == [("a", 1003.0, True), ("b", 1002.0, True), ("a", 1020.0, False)]
-    assert stamps(choose(work, Wanted(count=3)))[:3] == [("a", 1003.0, True), ("b", 1002.0, True), ("a", 1001.0, True)]
+def test_the_best_of_each_pair_of_sessions_and_the_best_rejected_without_a_closure(
+    work: Workspace,
+) -> None:
+    assert stamps(choose(work, Wanted())) == [
+        ("a", 1003.0, True),
+        ("b", 1002.0, True),
+        ("a", 1020.0, False),
+    ]
+    assert stamps(choose(work, Wanted(count=3)))[:3] == [
+        ("a", 1003.0, True),
+        ("b", 1002.0, True),
+        ("a", 1001.0, True),
+    ]
     assert stamps(choose(work, Wanted(session="b"))) == [("b", 1002.0, True)]
 
 
 @pytest.mark.parametrize(
-    ("at", "expected"), [(1003.2, (1003.0, True)), (3.2, (1003.0, True)), (11.0, (1010.0, False)), (1e6, (1020.0, False))]
+    ("at", "expected"),
+    [
+        (1003.2, (1003.0, True)),
+        (3.2, (1003.0, True)),
+        (11.0, (1010.0, False)),
+        (1e6, (1020.0, False)),
+    ],
 )
-def test_the_query_nearest_to_a_time(work: Workspace, at: float, expected: tuple[float, bool]) -> None:
+def test_the_query_nearest_to_a_time(
+    work: Workspace, at: float, expected: tuple[float, bool]
+) -> None:
     assert stamps(choose(work, Wanted(session="a", at=at))) == [("a", *expected)]
 
 
@@ -94,15 +125,28 @@ def view(shift: float, *, accepted: bool) -> ClosureView:
     """A square of walls seen from its middle, that lies ``shift`` metres off before it is aligned."""
     side = np.linspace(-4.0, 4.0, 60)
     walls = [
-        np.stack(np.broadcast_arrays(*xy, z), -1) for z in (0.2, 0.5, 0.8) for xy in ((side, 4.0), (side, -4.0), (4.0, side), (-4.0, side))
+        np.stack(np.broadcast_arrays(*xy, z), -1)
+        for z in (0.2, 0.5, 0.8)
+        for xy in ((side, 4.0), (side, -4.0), (4.0, side), (-4.0, side))
     ]
     points = np.concatenate(walls)
     fuser = Fuser(Settings().resolved().fusion)
-    fuser.add(points.astype(np.float32), np.full(len(points), 2, np.uint8), np.array([0.0, 0.0, 1.0]))
+    fuser.add(
+        points.astype(np.float32), np.full(len(points), 2, np.uint8), np.array([0.0, 0.0, 1.0])
+    )
     blocks = fuser.finish()
-    row: dict[str, Any] = {"query_session": "a", "target_session": "b", "query_stamp_ns": 10**9, "target_stamp_ns": 2 * 10**9}
+    row: dict[str, Any] = {
+        "query_session": "a",
+        "target_session": "b",
+        "query_stamp_ns": 10**9,
+        "target_stamp_ns": 2 * 10**9,
+    }
     row |= {"probability": 0.999, "overlap": 0.6, "inliers": 10, "words": 3}
-    row |= {"covariance": (np.eye(6) * 1e-4).ravel().tolist()} if accepted else {"reason": "too little"}
+    row |= (
+        {"covariance": (np.eye(6) * 1e-4).ravel().tolist()}
+        if accepted
+        else {"reason": "too little"}
+    )
     roads = (np.diag([1.0, 0, 0]), np.zeros((1, 3)))
     state = np.full((32, 32, 32), 253, np.uint8)
     state[:, :, 3] = 0
@@ -146,7 +190,9 @@ def test_what_json_says() -> None:
 def test_the_command_refuses_what_cannot_be_shown(tmp_path: Path) -> None:
     def show(*args: object) -> tuple[int, str]:
         done = CliRunner().invoke(
-            program, ["show", "-w", str(tmp_path), "-o", str(tmp_path / "o.png"), *map(str, args)], prog_name="semloc"
+            program,
+            ["show", "-w", str(tmp_path), "-o", str(tmp_path / "o.png"), *map(str, args)],
+            prog_name="semloc",
         )
         return done.exit_code, done.output
 

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from semloc_logs.benchmarks.descriptors import completion as module
-from semloc_logs.benchmarks.descriptors.completion import Completed, completed, completion_benchmark, completion_figures, load_completion
+from semloc_logs.benchmarks.descriptors.completion import (
+    Completed,
+    completed,
+    completion_benchmark,
+    completion_figures,
+    load_completion,
+)
 from semloc_logs.errors import SettingsError
 from semloc_logs.pictures.completion_picture import colours, draw_completions, render
 from semloc_logs.settings import Settings
@@ -23,7 +29,8 @@ def codes(*values: int) -> np.ndarray:
 
 
 def test_figures_by_hand() -> None:
-    truth = codes(2, 2, 8, 8, FREE, FREE, FREE, FREE, UNOBSERVED, UNKNOWN)  # the last two do not count
+    # the last two do not count
+    truth = codes(2, 2, 8, 8, FREE, FREE, FREE, FREE, UNOBSERVED, UNKNOWN)
     said = codes(2, 8, 8, 8, FREE, FREE, FREE, 2, FREE, FREE)
     given = codes(2, UNOBSERVED, 8, UNKNOWN, FREE, UNOBSERVED, UNOBSERVED, FREE, 3, 3)
     figures = completion_figures(Completed(given, said, truth, truth, CLASSES))
@@ -37,14 +44,17 @@ def test_figures_by_hand() -> None:
     assert figures["mean_iou"]["ours"] == pytest.approx((1 / 3 + 2 / 3) / 2)
     assert figures["occupied_iou"]["ours"] == pytest.approx(4 / 5)
     assert figures["free_iou"]["ours"] == pytest.approx(3 / 4)
-    assert figures["occupied_iou"]["copy_input"] == pytest.approx(3 / 4)  # the voxel of unknown class is there
+    # the voxel of unknown class is there
+    assert figures["occupied_iou"]["copy_input"] == pytest.approx(3 / 4)
     assert figures["free_iou"]["copy_input"] == pytest.approx(2 / 4)
     assert all("8 voxels" in str(row["unit"]) for row in figures.values())
 
 
 def test_a_perfect_answer() -> None:
     truth = np.random.default_rng(0).integers(0, 20, (2, 4, 4, 4)).astype(np.uint8)
-    figures = completion_figures(Completed(np.full_like(truth, UNOBSERVED), truth, truth, truth, CLASSES))
+    figures = completion_figures(
+        Completed(np.full_like(truth, UNOBSERVED), truth, truth, truth, CLASSES)
+    )
     assert [row["ours"] for row in figures.values()] == [1.0] * len(figures)
 
 
@@ -73,7 +83,9 @@ def test_other_weights_are_refused(tmp_path: Path) -> None:
             load_completion("semantic", path)
 
 
-def test_the_benchmark_draws_what_it_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_benchmark_draws_what_it_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def shard(task: SceneTask) -> Path:
         write_shard(task.shard, list(zip(*pairs(2), strict=True)))
         return task.shard
@@ -82,7 +94,13 @@ def test_the_benchmark_draws_what_it_measured(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(module, "SEEDS", (9001,))
     picture = tmp_path / "completion.png"
     figures = completion_benchmark("semantic", Settings(), work=tmp_path / "work", picture=picture)
-    assert set(figures) == {"accuracy", "mean_iou", "occupied_iou", "free_iou", "unobserved_accuracy"}
+    assert set(figures) == {
+        "accuracy",
+        "mean_iou",
+        "occupied_iou",
+        "free_iou",
+        "unobserved_accuracy",
+    }
     image = cv2.imread(str(picture))
     assert image is not None
     tops = colours()[[0, 2]][:, ::-1]

@@ -16,7 +16,9 @@ def network() -> Encoder:
 
 
 def test_multiplications_of_known_layers_are_counted(network: Encoder) -> None:
-    """What the last convolution alone does: 64 x 4^3 inputs for each of 256 outputs of one subvolume."""
+    """What the last convolution alone does: 64 x 4^3 inputs for each of 256 outputs of one
+    subvolume.
+    """
     codes = np.zeros((WIDE, WIDE, 32), np.uint8)
     seen = watch(network, codes)
     assert seen["convolution 3"][1] == 256 * 64 * 4**3

@@ -46,13 +46,15 @@ def test_steps_count_every_ray_and_voxels_count_once() -> None:
 
 def test_walked_voxels_are_those_that_a_dense_sampling_of_the_rays_meets() -> None:
     rng = np.random.default_rng(0)
-    points, origin = rng.uniform(-6, 6, (40, 3)), np.array([0.13, 0.21, 0.37])
+    points = rng.uniform(-6, 6, (40, 3))
+    origin = np.array([0.13, 0.21, 0.37])
     _, free, occupied = walk_all(points, origin, 0.5, 50.0)
     along = origin + (points - origin)[:, None] * np.linspace(0, 1, 20_001)[:, None]
     seen = {tuple(v) for v in np.unique(np.floor(along.reshape(-1, 3) / 0.5).astype(int), axis=0)}
     hit = {tuple(v) for v in np.floor(points / 0.5).astype(int)}
     assert occupied == len(hit)
-    assert len(seen - hit) <= free <= len(seen - hit) + 3  # a corner that is cut by less than the sampling's step
+    # a corner that is cut by less than the sampling's step
+    assert len(seen - hit) <= free <= len(seen - hit) + 3
 
 
 def test_clock_is_that_of_a_processor() -> None:
@@ -65,7 +67,9 @@ def test_sweeps_are_like_real_ones() -> None:
     assert len(first.points) == len(first.label) == 20_000
     assert 8.0 < reach.mean() < 13.0
     assert (reach < 50.0).mean() > 0.97
-    assert np.linalg.norm(second.map_T_sensor[:3, 3] - first.map_T_sensor[:3, 3]) == pytest.approx(1.2, abs=0.1)
+    assert np.linalg.norm(second.map_T_sensor[:3, 3] - first.map_T_sensor[:3, 3]) == pytest.approx(
+        1.2, abs=0.1
+    )
     assert len(np.unique(first.label)) > 4
 
 
@@ -92,29 +96,43 @@ def test_log_without_clouds_is_refused(tmp_path: Path) -> None:
         log_sweeps(tmp_path / "no.mcap")
 
 
-def test_ours_and_peers_are_measured_in_turn(scans: list[Scan], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_ours_and_peers_are_measured_in_turn(
+    scans: list[Scan], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     script = tmp_path / "fake_runner.py"
     script.write_text(FAKE)
     monkeypatch.setattr(peer_process, "runner", lambda name: script)
-    figures = measure(Case("depth", scans, 0.05, 8.0, 2, "a small image"), Settings().resolved(), {"fake": sys.executable})
+    figures = measure(
+        Case("depth", scans, 0.05, 8.0, 2, "a small image"),
+        Settings().resolved(),
+        {"fake": sys.executable},
+    )
     assert figures["depth_ms"]["fake"] == 5.0
     assert figures["depth_cpu_ms"]["fake"] == 4.0
-    assert figures["depth_free"]["fake"] == 2.0  # the third round: one to warm up and two that count
+    # the third round: one to warm up and two that count
+    assert figures["depth_free"]["fake"] == 2.0
     assert float(figures["depth_ms"]["ours"]) > 0
     assert float(figures["depth_occupied"]["ours"]) > 300
     assert all("unit" in row for row in figures.values())
 
 
-def test_peer_that_fails_is_named_with_what_it_said(scans: list[Scan], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_peer_that_fails_is_named_with_what_it_said(
+    scans: list[Scan], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     script = tmp_path / "broken_runner.py"
     script.write_text("import this_is_not_installed")
     monkeypatch.setattr(peer_process, "runner", lambda name: script)
     write_scans(tmp_path, scans)
-    with Peer("broken", sys.executable, tmp_path, 0.05, 8.0, 1) as peer, pytest.raises(SemlocError, match=r"broken.*this_is_not_installed"):
+    with (
+        Peer("broken", sys.executable, tmp_path, 0.05, 8.0, 1) as peer,
+        pytest.raises(SemlocError, match=r"broken.*this_is_not_installed"),
+    ):
         peer.round()
 
 
-def test_peer_without_python_or_script_is_wrong_usage(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_peer_without_python_or_script_is_wrong_usage(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     with pytest.raises(SettingsError, match="no peer 'nobody'"):
         runner("nobody")
     monkeypatch.setattr(peer_process, "runner", lambda name: tmp_path / "x.py")

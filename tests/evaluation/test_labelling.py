@@ -5,7 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semloc_logs.benchmarks.labels.label_quality import confusion, intersection_over_union, measure_labels
+from semloc_logs.benchmarks.labels.label_quality import (
+    confusion,
+    intersection_over_union,
+    measure_labels,
+)
 from semloc_logs.errors import SemlocError
 from semloc_logs.settings import Settings
 

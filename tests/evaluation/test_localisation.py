@@ -11,9 +11,27 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from semloc_logs.benchmarks.localisation.answers import Answer, World, figures_of, recall_at_full_precision
-from semloc_logs.benchmarks.localisation.city import CROSSING, OPPOSITE, SEED, UNSEEN, WorldDrive, world_path
-from semloc_logs.benchmarks.localisation.our_method import OURS, grid_hypotheses, link_workspace, settings_of, sweep_words
+from semloc_logs.benchmarks.localisation.answers import (
+    Answer,
+    World,
+    figures_of,
+    recall_at_full_precision,
+)
+from semloc_logs.benchmarks.localisation.city import (
+    CROSSING,
+    OPPOSITE,
+    SEED,
+    UNSEEN,
+    WorldDrive,
+    world_path,
+)
+from semloc_logs.benchmarks.localisation.our_method import (
+    OURS,
+    grid_hypotheses,
+    link_workspace,
+    settings_of,
+    sweep_words,
+)
 from semloc_logs.benchmarks.localisation.peer_methods import cloud_frame, database_keyframes
 from semloc_logs.benchmarks.peers import peer_process
 from semloc_logs.benchmarks.peers.scan_context import nearest_contexts, scan_context
@@ -44,7 +62,9 @@ def test_the_second_streets_cross_the_first_ones_at_about_right_angles() -> None
 
 
 def straight(heading_deg: float, condition: str) -> World:
-    """A database along x with keyframes every metre, and a query at (10, 2) of some heading; the database's map is moved by 5 m."""
+    """A database along x with keyframes every metre, and a query at (10, 2) of some heading; the
+    database's map is moved by 5 m.
+    """
     road = np.tile(np.eye(4), (30, 1, 1))
     road[:, 0, 3] = np.arange(30)
     moved = road.copy()
@@ -58,9 +78,18 @@ def straight(heading_deg: float, condition: str) -> World:
 
 @pytest.mark.parametrize(
     ("heading", "condition", "asks"),
-    [(10, "0", True), (50, "0", False), (170, OPPOSITE, True), (100, OPPOSITE, False), (-95, CROSSING, True), (0, CROSSING, False)],
+    [
+        (10, "0", True),
+        (50, "0", False),
+        (170, OPPOSITE, True),
+        (100, OPPOSITE, False),
+        (-95, CROSSING, True),
+        (0, CROSSING, False),
+    ],
 )
-def test_a_query_asks_where_its_heading_is_that_of_the_condition(heading: float, condition: str, asks: bool) -> None:
+def test_a_query_asks_where_its_heading_is_that_of_the_condition(
+    heading: float, condition: str, asks: bool
+) -> None:
     assert straight(heading, condition)._asks(0) is asks
 
 
@@ -79,7 +108,13 @@ def answer(score: float, error: float) -> Answer:
 
 
 def test_full_precision_ends_at_the_best_wrong_answer() -> None:
-    answers = [answer(0.9, 0.5), answer(0.8, 3.0), answer(0.7, 40.0), answer(0.6, 0.1), Answer(0, 1.0)]
+    answers = [
+        answer(0.9, 0.5),
+        answer(0.8, 3.0),
+        answer(0.7, 40.0),
+        answer(0.6, 0.1),
+        Answer(0, 1.0),
+    ]
     assert recall_at_full_precision(answers, []) == pytest.approx(0.4)
     assert recall_at_full_precision(answers, [answer(0.85, np.inf)]) == pytest.approx(0.2)
     assert recall_at_full_precision(answers, [answer(0.9, np.inf)]) == 0.0  # a tie counts as wrong
@@ -89,16 +124,27 @@ def test_full_precision_ends_at_the_best_wrong_answer() -> None:
     assert found["median error"] == pytest.approx(0.3)
     assert found["accepted and wrong"] == 3  # 3 m off, 40 m off, and elsewhere
     assert found["accepted and right"] == pytest.approx(0.4)
-    promoted = Answer(0, 1.0, 0.9, 40.0, 0.0, True, 0.2, 0.0)  # its neighbours told it the right one
+    # its neighbours told it the right one
+    promoted = Answer(0, 1.0, 0.9, 40.0, 0.0, True, 0.2, 0.0)
     assert figures_of([promoted], []) == pytest.approx(
-        {"recall 1 m": 0, "recall 5 m": 0, "recall at 100 % precision": 0, "time": 1, "accepted and right": 1, "accepted and wrong": 0}
+        {
+            "recall 1 m": 0,
+            "recall 5 m": 0,
+            "recall at 100 % precision": 0,
+            "time": 1,
+            "accepted and right": 1,
+            "accepted and wrong": 0,
+        }
     )
-    assert "accepted and right" not in figures_of([Answer(0, 1.0, 0.9, 0.1, 0.0)], [])  # a peer does not decide
+    # a peer does not decide
+    assert "accepted and right" not in figures_of([Answer(0, 1.0, 0.9, 0.1, 0.0)], [])
 
 
 def test_scan_context_knows_the_turn_and_the_place() -> None:
     rng = np.random.default_rng(3)
-    places = [np.column_stack([rng.uniform(-40, 40, (400, 2)), rng.uniform(0, 8, 400)]) for _ in range(4)]
+    places = [
+        np.column_stack([rng.uniform(-40, 40, (400, 2)), rng.uniform(0, 8, 400)]) for _ in range(4)
+    ]
     contexts = [scan_context(p.astype(np.float32)) for p in places]
     yaw = 2 * np.pi * 17 / 60
     asked = apply(yaw_transform(-yaw), places[2])  # database_T_query turns by yaw
@@ -112,8 +158,12 @@ def test_a_grid_has_every_heading_along_and_beside_the_road() -> None:
     settings = load().resolved()
     road = np.tile(np.eye(4), (9, 1, 1))
     road[:, 0, 3] = 2.0 * np.arange(9)
-    session = SimpleNamespace(submaps=[{"first": 0, "last": 8}], distance=2.0 * np.arange(9), map_T_base=road)
-    database = SimpleNamespace(settings=settings, places=[SimpleNamespace(session="a", submap=0)], sessions={"a": session})
+    session = SimpleNamespace(
+        submaps=[{"first": 0, "last": 8}], distance=2.0 * np.arange(9), map_T_base=road
+    )
+    database = SimpleNamespace(
+        settings=settings, places=[SimpleNamespace(session="a", submap=0)], sessions={"a": session}
+    )
     found = grid_hypotheses(database, None, 0, None)  # type: ignore[arg-type]
     assert len(found) == 5 * 3 * settings.descriptor.headings
     assert {h.pose[1] for h in found if h.pose[0] < 3} == {0.0, 4.0, 8.0, 12.0, 16.0}
@@ -127,28 +177,53 @@ def test_a_grid_has_every_heading_along_and_beside_the_road() -> None:
 
 def test_a_sweep_finds_a_map_that_was_described_at_another_heading() -> None:
     settings = load().resolved()
-    rng, step = np.random.default_rng(0), 2 * np.pi / settings.descriptor.headings
+    rng = np.random.default_rng(0)
+    step = 2 * np.pi / settings.descriptor.headings
     state = np.full((64, 48, 48), 253, np.uint8)
     state[rng.random(state.shape) < 0.02] = 2
-    blocks = SimpleNamespace(bounds=lambda: (np.array([-32, -16, -3]), np.array([32, 32, 45])), dense=lambda low, shape: state)
+    blocks = SimpleNamespace(
+        bounds=lambda: (np.array([-32, -16, -3]), np.array([32, 32, 45])),
+        dense=lambda low, shape: state,
+    )
     turned = turned_map(state, np.array([-32, -16, -3]), 3 * step)
     encoder = load_encoder("semantic", None)
-    known = describe_map(turned.state, turned.low, 0.0, 0.3, encoder, settings.descriptor.query_stride, settings.descriptor.min_occupied)
+    known = describe_map(
+        turned.state,
+        turned.low,
+        0.0,
+        0.3,
+        encoder,
+        settings.descriptor.query_stride,
+        settings.descriptor.min_occupied,
+    )
     centre = turned.to_map(known.centre) * 0.3
 
     def search(asked: np.ndarray, k: int, probes: int, allowed: Allowed) -> Matches:
         away = np.linalg.norm(asked[:, None] - known.descriptor[None], axis=2)
-        best, n = away.argmin(1), np.arange(len(asked), dtype=np.int32)
-        return Matches(n, 0 * best, best, centre[best].astype(float), np.full(len(asked), 3 * step), (1000 * away.min(1)).astype(np.int32))
+        best = away.argmin(1)
+        n = np.arange(len(asked), dtype=np.int32)
+        return Matches(
+            n,
+            0 * best,
+            best,
+            centre[best].astype(float),
+            np.full(len(asked), 3 * step),
+            (1000 * away.min(1)).astype(np.int32),
+        )
 
-    database = SimpleNamespace(settings=settings, words=lambda variant: SimpleNamespace(search=search))
-    allowed, query = Allowed(np.ones(1, bool)), SimpleNamespace(blocks=blocks)
+    database = SimpleNamespace(
+        settings=settings, words=lambda variant: SimpleNamespace(search=search)
+    )
+    allowed = Allowed(np.ones(1, bool))
+    query = SimpleNamespace(blocks=blocks)
     described, found = sweep_words(database, "semantic", allowed, query, 0.0)  # type: ignore[arg-type]
     assert len(described.centre) > 15 * len(known.centre)
     same = found.distance == 0
     assert same.sum() >= len(known.centre) > 0
     assert set(found.yaw[same]) == {0.0}  # the very map: not turned
-    np.testing.assert_allclose(described.centre[found.query[same]] * 0.3, found.centre[same], atol=1e-4)
+    np.testing.assert_allclose(
+        described.centre[found.query[same]] * 0.3, found.centre[same], atol=1e-4
+    )
 
 
 def test_systems_differ_only_in_what_they_say() -> None:
@@ -163,7 +238,8 @@ def test_systems_differ_only_in_what_they_say() -> None:
 
 
 def test_links_share_the_maps_and_not_the_words(tmp_path: Path) -> None:
-    source, target = Workspace(tmp_path / "a"), Workspace(tmp_path / "b")
+    source = Workspace(tmp_path / "a")
+    target = Workspace(tmp_path / "b")
     folder = source.session("s")
     (folder.words).mkdir(parents=True)
     (folder.words / "w").write_text("words")
@@ -179,13 +255,17 @@ def test_links_share_the_maps_and_not_the_words(tmp_path: Path) -> None:
 
 
 def test_cloud_frames_are_level_and_spaced() -> None:
-    tilted = yaw_transform(0.4, (3.0, 4.0, 5.0)) @ np.array([[1.0, 0, 0, 0], [0, 0.995, -0.0998, 0], [0, 0.0998, 0.995, 0], [0, 0, 0, 1]])
+    tilted = yaw_transform(0.4, (3.0, 4.0, 5.0)) @ np.array(
+        [[1.0, 0, 0, 0], [0, 0.995, -0.0998, 0], [0, 0.0998, 0.995, 0], [0, 0, 0, 1]]
+    )
     session = SimpleNamespace(map_T_base=tilted[None], distance=np.arange(20.0))
     assert cloud_frame(session, 0) == pytest.approx(yaw_transform(0.4, (3.0, 4.0, 5.0)), abs=1e-3)  # type: ignore[arg-type]
     assert database_keyframes(session, 5.0) == [0, 5, 10, 15]  # type: ignore[arg-type]
 
 
-def test_a_peer_that_fails_or_is_not_there_is_an_error_of_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_peer_that_fails_or_is_not_there_is_an_error_of_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     script = tmp_path / "x_runner.py"
     monkeypatch.setattr(peer_process, "runner", lambda name: script)
     script.write_text("import sys; print(sys.argv[1])")
@@ -203,7 +283,11 @@ def test_local_maps_ranks_and_warms_up(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for name, n in (("a", 5), ("b", 9), ("q", 3)):
         np.save(tmp_path / f"{name}.npy", rng.normal(size=(n, 3)).astype(np.float32))
-    job = {"folder": str(tmp_path), "database": ["a", "b"], "queries": [{"cloud": "q", "candidates": [[0, 0.0], [1, 0.5]]}]}
+    job = {
+        "folder": str(tmp_path),
+        "database": ["a", "b"],
+        "queries": [{"cloud": "q", "candidates": [[0, 0.0], [1, 0.5]]}],
+    }
     (tmp_path / "job.json").write_text(json.dumps(job))
     script = tmp_path / "runner.py"
     script.write_text(
@@ -211,7 +295,12 @@ def test_local_maps_ranks_and_warms_up(tmp_path: Path) -> None:
         "from local_maps import run_pairs, turned\n"
         "run_pairs(lambda c: c, lambda d, q, yaw: (len(d), turned(yaw)))\n"
     )
-    said = subprocess.run([sys.executable, str(script), str(tmp_path / "job.json")], capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(
+        [sys.executable, str(script), str(tmp_path / "job.json")],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
     (query,) = json.loads(said)["queries"]
     assert [f[:2] for f in query["found"]] == [[1, 9.0], [0, 5.0]]
     assert np.reshape(query["found"][0][2], (4, 4)) == pytest.approx(yaw_transform(0.5))

@@ -23,7 +23,11 @@ from semloc_logs.benchmarks.descriptors.recall import (
     retrieval_recall,
     true_radius,
 )
-from semloc_logs.benchmarks.descriptors.retrieval import RetrievalChoice, densely, retrieval_benchmark
+from semloc_logs.benchmarks.descriptors.retrieval import (
+    RetrievalChoice,
+    densely,
+    retrieval_benchmark,
+)
 from semloc_logs.benchmarks.peers.fpfh import fpfh_describes
 from semloc_logs.errors import SemlocError, SettingsError, WorkspaceError
 from semloc_logs.numerics.transforms import apply, yaw_transform
@@ -43,15 +47,22 @@ def test_found_again_as_the_slow_reference_says() -> None:
     asked = Words(rng.uniform(0, 20, (300, 3)), rng.normal(size=(300, 4)).astype(np.float32))
     found = found_again(asked, database, 6.0)
     for i in range(300):
-        distance = [float(np.linalg.norm(asked.descriptor[i].astype(float) - d)) for d in database.descriptor]
+        distance = [
+            float(np.linalg.norm(asked.descriptor[i].astype(float) - d))
+            for d in database.descriptor
+        ]
         best = sorted(range(700), key=distance.__getitem__)[:5]
-        assert found[i] == any(np.linalg.norm(asked.centre[i] - database.centre[j]) < 6.0 for j in best)
+        assert found[i] == any(
+            np.linalg.norm(asked.centre[i] - database.centre[j]) < 6.0 for j in best
+        )
     assert 0.05 < found.mean() < 0.95
 
 
 def test_the_radius_is_at_least_half_a_cell() -> None:
     for stride, radius in ((4, 1.5), (8, 0.3 * np.sqrt(8**2 * 3) / 2)):
-        settings = SETTINGS.model_copy(update={"descriptor": SETTINGS.descriptor.model_copy(update={"stride": stride})})
+        settings = SETTINGS.model_copy(
+            update={"descriptor": SETTINGS.descriptor.model_copy(update={"stride": stride})}
+        )
         assert true_radius(settings) == pytest.approx(radius)
 
 
@@ -59,7 +70,9 @@ def place(rng: np.random.Generator, x: float) -> Place:
     """Nothing but its position counts here."""
     pose = np.eye(4)
     pose[0, 3] = x
-    return Place(np.full((4, 4, 4), 253, np.uint8), np.zeros(3, np.int64), 0.0, rng.normal(size=(3, 3)), pose)
+    return Place(
+        np.full((4, 4, 4), 253, np.uint8), np.zeros(3, np.int64), 0.0, rng.normal(size=(3, 3)), pose
+    )
 
 
 class Fake(HeldOut):
@@ -85,7 +98,9 @@ def test_a_descriptor_that_knows_its_place_is_always_right_and_a_constant_one_ne
     def knows(at: Place, is_query: bool) -> Described:
         centre = lattice(at, is_query)
         seen.append(len(centre))
-        return Described(centre.astype(np.float32), apply(at.common_T_map, centre * V).astype(np.float32))
+        return Described(
+            centre.astype(np.float32), apply(at.common_T_map, centre * V).astype(np.float32)
+        )
 
     assert recalls(world, knows) == dict.fromkeys(DATABASES, 1.0)
     assert sum(seen) > 4000
@@ -104,7 +119,9 @@ def test_a_chance_descriptor_finds_five_of_all() -> None:
 
     def chance(at: Place, is_query: bool) -> Described:
         centre = lattice(at, is_query)
-        return Described(centre.astype(np.float32), rng.normal(size=(len(centre), 8)).astype(np.float32))
+        return Described(
+            centre.astype(np.float32), rng.normal(size=(len(centre), 8)).astype(np.float32)
+        )
 
     found = recalls(world, chance)
     assert max(found.values()) < 0.15
@@ -115,7 +132,9 @@ def test_the_database_is_cut_to_size_but_keeps_what_is_asked_for() -> None:
 
     def knows(at: Place, is_query: bool) -> Described:
         centre = lattice(at, is_query)
-        return Described(centre.astype(np.float32), apply(at.common_T_map, centre * V).astype(np.float32))
+        return Described(
+            centre.astype(np.float32), apply(at.common_T_map, centre * V).astype(np.float32)
+        )
 
     assert recalls(Fake((), SETTINGS, 1, 5), knows) == dict.fromkeys(DATABASES, 1.0)
 
@@ -137,13 +156,24 @@ def little_town(monkeypatch: pytest.MonkeyPatch) -> None:
     builder.add(box(140.0, 60.0, 0.1, 30.0, 0.0, -0.1), 0)
     for x in range(-30, 90, 6):
         for side in (-1, 1):
-            builder.add(box(5.0, 4.0, float(rng.uniform(1, 7)), float(x), side * float(rng.uniform(7, 9))), 2)
+            builder.add(
+                box(5.0, 4.0, float(rng.uniform(1, 7)), float(x), side * float(rng.uniform(7, 9))),
+                2,
+            )
     scene = Scene(builder.build())
-    network = path_network(np.random.default_rng(0), np.column_stack([np.arange(0.0, 61.0), np.zeros(61)]))
+    network = path_network(
+        np.random.default_rng(0), np.column_stack([np.arange(0.0, 61.0), np.zeros(61)])
+    )
     monkeypatch.setattr(module, "_scene", lru_cache(lambda *_: scene))
-    monkeypatch.setattr(module, "_network", lambda town, _: network if town == 0 else RoadNetwork(np.zeros((0, 2)), ()))
+    monkeypatch.setattr(
+        module,
+        "_network",
+        lambda town, _: network if town == 0 else RoadNetwork(np.zeros((0, 2)), ()),
+    )
     monkeypatch.setattr(module, "_ground", lambda *_: Flat())
-    monkeypatch.setattr(module, "random_traffic", lambda rng, ground, lines, density: Traffic(ground, ()))
+    monkeypatch.setattr(
+        module, "random_traffic", lambda rng, ground, lines, density: Traffic(ground, ())
+    )
     monkeypatch.setattr(module, "SPACING", 6.0)
     monkeypatch.setattr(module, "COLUMNS", 240)
 
@@ -168,9 +198,12 @@ def test_a_small_held_out_town(tmp_path: Path, little_town: None) -> None:
         # the same surfaces are in the map where the query claims to be, and not where it does not
         there = dict(street.database)[SCENARIOS[name]]
         mapped = cKDTree((np.argwhere(there.state < 20) + there.low + 0.5) * V)
-        occupied = occupied[np.linalg.norm(occupied[:, :2] * V, axis=1) < 9.0]  # beyond, the street may end
+        # beyond, the street may end
+        occupied = occupied[np.linalg.norm(occupied[:, :2] * V, axis=1) < 9.0]
         moved = (true, true @ yaw_transform(0.6, (3, 3, 0)))
-        away, elsewhere = (np.minimum(mapped.query(apply(pose, occupied * V))[0], 1.0).mean() for pose in moved)
+        away, elsewhere = (
+            np.minimum(mapped.query(apply(pose, occupied * V))[0], 1.0).mean() for pose in moved
+        )
         assert away < 0.8 * elsewhere, (name, away, elsewhere)
     found = retrieval_recall(world, NoEncoder())
     assert set(found) == set(DATABASES)
@@ -203,15 +236,21 @@ def test_everything_alike_has_one_descriptor_for_each_subvolume() -> None:
 
 def test_the_benchmark_names_its_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark, "held_out", lambda *_, **__: Fake((), SETTINGS, 100, 50))
-    monkeypatch.setattr(benchmark, "retrieval_recall", lambda world, encoder: {"0": 0.5, "season": 0.25})
+    monkeypatch.setattr(
+        benchmark, "retrieval_recall", lambda world, encoder: {"0": 0.5, "season": 0.25}
+    )
     asked: list[str] = []
-    figures = retrieval_benchmark(RetrievalChoice(("semantic", "geometric"), work=tmp_path), {}, SETTINGS, note=asked.append)
+    figures = retrieval_benchmark(
+        RetrievalChoice(("semantic", "geometric"), work=tmp_path), {}, SETTINGS, note=asked.append
+    )
     assert list(figures) == ["0", "season", "geometric_0", "geometric_season"]
     assert figures["geometric_0"] == {"trained": 0.5, "random": 0.5, "unit": "recall at 5"}
     with pytest.raises(SettingsError, match="octomap"):
         retrieval_benchmark(RetrievalChoice(), {"octomap": "python"}, SETTINGS)
     with pytest.raises(SettingsError, match="one variant"):
-        retrieval_benchmark(RetrievalChoice(("semantic", "geometric"), weights=tmp_path), {}, SETTINGS)
+        retrieval_benchmark(
+            RetrievalChoice(("semantic", "geometric"), weights=tmp_path), {}, SETTINGS
+        )
 
 
 def test_a_peer_that_is_not_there_is_an_error(tmp_path: Path) -> None:

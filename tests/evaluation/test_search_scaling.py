@@ -15,23 +15,42 @@ def streets(radius: float = 1.5) -> module.Streets:
     d = draw(1, 600)
     centre = np.stack([3.0 * np.arange(600), np.zeros(600), np.zeros(600)], 1)
     asked = d[::3] + 0.05 * draw(2, 200)
-    return module.Streets(centre, d, np.arange(600) // 200, centre[::3] + np.array([0, 1.0, 0]), np.asarray(asked, np.float32), radius)
+    return module.Streets(
+        centre,
+        d,
+        np.arange(600) // 200,
+        centre[::3] + np.array([0, 1.0, 0]),
+        np.asarray(asked, np.float32),
+        radius,
+    )
 
 
 def test_maps_grow_and_sessions_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "POOL", 500)
-    figures = module.search_scaling(Settings().resolved(), streets(), train_vocabulary(draw(1, 600), cells=8, children=4), (10, 40), 70)
+    figures = module.search_scaling(
+        Settings().resolved(),
+        streets(),
+        train_vocabulary(draw(1, 600), cells=8, children=4),
+        (10, 40),
+        70,
+    )
     assert [figures[f"{km} km: a query"]["words"] for km in (10, 40)] == [700, 2800]
     for km in (10, 40):
         assert float(figures[f"{km} km: a query"]["found"]) > 0.9
-        assert float(figures[f"{km} km: files"]["ours"]) * 1e6 > 32 * figures[f"{km} km: a query"]["words"]  # type: ignore[operator]
+        megabytes = float(figures[f"{km} km: files"]["ours"])
+        assert megabytes * 1e6 > 32 * float(figures[f"{km} km: a query"]["words"])
 
 
 def test_copies_lie_as_far_off_as_other_streets() -> None:
     s = streets()
     apart = s.apart()
     slow = [
-        min(float(np.linalg.norm(s.descriptor[i] - s.descriptor[j])) for j in range(600) if s.street[i] != s.street[j]) for i in (0, 250)
+        min(
+            float(np.linalg.norm(s.descriptor[i] - s.descriptor[j]))
+            for j in range(600)
+            if s.street[i] != s.street[j]
+        )
+        for i in (0, 250)
     ]
     assert 0.5 < apart / np.mean(slow) < 2
     moved = s.moved(50)

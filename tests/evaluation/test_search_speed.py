@@ -31,4 +31,9 @@ def test_peers_that_there_are_not_are_refused() -> None:
     with pytest.raises(SettingsError, match="faiss=PYTHON"):
         module.search_speed(Settings().resolved(), [100], {"annoy": sys.executable})
     with pytest.raises(SettingsError, match="install faiss-cpu"):
-        module._faiss(sys.executable + "-none", np.zeros(3, np.uint64), np.zeros(1, np.uint64), np.zeros(1, np.int64))
+        module._faiss(
+            sys.executable + "-none",
+            np.zeros(3, np.uint64),
+            np.zeros(1, np.uint64),
+            np.zeros(1, np.int64),
+        )

@@ -6,10 +6,13 @@ import pytest
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.pictures.solids import Solid, View, draw_solids, top_view
 
-RED, BLUE = np.array([[200, 0, 0]], np.uint8), np.array([[0, 0, 200]], np.uint8)
+RED = np.array([[200, 0, 0]], np.uint8)
+BLUE = np.array([[0, 0, 200]], np.uint8)
 
 
-def cube(ijk: tuple[int, int, int], rgb: np.ndarray = RED, size: float = 1.0, yaw: float = 0.0) -> Solid:
+def cube(
+    ijk: tuple[int, int, int], rgb: np.ndarray = RED, size: float = 1.0, yaw: float = 0.0
+) -> Solid:
     return Solid(np.array([ijk], np.int32), rgb, size, yaw_transform(yaw))
 
 
@@ -30,7 +33,8 @@ def test_a_voxel_from_above_covers_its_place() -> None:
 
 
 def test_the_nearer_voxel_hides_the_other() -> None:
-    low, high = cube((0, 0, 0), RED), cube((0, 0, 3), BLUE)
+    low = cube((0, 0, 0), RED)
+    high = cube((0, 0, 3), BLUE)
     for solids in ([low, high], [high, low]):
         image = draw_solids(solids, top_view((0.5, 0.5, 0.0), 60, 60, 0.05))
         assert len(coloured(image, 2)) > 200
@@ -40,13 +44,15 @@ def test_the_nearer_voxel_hides_the_other() -> None:
 def test_aside_both_are_seen_one_above_the_other() -> None:
     view = View(0.3, np.radians(20), (0.5, 0.5, 2.0), 120, 120, 0.06)
     image = draw_solids([cube((0, 0, 0), RED), cube((0, 0, 3), BLUE)], view)
-    assert coloured(image, 2)[:, 1].mean() < coloured(image, 0)[:, 1].mean() - 30  # rows count downwards
+    # rows count downwards
+    assert coloured(image, 2)[:, 1].mean() < coloured(image, 0)[:, 1].mean() - 30
 
 
 def test_a_turned_grid_is_turned() -> None:
     view = top_view((0.0, 0.0, 0.0), 100, 100, 0.1)
     middle = coloured(draw_solids([cube((3, 0, 0), yaw=np.pi / 2)], view), 0).mean(0)
-    np.testing.assert_allclose(middle, view.pixels(np.array([[-0.5, 3.5, 0.5]]))[0, :2], atol=1)  # (3.5, 0.5) turned by 90 degrees
+    # (3.5, 0.5) turned by 90 degrees
+    np.testing.assert_allclose(middle, view.pixels(np.array([[-0.5, 3.5, 0.5]]))[0, :2], atol=1)
 
 
 def test_nothing_is_white_and_what_lies_outside_is_left_out() -> None:

@@ -1,4 +1,6 @@
-"""Closures against truth, with numbers that can be checked by hand: two sessions drive along x, 1 m a second."""
+"""Closures against truth, with numbers that can be checked by hand: two sessions drive along x, 1 m
+a second.
+"""
 
 import json
 from pathlib import Path
@@ -45,7 +47,9 @@ def _session(work: Workspace, name: str, start_s: int, poses: NDArray[np.float64
         **{f"{name}_{c}": np.zeros(n, np.float32) for name in ("origin", "view") for c in "xyz"},
     }
     write_table(folder.frames, contracts.table("frames", frames), METADATA)
-    write_json(folder.session_json, {"posed": True, "session_T_map": np.eye(4).tolist(), "voxel_size": 0.3})
+    write_json(
+        folder.session_json, {"posed": True, "session_T_map": np.eye(4).tolist(), "voxel_size": 0.3}
+    )
 
 
 def _closures(work: Workspace, rows: list[tuple[str, int, str, int, NDArray[np.float64]]]) -> None:
@@ -68,7 +72,9 @@ def _closures(work: Workspace, rows: list[tuple[str, int, str, int, NDArray[np.f
 
 @pytest.fixture
 def work(tmp_path: Path) -> Workspace:
-    """a drives x = 0 .. 20 at seconds 0 .. 20; b drives x = 10 .. 40 in a frame that lies 3 m to the left of a's, at 1000 .. 1030."""
+    """a drives x = 0 .. 20 at seconds 0 .. 20; b drives x = 10 .. 40 in a frame that lies 3 m to
+    the left of a's, at 1000 .. 1030.
+    """
     work = Workspace(tmp_path / "work")
     _session(work, "a", 0, _poses(np.arange(21.0)))
     _session(work, "b", 1000, _poses(np.arange(31.0)))
@@ -81,17 +87,21 @@ def work(tmp_path: Path) -> Workspace:
 
 
 def _evaluate(work: Workspace, **options: Any) -> Any:
-    return evaluate_closures(work, work.path.parent / "truth.json", load(assignments={"query.every": "2.0"}), **options)
+    return evaluate_closures(
+        work, work.path.parent / "truth.json", load(assignments={"query.every": "2.0"}), **options
+    )
 
 
 def test_errors_are_those_of_the_relative_pose(work: Workspace) -> None:
-    # b at second 1004 is at (14, 3) in common, a at second 12 at (12, 0): truly target_T_query is (2, 3, 0)
+    # b at second 1004 is at (14, 3) in common, a at second 12 at (12, 0): truly target_T_query is
+    # (2, 3, 0)
     _closures(
         work,
         [
             ("b", 1004, "a", 12, yaw_transform(0.0, (2.3, 3.4, 0.0))),  # 0.5 m off
             ("b", 1006, "a", 14, yaw_transform(np.radians(4.0), (2.0, 3.0, 0.0))),  # 4 degrees off
-            ("b", 1008, "a", 16, yaw_transform(np.radians(6.0), (2.0, 3.0, 0.0))),  # 6 degrees: false
+            # 6 degrees: false
+            ("b", 1008, "a", 16, yaw_transform(np.radians(6.0), (2.0, 3.0, 0.0))),
             ("b", 1010, "a", 18, yaw_transform(0.0, (2.0, 4.1, 0.0))),  # 1.1 m: false
         ],
     )
@@ -107,14 +117,17 @@ def test_errors_are_those_of_the_relative_pose(work: Workspace) -> None:
 def test_the_pose_between_two_samples_is_interpolated(work: Workspace) -> None:
     folder = work.path.parent
     (folder / "b.tum").write_text("1000 10 3 0 0 0 0 1\n1030 40 3 0 0 0 0 1\n")
-    (folder / "truth.json").write_text(json.dumps({"a": {"T_common_session": np.eye(4).tolist()}, "b": {"trajectory": "b.tum"}}))
+    (folder / "truth.json").write_text(
+        json.dumps({"a": {"T_common_session": np.eye(4).tolist()}, "b": {"trajectory": "b.tum"}})
+    )
     _closures(work, [("b", 1004, "a", 12, yaw_transform(0.0, (2.0, 3.0, 0.0)))])
     assert _evaluate(work).rows[0].error_m == pytest.approx(0.0, abs=1e-6)
 
 
 def test_queries_near_the_other_session_count(work: Workspace) -> None:
-    # queries of a at x = 0, 2 .. 20: b's road starts at (10, 3), so within 5 m from x = 6 on: 6 8 .. 20 are 8 queries
-    # queries of b at x = 10, 12 .. 40: a's road ends at (20, 0): within 5 m up to x = 24: 10 .. 24 are 8 queries
+    # queries of a at x = 0, 2 .. 20: b's road starts at (10, 3), so within 5 m from x = 6 on: 6 8
+    # .. 20 are 8 queries queries of b at x = 10, 12 .. 40: a's road ends at (20, 0): within 5 m up
+    # to x = 24: 10 .. 24 are 8 queries
     _closures(work, [])
     result = _evaluate(work)
     assert (result.queries, result.possible, result.answered) == (11 + 16, 16, 0)
@@ -122,7 +135,8 @@ def test_queries_near_the_other_session_count(work: Workspace) -> None:
 
 
 def test_a_closure_answers_its_query_and_the_query_at_its_other_end(work: Workspace) -> None:
-    # b's query at second 1004; the target end, a at x = 12, is a query of a itself, and answered with it; x = 10 and 14 are 2 m away: not
+    # b's query at second 1004; the target end, a at x = 12, is a query of a itself, and answered
+    # with it; x = 10 and 14 are 2 m away: not
     _closures(work, [("b", 1004, "a", 12, yaw_transform(0.0, (2.0, 3.0, 0.0)))])
     assert _evaluate(work).answered == 2
     _closures(work, [("b", 1004, "a", 12, yaw_transform(0.0, (9.0, 3.0, 0.0)))])
@@ -133,7 +147,9 @@ def test_recall_is_unknown_without_revisits(tmp_path: Path) -> None:
     work = Workspace(tmp_path / "work")
     _session(work, "a", 0, _poses(np.arange(21.0)))
     _closures(work, [])
-    (tmp_path / "truth.json").write_text(json.dumps({"a.bag": {"T_common_session": np.eye(4).tolist()}}))
+    (tmp_path / "truth.json").write_text(
+        json.dumps({"a.bag": {"T_common_session": np.eye(4).tolist()}})
+    )
     result = _evaluate(work)
     assert result.recall is None
     assert result.median_error_m is None
@@ -141,15 +157,20 @@ def test_recall_is_unknown_without_revisits(tmp_path: Path) -> None:
 
 
 def test_a_session_revisits_itself_apart_from_what_is_near(tmp_path: Path) -> None:
-    """Out to x = 100 and back: keyframes of the way back lie on those of the way out, later than 30 s and farther than 50 m of road."""
+    """Out to x = 100 and back: keyframes of the way back lie on those of the way out, later than 30
+    s and farther than 50 m of road.
+    """
     work = Workspace(tmp_path / "work")
     xs = np.r_[np.arange(0.0, 101.0, 2.0), np.arange(98.0, -1.0, -2.0)]
     _session(work, "loop", 0, _poses(xs))
     _closures(work, [])
-    (tmp_path / "truth.json").write_text(json.dumps({"loop.mcap": {"T_common_session": np.eye(4).tolist()}}))
+    (tmp_path / "truth.json").write_text(
+        json.dumps({"loop.mcap": {"T_common_session": np.eye(4).tolist()}})
+    )
     result = _evaluate(work)
-    # keyframe k and 100 - k stand at one place; those within 5 m of it reach two keyframes (4 m) farther. A query at x has a revisit
-    # when 2 * (100 - x) + 4 >= 50 m of road and as many / 2 seconds >= 30: x <= 72, both ways: x = 0, 2 .. 72 are 37 queries each
+    # keyframe k and 100 - k stand at one place; those within 5 m of it reach two keyframes (4 m)
+    # farther. A query at x has a revisit when 2 * (100 - x) + 4 >= 50 m of road and as many / 2
+    # seconds >= 30: x <= 72, both ways: x = 0, 2 .. 72 are 37 queries each
     assert (result.queries, result.possible) == (101, 74)
     assert _evaluate(work, self_closures=False).possible == 0
 
@@ -165,7 +186,10 @@ def test_closures_of_sessions_without_truth_are_not_judged(work: Workspace) -> N
 
 def test_a_tum_file_says_the_same_as_the_matrix(work: Workspace) -> None:
     folder = work.path.parent
-    lines = ["# seconds x y z qx qy qz qw", *(f"{1000 + k}.0 {10 + k} 3 0 0 0 0 1" for k in range(31))]
+    lines = [
+        "# seconds x y z qx qy qz qw",
+        *(f"{1000 + k}.0 {10 + k} 3 0 0 0 0 1" for k in range(31)),
+    ]
     (folder / "b.tum").write_text("\n".join(lines))
     truth = {"a.mcap": {"T_common_session": np.eye(4).tolist()}, "b.bag": {"trajectory": "b.tum"}}
     (folder / "truth.json").write_text(json.dumps(truth))
@@ -180,7 +204,10 @@ def test_the_error_does_not_depend_on_the_common_frame(work: Workspace) -> None:
     _closures(work, [("b", 1004, "a", 12, yaw_transform(0.1, (2.3, 3.4, 0.0)))])
     first = _evaluate(work).rows[0]
     W = yaw_transform(float(rng.uniform(-3, 3)), tuple(rng.normal(size=3) * 100))
-    truth = {"a": {"T_common_session": W.tolist()}, "b": {"T_common_session": (W @ yaw_transform(0.0, (10.0, 3.0, 0.0))).tolist()}}
+    truth = {
+        "a": {"T_common_session": W.tolist()},
+        "b": {"T_common_session": (W @ yaw_transform(0.0, (10.0, 3.0, 0.0))).tolist()},
+    }
     (work.path.parent / "truth.json").write_text(json.dumps(truth))
     second = _evaluate(work).rows[0]
     assert second.error_m == pytest.approx(first.error_m)
@@ -201,7 +228,15 @@ def test_stamps_of_a_tum_file_are_exact(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "line",
-    ["1 2 3", "a 1 2 3 0 0 0 1", "1 nan 2 3 0 0 0 1", "1 1 2 3 0 0 0 0", "1e30 1 2 3 0 0 0 1", "nan 1 2 3 0 0 0 1", "inf 0 0 0 0 0 0 1"],
+    [
+        "1 2 3",
+        "a 1 2 3 0 0 0 1",
+        "1 nan 2 3 0 0 0 1",
+        "1 1 2 3 0 0 0 0",
+        "1e30 1 2 3 0 0 0 1",
+        "nan 1 2 3 0 0 0 1",
+        "inf 0 0 0 0 0 0 1",
+    ],
 )
 def test_wrong_lines_of_a_tum_file_are_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "t.tum"
@@ -232,7 +267,9 @@ def test_wrong_truth_files_are_refused(work: Workspace, content: str) -> None:
 
 
 def test_a_matrix_that_is_no_pose_is_refused(work: Workspace) -> None:
-    (work.path.parent / "truth.json").write_text(json.dumps({"a": {"T_common_session": (2 * np.eye(4)).tolist()}}))
+    (work.path.parent / "truth.json").write_text(
+        json.dumps({"a": {"T_common_session": (2 * np.eye(4)).tolist()}})
+    )
     _closures(work, [])
     with pytest.raises(TruthError, match="rigid"):
         _evaluate(work)

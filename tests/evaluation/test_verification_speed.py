@@ -1,4 +1,6 @@
-"""Verification beside the paper's own (3.5), written out slowly, on the drawn place of the benchmark."""
+"""Verification beside the paper's own (3.5), written out slowly, on the drawn place of the
+benchmark.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,15 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.overlap import pose_matrix, tau, yaw_between
 from semloc_logs.alignment.surface import surface_of
-from semloc_logs.alignment.verify import FINE_RADII, coarse_fit, escaped, fine_fit, same_place, search_hypotheses, structure_scores
+from semloc_logs.alignment.verify import (
+    FINE_RADII,
+    coarse_fit,
+    escaped,
+    fine_fit,
+    same_place,
+    search_hypotheses,
+    structure_scores,
+)
 from semloc_logs.benchmarks.speed.verification_speed import TRUTH, Scene, scene
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import Settings
@@ -31,13 +41,18 @@ def slow_tau(s: Scene, T: F64, every: int) -> float:
     low, high = s.target.blocks.bounds()
     state = s.target.blocks.dense(low, tuple((high - low).tolist()))
     observed = np.argwhere(state != UNOBSERVED_STATE)
-    states, centres = state[tuple(observed.T)], (observed + low + 0.5) * v
+    states = state[tuple(observed.T)]
+    centres = (observed + low + 0.5) * v
     ijk, label = s.query.blocks.occupied()
     aligned = 0
     for p, c in zip((ijk[::every] + 0.5) * v, label[::every], strict=True):
         squared = ((centres - (T[:3, :3] @ p + T[:3, 3])) ** 2).sum(1)
         n = int(squared.argmin())
-        aligned += int(squared[n] < KAPPA**2 and states[n] not in (FREE_STATE, UNOBSERVED_STATE) and states[n] == c)
+        aligned += int(
+            squared[n] < KAPPA**2
+            and states[n] not in (FREE_STATE, UNOBSERVED_STATE)
+            and states[n] == c
+        )
     return aligned / len(label[::every])
 
 
@@ -49,17 +64,24 @@ def test_the_ratio_is_the_papers(made: Scene) -> None:
 
 
 def test_the_search_ranks_first_what_the_paper_ranks_first(made: Scene) -> None:
-    """The paper's ranking is by tau of the hypotheses as refined; the true one is first in both, by far."""
+    """The paper's ranking is by tau of the hypotheses as refined; the true one is first in both, by
+    far.
+    """
     v = made.target.voxel_size
     candidates = search_hypotheses(made.hypotheses, {0: made.target}, made.query, 18, 6)
-    by_paper = [tau(made.query.occupied, made.target.blocks, v, c.target_T_query, KAPPA)[0] for c in candidates]
+    by_paper = [
+        tau(made.query.occupied, made.target.blocks, v, c.target_T_query, KAPPA)[0]
+        for c in candidates
+    ]
     assert int(np.argmax(by_paper)) == 0
     assert same_place(candidates[0].target_T_query, pose_matrix(TRUTH), v)
     assert candidates[0].score > 1.3 * candidates[1].score
 
 
 def test_a_fit_escapes_to_where_more_voxels_agree(made: Scene) -> None:
-    """Started 1 m and more off, past what a coarse fit finds its way back from; the fit of the truth stays as it is."""
+    """Started 1 m and more off, past what a coarse fit finds its way back from; the fit of the
+    truth stays as it is.
+    """
     v = made.target.voxel_size
     best = search_hypotheses(made.hypotheses, {0: made.target}, made.query, 18, 6)[0]
     right = replace(best, target_T_query=pose_matrix(TRUTH))
@@ -68,11 +90,14 @@ def test_a_fit_escapes_to_where_more_voxels_agree(made: Scene) -> None:
     off = replace(best, target_T_query=pose_matrix(TRUTH + np.array([0.0, 1.1, 1.1, 0.0])))
     stuck = coarse_fit(off, made.target, made.query)
     assert not same_place(stuck.target_T_query, pose_matrix(TRUTH), v / 2)
-    assert same_place(escaped(stuck, off, made.target, made.query, 18).target_T_query, pose_matrix(TRUTH), v / 2)
+    assert same_place(
+        escaped(stuck, off, made.target, made.query, 18).target_T_query, pose_matrix(TRUTH), v / 2
+    )
 
 
 def test_the_transform_put_in_comes_back(made: Scene) -> None:
-    truth, v = pose_matrix(TRUTH), made.target.voxel_size
+    truth = pose_matrix(TRUTH)
+    v = made.target.voxel_size
     best = search_hypotheses(made.hypotheses, {0: made.target}, made.query, 18, 6)[0]
     coarse = coarse_fit(best, made.target, made.query)
     assert np.linalg.norm((inverse(truth) @ coarse.target_T_query)[:3, 3]) < FINE_RADII[0] * v

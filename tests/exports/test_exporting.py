@@ -20,7 +20,8 @@ METADATA = {"schema_version": 1}
 
 def _session(work: Workspace, name: str, poses: np.ndarray[Any, Any]) -> None:
     """Keyframes at 0, 1, ... s; the map frame lies 100 m along x in the session frame."""
-    folder, n = work.session(name), len(poses)
+    folder = work.session(name)
+    n = len(poses)
     session_T_map = yaw_transform(0.0, (100.0, 0.0, 0.0))
     stamps = 1_500_000_000 + np.arange(n) * 10**9
     columns: dict[str, Any] = {"stamp_ns": stamps, **pose_columns(poses)}
@@ -38,21 +39,37 @@ def _session(work: Workspace, name: str, poses: np.ndarray[Any, Any]) -> None:
         **{f"{name}_{c}": np.zeros(n, np.float32) for name in ("origin", "view") for c in "xyz"},
     }
     write_table(folder.frames, contracts.table("frames", frames), METADATA)
-    voxels = {"ix": [0, 2], "iy": [1, 1], "iz": [-1, 0], "label": [2, 255], "occupancy": [1.0, 2.0], "hits": [3, 4]}
-    write_table(folder.voxels / "tile=0_0/part-0.parquet", contracts.table("voxels", voxels), METADATA)
-    write_json(folder.session_json, {"posed": True, "session_T_map": session_T_map.tolist(), "voxel_size": 0.5})
+    voxels = {
+        "ix": [0, 2],
+        "iy": [1, 1],
+        "iz": [-1, 0],
+        "label": [2, 255],
+        "occupancy": [1.0, 2.0],
+        "hits": [3, 4],
+    }
+    write_table(
+        folder.voxels / "tile=0_0/part-0.parquet", contracts.table("voxels", voxels), METADATA
+    )
+    write_json(
+        folder.session_json,
+        {"posed": True, "session_T_map": session_T_map.tolist(), "voxel_size": 0.5},
+    )
 
 
 @pytest.fixture
 def work(tmp_path: Path) -> Workspace:
     work = Workspace(tmp_path / "work")
     _session(work, "a", np.array([yaw_transform(0.0, (x, 0.0, 0.0)) for x in (0.0, 3.0)]))
-    _session(work, "b", np.array([yaw_transform(np.pi / 2, (x, 0.0, 0.0)) for x in (0.0, 1.0, 2.0)]))
+    _session(
+        work, "b", np.array([yaw_transform(np.pi / 2, (x, 0.0, 0.0)) for x in (0.0, 1.0, 2.0)])
+    )
     return work
 
 
 def _close(work: Workspace) -> None:
-    """b's keyframe 2 is seen from a's keyframe 1, turned by 90 degrees; it is sure of x in the target's axes and unsure of y."""
+    """b's keyframe 2 is seen from a's keyframe 1, turned by 90 degrees; it is sure of x in the
+    target's axes and unsure of y.
+    """
     covariance = np.diag([0.01, 0.04, 0.09, 0.001, 0.002, 0.004])
     columns: dict[str, Any] = {
         "query_session": ["b"],
@@ -94,9 +111,15 @@ def test_ply_has_voxel_centres_in_the_session_frame(work: Workspace, tmp_path: P
     head, _, body = paths[0].read_bytes().partition(b"end_header\n")
     assert b"element vertex 2\n" in head
     kinds = {"float": "<f4", "uchar": "u1"}
-    fields = [(line.split()[2], kinds[line.split()[1]]) for line in head.decode().splitlines() if line.startswith("property")]
+    fields = [
+        (line.split()[2], kinds[line.split()[1]])
+        for line in head.decode().splitlines()
+        if line.startswith("property")
+    ]
     rows = np.frombuffer(body, fields)
-    np.testing.assert_allclose([rows[c] for c in "xyz"], [[100.25, 101.25], [0.75, 0.75], [-0.25, 0.25]])
+    np.testing.assert_allclose(
+        [rows[c] for c in "xyz"], [[100.25, 101.25], [0.75, 0.75], [-0.25, 0.25]]
+    )
     assert rows["label"].tolist() == [2, 255]
     assert rows[["red", "green", "blue"]].tolist() == [(70, 70, 70), (128, 128, 128)]
 
@@ -120,7 +143,9 @@ def test_g2o_has_odometry_and_closures(work: Workspace, tmp_path: Path) -> None:
     np.testing.assert_allclose(closure[:7], [1, 2, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-9)
     full = np.zeros((6, 6))
     full[np.triu_indices(6)] = closure[7:]
-    np.testing.assert_allclose(np.diag(full), [1 / 0.04, 1 / 0.01, 1 / 0.09, 1 / 0.002, 1 / 0.001, 1 / 0.004])
+    np.testing.assert_allclose(
+        np.diag(full), [1 / 0.04, 1 / 0.01, 1 / 0.09, 1 / 0.002, 1 / 0.001, 1 / 0.004]
+    )
     np.testing.assert_allclose(full - np.diag(np.diag(full)), 0, atol=1e-9)
 
 

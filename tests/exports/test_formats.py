@@ -28,19 +28,39 @@ STAMP = 1_700_000_000 * 10**9  # 14 November 2023
 Cloud = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]  # xyz, train id, rgb
 
 
-def make(work: Workspace, session_T_map: NDArray[np.float64], posed: bool = True) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Two tiles in row groups of 50 voxels, two keyframes; returns the centres in the map frame and classes, in the files' order."""
-    rng, folder = np.random.default_rng(1), work.session("town")
-    every, labels = [], []
+def make(
+    work: Workspace, session_T_map: NDArray[np.float64], posed: bool = True
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Two tiles in row groups of 50 voxels, two keyframes; returns the centres in the map frame and
+    classes, in the files' order.
+    """
+    rng = np.random.default_rng(1)
+    folder = work.session("town")
+    every = []
+    labels = []
     for tile in (-1, 0):
         ijk = rng.integers(0, 256, (400, 3)) + np.array([256 * tile, 0, -100])
         ijk = ijk[np.argsort(ijk[:, 0])]
         label = rng.choice(np.array([0, 1, 2, 5, 8, 9, 13, 18, 255], np.uint8), 400)
-        columns = {"ix": ijk[:, 0], "iy": ijk[:, 1], "iz": ijk[:, 2], "label": label, "occupancy": np.ones(400), "hits": np.ones(400, int)}
-        write_table(folder.voxels / f"tile={tile}_0/part-0.parquet", contracts.table("voxels", columns), METADATA, row_group=50)
+        columns = {
+            "ix": ijk[:, 0],
+            "iy": ijk[:, 1],
+            "iz": ijk[:, 2],
+            "label": label,
+            "occupancy": np.ones(400),
+            "hits": np.ones(400, int),
+        }
+        write_table(
+            folder.voxels / f"tile={tile}_0/part-0.parquet",
+            contracts.table("voxels", columns),
+            METADATA,
+            row_group=50,
+        )
         every.append((ijk + 0.5) * VOXEL)
         labels.append(label)
-    poses = np.array([yaw_transform(0.0, (0.0, 0.0, 0.0)), yaw_transform(np.pi / 2, (10.0, 0.0, 0.0))])
+    poses = np.array(
+        [yaw_transform(0.0, (0.0, 0.0, 0.0)), yaw_transform(np.pi / 2, (10.0, 0.0, 0.0))]
+    )
     frames = {
         "stamp_ns": [STAMP, STAMP + 1],
         "keyframe": [0, 1],
@@ -60,15 +80,32 @@ def make(work: Workspace, session_T_map: NDArray[np.float64], posed: bool = True
     ]
     folder.keyframes.mkdir()
     list(keep_keyframes(folder.keyframes, [1, 2], clouds, METADATA))
-    write_json(folder.session_json, {"posed": posed, "session_T_map": session_T_map.tolist(), "voxel_size": VOXEL})
+    write_json(
+        folder.session_json,
+        {"posed": posed, "session_T_map": session_T_map.tolist(), "voxel_size": VOXEL},
+    )
     return np.concatenate(every), np.concatenate(labels)
 
 
 def read_pcd(path: Path) -> Cloud:
     """PCD v0.7 by its specification."""
     head, _, body = path.read_bytes().partition(b"DATA binary\n")
-    says = {line.split()[0]: line.split()[1:] for line in head.decode().splitlines() if not line.startswith("#")}
-    assert list(says) == ["VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS"]
+    says = {
+        line.split()[0]: line.split()[1:]
+        for line in head.decode().splitlines()
+        if not line.startswith("#")
+    }
+    assert list(says) == [
+        "VERSION",
+        "FIELDS",
+        "SIZE",
+        "TYPE",
+        "COUNT",
+        "WIDTH",
+        "HEIGHT",
+        "VIEWPOINT",
+        "POINTS",
+    ]
     assert (says["VERSION"], says["COUNT"], says["HEIGHT"]) == (["0.7"], ["1"] * 5, ["1"])
     kinds = [f"<{t.lower()}{s}" for t, s in zip(says["TYPE"], says["SIZE"], strict=True)]
     rows = np.frombuffer(body, list(zip(says["FIELDS"], kinds, strict=True)))
@@ -87,17 +124,29 @@ def read_ply(path: Path) -> Cloud:
     lines = head.decode().splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
     kinds = {"float": "<f4", "double": "<f8", "uchar": "u1"}
-    rows = np.frombuffer(body, [(line.split()[2], kinds[line.split()[1]]) for line in lines if line.startswith("property")])
+    rows = np.frombuffer(
+        body,
+        [
+            (line.split()[2], kinds[line.split()[1]])
+            for line in lines
+            if line.startswith("property")
+        ],
+    )
     assert f"element vertex {len(rows)}" in lines
     return tuple(
-        np.stack([rows[c] for c in names], 1).astype(t) for names, t in (("xyz", float), (("label",), int), (("red", "green", "blue"), int))
+        np.stack([rows[c] for c in names], 1).astype(t)
+        for names, t in (("xyz", float), (("label",), int), (("red", "green", "blue"), int))
     )  # type: ignore[return-value]
 
 
 def read_las(path: Path) -> Cloud:
     laspy = pytest.importorskip("laspy")
     las = laspy.read(path)
-    assert (str(las.header.version), las.header.point_format.id, las.header.creation_date) == ("1.4", 7, date(2023, 11, 14))
+    assert (str(las.header.version), las.header.point_format.id, las.header.creation_date) == (
+        "1.4",
+        7,
+        date(2023, 11, 14),
+    )
     label = np.asarray(las.train_id).astype(int)
     expected = {0: 2, 1: 2, 9: 2, 8: 5, 2: 6, 255: 1, 5: 69, 13: 77, 18: 82}
     assert np.asarray(las.classification).tolist() == [expected[c] for c in label.tolist()]
@@ -134,7 +183,11 @@ def test_clouds_come_back(form: str, frame: Any, tmp_path: Path) -> None:
     assert path.name == f"town.{form}"
     xyz, found, rgb = READERS[form](path)
     assert found.ravel().tolist() == label.tolist()
-    np.testing.assert_allclose(xyz, apply(NEAR, centres) if frame == "session" else centres, atol=6e-4 if form[:2] == "la" else 6e-5)
+    np.testing.assert_allclose(
+        xyz,
+        apply(NEAR, centres) if frame == "session" else centres,
+        atol=6e-4 if form[:2] == "la" else 6e-5,
+    )
     assert rgb.tolist() == colours(label).tolist()
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
@@ -143,9 +196,13 @@ def test_clouds_come_back(form: str, frame: Any, tmp_path: Path) -> None:
 def test_only_what_lies_in_the_bounds(form: str, tmp_path: Path) -> None:
     centres, label = make(Workspace(tmp_path), NEAR)
     bounds = (40.0, -10.0, 90.0, 60.0)
-    (path,) = export(Workspace(tmp_path), ["town"], form, tmp_path / "out", Selection(bounds=bounds))
+    (path,) = export(
+        Workspace(tmp_path), ["town"], form, tmp_path / "out", Selection(bounds=bounds)
+    )
     placed = apply(NEAR, centres)
-    inside = (placed[:, 0] >= 40) & (placed[:, 0] < 90) & (placed[:, 1] >= -10) & (placed[:, 1] < 60)
+    inside = (
+        (placed[:, 0] >= 40) & (placed[:, 0] < 90) & (placed[:, 1] >= -10) & (placed[:, 1] < 60)
+    )
     assert 20 < inside.sum() < 400
     xyz, found, _ = READERS[form](path)
     np.testing.assert_allclose(xyz, placed[inside], atol=6e-4)
@@ -156,7 +213,9 @@ def test_bounds_skip_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     from semloc_logs.closures.query import SessionMap
 
     make(Workspace(tmp_path), NEAR)
-    points = SessionPoints(SessionMap(Workspace(tmp_path).session("town")), "voxels", "map", (10.0, -1e9, 14.0, 1e9))
+    points = SessionPoints(
+        SessionMap(Workspace(tmp_path).session("town")), "voxels", "map", (10.0, -1e9, 14.0, 1e9)
+    )
     read: list[bool] = []
     original = points._may_hold
 
@@ -166,13 +225,20 @@ def test_bounds_skip_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(points, "_may_hold", noted)
     assert points.count() == sum(len(label) for _, label in points.batches()) > 0
-    assert (len(read) // 2, sum(read) // 2) in {(16, 1), (16, 2)}  # 16 row groups, each 50 columns of x wide
+    # 16 row groups, each 50 columns of x wide
+    assert (len(read) // 2, sum(read) // 2) in {(16, 1), (16, 2)}
 
 
 @pytest.mark.parametrize("form", POINT_FORMATS)
 def test_an_empty_box_is_a_file_without_points(form: str, tmp_path: Path) -> None:
     make(Workspace(tmp_path), NEAR)
-    (path,) = export(Workspace(tmp_path), [], form, tmp_path / "out", Selection(bounds=(1e6, 1e6, 1e6 + 1, 1e6 + 1)))
+    (path,) = export(
+        Workspace(tmp_path),
+        [],
+        form,
+        tmp_path / "out",
+        Selection(bounds=(1e6, 1e6, 1e6 + 1, 1e6 + 1)),
+    )
     if form == "xyz":
         assert path.read_text() == ""
     elif form in ("las", "laz"):
@@ -204,7 +270,8 @@ def test_points_of_keyframes(form: str, tmp_path: Path) -> None:
     if form in ("las", "laz"):
         assert pytest.importorskip("laspy").read(path).classification.tolist() == [2, 6, 5]
     xyz, label, _ = READERS[form](path)
-    np.testing.assert_allclose(xyz, [[1, 2, 3], [4, 5, 6], [8, 1, 3]], atol=6e-4)  # the second keyframe looks along y from x = 10
+    # the second keyframe looks along y from x = 10
+    np.testing.assert_allclose(xyz, [[1, 2, 3], [4, 5, 6], [8, 1, 3]], atol=6e-4)
     assert label.ravel().tolist() == [0, 2, 8]
 
 
@@ -220,12 +287,17 @@ def test_a_missing_library_is_named_with_the_way_to_get_it(
 ) -> None:
     make(Workspace(tmp_path), NEAR)
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(SemlocError, match=rf"{package}, which is not installed: run pip install 'semloc_logs\[las\]'"):
+    with pytest.raises(
+        SemlocError,
+        match=rf"{package}, which is not installed: run pip install 'semloc_logs\[las\]'",
+    ):
         export(Workspace(tmp_path), [], form, tmp_path / "out")
     assert not list((tmp_path / "out").iterdir())
 
 
-def test_a_failed_export_leaves_the_older_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_export_leaves_the_older_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     make(Workspace(tmp_path), NEAR)
     (path,) = export(Workspace(tmp_path), [], "pcd", tmp_path / "out")
     before = path.read_bytes()
@@ -257,7 +329,8 @@ def test_asprs_classes_cover_every_byte() -> None:
     table = formats_module.asprs_classes()
     assert table.shape == (256,)
     assert (table >= 1).all()
-    assert len({int(table[c]) for c in range(19) if table[c] >= 64}) == 19 - 5  # users' classes are not shared
+    # users' classes are not shared
+    assert len({int(table[c]) for c in range(19) if table[c] >= 64}) == 19 - 5
 
 
 def test_the_command_exports_and_refuses_what_makes_no_sense(tmp_path: Path) -> None:
@@ -268,11 +341,20 @@ def test_the_command_exports_and_refuses_what_makes_no_sense(tmp_path: Path) -> 
     make(Workspace(tmp_path), NEAR)
 
     def run(*arguments: str) -> tuple[int, str]:
-        done = CliRunner().invoke(program, ["export", "-w", str(tmp_path), *arguments], prog_name="semloc")
+        done = CliRunner().invoke(
+            program, ["export", "-w", str(tmp_path), *arguments], prog_name="semloc"
+        )
         return done.exit_code, done.output
 
-    assert run("--format", "xyz", "--bounds", "-50", "-50", "50", "50", "--frame", "map") == (0, f"{tmp_path}/export/town.xyz\n")
+    assert run("--format", "xyz", "--bounds", "-50", "-50", "50", "50", "--frame", "map") == (
+        0,
+        f"{tmp_path}/export/town.xyz\n",
+    )
     assert 0 < len((tmp_path / "export/town.xyz").read_text().splitlines()) < 800
-    for wrong in (("tum", "--frame", "map"), ("xyz", "--bounds", "1", "0", "1", "5"), ("xyz", "--bounds", "nan", "0", "1", "5")):
+    for wrong in (
+        ("tum", "--frame", "map"),
+        ("xyz", "--bounds", "1", "0", "1", "5"),
+        ("xyz", "--bounds", "nan", "0", "1", "5"),
+    ):
         code, said = run("--format", *wrong)
         assert code == 2, said

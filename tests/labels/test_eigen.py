@@ -12,7 +12,8 @@ F64 = NDArray[np.float64]
 
 
 def eigen_all(matrices: F64) -> tuple[F64, F64]:
-    values, vectors = np.empty(matrices.shape[:2]), np.empty(matrices.shape)
+    values = np.empty(matrices.shape[:2])
+    vectors = np.empty(matrices.shape)
     for a, w, v in zip(matrices.copy(), values, vectors, strict=True):
         eigen(a, w, v)
     return values, vectors
@@ -30,11 +31,24 @@ def test_as_numpy_says() -> None:
     expected = np.linalg.eigh(a)[0]
     size = np.abs(expected).max(1, keepdims=True)
     np.testing.assert_allclose(values / size, expected / size, atol=1e-13)
-    np.testing.assert_allclose(a @ vectors / size[..., None], vectors * values[:, None] / size[..., None], atol=1e-12)
-    np.testing.assert_allclose(vectors.transpose(0, 2, 1) @ vectors, np.tile(np.eye(3), (2000, 1, 1)), atol=1e-13)
+    np.testing.assert_allclose(
+        a @ vectors / size[..., None], vectors * values[:, None] / size[..., None], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        vectors.transpose(0, 2, 1) @ vectors, np.tile(np.eye(3), (2000, 1, 1)), atol=1e-13
+    )
 
 
-@pytest.mark.parametrize("a", [np.zeros((3, 3)), np.eye(3), np.diag([3.0, 1.0, 1.0]), np.ones((3, 3)), np.diag([0.0, 0.0, 1e-30])])
+@pytest.mark.parametrize(
+    "a",
+    [
+        np.zeros((3, 3)),
+        np.eye(3),
+        np.diag([3.0, 1.0, 1.0]),
+        np.ones((3, 3)),
+        np.diag([0.0, 0.0, 1e-30]),
+    ],
+)
 def test_equal_eigenvalues(a: F64) -> None:
     values, vectors = eigen_all(a[None])
     np.testing.assert_allclose(values[0], np.linalg.eigvalsh(a), atol=1e-15)
@@ -49,4 +63,6 @@ def test_any_matrix_is_put_together_again(upper: list[float]) -> None:
     a = a + np.triu(a, 1).T
     values, vectors = eigen_all(a[None])
     assert values[0].tolist() == sorted(values[0])
-    np.testing.assert_allclose(vectors[0] @ np.diag(values[0]) @ vectors[0].T, a, atol=1e-9 * (1 + np.abs(a).max()))
+    np.testing.assert_allclose(
+        vectors[0] @ np.diag(values[0]) @ vectors[0].T, a, atol=1e-9 * (1 + np.abs(a).max())
+    )

@@ -11,7 +11,12 @@ from semloc_logs.numerics.local_shape import shape
 F64 = NDArray[np.float64]
 
 
-def plane(rng: np.random.Generator, n: int, low: tuple[float, float, float], high: tuple[float, float, float]) -> F64:
+def plane(
+    rng: np.random.Generator,
+    n: int,
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+) -> F64:
     return rng.uniform(low, high, (n, 3)) + rng.normal(0, 0.01, (n, 3))
 
 
@@ -22,8 +27,15 @@ def street(rng: np.random.Generator, slope: float = 0.0) -> dict[int, F64]:
     bush *= (rng.uniform(0, 1, 1500) ** (1 / 3) / np.linalg.norm(bush, axis=1))[:, None]
     parts = {
         ROAD: plane(rng, 8000, (-15, -15, 0), (15, 15, 0)),
-        BUILDING: np.concatenate([plane(rng, 4000, (-15, 12, 0.6), (15, 12, 7)), plane(rng, 2500, (-15, 12.5, 7.5), (15, 15, 7.5))]),
-        POLE: np.c_[3 + 0.05 * np.cos(angle), -4 + 0.05 * np.sin(angle), np.linspace(0.5, 4.5, 120)],
+        BUILDING: np.concatenate(
+            [
+                plane(rng, 4000, (-15, 12, 0.6), (15, 12, 7)),
+                plane(rng, 2500, (-15, 12.5, 7.5), (15, 15, 7.5)),
+            ]
+        ),
+        POLE: np.c_[
+            3 + 0.05 * np.cos(angle), -4 + 0.05 * np.sin(angle), np.linspace(0.5, 4.5, 120)
+        ],
         VEGETATION: bush * 1.5 + [-6, -6, 2.4],
     }
     return {k: p + np.c_[np.zeros((len(p), 2)), slope * p[:, 0]] for k, p in parts.items()}
@@ -74,7 +86,9 @@ def test_classes_do_not_depend_on_the_order_of_points_or_on_where_the_map_begins
     assert (classify(points + away, origin + away) == found).mean() > 0.999
 
 
-def slow_shape(points: F64, i: int, neighbours: int, radius: float) -> tuple[F64, F64, float, float, float]:
+def slow_shape(
+    points: F64, i: int, neighbours: int, radius: float
+) -> tuple[F64, F64, float, float, float]:
     distance = np.linalg.norm(points - points[i], axis=1)
     near = np.argsort(distance, kind="stable")[:neighbours]
     near = near[distance[near] < radius]
@@ -93,11 +107,15 @@ def test_shape_is_that_of_the_covariance_of_the_neighbours(radius: float) -> Non
         normal, direction, linear, planar, scattered = slow_shape(points, i, 12, radius)
         assert abs(s.normal[i] @ normal) > 1 - 1e-5
         assert abs(s.direction[i] @ direction) > 1 - 1e-5
-        np.testing.assert_allclose([s.linear[i], s.planar[i], s.scattered[i]], [linear, planar, scattered], atol=1e-5)
+        np.testing.assert_allclose(
+            [s.linear[i], s.planar[i], s.scattered[i]], [linear, planar, scattered], atol=1e-5
+        )
 
 
 def test_points_without_neighbours_are_scattered() -> None:
-    s = shape(np.array([[0.0, 0, 0], [10, 0, 0], [20, 0, 0], [30, 0, 0], [40, 0, 0]]), 4, radius=1.0)
+    s = shape(
+        np.array([[0.0, 0, 0], [10, 0, 0], [20, 0, 0], [30, 0, 0], [40, 0, 0]]), 4, radius=1.0
+    )
     assert s.scattered.tolist() == [1] * 5
     assert np.isfinite(s.normal).all()
     same = shape(np.ones((6, 3)), 4)  # all in one place

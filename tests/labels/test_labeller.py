@@ -1,4 +1,6 @@
-"""Where the classes of a session come from, over logs in memory and over the real drive with a camera."""
+"""Where the classes of a session come from, over logs in memory and over the real drive with a
+camera.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,16 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from semloc_logs.errors import LogError, SettingsError
-from semloc_logs.frames import Camera, Frame, Header, ImageFrame, LabelNames, LidarFrame, PoseSample, TransformSample
+from semloc_logs.frames import (
+    Camera,
+    Frame,
+    Header,
+    ImageFrame,
+    LabelNames,
+    LidarFrame,
+    PoseSample,
+    TransformSample,
+)
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.log import Message, Stream
 from semloc_logs.logs.session.session import Session
@@ -41,13 +52,17 @@ class FakeLog:
 
     def __init__(self, frames: Sequence[Frame]) -> None:
         self._frames = sorted(frames, key=lambda f: f.header.log_time_ns)
-        self.path, self.format, self.encoding = Path("drive.mcap"), "mcap", "ros2"
+        self.path = Path("drive.mcap")
+        self.format = "mcap"
+        self.encoding = "ros2"
         self.start_ns, self.end_ns, self.problems = 0, 10**10, list[str]()
         topics = [f.header.topic for f in frames]
         kinds = {f.header.topic: TYPES[type(f)] for f in frames}
         if "/lidar/label_space" in kinds:
             kinds["/lidar/label_space"] = "std_msgs/msg/String"
-        self.streams = [Stream(t, kind, "cdr", topics.count(t)) for t, kind in sorted(kinds.items())]
+        self.streams = [
+            Stream(t, kind, "cdr", topics.count(t)) for t, kind in sorted(kinds.items())
+        ]
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         return iter(())
@@ -63,20 +78,37 @@ def header(topic: str, ms: float, frame_id: str = "") -> Header:
     return Header(topic, round(ms * MS), round(ms * MS), frame_id)
 
 
-def sweep(ms: float, label: Sequence[int] | None = None, points: NDArray[np.float32] = POINTS) -> LidarFrame:
-    return LidarFrame(header("/lidar/points", ms, "base_link"), points, None if label is None else np.array(label, np.uint32))
+def sweep(
+    ms: float, label: Sequence[int] | None = None, points: NDArray[np.float32] = POINTS
+) -> LidarFrame:
+    return LidarFrame(
+        header("/lidar/points", ms, "base_link"),
+        points,
+        None if label is None else np.array(label, np.uint32),
+    )
 
 
 def camera(topic: str = "/cam/camera_info", frame_id: str = "optical") -> Camera:
     K = np.array([[50.0, 0, 49.5], [0, 50, 49.5], [0, 0, 1]])
-    return Camera(header(topic, 0, frame_id), 100, 100, K, np.zeros(0), np.eye(3), np.zeros((3, 4)), "plumb_bob")
+    return Camera(
+        header(topic, 0, frame_id),
+        100,
+        100,
+        K,
+        np.zeros(0),
+        np.eye(3),
+        np.zeros((3, 4)),
+        "plumb_bob",
+    )
 
 
 def static(child: str = "optical", pose: NDArray[np.float64] = OPTICAL) -> TransformSample:
     return TransformSample(header("/tf_static", 0, "base_link"), child, pose, True)
 
 
-def halves(ms: float, left: Any, right: Any, topic: str = "/cam/labels", frame_id: str = "optical") -> ImageFrame:
+def halves(
+    ms: float, left: Any, right: Any, topic: str = "/cam/labels", frame_id: str = "optical"
+) -> ImageFrame:
     """A picture of two labels, ids or colours."""
     image = np.zeros((100, 100, *np.shape(left)), np.uint8)
     image[:, :50], image[:, 50:] = left, right
@@ -87,18 +119,32 @@ def classes(frames: Sequence[Frame], **settings: Any) -> tuple[list[list[int]], 
     """Classes of the points of every cloud, and the labeller that said so."""
     session = Session([FakeLog(frames)])
     labeller = Labeller(Labels(**settings), session)
-    taken = [(labeller.take(c, np.arange(len(c.points))), c.points) for c in session.clouds(labeller.on_image, labeller.images)]
+    taken = [
+        (labeller.take(c, np.arange(len(c.points))), c.points)
+        for c in session.clouds(labeller.on_image, labeller.images)
+    ]
     labeller.conclude()
     json.dumps(labeller.to_json())
-    return [labeller.labels(i, points, ORIGIN, ids, 1.0).tolist() for i, (ids, points) in enumerate(taken)], labeller
+    return [
+        labeller.labels(i, points, ORIGIN, ids, 1.0).tolist()
+        for i, (ids, points) in enumerate(taken)
+    ], labeller
 
 
 def test_the_log_says_what_its_ids_mean() -> None:
     names = {0: "unlabeled", 1: "Tree", 2: "street", 3: "quux"}
-    found, labeller = classes([LabelNames(header("/lidar/label_info", 0), names=names), sweep(10, [1, 2, 3])])
+    found, labeller = classes(
+        [LabelNames(header("/lidar/label_info", 0), names=names), sweep(10, [1, 2, 3])]
+    )
     assert found == [[8, ROAD, 255]]
-    assert labeller.to_json()["spaces"]["/lidar/points"] == {"space": "/lidar/label_info", "said_by": "log", "colours": False}
-    assert labeller.notes == ["Classes of /lidar/points that mean nothing here are unlabelled: quux."]
+    assert labeller.to_json()["spaces"]["/lidar/points"] == {
+        "space": "/lidar/label_info",
+        "said_by": "log",
+        "colours": False,
+    }
+    assert labeller.notes == [
+        "Classes of /lidar/points that mean nothing here are unlabelled: quux."
+    ]
 
 
 def test_a_space_that_the_log_names_instead_of_a_guess() -> None:
@@ -109,15 +155,25 @@ def test_a_space_that_the_log_names_instead_of_a_guess() -> None:
     assert labeller.to_json()["spaces"]["/lidar/points"]["said_by"] == "log"
     found, _ = classes([said, sweep(10, ids)], space="cityscapes_ids")
     assert found == [[ROAD, 1, BUILDING]]
-    found, labeller = classes([LabelNames(header("/lidar/label_space", 0), space="/etc/passwd.yaml"), sweep(10, ids)])
-    assert labeller.to_json()["spaces"]["/lidar/points"] == {"space": "cityscapes", "said_by": "guess", "colours": False}
+    found, labeller = classes(
+        [LabelNames(header("/lidar/label_space", 0), space="/etc/passwd.yaml"), sweep(10, ids)]
+    )
+    assert labeller.to_json()["spaces"]["/lidar/points"] == {
+        "space": "cityscapes",
+        "said_by": "guess",
+        "colours": False,
+    }
 
 
 def test_a_guess_looks_at_all_keyframes_and_is_recorded() -> None:
     found, labeller = classes([sweep(10, [0, 10, 10]), sweep(200, [40, 40, 50])])
     assert found == [[255, CAR, CAR], [ROAD, ROAD, BUILDING]]
     assert labeller.source == "log"
-    assert labeller.to_json()["spaces"]["/lidar/points"] == {"space": "semantickitti", "said_by": "guess", "colours": False}
+    assert labeller.to_json()["spaces"]["/lidar/points"] == {
+        "space": "semantickitti",
+        "said_by": "guess",
+        "colours": False,
+    }
     assert "semantickitti by their looks" in labeller.notes[0]
 
 
@@ -131,7 +187,14 @@ def test_labels_that_are_all_zero_are_none() -> None:
 
 
 def test_label_images_are_painted_onto_the_lidar() -> None:
-    frames: list[Frame] = [static(), camera(), halves(0, 5, 2), sweep(0), halves(100, 13, 13), sweep(100)]
+    frames: list[Frame] = [
+        static(),
+        camera(),
+        halves(0, 5, 2),
+        sweep(0),
+        halves(100, 13, 13),
+        sweep(100),
+    ]
     found, labeller = classes(frames)
     assert found == [[POLE, BUILDING, 255], [CAR, CAR, 255]]
     content = labeller.to_json()
@@ -142,34 +205,73 @@ def test_label_images_are_painted_onto_the_lidar() -> None:
 
 
 def test_colours_and_those_that_the_palette_does_not_have() -> None:
-    road, odd = (128, 64, 128), (1, 2, 3)
-    found, labeller = classes([static(), camera(), halves(0, road, odd), sweep(0), halves(100, road, road), sweep(100)])
+    road = (128, 64, 128)
+    odd = (1, 2, 3)
+    found, labeller = classes(
+        [static(), camera(), halves(0, road, odd), sweep(0), halves(100, road, road), sweep(100)]
+    )
     assert found == [[ROAD, 255, 255], [ROAD, ROAD, 255]]
-    assert labeller.to_json()["spaces"]["/cam/labels"] == {"space": "cityscapes", "said_by": "guess", "colours": True}
-    assert labeller.notes[1] == "1 points have colours of /cam/labels that cityscapes does not have and are unlabelled: (1, 2, 3)."
+    assert labeller.to_json()["spaces"]["/cam/labels"] == {
+        "space": "cityscapes",
+        "said_by": "guess",
+        "colours": True,
+    }
+    assert (
+        labeller.notes[1]
+        == "1 points have colours of /cam/labels that cityscapes does not have and are unlabelled: (1, 2, 3)."
+    )
 
 
 def test_without_poses_the_picture_has_to_be_of_the_same_time() -> None:
-    found, _ = classes([static(), camera(), halves(0, 5, 2), sweep(40), sweep(70), halves(200, 13, 13), sweep(190)])
+    found, _ = classes(
+        [static(), camera(), halves(0, 5, 2), sweep(40), sweep(70), halves(200, 13, 13), sweep(190)]
+    )
     assert found == [[POLE, BUILDING, 255], [255, 255, 255], [CAR, CAR, 255]]
 
 
 def test_with_poses_the_motion_between_picture_and_cloud_is_taken_out() -> None:
-    """The vehicle turns by 90 degrees a second; 200 ms later what was on the left lies straight ahead, 18 degrees further right."""
-    poses = [PoseSample(header("/odom", ms, "odom"), "base_link", yaw_transform(np.radians(0.09 * ms))) for ms in range(0, 420, 10)]
+    """The vehicle turns by 90 degrees a second; 200 ms later what was on the left lies straight
+    ahead, 18 degrees further right.
+    """
+    poses = [
+        PoseSample(header("/odom", ms, "odom"), "base_link", yaw_transform(np.radians(0.09 * ms)))
+        for ms in range(0, 420, 10)
+    ]
     points = np.array([[10.0, 0.7, 0], [10.0, -0.7, 0]], np.float32)
-    frames: list[Frame] = [static(), camera(), *poses, halves(0, 5, 2), halves(400, 5, 2), sweep(150, points=points)]
+    frames: list[Frame] = [
+        static(),
+        camera(),
+        *poses,
+        halves(0, 5, 2),
+        halves(400, 5, 2),
+        sweep(150, points=points),
+    ]
     found, _ = classes(frames)
     assert found == [[POLE, POLE]]  # at 13.5 degrees to the left in the first picture
-    still = [PoseSample(header("/odom", ms, "odom"), "base_link", np.eye(4)) for ms in range(0, 420, 10)]
-    stood: list[Frame] = [static(), camera(), *still, halves(0, 5, 2), halves(400, 5, 2), sweep(150, points=points)]
+    still = [
+        PoseSample(header("/odom", ms, "odom"), "base_link", np.eye(4)) for ms in range(0, 420, 10)
+    ]
+    stood: list[Frame] = [
+        static(),
+        camera(),
+        *still,
+        halves(0, 5, 2),
+        halves(400, 5, 2),
+        sweep(150, points=points),
+    ]
     found, _ = classes(stood)
     assert found == [[POLE, BUILDING]]
 
 
 def test_two_cameras() -> None:
     back = yaw_transform(np.pi) @ OPTICAL
-    frames: list[Frame] = [static(), static("rear", back), camera(), camera("/rear/camera_info", "rear"), sweep(0)]
+    frames: list[Frame] = [
+        static(),
+        static("rear", back),
+        camera(),
+        camera("/rear/camera_info", "rear"),
+        sweep(0),
+    ]
     frames += [halves(0, 5, 2), halves(0, 13, 13, "/rear/labels", "rear")]
     found, labeller = classes(frames)
     assert found == [[POLE, BUILDING, CAR]]
@@ -189,14 +291,21 @@ def test_cameras_that_cannot_be_placed_are_said() -> None:
 def by_brightness(folder: Path, rows: int, columns: int) -> dict[str, Any]:
     """A model that calls what is bright building and what is dark car."""
     weights = np.stack([np.full((3, 1, 1), 1 / 3, np.float32), np.zeros((3, 1, 1), np.float32)])
-    stored = [numpy_helper.from_array(weights, "w"), numpy_helper.from_array(np.array([0, 0.3], np.float32), "b")]
+    stored = [
+        numpy_helper.from_array(weights, "w"),
+        numpy_helper.from_array(np.array([0, 0.3], np.float32), "b"),
+    ]
     x = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3, rows, columns])
     y = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, 2, rows, columns])
-    graph = helper.make_graph([helper.make_node("Conv", ["x", "w", "b"], ["y"])], "brightness", [x], [y], stored)
+    graph = helper.make_graph(
+        [helper.make_node("Conv", ["x", "w", "b"], ["y"])], "brightness", [x], [y], stored
+    )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)])
     model.ir_version = 8
     onnx.save(model, str(folder / "model.onnx"))
-    (folder / "spec.yaml").write_text(f"input: {{size: [{rows}, {columns}]}}\nclasses: [building, car]\n")
+    (folder / "spec.yaml").write_text(
+        f"input: {{size: [{rows}, {columns}]}}\nclasses: [building, car]\n"
+    )
     return {"source": "onnx", "model": folder / "model.onnx", "spec": folder / "spec.yaml"}
 
 
@@ -226,7 +335,9 @@ def test_a_real_drive_without_poses(shared: Path, tmp_path: Path) -> None:
     from semloc_logs.logs.session.session import open_session
 
     settings = by_brightness(tmp_path, 94, 311)
-    session = open_session([shared / "logs" / "kitti_drive_camera_lidar.mcap"], min_range=0.9, max_range=80.0)
+    session = open_session(
+        [shared / "logs" / "kitti_drive_camera_lidar.mcap"], min_range=0.9, max_range=80.0
+    )
     try:
         labeller = Labeller(Labels(**settings), session)
         clouds = session.clouds(labeller.on_image, labeller.images)

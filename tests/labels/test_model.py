@@ -1,4 +1,6 @@
-"""A model that classifies by colour: its input as the spec says, its output as classes, and what is said when they do not fit."""
+"""A model that classifies by colour: its input as the spec says, its output as classes, and what is
+said when they do not fit.
+"""
 
 from __future__ import annotations
 
@@ -24,34 +26,61 @@ Pixels = NDArray[np.uint8]
 
 
 def save_model(
-    path: Path, rows: int = 8, columns: int = 16, nhwc: bool = False, ids: bool = False, classes: int = 3, times: int = 1, plus: int = 0
+    path: Path,
+    rows: int = 8,
+    columns: int = 16,
+    nhwc: bool = False,
+    ids: bool = False,
+    classes: int = 3,
+    times: int = 1,
+    plus: int = 0,
 ) -> Path:
-    """Class k of three is the channel that is brightest; more classes never win. Ids are k ``times`` this ``plus`` that."""
+    """Class k of three is the channel that is brightest; more classes never win. Ids are k
+    ``times`` this ``plus`` that.
+    """
     weights = np.zeros((classes, 3, 1, 1), np.float32)
     weights[:3, :, 0, 0] = np.eye(3)
     bias = np.where(np.arange(classes) < 3, 0, -100).astype(np.float32)
     shape = [1, rows, columns, 3] if nhwc else [1, 3, rows, columns]
     nodes = [helper.make_node("Transpose", ["x"], ["t"], perm=[0, 3, 1, 2])] if nhwc else []
-    nodes.append(helper.make_node("Conv", ["t" if nhwc else "x", "w", "b"], ["c" if ids or nhwc else "y"]))
+    nodes.append(
+        helper.make_node("Conv", ["t" if nhwc else "x", "w", "b"], ["c" if ids or nhwc else "y"])
+    )
     out = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, classes, rows, columns])
     if ids:
         nodes.append(helper.make_node("ArgMax", ["c"], ["k"], axis=1, keepdims=0))
-        nodes += [helper.make_node("Mul", ["k", "times"], ["m"]), helper.make_node("Add", ["m", "plus"], ["y"])]
+        nodes += [
+            helper.make_node("Mul", ["k", "times"], ["m"]),
+            helper.make_node("Add", ["m", "plus"], ["y"]),
+        ]
         out = helper.make_tensor_value_info("y", TensorProto.INT64, [1, rows, columns])
     elif nhwc:
         nodes.append(helper.make_node("Transpose", ["c"], ["y"], perm=[0, 2, 3, 1]))
         out = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, rows, columns, classes])
     x = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)
-    numbers = [numpy_helper.from_array(np.array(n, np.int64), name) for n, name in ((times, "times"), (plus, "plus"))]
-    stored = [*(numbers if ids else []), numpy_helper.from_array(weights, "w"), numpy_helper.from_array(bias, "b")]
-    model = helper.make_model(helper.make_graph(nodes, "by colour", [x], [out], stored), opset_imports=[helper.make_opsetid("", 13)])
+    numbers = [
+        numpy_helper.from_array(np.array(n, np.int64), name)
+        for n, name in ((times, "times"), (plus, "plus"))
+    ]
+    stored = [
+        *(numbers if ids else []),
+        numpy_helper.from_array(weights, "w"),
+        numpy_helper.from_array(bias, "b"),
+    ]
+    model = helper.make_model(
+        helper.make_graph(nodes, "by colour", [x], [out], stored),
+        opset_imports=[helper.make_opsetid("", 13)],
+    )
     model.ir_version = 8
     onnx.save(model, str(path))
     return path
 
 
 def opened(folder: Path, model: dict[str, Any] | None = None, **spec: Any) -> Segmenter:
-    content: dict[str, Any] = {"input": {"size": [8, 16]}, "classes": ["road", "vegetation", "car"]} | spec
+    content: dict[str, Any] = {
+        "input": {"size": [8, 16]},
+        "classes": ["road", "vegetation", "car"],
+    } | spec
     file = folder / "spec.yaml"
     file.write_text(yaml.safe_dump(content))
     path = save_model(folder / "model.onnx", **(model or {}))
@@ -80,7 +109,9 @@ def test_layouts_and_ids(tmp_path: Path, nhwc: bool, ids: bool) -> None:
     model = {"nhwc": nhwc, "ids": ids}
     spec_in = {"size": [8, 16], "layout": "NHWC" if nhwc else "NCHW"}
     spec_out = {"kind": "ids"} if ids else {"layout": "HWC" if nhwc else "CHW"}
-    assert opened(tmp_path, model, input=spec_in, output=spec_out).train_ids(stripes())[0, ::5].tolist() == [ROAD, VEGETATION, CAR, CAR]
+    assert opened(tmp_path, model, input=spec_in, output=spec_out).train_ids(stripes())[
+        0, ::5
+    ].tolist() == [ROAD, VEGETATION, CAR, CAR]
 
 
 def test_ids_that_models_give_to_nothing_are_unlabelled(tmp_path: Path) -> None:
@@ -94,9 +125,14 @@ def test_ids_that_models_give_to_nothing_are_unlabelled(tmp_path: Path) -> None:
         many.train_ids(stripes())
 
 
-@pytest.mark.parametrize("output", [np.zeros((1, 3, 0, 16), np.float32), np.full((1, 8, 16), "road"), np.full((3, 8, 16), None)])
+@pytest.mark.parametrize(
+    "output",
+    [np.zeros((1, 3, 0, 16), np.float32), np.full((1, 8, 16), "road"), np.full((3, 8, 16), None)],
+)
 @pytest.mark.parametrize("kind", ["ids", "logits"])
-def test_outputs_that_are_no_pictures_are_refused(tmp_path: Path, output: NDArray[Any], kind: str) -> None:
+def test_outputs_that_are_no_pictures_are_refused(
+    tmp_path: Path, output: NDArray[Any], kind: str
+) -> None:
     opened(tmp_path, output={"kind": kind})
     file = tmp_path / "spec.yaml"
     segmenter = Segmenter(lambda _: output, "none", read_spec(file), file, tmp_path / "model.onnx")
@@ -119,15 +155,21 @@ def test_pictures_of_other_sizes_come_back_in_their_own(tmp_path: Path) -> None:
     assert stretched.shape == (40, 48)
     assert stretched[20, [2, 24, 46]].tolist() == [ROAD, VEGETATION, CAR]
     tall = stripes(64, 16)
-    boxed = opened(tmp_path, input={"size": [8, 16], "resize": "letterbox"}).train_ids(stripes(32, 32))
+    boxed = opened(tmp_path, input={"size": [8, 16], "resize": "letterbox"}).train_ids(
+        stripes(32, 32)
+    )
     assert boxed[16, [2, 16, 29]].tolist() == [ROAD, VEGETATION, CAR]
-    assert opened(tmp_path, input={"size": [8, 16], "resize": "letterbox"}).train_ids(tall).shape == (64, 16)
+    assert opened(tmp_path, input={"size": [8, 16], "resize": "letterbox"}).train_ids(
+        tall
+    ).shape == (64, 16)
     grey = opened(tmp_path).train_ids(np.full((8, 16), 90, np.uint16))
     assert grey.shape == (8, 16)
 
 
 def test_crop_and_ignore(tmp_path: Path) -> None:
-    found = opened(tmp_path, input={"size": [8, 16], "crop": [0.25, 0.5, 0, 0]}, ignore=["car", 1]).train_ids(stripes())
+    found = opened(
+        tmp_path, input={"size": [8, 16], "crop": [0.25, 0.5, 0, 0]}, ignore=["car", 1]
+    ).train_ids(stripes())
     assert (found[:2] == UNPAINTED).all()
     assert (found[4:] == UNPAINTED).all()
     assert found[2, ::5].tolist() == [ROAD, 255, 255, 255]
@@ -136,14 +178,22 @@ def test_crop_and_ignore(tmp_path: Path) -> None:
 def test_a_space_by_name_and_beside_the_spec(tmp_path: Path) -> None:
     found = opened(tmp_path, {"classes": 19}, classes=None, space="cityscapes").train_ids(stripes())
     assert found[0, ::5].tolist() == [0, 1, 2, 2]
-    (tmp_path / "mine.yaml").write_text("classes: {0: {name: a, to: pole}, 1: {name: b, to: null}, 2: {name: fence}}")
-    assert opened(tmp_path, classes=None, space="mine.yaml").train_ids(stripes())[0, ::5].tolist() == [5, 255, 4, 4]
+    (tmp_path / "mine.yaml").write_text(
+        "classes: {0: {name: a, to: pole}, 1: {name: b, to: null}, 2: {name: fence}}"
+    )
+    assert opened(tmp_path, classes=None, space="mine.yaml").train_ids(stripes())[
+        0, ::5
+    ].tolist() == [5, 255, 4, 4]
 
 
 @pytest.mark.parametrize(
     ("model", "spec", "match"),
     [
-        ({}, {"input": {"size": [8, 8]}}, "takes an input of 1 x 3 x 8 x 16, but its spec says 1 x 3 x 8 x 8"),
+        (
+            {},
+            {"input": {"size": [8, 8]}},
+            "takes an input of 1 x 3 x 8 x 16, but its spec says 1 x 3 x 8 x 8",
+        ),
         ({}, {"input": {"size": [8, 16], "layout": "NHWC"}}, r"1 x 8 x 16 x 3 \(NHWC\)"),
         ({}, {"input": {"size": [8, 16], "type": "uint8"}}, r"takes tensor\(float\)"),
         ({}, {"input": {"size": [8, 16], "name": "picture"}}, "no input 'picture': name one of x"),
@@ -152,7 +202,11 @@ def test_a_space_by_name_and_beside_the_spec(tmp_path: Path) -> None:
         ({}, {"output": {"layout": "HWC"}}, "16 classes in layout HWC"),
         ({}, {"output": {"kind": "ids"}}, "output.kind may be 'logits'"),
         ({"ids": True}, {}, "output.kind may be 'ids'"),
-        ({"ids": True}, {"output": {"kind": "ids"}, "classes": ["road", "car"]}, "gives the class 2"),
+        (
+            {"ids": True},
+            {"output": {"kind": "ids"}, "classes": ["road", "car"]},
+            "gives the class 2",
+        ),
         ({}, {"ignore": ["moose"]}, "ignores 'moose'"),
         ({}, {"sise": 3}, "sise: Extra inputs"),
         ({}, {"input": {"size": [8, 0]}}, "size has to be"),
@@ -162,7 +216,9 @@ def test_a_space_by_name_and_beside_the_spec(tmp_path: Path) -> None:
         ({}, {"classes": None, "space": "marskitti"}, "marskitti"),
     ],
 )
-def test_what_does_not_fit_is_said(tmp_path: Path, model: dict[str, Any], spec: dict[str, Any], match: str) -> None:
+def test_what_does_not_fit_is_said(
+    tmp_path: Path, model: dict[str, Any], spec: dict[str, Any], match: str
+) -> None:
     with pytest.raises(SettingsError, match=match):
         opened(tmp_path, model, **spec).train_ids(stripes())
 
@@ -180,15 +236,21 @@ def test_files_that_are_missing_or_no_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ids", [False, True])
-def test_opencv_where_onnxruntime_is_missing(tmp_path: Path, ids: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = opened(tmp_path, {"ids": ids}, output={"kind": "ids" if ids else "logits"}).train_ids(stripes())
+def test_opencv_where_onnxruntime_is_missing(
+    tmp_path: Path, ids: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = opened(
+        tmp_path, {"ids": ids}, output={"kind": "ids" if ids else "logits"}
+    ).train_ids(stripes())
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     segmenter = opened(tmp_path, {"ids": ids}, output={"kind": "ids" if ids else "logits"})
     assert segmenter.to_json()["runtime"].startswith("opencv")
     np.testing.assert_array_equal(segmenter.train_ids(stripes()), expected)
     (tmp_path / "model.onnx").write_bytes(b"not a model" * 100)
     with pytest.raises(SettingsError, match="cannot be read by OpenCV"):
-        Segmenter.open(Labels(source="onnx", model=tmp_path / "model.onnx", spec=tmp_path / "spec.yaml"))
+        Segmenter.open(
+            Labels(source="onnx", model=tmp_path / "model.onnx", spec=tmp_path / "spec.yaml")
+        )
 
 
 def test_the_fingerprint_follows_the_files(tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""Painting: a near board before a far wall, seen by a camera beside the LIDAR; ground, walls along the road, windows."""
+"""Painting: a near board before a far wall, seen by a camera beside the LIDAR; ground, walls along
+the road, windows.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +20,21 @@ BOARD, WALL = 1, 2
 UP = np.array([0.0, 0.0, 1.0])
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 PROJECTOR = Projector(
-    Camera(Header("/info", 0, 0, ""), WIDTH, HEIGHT, K, np.zeros(0), np.eye(3), np.zeros((3, 4)), "plumb_bob"), HEIGHT, WIDTH
+    Camera(
+        Header("/info", 0, 0, ""),
+        WIDTH,
+        HEIGHT,
+        K,
+        np.zeros(0),
+        np.eye(3),
+        np.zeros((3, 4)),
+        "plumb_bob",
+    ),
+    HEIGHT,
+    WIDTH,
 )
-AXES = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # x right, y down, z forward in a base with x forward, y left, z up
+# x right, y down, z forward in a base with x forward, y left, z up
+AXES = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 def camera_at(x: float, y: float, z: float) -> F64:
@@ -29,51 +43,89 @@ def camera_at(x: float, y: float, z: float) -> F64:
     return base_T_camera
 
 
-def rays(rings: float, step: float = 0.2, reach: float = 45.0, low: float = -14.0, high: float = 10.0) -> F64:
-    """Unit vectors (n, 3) of a spinning LIDAR: one ring every ``rings`` degrees, one point every ``step`` degrees."""
-    elevation, azimuth = np.meshgrid(np.radians(np.arange(low, high, rings)), np.radians(np.arange(-reach, reach, step)), indexing="ij")
-    return np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
+def rays(
+    rings: float, step: float = 0.2, reach: float = 45.0, low: float = -14.0, high: float = 10.0
+) -> F64:
+    """Unit vectors (n, 3) of a spinning LIDAR: one ring every ``rings`` degrees, one point every
+    ``step`` degrees.
+    """
+    elevation, azimuth = np.meshgrid(
+        np.radians(np.arange(low, high, rings)),
+        np.radians(np.arange(-reach, reach, step)),
+        indexing="ij",
+    )
+    return np.stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
 
 
 def hit(origin: F64, directions: F64, x: float, half_y: float, half_z: float) -> F64:
-    """Distance (n,) along the rays to the upright rectangle at ``x``, infinite for those that miss it."""
+    """Distance (n,) along the rays to the upright rectangle at ``x``, infinite for those that miss
+    it.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (x - origin[0]) / directions[:, 0]
     p = origin + directions * np.where(np.isfinite(t), t, 0)[:, None]
-    return np.where(np.isfinite(t) & (t > 0) & (np.abs(p[:, 1]) <= half_y) & (np.abs(p[:, 2]) <= half_z), t, np.inf)
+    return np.where(
+        np.isfinite(t) & (t > 0) & (np.abs(p[:, 1]) <= half_y) & (np.abs(p[:, 2]) <= half_z),
+        t,
+        np.inf,
+    )
 
 
 def seen(origin: F64, directions: F64) -> tuple[F64, NDArray[np.int64]]:
     """Distance to the scene and which of BOARD and WALL it is, 0 for neither."""
-    board, wall = hit(origin, directions, 8.0, 1.0, 1.0), hit(origin, directions, 20.0, 12.0, 4.0)
+    board = hit(origin, directions, 8.0, 1.0, 1.0)
+    wall = hit(origin, directions, 20.0, 12.0, 4.0)
     nearest = np.minimum(board, wall)
     return nearest, np.where(~np.isfinite(nearest), 0, np.where(board <= wall, BOARD, WALL))
 
 
 def picture(base_T_camera: F64) -> NDArray[np.uint32]:
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
-    optical = np.stack([(u - K[0, 2]) / FOCAL, (v - K[1, 2]) / FOCAL, np.ones(u.shape)], axis=-1).reshape(-1, 3)
+    optical = np.stack(
+        [(u - K[0, 2]) / FOCAL, (v - K[1, 2]) / FOCAL, np.ones(u.shape)], axis=-1
+    ).reshape(-1, 3)
     return seen(base_T_camera[:3, 3], optical @ AXES.T)[1].reshape(HEIGHT, WIDTH).astype(np.uint32)
 
 
-def painted(points: F64, labels: NDArray[np.uint32], base_T_camera: F64, axis: F64 = UP) -> tuple[NDArray[np.uint32], NDArray[np.bool_]]:
+def painted(
+    points: F64, labels: NDArray[np.uint32], base_T_camera: F64, axis: F64 = UP
+) -> tuple[NDArray[np.uint32], NDArray[np.bool_]]:
     cloud = points.astype(np.float32)
-    out, inside = paint(cloud, np.arange(len(cloud)), Viewpoint(np.zeros(3), axis), labels, inverse(base_T_camera), PROJECTOR)
+    out, inside = paint(
+        cloud,
+        np.arange(len(cloud)),
+        Viewpoint(np.zeros(3), axis),
+        labels,
+        inverse(base_T_camera),
+        PROJECTOR,
+    )
     return np.where(out == UNPAINTED, out, out & np.uint32(DOUBTFUL - 1)), inside
 
 
-@pytest.mark.parametrize("offset", [(0.3, 0.5, -0.2), (0.3, -0.5, -0.2), (0.0, 0.0, -0.8), (-0.5, 1.2, 0.4)])
+@pytest.mark.parametrize(
+    "offset", [(0.3, 0.5, -0.2), (0.3, -0.5, -0.2), (0.0, 0.0, -0.8), (-0.5, 1.2, 0.4)]
+)
 @pytest.mark.parametrize("rings", [0.4, 2.0])
 def test_a_board_before_a_wall(offset: tuple[float, float, float], rings: float) -> None:
     base_T_camera = camera_at(*offset)
     directions = rays(rings)
     distance, truth = seen(np.zeros(3), directions)
-    points, truth = directions[truth > 0] * distance[truth > 0, None], truth[truth > 0]
+    points = directions[truth > 0] * distance[truth > 0, None]
+    truth = truth[truth > 0]
     found, inside = painted(points, without_borders(picture(base_T_camera), 2), base_T_camera)
     # what the camera sees: the first thing on its line to the point is the point itself
     lines = points - base_T_camera[:3, 3]
     is_visible = seen(base_T_camera[:3, 3], lines)[0] > 1 - 1e-6
-    pixels, _ = PROJECTOR.pixels(points @ base_T_camera[:3, :3] - base_T_camera[:3, 3] @ base_T_camera[:3, :3])
+    pixels, _ = PROJECTOR.pixels(
+        points @ base_T_camera[:3, :3] - base_T_camera[:3, 3] @ base_T_camera[:3, :3]
+    )
     hidden = inside & ~is_visible & (truth == WALL)
     assert hidden.sum() > (20 if rings < 1 else 3)  # otherwise there is nothing to test
     bleeding = inside & (truth == WALL) & (found == BOARD)
@@ -83,8 +135,14 @@ def test_a_board_before_a_wall(offset: tuple[float, float, float], rings: float)
     assert (found[hidden] == UNPAINTED).mean() > 0.95
     assert not (inside & (truth == BOARD) & (found == WALL)).any()
     # away from the board's silhouette nearly everything is painted, as what it is
-    silhouette = np.abs(_angles(points, base_T_camera) - _board_middle(base_T_camera)) - _board_half(base_T_camera)
-    clear = inside & is_visible & ((silhouette > np.radians(0.7)).any(1) | (silhouette < -np.radians(0.4)).all(1))
+    silhouette = np.abs(
+        _angles(points, base_T_camera) - _board_middle(base_T_camera)
+    ) - _board_half(base_T_camera)
+    clear = (
+        inside
+        & is_visible
+        & ((silhouette > np.radians(0.7)).any(1) | (silhouette < -np.radians(0.4)).all(1))
+    )
     assert (found[clear] == truth[clear]).mean() > 0.985
 
 
@@ -111,7 +169,8 @@ def test_a_lidar_on_its_side() -> None:
     base_T_camera = camera_at(0.3, 0.5, -0.2)
     turned = rays(1.0, reach=30.0, low=-30.0, high=30.0)[:, [0, 2, 1]]
     distance, truth = seen(np.zeros(3), turned)
-    points, truth = turned[truth > 0] * distance[truth > 0, None], truth[truth > 0]
+    points = turned[truth > 0] * distance[truth > 0, None]
+    truth = truth[truth > 0]
     labels = without_borders(picture(base_T_camera), 2)
     found, inside = painted(points, labels, base_T_camera, axis=np.array([0.0, 1.0, 0.0]))
     assert (found[inside & (truth == WALL)] == BOARD).mean() < 0.002
@@ -119,9 +178,12 @@ def test_a_lidar_on_its_side() -> None:
 
 
 @pytest.mark.parametrize("offset", [(0.3, 0.3, -0.3), (1.5, 0.0, -0.3)])
-def test_the_ground_and_a_wall_along_the_road_do_not_hide_themselves(offset: tuple[float, float, float]) -> None:
+def test_the_ground_and_a_wall_along_the_road_do_not_hide_themselves(
+    offset: tuple[float, float, float],
+) -> None:
     directions = rays(0.4, low=-24.0)
-    ground, wall = -1.73 / np.minimum(directions[:, 2], -1e-9), 4.0 / np.maximum(directions[:, 1], 1e-9)
+    ground = -1.73 / np.minimum(directions[:, 2], -1e-9)
+    wall = 4.0 / np.maximum(directions[:, 1], 1e-9)
     distance = np.minimum(ground, wall)
     points = (directions * distance[:, None])[distance < 45]
     found, inside = painted(points, np.zeros((HEIGHT, WIDTH), np.uint32), camera_at(*offset))
@@ -130,7 +192,9 @@ def test_the_ground_and_a_wall_along_the_road_do_not_hide_themselves(offset: tup
 
 
 def test_what_is_seen_through_a_window_is_doubtful() -> None:
-    """A board with a window that a LIDAR looks through, all of one label in the picture, before a wall."""
+    """A board with a window that a LIDAR looks through, all of one label in the picture, before a
+    wall.
+    """
     base_T_camera = camera_at(0.2, 0.1, -0.1)
     directions = rays(0.4)
     distance, _ = seen(np.zeros(3), directions)
@@ -138,9 +202,17 @@ def test_what_is_seen_through_a_window_is_doubtful() -> None:
     window = (np.abs(at_board[:, 1]) < 0.5) & (np.abs(at_board[:, 2]) < 0.3)
     distance[window] = hit(np.zeros(3), directions, 20.0, 12.0, 4.0)[window]
     kept = np.isfinite(distance)
-    points, window = (directions[kept] * distance[kept, None]).astype(np.float32), window[kept]
+    points = (directions[kept] * distance[kept, None]).astype(np.float32)
+    window = window[kept]
     viewpoint = Viewpoint(np.zeros(3), UP)
-    out, _ = paint(points, np.arange(len(points)), viewpoint, picture(base_T_camera), inverse(base_T_camera), PROJECTOR)
+    out, _ = paint(
+        points,
+        np.arange(len(points)),
+        viewpoint,
+        picture(base_T_camera),
+        inverse(base_T_camera),
+        PROJECTOR,
+    )
     through = window & (out != UNPAINTED) & (out & np.uint32(DOUBTFUL - 1) == BOARD)
     assert through.sum() > 100
     assert (out[through] & DOUBTFUL > 0).mean() > 0.99
@@ -154,7 +226,9 @@ def test_points_behind_beside_and_without_any_company() -> None:
     found, inside = painted(points, np.full((HEIGHT, WIDTH), 7, np.uint32), camera_at(0, 0, 0))
     assert inside.tolist() == [False, True, False]
     assert found.tolist() == [UNPAINTED, 7, UNPAINTED]
-    found, inside = painted(np.zeros((0, 3)), np.full((HEIGHT, WIDTH), 7, np.uint32), camera_at(0, 0, 0))
+    found, inside = painted(
+        np.zeros((0, 3)), np.full((HEIGHT, WIDTH), 7, np.uint32), camera_at(0, 0, 0)
+    )
     assert len(found) == len(inside) == 0
 
 

@@ -12,14 +12,24 @@ from semloc_logs.labels.projection import Projector
 from semloc_logs.logs.sensors.depth import Unprojector
 
 
-def camera(D: tuple[float, ...] = (), model: str = "plumb_bob", focal: float = 500.0, width: int = 640, height: int = 480) -> Camera:
+def camera(
+    D: tuple[float, ...] = (),
+    model: str = "plumb_bob",
+    focal: float = 500.0,
+    width: int = 640,
+    height: int = 480,
+) -> Camera:
     K = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1.0]])
     P = np.hstack([K * [[2], [2], [1]], np.zeros((3, 1))])
-    return Camera(Header("/info", 0, 0, "optical"), width, height, K, np.array(D), np.eye(3), P, model)
+    return Camera(
+        Header("/info", 0, 0, "optical"), width, height, K, np.array(D), np.eye(3), P, model
+    )
 
 
 def test_by_hand() -> None:
-    pixels, front = Projector(camera(), 480, 640).pixels(np.array([[0.2, -0.1, 2.0], [0.2, -0.1, -2.0], [0, 0, 0.01]]))
+    pixels, front = Projector(camera(), 480, 640).pixels(
+        np.array([[0.2, -0.1, 2.0], [0.2, -0.1, -2.0], [0, 0, 0.01]])
+    )
     assert front.tolist() == [True, False, False]
     np.testing.assert_allclose(pixels[0], [319.5 + 50, 239.5 - 25])
     assert np.isnan(pixels[1:]).all()
@@ -49,7 +59,9 @@ def test_a_distortion_that_turns_back_does_not_fold_the_surroundings_into_the_pi
     points = 10 * np.stack([np.sin(angle), np.zeros(100), np.cos(angle)], axis=1)
     projector = Projector(calibration, 480, 640)
     inside = projector.inside(projector.pixels(points)[0])
-    folded = np.asarray(cv2.projectPoints(points, np.zeros(3), np.zeros(3), calibration.K, calibration.D)[0], float)[:, 0]
+    folded = np.asarray(
+        cv2.projectPoints(points, np.zeros(3), np.zeros(3), calibration.K, calibration.D)[0], float
+    )[:, 0]
     assert projector.inside(folded)[-25:].any()  # the polynomial alone does fold
     assert not inside[angle > np.radians(50)].any()
     assert inside[angle < np.radians(25)].all()
@@ -58,7 +70,9 @@ def test_a_distortion_that_turns_back_does_not_fold_the_surroundings_into_the_pi
 def test_scaled_and_rectified_pictures() -> None:
     point = np.array([[0.2, -0.1, 2.0]])
     half, _ = Projector(camera(), 240, 320).pixels(point)
-    np.testing.assert_allclose(half[0], [(319.5 + 50 + 0.5) / 2 - 0.5, (239.5 - 25 + 0.5) / 2 - 0.5])
+    np.testing.assert_allclose(
+        half[0], [(319.5 + 50 + 0.5) / 2 - 0.5, (239.5 - 25 + 0.5) / 2 - 0.5]
+    )
     rectified, _ = Projector(camera((0.5, 0.5, 0, 0, 0)), 480, 640, rectified=True).pixels(point)
     np.testing.assert_allclose(rectified[0], [2 * 319.5 + 100, 2 * 239.5 - 50])
 

@@ -37,17 +37,33 @@ def test_cityscapes_has_its_19_classes_in_order() -> None:
     )
     assert space.names == tuple(n.replace("_", " ") for n in names.split())
     assert space.names[SKY] == "sky"
-    assert [space.names[i] for i in (BUILDING, POLE, VEGETATION)] == ["building", "pole", "vegetation"]
+    assert [space.names[i] for i in (BUILDING, POLE, VEGETATION)] == [
+        "building",
+        "pole",
+        "vegetation",
+    ]
     assert np.flatnonzero(space.dynamic).tolist() == list(range(11, 19))
     assert len({tuple(c) for c in space.colours.tolist()}) == 19
 
 
 def test_the_coarse_set() -> None:
     space = cityscapes()
-    assert space.coarse_names == ("ground", "construction", "pole", "vegetation", "vehicle", "other")
+    assert space.coarse_names == (
+        "ground",
+        "construction",
+        "pole",
+        "vegetation",
+        "vehicle",
+        "other",
+    )
     by_name = {space.names[i]: space.coarse_names[space.coarse[i]] for i in range(19)}
     assert {by_name[space.names[i]] for i in GROUND} == {"ground"}
-    assert (by_name["fence"], by_name["traffic sign"], by_name["car"], by_name["rider"]) == ("construction", "pole", "vehicle", "other")
+    assert (by_name["fence"], by_name["traffic sign"], by_name["car"], by_name["rider"]) == (
+        "construction",
+        "pole",
+        "vehicle",
+        "other",
+    )
     assert (space.coarse[19:] == UNLABELLED).all()
 
 
@@ -62,7 +78,10 @@ def test_semantickitti_ids_with_and_without_instances(kind: DTypeLike) -> None:
     ids = np.array([0, 10, 40, 48, 50, 71, 80, 99], kind)
     expected = [255, 13, 0, 1, 2, 8, 5, 255]
     assert to_cityscapes(ids, "semantickitti").tolist() == expected
-    assert to_cityscapes(ids.reshape(2, 4), "semantickitti").tolist() == [expected[:4], expected[4:]]
+    assert to_cityscapes(ids.reshape(2, 4), "semantickitti").tolist() == [
+        expected[:4],
+        expected[4:],
+    ]
     if np.iinfo(kind).max > 2**20:
         assert to_cityscapes(ids + np.array(7 << 16, kind), "semantickitti").tolist() == expected
     assert to_cityscapes(ids[:0], "semantickitti").tolist() == []
@@ -80,14 +99,16 @@ def test_guessing_the_space(kind: DTypeLike) -> None:
     assert guess_space(np.array([0, 8, 18], kind)) == "cityscapes"
     assert guess_space(np.array([0, 8, 50], kind)) == "semantickitti"
     if np.iinfo(kind).max > 2**17:
-        assert guess_space(np.array([10 + (1 << 16), 13], kind)) == "semantickitti"  # an instance in the upper half
+        # an instance in the upper half
+        assert guess_space(np.array([10 + (1 << 16), 13], kind)) == "semantickitti"
     if np.iinfo(kind).max >= 255:
         assert guess_space(np.array([2, 255], kind)) == "cityscapes"
 
 
 @pytest.mark.parametrize("name", spaces())
 def test_every_shipped_space_is_sound(name: str) -> None:
-    space, own = read_space(name), cityscapes()
+    space = read_space(name)
+    own = cityscapes()
     assert space.name == name
     assert len(set(space.names.values())) == len(space.names) > 10
     assert set(space.targets) == set(space.names)
@@ -96,8 +117,12 @@ def test_every_shipped_space_is_sound(name: str) -> None:
     by_colour: dict[tuple[int, int, int], set[int]] = {}
     for i, colour in space.colours.items():
         by_colour.setdefault(colour, set()).add(space.targets[i])
-    assert all(len(targets) == 1 for targets in by_colour.values()), {c: t for c, t in by_colour.items() if len(t) > 1}
-    train_ids, strange = space.train_ids_of_colours(np.array([c[0] << 16 | c[1] << 8 | c[2] for c in space.colours.values()], np.uint32))
+    assert all(len(targets) == 1 for targets in by_colour.values()), {
+        c: t for c, t in by_colour.items() if len(t) > 1
+    }
+    train_ids, strange = space.train_ids_of_colours(
+        np.array([c[0] << 16 | c[1] << 8 | c[2] for c in space.colours.values()], np.uint32)
+    )
     assert train_ids.tolist() == [space.targets[i] for i in space.colours]
     assert not strange
 
@@ -106,13 +131,64 @@ def test_every_shipped_space_is_sound(name: str) -> None:
     ("name", "count", "known"),
     [
         ("cityscapes", 19, {0: ("road", 0), 13: ("car", 13), 18: ("bicycle", 18)}),
-        ("cityscapes_ids", 34, {0: ("unlabeled", 255), 7: ("road", 0), 23: ("sky", 10), 26: ("car", 13), 33: ("bicycle", 18)}),
-        ("kitti360", 45, {7: ("road", 0), 34: ("garage", 2), 37: ("smallpole", 5), 44: ("unknown object", 255)}),
-        ("semantickitti", 34, {10: ("car", 13), 40: ("road", 0), 81: ("traffic-sign", 7), 252: ("moving-car", 13)}),
-        ("mapillary", 66, {13: ("road", 0), 27: ("sky", 10), 45: ("pole", 5), 55: ("car", 13), 65: ("unlabeled", 255)}),
-        ("ade20k", 150, {0: ("wall", 3), 2: ("sky", 10), 6: ("road", 0), 20: ("car", 13), 127: ("bicycle", 18), 149: ("flag", 255)}),
-        ("nuscenes_lidarseg", 32, {17: ("vehicle.car", 13), 24: ("flat.driveable_surface", 0), 30: ("static.vegetation", 8)}),
-        ("nuscenes_challenge", 17, {4: ("car", 13), 11: ("driveable_surface", 0), 16: ("vegetation", 8)}),
+        (
+            "cityscapes_ids",
+            34,
+            {
+                0: ("unlabeled", 255),
+                7: ("road", 0),
+                23: ("sky", 10),
+                26: ("car", 13),
+                33: ("bicycle", 18),
+            },
+        ),
+        (
+            "kitti360",
+            45,
+            {7: ("road", 0), 34: ("garage", 2), 37: ("smallpole", 5), 44: ("unknown object", 255)},
+        ),
+        (
+            "semantickitti",
+            34,
+            {10: ("car", 13), 40: ("road", 0), 81: ("traffic-sign", 7), 252: ("moving-car", 13)},
+        ),
+        (
+            "mapillary",
+            66,
+            {
+                13: ("road", 0),
+                27: ("sky", 10),
+                45: ("pole", 5),
+                55: ("car", 13),
+                65: ("unlabeled", 255),
+            },
+        ),
+        (
+            "ade20k",
+            150,
+            {
+                0: ("wall", 3),
+                2: ("sky", 10),
+                6: ("road", 0),
+                20: ("car", 13),
+                127: ("bicycle", 18),
+                149: ("flag", 255),
+            },
+        ),
+        (
+            "nuscenes_lidarseg",
+            32,
+            {
+                17: ("vehicle.car", 13),
+                24: ("flat.driveable_surface", 0),
+                30: ("static.vegetation", 8),
+            },
+        ),
+        (
+            "nuscenes_challenge",
+            17,
+            {4: ("car", 13), 11: ("driveable_surface", 0), 16: ("vegetation", 8)},
+        ),
     ],
 )
 def test_well_known_classes(name: str, count: int, known: dict[int, tuple[str, int]]) -> None:
@@ -122,8 +198,12 @@ def test_well_known_classes(name: str, count: int, known: dict[int, tuple[str, i
 
 
 def test_colours_that_the_palette_does_not_have_are_counted() -> None:
-    road, car, strange = (128 << 16 | 64 << 8 | 128), 142, 0x010203
-    found, unknown = read_space("cityscapes").train_ids_of_colours(np.array([[road, car, strange], [strange, 0, UNPAINTED]], np.uint32))
+    road = 128 << 16 | 64 << 8 | 128
+    car = 142
+    strange = 0x010203
+    found, unknown = read_space("cityscapes").train_ids_of_colours(
+        np.array([[road, car, strange], [strange, 0, UNPAINTED]], np.uint32)
+    )
     assert found.tolist() == [[0, 13, 255], [255, 255, 255]]
     assert unknown == {strange: 2}
 
@@ -132,7 +212,9 @@ def test_guessing_palettes_and_full_ids() -> None:
     assert guess_palette({128 << 16 | 64 << 8 | 128: 5, 0: 100}) == "cityscapes"
     assert guess_palette({0: 7}) is None
     assert guess_palette({0x010203: 5}) is None
-    semantickitti = {c[0] << 16 | c[1] << 8 | c[2]: 1 for c in read_space("semantickitti").colours.values()}
+    semantickitti = {
+        c[0] << 16 | c[1] << 8 | c[2]: 1 for c in read_space("semantickitti").colours.values()
+    }
     assert guess_palette(semantickitti) == "semantickitti"
     assert guess_space(np.array([7, 8, 11, 21, 22, 23, 26])) == "cityscapes_ids"
     assert guess_space(np.array([0, 10, 30, 31])) == "semantickitti"

@@ -38,7 +38,8 @@ def test_a_car_hides_the_ground_and_a_house_stands_on_it() -> None:
     surface = ground_surface(np.concatenate([p[~under_car & ~behind], car, house, roof]), EYE)
     assert np.abs(surface.height_at(car[:, :2])).max() < 0.12
     assert np.abs(surface.height_at(house[:, :2])).max() < 0.15
-    assert np.abs(surface.height_at(roof[:, :2])).max() < 0.3  # nothing was seen there: the street goes on
+    # nothing was seen there: the street goes on
+    assert np.abs(surface.height_at(roof[:, :2])).max() < 0.3
 
 
 def test_echoes_below_the_street_do_not_lower_it() -> None:
@@ -53,7 +54,8 @@ def test_echoes_below_the_street_do_not_lower_it() -> None:
 def test_a_ceiling_is_no_ground() -> None:
     """A sensor with a narrow view upwards and downwards: more of the ceiling than of the floor."""
     rng = np.random.default_rng(3)
-    floor, ceiling = field(rng, 3000), field(rng, 20_000) + np.array([0, 0, 3.2])
+    floor = field(rng, 3000)
+    ceiling = field(rng, 20_000) + np.array([0, 0, 3.2])
     floor = floor[np.hypot(floor[:, 0], floor[:, 1]) > 6]
     surface = ground_surface(np.concatenate([floor, ceiling]), EYE)
     assert np.abs(surface.height_at(ceiling[:, :2])).max() < 0.1
@@ -76,7 +78,9 @@ def test_no_points_one_point_and_points_far_away() -> None:
     assert ground_surface(np.zeros((0, 3)), EYE).height_at(np.zeros((1, 2))) == pytest.approx(0.1)
     one = ground_surface(np.array([[3.0, 4.0, 0.5]]), EYE)
     assert one.height_at(np.array([[3.0, 4.0]])) == pytest.approx(0.5, abs=0.01)
-    far = ground_surface(np.concatenate([field(np.random.default_rng(0)), [[1e9, 0, -3], [0, 0, -1e30]]]), EYE)
+    far = ground_surface(
+        np.concatenate([field(np.random.default_rng(0)), [[1e9, 0, -3], [0, 0, -1e30]]]), EYE
+    )
     assert far.z.size < 100 * 100
     assert np.isfinite(far.height_at(np.array([[1e12, 0.0]]))).all()
 

@@ -21,7 +21,14 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.annotation import tail_swap
-from semloc_logs.logs.annotation.annotate import ClosureRecord, Results, annotate_copy, annotate_in_place, content_fingerprint, recover
+from semloc_logs.logs.annotation.annotate import (
+    ClosureRecord,
+    Results,
+    annotate_copy,
+    annotate_in_place,
+    content_fingerprint,
+    recover,
+)
 from semloc_logs.logs.annotation.mcap_append import read_ending
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
@@ -32,21 +39,47 @@ NO_TIMES: dict[int, int] = {}
 def closures() -> list[ClosureRecord]:
     def one(query: str, target: str, query_ns: int, target_ns: int) -> ClosureRecord:
         covariance = tuple((np.eye(6) * 0.01).ravel())
-        pose, position = np.eye(4), np.arange(3.0)
-        return ClosureRecord(query, target, query_ns, target_ns, 1, 2, 3, 0, 0, 0, 1, covariance, 0.8, 0.97, 100, 20, pose, position)
+        pose = np.eye(4)
+        position = np.arange(3.0)
+        return ClosureRecord(
+            query,
+            target,
+            query_ns,
+            target_ns,
+            1,
+            2,
+            3,
+            0,
+            0,
+            0,
+            1,
+            covariance,
+            0.8,
+            0.97,
+            100,
+            20,
+            pose,
+            position,
+        )
 
     return [one("a", "b", 3, 5), one("b", "a", 7, 2), one("x", "y", 0, 0)]
 
 
-def write_log(path: Path, count: int = 20, *, payload: int = 50, attachment: bool = True, **options: Any) -> None:
+def write_log(
+    path: Path, count: int = 20, *, payload: int = 50, attachment: bool = True, **options: Any
+) -> None:
     """A log with two JSON channels, an attachment and a metadata record."""
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start("", "test")
         schema = writer.register_schema("thing", "jsonschema", b"{}")
-        channels = [writer.register_channel(topic, "json", schema, {"k": "v"}) for topic in ("/one", "/two")]
+        channels = [
+            writer.register_channel(topic, "json", schema, {"k": "v"}) for topic in ("/one", "/two")
+        ]
         for k in range(count):
-            writer.add_message(channels[k % 2], 100 + k, (b'{"v": %d}' % k).ljust(payload), 90 + k, k)
+            writer.add_message(
+                channels[k % 2], 100 + k, (b'{"v": %d}' % k).ljust(payload), 90 + k, k
+            )
         if attachment:
             writer.add_attachment(1, 2, "calibration.txt", "text/plain", b"fx 500")
             writer.add_metadata("vehicle", {"plate": "ZH 1"})
@@ -62,9 +95,27 @@ def linear(path: Path) -> list[tuple[Any, ...]]:
             if isinstance(record, Channel):
                 topics.setdefault(record.id, record.topic)
             elif isinstance(record, Message):
-                out.append(("m", topics[record.channel_id], record.log_time, record.publish_time, record.sequence, bytes(record.data)))
+                out.append(
+                    (
+                        "m",
+                        topics[record.channel_id],
+                        record.log_time,
+                        record.publish_time,
+                        record.sequence,
+                        bytes(record.data),
+                    )
+                )
             elif isinstance(record, Attachment):
-                out.append(("a", record.name, record.log_time, record.create_time, record.media_type, record.data))
+                out.append(
+                    (
+                        "a",
+                        record.name,
+                        record.log_time,
+                        record.create_time,
+                        record.media_type,
+                        record.data,
+                    )
+                )
             elif isinstance(record, Metadata):
                 out.append(("d", record.name, *sorted(record.metadata.items())))
     return out
@@ -77,7 +128,10 @@ def indexed(path: Path) -> list[tuple[Any, ...]]:
         reader = make_reader(file, validate_crcs=True)
         for _, channel, m in reader.iter_messages():
             out.append(("m", channel.topic, m.log_time, m.publish_time, m.sequence, bytes(m.data)))
-        out += [("a", a.name, a.log_time, a.create_time, a.media_type, a.data) for a in reader.iter_attachments()]
+        out += [
+            ("a", a.name, a.log_time, a.create_time, a.media_type, a.data)
+            for a in reader.iter_attachments()
+        ]
         out += [("d", d.name, *sorted(d.metadata.items())) for d in reader.iter_metadata()]
     return out
 
@@ -87,8 +141,11 @@ def is_ours(record: tuple[Any, ...]) -> bool:
 
 
 def check_annotated(original: Path, annotated: Path) -> None:
-    """Everything of the original is there in its order, our six records are the last, and the summary lists all of it."""
-    before, after = linear(original), linear(annotated)
+    """Everything of the original is there in its order, our six records are the last, and the
+    summary lists all of it.
+    """
+    before = linear(original)
+    after = linear(annotated)
     assert [r for r in after if not is_ours(r)] == before
     assert len(after) == len(before) + 6  # two closures, one pose, two markers, one metadata record
     assert all(is_ours(r) for r in after[-6:])
@@ -96,8 +153,14 @@ def check_annotated(original: Path, annotated: Path) -> None:
     with annotated.open("rb") as file:
         statistics = make_reader(file).get_summary().statistics  # type: ignore[union-attr]
     assert statistics is not None
-    assert statistics.message_count == sum(statistics.channel_message_counts.values()) == sum(r[0] == "m" for r in after)
-    assert (statistics.attachment_count, statistics.metadata_count) == tuple(sum(r[0] == k for r in after) for k in "ad")
+    assert (
+        statistics.message_count
+        == sum(statistics.channel_message_counts.values())
+        == sum(r[0] == "m" for r in after)
+    )
+    assert (statistics.attachment_count, statistics.metadata_count) == tuple(
+        sum(r[0] == k for r in after) for k in "ad"
+    )
 
 
 SHAPES: dict[str, dict[str, Any]] = {
@@ -139,10 +202,14 @@ def test_every_shape_copy_in_place_and_again(tmp_path: Path, shape: str, count: 
     assert place.read_bytes() == copy.read_bytes()
     annotate_in_place(place, Results(closures()[:1], "a", {"k": "other"}, log_times=NO_TIMES))
     assert sum(is_ours(r) for r in linear(place)) == 4
-    assert annotate_in_place(place, Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES)).replaced
+    assert annotate_in_place(
+        place, Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES)
+    ).replaced
     assert place.read_bytes() == copy.read_bytes()
     assert content_fingerprint(place) == content_fingerprint(log) == fingerprint
-    annotate_copy(place, tmp_path / "second.mcap", Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES))
+    annotate_copy(
+        place, tmp_path / "second.mcap", Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES)
+    )
     assert (tmp_path / "second.mcap").read_bytes() == copy.read_bytes()
 
 
@@ -150,7 +217,8 @@ def test_conformance_files(tmp_path: Path) -> None:
     if not CONFORMANCE.is_dir():
         pytest.skip("no shared/odd_logs/mcap_conformance beside the checkout")
     for log in sorted(CONFORMANCE.glob("*.mcap"))[::5]:
-        copy, place = tmp_path / "copy.mcap", tmp_path / "place.mcap"
+        copy = tmp_path / "copy.mcap"
+        place = tmp_path / "place.mcap"
         annotate_copy(log, copy, Results(closures(), "a", {}, log_times=NO_TIMES), overwrite=True)
         check_annotated(log, copy)
         shutil.copyfile(log, place)
@@ -160,10 +228,30 @@ def test_conformance_files(tmp_path: Path) -> None:
 
 
 def test_results_larger_than_a_chunk_are_split(tmp_path: Path) -> None:
-    log, copy = tmp_path / "log.mcap", tmp_path / "copy.mcap"
+    log = tmp_path / "log.mcap"
+    copy = tmp_path / "copy.mcap"
     write_log(log)
     many = [
-        ClosureRecord("a", f"target{k}", k, k, 0, 0, 0, 0, 0, 0, 1, tuple(np.eye(6).ravel()), 0.5, 0.9, 1, 1, None, np.zeros(3))
+        ClosureRecord(
+            "a",
+            f"target{k}",
+            k,
+            k,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            1,
+            tuple(np.eye(6).ravel()),
+            0.5,
+            0.9,
+            1,
+            1,
+            None,
+            np.zeros(3),
+        )
         for k in range(1500)
     ]
     annotate_copy(log, copy, Results(many, "a", {}, log_times={k: 10**9 + k for k in range(1500)}))
@@ -188,7 +276,9 @@ def test_no_closures_replace_earlier_ones(tmp_path: Path) -> None:
 
 
 def test_records_behind_ours_are_not_lost(tmp_path: Path) -> None:
-    """Another tool that adds an attachment behind our results: neither is it cut off nor are results written twice."""
+    """Another tool that adds an attachment behind our results: neither is it cut off nor are
+    results written twice.
+    """
     log = tmp_path / "log.mcap"
     write_log(log)
     annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
@@ -233,9 +323,15 @@ def test_a_damaged_chunk_is_refused_when_it_has_to_be_read(tmp_path: Path) -> No
 @settings(max_examples=150, deadline=None)
 def test_damaged_bytes_give_a_log_error_or_a_result(data: st.DataObject) -> None:
     file = io.BytesIO()
-    writer = Writer(file, compression=data.draw(st.sampled_from(list(CompressionType))), use_statistics=data.draw(st.booleans()))
+    writer = Writer(
+        file,
+        compression=data.draw(st.sampled_from(list(CompressionType))),
+        use_statistics=data.draw(st.booleans()),
+    )
     writer.start("", "test")
-    channel = writer.register_channel("/one", "json", writer.register_schema("thing", "jsonschema", b"{}"), {"a": "b"})
+    channel = writer.register_channel(
+        "/one", "json", writer.register_schema("thing", "jsonschema", b"{}"), {"a": "b"}
+    )
     writer.add_message(channel, 1, b"{}" * 30, 1)
     writer.add_metadata("semloc/x", {"start": "50", "records_sha256": "0"})
     writer.add_attachment(1, 2, "name", "type", b"data")
@@ -252,7 +348,9 @@ class Crash(BaseException):
 
 
 class Dying:
-    """The operating system for a process that dies after a number of steps; a write of n bytes is n // grain + 1 steps."""
+    """The operating system for a process that dies after a number of steps; a write of n bytes is n
+    // grain + 1 steps.
+    """
 
     def __init__(self, steps: int, grain: int) -> None:
         self.left, self.grain = steps, grain
@@ -282,9 +380,14 @@ class Dying:
 
 
 @pytest.mark.parametrize("fewer", [False, True])
-def test_interruption_at_every_step_of_writing_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fewer: bool) -> None:
-    """After the next look at the log it is exactly what it was before, or exactly what it was to become."""
-    log, done = tmp_path / "log.mcap", tmp_path / "done.mcap"
+def test_interruption_at_every_step_of_writing_in_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fewer: bool
+) -> None:
+    """After the next look at the log it is exactly what it was before, or exactly what it was to
+    become.
+    """
+    log = tmp_path / "log.mcap"
+    done = tmp_path / "done.mcap"
     write_log(log, chunk_size=100)
     if fewer:  # the file becomes shorter
         annotate_in_place(log, Results(closures(), "a", {"k": "old"}, log_times=NO_TIMES))
@@ -331,8 +434,11 @@ def test_interruption_of_the_repair_itself(tmp_path: Path, monkeypatch: pytest.M
                 return True
         return False
 
-    assert interrupted(lambda: annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES)), 12)
-    torn, side = log.read_bytes(), (tmp_path / "log.mcap.semloc-tail").read_bytes()
+    assert interrupted(
+        lambda: annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES)), 12
+    )
+    torn = log.read_bytes()
+    side = (tmp_path / "log.mcap.semloc-tail").read_bytes()
     assert torn != before
     for steps in range(100):
         log.write_bytes(torn)
@@ -345,7 +451,9 @@ def test_interruption_of_the_repair_itself(tmp_path: Path, monkeypatch: pytest.M
     pytest.fail("the repair never ended")
 
 
-def test_full_disk_while_writing_leaves_the_log_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_while_writing_leaves_the_log_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = tmp_path / "log.mcap"
     write_log(log)
     before = log.read_bytes()
@@ -370,7 +478,9 @@ def test_full_disk_while_writing_leaves_the_log_as_it_was(tmp_path: Path, monkey
         assert [p.name for p in tmp_path.iterdir()] == ["log.mcap"]
 
 
-def test_a_saved_tail_of_another_file_is_not_put_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_saved_tail_of_another_file_is_not_put_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = tmp_path / "log.mcap"
     write_log(log)
     with monkeypatch.context() as patch:

@@ -36,7 +36,26 @@ TEXT = "std_msgs/msg/String"
 
 def closure(query: str = "a", target: str = "b") -> ClosureRecord:
     covariance = tuple((np.eye(6) * 0.01).ravel())
-    return ClosureRecord(query, target, 3, 5, 1, 2, 3, 0, 0, 0, 1, covariance, 0.8, 0.97, 100, 20, np.eye(4), np.arange(3.0))
+    return ClosureRecord(
+        query,
+        target,
+        3,
+        5,
+        1,
+        2,
+        3,
+        0,
+        0,
+        0,
+        1,
+        covariance,
+        0.8,
+        0.97,
+        100,
+        20,
+        np.eye(4),
+        np.arange(3.0),
+    )
 
 
 def bag1(path: Path) -> Path:
@@ -45,7 +64,11 @@ def bag1(path: Path) -> Path:
         for topic in ("/one", "/two"):
             connection = writer.add_connection(topic, TEXT, typestore=store)
             for k in range(5):
-                writer.write(connection, 100 + k, store.serialize_ros1(store.types[TEXT](data=f"{topic} {k}"), TEXT))
+                writer.write(
+                    connection,
+                    100 + k,
+                    store.serialize_ros1(store.types[TEXT](data=f"{topic} {k}"), TEXT),
+                )
     return path
 
 
@@ -55,22 +78,32 @@ def bag2(folder: Path, plugin: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
         for topic in ("/one", "/two"):
             connection = writer.add_connection(topic, TEXT, typestore=store)
             for k in range(5):
-                writer.write(connection, 100 + k, store.serialize_cdr(store.types[TEXT](data=f"{topic} {k}"), TEXT))
+                writer.write(
+                    connection,
+                    100 + k,
+                    store.serialize_cdr(store.types[TEXT](data=f"{topic} {k}"), TEXT),
+                )
     return folder
 
 
 def mcap_messages(path: Path) -> list[tuple[str, int, bytes]]:
     with path.open("rb") as file:
-        return sorted((c.topic, m.log_time, bytes(m.data)) for _, c, m in make_reader(file, validate_crcs=True).iter_messages())
+        return sorted(
+            (c.topic, m.log_time, bytes(m.data))
+            for _, c, m in make_reader(file, validate_crcs=True).iter_messages()
+        )
 
 
 def bag_messages(reader: Any) -> list[tuple[str, int, bytes]]:
     with reader:
-        return sorted((c.topic, t, bytes(data)) for c, t, data in reader.messages(reader.connections))
+        return sorted(
+            (c.topic, t, bytes(data)) for c, t, data in reader.messages(reader.connections)
+        )
 
 
 def logs(tmp_path: Path) -> dict[str, tuple[Path, Any]]:
-    one, folder = bag1(tmp_path / "one.bag"), bag2(tmp_path / "two")
+    one = bag1(tmp_path / "one.bag")
+    folder = bag2(tmp_path / "two")
     db3 = tmp_path / "three.db3"
     shutil.copyfile(folder / "two.db3", db3)
     bare = tmp_path / "bare"
@@ -87,15 +120,22 @@ def logs(tmp_path: Path) -> dict[str, tuple[Path, Any]]:
     }
 
 
-@pytest.mark.parametrize("kind", ["bag", "folder", "metadata.yaml", "db3", "folder without metadata", "folder of mcap"])
+@pytest.mark.parametrize(
+    "kind", ["bag", "folder", "metadata.yaml", "db3", "folder without metadata", "folder of mcap"]
+)
 def test_bags_get_a_converted_copy_or_a_sidecar(tmp_path: Path, kind: str) -> None:
     log, reader = logs(tmp_path)[kind]
     before = content_fingerprint(log)
-    copy, side = tmp_path / "copy.mcap", tmp_path / "side.mcap"
+    copy = tmp_path / "copy.mcap"
+    side = tmp_path / "side.mcap"
     report = annotate_copy(log, copy, Results([closure()], "a", {}, log_times={3: 102}))
     annotate_sidecar(log, side, Results([closure()], "a", {}, log_times={3: 102}))
     ours = mcap_messages(side)
-    assert [m[:2] for m in ours] == [("/semloc/loop_closures", 102), ("/semloc/markers", 102), ("/semloc/pose", 102)]
+    assert [m[:2] for m in ours] == [
+        ("/semloc/loop_closures", 102),
+        ("/semloc/markers", 102),
+        ("/semloc/pose", 102),
+    ]
     assert mcap_messages(copy) == sorted(bag_messages(reader) + ours)
     assert content_fingerprint(log) == before
     profile = "ros1" if kind == "bag" else "ros2"
@@ -105,25 +145,48 @@ def test_bags_get_a_converted_copy_or_a_sidecar(tmp_path: Path, kind: str) -> No
     if profile == "ros2":
         for path, count in ((copy, 13), (side, 3)):
             with AnyReader([path]) as any_reader:
-                read = [any_reader.deserialize(raw, c.msgtype) for c, _, raw in any_reader.messages()]
+                read = [
+                    any_reader.deserialize(raw, c.msgtype) for c, _, raw in any_reader.messages()
+                ]
             assert len(read) == count
     with pytest.raises(LogError, match="sidecar"):
         annotate_in_place(log, Results([closure()], "a", {}, log_times={}))
-    again = annotate_in_place(copy, Results([closure()], "a", {}, log_times={3: 102}))  # the copy is an MCAP log like any other
+    # the copy is an MCAP log like any other
+    again = annotate_in_place(copy, Results([closure()], "a", {}, log_times={3: 102}))
     assert again.replaced
 
 
 def test_qos_of_the_log_is_kept(tmp_path: Path) -> None:
-    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    from rosbags.interfaces import (
+        Qos,
+        QosDurability,
+        QosHistory,
+        QosLiveliness,
+        QosReliability,
+        QosTime,
+    )
 
     never = QosTime(2147483647, 4294967295)
-    qos = Qos(QosHistory.KEEP_LAST, 7, QosReliability.RELIABLE, QosDurability.VOLATILE, never, never, QosLiveliness.AUTOMATIC, never, False)
+    qos = Qos(
+        QosHistory.KEEP_LAST,
+        7,
+        QosReliability.RELIABLE,
+        QosDurability.VOLATILE,
+        never,
+        never,
+        QosLiveliness.AUTOMATIC,
+        never,
+        False,
+    )
     store = get_typestore(Stores.ROS2_HUMBLE)
     folder = tmp_path / "log"
     with Writer2(folder, version=8) as writer:
-        connection = writer.add_connection("/one", TEXT, typestore=store, offered_qos_profiles=[qos])
+        connection = writer.add_connection(
+            "/one", TEXT, typestore=store, offered_qos_profiles=[qos]
+        )
         writer.write(connection, 1, store.serialize_cdr(store.types[TEXT](data="x"), TEXT))
-    first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
+    first = tmp_path / "first.mcap"
+    second = tmp_path / "second.mcap"
     annotate_copy(folder, first, Results([closure()], "a", {}, log_times={}))
     annotate_copy(first, second, Results([closure()], "a", {}, log_times={}))
     assert first.read_bytes() == second.read_bytes()
@@ -140,19 +203,23 @@ def test_markers_are_defined_as_in_the_log(tmp_path: Path) -> None:
     with Writer2(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/theirs", kind, typestore=store)
         writer.write(connection, 1, store.serialize_cdr(store.types[kind](markers=[]), kind))
-    log, out = tmp_path / "bag" / "bag.mcap", tmp_path / "out.mcap"
+    log = tmp_path / "bag" / "bag.mcap"
+    out = tmp_path / "out.mcap"
     for source in (log, tmp_path / "bag"):
         annotate_copy(source, out, Results([closure()], "a", {}, log_times={}), overwrite=True)
         with AnyReader([out]) as reader:
             definitions = {c.msgdef.data for c in reader.connections if c.msgtype == kind}
             assert len(definitions) == 1
-            ((c, _, raw),) = reader.messages([c for c in reader.connections if c.topic == "/semloc/markers"])
+            ((c, _, raw),) = reader.messages(
+                [c for c in reader.connections if c.topic == "/semloc/markers"]
+            )
             message: Any = reader.deserialize(raw, c.msgtype)
         assert [m.text for m in message.markers] == ["", "b 0.97"]
 
 
 def test_output_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
-    log, out = bag1(tmp_path / "log.bag"), tmp_path / "out.mcap"
+    log = bag1(tmp_path / "log.bag")
+    out = tmp_path / "out.mcap"
     out.write_bytes(b"precious")
     for annotate in (annotate_copy, annotate_sidecar):
         with pytest.raises(LogError, match="exists already"):
@@ -160,16 +227,26 @@ def test_output_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
         assert out.read_bytes() == b"precious"
         with pytest.raises(LogError, match="is the log itself"):
             annotate(log, log, Results([closure()], "a", {}, log_times={}), overwrite=True)
-        assert isinstance(annotate(log, out, Results([closure()], "a", {}, log_times={}), overwrite=True), AnnotateReport)
+        assert isinstance(
+            annotate(log, out, Results([closure()], "a", {}, log_times={}), overwrite=True),
+            AnnotateReport,
+        )
         out.write_bytes(b"precious")
 
 
 def test_missing_and_foreign_files(tmp_path: Path) -> None:
-    text, out = tmp_path / "text.bag", tmp_path / "out.mcap"
+    text = tmp_path / "text.bag"
+    out = tmp_path / "out.mcap"
     text.write_bytes(b"#ROSBAG V2.0\nnot really")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty.db3").write_bytes(b"")
-    for log in (text, tmp_path / "empty", tmp_path / "empty.db3", tmp_path / "nothing.mcap", tmp_path / "nothing.bag"):
+    for log in (
+        text,
+        tmp_path / "empty",
+        tmp_path / "empty.db3",
+        tmp_path / "nothing.mcap",
+        tmp_path / "nothing.bag",
+    ):
         for annotate in (annotate_copy, annotate_sidecar):
             with pytest.raises(LogError):
                 annotate(log, out, Results([closure()], "a", {}, log_times={}))
@@ -188,9 +265,13 @@ def test_a_bag_cut_off_in_the_middle_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_a_log_that_is_cut_off_still_gets_a_sidecar(tmp_path: Path) -> None:
-    log = annotate_copy(bag2(tmp_path / "bag"), tmp_path / "log.mcap", Results([], "a", {}, log_times={})).path
+    log = annotate_copy(
+        bag2(tmp_path / "bag"), tmp_path / "log.mcap", Results([], "a", {}, log_times={})
+    ).path
     log.write_bytes(log.read_bytes()[:-40])
-    report = annotate_sidecar(log, tmp_path / "side.mcap", Results([closure()], "a", {}, log_times={}))
+    report = annotate_sidecar(
+        log, tmp_path / "side.mcap", Results([closure()], "a", {}, log_times={})
+    )
     assert (report.encoding, report.closures) == ("ros2", 1)
     with AnyReader([tmp_path / "side.mcap"]) as reader:
         assert reader.message_count == 3
@@ -208,7 +289,9 @@ def test_a_log_that_is_cut_off_still_gets_a_sidecar(tmp_path: Path) -> None:
         ("", [], "json"),
     ],
 )
-def test_the_encoding_is_that_of_the_log(tmp_path: Path, profile: str, encodings: list[str], expected: str) -> None:
+def test_the_encoding_is_that_of_the_log(
+    tmp_path: Path, profile: str, encodings: list[str], expected: str
+) -> None:
     log = tmp_path / "log.mcap"
     with log.open("wb") as file:
         writer = Writer(file)
@@ -216,13 +299,22 @@ def test_the_encoding_is_that_of_the_log(tmp_path: Path, profile: str, encodings
         for k, encoding in enumerate(encodings):
             writer.add_message(writer.register_channel(f"/{k}", encoding, 0), 1, b"", 1)
         writer.finish()  # type: ignore[no-untyped-call]
-    assert annotate_copy(log, tmp_path / "out.mcap", Results([closure()], "a", {}, log_times={})).encoding == expected
+    assert (
+        annotate_copy(
+            log, tmp_path / "out.mcap", Results([closure()], "a", {}, log_times={})
+        ).encoding
+        == expected
+    )
 
 
 def test_metadata_record(tmp_path: Path) -> None:
-    log = annotate_copy(bag2(tmp_path / "bag"), tmp_path / "log.mcap", Results([], "a", {}, log_times={})).path
+    log = annotate_copy(
+        bag2(tmp_path / "bag"), tmp_path / "log.mcap", Results([], "a", {}, log_times={})
+    ).path
     size = log.stat().st_size
-    report = annotate_in_place(log, Results([closure()], "a", {"fusion.voxel_size": "0.1"}, log_times={}))
+    report = annotate_in_place(
+        log, Results([closure()], "a", {"fusion.voxel_size": "0.1"}, log_times={})
+    )
     with log.open("rb") as file:
         (metadata,) = make_reader(file).iter_metadata()
     assert metadata.name == f"semloc/{report.run_id}"
@@ -246,7 +338,14 @@ def test_fingerprint_sees_content(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["kitti00_000052.mcap", "room_a.mcap", "room_b", "../odd_logs/nav2_turtlebot.mcap", "../odd_logs/ros2_utm_drive_a"]
+    "name",
+    [
+        "kitti00_000052.mcap",
+        "room_a.mcap",
+        "room_b",
+        "../odd_logs/nav2_turtlebot.mcap",
+        "../odd_logs/ros2_utm_drive_a",
+    ],
 )
 def test_real_ros2_logs(tmp_path: Path, name: str) -> None:
     log = SHARED / "logs" / name
@@ -255,7 +354,9 @@ def test_real_ros2_logs(tmp_path: Path, name: str) -> None:
     from mcap_ros2.decoder import DecoderFactory
 
     out = tmp_path / "out.mcap"
-    annotate_copy(log, out, Results([closure(), closure("b", "a")], "a", {}, log_times={}, frame_id="odom"))
+    annotate_copy(
+        log, out, Results([closure(), closure("b", "a")], "a", {}, log_times={}, frame_id="odom")
+    )
     with Reader2(log) as original:
         expected = original.message_count
     with AnyReader([out]) as reader:
@@ -263,5 +364,9 @@ def test_real_ros2_logs(tmp_path: Path, name: str) -> None:
         mine = [c for c in reader.connections if c.topic.startswith("/semloc/")]
         assert len([reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(mine)]) == 5
     with out.open("rb") as file:
-        decoded = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(topics=["/semloc/loop_closures"]))
+        decoded = list(
+            make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(
+                topics=["/semloc/loop_closures"]
+            )
+        )
     assert [d.decoded_message.words for d in decoded] == [20, 20]

@@ -1,4 +1,6 @@
-"""Logs with one fault each: what is skipped is counted and named, the rest is used, and nothing claimed is allocated."""
+"""Logs with one fault each: what is skipped is counted and named, the rest is used, and nothing
+claimed is allocated.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ def all_of(log: Any) -> tuple[list[Any], Session]:
     return list(session.clouds()), session
 
 
-def good_and_bad(log: Any, bad: Callable[[int], None], good: int = 3, bads: int = 2) -> tuple[list[Any], list[str]]:
+def good_and_bad(
+    log: Any, bad: Callable[[int], None], good: int = 3, bads: int = 2
+) -> tuple[list[Any], list[str]]:
     stage(log)
     for k in range(good):
         log.cloud("/points", EPOCH + k * S // 5, "lidar", rows())
@@ -68,17 +72,26 @@ def good_and_bad(log: Any, bad: Callable[[int], None], good: int = 3, bads: int 
         ({"point_step": 0}, "it has no field x|points of 0 bytes need 0 bytes"),
         ({"point_step": 8}, "it has no field z within the 8 bytes of a point"),
         ({"point_step": 16}, "60 x 1 points of 16 bytes need 960 bytes, but it has 720"),
-        ({"height": 6, "width": 10, "row_step": 121}, "10 x 6 points of 12 bytes need 725 bytes, but it has 720"),
+        (
+            {"height": 6, "width": 10, "row_step": 121},
+            "10 x 6 points of 12 bytes need 725 bytes, but it has 720",
+        ),
         ({"data": np.zeros(0, np.uint8)}, "need 720 bytes, but it has 0"),
         ({"fields": []}, "it has no field x"),
     ],
 )
-def test_layouts_that_do_not_fit(recorder: Any, kind: str, changes: dict[str, Any], reason: str) -> None:
+def test_layouts_that_do_not_fit(
+    recorder: Any, kind: str, changes: dict[str, Any], reason: str
+) -> None:
     log = recorder(kind)
-    clouds, skipped = good_and_bad(log, lambda stamp: log.cloud("/points", stamp, "lidar", rows(), **changes))
+    clouds, skipped = good_and_bad(
+        log, lambda stamp: log.cloud("/points", stamp, "lidar", rows(), **changes)
+    )
     assert len(clouds) == 3
     [sentence] = skipped
-    assert sentence.startswith("/points: 2 messages skipped; the first because sensor_msgs/msg/PointCloud2 at log time ")
+    assert sentence.startswith(
+        "/points: 2 messages skipped; the first because sensor_msgs/msg/PointCloud2 at log time "
+    )
     assert any(part in sentence for part in reason.split("|"))
 
 
@@ -126,7 +139,9 @@ def test_points_that_are_no_numbers_are_counted(recorder: Any) -> None:
     log = recorder()
     clouds, skipped = good_and_bad(log, lambda stamp: holes(stamp, is_dense=True))
     assert [len(c.points) for c in clouds] == [60, 60, 60, 56, 56]
-    assert skipped == ["/points: 8 of 300 points are left out: they are not finite, although their clouds call themselves dense."]
+    assert skipped == [
+        "/points: 8 of 300 points are left out: they are not finite, although their clouds call themselves dense."
+    ]
     log = recorder(name="honest")
     assert good_and_bad(log, lambda stamp: holes(stamp, is_dense=False))[1] == []
 
@@ -136,28 +151,44 @@ def test_clouds_of_nothing_are_counted(recorder: Any) -> None:
     nothing["x"] = np.nan
     log = recorder()
     clouds, skipped = good_and_bad(
-        log, lambda stamp: log.cloud("/points", stamp, "lidar", nothing[:0] if stamp % S else nothing, is_dense=False)
+        log,
+        lambda stamp: log.cloud(
+            "/points", stamp, "lidar", nothing[:0] if stamp % S else nothing, is_dense=False
+        ),
     )
     assert len(clouds) == 3
-    assert skipped == ["/points: 2 of 5 frames are left out: they hold no points, or none whose position is a number."]
+    assert skipped == [
+        "/points: 2 of 5 frames are left out: they hold no points, or none whose position is a number."
+    ]
 
 
 def test_inspect_and_fuse_say_it_and_exit_with_3(recorder: Any, tmp_path: Path) -> None:
     log = recorder()
     stage(log)
     for k in range(5):
-        log.cloud("/points", EPOCH + k * S // 5, "lidar", rows(), **({"width": 61} if k == 0 else {}))
+        log.cloud(
+            "/points", EPOCH + k * S // 5, "lidar", rows(), **({"width": 61} if k == 0 else {})
+        )
     path = log.write()
     for args in (["inspect", str(path)], ["fuse", str(path), "-w", str(tmp_path / "w")]):
         done = CliRunner().invoke(program, args)
         assert done.exit_code == 3, done.output
-        assert "/points: 1 message skipped; sensor_msgs/msg/PointCloud2 at log time" in done.output.replace("\n", " ").replace("  ", " ")
+        assert (
+            "/points: 1 message skipped; sensor_msgs/msg/PointCloud2 at log time"
+            in done.output.replace("\n", " ").replace("  ", " ")
+        )
 
 
 # -- depth
 
 
-def depth_log(log: Any, pictures: list[NDArray[Any]], encoding: str, *, info: tuple[int, int, float] = (8, 6, 5.0)) -> None:
+def depth_log(
+    log: Any,
+    pictures: list[NDArray[Any]],
+    encoding: str,
+    *,
+    info: tuple[int, int, float] = (8, 6, 5.0),
+) -> None:
     stage(log)
     log.camera_info("/cam/depth/camera_info", EPOCH, "lidar", *info)
     for k, picture in enumerate(pictures):
@@ -179,7 +210,9 @@ def test_depth_values_that_are_none(recorder: Any) -> None:
     depth_log(log, [np.full((6, 8), 65535, np.uint16), whole], "16UC1")
     clouds, session = all_of(log)
     assert len(clouds) == 1
-    assert session.skipped == ["/cam/depth/image: 1 of 2 frames are left out: they have no points within the range limits."]
+    assert session.skipped == [
+        "/cam/depth/image: 1 of 2 frames are left out: they have no points within the range limits."
+    ]
 
 
 def test_a_calibration_of_another_size(recorder: Any) -> None:
@@ -188,8 +221,13 @@ def test_a_calibration_of_another_size(recorder: Any) -> None:
     clouds, session = all_of(log)
     assert clouds == []
     assert len(session.skipped) == 2
-    assert session.skipped[0].startswith("CameraInfo /cam/depth/camera_info is for 16 x 12 pixels but the depth image has 8 x 6")
-    assert session.skipped[1] == "/cam/depth/image: 3 of 3 frames are left out: their CameraInfo cannot be used."
+    assert session.skipped[0].startswith(
+        "CameraInfo /cam/depth/camera_info is for 16 x 12 pixels but the depth image has 8 x 6"
+    )
+    assert (
+        session.skipped[1]
+        == "/cam/depth/image: 3 of 3 frames are left out: their CameraInfo cannot be used."
+    )
 
 
 @pytest.mark.parametrize("kind", ["ros2", "ros1"])
@@ -198,9 +236,14 @@ def test_a_calibration_of_zeros(recorder: Any, kind: str) -> None:
     depth_log(log, [np.full((6, 8), 2000, np.uint16)] * 3, "16UC1", info=(8, 6, 0.0))
     clouds, session = all_of(log)
     assert clouds == []
-    assert "/cam/depth/camera_info: 1 message skipped; sensor_msgs/msg/CameraInfo" in session.skipped[0]
+    assert (
+        "/cam/depth/camera_info: 1 message skipped; sensor_msgs/msg/CameraInfo"
+        in session.skipped[0]
+    )
     assert "its camera is not calibrated (the focal length is zero)" in session.skipped[0]
-    assert session.skipped[1].startswith("/cam/depth/image: 3 of 3 frames are left out: no CameraInfo")
+    assert session.skipped[1].startswith(
+        "/cam/depth/image: 3 of 3 frames are left out: no CameraInfo"
+    )
 
 
 # -- time
@@ -228,7 +271,9 @@ def test_sweeps_with_impossible_times_are_counted(recorder: Any) -> None:
     clouds, session = all_of(log)
     assert len(clouds) == 5
     [sentence] = session.skipped
-    assert sentence.startswith("/points: 3 of 8 frames are left out: no pose is known at their time")
+    assert sentence.startswith(
+        "/points: 3 of 8 frames are left out: no pose is known at their time"
+    )
 
 
 def test_a_clock_that_is_set_back(recorder: Any) -> None:
@@ -281,10 +326,20 @@ def test_one_bad_transform_does_not_cost_its_message(recorder: Any) -> None:
 
 def png_head(width: int, height: int, depth: int = 8, colour: int = 2, body: bytes = b"") -> bytes:
     def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        return (
+            struct.pack(">I", len(content))
+            + kind
+            + content
+            + struct.pack(">I", zlib.crc32(kind + content))
+        )
 
     head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(body)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + chunk(b"IDAT", zlib.compress(body))
+        + chunk(b"IEND", b"")
+    )
 
 
 def jpeg_head(width: int, height: int) -> bytes:
@@ -298,11 +353,22 @@ BOMBS = {
     "png": ("png", png_head(100_000, 100_000)),
     "png of many bits": ("png", png_head(8000, 8000, 16, 6, bytes(40_000_000))),
     "png 2^31": ("png", png_head(2**31 - 1, 2**31 - 1, 16, 6)),
-    "png chunk": ("png", png_head(8, 8).replace(struct.pack(">I", len(zlib.compress(b""))) + b"IDAT", b"\x41\0\0\0IDAT")),
+    "png chunk": (
+        "png",
+        png_head(8, 8).replace(
+            struct.pack(">I", len(zlib.compress(b""))) + b"IDAT", b"\x41\0\0\0IDAT"
+        ),
+    ),
     "jpeg": ("jpeg", jpeg_head(65_000, 65_000)),
     "rvl": ("16UC1; compressedDepth rvl", struct.pack("<iffIII", 0, 0, 0, 60_000, 60_000, 0)),
-    "rvl of zeros": ("16UC1; compressedDepth rvl", struct.pack("<iffIIII", 0, 0, 0, 4096, 8192, 0xFFFFFFF7, 0)),
-    "depth png": ("16UC1; compressedDepth png", struct.pack("<iff", 0, 0, 0) + png_head(100_000, 100_000, 16, 0)),
+    "rvl of zeros": (
+        "16UC1; compressedDepth rvl",
+        struct.pack("<iffIIII", 0, 0, 0, 4096, 8192, 0xFFFFFFF7, 0),
+    ),
+    "depth png": (
+        "16UC1; compressedDepth png",
+        struct.pack("<iff", 0, 0, 0) + png_head(100_000, 100_000, 16, 0),
+    ),
 }
 
 
@@ -313,10 +379,21 @@ def test_bombs_in_a_log_cost_nothing(recorder: Any) -> None:
     log.camera_info("/cam/depth/camera_info", EPOCH, "lidar", 8, 6, 5.0)
     for k, (format_, data) in enumerate(BOMBS.values()):
         compressed = log.make(
-            "sensor_msgs/msg/CompressedImage", header=log.header(EPOCH + k, "lidar"), format=format_, data=np.frombuffer(data, np.uint8)
+            "sensor_msgs/msg/CompressedImage",
+            header=log.header(EPOCH + k, "lidar"),
+            format=format_,
+            data=np.frombuffer(data, np.uint8),
         )
-        log.add("/cam/depth/image/compressedDepth" if "Depth" in format_ else "/colour/image/compressed", compressed, EPOCH + k)
-    for k, changes in enumerate(({"width": 2**32 - 1}, {"height": 2**32 - 1, "width": 2**32 - 1}, {"point_step": 2**32 - 1})):
+        log.add(
+            "/cam/depth/image/compressedDepth"
+            if "Depth" in format_
+            else "/colour/image/compressed",
+            compressed,
+            EPOCH + k,
+        )
+    for k, changes in enumerate(
+        ({"width": 2**32 - 1}, {"height": 2**32 - 1, "width": 2**32 - 1}, {"point_step": 2**32 - 1})
+    ):
         log.cloud("/points", EPOCH + k * S // 10, "lidar", rows(), **changes)
     log.cloud("/points", EPOCH + S, "lidar", rows())
     path = log.write()
@@ -331,7 +408,9 @@ before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 clouds = list(session.clouds(on_image=lambda image: None))
 print(json.dumps([len(clouds), session.skipped, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before]))
 """
-    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=50)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=50
+    )
     assert done.returncode == 0, done.stderr
     count, skipped, grown_kib = json.loads(done.stdout)
     assert count == 1
@@ -345,7 +424,9 @@ print(json.dumps([len(clouds), session.skipped, resource.getrusage(resource.RUSA
 
 @pytest.mark.parametrize("name", BOMBS)
 def test_bombs_are_refused_for_their_claim(name: str) -> None:
-    """Before the decoder of pictures sees them: it would ask for the memory, and say only that it failed."""
+    """Before the decoder of pictures sees them: it would ask for the memory, and say only that it
+    failed.
+    """
     format_, data = BOMBS[name]
     with pytest.raises(UndecodableError, match=r"claim|cut off"):
         decode_compressed_depth(data, format_) if "Depth" in format_ else decode_compressed(data)
@@ -367,7 +448,9 @@ def test_inspect_names_clouds_without_points(recorder: Any) -> None:
         log.cloud("/points", EPOCH + k * S // 5, "lidar", rows()[: 0 if k < 2 else 60])
     told: Any = inspect_log(log.write())
     assert told["sensors"]["/points"]["points"] == 60
-    assert any("/points: no point with a position in the first 2 clouds." in p for p in told["problems"])
+    assert any(
+        "/points: no point with a position in the first 2 clouds." in p for p in told["problems"]
+    )
 
 
 def test_nothing_but_damage_is_an_error(recorder: Any, tmp_path: Path) -> None:

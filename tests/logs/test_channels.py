@@ -16,7 +16,16 @@ from mcap_protobuf.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.errors import ContractError
-from semloc_logs.logs.annotation.channels import COLUMNS, TOPICS, ClosureRecord, Encoding, LogFacts, channel_metadata, encode, run_id
+from semloc_logs.logs.annotation.channels import (
+    COLUMNS,
+    TOPICS,
+    ClosureRecord,
+    Encoding,
+    LogFacts,
+    channel_metadata,
+    encode,
+    run_id,
+)
 from semloc_logs.logs.annotation.channels_foxglove import loop_closure_class
 from semloc_logs.logs.annotation.mcap_append import NewChannel, NewMessage
 from semloc_logs.numerics.transforms import transform, yaw_transform
@@ -46,12 +55,15 @@ ROW: dict[str, object] = {
 
 def decode(channel: NewChannel, message: NewMessage) -> Any:
     """The message as an object, read by a library that only knows the channel and its schema."""
-    name, text = channel.schema_name, channel.schema_data
+    name = channel.schema_name
+    text = channel.schema_data
     if channel.schema_encoding in ("ros2msg", "ros1msg"):
         full = name if "/msg/" in name else name.replace("/", "/msg/")
         store = get_typestore(Stores.EMPTY)
         store.register(get_types_from_msg(text.decode(), full))
-        read = store.deserialize_cdr if channel.message_encoding == "cdr" else store.deserialize_ros1
+        read = (
+            store.deserialize_cdr if channel.message_encoding == "cdr" else store.deserialize_ros1
+        )
         return read(message.data, full)
     if channel.message_encoding == "protobuf":
         decoder = DecoderFactory().decoder_for("protobuf", Schema(1, text, "protobuf", name))
@@ -62,10 +74,21 @@ def decode(channel: NewChannel, message: NewMessage) -> Any:
 
 
 def decoded(
-    closures: Sequence[ClosureRecord], session: str, encoding: Encoding, log_times: dict[int, int] | None = None
+    closures: Sequence[ClosureRecord],
+    session: str,
+    encoding: Encoding,
+    log_times: dict[int, int] | None = None,
 ) -> dict[str, list[tuple[int, Any]]]:
     facts = LogFacts(encoding, "", {}, 10, 20, 1)
-    channels, messages = encode(closures, session, facts, log_times=log_times or {}, frame_id="odom", size=1.0, metadata={"run": "1"})
+    channels, messages = encode(
+        closures,
+        session,
+        facts,
+        log_times=log_times or {},
+        frame_id="odom",
+        size=1.0,
+        metadata={"run": "1"},
+    )
     out: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in TOPICS}
     for m in messages:
         out[channels[m.channel].topic].append((m.log_time_ns, decode(channels[m.channel], m)))
@@ -95,21 +118,34 @@ def test_pose_of_the_query_in_the_frame_of_the_target(encoding: Encoding) -> Non
     inner = message.pose.pose if encoding.startswith("ros") else message.pose
     assert (inner.position.x, inner.position.y, inner.position.z) == (10.0, 20.0, 30.0)
     assert np.allclose([inner.orientation.z, inner.orientation.w], np.sqrt(0.5))
-    assert (message.header.frame_id if encoding.startswith("ros") else message.frame_id) == "semloc/dry_sunday"
-    assert not decoded([closure], "dry_sunday", encoding)["/semloc/pose"]  # there the log is the target
+    assert (
+        message.header.frame_id if encoding.startswith("ros") else message.frame_id
+    ) == "semloc/dry_sunday"
+    # there the log is the target
+    assert not decoded([closure], "dry_sunday", encoding)["/semloc/pose"]
 
 
 def test_covariance_of_the_pose_is_turned_into_the_axes_of_the_session() -> None:
     """The target stands turned by 90 degrees: its x axis is the session's y axis."""
-    row = ROW | {"q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 1.0, "covariance": list(COVARIANCE.ravel())}
+    row = ROW | {
+        "q_x": 0.0,
+        "q_y": 0.0,
+        "q_z": 0.0,
+        "q_w": 1.0,
+        "covariance": list(COVARIANCE.ravel()),
+    }
     closure = ClosureRecord.from_row(row, session_T_query=yaw_transform(np.pi / 2, (5.0, 0.0, 0.0)))
     assert np.allclose(closure.covariance_in_session(), np.diag([2.0, 1.0, 3.0, 5.0, 4.0, 6.0]))
     ((_, message),) = decoded([closure], "wet_monday", "ros2")["/semloc/pose"]
-    assert np.allclose(message.pose.covariance.reshape(6, 6), np.diag([2.0, 1.0, 3.0, 5.0, 4.0, 6.0]))
+    assert np.allclose(
+        message.pose.covariance.reshape(6, 6), np.diag([2.0, 1.0, 3.0, 5.0, 4.0, 6.0])
+    )
 
 
 def test_covariance_in_session_against_sampled_errors() -> None:
-    """Perturb the closure as 3.3 defines its errors, and look at the errors of the pose in the session."""
+    """Perturb the closure as 3.3 defines its errors, and look at the errors of the pose in the
+    session.
+    """
     from scipy.spatial.transform import Rotation
 
     rng = np.random.default_rng(1)
@@ -121,19 +157,37 @@ def test_covariance_in_session_against_sampled_errors() -> None:
     true = np.repeat(target_T_query[None], len(errors), 0)
     true[:, :3, 3] += errors[:, :3]
     true[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ target_T_query[:3, :3]
-    seen, mean = session_T_target @ true, session_T_target @ target_T_query
+    seen = session_T_target @ true
+    mean = session_T_target @ target_T_query
     turns = Rotation.from_matrix(seen[:, :3, :3] @ mean[:3, :3].T).as_rotvec()
     sampled = np.cov(np.hstack([seen[:, :3, 3] - mean[:3, 3], turns]).T)
     q = Rotation.from_matrix(target_T_query[:3, :3]).as_quat()
-    row = ROW | dict(zip(("q_x", "q_y", "q_z", "q_w"), map(float, q), strict=True)) | {"covariance": list(covariance.ravel())}
+    row = (
+        ROW
+        | dict(zip(("q_x", "q_y", "q_z", "q_w"), map(float, q), strict=True))
+        | {"covariance": list(covariance.ravel())}
+    )
     computed = ClosureRecord.from_row(row, session_T_query=mean).covariance_in_session()
     assert np.abs(computed - sampled).max() < 0.05 * np.abs(computed).max()
 
 
 def test_markers_show_the_place_and_the_other_end() -> None:
-    """A self closure: the query stands at (5, 0, 0) by its own odometry, the target end lies at (0, 0, 0)."""
-    row = ROW | {"target_session": "wet_monday", "t_x": 4.0, "t_y": 0.0, "t_z": 0.0, "q_z": 0.0, "q_w": 1.0}
-    closure = ClosureRecord.from_row(row, session_T_query=yaw_transform(0.0, (4.0, 0.0, 0.0)), session_position=np.array([5.0, 0.0, 0.0]))
+    """A self closure: the query stands at (5, 0, 0) by its own odometry, the target end lies at (0,
+    0, 0).
+    """
+    row = ROW | {
+        "target_session": "wet_monday",
+        "t_x": 4.0,
+        "t_y": 0.0,
+        "t_z": 0.0,
+        "q_z": 0.0,
+        "q_w": 1.0,
+    }
+    closure = ClosureRecord.from_row(
+        row,
+        session_T_query=yaw_transform(0.0, (4.0, 0.0, 0.0)),
+        session_position=np.array([5.0, 0.0, 0.0]),
+    )
     found = decoded([closure], "wet_monday", "ros2")
     assert [len(found[t]) for t in TOPICS] == [1, 1, 1]  # one message, at the query's end
     sphere, line, text = found["/semloc/markers"][0][1].markers
@@ -150,33 +204,63 @@ def test_markers_show_the_place_and_the_other_end() -> None:
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_markers_between_sessions_have_no_line(encoding: Encoding) -> None:
-    closure = ClosureRecord.from_row(ROW, session_T_query=np.eye(4), session_position=np.array([1.0, 2.0, 3.0]))
+    closure = ClosureRecord.from_row(
+        ROW, session_T_query=np.eye(4), session_position=np.array([1.0, 2.0, 3.0])
+    )
     for session, other in (("wet_monday", "dry_sunday"), ("dry_sunday", "wet_monday")):
         ((_, message),) = decoded([closure], session, encoding)["/semloc/markers"]
-        texts = [m.text for m in message.markers] if encoding.startswith("ros") else [message.entities[0].texts[0].text]
+        texts = (
+            [m.text for m in message.markers]
+            if encoding.startswith("ros")
+            else [message.entities[0].texts[0].text]
+        )
         assert f"{other} 0.97" in texts
-        assert (len(message.markers) == 2) if encoding.startswith("ros") else (len(message.entities[0].lines) == 0)
+        assert (
+            (len(message.markers) == 2)
+            if encoding.startswith("ros")
+            else (len(message.entities[0].lines) == 0)
+        )
 
 
 def test_times_and_order() -> None:
-    """An end takes the receive time of its frame; one without takes its stamp, moved into the log's range of 10 to 20."""
+    """An end takes the receive time of its frame; one without takes its stamp, moved into the log's
+    range of 10 to 20.
+    """
 
     def one(stamp: int) -> ClosureRecord:
         return ClosureRecord.from_row(ROW | {"query_stamp_ns": stamp, "words": stamp})
 
     closures = [one(stamp) for stamp in (14, 13, 25, 5)]
-    found = decoded([*closures, ClosureRecord.from_row(ROW | {"query_session": "other"})], "wet_monday", "ros2", {14: 11, 13: 12})
-    assert [(t, m.words) for t, m in found["/semloc/loop_closures"]] == [(10, 5), (11, 14), (12, 13), (20, 25)]
+    found = decoded(
+        [*closures, ClosureRecord.from_row(ROW | {"query_session": "other"})],
+        "wet_monday",
+        "ros2",
+        {14: 11, 13: 12},
+    )
+    assert [(t, m.words) for t, m in found["/semloc/loop_closures"]] == [
+        (10, 5),
+        (11, 14),
+        (12, 13),
+        (20, 25),
+    ]
 
 
 def test_as_target_the_time_is_that_of_the_target() -> None:
-    found = decoded([ClosureRecord.from_row(ROW)], "dry_sunday", "ros2", {1_600_000_000_987_654_321: 17})
+    found = decoded(
+        [ClosureRecord.from_row(ROW)], "dry_sunday", "ros2", {1_600_000_000_987_654_321: 17}
+    )
     ((time, message),) = found["/semloc/loop_closures"]
-    assert (time, message.header.stamp.sec, message.query_session) == (17, 1_600_000_000, "wet_monday")
+    assert (time, message.header.stamp.sec, message.query_session) == (
+        17,
+        1_600_000_000,
+        "wet_monday",
+    )
 
 
 def test_schemas_agree_with_the_columns() -> None:
-    fields = re.findall(r"^(\w+)(\[36\])? (\w+)$", read_text("messages/LoopClosure.msg"), re.MULTILINE)
+    fields = re.findall(
+        r"^(\w+)(\[36\])? (\w+)$", read_text("messages/LoopClosure.msg"), re.MULTILINE
+    )
     assert [name for _, _, name in fields] == list(COLUMNS)
     properties = json.loads(read_text("messages/LoopClosure.json"))["properties"]
     assert list(properties) == ["timestamp", *COLUMNS]
@@ -184,29 +268,53 @@ def test_schemas_agree_with_the_columns() -> None:
     for kind, array, name in fields:
         entry = properties[name]["items"] if array else properties[name]
         assert entry["type"] == kinds[kind], name
-    proto = re.findall(r"^  (repeated )?([\w.]+) (\w+) = (\d+);$", read_text("messages/LoopClosure.proto"), re.MULTILINE)
+    proto = re.findall(
+        r"^  (repeated )?([\w.]+) (\w+) = (\d+);$",
+        read_text("messages/LoopClosure.proto"),
+        re.MULTILINE,
+    )
     descriptor = descriptor_pb2.DescriptorProto()
     loop_closure_class().DESCRIPTOR.CopyToProto(descriptor)
     types = {"string": 9, "int64": 3, "int32": 5, "double": 1, "google.protobuf.Timestamp": 11}
     built = [(f.name, f.number, f.type, f.label == 3) for f in descriptor.field]
-    assert built == [(name, int(number), types[kind], bool(repeated)) for repeated, kind, name, number in proto]
+    assert built == [
+        (name, int(number), types[kind], bool(repeated)) for repeated, kind, name, number in proto
+    ]
     assert [name for _, _, name, _ in proto] == ["timestamp", *COLUMNS]
 
 
 def test_ros_definitions_name_their_types_as_the_profile_wants() -> None:
     facts = LogFacts("ros1", "ros1", {}, 0, 0, 0)
     closure = ClosureRecord.from_row(ROW, session_T_query=np.eye(4), session_position=np.zeros(3))
-    channels, _ = encode([closure], "wet_monday", facts, log_times={}, frame_id="", size=1.0, metadata={"run": "1"})
-    assert [(c.topic, c.schema_name, c.schema_encoding, c.message_encoding, dict(c.metadata)) for c in channels] == [
+    channels, _ = encode(
+        [closure], "wet_monday", facts, log_times={}, frame_id="", size=1.0, metadata={"run": "1"}
+    )
+    assert [
+        (c.topic, c.schema_name, c.schema_encoding, c.message_encoding, dict(c.metadata))
+        for c in channels
+    ] == [
         ("/semloc/loop_closures", "semloc_msgs/LoopClosure", "ros1msg", "ros1", {"run": "1"}),
-        ("/semloc/pose", "geometry_msgs/PoseWithCovarianceStamped", "ros1msg", "ros1", {"run": "1"}),
+        (
+            "/semloc/pose",
+            "geometry_msgs/PoseWithCovarianceStamped",
+            "ros1msg",
+            "ros1",
+            {"run": "1"},
+        ),
         ("/semloc/markers", "visualization_msgs/MarkerArray", "ros1msg", "ros1", {"run": "1"}),
     ]
     assert b"MSG: std_msgs/Header\nuint32 seq\ntime stamp" in channels[0].schema_data
 
 
 @pytest.mark.parametrize(
-    "change", [{"covariance": [1.0] * 35}, {"t_x": None}, {"words": "many"}, {"covariance": 1.0}, {"query_stamp_ns": None}]
+    "change",
+    [
+        {"covariance": [1.0] * 35},
+        {"t_x": None},
+        {"words": "many"},
+        {"covariance": 1.0},
+        {"query_stamp_ns": None},
+    ],
 )
 def test_rows_that_break_the_contract(change: dict[str, object]) -> None:
     with pytest.raises(ContractError):
@@ -224,7 +332,9 @@ def test_numbers_that_are_not_finite_are_refused(encoding: Encoding) -> None:
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("stamp", [0, -5, 2**63 - 1])
 def test_extreme_stamps(encoding: Encoding, stamp: int) -> None:
-    ((_, message),) = decoded([ClosureRecord.from_row(ROW | {"query_stamp_ns": stamp})], "wet_monday", encoding)["/semloc/loop_closures"]
+    ((_, message),) = decoded(
+        [ClosureRecord.from_row(ROW | {"query_stamp_ns": stamp})], "wet_monday", encoding
+    )["/semloc/loop_closures"]
     assert message.query_stamp_ns == stamp
 
 
@@ -232,7 +342,11 @@ def test_run_id_follows_content() -> None:
     closure = ClosureRecord.from_row(ROW)
     same = run_id([ClosureRecord.from_row(dict(ROW))], "s", {"a": "1", "b": "2"}, "1")
     assert run_id([closure], "s", {"b": "2", "a": "1"}, "1") == same
-    others = [([], "s", {"a": "1", "b": "2"}, "1"), ([closure], "s", {}, "1"), ([closure], "t", {"a": "1", "b": "2"}, "1")]
+    others = [
+        ([], "s", {"a": "1", "b": "2"}, "1"),
+        ([closure], "s", {}, "1"),
+        ([closure], "t", {"a": "1", "b": "2"}, "1"),
+    ]
     assert all(run_id(*other) != same for other in others)
     assert re.fullmatch("[0-9a-f]{16}", same)
     assert channel_metadata(same, "1")["semloc.run_id"] == same

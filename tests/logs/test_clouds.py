@@ -31,7 +31,12 @@ def test_one_point_by_hand() -> None:
 
 
 def test_big_endian_float64() -> None:
-    fields = [Field("z", 16, "f8"), Field("y", 8, "f8"), Field("x", 0, "f8"), Field("semantic", 24, "u2")]
+    fields = [
+        Field("z", 16, "f8"),
+        Field("y", 8, "f8"),
+        Field("x", 0, "f8"),
+        Field("semantic", 24, "u2"),
+    ]
     data = struct.pack(">dddH", 1.0, 2.0, 3.0, 258)
     p = decode_points(data, Layout(1, 1, 26, 26, big_endian=True), fields, STAMP)
     assert p.points.tolist() == [[1.0, 2.0, 3.0]]
@@ -40,7 +45,8 @@ def test_big_endian_float64() -> None:
 
 
 def test_rows_with_padding_and_points_that_are_none() -> None:
-    nan, inf = float("nan"), float("inf")
+    nan = float("nan")
+    inf = float("inf")
     first = struct.pack("<ffffff", 1, 2, 3, nan, 0, 0) + b"padding!"
     second = struct.pack("<ffffff", 0, 0, 0, 0, 0, 4)
     p = decode_points(first + second, Layout(2, 2, 12, 32), XYZ, STAMP)
@@ -51,7 +57,9 @@ def test_rows_with_padding_and_points_that_are_none() -> None:
 
 def test_columns_follow_the_points_that_are_kept() -> None:
     fields = [*XYZ, Field("label", 12, "u1")]
-    data = b"".join(struct.pack("<fffB", x, 0, 0, label) for x, label in ((1, 10), (0, 20), (2, 30)))
+    data = b"".join(
+        struct.pack("<fffB", x, 0, 0, label) for x, label in ((1, 10), (0, 20), (2, 30))
+    )
     p = decode_points(data, Layout(3, 1, 13, 39), fields, STAMP)
     assert p.label is not None
     assert p.points[:, 0].tolist() == [1, 2]
@@ -63,7 +71,10 @@ def test_empty_clouds(layout: Layout) -> None:
     assert decode_points(b"", layout, XYZ, STAMP).points.shape == (0, 3)
 
 
-@pytest.mark.parametrize("layout", [Layout(3, 1, 12, 36), Layout(2**31, 2**31, 12, 0), Layout(1, 2, 12, 13), Layout(1, 1, 0, 0)])
+@pytest.mark.parametrize(
+    "layout",
+    [Layout(3, 1, 12, 36), Layout(2**31, 2**31, 12, 0), Layout(1, 2, 12, 13), Layout(1, 1, 0, 0)],
+)
 def test_claims_beyond_the_data_are_refused(layout: Layout) -> None:
     with pytest.raises(UndecodableError):
         decode_points(b"\0" * 24, layout, XYZ, STAMP)
@@ -75,7 +86,9 @@ def test_row_step_zero_means_dense() -> None:
     assert decode_points(data, Layout(1, 2, 12, 0), XYZ, STAMP).points[:, 0].tolist() == [1, 2]
 
 
-@pytest.mark.parametrize("fields", [XYZ[:2], [*XYZ[:2], Field("z", 9, "f4")], [*XYZ[:2], Field("z", 8, "u4")]])
+@pytest.mark.parametrize(
+    "fields", [XYZ[:2], [*XYZ[:2], Field("z", 9, "f4")], [*XYZ[:2], Field("z", 8, "u4")]]
+)
 def test_positions_must_be_floating_point_fields_inside_the_point(fields: list[Field]) -> None:
     with pytest.raises(UndecodableError, match="field z"):
         decode_points(b"\0" * 12, Layout(1, 1, 12, 12), fields, STAMP)
@@ -84,15 +97,18 @@ def test_positions_must_be_floating_point_fields_inside_the_point(fields: list[F
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        (np.array([0, 50_000_000, 99_999_999], np.uint32), [0, 50_000_000, 99_999_999]),  # ns since the stamp
+        # ns since the stamp
+        (np.array([0, 50_000_000, 99_999_999], np.uint32), [0, 50_000_000, 99_999_999]),
         (np.array([0, 50_000, 99_999], np.uint32), [0, 50_000_000, 99_999_000]),  # us
         (np.array([0.0, 0.05, 0.0999], np.float32), [0, 50_000_000, 99_900_000]),  # s
         (np.array([0.0, 50.0, 99.9], np.float32), [0, 50_000_000, 99_900_000]),  # ms
         (np.array([0.0, 5e4, 99900], np.float32), [0, 50_000_000, 99_900_000]),  # us
-        (np.array([-0.1, -0.05, 0.0]), [-100_000_000, -50_000_000, 0]),  # stamped at the end of the sweep
+        # stamped at the end of the sweep
+        (np.array([-0.1, -0.05, 0.0]), [-100_000_000, -50_000_000, 0]),
         (np.array([STAMP, STAMP + 7_000_001], np.uint64), [0, 7_000_001]),  # ns since 1970
         (np.array([STAMP - 10_000_000, STAMP], np.int64), [-10_000_000, 0]),
-        (np.array([STAMP // 1000, STAMP // 1000 + 90_000], np.uint64), [-789, 90_000_000 - 789]),  # us since 1970
+        # us since 1970
+        (np.array([STAMP // 1000, STAMP // 1000 + 90_000], np.uint64), [-789, 90_000_000 - 789]),
         (np.array([0, 0], np.uint32), [0, 0]),  # a flash sensor
     ],
 )
@@ -107,10 +123,13 @@ def test_absolute_seconds_are_exact_to_their_precision() -> None:
     seconds = STAMP * 1e-9 + np.array([0.0, 0.02, 0.1])
     found, _ = offsets_ns(seconds, STAMP)
     assert found is not None
-    np.testing.assert_allclose(found, [0, 20_000_000, 100_000_000], atol=500)  # a float64 of 1.7e9 s resolves 240 ns
+    # a float64 of 1.7e9 s resolves 240 ns
+    np.testing.assert_allclose(found, [0, 20_000_000, 100_000_000], atol=500)
 
 
-@pytest.mark.parametrize("values", [np.array([5.0, np.nan]), np.array([0.0, 1e300]), np.array([0, 2**63], np.uint64)])
+@pytest.mark.parametrize(
+    "values", [np.array([5.0, np.nan]), np.array([0.0, 1e300]), np.array([0, 2**63], np.uint64)]
+)
 def test_times_without_sense_are_left_out(values: NDArray[np.generic]) -> None:
     assert offsets_ns(values, STAMP) == (None, False)
 
@@ -126,23 +145,40 @@ def test_relative_and_absolute_nanoseconds_agree(offsets: list[int]) -> None:
     assert relative.tolist() == absolute.tolist() == offsets
 
 
-def slow_points(data: bytes, layout: Layout, kinds: dict[str, tuple[int, str]]) -> list[tuple[float, ...]]:
+def slow_points(
+    data: bytes, layout: Layout, kinds: dict[str, tuple[int, str]]
+) -> list[tuple[float, ...]]:
     """The obvious loop."""
     order = ">" if layout.big_endian else "<"
     found = []
     for v in range(layout.height):
         for u in range(layout.width):
             at = v * layout.row_step + u * layout.point_step
-            point = tuple(struct.unpack_from(order + kinds[a][1], data, at + kinds[a][0])[0] for a in "xyz")
-            if all(np.isfinite(np.float32(c)) for c in point) and any(np.float32(c) != 0 for c in point):
+            point = tuple(
+                struct.unpack_from(order + kinds[a][1], data, at + kinds[a][0])[0] for a in "xyz"
+            )
+            if all(np.isfinite(np.float32(c)) for c in point) and any(
+                np.float32(c) != 0 for c in point
+            ):
                 found.append(point)
     return found
 
 
-@given(st.data(), st.integers(0, 3), st.integers(0, 4), st.integers(0, 5), st.integers(0, 7), st.booleans())
-def test_agrees_with_the_obvious_loop(data: st.DataObject, height: int, width: int, gap: int, padding: int, big: bool) -> None:
+@given(
+    st.data(),
+    st.integers(0, 3),
+    st.integers(0, 4),
+    st.integers(0, 5),
+    st.integers(0, 7),
+    st.booleans(),
+)
+def test_agrees_with_the_obvious_loop(
+    data: st.DataObject, height: int, width: int, gap: int, padding: int, big: bool
+) -> None:
     layout = Layout(width, height, 12 + gap, (12 + gap) * width + padding, big)
-    content = data.draw(st.binary(min_size=layout.row_step * height, max_size=layout.row_step * height))
+    content = data.draw(
+        st.binary(min_size=layout.row_step * height, max_size=layout.row_step * height)
+    )
     kinds = {"y": (0, "f"), "z": (4, "f"), "x": (8 + gap, "f")}
     fields = [Field(name, offset, "f4") for name, (offset, _) in kinds.items()]
     expected = np.array(slow_points(content, layout, kinds), np.float32).reshape(-1, 3)

@@ -17,7 +17,17 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from semloc_logs.frames import Camera, DepthFrame, ImageFrame, ImuSample, LabelNames, LidarFrame, NavSatSample, PoseSample, TransformSample
+from semloc_logs.frames import (
+    Camera,
+    DepthFrame,
+    ImageFrame,
+    ImuSample,
+    LabelNames,
+    LidarFrame,
+    NavSatSample,
+    PoseSample,
+    TransformSample,
+)
 from semloc_logs.logs.log import Definition, Message
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problems
@@ -31,7 +41,8 @@ class Ros:
     """Builds messages of one generation and decodes their bytes."""
 
     def __init__(self, encoding: str) -> None:
-        self.encoding, self.store = encoding, STORES[encoding]
+        self.encoding = encoding
+        self.store = STORES[encoding]
         self.problems = Problems()
         self.decoder = Decoder(self.problems)
 
@@ -50,10 +61,16 @@ class Ros:
             orientation=self.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
         )
 
-    def frames(self, message: Any, topic: str = "/t", definition: Definition = NOTHING) -> list[Any]:
+    def frames(
+        self, message: Any, topic: str = "/t", definition: Definition = NOTHING
+    ) -> list[Any]:
         name = message.__msgtype__
-        serialize = self.store.serialize_cdr if self.encoding == "cdr" else self.store.serialize_ros1
-        return self.decoder.frames(Message(topic, name, self.encoding, LOG_TIME, serialize(message, name), definition))
+        serialize = (
+            self.store.serialize_cdr if self.encoding == "cdr" else self.store.serialize_ros1
+        )
+        return self.decoder.frames(
+            Message(topic, name, self.encoding, LOG_TIME, serialize(message, name), definition)
+        )
 
 
 @pytest.fixture(params=["cdr", "ros1"])
@@ -67,26 +84,44 @@ TURNED = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 
 def odometry(ros: Ros, q: tuple[float, float, float, float]) -> Any:
     zero = ros.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    pose = ros.make("geometry_msgs/msg/PoseWithCovariance", pose=ros.pose((1, 2, 3), q), covariance=np.zeros(36))
+    pose = ros.make(
+        "geometry_msgs/msg/PoseWithCovariance", pose=ros.pose((1, 2, 3), q), covariance=np.zeros(36)
+    )
     twist = ros.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
     twist = ros.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36))
-    return ros.make("nav_msgs/msg/Odometry", header=ros.header(frame_id="odom"), child_frame_id="base", pose=pose, twist=twist)
+    return ros.make(
+        "nav_msgs/msg/Odometry",
+        header=ros.header(frame_id="odom"),
+        child_frame_id="base",
+        pose=pose,
+        twist=twist,
+    )
 
 
 def test_odometry(ros: Ros) -> None:
     [frame] = ros.frames(odometry(ros, QUARTER_TURN), "/odom")
     assert isinstance(frame, PoseSample)
-    assert (frame.header.topic, frame.header.stamp_ns, frame.header.log_time_ns) == ("/odom", 5_000_000_007, LOG_TIME)
+    assert (frame.header.topic, frame.header.stamp_ns, frame.header.log_time_ns) == (
+        "/odom",
+        5_000_000_007,
+        LOG_TIME,
+    )
     assert (frame.header.frame_id, frame.child_frame_id) == ("odom", "base")
     np.testing.assert_allclose(frame.frame_T_child, TURNED, atol=1e-12)
 
 
-@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, math.nan), (math.inf, 0.0, 0.0, 1.0)])
-def test_impossible_rotations_are_skipped_and_counted(ros: Ros, q: tuple[float, float, float, float]) -> None:
+@pytest.mark.parametrize(
+    "q", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, math.nan), (math.inf, 0.0, 0.0, 1.0)]
+)
+def test_impossible_rotations_are_skipped_and_counted(
+    ros: Ros, q: tuple[float, float, float, float]
+) -> None:
     assert ros.frames(odometry(ros, q)) == []
     assert ros.frames(odometry(ros, q)) == []
     [sentence] = ros.problems.sentences()
-    assert sentence.startswith("/t: 2 messages skipped; the first because nav_msgs/msg/Odometry at log time 9000000000 ns: ")
+    assert sentence.startswith(
+        "/t: 2 messages skipped; the first because nav_msgs/msg/Odometry at log time 9000000000 ns: "
+    )
 
 
 def test_pose_stamped_and_with_covariance(ros: Ros) -> None:
@@ -96,22 +131,36 @@ def test_pose_stamped_and_with_covariance(ros: Ros) -> None:
     assert frame.child_frame_id == ""
     np.testing.assert_allclose(frame.frame_T_child, TURNED, atol=1e-12)
     pose = ros.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
-    [frame] = ros.frames(ros.make("geometry_msgs/msg/PoseWithCovarianceStamped", header=ros.header(), pose=pose))
+    [frame] = ros.frames(
+        ros.make("geometry_msgs/msg/PoseWithCovarianceStamped", header=ros.header(), pose=pose)
+    )
     np.testing.assert_allclose(frame.frame_T_child, TURNED, atol=1e-12)
 
 
-@pytest.mark.parametrize(("topic", "static"), [("/tf", False), ("/tf_static", True), ("/robot/tf_static", True)])
+@pytest.mark.parametrize(
+    ("topic", "static"), [("/tf", False), ("/tf_static", True), ("/robot/tf_static", True)]
+)
 def test_tf_yields_every_transform(topic: str, static: bool) -> None:
     ros = Ros("cdr")
     pose = ros.pose((1, 2, 3), QUARTER_TURN)
     translation = ros.make("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0)
-    transform = ros.make("geometry_msgs/msg/Transform", translation=translation, rotation=pose.orientation)
+    transform = ros.make(
+        "geometry_msgs/msg/Transform", translation=translation, rotation=pose.orientation
+    )
     edges = [
-        ros.make("geometry_msgs/msg/TransformStamped", header=ros.header(frame_id="a"), child_frame_id=c, transform=transform)
+        ros.make(
+            "geometry_msgs/msg/TransformStamped",
+            header=ros.header(frame_id="a"),
+            child_frame_id=c,
+            transform=transform,
+        )
         for c in ("b", "c")
     ]
     frames = ros.frames(ros.make("tf2_msgs/msg/TFMessage", transforms=edges), topic)
-    assert [(f.header.frame_id, f.child_frame_id, f.static) for f in frames] == [("a", "b", static), ("a", "c", static)]
+    assert [(f.header.frame_id, f.child_frame_id, f.static) for f in frames] == [
+        ("a", "b", static),
+        ("a", "c", static),
+    ]
     assert all(isinstance(f, TransformSample) for f in frames)
     np.testing.assert_allclose(frames[1].frame_T_child, TURNED, atol=1e-12)
 
@@ -176,11 +225,18 @@ def test_images_and_depth(ros: Ros) -> None:
 
 def test_compressed_images(ros: Ros) -> None:
     def compressed(format_: str, data: bytes) -> Any:
-        return ros.make("sensor_msgs/msg/CompressedImage", header=ros.header(), format=format_, data=np.frombuffer(data, np.uint8))
+        return ros.make(
+            "sensor_msgs/msg/CompressedImage",
+            header=ros.header(),
+            format=format_,
+            data=np.frombuffer(data, np.uint8),
+        )
 
     pixels = np.array([[0, 1500, 65535]], np.uint16)
     png = bytes(cv2.imencode(".png", pixels)[1])
-    [frame] = ros.frames(compressed("16UC1; compressedDepth png", b"\0" * 12 + png), "/d/compressedDepth")
+    [frame] = ros.frames(
+        compressed("16UC1; compressedDepth png", b"\0" * 12 + png), "/d/compressedDepth"
+    )
     assert isinstance(frame, DepthFrame)
     np.testing.assert_allclose(frame.depth, [[0, 1.5, 0]])
     [frame] = ros.frames(compressed("16UC1; png compressed", png))
@@ -191,13 +247,27 @@ def test_compressed_images(ros: Ros) -> None:
 
 
 def camera_info(ros: Ros, focal: float) -> Any:
-    values = {"k": [focal, 0, 2, 0, focal, 3, 0, 0, 1], "d": [0.1, 0.2], "r": [0.0] * 9, "p": [0.0] * 12}
+    values = {
+        "k": [focal, 0, 2, 0, focal, 3, 0, 0, 1],
+        "d": [0.1, 0.2],
+        "r": [0.0] * 9,
+        "p": [0.0] * 12,
+    }
     if ros.encoding == "ros1":
         values = {k.upper(): v for k, v in values.items()}
-    roi = ros.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    roi = ros.make(
+        "sensor_msgs/msg/RegionOfInterest",
+        x_offset=0,
+        y_offset=0,
+        height=0,
+        width=0,
+        do_rectify=False,
+    )
     arrays = {k: np.array(v, float) for k, v in values.items()}
     head = {"header": ros.header(), "height": 6, "width": 4, "distortion_model": "plumb_bob"}
-    return ros.make("sensor_msgs/msg/CameraInfo", **head, **arrays, binning_x=0, binning_y=0, roi=roi)
+    return ros.make(
+        "sensor_msgs/msg/CameraInfo", **head, **arrays, binning_x=0, binning_y=0, roi=roi
+    )
 
 
 def test_camera_info(ros: Ros) -> None:
@@ -214,38 +284,63 @@ def test_camera_info(ros: Ros) -> None:
 
 def test_imu_and_nav_sat(ros: Ros) -> None:
     rate, force = (ros.make("geometry_msgs/msg/Vector3", x=x, y=2.0, z=3.0) for x in (0.5, 9.0))
-    covariances = {f"{n}_covariance": np.zeros(9) for n in ("orientation", "angular_velocity", "linear_acceleration")}
+    covariances = {
+        f"{n}_covariance": np.zeros(9)
+        for n in ("orientation", "angular_velocity", "linear_acceleration")
+    }
     orientation = ros.pose((0, 0, 0), (0, 0, 0, 0)).orientation
     parts = {"orientation": orientation, "angular_velocity": rate, "linear_acceleration": force}
-    [frame] = ros.frames(ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances))
+    [frame] = ros.frames(
+        ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances)
+    )
     assert isinstance(frame, ImuSample)
     assert frame.acceleration.tolist() == [9, 2, 3]
     assert frame.angular_velocity.tolist() == [0.5, 2, 3]
     assert frame.orientation is None  # a quaternion of zeros is none
     parts["orientation"] = ros.pose((0, 0, 0), (0, 0, 0.6, 0.8)).orientation
-    [frame] = ros.frames(ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances))
+    [frame] = ros.frames(
+        ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances)
+    )
     assert isinstance(frame, ImuSample)
     assert frame.orientation is not None
     assert frame.orientation.tolist() == [0, 0, 0.6, 0.8]
-    covariances["orientation_covariance"] = np.r_[-1.0, np.zeros(8)]  # the IMU has no estimate of it
-    [frame] = ros.frames(ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances))
+    # the IMU has no estimate of it
+    covariances["orientation_covariance"] = np.r_[-1.0, np.zeros(8)]
+    [frame] = ros.frames(
+        ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances)
+    )
     assert isinstance(frame, ImuSample)
     assert frame.orientation is None
 
     def fix(status: int, latitude: float, kind: int = 0, variance: float = 0.0) -> list[Any]:
         s = ros.make("sensor_msgs/msg/NavSatStatus", status=status, service=1)
-        rest = {"position_covariance": np.diag([variance] * 3).ravel(), "position_covariance_type": kind}
+        rest = {
+            "position_covariance": np.diag([variance] * 3).ravel(),
+            "position_covariance_type": kind,
+        }
         position = {"latitude": latitude, "longitude": 8.5, "altitude": 400.0}
-        return ros.frames(ros.make("sensor_msgs/msg/NavSatFix", header=ros.header(), status=s, **position, **rest), "/fix")
+        return ros.frames(
+            ros.make(
+                "sensor_msgs/msg/NavSatFix", header=ros.header(), status=s, **position, **rest
+            ),
+            "/fix",
+        )
 
     [frame] = fix(0, 47.25)
     assert isinstance(frame, NavSatSample)
     assert (frame.latitude_deg, frame.longitude_deg, frame.altitude) == (47.25, 8.5, 400.0)
     assert frame.covariance is None
-    for variance, kind, known in ((4.0, 2, True), (4.0, 0, False), (-4.0, 2, False), (math.inf, 2, False)):
+    for variance, kind, known in (
+        (4.0, 2, True),
+        (4.0, 0, False),
+        (-4.0, 2, False),
+        (math.inf, 2, False),
+    ):
         [frame] = fix(0, 47.25, kind, variance)
         assert isinstance(frame, NavSatSample)
-        assert (None if frame.covariance is None else frame.covariance.tolist()) == (np.diag([4.0] * 3).tolist() if known else None)
+        assert (None if frame.covariance is None else frame.covariance.tolist()) == (
+            np.diag([4.0] * 3).tolist() if known else None
+        )
     assert fix(-1, 47.25) == []
     assert ros.problems.sentences() == []  # a receiver without a fix is no problem of the log
     assert fix(0, math.nan) == []
@@ -276,8 +371,12 @@ module geometry_msgs { module msg { struct PoseStamped {
 }; }; };
 """
     ros = Ros("cdr")
-    message = ros.make("geometry_msgs/msg/PoseStamped", header=ros.header(), pose=ros.pose((1, 2, 3), QUARTER_TURN))
-    [frame] = ros.frames(message, "/p", Definition("geometry_msgs/msg/PoseStamped", "ros2idl", idl.encode()))
+    message = ros.make(
+        "geometry_msgs/msg/PoseStamped", header=ros.header(), pose=ros.pose((1, 2, 3), QUARTER_TURN)
+    )
+    [frame] = ros.frames(
+        message, "/p", Definition("geometry_msgs/msg/PoseStamped", "ros2idl", idl.encode())
+    )
     np.testing.assert_allclose(frame.frame_T_child, TURNED, atol=1e-12)
     assert ros.problems.sentences() == []
 
@@ -300,7 +399,14 @@ def test_definitions_that_cannot_be_used_are_named(encoding: str, text: bytes) -
     ros = Ros("cdr")
     definition = Definition("sensor_msgs/msg/Imu", encoding, text)
     for _ in range(2):
-        assert ros.decoder.frames(Message("/i", "sensor_msgs/msg/Imu", "cdr", 1, b"\0\1\0\0" + b"\0" * 400, definition)) == []
+        assert (
+            ros.decoder.frames(
+                Message(
+                    "/i", "sensor_msgs/msg/Imu", "cdr", 1, b"\0\1\0\0" + b"\0" * 400, definition
+                )
+            )
+            == []
+        )
     [sentence] = ros.problems.sentences()
     assert sentence.startswith("/i: 2 messages skipped")
 
@@ -310,7 +416,12 @@ def test_cut_off_messages_are_named(ros: Ros) -> None:
     serialize = ros.store.serialize_cdr if ros.encoding == "cdr" else ros.store.serialize_ros1
     data = bytes(serialize(message, "nav_msgs/msg/Odometry"))
     for size in range(len(data) - 8):
-        assert ros.decoder.frames(Message("/o", "nav_msgs/msg/Odometry", ros.encoding, 1, data[:size], NOTHING)) == []
+        assert (
+            ros.decoder.frames(
+                Message("/o", "nav_msgs/msg/Odometry", ros.encoding, 1, data[:size], NOTHING)
+            )
+            == []
+        )
     assert ros.problems.sentences()[0].startswith(f"/o: {len(data) - 8} messages skipped")
 
 
@@ -336,14 +447,20 @@ def descriptors(message: Any) -> Definition:
 def protobuf_frames(message: Any, topic: str = "/t") -> tuple[list[Any], Problems]:
     problems = Problems()
     definition = descriptors(message)
-    m = Message(topic, definition.name, "protobuf", LOG_TIME, message.SerializeToString(), definition)
+    m = Message(
+        topic, definition.name, "protobuf", LOG_TIME, message.SerializeToString(), definition
+    )
     return list(Decoder(problems).frames(m)), problems
 
 
 def json_frames(name: str, value: Any, topic: str = "/t") -> tuple[list[Any], Problems]:
     problems = Problems()
     data = value if isinstance(value, bytes) else json.dumps(value).encode()
-    return list(Decoder(problems).frames(Message(topic, name, "json", LOG_TIME, data, Definition(name, "jsonschema", b"{}")))), problems
+    return list(
+        Decoder(problems).frames(
+            Message(topic, name, "json", LOG_TIME, data, Definition(name, "jsonschema", b"{}"))
+        )
+    ), problems
 
 
 def test_protobuf_point_cloud_with_its_pose() -> None:
@@ -371,17 +488,27 @@ def test_protobuf_transforms_and_images() -> None:
         t.translation.x, t.translation.y, t.translation.z = 1, 2, 3
         t.rotation.z, t.rotation.w = QUARTER_TURN[2:]
     frames, _ = protobuf_frames(m, "/tf")
-    assert [(f.header.frame_id, f.child_frame_id, f.static) for f in frames] == [("a", "b", False), ("a", "c", False)]
+    assert [(f.header.frame_id, f.child_frame_id, f.static) for f in frames] == [
+        ("a", "b", False),
+        ("a", "c", False),
+    ]
     np.testing.assert_allclose(frames[0].frame_T_child, TURNED, atol=1e-12)
-    [frame], _ = protobuf_frames(RawImage(width=2, height=1, step=4, encoding="16UC1", data=struct.pack("<HH", 1000, 0)))
+    [frame], _ = protobuf_frames(
+        RawImage(width=2, height=1, step=4, encoding="16UC1", data=struct.pack("<HH", 1000, 0))
+    )
     assert isinstance(frame, DepthFrame)
     np.testing.assert_allclose(frame.depth, [[1, 0]])
 
 
 def test_json_messages() -> None:
     time = {"sec": 5, "nsec": 7}
-    pose = {"position": {"x": 1, "y": 2, "z": 3}, "orientation": dict(zip("xyzw", QUARTER_TURN, strict=True))}
-    [frame], _ = json_frames("foxglove.PoseInFrame", {"timestamp": time, "frame_id": "odom", "pose": pose})
+    pose = {
+        "position": {"x": 1, "y": 2, "z": 3},
+        "orientation": dict(zip("xyzw", QUARTER_TURN, strict=True)),
+    }
+    [frame], _ = json_frames(
+        "foxglove.PoseInFrame", {"timestamp": time, "frame_id": "odom", "pose": pose}
+    )
     assert isinstance(frame, PoseSample)
     assert (frame.header.stamp_ns, frame.header.frame_id) == (5_000_000_007, "odom")
     np.testing.assert_allclose(frame.frame_T_child, TURNED, atol=1e-12)
@@ -394,7 +521,14 @@ def test_json_messages() -> None:
     [frame], _ = json_frames("foxglove.LocationFix", fix)
     assert isinstance(frame, NavSatSample)
     assert frame.latitude_deg == 47.25
-    calibration = {"timestamp": time, "width": 4, "height": 6, "distortion_model": "", "K": [9, 0, 2, 0, 9, 3, 0, 0, 1], "D": []}
+    calibration = {
+        "timestamp": time,
+        "width": 4,
+        "height": 6,
+        "distortion_model": "",
+        "K": [9, 0, 2, 0, 9, 3, 0, 0, 1],
+        "D": [],
+    }
     [frame], _ = json_frames("foxglove.CameraCalibration", calibration)
     assert isinstance(frame, Camera)
     assert frame.K[0, 0] == 9
@@ -402,7 +536,16 @@ def test_json_messages() -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [b"", b"{", b"[]", b"[" * 100_000, {}, {"timestamp": 5}, {"timestamp": {"sec": "x", "nsec": []}}, {"pose": [1], "frame_id": 3}],
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"[" * 100_000,
+        {},
+        {"timestamp": 5},
+        {"timestamp": {"sec": "x", "nsec": []}},
+        {"pose": [1], "frame_id": 3},
+    ],
 )
 def test_json_without_sense_is_named(value: Any) -> None:
     frames, problems = json_frames("foxglove.PoseInFrame", value)
@@ -412,12 +555,17 @@ def test_json_without_sense_is_named(value: Any) -> None:
 
 def test_types_of_no_use_are_no_problem() -> None:
     problems = Problems()
-    assert Decoder(problems).frames(Message("/c", "std_msgs/msg/String", "cdr", 1, b"", NOTHING)) == []
+    assert (
+        Decoder(problems).frames(Message("/c", "std_msgs/msg/String", "cdr", 1, b"", NOTHING)) == []
+    )
     assert problems.sentences() == []
 
 
 def test_impossible_times_are_named() -> None:
-    frames, problems = json_frames("foxglove.LocationFix", {"timestamp": {"sec": 1 << 60, "nsec": 0}, "latitude": 1, "longitude": 2})
+    frames, problems = json_frames(
+        "foxglove.LocationFix",
+        {"timestamp": {"sec": 1 << 60, "nsec": 0}, "latitude": 1, "longitude": 2},
+    )
     assert frames == []
     assert "is impossible" in problems.sentences()[0]
 
@@ -425,23 +573,48 @@ def test_impossible_times_are_named() -> None:
 def test_what_labels_mean() -> None:
     """A LabelInfo without a definition in the log, and the name of a label space."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg("uint16 class_id\nstring class_name", "vision_msgs/msg/VisionClass"))
-    store.register(get_types_from_msg("std_msgs/Header header\nVisionClass[] class_map\nfloat32 threshold", "vision_msgs/msg/LabelInfo"))
+    store.register(
+        get_types_from_msg("uint16 class_id\nstring class_name", "vision_msgs/msg/VisionClass")
+    )
+    store.register(
+        get_types_from_msg(
+            "std_msgs/Header header\nVisionClass[] class_map\nfloat32 threshold",
+            "vision_msgs/msg/LabelInfo",
+        )
+    )
     types: Any = store.types
     stamp = types["builtin_interfaces/msg/Time"](sec=3, nanosec=4)
-    classes = [types["vision_msgs/msg/VisionClass"](class_id=i, class_name=n) for i, n in ((0, "road"), (7, "tree"))]
+    classes = [
+        types["vision_msgs/msg/VisionClass"](class_id=i, class_name=n)
+        for i, n in ((0, "road"), (7, "tree"))
+    ]
     message = types["vision_msgs/msg/LabelInfo"](
-        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="cam"), class_map=classes, threshold=0.5
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="cam"),
+        class_map=classes,
+        threshold=0.5,
     )
     problems = Problems()
     data = bytes(store.serialize_cdr(message, "vision_msgs/msg/LabelInfo"))
-    (found,) = Decoder(problems).frames(Message("/label_info", "vision_msgs/msg/LabelInfo", "cdr", 1, data, NOTHING))
+    (found,) = Decoder(problems).frames(
+        Message("/label_info", "vision_msgs/msg/LabelInfo", "cdr", 1, data, NOTHING)
+    )
     assert isinstance(found, LabelNames)
     assert found.names == {0: "road", 7: "tree"}
     assert found.header.stamp_ns == 3_000_000_004
-    text = bytes(store.serialize_cdr(types["std_msgs/msg/String"](data="semantickitti"), "std_msgs/msg/String"))
-    (found,) = Decoder(problems).frames(Message("/lidar/label_space", "std_msgs/msg/String", "cdr", 9, text, NOTHING))
+    text = bytes(
+        store.serialize_cdr(
+            types["std_msgs/msg/String"](data="semantickitti"), "std_msgs/msg/String"
+        )
+    )
+    (found,) = Decoder(problems).frames(
+        Message("/lidar/label_space", "std_msgs/msg/String", "cdr", 9, text, NOTHING)
+    )
     assert isinstance(found, LabelNames)
     assert found.space == "semantickitti"
-    assert Decoder(problems).frames(Message("/chatter", "std_msgs/msg/String", "cdr", 9, text, NOTHING)) == []
+    assert (
+        Decoder(problems).frames(
+            Message("/chatter", "std_msgs/msg/String", "cdr", 9, text, NOTHING)
+        )
+        == []
+    )
     assert problems.sentences() == []

@@ -12,10 +12,25 @@ from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.depth import DepthClouds, Unprojector, depth_sigma, label_ids
 
 
-def camera(width: int = 8, height: int = 6, focal: float = 4.0, D: tuple[float, ...] = (), model: str = "plumb_bob") -> Camera:
+def camera(
+    width: int = 8,
+    height: int = 6,
+    focal: float = 4.0,
+    D: tuple[float, ...] = (),
+    model: str = "plumb_bob",
+) -> Camera:
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     P = np.hstack([K * [[2], [2], [1]], np.zeros((3, 1))])
-    return Camera(Header("/d/camera_info", 0, 0, "optical"), width, height, K, np.array(D), np.eye(3), P, model)
+    return Camera(
+        Header("/d/camera_info", 0, 0, "optical"),
+        width,
+        height,
+        K,
+        np.array(D),
+        np.eye(3),
+        P,
+        model,
+    )
 
 
 def test_a_pixel_by_hand() -> None:
@@ -35,7 +50,10 @@ def test_range_is_along_the_ray_and_zero_is_nothing() -> None:
     assert 0 < len(points) < 44
     assert distances.max() <= 3.2
     assert len(Unprojector(camera(), 6, 8).points(depth, 0.0, 80.0)[0]) == 44
-    assert len(Unprojector(camera(), 6, 8).points(np.full((6, 8), np.nan, np.float32), 0.0, 80.0)[0]) == 0
+    assert (
+        len(Unprojector(camera(), 6, 8).points(np.full((6, 8), np.nan, np.float32), 0.0, 80.0)[0])
+        == 0
+    )
 
 
 def test_stride_keeps_the_same_rays_and_the_right_pixels() -> None:
@@ -53,27 +71,42 @@ def test_large_images_are_thinned() -> None:
     assert Unprojector(camera(320, 240), 240, 320).step == 1
 
 
-@pytest.mark.parametrize("D", [(-0.28, 0.07, 0.0002, 0.00002, 0.0), (0.1, -0.05, 0.001, 0.001, 0.01, 0.05, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    "D", [(-0.28, 0.07, 0.0002, 0.00002, 0.0), (0.1, -0.05, 0.001, 0.001, 0.01, 0.05, 0.0, 0.0)]
+)
 def test_distortion_is_undone(D: tuple[float, ...]) -> None:
     calibration = camera(64, 48, 40.0, D, "rational_polynomial" if len(D) > 5 else "plumb_bob")
-    points, pixels = Unprojector(calibration, 48, 64).points(np.ones((48, 64), np.float32), 0.0, 80.0)
-    projected, _ = cv2.projectPoints(points.astype(float), np.zeros(3), np.zeros(3), calibration.K, calibration.D)
+    points, pixels = Unprojector(calibration, 48, 64).points(
+        np.ones((48, 64), np.float32), 0.0, 80.0
+    )
+    projected, _ = cv2.projectPoints(
+        points.astype(float), np.zeros(3), np.zeros(3), calibration.K, calibration.D
+    )
     expected = np.stack([pixels % 64, pixels // 64], axis=1)
-    middle = np.linalg.norm(expected - [32, 24], axis=1) < 20  # OpenCV's inverse is iterative and gives up at the rim
+    # OpenCV's inverse is iterative and gives up at the rim
+    middle = np.linalg.norm(expected - [32, 24], axis=1) < 20
     np.testing.assert_allclose(projected[middle, 0], expected[middle], atol=0.05)
 
 
 def test_fisheye() -> None:
     calibration = camera(64, 48, 40.0, (0.02, -0.01, 0.0, 0.0), "equidistant")
-    points, pixels = Unprojector(calibration, 48, 64).points(np.ones((48, 64), np.float32), 0.0, 80.0)
-    projected, _ = cv2.fisheye.projectPoints(points.astype(float)[:, None], np.zeros(3), np.zeros(3), calibration.K, calibration.D)
-    np.testing.assert_allclose(projected[:, 0], np.stack([pixels % 64, pixels // 64], axis=1), atol=1e-3)
+    points, pixels = Unprojector(calibration, 48, 64).points(
+        np.ones((48, 64), np.float32), 0.0, 80.0
+    )
+    projected, _ = cv2.fisheye.projectPoints(
+        points.astype(float)[:, None], np.zeros(3), np.zeros(3), calibration.K, calibration.D
+    )
+    np.testing.assert_allclose(
+        projected[:, 0], np.stack([pixels % 64, pixels // 64], axis=1), atol=1e-3
+    )
 
 
 def test_rectified_pictures_use_the_projection_matrix() -> None:
     depth = np.zeros((6, 8), np.float32)
     depth[3, 6] = 2.0
-    points, _ = Unprojector(camera(D=(0.3, 0, 0, 0, 0)), 6, 8, rectified=True).points(depth, 0.0, 80.0)
+    points, _ = Unprojector(camera(D=(0.3, 0, 0, 0, 0)), 6, 8, rectified=True).points(
+        depth, 0.0, 80.0
+    )
     assert points[0].tolist() == pytest.approx([(6 - 8) / 8 * 2.0, (3 - 6) / 8 * 2.0, 2.0])
 
 
@@ -87,22 +120,32 @@ def test_unusable_calibrations_are_said_so() -> None:
 
 
 def test_sigma_grows_with_the_square_of_depth() -> None:
-    # Nguyen et al. 2012: 1.2 mm at 0.4 m, 1.2 + 1.9 * 2.6^2 = 14.0 mm at 3 m; along a ray of slope 1 longer by the square root of 2
+    # Nguyen et al. 2012: 1.2 mm at 0.4 m, 1.2 + 1.9 * 2.6^2 = 14.0 mm at 3 m; along a ray of slope
+    # 1 longer by the square root of 2
     points = np.array([[0, 0, 0.4], [0, 0, 3.0], [3.0, 0, 3.0], [0, 0, 0.2]], np.float32)
     expected = [0.0012, 0.0012 + 0.0019 * 2.6**2, (0.0012 + 0.0019 * 2.6**2) * 2**0.5, 0.0012]
     np.testing.assert_allclose(depth_sigma(points), expected, rtol=1e-5)
     assert depth_sigma(points, 0.0)[1] == pytest.approx(0.0012)
 
 
-ROLES = Roles(depth=("/d/depth",), label_image=("/d/label",), info_of={"/d/depth": "/d/camera_info"}, label_of={"/d/depth": "/d/label"})
+ROLES = Roles(
+    depth=("/d/depth",),
+    label_image=("/d/label",),
+    info_of={"/d/depth": "/d/camera_info"},
+    label_of={"/d/depth": "/d/label"},
+)
 
 
 def depth_frame(stamp_ns: int = 0, shape: tuple[int, int] = (6, 8)) -> DepthFrame:
-    return DepthFrame(Header("/d/depth", stamp_ns, stamp_ns, "optical"), np.full(shape, 2.0, np.float32))
+    return DepthFrame(
+        Header("/d/depth", stamp_ns, stamp_ns, "optical"), np.full(shape, 2.0, np.float32)
+    )
 
 
 def label_frame(stamp_ns: int, value: int, shape: tuple[int, ...] = (6, 8)) -> ImageFrame:
-    return ImageFrame(Header("/d/label", stamp_ns, stamp_ns, "optical"), np.full(shape, value, np.uint8), "mono8")
+    return ImageFrame(
+        Header("/d/label", stamp_ns, stamp_ns, "optical"), np.full(shape, value, np.uint8), "mono8"
+    )
 
 
 def test_labels_come_from_the_nearest_label_image() -> None:
@@ -162,7 +205,9 @@ def test_reasons() -> None:
     assert len(clouds.lost) == 1
     picture = ImageFrame(Header("/d/depth", 0, 0, ""), np.zeros((6, 8, 3), np.uint8), "rgb8")
     assert clouds.points(picture, 0.0, 80.0) == "no depth"
-    millimetres = ImageFrame(Header("/d/depth", 0, 0, ""), np.full((6, 8), 1500, np.uint16), "mono16")
+    millimetres = ImageFrame(
+        Header("/d/depth", 0, 0, ""), np.full((6, 8), 1500, np.uint16), "mono16"
+    )
     found = clouds.points(millimetres, 0.0, 80.0)
     assert not isinstance(found, str)
     np.testing.assert_allclose(found[0][:, 2], 1.5)
@@ -170,6 +215,8 @@ def test_reasons() -> None:
 
 def test_label_ids_survive_being_taken_for_millimetres() -> None:
     ids = np.arange(65535, dtype=np.float32).reshape(1, -1)
-    found = label_ids(DepthFrame(Header("/l", 0, 0, ""), (ids * np.float32(0.001)).astype(np.float32)))
+    found = label_ids(
+        DepthFrame(Header("/l", 0, 0, ""), (ids * np.float32(0.001)).astype(np.float32))
+    )
     assert found is not None
     np.testing.assert_array_equal(found, ids.astype(np.uint32))

@@ -30,7 +30,8 @@ from semloc_logs.logs.log import Definition, Message
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problems
 
-ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
 HURRY = settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
 
 
@@ -38,28 +39,48 @@ def ros_messages(store: Any) -> dict[str, Any]:
     """A message of each kind whose bytes say how much there is."""
     t = store.types
     head = {"seq": 0} if store is ROS1 else {}
-    header = t["std_msgs/msg/Header"](stamp=t["builtin_interfaces/msg/Time"](sec=1, nanosec=2), frame_id="f", **head)
+    header = t["std_msgs/msg/Header"](
+        stamp=t["builtin_interfaces/msg/Time"](sec=1, nanosec=2), frame_id="f", **head
+    )
     field = t["sensor_msgs/msg/PointField"]
     fields = [field(name=n, offset=4 * k, datatype=7, count=1) for k, n in enumerate("xyzt")]
     data = np.arange(64, dtype=np.uint8)
-    layout = {"height": 1, "width": 4, "fields": fields, "is_bigendian": False, "point_step": 16, "row_step": 64}
+    layout = {
+        "height": 1,
+        "width": 4,
+        "fields": fields,
+        "is_bigendian": False,
+        "point_step": 16,
+        "row_step": 64,
+    }
     png = np.array(cv2.imencode(".png", np.full((4, 4), 900, np.uint16))[1]).reshape(-1)
     jpeg = np.array(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1]).reshape(-1)
     rvl = np.frombuffer(struct.pack("<iffIII", 0, 0, 0, 3, 2, 0x60000000), np.uint8)
-    compressed, image = t["sensor_msgs/msg/CompressedImage"], t["sensor_msgs/msg/Image"]
+    compressed = t["sensor_msgs/msg/CompressedImage"]
+    image = t["sensor_msgs/msg/Image"]
     size = {"height": 4, "width": 4, "is_bigendian": 0}
     rotation = t["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
-    transform = t["geometry_msgs/msg/Transform"](translation=t["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0), rotation=rotation)
-    edge = t["geometry_msgs/msg/TransformStamped"](header=header, child_frame_id="c", transform=transform)
+    transform = t["geometry_msgs/msg/Transform"](
+        translation=t["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0), rotation=rotation
+    )
+    edge = t["geometry_msgs/msg/TransformStamped"](
+        header=header, child_frame_id="c", transform=transform
+    )
     found = {
-        "/cloud": t["sensor_msgs/msg/PointCloud2"](header=header, data=data, is_dense=True, **layout),
+        "/cloud": t["sensor_msgs/msg/PointCloud2"](
+            header=header, data=data, is_dense=True, **layout
+        ),
         "/image": image(header=header, encoding="rgb8", step=16, data=data, **size),
         "/depth": image(header=header, encoding="16UC1", step=8, data=data[:32], **size),
         "/bayer": image(header=header, encoding="bayer_rggb8", step=4, data=data[:16], **size),
         "/png": compressed(header=header, format="png", data=png),
         "/jpeg": compressed(header=header, format="jpeg", data=jpeg),
-        "/d/compressedDepth": compressed(header=header, format="32FC1; compressedDepth", data=np.concatenate([data[:12], png])),
-        "/r/compressedDepth": compressed(header=header, format="16UC1; compressedDepth rvl", data=rvl),
+        "/d/compressedDepth": compressed(
+            header=header, format="32FC1; compressedDepth", data=np.concatenate([data[:12], png])
+        ),
+        "/r/compressedDepth": compressed(
+            header=header, format="16UC1; compressedDepth rvl", data=rvl
+        ),
         "/pose": edge,
     }
     if store is ROS2:
@@ -84,11 +105,17 @@ def recorded(kind: str) -> dict[str, bytes]:
                     connection2 = bag2.add_connection(topic, message.__msgtype__, typestore=ROS2)
                     bag2.write(connection2, k, ROS2.serialize_cdr(message, message.__msgtype__))
             return {p.name: p.read_bytes() for p in path.iterdir()}
-        writer = Writer(str(path), compression=CompressionType.NONE if kind == "mcap" else CompressionType.ZSTD, chunk_size=1500)
+        writer = Writer(
+            str(path),
+            compression=CompressionType.NONE if kind == "mcap" else CompressionType.ZSTD,
+            chunk_size=1500,
+        )
         writer.start("ros2")
         for k, (topic, message) in enumerate(ros_messages(ROS2).items()):
             text = ROS2.generate_msgdef(message.__msgtype__, ros_version=2)[0].encode()
-            channel = writer.register_channel(topic, "cdr", writer.register_schema(message.__msgtype__, "ros2msg", text))
+            channel = writer.register_channel(
+                topic, "cdr", writer.register_schema(message.__msgtype__, "ros2msg", text)
+            )
             data = bytes(ROS2.serialize_cdr(message, message.__msgtype__))
             writer.add_message(channel, log_time=k, publish_time=k, data=data)
         writer.finish()  # type: ignore[no-untyped-call]
@@ -101,7 +128,8 @@ def damaged(data: st.DataObject, content: bytes) -> bytes:
     for _ in range(data.draw(st.integers(0, 4))):
         at = data.draw(st.integers(0, len(found) - 1))
         value = data.draw(
-            st.sampled_from([b"\xff", b"\0", b"\xff" * 4, b"\0\0\0\x7f", b"\xff" * 8, b"A"]) | st.binary(min_size=1, max_size=8)
+            st.sampled_from([b"\xff", b"\0", b"\xff" * 4, b"\0\0\0\x7f", b"\xff" * 8, b"A"])
+            | st.binary(min_size=1, max_size=8)
         )
         found[at : at + len(value)] = value
     cut = data.draw(st.sampled_from(["", "", "end", "piece"]))
@@ -123,7 +151,8 @@ def test_damaged_logs(kind: str, data: st.DataObject) -> None:
         with contextlib.suppress(LogError):
             log = open_log(path)
             times = [m.log_time_ns for m in log.messages()]
-            assert times == sorted(times) or kind.startswith(("mcap", "rosbag1"))  # a damaged index may lie about times
+            # a damaged index may lie about times
+            assert times == sorted(times) or kind.startswith(("mcap", "rosbag1"))
             list(log.frames())
             assert all(isinstance(p, str) for p in log.problems)
             log.close()
@@ -133,15 +162,28 @@ def payloads() -> Iterator[tuple[str, str, str, bytes]]:
     for encoding, store in (("cdr", ROS2), ("ros1", ROS1)):
         for topic, message in ros_messages(store).items():
             serialize = store.serialize_cdr if encoding == "cdr" else store.serialize_ros1
-            yield topic, message.__msgtype__, encoding, bytes(serialize(message, message.__msgtype__))
-    cloud = {"timestamp": {"sec": 1, "nsec": 2}, "frame_id": "f", "point_stride": 12, "data": "AACAPwAAgD8AAIA/"}
+            yield (
+                topic,
+                message.__msgtype__,
+                encoding,
+                bytes(serialize(message, message.__msgtype__)),
+            )
+    cloud = {
+        "timestamp": {"sec": 1, "nsec": 2},
+        "frame_id": "f",
+        "point_stride": 12,
+        "data": "AACAPwAAgD8AAIA/",
+    }
     cloud["fields"] = [{"name": n, "offset": 4 * k, "type": 7} for k, n in enumerate("xyz")]
     yield "/c", "foxglove.PointCloud", "json", json.dumps(cloud).encode()
     image = {"width": 2, "height": 1, "step": 2, "encoding": "mono8", "data": "AAE="}
     yield "/i", "foxglove.RawImage", "json", json.dumps(image).encode()
 
 
-PAYLOADS = {f"{encoding} {topic}": (topic, type_, encoding, content) for topic, type_, encoding, content in payloads()}
+PAYLOADS = {
+    f"{encoding} {topic}": (topic, type_, encoding, content)
+    for topic, type_, encoding, content in payloads()
+}
 
 
 @pytest.mark.parametrize("name", PAYLOADS)
@@ -167,11 +209,36 @@ def decoder_of(name: str) -> Decoder:
 @given(
     value=st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["timestamp", "sec", "pose", "x", "data"]), inner),
+        lambda inner: (
+            st.lists(inner, max_size=3)
+            | st.dictionaries(st.sampled_from(["timestamp", "sec", "pose", "x", "data"]), inner)
+        ),
         max_leaves=8,
     ),
-    name=st.sampled_from(["timestamp", "frame_id", "data", "fields", "point_stride", "pose", "width", "K", "transforms", "latitude"]),
-    type_=st.sampled_from(["PointCloud", "RawImage", "CompressedImage", "CameraCalibration", "FrameTransforms", "LocationFix"]),
+    name=st.sampled_from(
+        [
+            "timestamp",
+            "frame_id",
+            "data",
+            "fields",
+            "point_stride",
+            "pose",
+            "width",
+            "K",
+            "transforms",
+            "latitude",
+        ]
+    ),
+    type_=st.sampled_from(
+        [
+            "PointCloud",
+            "RawImage",
+            "CompressedImage",
+            "CameraCalibration",
+            "FrameTransforms",
+            "LocationFix",
+        ]
+    ),
 )
 def test_json_of_any_shape(value: Any, name: str, type_: str) -> None:
     data = json.dumps({name: value}).encode()
@@ -180,8 +247,18 @@ def test_json_of_any_shape(value: Any, name: str, type_: str) -> None:
 
 def test_some_seeds_of_the_fuzzer(repository: Path, tmp_path: Path) -> None:
     """Every message type in every encoding, and layouts of clouds; `make fuzz` runs longer."""
-    command = [sys.executable, "-P", str(repository / "benchmarks" / "fuzz.py"), "--seed", "5000000", "--count", "400"]
-    done = subprocess.run([*command, "--keep", str(tmp_path / "found")], capture_output=True, text=True, timeout=55)
+    command = [
+        sys.executable,
+        "-P",
+        str(repository / "benchmarks" / "fuzz.py"),
+        "--seed",
+        "5000000",
+        "--count",
+        "400",
+    ]
+    done = subprocess.run(
+        [*command, "--keep", str(tmp_path / "found")], capture_output=True, text=True, timeout=55
+    )
     assert done.returncode == 0, done.stdout
     assert "400 inputs, 0 findings" in done.stdout
 
@@ -201,5 +278,10 @@ def test_lists_of_elements_without_content_are_refused(encoding: str) -> None:
     text = b"E[] transforms\n" + b"=" * 80 + b"\nMSG: tf2_msgs/E\n"
     definition = Definition("", "ros1msg" if encoding == "ros1" else "ros2msg", text)
     data = (b"" if encoding == "ros1" else b"\0\1\0\0") + struct.pack("<I", 2**31)
-    assert Decoder(problems).frames(Message("/tf", "tf2_msgs/msg/TFMessage", encoding, 1, data, definition)) == []
+    assert (
+        Decoder(problems).frames(
+            Message("/tf", "tf2_msgs/msg/TFMessage", encoding, 1, data, definition)
+        )
+        == []
+    )
     assert "have no content" in problems.sentences()[0]

@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, Frame, Header, LidarFrame, NavSatSample, PoseSample, TransformSample
+from semloc_logs.frames import (
+    F64,
+    Frame,
+    Header,
+    LidarFrame,
+    NavSatSample,
+    PoseSample,
+    TransformSample,
+)
 from semloc_logs.logs.log import Message, Stream
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.logs.session import lidar_odometry
@@ -36,13 +44,17 @@ class FakeLog:
 
     def __init__(self, frames: list[Frame]) -> None:
         self._frames = sorted(frames, key=lambda f: f.header.log_time_ns)
-        self.path, self.format, self.encoding = Path("drive.mcap"), "mcap", "ros2"
+        self.path = Path("drive.mcap")
+        self.format = "mcap"
+        self.encoding = "ros2"
         self.start_ns: int | None = self._frames[0].header.log_time_ns
         self.end_ns: int | None = self._frames[-1].header.log_time_ns
         self.problems: list[str] = []
         topics = [f.header.topic for f in frames]
         kinds = {f.header.topic: TYPES[type(f)] for f in frames}
-        self.streams = [Stream(topic, kind, "cdr", topics.count(topic)) for topic, kind in sorted(kinds.items())]
+        self.streams = [
+            Stream(topic, kind, "cdr", topics.count(topic)) for topic, kind in sorted(kinds.items())
+        ]
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         return iter(())
@@ -60,7 +72,10 @@ def header(topic: str, seconds: float, frame_id: str) -> Header:
 
 
 def sweeps(count: int, topic: str = "/points", many: int = 1) -> list[Frame]:
-    return [LidarFrame(header(topic, 0.1 * k, "lidar"), np.tile(POINTS, (many, 1))) for k in range(count)]
+    return [
+        LidarFrame(header(topic, 0.1 * k, "lidar"), np.tile(POINTS, (many, 1)))
+        for k in range(count)
+    ]
 
 
 STATIC: Frame = TransformSample(header("/tf_static", 0.0, "base_link"), "lidar", MOUNT, static=True)
@@ -81,7 +96,9 @@ def test_a_tum_file_gives_the_poses_of_the_base_frame(tmp_path: Path) -> None:
     clouds = list(session.clouds())
     assert len(clouds) == 10
     assert clouds[3].session_T_base is not None
-    np.testing.assert_allclose(clouds[3].session_T_base, yaw_transform(0.0, (10.3, 0, 0)), atol=1e-9)
+    np.testing.assert_allclose(
+        clouds[3].session_T_base, yaw_transform(0.0, (10.3, 0, 0)), atol=1e-9
+    )
     np.testing.assert_allclose(clouds[3].points[0], [1.0, 5.0, 2.0], atol=1e-5)
     assert (session.base_frame, session.session_frame) == ("base_link", "trajectory")
     assert len(session.trajectory()[0]) == 21
@@ -89,7 +106,11 @@ def test_a_tum_file_gives_the_poses_of_the_base_frame(tmp_path: Path) -> None:
     assert session.problems == []
     told = session.to_json()["pose_source"]
     assert isinstance(told, dict)
-    assert (told["kind"], told["path"], told["fingerprint"]) == ("file", str(poses.path), poses.fingerprint())
+    assert (told["kind"], told["path"], told["fingerprint"]) == (
+        "file",
+        str(poses.path),
+        poses.fingerprint(),
+    )
 
 
 def test_poses_of_a_named_frame(tmp_path: Path) -> None:
@@ -98,9 +119,16 @@ def test_poses_of_a_named_frame(tmp_path: Path) -> None:
     clouds = list(session.clouds())
     assert session.base_frame == "base_link"
     assert clouds[5].session_T_base is not None
-    np.testing.assert_allclose(clouds[5].session_T_base, yaw_transform(0.0, (10.5, 0, 0)) @ inverse(MOUNT), atol=1e-9)
-    wrong = Session([FakeLog([STATIC, *sweeps(10)])], poses=TrajectoryFile(source.path, frame="velodine"))
-    with pytest.raises(LogError, match=r"poses of 'velodine', but the log has no such frame: name one of base_link, lidar\."):
+    np.testing.assert_allclose(
+        clouds[5].session_T_base, yaw_transform(0.0, (10.5, 0, 0)) @ inverse(MOUNT), atol=1e-9
+    )
+    wrong = Session(
+        [FakeLog([STATIC, *sweeps(10)])], poses=TrajectoryFile(source.path, frame="velodine")
+    )
+    with pytest.raises(
+        LogError,
+        match=r"poses of 'velodine', but the log has no such frame: name one of base_link, lidar\.",
+    ):
         list(wrong.clouds())
 
 
@@ -109,13 +137,23 @@ def test_a_file_that_covers_part_of_the_log(tmp_path: Path) -> None:
     session = Session([FakeLog([STATIC, *sweeps(100)])], poses=source)
     clouds = list(session.clouds())
     stamps = [c.header.stamp_ns - EPOCH for c in clouds]
-    assert (min(stamps), max(stamps)) == (19 * S // 10, 41 * S // 10)  # the nearest pose serves a tenth of a second
-    assert any("77 of 100 frames are left out: no pose is known" in said for said in session.skipped)
+    # the nearest pose serves a tenth of a second
+    assert (min(stamps), max(stamps)) == (19 * S // 10, 41 * S // 10)
+    assert any(
+        "77 of 100 frames are left out: no pose is known" in said for said in session.skipped
+    )
 
 
 def test_the_logs_own_poses_are_not_used_beside_a_file(tmp_path: Path) -> None:
-    own: list[Frame] = [PoseSample(header(t, 0.1 * k, "odom"), "base_link", np.eye(4)) for k in range(11) for t in ("/a/odom", "/b/odom")]
-    own += [TransformSample(header("/tf", 0.1 * k, "odom"), "base_link", np.eye(4), static=False) for k in range(11)]
+    own: list[Frame] = [
+        PoseSample(header(t, 0.1 * k, "odom"), "base_link", np.eye(4))
+        for k in range(11)
+        for t in ("/a/odom", "/b/odom")
+    ]
+    own += [
+        TransformSample(header("/tf", 0.1 * k, "odom"), "base_link", np.eye(4), static=False)
+        for k in range(11)
+    ]
     source = TrajectoryFile(tum(tmp_path / "a.tum", [0.0, 0.5, 1.0]))
     session = Session([FakeLog([STATIC, *sweeps(10), *own])], poses=source)
     clouds = list(session.clouds())
@@ -127,12 +165,18 @@ def test_the_logs_own_poses_are_not_used_beside_a_file(tmp_path: Path) -> None:
 def test_kitti_lines_belong_to_the_frames_of_the_first_lidar(tmp_path: Path) -> None:
     path = tmp_path / "00.txt"
     path.write_text("".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(10)))
-    session = Session([FakeLog([STATIC, *sweeps(10), *sweeps(5, "/rear")])], {"lidar": "/points,/rear"}, poses=TrajectoryFile(path))
+    session = Session(
+        [FakeLog([STATIC, *sweeps(10), *sweeps(5, "/rear")])],
+        {"lidar": "/points,/rear"},
+        poses=TrajectoryFile(path),
+    )
     clouds = list(session.clouds())
     assert len(clouds) == 15
     for cloud in clouds:
         assert cloud.session_T_base is not None
-        assert cloud.session_T_base[0, 3] == pytest.approx((cloud.header.stamp_ns - EPOCH) / S * 10, abs=1e-6)
+        assert cloud.session_T_base[0, 3] == pytest.approx(
+            (cloud.header.stamp_ns - EPOCH) / S * 10, abs=1e-6
+        )
 
 
 # -- odometry with a stand-in for KISS-ICP
@@ -165,16 +209,26 @@ def test_odometry_of_the_sensor_becomes_that_of_the_base(engine: Any) -> None:
     for k, cloud in enumerate(clouds):
         assert cloud.session_T_base is not None
         # the sensor looks to the left of the base: its x is the base's y
-        np.testing.assert_allclose(cloud.session_T_base, yaw_transform(0.0, (0.0, 0.2 * k, 0.0)), atol=1e-9)
+        np.testing.assert_allclose(
+            cloud.session_T_base, yaw_transform(0.0, (0.0, 0.2 * k, 0.0)), atol=1e-9
+        )
     assert (session.base_frame, session.session_frame) == ("base_link", "lidar_odometry")
     assert session.problems == []
-    assert session.to_json()["pose_source"] == {"kind": "lidar_odometry", "topic": "/points", "sweeps": 10, "kiss_icp": "1.3.0"}
+    assert session.to_json()["pose_source"] == {
+        "kind": "lidar_odometry",
+        "topic": "/points",
+        "sweeps": 10,
+        "kiss_icp": "1.3.0",
+    }
 
 
 def test_every_sweep_is_registered_and_its_pose_is_that_of_its_last_point(engine: Any) -> None:
     engine.steps = along(0.0, 0.1, 0.2)
     offsets = np.linspace(0, S // 10, 120).astype(np.int64)
-    frames: list[Frame] = [LidarFrame(header("/points", 0.1 * k, "lidar"), np.tile(POINTS, (60, 1)), offset_ns=offsets) for k in range(3)]
+    frames: list[Frame] = [
+        LidarFrame(header("/points", 0.1 * k, "lidar"), np.tile(POINTS, (60, 1)), offset_ns=offsets)
+        for k in range(3)
+    ]
     session = Session([FakeLog(frames)], odometry="lidar")
     clouds = list(session.clouds())
     stamps, poses = session.trajectory()
@@ -192,12 +246,15 @@ def test_a_jump_ends_the_poses_and_is_said(engine: Any) -> None:
     clouds = list(session.clouds())
     assert len(engine.calls) == 7
     assert len(clouds) == 7  # the nearest pose serves a tenth of a second
-    assert any("LIDAR odometry lost track at 2023-11-14T22:13:20.600Z" in said for said in session.skipped)
+    assert any(
+        "LIDAR odometry lost track at 2023-11-14T22:13:20.600Z" in said for said in session.skipped
+    )
     assert any("13 of 20 frames are left out: no pose" in said for said in session.skipped)
 
 
 def test_a_sweep_that_does_not_lie_on_the_one_before_ends_the_poses(engine: Any) -> None:
-    engine.steps = along(0.0, 0.1, 0.2, 0.7, 1.2)  # within what a vehicle can do, but the points stay where they are
+    # within what a vehicle can do, but the points stay where they are
+    engine.steps = along(0.0, 0.1, 0.2, 0.7, 1.2)
     made = LidarOdometry("/points", min_range=0.5, max_range=80.0)
     for frame in sweeps(5, many=60):
         made.take(frame)
@@ -205,7 +262,9 @@ def test_a_sweep_that_does_not_lie_on_the_one_before_ends_the_poses(engine: Any)
     assert "lost track at 2023-11-14T22:13:20.300Z" in made.problems[0]
 
 
-@pytest.mark.parametrize("pose", [yaw_transform(1.5), np.full((4, 4), np.nan), yaw_transform(0.0, (30.0, 0, 0))])
+@pytest.mark.parametrize(
+    "pose", [yaw_transform(1.5), np.full((4, 4), np.nan), yaw_transform(0.0, (30.0, 0, 0))]
+)
 def test_what_no_vehicle_does_is_a_jump(engine: Any, pose: F64) -> None:
     engine.steps = [np.eye(4), pose]
     made = LidarOdometry("/points", min_range=0.5, max_range=80.0)
@@ -223,7 +282,9 @@ def test_sparse_and_repeated_sweeps_are_counted(engine: Any) -> None:
         made.take(frame)
     made.finish()
     assert len(list(made.poses(lambda *_: None))) == 2
-    assert made.problems == ["/points: 3 sweeps are too sparse or out of order for LIDAR odometry and were left out."]
+    assert made.problems == [
+        "/points: 3 sweeps are too sparse or out of order for LIDAR odometry and were left out."
+    ]
 
 
 def test_one_sweep_has_the_identity(engine: Any) -> None:
@@ -236,27 +297,40 @@ def test_one_sweep_has_the_identity(engine: Any) -> None:
 
 def test_without_kiss_icp_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
-    with pytest.raises(LogError, match=r"install it with pip install 'semloc_logs\[odometry\]', or give poses with --poses FILE"):
+    with pytest.raises(
+        LogError,
+        match=r"install it with pip install 'semloc_logs\[odometry\]', or give poses with --poses FILE",
+    ):
         Session([FakeLog(sweeps(1))], odometry="lidar")
 
 
 # -- KISS-ICP itself
 
 
-@pytest.mark.skipif(importlib.util.find_spec("kiss_icp") is None, reason="the extra 'odometry' is not installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("kiss_icp") is None, reason="the extra 'odometry' is not installed"
+)
 def test_kiss_icp_finds_a_known_motion_twice_the_same() -> None:
     """A sensor that drives through a box of walls with pillars."""
     rng = np.random.default_rng(3)
     faces = [np.c_[rng.uniform(-20, 20, (6000, 2)), np.full(6000, -1.5)]]
     for axis, side in ((0, -20.0), (0, 20.0), (1, -12.0), (1, 12.0)):
-        wall = np.c_[rng.uniform(-20, 20, 4000), rng.uniform(-20, 20, 4000), rng.uniform(-1.5, 4, 4000)]
+        wall = np.c_[
+            rng.uniform(-20, 20, 4000), rng.uniform(-20, 20, 4000), rng.uniform(-1.5, 4, 4000)
+        ]
         wall[:, axis] = side
         faces.append(wall)
-    faces += [np.r_[x, y, 0] + rng.normal(0, 0.2, (400, 3)) * [1, 1, 5] for x, y in rng.uniform(-10, 10, (12, 2))]
+    faces += [
+        np.r_[x, y, 0] + rng.normal(0, 0.2, (400, 3)) * [1, 1, 5]
+        for x, y in rng.uniform(-10, 10, (12, 2))
+    ]
     world = np.concatenate(faces)
     truth = [yaw_transform(0.02 * k, (0.3 * k, 0.01 * k * k, 0.0)) for k in range(15)]
     frames = [
-        LidarFrame(header("/points", 0.1 * k, "lidar"), ((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32))
+        LidarFrame(
+            header("/points", 0.1 * k, "lidar"),
+            ((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32),
+        )
         for k, pose in enumerate(truth)
     ]
     found = []
@@ -285,10 +359,17 @@ def test_fixes_serve_where_there_is_nothing_else() -> None:
     assert len(clouds) == 40
     assert clouds[20].session_T_base is not None
     # 1e-5 degrees are 0.746 m at 48 degrees north and 500 m
-    np.testing.assert_allclose(clouds[20].session_T_base, yaw_transform(0.0, (20 * 0.746, 0, 0)), atol=0.02)
+    np.testing.assert_allclose(
+        clouds[20].session_T_base, yaw_transform(0.0, (20 * 0.746, 0, 0)), atol=0.02
+    )
     assert (session.base_frame, session.session_frame) == ("base_link", "enu")
-    own: list[Frame] = [PoseSample(header("/odom", 0.1 * k, "odom"), "base_link", np.eye(4)) for k in range(41)]
-    tf: list[Frame] = [TransformSample(header("/tf", 0.1 * k, "odom"), "base_link", np.eye(4), static=False) for k in range(41)]
+    own: list[Frame] = [
+        PoseSample(header("/odom", 0.1 * k, "odom"), "base_link", np.eye(4)) for k in range(41)
+    ]
+    tf: list[Frame] = [
+        TransformSample(header("/tf", 0.1 * k, "odom"), "base_link", np.eye(4), static=False)
+        for k in range(41)
+    ]
     for better in (own, tf):
         session = Session([FakeLog([*frames, *better])])
         assert len(list(session.clouds())) == 40

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.logs.messages.definitions import UndecodableError
-from semloc_logs.logs.messages.image_codecs import decode_compressed, decode_compressed_depth, decode_raw, depth_metres, is_depth
+from semloc_logs.logs.messages.image_codecs import (
+    decode_compressed,
+    decode_compressed_depth,
+    decode_raw,
+    depth_metres,
+    is_depth,
+)
 from semloc_logs.logs.messages.rvl import decode_rvl
 
 
@@ -44,7 +50,9 @@ def test_row_padding_and_byte_order() -> None:
     assert decode_raw(data, 2, 2, 6, "16UC1", True).tolist() == [[1, 2], [3, 4]]
 
 
-@pytest.mark.parametrize(("pattern", "site"), [("rggb", (0, 0)), ("bggr", (1, 1)), ("gbrg", (1, 0)), ("grbg", (0, 1))])
+@pytest.mark.parametrize(
+    ("pattern", "site"), [("rggb", (0, 0)), ("bggr", (1, 1)), ("gbrg", (1, 0)), ("grbg", (0, 1))]
+)
 def test_bayer_patterns_put_red_where_it_is(pattern: str, site: tuple[int, int]) -> None:
     mosaic = np.zeros((8, 8), np.uint8)
     mosaic[site[0] :: 2, site[1] :: 2] = 200  # light on the red sites only
@@ -54,7 +62,8 @@ def test_bayer_patterns_put_red_where_it_is(pattern: str, site: tuple[int, int])
 
 
 @pytest.mark.parametrize(
-    ("width", "height", "encoding"), [(3, 1, "mono8"), (2**31, 2**31, "rgb8"), (0, 1, "mono8"), (1, 1, "h264"), (-1, -1, "mono8")]
+    ("width", "height", "encoding"),
+    [(3, 1, "mono8"), (2**31, 2**31, "rgb8"), (0, 1, "mono8"), (1, 1, "h264"), (-1, -1, "mono8")],
 )
 def test_claims_beyond_the_data_are_refused(width: int, height: int, encoding: str) -> None:
     with pytest.raises(UndecodableError):
@@ -88,7 +97,17 @@ def test_a_png_that_claims_gigapixels_is_refused_before_it_is_decoded() -> None:
         decode_compressed(bytes(data))
 
 
-@pytest.mark.parametrize("data", [b"", b"\xff\xd8", b"\xff\xd8\xff\xe0\0\0", b"GIF89a", b"\x89PNG\r\n\x1a\n", b"\xff\xd8" + b"\xff" * 40])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff\xd8",
+        b"\xff\xd8\xff\xe0\0\0",
+        b"GIF89a",
+        b"\x89PNG\r\n\x1a\n",
+        b"\xff\xd8" + b"\xff" * 40,
+    ],
+)
 def test_what_is_no_picture(data: bytes) -> None:
     with pytest.raises(UndecodableError):
         decode_compressed(data)
@@ -103,7 +122,9 @@ def test_depth_units_and_holes() -> None:
 
 def test_compressed_depth_in_millimetres_and_as_inverse_depth() -> None:
     raw = np.array([[0, 1000, 2500]], np.uint16)
-    found = decode_compressed_depth(struct.pack("<iff", 0, 0, 0) + png(raw), "16UC1; compressedDepth png")
+    found = decode_compressed_depth(
+        struct.pack("<iff", 0, 0, 0) + png(raw), "16UC1; compressedDepth png"
+    )
     np.testing.assert_allclose(found, [[0, 1.0, 2.5]])
     quant_a, quant_b = 10100.0, -9.0
     depth = np.array([0.5, 2.0, 9.0])
@@ -119,7 +140,8 @@ def rvl(pixels: list[int], width: int, height: int) -> bytes:
 
     def number(value: int) -> None:
         while True:
-            low, value = value & 7, value >> 3
+            low = value & 7
+            value = value >> 3
             nibbles.append(low | (8 if value else 0))
             if not value:
                 return
@@ -132,11 +154,15 @@ def rvl(pixels: list[int], width: int, height: int) -> bytes:
         number(zeros)
         number(run)
         for p in pixels[at : at + run]:
-            delta, previous = p - previous, p
+            delta = p - previous
+            previous = p
             number(2 * delta if delta >= 0 else -2 * delta - 1)
         at += run
     nibbles += [0] * (-len(nibbles) % 8)
-    words = [sum(n << (28 - 4 * k) for k, n in enumerate(nibbles[i : i + 8])) for i in range(0, len(nibbles), 8)]
+    words = [
+        sum(n << (28 - 4 * k) for k, n in enumerate(nibbles[i : i + 8]))
+        for i in range(0, len(nibbles), 8)
+    ]
     return struct.pack("<II", width, height) + struct.pack(f"<{len(words)}I", *words)
 
 
@@ -149,7 +175,9 @@ def test_rvl_round_trip(width: int, height: int, data: st.DataObject) -> None:
 
 def test_rvl_inside_compressed_depth() -> None:
     data = struct.pack("<iff", 1, 0, 0) + rvl([0, 0, 1200, 1300, 0, 7], 3, 2)
-    np.testing.assert_allclose(decode_compressed_depth(data, "16UC1; compressedDepth rvl"), [[0, 0, 1.2], [1.3, 0, 0.007]])
+    np.testing.assert_allclose(
+        decode_compressed_depth(data, "16UC1; compressedDepth rvl"), [[0, 0, 1.2], [1.3, 0, 0.007]]
+    )
 
 
 @given(st.binary(max_size=60))

@@ -15,7 +15,9 @@ from semloc_logs.errors import LogError, RoleError
 from semloc_logs.logs.session.inspect import inspect_log
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
-needs_logs = pytest.mark.skipif(not SHARED.is_dir(), reason="the folder ../shared with recorded logs is missing")
+needs_logs = pytest.mark.skipif(
+    not SHARED.is_dir(), reason="the folder ../shared with recorded logs is missing"
+)
 STORE = get_typestore(Stores.ROS1_NOETIC)
 S = 1_000_000_000
 
@@ -31,9 +33,13 @@ def inspect(path: Path, topics: dict[str, str] | None = None) -> dict[str, Any]:
 def write_odometry_bag(path: Path, topics: tuple[str, ...], seconds: int = 20) -> None:
     """A ROS 1 bag whose odometry topics stand still."""
     T = STORE.types
-    header_type, odometry_type = T["std_msgs/msg/Header"], T["nav_msgs/msg/Odometry"]
+    header_type = T["std_msgs/msg/Header"]
+    odometry_type = T["nav_msgs/msg/Odometry"]
     time_type = T["builtin_interfaces/msg/Time"]
-    pose = T["geometry_msgs/msg/Pose"](T["geometry_msgs/msg/Point"](1.0, 2.0, 3.0), T["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0))
+    pose = T["geometry_msgs/msg/Pose"](
+        T["geometry_msgs/msg/Point"](1.0, 2.0, 3.0),
+        T["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+    )
     zero = T["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     covariance = np.zeros(36)
     with Writer(path) as writer:
@@ -45,15 +51,21 @@ def write_odometry_bag(path: Path, topics: tuple[str, ...], seconds: int = 20) -
                     header_type(k, time_type(stamp // S, stamp % S), "odom"),
                     "base_link",
                     T["geometry_msgs/msg/PoseWithCovariance"](pose, covariance),
-                    T["geometry_msgs/msg/TwistWithCovariance"](T["geometry_msgs/msg/Twist"](zero, zero), covariance),
+                    T["geometry_msgs/msg/TwistWithCovariance"](
+                        T["geometry_msgs/msg/Twist"](zero, zero), covariance
+                    ),
                 )
-                writer.write(connection, stamp, STORE.serialize_ros1(message, odometry_type.__msgtype__))
+                writer.write(
+                    connection, stamp, STORE.serialize_ros1(message, odometry_type.__msgtype__)
+                )
 
 
 def test_ambiguity_is_a_problem_and_not_an_error(tmp_path: Path) -> None:
     write_odometry_bag(tmp_path / "two.bag", ("/a/odom", "/b/odom"))
     told = inspect(tmp_path / "two.bag")
-    assert any("--topic pose=/a/odom or --topic pose=/b/odom" in problem for problem in told["problems"])
+    assert any(
+        "--topic pose=/a/odom or --topic pose=/b/odom" in problem for problem in told["problems"]
+    )
     assert [s["role"] for s in told["streams"]] == [None, None]
     chosen = inspect(tmp_path / "two.bag", {"pose": "/b/odom"})
     assert [s["role"] for s in chosen["streams"]] == [None, "pose"]
@@ -67,7 +79,11 @@ def test_odometry_that_was_never_filled_in(tmp_path: Path) -> None:
     told = inspect(tmp_path / "still.bag")
     assert any("/odom gives the same position for 20 s" in problem for problem in told["problems"])
     assert told["skipped"] == []
-    assert (told["base_frame"], told["session_frame"], told["duration_s"]) == ("base_link", "odom", 19.5)
+    assert (told["base_frame"], told["session_frame"], told["duration_s"]) == (
+        "base_link",
+        "odom",
+        19.5,
+    )
 
 
 def test_no_log_at_all(tmp_path: Path) -> None:
@@ -84,11 +100,31 @@ def test_no_log_at_all(tmp_path: Path) -> None:
     [
         ("basement_a.mcap", "base_link", 88, {"lidar": 88, "pose": 88, "tf_static": 1}),
         ("basement_b.bag", "base_link", 87, {"lidar": 87, "pose": 87, "tf_static": 1}),
-        ("room_a.mcap", "camera_optical", 125, {"depth": 125, "image": 125, "camera_info": 250, "pose": 125}),
-        ("room_b", "camera_optical", 125, {"depth": 125, "image": 125, "camera_info": 250, "pose": 125}),
+        (
+            "room_a.mcap",
+            "camera_optical",
+            125,
+            {"depth": 125, "image": 125, "camera_info": 250, "pose": 125},
+        ),
+        (
+            "room_b",
+            "camera_optical",
+            125,
+            {"depth": 125, "image": 125, "camera_info": 250, "pose": 125},
+        ),
         ("kitti00_000850.mcap", "base_link", 1, {"lidar": 1, "pose": 1, "tf_static": 1}),
-        ("kitti_drive_camera_lidar.mcap", "velodyne", 0, {"lidar": 24, "image": 24, "camera_info": 24, "tf_static": 1}),
-        ("euroc_v101_stereo.bag", "imu", 97, {"stereo_left": 32, "stereo_right": 32, "camera_info": 64, "pose": 97, "tf_static": 1}),
+        (
+            "kitti_drive_camera_lidar.mcap",
+            "velodyne",
+            0,
+            {"lidar": 24, "image": 24, "camera_info": 24, "tf_static": 1},
+        ),
+        (
+            "euroc_v101_stereo.bag",
+            "imu",
+            97,
+            {"stereo_left": 32, "stereo_right": 32, "camera_info": 64, "pose": 97, "tf_static": 1},
+        ),
     ],
 )
 def test_recorded_logs(name: str, base: str, poses: int, roles: dict[str, int]) -> None:
@@ -113,7 +149,12 @@ def test_odd_logs_give_an_answer_or_a_log_error() -> None:
         except LogError as error:
             refused[path.name] = str(error)
     assert all(sentence.endswith(".") for sentence in refused.values())
-    assert set(refused) == {"empty-file.bag", "lfs_pointer.bag", "lfs_pointer.mcap", "not_a_bag.bag"}
+    assert set(refused) == {
+        "empty-file.bag",
+        "lfs_pointer.bag",
+        "lfs_pointer.mcap",
+        "not_a_bag.bag",
+    }
 
 
 @needs_logs
@@ -139,7 +180,11 @@ def test_cut_off_and_scribbled_logs(name: str, tmp_path: Path) -> None:
 @needs_logs
 def test_tf_alone_gives_poses() -> None:
     told = inspect(SHARED / "odd_logs" / "tf_example.bag")
-    assert (told["poses"]["count"], told["base_frame"], told["session_frame"]) == (517, "base_link", "odom")
+    assert (told["poses"]["count"], told["base_frame"], told["session_frame"]) == (
+        517,
+        "base_link",
+        "odom",
+    )
     assert "base_footprint" in told["frames"]
 
 

@@ -30,7 +30,10 @@ from semloc_logs.numerics.transforms import Array, yaw_transform
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
 HALF = np.array([10.0, 6.0, 2.0])
-MOUNTS = {"front": yaw_transform(0.2, (2.0, 0.5, 0.3)), "rear": yaw_transform(3.0, (-1.5, -0.4, 0.1))}
+MOUNTS = {
+    "front": yaw_transform(0.2, (2.0, 0.5, 0.3)),
+    "rear": yaw_transform(3.0, (-1.5, -0.4, 0.1)),
+}
 XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
 
@@ -39,7 +42,9 @@ def rows(points: Array) -> NDArray[np.void]:
 
 
 def half_room(world_T_sensor: Array, ahead: float, seed: int) -> Array:
-    """Points (n, 3) of the room's walls, in the sensor frame, with x in the room on the side ``ahead`` (1 or -1)."""
+    """Points (n, 3) of the room's walls, in the sensor frame, with x in the room on the side
+    ``ahead`` (1 or -1).
+    """
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (6000, 3)) * HALF
     axis = rng.integers(0, 3, len(points))
@@ -58,7 +63,12 @@ def drive(log: Any, *, mounts: tuple[str, ...] = ("front", "rear")) -> Path:
         for k in range(8):
             t = start + k * period
             world_T_sensor = yaw_transform(0.0, (2.0 * t, 0.0, 0.0)) @ MOUNTS[name]
-            log.cloud(f"/{name}/points", EPOCH + round(t * S), name, rows(half_room(world_T_sensor, ahead, k)))
+            log.cloud(
+                f"/{name}/points",
+                EPOCH + round(t * S),
+                name,
+                rows(half_room(world_T_sensor, ahead, k)),
+            )
     return Path(log.write())
 
 
@@ -68,8 +78,13 @@ def test_two_lidars_see_one_room(recorder: Any, kind: str) -> None:
     seen: dict[str, list[Array]] = {}
     for cloud in session.clouds():
         assert cloud.session_T_base is not None
-        seen.setdefault(cloud.header.topic, []).append(transforms.apply(cloud.session_T_base, cloud.points))
-    assert {topic: len(found) for topic, found in seen.items()} == {"/front/points": 8, "/rear/points": 8}
+        seen.setdefault(cloud.header.topic, []).append(
+            transforms.apply(cloud.session_T_base, cloud.points)
+        )
+    assert {topic: len(found) for topic, found in seen.items()} == {
+        "/front/points": 8,
+        "/rear/points": 8,
+    }
     for topic, side in (("/front/points", 1), ("/rear/points", -1)):
         points = np.concatenate(seen[topic])
         assert (points[:, 0] * side > -0.01).all()
@@ -80,11 +95,17 @@ def test_two_lidars_see_one_room(recorder: Any, kind: str) -> None:
 
 def test_the_fused_map_is_the_room(recorder: Any, tmp_path: Path) -> None:
     log = drive(recorder())
-    done = CliRunner().invoke(program, ["fuse", str(log), "-w", str(tmp_path / "w"), "--set", "fusion.voxel_size=0.3"])
+    done = CliRunner().invoke(
+        program, ["fuse", str(log), "-w", str(tmp_path / "w"), "--set", "fusion.voxel_size=0.3"]
+    )
     assert done.exit_code == 0, done.output
     table = pyarrow.parquet.read_table(tmp_path / "w" / "sessions" / "drive" / "voxels")
     centres = np.stack([table[f"i{a}"].to_numpy() for a in "xyz"], 1) * 0.3 + 0.15
-    session_T_map = np.array(json.loads((tmp_path / "w" / "sessions" / "drive" / "session.json").read_text())["session_T_map"])
+    session_T_map = np.array(
+        json.loads((tmp_path / "w" / "sessions" / "drive" / "session.json").read_text())[
+            "session_T_map"
+        ]
+    )
     room = transforms.apply(session_T_map, centres)
     off = np.min(np.abs(HALF - np.abs(room)), axis=1)
     assert np.quantile(off, 0.99) < 0.35
@@ -96,10 +117,14 @@ def test_a_missing_extrinsic_costs_one_lidar_and_one_sentence(recorder: Any) -> 
     session = open_session([drive(recorder(), mounts=("front",))])
     assert {c.header.topic for c in session.clouds()} == {"/front/points"}
     [sentence] = session.skipped
-    assert sentence.startswith("/rear/points: 8 of 8 frames are left out: no transform leads from their frame to the base frame")
+    assert sentence.startswith(
+        "/rear/points: 8 of 8 frames are left out: no transform leads from their frame to the base frame"
+    )
 
 
-def publish_twice(log: Any, change: Callable[[Array], Array], name: str, frame: str = "front") -> Path:
+def publish_twice(
+    log: Any, change: Callable[[Array], Array], name: str, frame: str = "front"
+) -> Path:
     log.transform("base_link", "front", MOUNTS["front"], EPOCH - S)
     for k in range(-10, 40):
         log.pose(EPOCH + k * S // 20, yaw_transform(0.0, (0.1 * k, 0.0, 0.0)))
@@ -133,7 +158,9 @@ def centroids(points: Array) -> Array:
     ],
     ids=["no ground", "thinned", "voxels", "in the base frame"],
 )
-def test_one_lidar_twice_is_used_once(recorder: Any, change: Callable[[Array], Array], frame: str) -> None:
+def test_one_lidar_twice_is_used_once(
+    recorder: Any, change: Callable[[Array], Array], frame: str
+) -> None:
     path = publish_twice(recorder(), change, "/segmented_or_not", frame)
     session = open_session([path])
     assert [c.header.topic for c in session.clouds()] == ["/lidar"] * 6
@@ -168,22 +195,37 @@ CUSTOM = {
 PACKAGES = ["livox_ros_driver", "livox_ros_driver2", "livox_interfaces"]
 
 
-def livox_message(package: str, encoding: str, frame_id: str = "livox", count: int = 5) -> tuple[bytes, Definition]:
+def livox_message(
+    package: str, encoding: str, frame_id: str = "livox", count: int = 5
+) -> tuple[bytes, Definition]:
     store = get_typestore(Stores.ROS2_HUMBLE if encoding == "cdr" else Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(CUSTOM["point"], f"{package}/msg/CustomPoint"))
     store.register(get_types_from_msg(CUSTOM["ros2"], f"{package}/msg/CustomMsg"))
     t = store.types
     stamp = t["builtin_interfaces/msg/Time"](sec=1_700_000_000, nanosec=250)
-    header = t["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id, **({} if encoding == "cdr" else {"seq": 0}))
+    header = t["std_msgs/msg/Header"](
+        stamp=stamp, frame_id=frame_id, **({} if encoding == "cdr" else {"seq": 0})
+    )
     points = [
-        t[f"{package}/msg/CustomPoint"](offset_time=k * 20_000_000, x=1.0 + k, y=2.0, z=-k, reflectivity=7, tag=16, line=k)
+        t[f"{package}/msg/CustomPoint"](
+            offset_time=k * 20_000_000, x=1.0 + k, y=2.0, z=-k, reflectivity=7, tag=16, line=k
+        )
         for k in range(count)
     ]
     m = t[f"{package}/msg/CustomMsg"](
-        header=header, timebase=EPOCH + 1250, point_num=count, lidar_id=3, rsvd=np.zeros(3, np.uint8), points=points
+        header=header,
+        timebase=EPOCH + 1250,
+        point_num=count,
+        lidar_id=3,
+        rsvd=np.zeros(3, np.uint8),
+        points=points,
     )
     text, _ = store.generate_msgdef(m.__msgtype__, ros_version=2 if encoding == "cdr" else 1)
-    data = store.serialize_cdr(m, m.__msgtype__) if encoding == "cdr" else store.serialize_ros1(m, m.__msgtype__)
+    data = (
+        store.serialize_cdr(m, m.__msgtype__)
+        if encoding == "cdr"
+        else store.serialize_ros1(m, m.__msgtype__)
+    )
     return bytes(data), Definition("", "ros2msg" if encoding == "cdr" else "ros1msg", text.encode())
 
 
@@ -194,7 +236,9 @@ def test_livox_with_and_without_its_definition(package: str, encoding: str, fram
     data, definition = livox_message(package, encoding, frame_id)
     for known in (definition, Definition("", "", b"")):
         problems = Problems()
-        frames = Decoder(problems).frames(Message("/livox/lidar", f"{package}/msg/CustomMsg", encoding, 1, data, known))
+        frames = Decoder(problems).frames(
+            Message("/livox/lidar", f"{package}/msg/CustomMsg", encoding, 1, data, known)
+        )
         assert problems.sentences() == []
         [frame] = frames
         assert isinstance(frame, LidarFrame)
@@ -218,10 +262,25 @@ def test_livox_claims_and_strange_definitions(encoding: str) -> None:
     at = data.rindex(count, 0, len(data) - 5 * 19)
     problems = Problems()
     claimed = data[:at] + struct.pack("<I", 2**32 - 1) + data[at + 4 :]
-    assert Decoder(problems).frames(Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", encoding, 1, claimed, definition)) == []
-    strange = Definition("", definition.encoding, definition.text.replace(b"float32 x", b"float64 x"))
-    assert Decoder(problems).frames(Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", encoding, 1, data, strange)) == []
-    assert "not that of the Livox drivers" in problems.sentences()[0] or "need" in problems.sentences()[0]
+    assert (
+        Decoder(problems).frames(
+            Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", encoding, 1, claimed, definition)
+        )
+        == []
+    )
+    strange = Definition(
+        "", definition.encoding, definition.text.replace(b"float32 x", b"float64 x")
+    )
+    assert (
+        Decoder(problems).frames(
+            Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", encoding, 1, data, strange)
+        )
+        == []
+    )
+    assert (
+        "not that of the Livox drivers" in problems.sentences()[0]
+        or "need" in problems.sentences()[0]
+    )
 
 
 def test_livox_points_of_signalling_nan_are_dropped_without_a_warning() -> None:
@@ -230,17 +289,24 @@ def test_livox_points_of_signalling_nan_are_dropped_without_a_warning() -> None:
     damaged = data[:at] + struct.pack("<I", 0x7F800001) + data[at + 4 :]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        [frame] = Decoder(Problems()).frames(Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", "ros1", 1, damaged, definition))
+        [frame] = Decoder(Problems()).frames(
+            Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", "ros1", 1, damaged, definition)
+        )
     assert isinstance(frame, LidarFrame)
     assert (len(frame.points), frame.lost) == (4, 1)
 
 
 def test_livox_is_a_lidar() -> None:
-    assert find_roles([Stream("/livox/lidar", "livox_ros_driver2/msg/CustomMsg", "cdr", 3)]).lidar == ("/livox/lidar",)
+    assert find_roles(
+        [Stream("/livox/lidar", "livox_ros_driver2/msg/CustomMsg", "cdr", 3)]
+    ).lidar == ("/livox/lidar",)
     assert find_roles([Stream("/x", "other/msg/CustomMsg", "cdr", 3)]).lidar == ()
 
 
-@pytest.mark.parametrize("type_", ["velodyne_msgs/msg/VelodyneScan", "ouster_ros/msg/PacketMsg", "pandar_msgs/msg/PandarScan"])
+@pytest.mark.parametrize(
+    "type_",
+    ["velodyne_msgs/msg/VelodyneScan", "ouster_ros/msg/PacketMsg", "pandar_msgs/msg/PandarScan"],
+)
 def test_packets_are_named(type_: str, recorder: Any) -> None:
     streams = [Stream("/packets", type_, "cdr", 3)]
     assert no_sensor(streams).startswith(f"/packets holds {type_}, packets")
@@ -253,20 +319,38 @@ def test_a_log_of_packets_is_refused_with_what_to_do(recorder: Any) -> None:
     log = recorder()
     text = "std_msgs/Header header\nVelodynePacket[] packets\n"
     log.store = get_typestore(Stores.ROS2_HUMBLE)
-    log.store.register(get_types_from_msg("builtin_interfaces/Time stamp\nuint8[1206] data\n", "velodyne_msgs/msg/VelodynePacket"))
+    log.store.register(
+        get_types_from_msg(
+            "builtin_interfaces/Time stamp\nuint8[1206] data\n", "velodyne_msgs/msg/VelodynePacket"
+        )
+    )
     log.store.register(get_types_from_msg(text, "velodyne_msgs/msg/VelodyneScan"))
-    scan = log.make("velodyne_msgs/msg/VelodyneScan", header=log.header(EPOCH, "velodyne"), packets=[])
+    scan = log.make(
+        "velodyne_msgs/msg/VelodyneScan", header=log.header(EPOCH, "velodyne"), packets=[]
+    )
     log.add("/velodyne_packets", scan, EPOCH)
-    with pytest.raises(RoleError, match=r"drive.mcap: /velodyne_packets holds velodyne_msgs/msg/VelodyneScan, packets .* PointCloud2"):
+    with pytest.raises(
+        RoleError,
+        match=r"drive.mcap: /velodyne_packets holds velodyne_msgs/msg/VelodyneScan, packets .* PointCloud2",
+    ):
         open_session([log.write()])
 
 
 def test_the_old_point_cloud(recorder: Any) -> None:
     log = recorder("ros1")
     point, channel = "geometry_msgs/msg/Point32", "sensor_msgs/msg/ChannelFloat32"
-    points = [log.make(point, x=1.0, y=2.0, z=3.0), log.make(point, x=np.nan, y=0.0, z=0.0), log.make(point, x=4.0, y=5.0, z=6.0)]
+    points = [
+        log.make(point, x=1.0, y=2.0, z=3.0),
+        log.make(point, x=np.nan, y=0.0, z=0.0),
+        log.make(point, x=4.0, y=5.0, z=6.0),
+    ]
     times = log.make(channel, name="time", values=np.array([0.0, 0.05, 0.1], np.float32))
-    message = log.make("sensor_msgs/msg/PointCloud", header=log.header(EPOCH, "lidar"), points=points, channels=[times])
+    message = log.make(
+        "sensor_msgs/msg/PointCloud",
+        header=log.header(EPOCH, "lidar"),
+        points=points,
+        channels=[times],
+    )
     log.add("/scan", message, EPOCH)
     log.pose(EPOCH, np.eye(4))
     session = open_session([log.write()])

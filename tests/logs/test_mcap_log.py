@@ -6,6 +6,7 @@ import bz2
 import json
 import zlib
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import lz4.frame
@@ -23,13 +24,29 @@ from semloc_logs.logs.containers.mcap import McapLog
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Definition, Message, Stream
 
-ENTRIES = [("/a", 10), ("/b", 20), ("/a", 30), ("/a", 25), ("/b", 40), ("/a", 35), ("/b", 50), ("/a", 60)]
+ENTRIES = [
+    ("/a", 10),
+    ("/b", 20),
+    ("/a", 30),
+    ("/a", 25),
+    ("/b", 40),
+    ("/a", 35),
+    ("/b", 50),
+    ("/a", 60),
+]
 
 
 def pose(x: float) -> bytes:
-    position, orientation = {"x": x, "y": 0, "z": 0}, {"x": 0, "y": 0, "z": 0, "w": 1}
+    position = {"x": x, "y": 0, "z": 0}
+    orientation = {"x": 0, "y": 0, "z": 0, "w": 1}
     stamp = {"sec": 1, "nsec": int(x)}
-    return json.dumps({"timestamp": stamp, "frame_id": "odom", "pose": {"position": position, "orientation": orientation}}).encode()
+    return json.dumps(
+        {
+            "timestamp": stamp,
+            "frame_id": "odom",
+            "pose": {"position": position, "orientation": orientation},
+        }
+    ).encode()
 
 
 def write(
@@ -80,7 +97,10 @@ def test_every_layout_reads_the_same_in_log_time_order(tmp_path: Path, variant: 
     log = open_log(write(tmp_path / "x.mcap", **VARIANTS[variant]))  # type: ignore[arg-type]
     assert [(m.topic, m.log_time_ns) for m in log.messages()] == sorted(ENTRIES, key=lambda e: e[1])
     assert [m.log_time_ns for m in log.messages({"/b"})] == [20, 40, 50]
-    assert log.streams == [Stream("/a", "foxglove.PoseInFrame", "json", 5), Stream("/b", "foxglove.PoseInFrame", "json", 3)]
+    assert log.streams == [
+        Stream("/a", "foxglove.PoseInFrame", "json", 5),
+        Stream("/b", "foxglove.PoseInFrame", "json", 3),
+    ]
     assert (log.format, log.encoding, log.start_ns, log.end_ns) == ("mcap", "json", 10, 60)
     frames = list(log.frames(["/a"]))
     assert all(isinstance(f, PoseSample) for f in frames)
@@ -90,7 +110,9 @@ def test_every_layout_reads_the_same_in_log_time_order(tmp_path: Path, variant: 
 
 
 def test_agrees_with_the_reader_of_the_format(tmp_path: Path) -> None:
-    path = write(tmp_path / "x.mcap", [("/a" if k % 3 else "/b", (k * 37) % 101) for k in range(200)])
+    path = write(
+        tmp_path / "x.mcap", [("/a" if k % 3 else "/b", (k * 37) % 101) for k in range(200)]
+    )
     with path.open("rb") as file:
         theirs = [(c.topic, m.log_time, m.data) for _, c, m in make_reader(file).iter_messages()]
     ours = [(m.topic, m.log_time_ns, bytes(m.data)) for m in open_log(path).messages()]
@@ -115,7 +137,9 @@ def test_a_truncated_file_gives_what_is_before_the_cut(tmp_path: Path, share: fl
 
 
 def test_a_damaged_chunk_is_skipped_and_named(tmp_path: Path) -> None:
-    path = write(tmp_path / "x.mcap", [("/a", k) for k in range(100)], compression=CompressionType.NONE)
+    path = write(
+        tmp_path / "x.mcap", [("/a", k) for k in range(100)], compression=CompressionType.NONE
+    )
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -126,7 +150,9 @@ def test_a_damaged_chunk_is_skipped_and_named(tmp_path: Path) -> None:
     log = open_log(path)
     lost = range(chunk.message_start_time, chunk.message_end_time + 1)
     assert [m.log_time_ns for m in log.messages()] == [k for k in range(100) if k not in lost]
-    assert log.problems == [f"x.mcap: the chunk at byte {chunk.chunk_start_offset} was skipped: its checksum does not match its data."]
+    assert log.problems == [
+        f"x.mcap: the chunk at byte {chunk.chunk_start_offset} was skipped: its checksum does not match its data."
+    ]
 
 
 def test_a_damaged_index_is_named_and_not_used(tmp_path: Path) -> None:
@@ -149,7 +175,8 @@ def test_an_index_that_points_behind_the_file_is_not_used(tmp_path: Path) -> Non
     old = summary.chunk_indexes[0].chunk_start_offset.to_bytes(8, "little")
     at = data.index(old, start)
     data[at : at + 8] = (1 << 60).to_bytes(8, "little")
-    data[-12:-8] = zlib.crc32(bytes(data[start:-12])).to_bytes(4, "little")  # a liar that knows how to count
+    # a liar that knows how to count
+    data[-12:-8] = zlib.crc32(bytes(data[start:-12])).to_bytes(4, "little")
     path.write_bytes(data)
     log = open_log(path)
     assert len(list(log.messages())) == len(ENTRIES)
@@ -161,12 +188,23 @@ def test_several_encodings_in_one_file(tmp_path: Path) -> None:
     writer = Writer(str(path))
     writer.start("ros2")
     schema = writer.register_schema("foxglove.PoseInFrame", "jsonschema", b"{}")
-    writer.add_message(writer.register_channel("/json", "json", schema), log_time=1, publish_time=1, data=pose(1))
+    writer.add_message(
+        writer.register_channel("/json", "json", schema), log_time=1, publish_time=1, data=pose(1)
+    )
     schema = writer.register_schema("std_msgs/String", "ros1msg", b"string data")
-    writer.add_message(writer.register_channel("/ros1", "ros1", schema), log_time=2, publish_time=2, data=b"\0\0\0\0")
-    writer.add_message(writer.register_channel("/raw", "", 0), log_time=3, publish_time=3, data=b"?")
+    writer.add_message(
+        writer.register_channel("/ros1", "ros1", schema),
+        log_time=2,
+        publish_time=2,
+        data=b"\0\0\0\0",
+    )
+    writer.add_message(
+        writer.register_channel("/raw", "", 0), log_time=3, publish_time=3, data=b"?"
+    )
     schema = writer.register_schema("sensor_msgs/msg/Imu", "ros2msg", b"broken [")
-    writer.add_message(writer.register_channel("/imu", "cdr", schema), log_time=4, publish_time=4, data=b"\0\1\0\0")
+    writer.add_message(
+        writer.register_channel("/imu", "cdr", schema), log_time=4, publish_time=4, data=b"\0\1\0\0"
+    )
     writer.finish()  # type: ignore[no-untyped-call]
     log = open_log(path)
     assert log.encoding == "ros2"
@@ -206,13 +244,17 @@ def message(time: int, topic: str) -> Message:
 def test_parts_merge_like_a_stable_sort(parts: list[list[int]], slack: int) -> None:
     opened: list[int] = []
 
-    def part(k: int) -> Iterable[Message]:
+    def part(k: int) -> Iterator[Message]:
         opened.append(k)
         yield from (message(t, f"{k}/{i}") for i, t in enumerate(sorted(parts[k])))
 
     starts = [min(p, default=0) - slack for p in parts]
-    merged = list(in_log_time_order((start, lambda k=k: iter(part(k))) for k, start in enumerate(starts)))  # type: ignore[misc]
-    expected = sorted((message(t, f"{k}/{i}") for k, p in enumerate(parts) for i, t in enumerate(sorted(p))), key=lambda m: m.log_time_ns)
+    openers = [(start, partial(part, k)) for k, start in enumerate(starts)]
+    merged = list(in_log_time_order(openers))
+    expected = sorted(
+        (message(t, f"{k}/{i}") for k, p in enumerate(parts) for i, t in enumerate(sorted(p))),
+        key=lambda m: m.log_time_ns,
+    )
     times = [m.log_time_ns for m in merged]
     assert times == [m.log_time_ns for m in expected]
     assert sorted(m.topic for m in merged) == sorted(m.topic for m in expected)
@@ -222,7 +264,7 @@ def test_parts_merge_like_a_stable_sort(parts: list[list[int]], slack: int) -> N
 def test_parts_are_opened_only_when_due() -> None:
     opened = []
 
-    def part(k: int) -> Iterable[Message]:
+    def part(k: int) -> Iterator[Message]:
         opened.append(k)
         yield from (message(10 * k + i, "") for i in range(10))
 
@@ -232,7 +274,11 @@ def test_parts_are_opened_only_when_due() -> None:
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "bz2"])
 def test_decompression_believes_no_claim(compression: str) -> None:
-    pack = {"zstd": zstandard.ZstdCompressor().compress, "lz4": lz4.frame.compress, "bz2": bz2.compress}[compression]
+    pack = {
+        "zstd": zstandard.ZstdCompressor().compress,
+        "lz4": lz4.frame.compress,
+        "bz2": bz2.compress,
+    }[compression]
     for content in (b"", b"abc", bytes(10_000_000)):
         packed = pack(content)
         assert decompress(packed, compression, len(content)) == content

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -41,8 +40,11 @@ def test_earth_centred_at_known_places() -> None:
 def test_axes_point_east_north_and_up() -> None:
     local = LocalFrame(LATITUDE, LONGITUDE, HEIGHT)
     np.testing.assert_allclose(local.position(LATITUDE, LONGITUDE, HEIGHT), 0.0, atol=1e-9)
-    np.testing.assert_allclose(local.position(LATITUDE, LONGITUDE, HEIGHT + 7), [0, 0, 7], atol=1e-8)
-    east, north = local.position(LATITUDE, LONGITUDE + 1e-5, HEIGHT), local.position(LATITUDE + 1e-5, LONGITUDE, HEIGHT)
+    np.testing.assert_allclose(
+        local.position(LATITUDE, LONGITUDE, HEIGHT + 7), [0, 0, 7], atol=1e-8
+    )
+    east = local.position(LATITUDE, LONGITUDE + 1e-5, HEIGHT)
+    north = local.position(LATITUDE + 1e-5, LONGITUDE, HEIGHT)
     assert east[0] > 0.7
     assert abs(east[1]) < 1e-5
     assert north[1] > 1.1
@@ -50,10 +52,13 @@ def test_axes_point_east_north_and_up() -> None:
 
 
 def degrees_of(east: float, north: float) -> tuple[float, float]:
-    """Latitude and longitude of a place near the datum, by the radii of curvature at the datum: good to a millimetre within 100 m."""
+    """Latitude and longitude of a place near the datum, by the radii of curvature at the datum:
+    good to a millimetre within 100 m.
+    """
     eccentricity = 1.0 - (B / A) ** 2
     w = 1.0 - eccentricity * np.sin(np.radians(LATITUDE)) ** 2
-    meridian, normal = A * (1.0 - eccentricity) / w**1.5, A / np.sqrt(w)
+    meridian = A * (1.0 - eccentricity) / w**1.5
+    normal = A / np.sqrt(w)
     return (
         LATITUDE + np.degrees(north / (meridian + HEIGHT)),
         LONGITUDE + np.degrees(east / ((normal + HEIGHT) * np.cos(np.radians(LATITUDE)))),
@@ -84,7 +89,9 @@ def header(topic: str, seconds: float, frame_id: str) -> Header:
 def fix(seconds: float, place: F64, sigma: float | None = 0.02) -> Frame:
     latitude, longitude = degrees_of(place[0], place[1])
     covariance = None if sigma is None else np.diag([sigma**2] * 3)
-    return NavSatSample(header("/fix", seconds, "gps"), latitude, longitude, HEIGHT + place[2], covariance)
+    return NavSatSample(
+        header("/fix", seconds, "gps"), latitude, longitude, HEIGHT + place[2], covariance
+    )
 
 
 def antenna_at(seconds: float) -> F64:
@@ -101,10 +108,15 @@ def imu(seconds: float, *, with_orientation: bool, offset: float = 0.0) -> Frame
     return ImuSample(header("/imu", seconds, "imu"), force, np.zeros(3), orientation)
 
 
-def drive(source: NavSatPoses, frames: list[Frame], *, knows: tuple[str, ...] = ("gps", "imu")) -> dict[float, F64]:
+def drive(
+    source: NavSatPoses, frames: list[Frame], *, knows: tuple[str, ...] = ("gps", "imu")
+) -> dict[float, F64]:
     """Poses by time, taken as they come."""
     mounts = {"gps": ANTENNA, "imu": MOUNTED}
-    base_T: Callable[[str, int], F64 | None] = lambda frame, _: mounts[frame] if frame in knows else None  # noqa: E731
+
+    def base_T(frame: str, _: int) -> F64 | None:
+        return mounts[frame] if frame in knows else None
+
     found = []
     for frame in sorted(frames, key=lambda f: f.header.stamp_ns):
         source.take(frame)
@@ -119,7 +131,10 @@ def fixes(until: float = 20.0, step: float = 0.2) -> list[Frame]:
 
 
 def samples(*, with_orientation: bool, until: float = 20.0, offset: float = 0.0) -> list[Frame]:
-    return [imu(t, with_orientation=with_orientation, offset=offset) for t in np.arange(-0.005, until, 0.01)]
+    return [
+        imu(t, with_orientation=with_orientation, offset=offset)
+        for t in np.arange(-0.005, until, 0.01)
+    ]
 
 
 def check(found: dict[float, F64], *, position: float, angle: float) -> None:
@@ -129,7 +144,9 @@ def check(found: dict[float, F64], *, position: float, angle: float) -> None:
         wanted[:3, 3] -= start
         off = inverse(wanted) @ pose
         assert np.linalg.norm(off[:3, 3]) < position, seconds
-        assert np.degrees(np.linalg.norm(Rotation.from_matrix(off[:3, :3]).as_rotvec())) < angle, seconds
+        assert np.degrees(np.linalg.norm(Rotation.from_matrix(off[:3, :3]).as_rotvec())) < angle, (
+            seconds
+        )
 
 
 def test_with_the_orientation_of_a_mounted_imu() -> None:
@@ -162,7 +179,13 @@ def test_with_fixes_alone() -> None:
 def test_an_imu_of_unknown_mounting_is_not_believed() -> None:
     source = NavSatPoses("/fix", 100)
     check(
-        {t: p for t, p in drive(source, [*fixes(), *samples(with_orientation=True)], knows=()).items() if 1.5 < t < 18}, position=2, angle=1
+        {
+            t: p
+            for t, p in drive(source, [*fixes(), *samples(with_orientation=True)], knows=()).items()
+            if 1.5 < t < 18
+        },
+        position=2,
+        angle=1,
     )
     assert any("from 'imu', the IMU's frame" in note for note in source.notes)
     assert any("from 'gps', the antenna of /fix" in note for note in source.notes)
@@ -179,7 +202,8 @@ def test_uncertain_and_missing_fixes_are_left_out() -> None:
     frames = fixes()
     frames[10] = fix(2.0, antenna_at(2.0) + np.array([30.0, 0, 0]), sigma=8.0)
     frames[11] = fix(2.2, antenna_at(2.2), sigma=None)
-    source = NavSatPoses("/fix", 103)  # three messages said that there was no fix, so they gave no sample
+    # three messages said that there was no fix, so they gave no sample
+    source = NavSatPoses("/fix", 103)
     found = drive(source, [*frames, *samples(with_orientation=True)])
     assert len(found) == 99
     assert 2.0 not in found
@@ -219,12 +243,18 @@ def test_driving_backwards_is_not_turning() -> None:
     assert all(abs(np.arctan2(p[1, 0], p[0, 0])) < 0.1 for p in found.values())
 
 
-@pytest.mark.skipif(not ODD.is_dir(), reason="the folder ../shared/odd_logs with recorded logs is missing")
+@pytest.mark.skipif(
+    not ODD.is_dir(), reason="the folder ../shared/odd_logs with recorded logs is missing"
+)
 def test_the_fixes_of_a_husky_agree_with_its_odometry() -> None:
-    """Its length by fixes of a metre's noise is longer than by its wheels, but of the same size; fixes are used when named."""
+    """Its length by fixes of a metre's noise is longer than by its wheels, but of the same size;
+    fixes are used when named.
+    """
     log = ODD / "husky_imu_gnss_odometry.bag"
-    wheels, named = inspect_log(log), inspect_log(log, {"pose": "/fix"})
-    poses, fixed = wheels["poses"], named["poses"]
+    wheels = inspect_log(log)
+    named = inspect_log(log, {"pose": "/fix"})
+    poses = wheels["poses"]
+    fixed = named["poses"]
     assert isinstance(poses, dict)
     assert isinstance(fixed, dict)
     assert poses["count"] == 3952

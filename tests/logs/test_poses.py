@@ -92,7 +92,9 @@ def test_hostile_numbers_are_refused() -> None:
 
 def test_samples_are_taken_at_their_header_stamp() -> None:
     poses = PoseTrack()
-    assert poses.add(PoseSample(Header("/odom", 5, 9, "odom"), "base_link", yaw_transform(0.0, (1.0, 2.0, 3.0))))
+    assert poses.add(
+        PoseSample(Header("/odom", 5, 9, "odom"), "base_link", yaw_transform(0.0, (1.0, 2.0, 3.0)))
+    )
     assert poses.start_ns == poses.end_ns == 5
 
 
@@ -125,14 +127,19 @@ def test_an_empty_track_knows_nothing() -> None:
     assert poses.poses.shape == (0, 4, 4)
 
 
-@given(st.lists(st.integers(0, 4000), min_size=2, max_size=30, unique=True), st.lists(st.integers(-300, 4300), min_size=1, max_size=20))
+@given(
+    st.lists(st.integers(0, 4000), min_size=2, max_size=30, unique=True),
+    st.lists(st.integers(-300, 4300), min_size=1, max_size=20),
+)
 def test_agrees_with_a_slow_version(milliseconds: list[int], asked: list[int]) -> None:
     stamps = np.sort(np.array(milliseconds)) * 1_000_000 + EPOCH
     rng = np.random.default_rng(len(milliseconds))
     rotations = Rotation.random(len(stamps), random_state=rng)
     positions = rng.normal(size=(len(stamps), 3))
     poses = PoseTrack()
-    for stamp, rotation, position in zip(stamps.tolist(), rotations.as_matrix(), positions, strict=True):
+    for stamp, rotation, position in zip(
+        stamps.tolist(), rotations.as_matrix(), positions, strict=True
+    ):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, position
         assert poses.append(stamp, pose)
@@ -143,12 +150,18 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], asked: list[int]) -
         inside = int(np.clip(t, stamps[0], stamps[-1]))
         k = max(int(np.searchsorted(stamps, inside)), 1)
         is_exact = inside in stamps
-        is_known = abs(t - inside) <= 100_000_000 and (is_exact or stamps[k] - stamps[k - 1] <= limit)
+        is_known = abs(t - inside) <= 100_000_000 and (
+            is_exact or stamps[k] - stamps[k - 1] <= limit
+        )
         assert (found is not None) == is_known
         if found is not None:
             w = (inside - stamps[k - 1]) / (stamps[k] - stamps[k - 1])
-            np.testing.assert_allclose(found[:3, 3], (1 - w) * positions[k - 1] + w * positions[k], atol=1e-9)
-            np.testing.assert_allclose(found[:3, :3], Slerp([0, 1], rotations[k - 1 : k + 1])(w).as_matrix(), atol=1e-7)
+            np.testing.assert_allclose(
+                found[:3, 3], (1 - w) * positions[k - 1] + w * positions[k], atol=1e-9
+            )
+            np.testing.assert_allclose(
+                found[:3, :3], Slerp([0, 1], rotations[k - 1 : k + 1])(w).as_matrix(), atol=1e-7
+            )
 
 
 def test_a_glitch_of_the_clock_is_taken_back() -> None:

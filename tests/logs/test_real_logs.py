@@ -22,7 +22,10 @@ def frames(log: Log) -> Counter[tuple[str, str]]:
     return Counter((f.header.topic, type(f).__name__) for f in log.frames())
 
 
-@pytest.mark.parametrize("name", ["empty-file.bag", "not_a_bag.bag", "lfs_pointer.bag", "lfs_pointer.mcap", "no such file"])
+@pytest.mark.parametrize(
+    "name",
+    ["empty-file.bag", "not_a_bag.bag", "lfs_pointer.bag", "lfs_pointer.mcap", "no such file"],
+)
 def test_what_is_no_log_is_refused(name: str) -> None:
     with pytest.raises(LogError, match=name):
         open_log(ODD / name)
@@ -33,21 +36,42 @@ def test_what_is_no_log_is_refused(name: str) -> None:
     [
         (
             "nav2_turtlebot.mcap",
-            {("/amcl_pose", "PoseSample"): 135, ("/odom", "PoseSample"): 2639, ("/tf", "TransformSample"): 7284}
+            {
+                ("/amcl_pose", "PoseSample"): 135,
+                ("/odom", "PoseSample"): 2639,
+                ("/tf", "TransformSample"): 7284,
+            }
             | {("/tf_static", "TransformSample"): 29},
         ),
         (
             "husky_imu_gnss_odometry.bag",
-            {("/fix", "NavSatSample"): 989, ("/husky_velocity_controller/odom", "PoseSample"): 3952, ("/imu/data", "ImuSample"): 11865},
+            {
+                ("/fix", "NavSatSample"): 989,
+                ("/husky_velocity_controller/odom", "PoseSample"): 3952,
+                ("/imu/data", "ImuSample"): 11865,
+            },
         ),
-        ("example-lz4.bag", {("/tf", "TransformSample"): 2688, ("/tf_static", "TransformSample"): 1}),
-        ("example-bz2.bag", {("/tf", "TransformSample"): 2688, ("/tf_static", "TransformSample"): 1}),
+        (
+            "example-lz4.bag",
+            {("/tf", "TransformSample"): 2688, ("/tf_static", "TransformSample"): 1},
+        ),
+        (
+            "example-bz2.bag",
+            {("/tf", "TransformSample"): 2688, ("/tf_static", "TransformSample"): 1},
+        ),
         ("one_cloud_lz4.bag", {("/pointcloud2", "LidarFrame"): 1}),
         (
             "foxglove_json_camera.mcap",
-            {("/camera_calibration", "Camera"): 10, ("/camera_calibration/custom", "Camera"): 10, ("/image/compressed", "ImageFrame"): 10},
+            {
+                ("/camera_calibration", "Camera"): 10,
+                ("/camera_calibration/custom", "Camera"): 10,
+                ("/image/compressed", "ImageFrame"): 10,
+            },
         ),
-        ("tf_example_ros2", {("/tf", "TransformSample"): 517, ("/tf_static", "TransformSample"): 1}),
+        (
+            "tf_example_ros2",
+            {("/tf", "TransformSample"): 517, ("/tf_static", "TransformSample"): 1},
+        ),
         ("no-messages.bag", {}),
         ("example-unsorted-chunks.bag", {}),
         ("ros2_message_zstd", {}),
@@ -55,7 +79,9 @@ def test_what_is_no_log_is_refused(name: str) -> None:
         ("chatter_no_metadata.db3", {}),
     ],
 )
-def test_odd_logs_are_read_without_a_problem(name: str, expected: dict[tuple[str, str], int]) -> None:
+def test_odd_logs_are_read_without_a_problem(
+    name: str, expected: dict[tuple[str, str], int]
+) -> None:
     log = open_log(ODD / name)
     assert frames(log) == expected
     assert sum(s.count for s in log.streams) == sum(1 for _ in log.messages())
@@ -64,9 +90,15 @@ def test_odd_logs_are_read_without_a_problem(name: str, expected: dict[tuple[str
 
 def test_a_type_without_definition_is_named_and_the_rest_read() -> None:
     log = open_log(ODD / "ros2_utm_drive_a")
-    assert frames(log) == {("/gps", "NavSatSample"): 107, ("/odometry", "PoseSample"): 2143, ("/vehicle_pose", "PoseSample"): 2034}
+    assert frames(log) == {
+        ("/gps", "NavSatSample"): 107,
+        ("/odometry", "PoseSample"): 2143,
+        ("/vehicle_pose", "PoseSample"): 2034,
+    }
     [sentence] = log.problems
-    assert sentence.startswith("/vehicle_command_ackermann: messages of type ackermann_msgs/msg/AckermannDriveStamped cannot be decoded")
+    assert sentence.startswith(
+        "/vehicle_command_ackermann: messages of type ackermann_msgs/msg/AckermannDriveStamped cannot be decoded"
+    )
 
 
 def test_the_conformance_files_of_the_format() -> None:
@@ -76,7 +108,9 @@ def test_the_conformance_files_of_the_format() -> None:
         log = open_log(path)
         kind = path.stem.split("-")[0]
         count = sum(1 for _ in log.messages())
-        assert count == {"OneMessage": 1, "TenMessages": 10, "TenMessagesOneAttachment": 10}.get(kind, 0), path
+        assert count == {"OneMessage": 1, "TenMessages": 10, "TenMessagesOneAttachment": 10}.get(
+            kind, 0
+        ), path
         assert count == sum(s.count for s in log.streams), path
         assert list(log.frames()) == []
         assert log.problems == [], path
@@ -100,7 +134,8 @@ def test_labels_of_a_real_sweep() -> None:
     assert isinstance(sweep, LidarFrame)
     assert sweep.label is not None
     assert len(sweep.points) == len(sweep.label) > 50_000
-    assert {40, 50, 70} <= set((sweep.label & 0xFFFF).tolist())  # road, building, vegetation of SemanticKITTI
+    # road, building, vegetation of SemanticKITTI
+    assert {40, 50, 70} <= set((sweep.label & 0xFFFF).tolist())
 
 
 @pytest.mark.parametrize("name", ["room_a.mcap", "room_b"])

@@ -14,7 +14,11 @@ CLOUD, IMAGE, JPEG, INFO = (
     "sensor_msgs/msg/CompressedImage",
     "sensor_msgs/msg/CameraInfo",
 )
-ODOM, POSE, POSE_COV = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+ODOM, POSE, POSE_COV = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
 TF, IMU, FIX = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
 
 
@@ -59,16 +63,27 @@ def test_depth_camera_with_both_infos_and_a_posestamped() -> None:
 
 
 def test_the_same_picture_through_two_transports_counts_once() -> None:
-    found = roles({"/d/depth": IMAGE, "/d/depth/compressedDepth": JPEG, "/d/rgb/image_raw": IMAGE, "/d/rgb/image_raw/compressed": JPEG})
+    found = roles(
+        {
+            "/d/depth": IMAGE,
+            "/d/depth/compressedDepth": JPEG,
+            "/d/rgb/image_raw": IMAGE,
+            "/d/rgb/image_raw/compressed": JPEG,
+        }
+    )
     assert found.depth == ("/d/depth",)
     assert found.image == ("/d/rgb/image_raw",)
 
 
 @pytest.mark.parametrize(
-    ("labelled", "expected"), [(False, "/camera/depth/image_rect_raw"), (True, "/camera/aligned_depth_to_color/image_raw")]
+    ("labelled", "expected"),
+    [(False, "/camera/depth/image_rect_raw"), (True, "/camera/aligned_depth_to_color/image_raw")],
 )
 def test_one_depth_stream_for_each_camera(labelled: bool, expected: str) -> None:
-    topics = {"/camera/depth/image_rect_raw": IMAGE, "/camera/aligned_depth_to_color/image_raw": IMAGE}
+    topics = {
+        "/camera/depth/image_rect_raw": IMAGE,
+        "/camera/aligned_depth_to_color/image_raw": IMAGE,
+    }
     if labelled:
         topics["/camera/color/labels"] = IMAGE
     found = roles(topics)
@@ -77,13 +92,26 @@ def test_one_depth_stream_for_each_camera(labelled: bool, expected: str) -> None
 
 
 def test_label_images_but_not_their_coloured_version() -> None:
-    found = roles({"/unet/raw_segmentation_mask": IMAGE, "/unet/colored_segmentation_mask": IMAGE, "/depth/image": IMAGE})
+    found = roles(
+        {
+            "/unet/raw_segmentation_mask": IMAGE,
+            "/unet/colored_segmentation_mask": IMAGE,
+            "/depth/image": IMAGE,
+        }
+    )
     assert found.label_image == ("/unet/raw_segmentation_mask",)
     assert found.label_of == {"/depth/image": "/unet/raw_segmentation_mask"}
 
 
 def test_stereo_pairs() -> None:
-    found = roles({"/cam0/image_raw": IMAGE, "/cam1/image_raw": IMAGE, "/cam0/camera_info": INFO, "/cam1/camera_info": INFO})
+    found = roles(
+        {
+            "/cam0/image_raw": IMAGE,
+            "/cam1/image_raw": IMAGE,
+            "/cam0/camera_info": INFO,
+            "/cam1/camera_info": INFO,
+        }
+    )
     assert (found.stereo_left, found.stereo_right) == ("/cam0/image_raw", "/cam1/image_raw")
     assert found.info_of["/cam1/image_raw"] == "/cam1/camera_info"
     assert found.role_of("/cam0/image_raw") == "stereo_left"
@@ -99,7 +127,10 @@ def test_a_stereo_pair_beside_ranges_stays_two_images_unless_it_is_named() -> No
         assert found.ranging == tuple(ranges)
         for named in ({"stereo_left": "/left/image_raw"}, {"stereo_right": "/right/image_raw"}):
             asked = roles(pair | ranges, **named)
-            assert (asked.stereo_left, asked.stereo_right) == ("/left/image_raw", "/right/image_raw")
+            assert (asked.stereo_left, asked.stereo_right) == (
+                "/left/image_raw",
+                "/right/image_raw",
+            )
             assert asked.ranging == (*ranges, "/left/image_raw")
     assert roles(pair, stereo_left="none").ranging == ()
 
@@ -115,10 +146,24 @@ def test_a_pair_takes_two_topics() -> None:
 @pytest.mark.parametrize(
     ("topics", "expected"),
     [
-        (("/s/left/image_rect", "/s/right/image_rect", "/s/left/image_raw", "/s/right/image_raw"), "/s/left/image_raw"),
-        (("/c/infra1/image_rect_raw", "/c/infra2/image_rect_raw", "/c/color/image_raw"), "/c/infra1/image_rect_raw"),
+        (
+            (
+                "/s/left/image_rect",
+                "/s/right/image_rect",
+                "/s/left/image_raw",
+                "/s/right/image_raw",
+            ),
+            "/s/left/image_raw",
+        ),
+        (
+            ("/c/infra1/image_rect_raw", "/c/infra2/image_rect_raw", "/c/color/image_raw"),
+            "/c/infra1/image_rect_raw",
+        ),
         (("/k/image_02/compressed", "/k/image_03/compressed"), "/k/image_02/compressed"),
-        (("/left/image_color", "/right/image_color", "/left/image_mono", "/right/image_mono"), "/left/image_mono"),
+        (
+            ("/left/image_color", "/right/image_color", "/left/image_mono", "/right/image_mono"),
+            "/left/image_mono",
+        ),
         (("/front/image", "/rear/image"), None),
     ],
 )
@@ -128,8 +173,12 @@ def test_which_pair(topics: tuple[str, ...], expected: str | None) -> None:
 
 def test_the_cameras_of_a_pair_never_share_a_calibration() -> None:
     pair = {"/cam0/image_raw": IMAGE, "/cam1/image_raw": IMAGE}
-    assert roles(pair | {"/cam0/camera_info": INFO}).info_of == {"/cam0/image_raw": "/cam0/camera_info"}
-    assert roles(pair | {"/cam1/camera_info": INFO}).info_of == {"/cam1/image_raw": "/cam1/camera_info"}
+    assert roles(pair | {"/cam0/camera_info": INFO}).info_of == {
+        "/cam0/image_raw": "/cam0/camera_info"
+    }
+    assert roles(pair | {"/cam1/camera_info": INFO}).info_of == {
+        "/cam1/image_raw": "/cam1/camera_info"
+    }
 
 
 @pytest.mark.parametrize(
@@ -174,7 +223,9 @@ def test_overrides_that_cannot_be() -> None:
     topics = {"/points": CLOUD, "/odom": ODOM}
     with pytest.raises(RoleError, match=r"no role 'laser'.*lidar, depth"):
         roles(topics, laser="/points")
-    with pytest.raises(RoleError, match=r"no topic '/pionts'.*/odom \(nav_msgs/msg/Odometry\), /points"):
+    with pytest.raises(
+        RoleError, match=r"no topic '/pionts'.*/odom \(nav_msgs/msg/Odometry\), /points"
+    ):
         roles(topics, lidar="/pionts")
     with pytest.raises(RoleError, match="Odometry cannot be the lidar"):
         roles(topics, lidar="/odom")
@@ -183,7 +234,13 @@ def test_overrides_that_cannot_be() -> None:
 
 
 def test_an_override_takes_the_topic_from_its_guessed_role() -> None:
-    topics = {"/front/depth": IMAGE, "/front/camera_info": INFO, "/x": IMAGE, "/a": CLOUD, "/b": CLOUD}
+    topics = {
+        "/front/depth": IMAGE,
+        "/front/camera_info": INFO,
+        "/x": IMAGE,
+        "/a": CLOUD,
+        "/b": CLOUD,
+    }
     found = roles(topics, label_image="/x", lidar="/b,/a")
     assert found.label_image == ("/x",)
     assert found.image == ()
@@ -192,7 +249,10 @@ def test_an_override_takes_the_topic_from_its_guessed_role() -> None:
 
 
 def test_streams_without_messages_play_no_role() -> None:
-    assert find_roles([Stream("/odom", ODOM, "cdr", 0), Stream("/pose", POSE, "cdr", 4)]).pose == "/pose"
+    assert (
+        find_roles([Stream("/odom", ODOM, "cdr", 0), Stream("/pose", POSE, "cdr", 4)]).pose
+        == "/pose"
+    )
 
 
 def test_foxglove_types() -> None:

@@ -20,16 +20,21 @@ from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log, Stream
 
 POSE = "geometry_msgs/msg/PoseStamped"
-STORE1, STORE2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
+STORE1 = get_typestore(Stores.ROS1_NOETIC)
+STORE2 = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def pose(store: Any, x: float) -> Any:
     t = store.types
     head = {"seq": 0} if store is STORE1 else {}
-    header = t["std_msgs/msg/Header"](stamp=t["builtin_interfaces/msg/Time"](sec=1, nanosec=2), frame_id="odom", **head)
+    header = t["std_msgs/msg/Header"](
+        stamp=t["builtin_interfaces/msg/Time"](sec=1, nanosec=2), frame_id="odom", **head
+    )
     position = t["geometry_msgs/msg/Point"](x=x, y=0.0, z=0.0)
     orientation = t["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
-    return t[POSE](header=header, pose=t["geometry_msgs/msg/Pose"](position=position, orientation=orientation))
+    return t[POSE](
+        header=header, pose=t["geometry_msgs/msg/Pose"](position=position, orientation=orientation)
+    )
 
 
 def bag1(path: Path, times: list[int], compression: Any = None, chunk: int = 400) -> Path:
@@ -38,18 +43,24 @@ def bag1(path: Path, times: list[int], compression: Any = None, chunk: int = 400
     if compression is not None:
         writer.set_compression(compression)
     with writer:
-        connections = [writer.add_connection(topic, POSE, typestore=STORE1) for topic in ("/a", "/b")]
+        connections = [
+            writer.add_connection(topic, POSE, typestore=STORE1) for topic in ("/a", "/b")
+        ]
         for k, time in enumerate(times):
             writer.write(connections[k % 2], time, STORE1.serialize_ros1(pose(STORE1, time), POSE))
     return path
 
 
-def bag2(path: Path, times: list[int], plugin: Any = StoragePlugin.SQLITE3, mode: Any = None) -> Path:
+def bag2(
+    path: Path, times: list[int], plugin: Any = StoragePlugin.SQLITE3, mode: Any = None
+) -> Path:
     writer = Writer2(path, version=8, storage_plugin=plugin)
     if mode is not None:
         writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
-        connections = [writer.add_connection(topic, POSE, typestore=STORE2) for topic in ("/a", "/b")]
+        connections = [
+            writer.add_connection(topic, POSE, typestore=STORE2) for topic in ("/a", "/b")
+        ]
         for k, time in enumerate(times):
             writer.write(connections[k % 2], time, STORE2.serialize_cdr(pose(STORE2, time), POSE))
     return path
@@ -64,14 +75,19 @@ def check(log: Log, times: list[int], encoding: str) -> None:
     assert [f.frame_T_child[0, 3] for f in found if isinstance(f, PoseSample)] == sorted(times)
     assert (log.start_ns, log.end_ns) == (min(times), max(times))
     counts = len(times) - len(times) // 2, len(times) // 2
-    assert log.streams == [Stream("/a", POSE, encoding, counts[0]), Stream("/b", POSE, encoding, counts[1])]
+    assert log.streams == [
+        Stream("/a", POSE, encoding, counts[0]),
+        Stream("/b", POSE, encoding, counts[1]),
+    ]
 
 
 TIMES = [1000 + 7 * k for k in range(30)]
 SHUFFLED = [1000 + (37 * k) % 101 for k in range(60)]  # chunks overlap completely
 
 
-@pytest.mark.parametrize("compression", [None, Writer1.CompressionFormat.BZ2, Writer1.CompressionFormat.LZ4])
+@pytest.mark.parametrize(
+    "compression", [None, Writer1.CompressionFormat.BZ2, Writer1.CompressionFormat.LZ4]
+)
 @pytest.mark.parametrize("times", [TIMES, SHUFFLED])
 def test_ros1(tmp_path: Path, compression: Any, times: list[int]) -> None:
     log = open_log(bag1(tmp_path / "x.bag", times, compression))
@@ -138,7 +154,9 @@ def split_bag(tmp_path: Path) -> Path:
         shutil.copy(part / f"part{k}.db3", folder / f"split_{k}.db3")
     listed = ", ".join(f"elsewhere/split_{k}.db3" for k in range(3))
     information = f"storage_identifier: sqlite3, message_count: 30, relative_file_paths: [{listed}]"
-    (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {{version: 5, {information}}}\n")
+    (folder / "metadata.yaml").write_text(
+        f"rosbag2_bagfile_information: {{version: 5, {information}}}\n"
+    )
     return folder
 
 
@@ -164,7 +182,17 @@ def test_missing_and_unlisted_files_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[", "a: b", "rosbag2_bagfile_information: 3", "x: &a [*a]", "- " * 3000, "\0", "a: &a {b: 1}\nc: {<<: [*a, *a]}"]
+    "text",
+    [
+        "",
+        "[",
+        "a: b",
+        "rosbag2_bagfile_information: 3",
+        "x: &a [*a]",
+        "- " * 3000,
+        "\0",
+        "a: &a {b: 1}\nc: {<<: [*a, *a]}",
+    ],
 )
 def test_unusable_metadata_is_no_obstacle(tmp_path: Path, text: str) -> None:
     folder = bag2(tmp_path / "x", TIMES)
@@ -193,7 +221,9 @@ def test_a_damaged_message_is_skipped_alone(tmp_path: Path) -> None:
     log = open_log(folder)
     assert len(list(log.frames())) == len(TIMES) - 3
     assert len(list(log.frames())) == len(TIMES) - 3
-    assert sorted(p[:22] for p in log.problems) == ["/a: 1 message skipped;"] * 2 + ["/b: 1 message skipped;"]
+    assert sorted(p[:22] for p in log.problems) == ["/a: 1 message skipped;"] * 2 + [
+        "/b: 1 message skipped;"
+    ]
 
 
 def test_times_of_another_type_are_skipped(tmp_path: Path) -> None:
@@ -212,7 +242,9 @@ def test_undefined_types_are_named(tmp_path: Path) -> None:
         database.execute("DELETE FROM message_definitions")
     log = open_log(folder / "x.db3")
     assert len(list(log.frames())) == 15
-    assert log.problems == ["/b: messages of type foo_msgs/msg/Bar cannot be decoded because the log does not define the type."]
+    assert log.problems == [
+        "/b: messages of type foo_msgs/msg/Bar cannot be decoded because the log does not define the type."
+    ]
 
 
 def test_a_truncated_sqlite_file_is_refused_clearly(tmp_path: Path) -> None:

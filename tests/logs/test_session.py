@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 
 from semloc_logs.errors import LogError, RoleError
-from semloc_logs.frames import Camera, DepthFrame, Frame, Header, ImageFrame, ImuSample, LidarFrame, PoseSample, TransformSample
+from semloc_logs.frames import (
+    Camera,
+    DepthFrame,
+    Frame,
+    Header,
+    ImageFrame,
+    ImuSample,
+    LidarFrame,
+    PoseSample,
+    TransformSample,
+)
 from semloc_logs.logs.log import Message, Stream
 from semloc_logs.logs.session.frame_queue import MAX_WAITING
 from semloc_logs.logs.session.session import Session, open_session
@@ -28,9 +38,16 @@ TYPES = {
 class FakeLog:
     """Frames in memory as a log."""
 
-    def __init__(self, frames: Iterable[Frame], name: str = "drive.mcap", pose_type: str = "nav_msgs/msg/Odometry") -> None:
+    def __init__(
+        self,
+        frames: Iterable[Frame],
+        name: str = "drive.mcap",
+        pose_type: str = "nav_msgs/msg/Odometry",
+    ) -> None:
         self._frames = sorted(frames, key=lambda f: f.header.log_time_ns)
-        self.path, self.format, self.encoding = Path(name), "mcap", "ros2"
+        self.path = Path(name)
+        self.format = "mcap"
+        self.encoding = "ros2"
         times = [f.header.log_time_ns for f in self._frames]
         self.start_ns: int | None = times[0] if times else None
         self.end_ns: int | None = times[-1] if times else None
@@ -38,7 +55,9 @@ class FakeLog:
         self.given = 0
         kinds = {f.header.topic: TYPES.get(type(f), pose_type) for f in self._frames}
         topics = [f.header.topic for f in self._frames]
-        self.streams = [Stream(topic, kind, "cdr", topics.count(topic)) for topic, kind in sorted(kinds.items())]
+        self.streams = [
+            Stream(topic, kind, "cdr", topics.count(topic)) for topic, kind in sorted(kinds.items())
+        ]
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         return iter(())
@@ -62,15 +81,21 @@ def sweep(seconds: float, topic: str = "/points", frame_id: str = "lidar") -> Li
     return LidarFrame(header(topic, seconds, frame_id), points, label=np.array([1, 2], np.uint32))
 
 
-def odometry(seconds: float, child: str = "base_link", late: float = 0.0, topic: str = "/odom") -> PoseSample:
-    return PoseSample(header(topic, seconds, "odom", late), child, yaw_transform(0.0, (seconds, 0.0, 0.0)))
+def odometry(
+    seconds: float, child: str = "base_link", late: float = 0.0, topic: str = "/odom"
+) -> PoseSample:
+    return PoseSample(
+        header(topic, seconds, "odom", late), child, yaw_transform(0.0, (seconds, 0.0, 0.0))
+    )
 
 
 def static(parent: str, child: str, pose: Array, seconds: float = 0.0) -> TransformSample:
     return TransformSample(header("/tf_static", seconds, parent), child, pose, static=True)
 
 
-def moving(parent: str, child: str, seconds: float, pose: Array, late: float = 0.0) -> TransformSample:
+def moving(
+    parent: str, child: str, seconds: float, pose: Array, late: float = 0.0
+) -> TransformSample:
     return TransformSample(header("/tf", seconds, parent, late), child, pose, static=False)
 
 
@@ -95,14 +120,27 @@ def test_clouds_in_the_base_frame_with_poses() -> None:
     assert poses[-1, 0, 3] == pytest.approx(1.1)
     assert session.problems == []
     assert session.skipped == []
-    assert json.loads(json.dumps(session.to_json()))["frames"]["/points"] == {"seen": 10, "used": 10, "left_out": {}}
+    assert json.loads(json.dumps(session.to_json()))["frames"]["/points"] == {
+        "seen": 10,
+        "used": 10,
+        "left_out": {},
+    }
 
 
 def test_twice_gives_the_same() -> None:
     session = Session(
-        [FakeLog([static("base_link", "lidar", MOUNT), *[sweep(0.1 * k) for k in range(5)], *[odometry(0.1 * k) for k in range(6)]])]
+        [
+            FakeLog(
+                [
+                    static("base_link", "lidar", MOUNT),
+                    *[sweep(0.1 * k) for k in range(5)],
+                    *[odometry(0.1 * k) for k in range(6)],
+                ]
+            )
+        ]
     )
-    first, second = list(session.clouds()), list(session.clouds())
+    first = list(session.clouds())
+    second = list(session.clouds())
     assert len(first) == len(second) == 5
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a.points, b.points)
@@ -119,14 +157,19 @@ def test_frames_wait_for_late_poses_in_bounded_memory() -> None:
     for cloud in session.clouds():
         seen += 1
         assert cloud.session_T_base is not None
-        assert cloud.session_T_base[0, 3] == pytest.approx((cloud.header.stamp_ns - EPOCH) / S, abs=1e-6)
+        assert cloud.session_T_base[0, 3] == pytest.approx(
+            (cloud.header.stamp_ns - EPOCH) / S, abs=1e-6
+        )
         most = max(most, len(session._pass.waiting))
     assert seen == 400
     assert most <= 30
 
 
 def test_a_gap_in_the_poses_costs_its_frames_and_a_sentence() -> None:
-    frames: list[Frame] = [static("base_link", "lidar", MOUNT), *[sweep(0.1 * k) for k in range(300)]]
+    frames: list[Frame] = [
+        static("base_link", "lidar", MOUNT),
+        *[sweep(0.1 * k) for k in range(300)],
+    ]
     frames += [odometry(0.1 * k) for k in range(301) if not 100 < k < 200]
     session = Session([FakeLog(frames)])
     clouds = list(session.clouds())
@@ -137,16 +180,24 @@ def test_a_gap_in_the_poses_costs_its_frames_and_a_sentence() -> None:
 
 
 def test_poses_that_start_late_and_a_clock_of_its_own() -> None:
-    frames: list[Frame] = [static("base_link", "lidar", MOUNT), *[sweep(0.1 * k) for k in range(200)]]
+    frames: list[Frame] = [
+        static("base_link", "lidar", MOUNT),
+        *[sweep(0.1 * k) for k in range(200)],
+    ]
     late = Session([FakeLog([*frames, *[odometry(10.0 + 0.1 * k) for k in range(110)]])])
     assert len(list(late.clouds())) == 101
-    other = Session([FakeLog([*frames, *[odometry(-9000.0 + 0.1 * k, late=9000.0) for k in range(200)]])])
+    other = Session(
+        [FakeLog([*frames, *[odometry(-9000.0 + 0.1 * k, late=9000.0) for k in range(200)]])]
+    )
     assert list(other.clouds()) == []
     assert "2023-11-14T22:13:20.000Z" in other.skipped[0]
 
 
 def test_transforms_that_come_late() -> None:
-    frames: list[Frame] = [*[sweep(0.1 * k) for k in range(30)], *[odometry(0.1 * k) for k in range(31)]]
+    frames: list[Frame] = [
+        *[sweep(0.1 * k) for k in range(30)],
+        *[odometry(0.1 * k) for k in range(31)],
+    ]
     frames.append(static("base_link", "lidar", MOUNT, seconds=2.0))
     session = Session([FakeLog(frames)])
     assert len(list(session.clouds())) == 30
@@ -180,7 +231,9 @@ def test_the_frame_of_the_pose_is_the_base_without_base_link() -> None:
 
 
 def test_an_unconnected_sensor_is_taken_as_the_base_and_that_is_said() -> None:
-    session = Session([FakeLog([*[sweep(0.1 * k) for k in range(3)], *[odometry(0.1 * k) for k in range(4)]])])
+    session = Session(
+        [FakeLog([*[sweep(0.1 * k) for k in range(3)], *[odometry(0.1 * k) for k in range(4)]])]
+    )
     clouds = list(session.clouds())
     assert len(clouds) == 3
     np.testing.assert_allclose(clouds[0].points, sweep(0).points)
@@ -189,15 +242,23 @@ def test_an_unconnected_sensor_is_taken_as_the_base_and_that_is_said() -> None:
 
 
 def test_a_second_unconnected_sensor_is_not_guessed() -> None:
-    frames: list[Frame] = [*[sweep(0.1 * k) for k in range(3)], *[odometry(0.1 * k) for k in range(4)]]
+    frames: list[Frame] = [
+        *[sweep(0.1 * k) for k in range(3)],
+        *[odometry(0.1 * k) for k in range(4)],
+    ]
     frames += [sweep(0.1 * k, "/rear", "rear") for k in range(3)]
     session = Session([FakeLog(frames)])
     assert {cloud.header.topic for cloud in session.clouds()} == {"/points"}
-    assert any("/rear: 3 of 3 frames are left out: no transform" in problem for problem in session.skipped)
+    assert any(
+        "/rear: 3 of 3 frames are left out: no transform" in problem for problem in session.skipped
+    )
 
 
 def test_a_pose_without_child_frame_is_that_of_the_sensor() -> None:
-    frames: list[Frame] = [*[sweep(0.1 * k) for k in range(3)], *[odometry(0.1 * k, "", topic="/pose") for k in range(4)]]
+    frames: list[Frame] = [
+        *[sweep(0.1 * k) for k in range(3)],
+        *[odometry(0.1 * k, "", topic="/pose") for k in range(4)],
+    ]
     session = Session([FakeLog(frames, pose_type="geometry_msgs/msg/PoseStamped")])
     assert len(list(session.clouds())) == 3
     assert session.base_frame == "lidar"
@@ -205,9 +266,17 @@ def test_a_pose_without_child_frame_is_that_of_the_sensor() -> None:
 
 
 def test_poses_from_the_tf_tree() -> None:
-    frames: list[Frame] = [static("base_link", "lidar", MOUNT), *[sweep(0.1 * k) for k in range(20)]]
-    frames += [moving("odom", "base_link", 0.1 * k, yaw_transform(0.0, (0.1 * k, 0.0, 0.0)), late=0.5) for k in range(21)]
-    frames += [moving("map", "odom", 0.1 * k, yaw_transform(0.0, (100.0, 0.0, 0.0))) for k in range(21)]
+    frames: list[Frame] = [
+        static("base_link", "lidar", MOUNT),
+        *[sweep(0.1 * k) for k in range(20)],
+    ]
+    frames += [
+        moving("odom", "base_link", 0.1 * k, yaw_transform(0.0, (0.1 * k, 0.0, 0.0)), late=0.5)
+        for k in range(21)
+    ]
+    frames += [
+        moving("map", "odom", 0.1 * k, yaw_transform(0.0, (100.0, 0.0, 0.0))) for k in range(21)
+    ]
     session = Session([FakeLog(frames)])
     clouds = list(session.clouds())
     assert len(clouds) == 20
@@ -218,15 +287,24 @@ def test_poses_from_the_tf_tree() -> None:
 
 
 def test_a_turning_sensor_waits_for_its_transform() -> None:
-    frames: list[Frame] = [*[sweep(0.1 * k) for k in range(20)], *[odometry(0.1 * k) for k in range(21)]]
-    frames += [moving("base_link", "lidar", 0.1 * k, yaw_transform(0.1 * k), late=0.3) for k in range(21)]
+    frames: list[Frame] = [
+        *[sweep(0.1 * k) for k in range(20)],
+        *[odometry(0.1 * k) for k in range(21)],
+    ]
+    frames += [
+        moving("base_link", "lidar", 0.1 * k, yaw_transform(0.1 * k), late=0.3) for k in range(21)
+    ]
     clouds = list(Session([FakeLog(frames)]).clouds())
     assert len(clouds) == 20
-    np.testing.assert_allclose(clouds[10].points[0], [5 * np.cos(1.0), 5 * np.sin(1.0), 0.0], atol=1e-5)
+    np.testing.assert_allclose(
+        clouds[10].points[0], [5 * np.cos(1.0), 5 * np.sin(1.0), 0.0], atol=1e-5
+    )
 
 
 def test_without_any_pose_stream() -> None:
-    session = Session([FakeLog([static("base_link", "lidar", MOUNT), *[sweep(0.1 * k) for k in range(3)]])])
+    session = Session(
+        [FakeLog([static("base_link", "lidar", MOUNT), *[sweep(0.1 * k) for k in range(3)]])]
+    )
     clouds = list(session.clouds())
     assert [cloud.session_T_base for cloud in clouds] == [None, None, None]
     assert session.base_frame == "base_link"
@@ -237,14 +315,23 @@ def test_without_any_pose_stream() -> None:
 
 def test_logs_recorded_back_to_back_and_side_by_side() -> None:
     first = FakeLog(
-        [static("base_link", "lidar", MOUNT), *[sweep(0.1 * k) for k in range(10)], *[odometry(0.1 * k) for k in range(10)]], "a.mcap"
+        [
+            static("base_link", "lidar", MOUNT),
+            *[sweep(0.1 * k) for k in range(10)],
+            *[odometry(0.1 * k) for k in range(10)],
+        ],
+        "a.mcap",
     )
-    second = FakeLog([*[sweep(1 + 0.1 * k) for k in range(10)], *[odometry(1 + 0.1 * k) for k in range(10)]], "b.mcap")
+    second = FakeLog(
+        [*[sweep(1 + 0.1 * k) for k in range(10)], *[odometry(1 + 0.1 * k) for k in range(10)]],
+        "b.mcap",
+    )
     second.problems.append("the file is cut off at byte 9.")
     session = Session([first, second])
     assert len(list(session.clouds())) == 20
     assert session.skipped == ["b.mcap: the file is cut off at byte 9."]
-    sensors, poses = FakeLog([sweep(0.1 * k + 0.05) for k in range(10)]), FakeLog([odometry(0.1 * k) for k in range(11)])
+    sensors = FakeLog([sweep(0.1 * k + 0.05) for k in range(10)])
+    poses = FakeLog([odometry(0.1 * k) for k in range(11)])
     assert len(list(Session([sensors, poses]).clouds())) == 10
 
 
@@ -261,8 +348,18 @@ def test_depth_camera_with_labels_and_its_own_pose() -> None:
                   np.zeros(5), np.eye(3), np.zeros((3, 4)), "plumb_bob")  # fmt: skip
     frames: list[Frame] = [info]
     for k in range(4):
-        frames.append(DepthFrame(header("/camera/depth/image", 0.1 * k, "optical"), np.full((4, 4), 2.0, np.float32)))
-        frames.append(ImageFrame(header("/camera/label", 0.1 * k, "optical", late=0.05), np.full((4, 4), k, np.uint8), "mono8"))
+        frames.append(
+            DepthFrame(
+                header("/camera/depth/image", 0.1 * k, "optical"), np.full((4, 4), 2.0, np.float32)
+            )
+        )
+        frames.append(
+            ImageFrame(
+                header("/camera/label", 0.1 * k, "optical", late=0.05),
+                np.full((4, 4), k, np.uint8),
+                "mono8",
+            )
+        )
         frames.append(odometry(0.1 * k, "", topic="/camera/pose"))
     session = Session([FakeLog(frames, pose_type="geometry_msgs/msg/PoseStamped")])
     clouds = list(session.clouds())
@@ -273,7 +370,10 @@ def test_depth_camera_with_labels_and_its_own_pose() -> None:
 
 
 def test_depth_without_calibration_is_said() -> None:
-    frames: list[Frame] = [DepthFrame(header("/depth", 0.0, "optical"), np.ones((4, 4), np.float32)), odometry(0.0, "optical")]
+    frames: list[Frame] = [
+        DepthFrame(header("/depth", 0.0, "optical"), np.ones((4, 4), np.float32)),
+        odometry(0.0, "optical"),
+    ]
     session = Session([FakeLog(frames)])
     assert list(session.clouds()) == []
     assert "no CameraInfo belongs to them" in session.skipped[0]
@@ -285,7 +385,12 @@ def test_images_come_before_their_clouds() -> None:
         *[sweep(0.1 * k) for k in range(10)],
         *[odometry(0.1 * k) for k in range(11)],
     ]
-    frames += [ImageFrame(header("/cam/image", 0.1 * k, "cam", late=0.25), np.zeros((2, 2, 3), np.uint8), "rgb8") for k in range(10)]
+    frames += [
+        ImageFrame(
+            header("/cam/image", 0.1 * k, "cam", late=0.25), np.zeros((2, 2, 3), np.uint8), "rgb8"
+        )
+        for k in range(10)
+    ]
     seen: list[int] = []
     session = Session([FakeLog(frames)])
     for cloud in session.clouds(on_image=lambda image: seen.append(image.header.stamp_ns)):
@@ -297,10 +402,18 @@ def test_up_from_a_tilted_imu_on_a_turning_base() -> None:
     rng = np.random.default_rng(1)
     base_T_imu = np.eye(4)
     base_T_imu[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # its y axis points up
-    frames: list[Frame] = [static("base_link", "lidar", MOUNT), static("base_link", "imu", base_T_imu), sweep(0.0)]
+    frames: list[Frame] = [
+        static("base_link", "lidar", MOUNT),
+        static("base_link", "imu", base_T_imu),
+        sweep(0.0),
+    ]
     frames += [odometry(0.1 * k) for k in range(100)]
     for k in range(1000):
-        force = np.array([0.0, 9.81, 0.0]) + rng.normal(0, 0.3, 3) + (np.array([6.0, 0.0, 0.0]) if k % 10 == 0 else 0.0)
+        force = (
+            np.array([0.0, 9.81, 0.0])
+            + rng.normal(0, 0.3, 3)
+            + (np.array([6.0, 0.0, 0.0]) if k % 10 == 0 else 0.0)
+        )
         frames.append(ImuSample(header("/imu", 0.0099 * k, "imu"), force, np.zeros(3)))
     session = Session([FakeLog(frames)])
     list(session.clouds())
@@ -338,11 +451,15 @@ def test_the_buffer_is_bounded_when_nothing_ever_comes() -> None:
     most = 0
     for frame in session.clouds():
         raise AssertionError(frame)
-    assert session.to_json()["frames"] == {"/points": {"seen": 500, "used": 0, "left_out": {"no pose": 500}}}
+    assert session.to_json()["frames"] == {
+        "/points": {"seen": 500, "used": 0, "left_out": {"no pose": 500}}
+    }
     assert most <= MAX_WAITING
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the folder ../shared/logs with recorded logs is missing")
+@pytest.mark.skipif(
+    not REAL.is_dir(), reason="the folder ../shared/logs with recorded logs is missing"
+)
 class TestRecordedLogs:
     def test_basement_has_a_pose_for_every_sweep(self) -> None:
         for name, count in (("basement_a.mcap", 88), ("basement_b.bag", 87)):
@@ -350,11 +467,17 @@ class TestRecordedLogs:
             clouds = list(session.clouds())
             assert len(clouds) == count
             assert all(c.session_T_base is not None for c in clouds)
-            assert (session.base_frame, session.session_frame, session.problems) == ("base_link", "odom", [])
+            assert (session.base_frame, session.session_frame, session.problems) == (
+                "base_link",
+                "odom",
+                [],
+            )
             session.close()
 
     def test_the_two_basements_meet_in_their_common_frame(self) -> None:
-        """The last sweep of a and the first of b were taken within a second: in the common frame they are the same hall."""
+        """The last sweep of a and the first of b were taken within a second: in the common frame
+        they are the same hall.
+        """
         from scipy.spatial import cKDTree
 
         truth = json.loads((REAL / "basement_truth.json").read_text())
@@ -378,7 +501,9 @@ class TestRecordedLogs:
         worlds = []
         for cloud, _ in zip(session.clouds(), range(6), strict=False):
             assert cloud.session_T_base is not None
-            worlds.append(cloud.points @ cloud.session_T_base[:3, :3].T + cloud.session_T_base[:3, 3])
+            worlds.append(
+                cloud.points @ cloud.session_T_base[:3, :3].T + cloud.session_T_base[:3, 3]
+            )
         assert session.base_frame == "camera_optical"
         distance, _ = cKDTree(worlds[0]).query(worlds[-1])
         assert np.median(distance) < 0.04

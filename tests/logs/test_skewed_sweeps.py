@@ -1,4 +1,6 @@
-"""Sweeps of a moving sensor, their point times in every usual encoding, read back from logs as plane walls."""
+"""Sweeps of a moving sensor, their point times in every usual encoding, read back from logs as
+plane walls.
+"""
 
 from __future__ import annotations
 
@@ -26,23 +28,37 @@ SWEEPS = 4
 
 
 def pose(seconds: float) -> Array:
-    """15 m/s and 0.5 rad/s: a circle of 30 m, started so that the vehicle passes the middle of the room."""
+    """15 m/s and 0.5 rad/s: a circle of 30 m, started so that the vehicle passes the middle of the
+    room.
+    """
     a = 0.5 * seconds
     return yaw_transform(a, (30.0 * np.sin(a) - 3.0, 30.0 * (1 - np.cos(a)) - 1.0, 0.0))
 
 
 @cache
 def skewed(start: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Points (n, 3) in the moving sensor, time of each since the sweep's start in ns, and ring; in firing order."""
+    """Points (n, 3) in the moving sensor, time of each since the sweep's start in ns, and ring; in
+    firing order.
+    """
     turn = np.repeat(np.arange(COLUMNS) / COLUMNS, RINGS)
     ring = np.tile(np.arange(RINGS), COLUMNS)
-    offset = np.round(turn * PERIOD_NS + ring * 2304).astype(np.int64)  # rings fire one after the other
-    azimuth, elevation = np.pi - 2 * np.pi * turn, np.radians(-15 + 2.0 * ring)
-    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1)
+    # rings fire one after the other
+    offset = np.round(turn * PERIOD_NS + ring * 2304).astype(np.int64)
+    azimuth = np.pi - 2 * np.pi * turn
+    elevation = np.radians(-15 + 2.0 * ring)
+    rays = np.stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
+        1,
+    )
     found = np.empty((len(turn), 3))
     for k, o in enumerate(offset):
         room_T_lidar = pose(start + o * 1e-9) @ BASE_T_LIDAR
-        ray, origin = room_T_lidar[:3, :3] @ rays[k], room_T_lidar[:3, 3]
+        ray = room_T_lidar[:3, :3] @ rays[k]
+        origin = room_T_lidar[:3, 3]
         with np.errstate(divide="ignore"):
             distance = np.min(np.where(ray > 0, HALF - origin, -HALF - origin) / ray)
         found[k] = rays[k] * distance
@@ -50,7 +66,9 @@ def skewed(start: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
 
 
 def off_the_walls(points: Array) -> float:
-    """Largest distance of points (n, 3) in the room from the nearest wall, the worst in a thousand left out."""
+    """Largest distance of points (n, 3) in the room from the nearest wall, the worst in a thousand
+    left out.
+    """
     return float(np.quantile(np.min(np.abs(HALF - np.abs(points)), axis=1), 0.999))
 
 
@@ -74,12 +92,23 @@ ENCODINGS: dict[str, tuple[str, str, Encode]] = {
 ABSOLUTE_INTEGERS = {"ns since 1970": 1, "us since 1970": 1000}
 
 
-def record(log: Any, name: str, encode: Encode, kind: str, stamp_at: float = 0.0, order: Any = None) -> Path:
+def record(
+    log: Any, name: str, encode: Encode, kind: str, stamp_at: float = 0.0, order: Any = None
+) -> Path:
     """Sweeps whose stamp lies at ``stamp_at`` of the sweep (0: start, 1: end), with poses at 50 Hz."""
     log.transform("base_link", "lidar", BASE_T_LIDAR, EPOCH - S)
     for t in np.arange(-0.3, 0.1 * SWEEPS + 0.3, 0.02):
         log.pose(EPOCH + round(t * S), pose(t))
-    dtype = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), (name, f"<{kind}")])
+    dtype = np.dtype(
+        [
+            ("x", "<f4"),
+            ("y", "<f4"),
+            ("z", "<f4"),
+            ("intensity", "<f4"),
+            ("ring", "<u2"),
+            (name, f"<{kind}"),
+        ]
+    )
     for k in range(SWEEPS):
         points, offset, ring = skewed(0.1 * k)
         stamp = EPOCH + round((k + stamp_at) * PERIOD_NS)
@@ -123,9 +152,13 @@ def test_every_encoding_from_the_start(recorder: Any, name: str) -> None:
     assert any("another clock" in p for p in session.problems) == (name == "since power-on")
 
 
-@pytest.mark.parametrize("name", [n for n, (_, kind, _) in ENCODINGS.items() if kind[0] != "u" and n != "since power-on"])
+@pytest.mark.parametrize(
+    "name", [n for n, (_, kind, _) in ENCODINGS.items() if kind[0] != "u" and n != "since power-on"]
+)
 @pytest.mark.parametrize("stamp_at", [0.5, 1.0])
-def test_stamps_within_and_at_the_end_of_the_sweep(recorder: Any, name: str, stamp_at: float) -> None:
+def test_stamps_within_and_at_the_end_of_the_sweep(
+    recorder: Any, name: str, stamp_at: float
+) -> None:
     field, kind, encode = ENCODINGS[name]
     plane, _ = walls(record(recorder(), field, encode, kind, stamp_at))
     assert max(plane) < 0.02
@@ -145,7 +178,10 @@ def test_absolute_integers(name: str, stamp_at: float) -> None:
 
 @pytest.mark.parametrize(
     "order",
-    [lambda rows: np.lexsort((rows["t"], rows["ring"])), lambda rows: np.random.default_rng(1).permutation(len(rows))],
+    [
+        lambda rows: np.lexsort((rows["t"], rows["ring"])),
+        lambda rows: np.random.default_rng(1).permutation(len(rows)),
+    ],
     ids=["ring by ring", "shuffled"],
 )
 def test_the_order_of_recording_does_not_matter(recorder: Any, order: Any) -> None:
@@ -170,7 +206,10 @@ GARBAGE: dict[str, tuple[str, str, Encode]] = {
 def test_times_that_are_none_leave_the_sweep_as_it_was(recorder: Any, name: str) -> None:
     field, kind, encode = GARBAGE[name]
     found, session = walls(record(recorder(), field, encode, kind))
-    measured = [off_the_walls(transforms.apply(pose(0.1 * k) @ BASE_T_LIDAR, skewed(0.1 * k)[0])) for k in range(SWEEPS)]
+    measured = [
+        off_the_walls(transforms.apply(pose(0.1 * k) @ BASE_T_LIDAR, skewed(0.1 * k)[0]))
+        for k in range(SWEEPS)
+    ]
     np.testing.assert_allclose(found, measured, atol=1e-3)
     assert session.skipped == []
     assert session.to_json()["sweeps_deskewed"] == 0

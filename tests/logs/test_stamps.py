@@ -48,8 +48,12 @@ def test_surroundings_that_move_while_the_poses_stand(speed: float, moves: bool)
     rng = np.random.default_rng(2)
     watch = Standstill()
     for k in range(20):
-        street = np.c_[rng.uniform(-20, 20, 5000), rng.choice([-6.0, 6.0], 5000), rng.uniform(0, 4, 5000)]
-        street = np.r_[street, np.c_[np.full(5000, 25.0), rng.uniform(-6, 6, 5000), rng.uniform(0, 4, 5000)]]
+        street = np.c_[
+            rng.uniform(-20, 20, 5000), rng.choice([-6.0, 6.0], 5000), rng.uniform(0, 4, 5000)
+        ]
+        street = np.r_[
+            street, np.c_[np.full(5000, 25.0), rng.uniform(-6, 6, 5000), rng.uniform(0, 4, 5000)]
+        ]
         street += rng.normal(0, 0.02, street.shape)
         watch.add((street - [speed * k, 0, 0]).astype(np.float32), yaw_transform(0.0, (7.0, 0, 0)))
     assert (watch.shift > 0) == moves

@@ -28,12 +28,25 @@ MODELS = {
 }
 
 
-def camera(model: str = "", side: int = 0, K: F64 | None = None, R: F64 | None = None, P: F64 | None = None) -> Camera:
+def camera(
+    model: str = "", side: int = 0, K: F64 | None = None, R: F64 | None = None, P: F64 | None = None
+) -> Camera:
     if K is None:
-        K = np.array([[210.0 + 3 * side, 0, 161.0 - 4 * side], [0, 209.0, 118.0 + 5 * side], [0, 0, 1]])
+        K = np.array(
+            [[210.0 + 3 * side, 0, 161.0 - 4 * side], [0, 209.0, 118.0 + 5 * side], [0, 0, 1]]
+        )
     D = np.array(MODELS[model])
     P = np.hstack([K, np.zeros((3, 1))]) if P is None else P
-    return Camera(Header(f"/cam{side}/camera_info", 0, 0, f"cam{side}"), WIDTH, HEIGHT, K, D, np.eye(3) if R is None else R, P, model)
+    return Camera(
+        Header(f"/cam{side}/camera_info", 0, 0, f"cam{side}"),
+        WIDTH,
+        HEIGHT,
+        K,
+        D,
+        np.eye(3) if R is None else R,
+        P,
+        model,
+    )
 
 
 def texture(seed: int = 0) -> NDArray[np.float32]:
@@ -52,21 +65,32 @@ def rays_of(lens: Camera) -> F64:
     D = lens.D if len(lens.D) else np.zeros(4)
     flat = (pixels - lens.K[:2, 2]) / lens.K[[0, 1], [0, 1]]
     for _ in range(15):
-        there, _ = project(np.hstack([flat, np.ones((len(flat), 1))])[:, None], np.zeros(3), np.zeros(3), lens.K, D)
+        there, _ = project(
+            np.hstack([flat, np.ones((len(flat), 1))])[:, None], np.zeros(3), np.zeros(3), lens.K, D
+        )
         flat = flat - (there.reshape(-1, 2) - pixels) / lens.K[[0, 1], [0, 1]]
     return np.hstack([flat, np.ones((len(flat), 1))])
 
 
-def drawn(lens: Camera, left_T_camera: F64, seed: int, noise: float = 2.0, contrast: float = 1.0) -> tuple[NDArray[np.uint8], F64]:
-    """The picture of the plane, and the true point of each pixel in the camera's own frame (h * w, 3)."""
+def drawn(
+    lens: Camera, left_T_camera: F64, seed: int, noise: float = 2.0, contrast: float = 1.0
+) -> tuple[NDArray[np.uint8], F64]:
+    """The picture of the plane, and the true point of each pixel in the camera's own frame (h * w,
+    3).
+    """
     rays = rays_of(lens)
-    normal, distance = left_T_camera[:3, :3].T @ NORMAL, DISTANCE - NORMAL @ left_T_camera[:3, 3]
+    normal = left_T_camera[:3, :3].T @ NORMAL
+    distance = DISTANCE - NORMAL @ left_T_camera[:3, 3]
     points = rays * (distance / (rays @ normal))[:, None]
     on_plane = points @ left_T_camera[:3, :3].T + left_T_camera[:3, 3]
     side = np.cross(NORMAL, [0, 1, 0])
-    u, v = on_plane @ side / np.linalg.norm(side), on_plane @ np.cross(NORMAL, side) / np.linalg.norm(side)
+    u = on_plane @ side / np.linalg.norm(side)
+    v = on_plane @ np.cross(NORMAL, side) / np.linalg.norm(side)
     where = [(512 + 100 * a).reshape(HEIGHT, WIDTH).astype(np.float32) for a in (u, v)]
-    grey = 128 + contrast * (cv2.remap(texture(), where[0], where[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT) - 128)
+    grey = 128 + contrast * (
+        cv2.remap(texture(), where[0], where[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        - 128
+    )
     grey = grey + np.random.default_rng(seed).normal(scale=noise, size=grey.shape)
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8), points
 
@@ -79,13 +103,15 @@ def errors(points: NDArray[np.float32]) -> F64:
 
 @pytest.mark.parametrize("model", list(MODELS))
 def test_a_slanted_plane_through_each_lens(model: str) -> None:
-    left, right = camera(model), camera(model, 1)
+    left = camera(model)
+    right = camera(model, 1)
     how = rectification(left, right, (HEIGHT, WIDTH), inverse(LEFT_T_RIGHT), rectified=False)
     matcher = StereoMatcher(how, min_range=0.3, max_range=20.0)
     picture, truth = drawn(left, np.eye(4), 1)
     found = matcher.points(picture, drawn(right, LEFT_T_RIGHT, 2)[0])
     assert len(found.points) > 0.6 * HEIGHT * WIDTH
-    error, normalised = errors(found.points), errors(found.points) / found.sigma
+    error = errors(found.points)
+    normalised = errors(found.points) / found.sigma
     assert abs(np.median(error)) < 0.01
     assert np.median(np.abs(error)) < 0.05
     # sigma is meant to hold, neither hopeful nor timid
@@ -99,10 +125,12 @@ def test_a_slanted_plane_through_each_lens(model: str) -> None:
 
 @pytest.mark.parametrize("wrong", ["distortion", "rotation"])
 def test_a_wrong_calibration_would_be_seen(wrong: str) -> None:
-    left, right = camera("plumb_bob"), camera("plumb_bob", 1)
+    left = camera("plumb_bob")
+    right = camera("plumb_bob", 1)
     pictures = drawn(left, np.eye(4), 1)[0], drawn(right, LEFT_T_RIGHT, 2)[0]
     if wrong == "distortion":
-        left, right = camera(), camera(side=1)
+        left = camera()
+        right = camera(side=1)
     right_T_left = inverse(LEFT_T_RIGHT)
     if wrong == "rotation":
         right_T_left = right_T_left @ exp_se3(np.zeros(3), np.array([0.01, 0.01, 0.0]))
@@ -112,11 +140,13 @@ def test_a_wrong_calibration_would_be_seen(wrong: str) -> None:
 
 
 def test_shrunk_pictures_and_thinned_points() -> None:
-    left, right = camera("plumb_bob"), camera("plumb_bob", 1)
+    left = camera("plumb_bob")
+    right = camera("plumb_bob", 1)
     how = rectification(left, right, (HEIGHT, WIDTH), inverse(LEFT_T_RIGHT), rectified=False)
     pictures = drawn(left, np.eye(4), 1)[0], drawn(right, LEFT_T_RIGHT, 2)[0]
     whole, half = (StereoMatcher(how, min_range=0.3, max_range=20.0, stride=n) for n in (1, 2))
-    a, b = whole.points(*pictures), half.points(*pictures)
+    a = whole.points(*pictures)
+    b = half.points(*pictures)
     assert half.count < whole.count
     assert 0.15 < len(b.points) / len(a.points) < 0.35
     assert abs(np.median(errors(b.points))) < 0.01
@@ -127,14 +157,25 @@ def test_shrunk_pictures_and_thinned_points() -> None:
     assert StereoMatcher(_unturned(1200, 1920), min_range=0.3, max_range=20.0).shrink == 3
 
 
-def _unturned(height: int, width: int, focal: float = 400.0, baseline: float = 0.1, shift: float = 0.0) -> Rectification:
+def _unturned(
+    height: int, width: int, focal: float = 400.0, baseline: float = 0.1, shift: float = 0.0
+) -> Rectification:
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     P = [
         np.array([[focal, 0, width / 2 + x, t], [0, focal, height / 2, 0], [0, 0, 1, 0]])
         for x, t in ((shift, 0.0), (0.0, -focal * baseline))
     ]
     infos = [
-        Camera(Header(f"/{side}/camera_info", 0, 0, side), width, height, K, np.zeros(5), np.eye(3), p, "plumb_bob")
+        Camera(
+            Header(f"/{side}/camera_info", 0, 0, side),
+            width,
+            height,
+            K,
+            np.zeros(5),
+            np.eye(3),
+            p,
+            "plumb_bob",
+        )
         for side, p in zip(("left", "right"), P, strict=True)
     ]
     return rectification(infos[0], infos[1], (height, width), None, rectified=True)
@@ -148,14 +189,18 @@ def _unturned(height: int, width: int, focal: float = 400.0, baseline: float = 0
         (640, 2.0, 4.0, (9, 16)),
     ],
 )
-def test_disparities_follow_from_the_ranges(width: int, near: float, far: float, expected: tuple[int, int]) -> None:
+def test_disparities_follow_from_the_ranges(
+    width: int, near: float, far: float, expected: tuple[int, int]
+) -> None:
     matcher = StereoMatcher(_unturned(480, width), min_range=near, max_range=far, stride=1)
     assert (matcher.least, matcher.count) == expected
 
 
 @pytest.mark.parametrize("shift", [0.0, 12.0, -30.0])
 def test_a_step_by_hand_in_rectified_pictures(shift: float) -> None:
-    """Two layers 20 and 8 pixels apart, at 2 and 5 m when the principal points are the same, and also when they are not."""
+    """Two layers 20 and 8 pixels apart, at 2 and 5 m when the principal points are the same, and
+    also when they are not.
+    """
     how = _unturned(240, 320, 400.0, 0.1, shift)
     noise = np.random.default_rng(3).integers(0, 255, (240, 700)).astype(np.uint8)
     left = noise[:, 100:420]
@@ -167,15 +212,24 @@ def test_a_step_by_hand_in_rectified_pictures(shift: float) -> None:
         inside = (found.pixels // 320 >= first) & (found.pixels // 320 < last)
         assert inside.sum() > 0.7 * 106 * 320
         assert np.mean(np.abs(found.points[inside, 2] - depth) < 0.03 * depth) > 0.98
-    column, row = found.pixels % 320, found.pixels // 320
-    np.testing.assert_allclose(found.points[:, 0], (column - 160 - shift) / 400 * found.points[:, 2], rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(found.points[:, 1], (row - 120) / 400 * found.points[:, 2], rtol=1e-4, atol=1e-4)
+    column = found.pixels % 320
+    row = found.pixels // 320
+    np.testing.assert_allclose(
+        found.points[:, 0], (column - 160 - shift) / 400 * found.points[:, 2], rtol=1e-4, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        found.points[:, 1], (row - 120) / 400 * found.points[:, 2], rtol=1e-4, atol=1e-4
+    )
 
 
 def test_sigma_by_hand() -> None:
-    """f b = 40 px m: at 2 m the disparity is 20, and a fifth of a pixel is 4 / 40 / 5 = 2 cm on the axis."""
+    """f b = 40 px m: at 2 m the disparity is 20, and a fifth of a pixel is 4 / 40 / 5 = 2 cm on the
+    axis.
+    """
     noise = np.random.default_rng(3).integers(0, 255, (240, 700)).astype(np.uint8)
-    found = StereoMatcher(_unturned(240, 320), min_range=0.5, max_range=20.0, noise=0.2).points(noise[:, 100:420], noise[:, 120:440])
+    found = StereoMatcher(_unturned(240, 320), min_range=0.5, max_range=20.0, noise=0.2).points(
+        noise[:, 100:420], noise[:, 120:440]
+    )
     middle = np.argmin(np.abs(found.pixels - (120 * 320 + 160)))
     assert found.sigma[middle] == pytest.approx(0.02, rel=0.1)
     ray = np.linalg.norm(found.points, axis=1) / found.points[:, 2]
@@ -204,10 +258,12 @@ def test_less_texture_is_less_certain() -> None:
 
 
 def test_any_number_of_threads_gives_the_same() -> None:
-    left, right = camera("plumb_bob"), camera("plumb_bob", 1)
+    left = camera("plumb_bob")
+    right = camera("plumb_bob", 1)
     how = rectification(left, right, (HEIGHT, WIDTH), inverse(LEFT_T_RIGHT), rectified=False)
     pictures = drawn(left, np.eye(4), 1)[0], drawn(right, LEFT_T_RIGHT, 2)[0]
-    before, found = cv2.getNumThreads(), []
+    before = cv2.getNumThreads()
+    found = []
     try:
         for threads in (1, 2, 3):
             cv2.setNumThreads(threads)
@@ -222,8 +278,11 @@ def test_any_number_of_threads_gives_the_same() -> None:
 def test_rotations_are_those_of_opencv() -> None:
     right_T_left = inverse(LEFT_T_RIGHT)
     ours = bouguet_rotations(right_T_left)
-    K, D = camera().K, np.zeros(5)
-    theirs = cv2.stereoRectify(K, D, K, D, (WIDTH, HEIGHT), right_T_left[:3, :3], right_T_left[:3, 3:])[:2]
+    K = camera().K
+    D = np.zeros(5)
+    theirs = cv2.stereoRectify(
+        K, D, K, D, (WIDTH, HEIGHT), right_T_left[:3, :3], right_T_left[:3, 3:]
+    )[:2]
     np.testing.assert_allclose(ours[0], theirs[0], atol=1e-9)
     np.testing.assert_allclose(ours[1], theirs[1], atol=1e-9)
 
@@ -232,28 +291,66 @@ def test_recorded_rotations_and_projections_serve_where_tf_is_missing() -> None:
     right_T_left = inverse(LEFT_T_RIGHT)
     lenses = camera("plumb_bob"), camera("plumb_bob", 1)
     turned = cv2.stereoRectify(
-        lenses[0].K, lenses[0].D, lenses[1].K, lenses[1].D, (WIDTH, HEIGHT), right_T_left[:3, :3], right_T_left[:3, 3:], alpha=0
+        lenses[0].K,
+        lenses[0].D,
+        lenses[1].K,
+        lenses[1].D,
+        (WIDTH, HEIGHT),
+        right_T_left[:3, :3],
+        right_T_left[:3, 3:],
+        alpha=0,
     )
-    left, right = (camera("plumb_bob", side, R=np.asarray(turned[side], float), P=np.asarray(turned[2 + side], float)) for side in (0, 1))
+    left, right = (
+        camera(
+            "plumb_bob",
+            side,
+            R=np.asarray(turned[side], float),
+            P=np.asarray(turned[2 + side], float),
+        )
+        for side in (0, 1)
+    )
     how = rectification(left, right, (HEIGHT, WIDTH), None, rectified=False)
     assert how.baseline == pytest.approx(np.linalg.norm(LEFT_T_RIGHT[:3, 3]))
-    found = StereoMatcher(how, min_range=0.3, max_range=20.0).points(drawn(left, np.eye(4), 1)[0], drawn(right, LEFT_T_RIGHT, 2)[0])
+    found = StereoMatcher(how, min_range=0.3, max_range=20.0).points(
+        drawn(left, np.eye(4), 1)[0], drawn(right, LEFT_T_RIGHT, 2)[0]
+    )
     assert np.mean(np.abs(errors(found.points)) < 3 * found.sigma) > 0.97
 
 
 def test_wide_lenses_keep_their_field_of_view_within_limits() -> None:
-    how = rectification(camera("plumb_bob"), camera("plumb_bob", 1), (HEIGHT, WIDTH), inverse(LEFT_T_RIGHT), rectified=False)
+    how = rectification(
+        camera("plumb_bob"),
+        camera("plumb_bob", 1),
+        (HEIGHT, WIDTH),
+        inverse(LEFT_T_RIGHT),
+        rectified=False,
+    )
     assert 0.6 * 210 < how.focal < 210
-    K = np.array([[100.0, 0, 160], [0, 100, 120], [0, 0, 1]])  # 320 px of an equidistant lens of 100 px: 183 degrees
-    wide = rectification(camera("equidistant", K=K), camera("equidistant", 1, K=K), (HEIGHT, WIDTH), inverse(LEFT_T_RIGHT), rectified=False)
+    # 320 px of an equidistant lens of 100 px: 183 degrees
+    K = np.array([[100.0, 0, 160], [0, 100, 120], [0, 0, 1]])
+    wide = rectification(
+        camera("equidistant", K=K),
+        camera("equidistant", 1, K=K),
+        (HEIGHT, WIDTH),
+        inverse(LEFT_T_RIGHT),
+        rectified=False,
+    )
     assert wide.focal == pytest.approx(60.0)
     assert wide.valid[0].mean() > 0.9
 
 
 def test_what_is_no_stereo_pair_is_said_in_a_sentence() -> None:
-    def refused(right_T_left: F64 | None, match: str, rectified: bool = False, right: Camera | None = None) -> None:
+    def refused(
+        right_T_left: F64 | None, match: str, rectified: bool = False, right: Camera | None = None
+    ) -> None:
         with pytest.raises(LogError, match=match) as error:
-            rectification(camera("plumb_bob"), right or camera("plumb_bob", 1), (HEIGHT, WIDTH), right_T_left, rectified=rectified)
+            rectification(
+                camera("plumb_bob"),
+                right or camera("plumb_bob", 1),
+                (HEIGHT, WIDTH),
+                right_T_left,
+                rectified=rectified,
+            )
         assert str(error.value).endswith(".")
 
     ahead = exp_se3(np.array([-0.2, 0.0, 0.0]), np.zeros(3))
@@ -261,21 +358,61 @@ def test_what_is_no_stereo_pair_is_said_in_a_sentence() -> None:
     refused(np.eye(4), "Nothing says where the cameras")
     refused(None, "no baseline in P and no transform", rectified=True)
     refused(inverse(ahead), "sits right of the other: exchange them")
-    refused(exp_se3(np.array([-0.2, 0, 0]), np.array([0, 1.9, 0])), "no stereo pair: they would have to be turned by 109 deg")
-    refused(exp_se3(np.array([-0.01, -0.2, 0]), np.zeros(3)), "no stereo pair: they would have to be turned by 87 deg")
-    small = Camera(Header("/s", 0, 0, ""), 8, 6, camera().K, np.zeros(5), np.eye(3), np.zeros((3, 4)), "plumb_bob")
+    refused(
+        exp_se3(np.array([-0.2, 0, 0]), np.array([0, 1.9, 0])),
+        "no stereo pair: they would have to be turned by 109 deg",
+    )
+    refused(
+        exp_se3(np.array([-0.01, -0.2, 0]), np.zeros(3)),
+        "no stereo pair: they would have to be turned by 87 deg",
+    )
+    small = Camera(
+        Header("/s", 0, 0, ""),
+        8,
+        6,
+        camera().K,
+        np.zeros(5),
+        np.eye(3),
+        np.zeros((3, 4)),
+        "plumb_bob",
+    )
     refused(ahead, "CameraInfo /s is for 8 x 6 pixels but the picture has 320 x 240", right=small)
-    odd = Camera(Header("/o", 0, 0, ""), 0, 0, camera().K, np.array([0.1, 0.2]), np.eye(3), np.zeros((3, 4)), "double_sphere")
+    odd = Camera(
+        Header("/o", 0, 0, ""),
+        0,
+        0,
+        camera().K,
+        np.array([0.1, 0.2]),
+        np.eye(3),
+        np.zeros((3, 4)),
+        "double_sphere",
+    )
     refused(ahead, "distortion model 'double_sphere' with 2 coefficients", right=odd)
-    other = camera("plumb_bob", 1, P=np.array([[400.0, 0, 160, -80], [0, 400, 120, 0], [0, 0, 1, 0]]))
+    other = camera(
+        "plumb_bob", 1, P=np.array([[400.0, 0, 160, -80], [0, 400, 120, 0], [0, 0, 1, 0]])
+    )
     refused(None, "are not those of one rectified pair", rectified=True, right=other)
     far_off = np.array([[210.0, 0, 1e5], [0, 210, 120], [0, 0, 1]])
     refused(ahead, "Nothing of the pictures is left", right=camera("plumb_bob", 1, K=far_off))
-    refused(ahead, "calibrations of .* make no sense", right=camera("plumb_bob", 1, K=far_off * 100))
-    refused(ahead, "calibrations of .* make no sense", right=camera("plumb_bob", 1, R=np.diag([1.0, 1.0, -1.0])))
+    refused(
+        ahead, "calibrations of .* make no sense", right=camera("plumb_bob", 1, K=far_off * 100)
+    )
+    refused(
+        ahead,
+        "calibrations of .* make no sense",
+        right=camera("plumb_bob", 1, R=np.diag([1.0, 1.0, -1.0])),
+    )
     with pytest.raises(LogError, match="320 x 20 pixels: too few"):
-        rectification(replace(camera(), height=20), replace(camera(), height=20), (20, WIDTH), ahead, rectified=False)
-    with pytest.raises(LogError, match="disparities of 399 pixels and more, too many for pictures 320 pixels wide"):
+        rectification(
+            replace(camera(), height=20),
+            replace(camera(), height=20),
+            (20, WIDTH),
+            ahead,
+            rectified=False,
+        )
+    with pytest.raises(
+        LogError, match="disparities of 399 pixels and more, too many for pictures 320 pixels wide"
+    ):
         StereoMatcher(_unturned(240, 320, 1000.0, 4.0), min_range=0.3, max_range=10.0)
 
 
@@ -284,17 +421,29 @@ def test_numbers_at_random_give_a_sentence_or_points() -> None:
     rng = np.random.default_rng(5)
     outcomes = set()
     for _ in range(150):
-        width, height = (int(n) for n in rng.choice([1, 31, 32, 50, 130], 2, p=[0.1, 0.1, 0.2, 0.3, 0.3]))
+        width, height = (
+            int(n) for n in rng.choice([1, 31, 32, 50, 130], 2, p=[0.1, 0.1, 0.2, 0.3, 0.3])
+        )
         infos = []
         for side in (0, 1):
-            K = np.array([[40.0, 0, width / 2], [0, 40, height / 2], [0, 0, 1]]) + (rng.random() < 0.3) * rng.normal(size=(3, 3)) * 30
+            K = (
+                np.array([[40.0, 0, width / 2], [0, 40, height / 2], [0, 0, 1]])
+                + (rng.random() < 0.3) * rng.normal(size=(3, 3)) * 30
+            )
             D = rng.normal(size=int(rng.choice([0, 4, 5, 8, 14]))) * 10.0 ** rng.choice([-2, 0, 3])
-            P = np.hstack([K, np.array([[-8.0 * side], [0.0], [0.0]])]) * 10.0 ** rng.choice([0, 0, 0, 9])
+            P = np.hstack([K, np.array([[-8.0 * side], [0.0], [0.0]])]) * 10.0 ** rng.choice(
+                [0, 0, 0, 9]
+            )
             model = str(rng.choice(list(MODELS)))
             infos.append(Camera(Header(f"/{side}", 0, 0, ""), 0, 0, K, D, np.eye(3), P, model))
-        transform = exp_se3(np.array([-0.2, 0, 0]) + rng.normal(size=3) * 0.05, rng.normal(size=3) * rng.choice([0, 0.1]))
+        transform = exp_se3(
+            np.array([-0.2, 0, 0]) + rng.normal(size=3) * 0.05,
+            rng.normal(size=3) * rng.choice([0, 0.1]),
+        )
         try:
-            how = rectification(infos[0], infos[1], (height, width), transform, rectified=bool(rng.integers(2)))
+            how = rectification(
+                infos[0], infos[1], (height, width), transform, rectified=bool(rng.integers(2))
+            )
             pictures = rng.integers(0, 255, (2, height, width)).astype(np.uint8)
             StereoMatcher(how, min_range=0.0, max_range=10.0).points(pictures[0], pictures[1])
             outcomes.add("points")

@@ -40,13 +40,22 @@ def info(topic: str, t: float = 0.0, width: int = 160) -> Camera:
 
 def picture(topic: str, stamp_ns: int, shift: int = 0, width: int = 160) -> ImageFrame:
     grain = np.random.default_rng(0).integers(0, 255, (120, 400)).astype(np.uint8)
-    return ImageFrame(Header(topic, stamp_ns, stamp_ns, topic), grain[:, 50 + shift : 50 + shift + width], "mono8")
+    return ImageFrame(
+        Header(topic, stamp_ns, stamp_ns, topic), grain[:, 50 + shift : 50 + shift + width], "mono8"
+    )
 
 
 def clouds(
-    roles: Roles = ROLES, right_T_left: F64 | None = None, cameras: Iterable[Camera] = (info("/l"), info("/r", -20.0))
+    roles: Roles = ROLES,
+    right_T_left: F64 | None = None,
+    cameras: Iterable[Camera] = (info("/l"), info("/r", -20.0)),
 ) -> StereoClouds:
-    return StereoClouds(roles, {c.header.topic: c for c in cameras}, LabelImages(roles), lambda right, left, stamp_ns: right_T_left)
+    return StereoClouds(
+        roles,
+        {c.header.topic: c for c in cameras},
+        LabelImages(roles),
+        lambda right, left, stamp_ns: right_T_left,
+    )
 
 
 def test_partners_are_the_nearest_within_half_a_period() -> None:
@@ -60,7 +69,8 @@ def test_partners_are_the_nearest_within_half_a_period() -> None:
     assert reasons[2] == "no partner"
     for found in (reasons[0], reasons[1], reasons[3]):
         assert not isinstance(found, str)
-        np.testing.assert_allclose(np.median(found.points[:, 2]), 2.0, atol=0.02)  # 100 px * 0.2 m / 10 px
+        # 100 px * 0.2 m / 10 px
+        np.testing.assert_allclose(np.median(found.points[:, 2]), 2.0, atol=0.02)
 
 
 def test_a_pair_waits_for_all_that_belongs_to_it() -> None:
@@ -74,7 +84,9 @@ def test_a_pair_waits_for_all_that_belongs_to_it() -> None:
     stereo = clouds()
     stereo.take_right(picture(RIGHT, 12 * MS, 10))
     assert not stereo.has_all(left)  # the label image
-    stereo._labels.take(ImageFrame(Header("/ids", 10 * MS, 0, ""), np.zeros((120, 160), np.uint8), "mono8"))
+    stereo._labels.take(
+        ImageFrame(Header("/ids", 10 * MS, 0, ""), np.zeros((120, 160), np.uint8), "mono8")
+    )
     assert stereo.has_all(left)
 
 
@@ -126,7 +138,9 @@ def test_transforms_serve_where_the_infos_say_nothing() -> None:
     right_T_left = np.eye(4)
     right_T_left[0, 3] = -0.2
     for left, right in ((LEFT, RIGHT), ("/left/image_raw", "/right/image_raw")):
-        roles = replace(ROLES, stereo_left=left, stereo_right=right, info_of={left: "/l", right: "/r"})
+        roles = replace(
+            ROLES, stereo_left=left, stereo_right=right, info_of={left: "/l", right: "/r"}
+        )
         stereo = clouds(roles, right_T_left, [info("/l"), info("/r")])
         stereo.take_right(picture(right, 0, 10))
         found = stereo.points(picture(left, 0), 0.3, 20.0)
@@ -143,15 +157,23 @@ def test_colour_and_sixteen_bits_become_the_same_grey() -> None:
         np.testing.assert_array_equal(b, grey)
 
 
-# -- a real pair ------------------------------------------------------------------------------------------------------------------------
+# -- a real pair
+# ------------------------------------------------------------------------------------------------------------------------
 
 
-def planes(points: NDArray[np.floating], count: int, width: float = 0.05) -> list[tuple[F64, float, float]]:
-    """The largest planes one after the other, by RANSAC: unit normal, root mean square (m) and share of the points within ``width``."""
-    rng, found, rest = np.random.default_rng(0), [], np.asarray(points, float)
+def planes(
+    points: NDArray[np.floating], count: int, width: float = 0.05
+) -> list[tuple[F64, float, float]]:
+    """The largest planes one after the other, by RANSAC: unit normal, root mean square (m) and
+    share of the points within ``width``.
+    """
+    rng = np.random.default_rng(0)
+    found = []
+    rest = np.asarray(points, float)
     for _ in range(count):
         some = rest[rng.permutation(len(rest))[:3000]]
-        best, most = (np.zeros(3), np.zeros(3)), 0
+        best = (np.zeros(3), np.zeros(3))
+        most = 0
         for _ in range(300):
             a, b, c = some[rng.integers(len(some), size=3)]
             normal = np.cross(b - a, c - a)
@@ -166,7 +188,9 @@ def planes(points: NDArray[np.floating], count: int, width: float = 0.05) -> lis
             normal = np.linalg.svd((near - centre).T @ (near - centre))[2][-1]
         distance = (rest - centre) @ normal
         inside = np.abs(distance) < width
-        found.append((normal, float(np.sqrt(np.mean(distance[inside] ** 2))), inside.sum() / len(points)))
+        found.append(
+            (normal, float(np.sqrt(np.mean(distance[inside] ** 2))), inside.sum() / len(points))
+        )
         rest = rest[~inside]
     return found
 
@@ -182,7 +206,9 @@ def tilt(normal: F64) -> float:
 
 
 def is_the_room(points: F64) -> bool:
-    """A level, flat floor at the height of the world's origin, and walls that stand: mattresses, some of which lean by 20 degrees."""
+    """A level, flat floor at the height of the world's origin, and walls that stand: mattresses,
+    some of which lean by 20 degrees.
+    """
     floor, *walls = planes(points, 3)
     height = np.percentile(points[:, 2], 25)  # the floor is nearly half of what is seen
     is_floor = tilt(floor[0]) < 2.0 and floor[1] < 0.018 and floor[2] > 0.4 and abs(height) < 0.03
@@ -215,7 +241,8 @@ def test_all_frames_together_are_the_same_room(room: list[PosedCloud]) -> None:
     points = np.vstack([in_world(cloud)[::8] for cloud in room])
     assert is_the_room(points)
     # the wall ahead, and the one to the left at a right angle to it as seen from above
-    ahead, left = points[points[:, 1] < 3.9], points[points[:, 1] > 4.75]
+    ahead = points[points[:, 1] < 3.9]
+    left = points[points[:, 1] > 4.75]
     normals = [planes(part[part[:, 2] > 0.2], 1, 0.10)[0][0] for part in (ahead, left)]
     yaws = [np.rad2deg(np.arctan2(n[1], n[0])) for n in normals]
     assert abs((yaws[0] - yaws[1]) % 180 - 90) < 12
@@ -238,7 +265,9 @@ def test_sigma_of_a_real_floor(room: list[PosedCloud]) -> None:
 
 
 @pytest.mark.parametrize("voxel", [0.03, 0.05, 0.1, 0.3])
-def test_the_direction_of_gravity_is_found_at_every_voxel_size(room: list[PosedCloud], voxel: float, tmp_path: Path) -> None:
+def test_the_direction_of_gravity_is_found_at_every_voxel_size(
+    room: list[PosedCloud], voxel: float, tmp_path: Path
+) -> None:
     """Leaning mattresses and noise of several voxels do not make the floor a slope."""
     collected = Collected(tmp_path, voxel / 3)
     for cloud in room[:3]:
@@ -249,13 +278,28 @@ def test_the_direction_of_gravity_is_found_at_every_voxel_size(room: list[PosedC
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.01, 0.0), (0.01, 0.0, 0.0), (0.0, 0.0, 0.03)])
-def test_the_room_would_not_be_there_with_a_wrong_rectification(monkeypatch: pytest.MonkeyPatch, turn: tuple[float, float, float]) -> None:
+def test_the_room_would_not_be_there_with_a_wrong_rectification(
+    monkeypatch: pytest.MonkeyPatch, turn: tuple[float, float, float]
+) -> None:
     if not REAL.is_file():
         pytest.skip(f"{REAL} is missing")
 
-    def wrong(left: Camera, right: Camera, shape: tuple[int, int], right_T_left: F64 | None, *, rectified: bool) -> Rectification:
+    def wrong(
+        left: Camera,
+        right: Camera,
+        shape: tuple[int, int],
+        right_T_left: F64 | None,
+        *,
+        rectified: bool,
+    ) -> Rectification:
         assert right_T_left is not None
-        return rectification(left, right, shape, exp_se3(np.zeros(3), np.array(turn)) @ right_T_left, rectified=rectified)
+        return rectification(
+            left,
+            right,
+            shape,
+            exp_se3(np.zeros(3), np.array(turn)) @ right_T_left,
+            rectified=rectified,
+        )
 
     monkeypatch.setattr("semloc_logs.logs.sensors.stereo_pairs.rectification", wrong)
     session = open_session([REAL], max_range=10.0)
@@ -273,9 +317,17 @@ def test_inspect_names_the_roles() -> None:
     assert isinstance(streams, list)
     roles = {s["topic"]: s["role"] for s in streams}
     assert (roles["/cam0/image_raw"], roles["/cam1/image_raw"]) == ("stereo_left", "stereo_right")
-    [sentence] = [p for p in _listed(inspect_log(REAL, {"tf_static": "none"})["problems"]) if "Nothing says where the cameras" in p]
+    [sentence] = [
+        p
+        for p in _listed(inspect_log(REAL, {"tf_static": "none"})["problems"])
+        if "Nothing says where the cameras" in p
+    ]
     assert sentence.endswith(".")
-    swapped = _listed(inspect_log(REAL, {"stereo_left": "/cam1/image_raw", "stereo_right": "/cam0/image_raw"})["problems"])
+    swapped = _listed(
+        inspect_log(REAL, {"stereo_left": "/cam1/image_raw", "stereo_right": "/cam0/image_raw"})[
+            "problems"
+        ]
+    )
     assert any("sits right of the other: exchange them" in p for p in swapped)
 
 

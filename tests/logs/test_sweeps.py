@@ -35,16 +35,27 @@ def world_points(n: int = 500) -> Array:
 
 def measured(world: Array, offset_ns: NDArray[np.int64]) -> Array:
     """What a moving sensor sees of resting points, point by point."""
-    seen = [transforms.apply(transforms.inverse(pose(o * 1e-9) @ BASE_T_SENSOR), p[None])[0] for p, o in zip(world, offset_ns, strict=True)]
+    seen = [
+        transforms.apply(transforms.inverse(pose(o * 1e-9) @ BASE_T_SENSOR), p[None])[0]
+        for p, o in zip(world, offset_ns, strict=True)
+    ]
     return np.array(seen)
 
 
-@pytest.mark.parametrize(("first", "last"), [(0, 100_000_000), (-100_000_000, 0), (-50_000_000, 50_000_000)])
+@pytest.mark.parametrize(
+    ("first", "last"), [(0, 100_000_000), (-100_000_000, 0), (-50_000_000, 50_000_000)]
+)
 def test_resting_points_come_out_where_they_are(first: int, last: int) -> None:
     world = world_points()
     offset = np.linspace(first, last, len(world)).astype(np.int64)
-    frame = LidarFrame(Header("/l", STAMP, STAMP, "lidar"), measured(world, offset).astype(np.float32), offset_ns=offset)
-    points, _, is_deskewed = sweep_in_base(frame, BASE_T_SENSOR, track().at_many, min_range=0.0, max_range=200.0)
+    frame = LidarFrame(
+        Header("/l", STAMP, STAMP, "lidar"),
+        measured(world, offset).astype(np.float32),
+        offset_ns=offset,
+    )
+    points, _, is_deskewed = sweep_in_base(
+        frame, BASE_T_SENSOR, track().at_many, min_range=0.0, max_range=200.0
+    )
     assert is_deskewed
     # bins of a millisecond: 15 m/s * 0.5 ms, and 60 m * 0.5 rad/s * 0.5 ms
     np.testing.assert_allclose(points, world, atol=0.03)
@@ -55,9 +66,16 @@ def test_resting_points_come_out_where_they_are(first: int, last: int) -> None:
 def test_without_poses_for_the_whole_span_the_sweep_stays() -> None:
     world = world_points(50)
     offset = np.linspace(0, 400_000_000, 50).astype(np.int64)
-    assert deskew(world.astype(np.float32), offset, STAMP, BASE_T_SENSOR, track(-0.2, 0.2).at_many) is None
-    frame = LidarFrame(Header("/l", STAMP, STAMP, "lidar"), world.astype(np.float32), offset_ns=offset)
-    points, _, is_deskewed = sweep_in_base(frame, BASE_T_SENSOR, track(-0.2, 0.2).at_many, min_range=0.0, max_range=200.0)
+    assert (
+        deskew(world.astype(np.float32), offset, STAMP, BASE_T_SENSOR, track(-0.2, 0.2).at_many)
+        is None
+    )
+    frame = LidarFrame(
+        Header("/l", STAMP, STAMP, "lidar"), world.astype(np.float32), offset_ns=offset
+    )
+    points, _, is_deskewed = sweep_in_base(
+        frame, BASE_T_SENSOR, track(-0.2, 0.2).at_many, min_range=0.0, max_range=200.0
+    )
     assert not is_deskewed
     np.testing.assert_allclose(points, transforms.apply(BASE_T_SENSOR, world), atol=1e-4)
 

@@ -1,4 +1,6 @@
-"""Trajectories from files: exact stamps, both formats, what is refused and where, and sessions that use them."""
+"""Trajectories from files: exact stamps, both formats, what is refused and where, and sessions that
+use them.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, Header, LidarFrame
-from semloc_logs.logs.poses.trajectory_file import FilePoses, Trajectory, TrajectoryFile, read_trajectory, seconds_to_ns
+from semloc_logs.logs.poses.trajectory_file import (
+    FilePoses,
+    Trajectory,
+    TrajectoryFile,
+    read_trajectory,
+    seconds_to_ns,
+)
 
 TUM_LINE = "{stamp} 1 2 3 0 0 0.6 0.8"
 
@@ -26,7 +34,11 @@ def file(folder: Path, text: str, name: str = "poses.txt") -> Path:
 
 
 def read(folder: Path, text: str, times: str | None = None) -> Trajectory:
-    return read_trajectory(TrajectoryFile(file(folder, text), None if times is None else file(folder, times, "times.txt")))
+    return read_trajectory(
+        TrajectoryFile(
+            file(folder, text), None if times is None else file(folder, times, "times.txt")
+        )
+    )
 
 
 def kitti(pose: F64) -> str:
@@ -34,7 +46,10 @@ def kitti(pose: F64) -> str:
 
 
 def test_tum_with_comments_and_blank_lines(tmp_path: Path) -> None:
-    found = read(tmp_path, f"# stamp tx ty tz qx qy qz qw\n\n{TUM_LINE.format(stamp='1.5')}\n{TUM_LINE.format(stamp='2')} # end\n")
+    found = read(
+        tmp_path,
+        f"# stamp tx ty tz qx qy qz qw\n\n{TUM_LINE.format(stamp='1.5')}\n{TUM_LINE.format(stamp='2')} # end\n",
+    )
     assert found.stamps_ns is not None
     assert found.stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
     np.testing.assert_allclose(found.poses[0][:3, 3], [1, 2, 3])
@@ -55,7 +70,9 @@ def test_nanoseconds_survive_as_decimals(stamp_ns: int) -> None:
     assert seconds_to_ns(str(Decimal(stamp_ns).scaleb(-9)), Path("x"), 1) == stamp_ns
 
 
-@pytest.mark.parametrize("text", ["nan", "inf", "1e99999999", "x", "1700000000123456789", "1,5", "-9e99"])
+@pytest.mark.parametrize(
+    "text", ["nan", "inf", "1e99999999", "x", "1700000000123456789", "1,5", "-9e99"]
+)
 def test_what_is_no_time(text: str) -> None:
     with pytest.raises(LogError, match=r"x.tum, line 7: '.*' is no time in seconds\."):
         seconds_to_ns(text, Path("x.tum"), 7)
@@ -82,11 +99,23 @@ def test_kitti_round_trip_with_and_without_times(tmp_path: Path) -> None:
         ("", "poses.txt has no poses"),
         ("# nothing\n", "poses.txt has no poses"),
         ("1 2 3\n", r"line 1 has 3 numbers: give a file with 8 \(TUM\) or 12"),
-        (TUM_LINE.format(stamp=1) + "\n1 2 3\n", "line 2 has 3 numbers: give a file with 8 numbers like the lines before"),
-        ("# a\n" + TUM_LINE.format(stamp=1) + "\n2 1 x 3 0 0 0 1\n", "line 3 has something that is no number"),
-        (TUM_LINE.format(stamp=1) + "\n2 1 nan 3 0 0 0 1\n", "line 2 has something that is no number"),
+        (
+            TUM_LINE.format(stamp=1) + "\n1 2 3\n",
+            "line 2 has 3 numbers: give a file with 8 numbers like the lines before",
+        ),
+        (
+            "# a\n" + TUM_LINE.format(stamp=1) + "\n2 1 x 3 0 0 0 1\n",
+            "line 3 has something that is no number",
+        ),
+        (
+            TUM_LINE.format(stamp=1) + "\n2 1 nan 3 0 0 0 1\n",
+            "line 2 has something that is no number",
+        ),
         ("1 1 2 3 0 0 0 0\n", "line 1: the quaternion .* has the length 0, not 1"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 2 0\n", "line 2: the 3 x 3 part is no rotation"),
+        (
+            "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 2 0\n",
+            "line 2: the 3 x 3 part is no rotation",
+        ),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "line 1: the 3 x 3 part is no rotation"),
         ("1e200 0 0 0 0 1e200 0 0 0 0 1e200 0\n", "line 1: the 3 x 3 part is no rotation"),
         ("1 " * 5000, "line 1 is longer than 4096 characters"),
@@ -145,13 +174,20 @@ def test_kitti_lines_take_the_stamps_of_the_frames(tmp_path: Path) -> None:
     assert given_by(source) == [200, 250]
     assert source.is_over
     source.finish()
-    with pytest.raises(LogError, match=r"has 3 poses without stamps but /points has 4 frames: .*--pose-times FILE"):
+    with pytest.raises(
+        LogError, match=r"has 3 poses without stamps but /points has 4 frames: .*--pose-times FILE"
+    ):
         FilePoses(TrajectoryFile(file(tmp_path, text)), "/points", 4)
 
 
 def test_times_from_zero_count_from_the_first_frame(tmp_path: Path) -> None:
     source = FilePoses(
-        TrajectoryFile(file(tmp_path, "\n".join([kitti(np.eye(4))] * 2)), file(tmp_path, "0.0\n0.5\n", "times.txt")), "/points", 9
+        TrajectoryFile(
+            file(tmp_path, "\n".join([kitti(np.eye(4))] * 2)),
+            file(tmp_path, "0.0\n0.5\n", "times.txt"),
+        ),
+        "/points",
+        9,
     )
     assert given_by(source) == []
     assert not source.is_over

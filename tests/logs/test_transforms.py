@@ -13,12 +13,20 @@ from semloc_logs.numerics.transforms import Array, yaw_transform
 S = 1_000_000_000
 
 
-def edge(parent: str, child: str, pose: Array, stamp_ns: int = 0, *, static: bool = True) -> TransformSample:
+def edge(
+    parent: str, child: str, pose: Array, stamp_ns: int = 0, *, static: bool = True
+) -> TransformSample:
     return TransformSample(Header("/tf", stamp_ns, stamp_ns, parent), child, pose, static)
 
 
 def drive(parent: str, child: str, seconds: float) -> TransformSample:
-    return edge(parent, child, yaw_transform(0.0, (10.0 * seconds, 0.0, 0.0)), round(seconds * S), static=False)
+    return edge(
+        parent,
+        child,
+        yaw_transform(0.0, (10.0 * seconds, 0.0, 0.0)),
+        round(seconds * S),
+        static=False,
+    )
 
 
 def test_chain_and_its_inverse() -> None:
@@ -28,7 +36,9 @@ def test_chain_and_its_inverse() -> None:
     found = tree.lookup("base_link", "lidar", 0)
     assert found is not None
     # 3 m ahead on a mast that is turned to the left is 3 m to the left of it
-    np.testing.assert_allclose(transforms.apply(found, np.zeros((1, 3)))[0], [1.0, 3.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(
+        transforms.apply(found, np.zeros((1, 3)))[0], [1.0, 3.0, 2.0], atol=1e-12
+    )
     back = tree.lookup("/lidar", "base_link", 5)
     assert back is not None
     np.testing.assert_allclose(back @ found, np.eye(4), atol=1e-12)
@@ -44,7 +54,8 @@ def test_same_frame_is_identity_and_strangers_are_unknown() -> None:
     assert tree.lookup("a", "d", 0) is None
     assert tree.lookup("a", "nowhere", 0) is None
     assert not tree.connected("b", "c")
-    tree.add(edge("b", "c", np.eye(4)))  # what was looked up before is not remembered as unconnected
+    # what was looked up before is not remembered as unconnected
+    tree.add(edge("b", "c", np.eye(4)))
     assert tree.connected("a", "d")
     assert tree.frames == ["a", "b", "c", "d"]
 

@@ -43,10 +43,13 @@ def test_fusing_is_split_into_parts(lap: Lap, tmp_path: Path) -> None:
     figures, rows = profile_fuse([log], Settings(), rounds=1)
     value = {k: float(v["ours"]) for k, v in figures.items()}
     assert value["clouds"] == value["keyframes"] == 20
-    assert value["ratio"] == pytest.approx(value["whole"] / (value["reading"] + value["integrating"]))
+    assert value["ratio"] == pytest.approx(
+        value["whole"] / (value["reading"] + value["integrating"])
+    )
     assert value["whole"] > value["reading"] > 0
     parts = {k: v for k, v in value.items() if k.startswith("part: ")}
-    assert parts.keys() == {"part: rest", *(f"part: {p}" for p in _PARTS)}  # a renamed function would be missing
+    # a renamed function would be missing
+    assert parts.keys() == {"part: rest", *(f"part: {p}" for p in _PARTS)}
     assert min(parts.values()) >= 0
     assert parts["part: rest"] < 0.5 * sum(parts.values())
     assert len(rows) == 12

@@ -41,7 +41,9 @@ def test_errors_of_depth_grow_with_its_square(yard: Scene) -> None:
     for distance in (6.0, 12.0, 24.0):
         world_T_base = np.eye(4)
         world_T_base[:2, 3] = 9.7 - distance, 15.0  # beside the pole; the camera is 0.3 m ahead
-        frame = depth_frame(yard, world_T_base @ base_T_camera(model), np.random.default_rng(0), model)
+        frame = depth_frame(
+            yard, world_T_base @ base_T_camera(model), np.random.default_rng(0), model
+        )
         wall = (frame.depth > 0) & (frame.label_image == WALL)
         error = frame.depth[wall] - distance
         expected = distance**2 * 0.25 / (320 * 0.5)
@@ -52,7 +54,9 @@ def test_errors_of_depth_grow_with_its_square(yard: Scene) -> None:
 
 
 def test_shadow_lies_to_the_left_of_what_is_near(yard: Scene) -> None:
-    """Focal length 320, baseline 0.5: the pole's disparity is 320 * 0.5 / 3.7, the wall's 320 * 0.5 / 9.7; the difference is 26.7 px."""
+    """Focal length 320, baseline 0.5: the pole's disparity is 320 * 0.5 / 3.7, the wall's 320 * 0.5
+    / 9.7; the difference is 26.7 px.
+    """
     model = replace(STEREO, bleed=0, disparity_noise=0.0)
     pose = base_T_camera(model)
     frame = depth_frame(yard, pose, np.random.default_rng(0), model)
@@ -93,19 +97,30 @@ def test_a_thinned_cloud_is_in_the_base_frame(yard: Scene) -> None:
     model = replace(CAMERAS["depth"], disparity_noise=0.0, bleed=0)
     world_T_base = np.eye(4)
     world_T_base[:2, 3] = 7.0, 5.0
-    points, origin, labels, sigma = camera_points(yard, world_T_base, np.random.default_rng(2), model, yaw=-np.pi / 2 + 0.9)
+    points, origin, labels, sigma = camera_points(
+        yard, world_T_base, np.random.default_rng(2), model, yaw=-np.pi / 2 + 0.9
+    )
     assert points.dtype == origin.dtype == sigma.dtype == np.float32
     assert labels.dtype == np.uint8
     assert np.abs(points[labels == WALL, 0] - 3).max() < 1e-3
     assert np.abs(points[labels == ROAD, 2]).max() < 1e-3
-    again = camera_points(yard, world_T_base, np.random.default_rng(2), model, yaw=-np.pi / 2 + 0.9)[0]
+    again = camera_points(
+        yard, world_T_base, np.random.default_rng(2), model, yaw=-np.pi / 2 + 0.9
+    )[0]
     assert np.array_equal(points, again)
 
 
 def test_what_moves_hides_what_stands(yard: Scene) -> None:
     builder = MeshBuilder(lambda x, y: np.zeros_like(x))
     builder.add(box(1.0, 8.0, 3.0, x=3.0), 14, ground="none")
-    frame = depth_frame(yard, base_T_camera(STEREO), np.random.default_rng(0), STEREO, traffic=Scene(builder.build()), step=2)
+    frame = depth_frame(
+        yard,
+        base_T_camera(STEREO),
+        np.random.default_rng(0),
+        STEREO,
+        traffic=Scene(builder.build()),
+        step=2,
+    )
     assert frame.depth.shape == (180, 320)
     assert not (frame.labels == POLE).any()
     assert (frame.labels == 14).any()

@@ -12,7 +12,17 @@ from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.simulation.drives.camera_drive import SKY, simulate_cameras, wrong_label_image
 from semloc_logs.simulation.drives.trajectory import Trajectory
-from semloc_logs.simulation.meshes.world import BUILDING, POLE, ROAD, UNLABELLED, WALL, MeshBuilder, Scene, World, box
+from semloc_logs.simulation.meshes.world import (
+    BUILDING,
+    POLE,
+    ROAD,
+    UNLABELLED,
+    WALL,
+    MeshBuilder,
+    Scene,
+    World,
+    box,
+)
 from semloc_logs.simulation.output.drive_log import FORMATS, write_session
 from semloc_logs.simulation.sensors.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
 
@@ -21,7 +31,9 @@ SECOND = 10**9
 
 @pytest.fixture(scope="module")
 def yard() -> World:
-    """A floor, a brick wall whose face is at x = 12, a house to the left with its face at y = 5, a box."""
+    """A floor, a brick wall whose face is at x = 12, a house to the left with its face at y = 5, a
+    box.
+    """
     builder = MeshBuilder(lambda x, y: np.zeros_like(x))
     builder.add(box(60, 60, 0.5, z=-0.5), ROAD, ground="none")
     builder.add(box(1, 60, 6, x=12.5), WALL, ground="none")
@@ -44,7 +56,8 @@ def clouds(path: Path) -> list[PosedCloud]:
 
 def test_masks_of_a_network_miss_edges_and_classes(yard: World) -> None:
     model = CAMERAS["depth"]
-    rays, pose = pixel_rays(model), base_T_camera(model)
+    rays = pixel_rays(model)
+    pose = base_T_camera(model)
     hits = first_hits(Scene(yard), pose, rays)
     true = wrong_label_image(hits, rays, pose, 0, 0.0, 0)
     assert (true[~np.isfinite(hits.depth)] == SKY).all()
@@ -54,16 +67,28 @@ def test_masks_of_a_network_miss_edges_and_classes(yard: World) -> None:
     assert np.array_equal(wrong, wrong_label_image(hits, rays, pose, 0, 0.12, 0) != true)
 
 
-@pytest.mark.parametrize(("sensor", "format_"), [("depth", "protobuf"), ("depth", "bag"), ("stereo", "mcap")])
-def test_cameras_see_floor_and_walls_where_they_are(yard: World, tmp_path: Path, sensor: str, format_: str) -> None:
-    path, trajectory = tmp_path / f"log{FORMATS[format_]}", standing()
-    write_session(path, trajectory, [], shots=simulate_cameras(yard, trajectory, sensor, rate_hz=2.0), format=format_)
+@pytest.mark.parametrize(
+    ("sensor", "format_"), [("depth", "protobuf"), ("depth", "bag"), ("stereo", "mcap")]
+)
+def test_cameras_see_floor_and_walls_where_they_are(
+    yard: World, tmp_path: Path, sensor: str, format_: str
+) -> None:
+    path = tmp_path / f"log{FORMATS[format_]}"
+    trajectory = standing()
+    write_session(
+        path,
+        trajectory,
+        [],
+        shots=simulate_cameras(yard, trajectory, sensor, rate_hz=2.0),
+        format=format_,
+    )
     seen = clouds(path)
     assert len(seen) == 3
     for cloud in seen:
         assert cloud.session_T_base is not None
         assert cloud.label is not None
-        points, label = apply(cloud.session_T_base, cloud.points), cloud.label
+        points = apply(cloud.session_T_base, cloud.points)
+        label = cloud.label
         off = np.abs(points[label == ROAD, 2])
         assert np.median(off) < 0.06
         assert np.quantile(off, 0.9) < 0.3

@@ -33,10 +33,12 @@ def pose(x: float) -> NDArray[np.float64]:
 
 
 def inliers(a: U8, b: U8) -> int:
-    sift, grey = cv2.SIFT.create(), [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in (a, b)]
+    sift = cv2.SIFT.create()
+    grey = [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in (a, b)]
     (ka, da), (kb, db) = (sift.detectAndCompute(g, None) for g in grey)
     good = [m for m, n in cv2.BFMatcher().knnMatch(da, db, k=2) if m.distance < 0.8 * n.distance]
-    pa, pb = np.array([ka[m.queryIdx].pt for m in good]), np.array([kb[m.trainIdx].pt for m in good])
+    pa = np.array([ka[m.queryIdx].pt for m in good])
+    pb = np.array([kb[m.trainIdx].pt for m in good])
     return int(cv2.findFundamentalMat(pa, pb, cv2.FM_RANSAC, 1.5, 0.999)[1].sum())
 
 
@@ -51,12 +53,15 @@ def test_neighbouring_pictures_match_and_others_do_not(painter: Painter) -> None
 
 
 def test_depth_comes_back_from_a_pair(painter: Painter) -> None:
-    rng, left = np.random.default_rng(1), pose(60.0)
+    rng = np.random.default_rng(1)
+    left = pose(60.0)
     right = left.copy()
     right[:3, 3] += STEREO.baseline * left[:3, 0]
     hits = first_hits(painter.scene, left, pixel_rays(STEREO))
     pair = [painter.picture(left, rng, STEREO, hits=hits), painter.picture(right, rng, STEREO)]
-    matcher = cv2.StereoSGBM.create(0, 112, 5, 200, 800, 1, 31, 10, 100, 2, mode=cv2.STEREO_SGBM_MODE_HH)
+    matcher = cv2.StereoSGBM.create(
+        0, 112, 5, 200, 800, 1, 31, 10, 100, 2, mode=cv2.STEREO_SGBM_MODE_HH
+    )
     disparity = matcher.compute(*(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in pair)) / 16
     found = (disparity > 1) & np.isfinite(hits.depth)
     error = disparity[found] - STEREO.focal * STEREO.baseline / hits.depth[found]
@@ -67,8 +72,11 @@ def test_depth_comes_back_from_a_pair(painter: Painter) -> None:
 
 def test_surfaces_keep_their_colours_between_sessions(street: World) -> None:
     other = build_street(PATH, 4, Condition(1))
-    a, b = surfaces(street), surfaces(other)
-    houses_a, houses_b = (set(s.seed[s.piece[w.labels == BUILDING]].tolist()) for s, w in ((a, street), (b, other)))
+    a = surfaces(street)
+    b = surfaces(other)
+    houses_a, houses_b = (
+        set(s.seed[s.piece[w.labels == BUILDING]].tolist()) for s, w in ((a, street), (b, other))
+    )
     assert houses_a == houses_b
     assert len(houses_a) > 5
 
@@ -76,30 +84,43 @@ def test_surfaces_keep_their_colours_between_sessions(street: World) -> None:
 def test_light_and_season_change_the_picture(painter: Painter) -> None:
     def mean(condition: Condition, label: int | None) -> NDArray[np.float64]:
         hits = first_hits(painter.scene, pose(30.0), pixel_rays(STEREO))
-        picture = Painter(painter.scene, condition).picture(pose(30.0), np.random.default_rng(0), STEREO, hits=hits)
-        return np.asarray(picture[hits.triangle < 0 if label is None else hits.labels == label].mean(0), np.float64)
+        picture = Painter(painter.scene, condition).picture(
+            pose(30.0), np.random.default_rng(0), STEREO, hits=hits
+        )
+        return np.asarray(
+            picture[hits.triangle < 0 if label is None else hits.labels == label].mean(0),
+            np.float64,
+        )
 
-    summer, snow = (mean(Condition(season=season, daytime="overcast"), 9) for season in ("summer", "snow"))
+    summer, snow = (
+        mean(Condition(season=season, daytime="overcast"), 9) for season in ("summer", "snow")
+    )
     assert snow.mean() > summer.mean() + 30  # lawns
     evening = mean(Condition(daytime="evening"), None)
     noon = mean(Condition(), None)
-    assert evening[0] - evening[2] > noon[0] - noon[2] + 10  # redder sky, though it is nearly white where the sun stands
+    # redder sky, though it is nearly white where the sun stands
+    assert evening[0] - evening[2] > noon[0] - noon[2] + 10
 
 
 def test_a_box_casts_a_shadow() -> None:
     builder = MeshBuilder(lambda x, y: np.zeros_like(x))
     builder.add(box(60, 60, 0.5, z=-0.5), ROAD, ground="none")
-    builder.add(box(40, 1, 10, x=20, y=-6), BUILDING, ground="none")  # the sun of noon stands behind it
+    # the sun of noon stands behind it
+    builder.add(box(40, 1, 10, x=20, y=-6), BUILDING, ground="none")
     painter = Painter(Scene(builder.build()))
     camera = base_T_camera(STEREO)
     picture = painter.picture(camera, np.random.default_rng(0), STEREO).mean(2)
-    dark, bright = picture[330, 560:600].mean(), picture[330, 40:80].mean()  # the shadow is 10 / tan(0.9) = 7.9 m long
+    # the shadow is 10 / tan(0.9) = 7.9 m long
+    dark = picture[330, 560:600].mean()
+    bright = picture[330, 40:80].mean()
     assert dark < 0.7 * bright
 
 
 def test_noise_fades_with_the_size_of_the_pixel() -> None:
     points = np.random.default_rng(0).uniform(-50, 50, (2000, 3)).astype(np.float32)
-    near, far = (octaves(points, np.full(2000, f, np.float32), 1.0, 4, 0.8, 1.0, 3) for f in (0.001, 3.0))
+    near, far = (
+        octaves(points, np.full(2000, f, np.float32), 1.0, 4, 0.8, 1.0, 3) for f in (0.001, 3.0)
+    )
     assert 0.2 < near.std() < 1.5
     assert abs(near.mean()) < 0.1
     assert not far.any()

@@ -9,13 +9,22 @@ import pytest
 
 from semloc_logs.numerics.transforms import apply, interpolate, yaw_transform
 from semloc_logs.simulation.meshes.world import CAR, POLE, SIDEWALK, WALL, MeshBuilder, Scene, box
-from semloc_logs.simulation.sensors.lidar import CONFUSIONS, MODELS, beam_directions, corrupt_labels, full_sweep, sweep
+from semloc_logs.simulation.sensors.lidar import (
+    CONFUSIONS,
+    MODELS,
+    beam_directions,
+    corrupt_labels,
+    full_sweep,
+    sweep,
+)
 
 QUIET = replace(MODELS["hdl32"], noise=0.0, beam_bias=0.0, pointing_deg=0.0, divergence=0.0)
 
 
 def room() -> Scene:
-    """20 x 10 m inside, floor at 0, walls of 6 m: the long ones WALL, the short ones POLE, the floor SIDEWALK."""
+    """20 x 10 m inside, floor at 0, walls of 6 m: the long ones WALL, the short ones POLE, the
+    floor SIDEWALK.
+    """
     builder = MeshBuilder(lambda x, y: np.zeros_like(x))
     for x in (-10.5, 10.5):
         builder.add(box(1.0, 12.0, 6.0, x=x), POLE, ground="none")
@@ -27,7 +36,11 @@ def room() -> Scene:
 
 def misplaced(points: np.ndarray, labels: np.ndarray) -> float:
     """The largest distance of a point from the surface of its label."""
-    off = {POLE: np.abs(np.abs(points[:, 0]) - 10), WALL: np.abs(np.abs(points[:, 1]) - 5), SIDEWALK: np.abs(points[:, 2])}
+    off = {
+        POLE: np.abs(np.abs(points[:, 0]) - 10),
+        WALL: np.abs(np.abs(points[:, 1]) - 5),
+        SIDEWALK: np.abs(points[:, 2]),
+    }
     return float(max(off[int(label)][labels == label].max() for label in np.unique(labels)))
 
 
@@ -49,13 +62,23 @@ def test_noise_has_its_size() -> None:
 
 
 def test_the_same_generator_gives_the_same_sweep() -> None:
-    pose, scene = yaw_transform(0.0, (0.0, 0.0, 1.9)), room()
-    first, again = (sweep(scene, pose, np.random.default_rng(5), MODELS["vlp16"])[0] for _ in range(2))
+    pose = yaw_transform(0.0, (0.0, 0.0, 1.9))
+    scene = room()
+    first, again = (
+        sweep(scene, pose, np.random.default_rng(5), MODELS["vlp16"])[0] for _ in range(2)
+    )
     np.testing.assert_array_equal(first, again)
 
 
 def test_range_and_sector_are_kept() -> None:
-    turn = full_sweep(room(), yaw_transform(0.0, (0.0, 0.0, 1.9)), np.random.default_rng(0), QUIET, max_range=7.0, sector=(-0.8, 0.8))
+    turn = full_sweep(
+        room(),
+        yaw_transform(0.0, (0.0, 0.0, 1.9)),
+        np.random.default_rng(0),
+        QUIET,
+        max_range=7.0,
+        sector=(-0.8, 0.8),
+    )
     distance = np.linalg.norm(turn.points, axis=1)
     assert distance.max() < 7.0
     assert np.abs(np.arctan2(turn.points[:, 1], turn.points[:, 0])).max() <= 0.8
@@ -86,10 +109,13 @@ def test_traffic_hides_what_is_behind_it() -> None:
 
 
 def test_a_moving_sensor_measures_in_the_frame_of_each_moment() -> None:
-    start, end = yaw_transform(0.0, (0.0, 0.0, 1.9)), yaw_transform(0.1, (0.8, 0.1, 1.9))
+    start = yaw_transform(0.0, (0.0, 0.0, 1.9))
+    end = yaw_transform(0.1, (0.8, 0.1, 1.9))
     turn = full_sweep(room(), start, np.random.default_rng(0), QUIET, world_T_end=end)
     still = apply(start, turn.points)
-    poses = interpolate(np.array([0, 10**9]), np.stack([start, end]), (turn.turn * 1e9).astype(np.int64))
+    poses = interpolate(
+        np.array([0, 10**9]), np.stack([start, end]), (turn.turn * 1e9).astype(np.int64)
+    )
     moved = np.einsum("nij,nj->ni", poses[:, :3, :3], turn.points) + poses[:, :3, 3]
     assert misplaced(moved, turn.labels) < 2e-3
     assert misplaced(still, turn.labels) > 0.3
@@ -107,7 +133,9 @@ def test_label_errors_have_their_share_and_stay_in_place() -> None:
 
 
 def test_label_errors_come_in_patches() -> None:
-    grid = np.stack(np.meshgrid(np.arange(0, 20, 0.1), np.arange(0, 20, 0.1), [0.2], indexing="ij"), -1).reshape(-1, 3)
+    grid = np.stack(
+        np.meshgrid(np.arange(0, 20, 0.1), np.arange(0, 20, 0.1), [0.2], indexing="ij"), -1
+    ).reshape(-1, 3)
     labels = np.full(len(grid), 2, np.uint8)
     wrong = (corrupt_labels(grid, labels, 3, 0.15) != labels).reshape(200, 200)
     neighbour = wrong[1:][wrong[:-1]].mean()

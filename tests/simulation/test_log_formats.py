@@ -1,4 +1,6 @@
-"""One drive in every format that logs can be simulated in: read back by our reader it is the same drive."""
+"""One drive in every format that logs can be simulated in: read back by our reader it is the same
+drive.
+"""
 
 from __future__ import annotations
 
@@ -36,12 +38,24 @@ def yard() -> World:
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     start = 1_760_000_000_123_456_789
-    trajectory = drive(smooth_line(np.array([[0.0, 0], [16, 0]])), lambda x, y: 0 * x, np.random.default_rng(0), start_ns=start)
-    folder, out = tmp_path_factory.mktemp("formats"), {}
+    trajectory = drive(
+        smooth_line(np.array([[0.0, 0], [16, 0]])),
+        lambda x, y: 0 * x,
+        np.random.default_rng(0),
+        start_ns=start,
+    )
+    folder = tmp_path_factory.mktemp("formats")
+    out = {}
     for name, suffix in FORMATS.items():
         out[name] = folder / f"{name}{suffix}"
         frames = simulate_drive(yard(), trajectory, MODELS["vlp16"], rate_hz=2.0, columns=300)
-        write_session(out[name], trajectory, frames, format=name, sensors=VehicleSensors(imu_hz=100.0, outage_km=0.002))
+        write_session(
+            out[name],
+            trajectory,
+            frames,
+            format=name,
+            sensors=VehicleSensors(imu_hz=100.0, outage_km=0.002),
+        )
     return out
 
 
@@ -52,7 +66,9 @@ def test_our_reader_finds_the_roles_in_every_format(logs: dict[str, Path], name:
     assert isinstance(streams, list)
     roles = {s["topic"]: s["role"] for s in streams}
     pose = {"/tf": "tf"} if name == "protobuf" else {"/odometry": "pose", "/imu": "imu"}
-    assert (pose | {"/lidar/points": "lidar", "/gnss": "gnss", "/tf_static": "tf_static"}).items() <= roles.items()
+    assert (
+        pose | {"/lidar/points": "lidar", "/gnss": "gnss", "/tf_static": "tf_static"}
+    ).items() <= roles.items()
     assert found["problems"] == []
     counts = {s["topic"]: s["count"] for s in streams}
     if name != "protobuf":
@@ -84,7 +100,11 @@ def test_a_ros2_bag_is_a_directory_that_others_read(logs: dict[str, Path]) -> No
 
     assert sorted(p.name for p in logs["ros2"].iterdir()) == ["metadata.yaml", "ros2.db3"]
     with AnyReader([logs["ros2"]]) as reader:
-        fixes: list[Any] = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages() if c.topic == "/gnss"]
+        fixes: list[Any] = [
+            reader.deserialize(data, c.msgtype)
+            for c, _, data in reader.messages()
+            if c.topic == "/gnss"
+        ]
     lost = [f for f in fixes if f.status.status < 0]
     known = [f for f in fixes if f.status.status >= 0]
     assert lost
@@ -97,21 +117,35 @@ def test_protobuf_messages_are_read_by_others(logs: dict[str, Path]) -> None:
     from mcap_protobuf.decoder import DecoderFactory
 
     with logs["protobuf"].open("rb") as stream:
-        read = [(c.topic, m) for _, c, _, m in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()]
+        read = [
+            (c.topic, m)
+            for _, c, _, m in make_reader(
+                stream, decoder_factories=[DecoderFactory()]
+            ).iter_decoded_messages()
+        ]
     clouds = [m for topic, m in read if topic == "/lidar/points"]
     assert [f.name for f in clouds[0].fields] == ["x", "y", "z", "label", "ring", "t"]
     assert len(clouds[0].data) % clouds[0].point_stride == 0
-    edges = {(m.parent_frame_id, m.child_frame_id) for topic, m in read if topic in ("/tf", "/tf_static")}
+    edges = {
+        (m.parent_frame_id, m.child_frame_id) for topic, m in read if topic in ("/tf", "/tf_static")
+    }
     assert edges == {("odom", "base_link"), ("base_link", "lidar"), ("base_link", "gnss")}
 
 
 def test_a_format_and_its_ending_belong_together(tmp_path: Path) -> None:
-    trajectory = drive(smooth_line(np.array([[0.0, 0], [5, 0]])), lambda x, y: 0 * x, np.random.default_rng(0), start_ns=10**18)
+    trajectory = drive(
+        smooth_line(np.array([[0.0, 0], [5, 0]])),
+        lambda x, y: 0 * x,
+        np.random.default_rng(0),
+        start_ns=10**18,
+    )
     with pytest.raises(LogError, match="ending of its format"):
         write_session(tmp_path / "a.bag", trajectory, [], format="protobuf")
 
 
-def test_sessions_come_as_ros2_bags_and_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sessions_come_as_ros2_bags_and_are_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("semloc_logs.simulation.sessions.build_street", lambda *_: yard())
     for overwrite in (False, True):
         truth = simulate_sessions(
@@ -126,6 +160,10 @@ def test_sessions_come_as_ros2_bags_and_are_replaced(tmp_path: Path, monkeypatch
             imu_hz=50.0,
             overwrite=overwrite,
         )
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["session_0", "session_0.tum", "truth.json"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "session_0",
+        "session_0.tum",
+        "truth.json",
+    ]
     assert (tmp_path / "session_0" / "metadata.yaml").exists()
     assert truth.exists()

@@ -29,7 +29,12 @@ START = 1_760_000_000_123_456_789
 
 @pytest.fixture(scope="module")
 def trajectory() -> Trajectory:
-    return drive(smooth_line(np.array([[0.0, 0], [25, 0]])), lambda x, y: 0.01 * x, np.random.default_rng(0), start_ns=START)
+    return drive(
+        smooth_line(np.array([[0.0, 0], [25, 0]])),
+        lambda x, y: 0.01 * x,
+        np.random.default_rng(0),
+        start_ns=START,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +51,9 @@ def frames(yard: World, trajectory: Trajectory) -> list[DriveFrame]:
     return list(simulate_drive(yard, trajectory, MODELS["vlp16"], rate_hz=2.0, columns=300))
 
 
-def test_drive_frames_are_on_time_and_in_place(frames: list[DriveFrame], trajectory: Trajectory) -> None:
+def test_drive_frames_are_on_time_and_in_place(
+    frames: list[DriveFrame], trajectory: Trajectory
+) -> None:
     assert [f.stamp_ns for f in frames[:3]] == [START, START + 500_000_000, START + 1_000_000_000]
     assert frames[-1].stamp_ns + 100_000_000 <= trajectory.stamps_ns[-1]
     for frame in frames:
@@ -54,15 +61,28 @@ def test_drive_frames_are_on_time_and_in_place(frames: list[DriveFrame], traject
         assert np.median(np.abs(walls[:, 1])) == pytest.approx(5.5, abs=0.05)
 
 
-def test_label_noise_leaves_the_points(yard: World, trajectory: Trajectory, frames: list[DriveFrame]) -> None:
-    noisy = list(simulate_drive(yard, trajectory, MODELS["vlp16"], rate_hz=2.0, columns=300, label_noise=0.15))
-    wrong = np.concatenate([a.sweep.labels != b.sweep.labels for a, b in zip(frames, noisy, strict=True)])
+def test_label_noise_leaves_the_points(
+    yard: World, trajectory: Trajectory, frames: list[DriveFrame]
+) -> None:
+    noisy = list(
+        simulate_drive(
+            yard, trajectory, MODELS["vlp16"], rate_hz=2.0, columns=300, label_noise=0.15
+        )
+    )
+    wrong = np.concatenate(
+        [a.sweep.labels != b.sweep.labels for a, b in zip(frames, noisy, strict=True)]
+    )
     assert 0.05 < wrong.mean() < 0.25
     np.testing.assert_array_equal(frames[0].sweep.points, noisy[0].sweep.points)
 
 
 @pytest.fixture(scope="module", params=["drive.mcap", "drive.bag"])
-def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, trajectory: Trajectory, frames: list[DriveFrame]) -> Path:
+def log(
+    request: pytest.FixtureRequest,
+    tmp_path_factory: pytest.TempPathFactory,
+    trajectory: Trajectory,
+    frames: list[DriveFrame],
+) -> Path:
     path: Path = tmp_path_factory.mktemp("log") / request.param
     assert write_session(path, trajectory, frames) == len(frames)
     return path
@@ -75,24 +95,44 @@ def messages(path: Path) -> Iterator[tuple[str, int, Any]]:
                 yield connection.topic, time, reader.deserialize(data, connection.msgtype)
         return
     with path.open("rb") as stream:
-        for _, channel, message, decoded in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+        for _, channel, message, decoded in make_reader(
+            stream, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
             yield channel.topic, message.log_time, decoded
 
 
-def test_other_readers_read_the_log(log: Path, trajectory: Trajectory, frames: list[DriveFrame]) -> None:
+def test_other_readers_read_the_log(
+    log: Path, trajectory: Trajectory, frames: list[DriveFrame]
+) -> None:
     read = list(messages(log))
     times = [time for _, time, _ in read]
     assert times == sorted(times)
     by_topic = {topic: [m for t, _, m in read if t == topic] for topic, _, _ in read}
-    assert set(by_topic) == {"/lidar/points", "/odometry", "/imu", "/gnss", "/tf_static", "/lidar/label_space"}
+    assert set(by_topic) == {
+        "/lidar/points",
+        "/odometry",
+        "/imu",
+        "/gnss",
+        "/tf_static",
+        "/lidar/label_space",
+    }
     assert len(by_topic["/odometry"]) == len(by_topic["/imu"]) == len(trajectory.stamps_ns)
     assert by_topic["/lidar/label_space"][0].data == "cityscapes"
     edge = by_topic["/tf_static"][0].transforms[0]
-    assert (edge.header.frame_id, edge.child_frame_id, edge.transform.translation.z) == ("base_link", "lidar", MODELS["vlp16"].height)
+    assert (edge.header.frame_id, edge.child_frame_id, edge.transform.translation.z) == (
+        "base_link",
+        "lidar",
+        MODELS["vlp16"].height,
+    )
     odometry = by_topic["/odometry"][-1]
-    assert odometry.header.stamp.sec * 10**9 + odometry.header.stamp.nanosec == trajectory.stamps_ns[-1]
+    assert (
+        odometry.header.stamp.sec * 10**9 + odometry.header.stamp.nanosec
+        == trajectory.stamps_ns[-1]
+    )
     position = odometry.pose.pose.position
-    np.testing.assert_allclose([position.x, position.y, position.z], trajectory.odom_T_base[-1, :3, 3])
+    np.testing.assert_allclose(
+        [position.x, position.y, position.z], trajectory.odom_T_base[-1, :3, 3]
+    )
 
 
 def test_clouds_come_back_as_they_were(log: Path, frames: list[DriveFrame]) -> None:
@@ -102,17 +142,29 @@ def test_clouds_come_back_as_they_were(log: Path, frames: list[DriveFrame]) -> N
     for cloud, frame in zip(clouds, frames, strict=True):
         fields = cloud.fields
         row = np.dtype(
-            {"names": [f.name for f in fields], "formats": [kinds[f.datatype] for f in fields], "offsets": [f.offset for f in fields]}
+            {
+                "names": [f.name for f in fields],
+                "formats": [kinds[f.datatype] for f in fields],
+                "offsets": [f.offset for f in fields],
+            }
         )
         points = np.frombuffer(bytes(cloud.data), row)
-        np.testing.assert_array_equal(np.column_stack([points[a] for a in "xyz"]), frame.sweep.points)
+        np.testing.assert_array_equal(
+            np.column_stack([points[a] for a in "xyz"]), frame.sweep.points
+        )
         np.testing.assert_array_equal(points["label"], frame.sweep.labels)
         np.testing.assert_array_equal(points["ring"], frame.sweep.ring)
         assert 0 <= points["t"].min() <= points["t"].max() < 100_000_000
 
 
 def test_imu_feels_gravity(log: Path) -> None:
-    up = np.array([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z] for t, _, m in messages(log) if t == "/imu"])
+    up = np.array(
+        [
+            [m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z]
+            for t, _, m in messages(log)
+            if t == "/imu"
+        ]
+    )
     assert np.linalg.norm(up[5:-5].mean(0)) == pytest.approx(9.81, abs=0.2)
     assert up[:, 2].mean() == pytest.approx(9.81, abs=0.2)
 
@@ -121,7 +173,9 @@ def test_our_reader_finds_the_roles(log: Path) -> None:
     found = inspect_log(log)
     streams = found["streams"]
     assert isinstance(streams, list)
-    assert {"/lidar/points": "lidar", "/odometry": "pose", "/imu": "imu"}.items() <= {s["topic"]: s["role"] for s in streams}.items()
+    assert {"/lidar/points": "lidar", "/odometry": "pose", "/imu": "imu"}.items() <= {
+        s["topic"]: s["role"] for s in streams
+    }.items()
     assert found["problems"] == []
 
 
@@ -130,10 +184,14 @@ def test_truth_is_tum_with_nine_decimals(tmp_path: Path, trajectory: Trajectory)
     lines = (tmp_path / "t.tum").read_text().splitlines()
     assert lines[0].split()[0] == "1760000000.123456789"
     rows = np.array([[float(v) for v in line.split()[1:]] for line in lines])
-    np.testing.assert_allclose(transform(rows[:, :3], rows[:, 3:]), trajectory.world_T_base, atol=1e-8)
+    np.testing.assert_allclose(
+        transform(rows[:, :3], rows[:, 3:]), trajectory.world_T_base, atol=1e-8
+    )
 
 
-def test_an_interrupted_write_leaves_nothing(tmp_path: Path, trajectory: Trajectory, frames: list[DriveFrame]) -> None:
+def test_an_interrupted_write_leaves_nothing(
+    tmp_path: Path, trajectory: Trajectory, frames: list[DriveFrame]
+) -> None:
     def broken() -> Iterator[DriveFrame]:
         yield frames[0]
         raise RuntimeError("stop")
@@ -156,12 +214,16 @@ def test_a_folder_that_is_not_there_is_an_error(tmp_path: Path, trajectory: Traj
 
 
 def test_sessions_share_a_town_and_have_truth(tmp_path: Path) -> None:
-    truth = simulate_sessions(tmp_path, seed=2, sessions=2, length_m=60, sensor="vlp16", rate_hz=0.5)
+    truth = simulate_sessions(
+        tmp_path, seed=2, sessions=2, length_m=60, sensor="vlp16", rate_hz=0.5
+    )
     entries = json.loads(truth.read_text())
     assert entries == {f"session_{k}.mcap": {"trajectory": f"session_{k}.tum"} for k in (0, 1)}
     for k in (0, 1):
         poses = np.loadtxt(tmp_path / f"session_{k}.tum")
-        assert np.linalg.norm(np.diff(poses[:, 1:4], axis=0), axis=1).sum() == pytest.approx(60, abs=8)
+        assert np.linalg.norm(np.diff(poses[:, 1:4], axis=0), axis=1).sum() == pytest.approx(
+            60, abs=8
+        )
     with pytest.raises(SemlocError, match="already has"):
         simulate_sessions(tmp_path, seed=2, sessions=2, length_m=60, sensor="vlp16", rate_hz=0.5)
 
@@ -184,11 +246,19 @@ def test_impossible_settings_are_refused(tmp_path: Path, wrong: dict[str, Any]) 
     assert not (tmp_path / "out").exists()
 
 
-def test_the_demo_meets_itself_in_both_directions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_meets_itself_in_both_directions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     few = MODELS["vlp16"]
     monkeypatch.setitem(MODELS, "hdl32", few)
     files = simulate_demo(tmp_path)
-    assert [f.name for f in files] == ["monday.mcap", "tuesday.bag", "monday.tum", "tuesday.tum", "truth.json"]
+    assert [f.name for f in files] == [
+        "monday.mcap",
+        "tuesday.bag",
+        "monday.tum",
+        "tuesday.tum",
+        "truth.json",
+    ]
     assert all(f.exists() for f in files)
     monday, tuesday = (np.loadtxt(tmp_path / f"{day}.tum") for day in ("monday", "tuesday"))
     for poses in (monday, tuesday):
@@ -201,7 +271,13 @@ def test_the_demo_meets_itself_in_both_directions(tmp_path: Path, monkeypatch: p
     assert (near & (ahead < -0.9)).any(0).sum() > 5
 
 
-def test_interpolated_poses_match_the_frames(frames: list[DriveFrame], trajectory: Trajectory) -> None:
+def test_interpolated_poses_match_the_frames(
+    frames: list[DriveFrame], trajectory: Trajectory
+) -> None:
     at = np.array([f.stamp_ns for f in frames])
-    np.testing.assert_allclose(interpolate(trajectory.stamps_ns, trajectory.world_T_base, at), [f.world_T_base for f in frames], atol=1e-9)
+    np.testing.assert_allclose(
+        interpolate(trajectory.stamps_ns, trajectory.world_T_base, at),
+        [f.world_T_base for f in frames],
+        atol=1e-9,
+    )
     np.testing.assert_allclose(frames[0].base_T_lidar, mounting(MODELS["vlp16"]))

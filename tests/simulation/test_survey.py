@@ -1,4 +1,6 @@
-"""Streets along recorded drives: where it was driven again it is the same street, and the road lies under every pose."""
+"""Streets along recorded drives: where it was driven again it is the same street, and the road lies
+under every pose.
+"""
 
 from __future__ import annotations
 
@@ -48,13 +50,17 @@ def write_kitti(path: Path, drive: F64) -> Path:
 
 
 def length(network: RoadNetwork) -> float:
-    return sum(float(np.linalg.norm(np.diff(road.path, axis=0), axis=1).sum()) for road in network.roads)
+    return sum(
+        float(np.linalg.norm(np.diff(road.path, axis=0), axis=1).sum()) for road in network.roads
+    )
 
 
 def test_kitti_poses_are_those_of_a_camera_and_tum_poses_have_z_up(tmp_path: Path) -> None:
     drive = eight(slope=0.05)
     kitti = read_drive(write_kitti(tmp_path / "a.txt", drive))
-    (tmp_path / "a.tum").write_text("".join(f"{i} {x} {y} {z} 0 0 0 1\n" for i, (x, y, z) in enumerate(drive)))
+    (tmp_path / "a.tum").write_text(
+        "".join(f"{i} {x} {y} {z} 0 0 0 1\n" for i, (x, y, z) in enumerate(drive))
+    )
     tum = read_drive(tmp_path / "a.tum")
     np.testing.assert_allclose(kitti, tum, atol=1e-4)
     assert len(tum) == pytest.approx(len(drive), abs=4)
@@ -67,7 +73,9 @@ def test_standing_and_trembling_make_no_street(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).normal(size=(300, 3)) * 0.05
     still = np.concatenate([drive[:60], drive[60] + noise, drive[60:]])
     np.testing.assert_allclose(
-        read_drive(write_kitti(tmp_path / "b.txt", still))[:50], read_drive(write_kitti(tmp_path / "a.txt", drive))[:50], atol=0.3
+        read_drive(write_kitti(tmp_path / "b.txt", still))[:50],
+        read_drive(write_kitti(tmp_path / "a.txt", drive))[:50],
+        atol=0.3,
     )
 
 
@@ -83,11 +91,13 @@ def test_crossing_oneself_makes_a_crossing() -> None:
 @pytest.mark.parametrize("again", ["opposite", "same"])
 def test_a_street_that_is_driven_again_is_the_same_street(again: str) -> None:
     if again == "opposite":
-        drive, expected = out_and_back(), 150 + 50 + 42 + 10
+        drive = out_and_back()
+        expected = 150 + 50 + 42 + 10
     else:
         t = np.linspace(0, 3 * np.pi, 600)
         plan = np.column_stack([60 * np.cos(t), 60 * np.sin(t)])
-        drive, expected = np.column_stack([plan, 0 * t])[::1], int(2 * np.pi * 60)
+        drive = np.column_stack([plan, 0 * t])[::1]
+        expected = int(2 * np.pi * 60)
     network = drive_network(np.random.default_rng(0), drive)
     assert length(network) == pytest.approx(expected, rel=0.12)
     assert length(network) < 0.85 * np.linalg.norm(np.diff(drive, axis=0), axis=1).sum()
@@ -108,10 +118,17 @@ def test_heights_of_two_passes_agree_and_rises_stay() -> None:
 def test_the_road_lies_under_every_pose_and_nothing_stands_in_the_lane(seed: int) -> None:
     drive = [eight(slope=0.06), out_and_back()][seed % 2]
     network = drive_network(np.random.default_rng(seed), drive)
-    ground, world = street_ground(network, seed), build_street(network, seed)
+    ground = street_ground(network, seed)
+    world = build_street(network, seed)
     scene = Scene(world)
     for line in (drive[:, :2], opposite_lane(drive[:, :2])[::-1]):
-        poses = poses_along(line, np.arange(2.0, len(line) - 4.0, 0.7), ground.slope_height, np.random.default_rng(0), shake=0.0)
+        poses = poses_along(
+            line,
+            np.arange(2.0, len(line) - 4.0, 0.7),
+            ground.slope_height,
+            np.random.default_rng(0),
+            shake=0.0,
+        )
         for across in (-1.0, 0.0, 1.0):
             origins = poses[:, :3, 3] + across * poses[:, :3, 1] + [0, 0, 0.2]
             down = np.tile(np.array([0, 0, -1], np.float32), (len(origins), 1))
@@ -121,7 +138,9 @@ def test_the_road_lies_under_every_pose_and_nothing_stands_in_the_lane(seed: int
         for height in (0.3, 0.8, 1.4, 1.9):
             for side in (-1.2, 1.2):
                 origins = poses[:, :3, 3] + height * poses[:, :3, 2]
-                distance, _, _ = scene.cast(origins.astype(np.float32), (side * poses[:, :3, 1]).astype(np.float32))
+                distance, _, _ = scene.cast(
+                    origins.astype(np.float32), (side * poses[:, :3, 1]).astype(np.float32)
+                )
                 assert (distance > 1).all()
 
 

@@ -1,4 +1,6 @@
-"""What training gets: labelled clouds in the base frame with true poses, of one drive that maps and one that asks."""
+"""What training gets: labelled clouds in the base frame with true poses, of one drive that maps and
+one that asks.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,16 @@ def test_scenes_have_the_promised_form(seed: int) -> None:
     assert len(scene.mapped) == 8
     assert scene.asked is scene.mapped or len(scene.asked) in (5, 8)
     for frame in [*scene.mapped, *scene.asked]:
-        points, origin, labels, pose = frame.points, frame.origin, frame.labels, frame.world_T_base
-        assert [str(a.dtype) for a in (points, origin, labels, pose)] == ["float32", "float32", "uint8", "float64"]
+        points = frame.points
+        origin = frame.origin
+        labels = frame.labels
+        pose = frame.world_T_base
+        assert [str(a.dtype) for a in (points, origin, labels, pose)] == [
+            "float32",
+            "float32",
+            "uint8",
+            "float64",
+        ]
         assert points.shape == (len(labels), 3)
         assert frame.sigma is None or frame.sigma.shape == labels.shape
         assert 1_000 < len(points) <= 60_000
@@ -55,7 +65,11 @@ def test_sensors_and_label_errors_vary() -> None:
     assert 0.25 < len(cameras) / 300 < 0.45
     assert {round(r.yaw, 1) for r in cameras} == {0.0, 1.6, -1.6, 3.1}
     assert {r.model.name for r in rigs} == {"stereo", *MODELS}
-    assert {r.model.name for r in (_rig(rng, "hall") for _ in range(100)) if isinstance(r.model, CameraModel)} == {"depth"}
+    assert {
+        r.model.name
+        for r in (_rig(rng, "hall") for _ in range(100))
+        if isinstance(r.model, CameraModel)
+    } == {"depth"}
     noise = [r.label_noise for r in rigs]
     assert min(noise) >= 0.02
     assert 0.15 < max(noise) <= 0.2
@@ -64,7 +78,10 @@ def test_sensors_and_label_errors_vary() -> None:
 def test_the_same_seed_gives_the_same_frames() -> None:
     first, again, other = (training_scene(seed, frames=2) for seed in (3, 3, 5))
     for a, b in zip(first.mapped + first.asked, again.mapped + again.asked, strict=True):
-        assert all(np.array_equal(getattr(a, k), getattr(b, k)) for k in ("points", "origin", "labels", "world_T_base"))
+        assert all(
+            np.array_equal(getattr(a, k), getattr(b, k))
+            for k in ("points", "origin", "labels", "world_T_base")
+        )
     assert first.mapped[0].points.tobytes() != other.mapped[0].points.tobytes()
 
 

@@ -1,4 +1,6 @@
-"""Shapes have the volumes that one can work out by hand, and rays hit what a slow obvious ray caster hits."""
+"""Shapes have the volumes that one can work out by hand, and rays hit what a slow obvious ray
+caster hits.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,12 @@ def volume(mesh: Mesh) -> float:
 
 def open_edges(mesh: Mesh) -> int:
     """Edges that are not shared by exactly two triangles."""
-    edges = np.sort(np.concatenate([mesh.triangles[:, (0, 1)], mesh.triangles[:, (1, 2)], mesh.triangles[:, (2, 0)]]), axis=1)
+    edges = np.sort(
+        np.concatenate(
+            [mesh.triangles[:, (0, 1)], mesh.triangles[:, (1, 2)], mesh.triangles[:, (2, 0)]]
+        ),
+        axis=1,
+    )
     return int((np.unique(edges, axis=0, return_counts=True)[1] != 2).sum())
 
 
@@ -46,7 +53,13 @@ def open_edges(mesh: Mesh) -> int:
         (gabled_roof(6.0, 4.0, 2.0), 24.0),
         (cylinder(1.0, 2.0, sides=4), 4.0),  # a square of diagonal 2, two high
         (cylinder(1.0, 3.0, sides=4, top_radius=0.0), 2.0),  # a pyramid
-        (ribbon(np.array([[0.0, 0], [5, 0], [10, 0]]), np.array([[-1.0, 0], [1, 0], [1, 2], [-1, 2]])), 40.0),
+        (
+            ribbon(
+                np.array([[0.0, 0], [5, 0], [10, 0]]),
+                np.array([[-1.0, 0], [1, 0], [1, 2], [-1, 2]]),
+            ),
+            40.0,
+        ),
     ],
 )
 def test_solids_are_closed_and_have_their_volume(mesh: Mesh, expected: float) -> None:
@@ -60,7 +73,9 @@ def test_ellipsoid_nears_its_volume() -> None:
 
 
 def test_place_turns_about_z_then_moves() -> None:
-    moved = place(Mesh(np.array([[1.0, 0.0, 5.0]]), np.zeros((0, 3), np.int64)), 10.0, 20.0, 1.0, np.pi / 2)
+    moved = place(
+        Mesh(np.array([[1.0, 0.0, 5.0]]), np.zeros((0, 3), np.int64)), 10.0, 20.0, 1.0, np.pi / 2
+    )
     np.testing.assert_allclose(moved.vertices, [[10.0, 21.0, 6.0]], atol=1e-12)
 
 
@@ -75,8 +90,11 @@ def test_builder_puts_meshes_on_the_ground() -> None:
 
 
 def first_hits(triangles: F64, origins: F64, directions: F64) -> tuple[F64, NDArray[np.int64]]:
-    """Distance and number of the first triangle of each ray, one at a time by solving for the barycentric coordinates."""
-    distance, number = np.full(len(origins), np.inf), np.full(len(origins), -1)
+    """Distance and number of the first triangle of each ray, one at a time by solving for the
+    barycentric coordinates.
+    """
+    distance = np.full(len(origins), np.inf)
+    number = np.full(len(origins), -1)
     for r, (o, d) in enumerate(zip(origins, directions, strict=True)):
         for k, (a, b, c) in enumerate(triangles):
             u, v, t = np.linalg.solve(np.column_stack([b - a, c - a, -d]), o - a)
@@ -88,10 +106,17 @@ def first_hits(triangles: F64, origins: F64, directions: F64) -> tuple[F64, NDAr
 def test_rays_hit_what_the_slow_caster_hits() -> None:
     rng = np.random.default_rng(3)
     triangles = rng.uniform(-5, 5, (25, 1, 3)) + rng.normal(size=(25, 3, 3)) * 2
-    world = World(triangles.reshape(-1, 3).astype(np.float32), np.arange(75, dtype=np.int32).reshape(-1, 3), np.arange(25, dtype=np.uint8))
-    origins, directions = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
+    world = World(
+        triangles.reshape(-1, 3).astype(np.float32),
+        np.arange(75, dtype=np.int32).reshape(-1, 3),
+        np.arange(25, dtype=np.uint8),
+    )
+    origins = rng.normal(size=(200, 3))
+    directions = rng.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    distance, number, _ = Scene(world).cast(origins.astype(np.float32), directions.astype(np.float32))
+    distance, number, _ = Scene(world).cast(
+        origins.astype(np.float32), directions.astype(np.float32)
+    )
     expected_distance, expected_number = first_hits(triangles, origins, directions)
     assert (expected_number >= 0).sum() > 50
     assert (expected_number < 0).sum() > 10
@@ -107,7 +132,11 @@ def test_an_empty_world_is_refused() -> None:
 def test_without_embreex_the_error_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
     with pytest.raises(SemlocError, match="embreex"):
-        Scene(World(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32), np.zeros(1, np.uint8)))
+        Scene(
+            World(
+                np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32), np.zeros(1, np.uint8)
+            )
+        )
 
 
 def test_pieces_keep_their_numbers_apart_when_worlds_are_joined() -> None:

@@ -9,7 +9,8 @@ from semloc_logs.subvolumes.cut import code_table, turn
 
 
 def test_codes_of_the_states() -> None:
-    semantic, geometric = code_table("semantic"), code_table("geometric")
+    semantic = code_table("semantic")
+    geometric = code_table("geometric")
     assert semantic[:19].tolist() == list(range(19))
     assert [int(semantic[s]) for s in (254, 253, 255)] == [19, 20, 21]
     assert [int(geometric[s]) for s in (254, 253, 255)] == [1, 2, 0]
@@ -26,7 +27,9 @@ def test_codes_of_the_states() -> None:
     st.tuples(st.integers(1, 9), st.integers(1, 9), st.integers(1, 9)),
 )
 @settings(max_examples=60, deadline=None)
-def test_turning_is_what_the_slow_loop_says(seed: int, yaw: float, centre: tuple[float, ...], size: tuple[int, ...]) -> None:
+def test_turning_is_what_the_slow_loop_says(
+    seed: int, yaw: float, centre: tuple[float, ...], size: tuple[int, ...]
+) -> None:
     state = np.random.default_rng(seed).integers(0, 19, (11, 7, 5)).astype(np.uint8)
     low = np.array([-4, -9, -2])
     out = np.zeros(size, np.uint8)
@@ -45,5 +48,11 @@ def test_quarter_turns_are_those_of_numpy() -> None:
     state = np.random.default_rng(0).integers(0, 19, (8, 8, 4)).astype(np.uint8)
     out = np.zeros_like(state)
     for quarter in range(4):
-        turn(state, np.zeros(3, np.int64), quarter * np.pi / 2 + 1e-12, np.array([4.0, 4.0, 2.0]), out)
+        turn(
+            state,
+            np.zeros(3, np.int64),
+            quarter * np.pi / 2 + 1e-12,
+            np.array([4.0, 4.0, 2.0]),
+            out,
+        )
         np.testing.assert_array_equal(out, np.rot90(state, -quarter, (0, 1)))

@@ -14,8 +14,21 @@ from safetensors.torch import save_file
 from semloc_logs.errors import SettingsError
 from semloc_logs.subvolumes import describe
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table, turned_map
-from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns, random_encoder
-from semloc_logs.subvolumes.network import Completion, Decoder, Encoder, descriptors, from_eights, in_eights
+from semloc_logs.subvolumes.describe import (
+    Described,
+    describe_map,
+    load_encoder,
+    quarter_turns,
+    random_encoder,
+)
+from semloc_logs.subvolumes.network import (
+    Completion,
+    Decoder,
+    Encoder,
+    descriptors,
+    from_eights,
+    in_eights,
+)
 from semloc_logs.training.checkpoints import save_weights
 from semloc_logs.training.pairs import occupied
 
@@ -33,8 +46,11 @@ def world(seed: int = 0, size: tuple[int, int, int] = (56, 48, 40)) -> U8:
         s[x, y, : height[x, y]] = 253
         s[x, y, height[x, y]] = rng.choice([0, 1, 9])
     for _ in range(8):
-        x, y = rng.integers(0, size[0] - 12), rng.integers(0, size[1] - 12)
-        s[x : x + rng.integers(1, 12), y : y + rng.integers(1, 4), 13 : rng.integers(20, 38)] = rng.choice([2, 5, 8, 255])
+        x = rng.integers(0, size[0] - 12)
+        y = rng.integers(0, size[1] - 12)
+        s[x : x + rng.integers(1, 12), y : y + rng.integers(1, 4), 13 : rng.integers(20, 38)] = (
+            rng.choice([2, 5, 8, 255])
+        )
     s[rng.random(size) < 0.2] = 253
     return s
 
@@ -55,14 +71,21 @@ def one_by_one(state: U8, found: Described, encoder: Encoder) -> NDArray[np.floa
         x, y, z = corner - [MARGIN, MARGIN, 0]
         crop = padded[x : x + WIDE, y : y + WIDE, z : z + SIZE]
         with torch.inference_mode():
-            out.append(descriptors(encoder(torch.from_numpy(code_table(encoder.variant)[crop])[None])).numpy()[0])
+            out.append(
+                descriptors(
+                    encoder(torch.from_numpy(code_table(encoder.variant)[crop])[None])
+                ).numpy()[0]
+            )
     return np.array(out)
 
 
 @pytest.mark.parametrize("variant", ["semantic", "geometric"])
-def test_a_map_at_once_is_its_subvolumes_one_by_one(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_at_once_is_its_subvolumes_one_by_one(
+    variant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(describe, "PATCH", 40)  # several patches
-    state, encoder = world(), random_encoder(variant)
+    state = world()
+    encoder = random_encoder(variant)
     with full_precision():
         found = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
     assert len(found.descriptor) > 30
@@ -73,11 +96,13 @@ def test_a_map_at_once_is_its_subvolumes_one_by_one(variant: str, monkeypatch: p
     reduced = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
     np.testing.assert_array_equal(reduced.centre, found.centre)
     assert np.abs(reduced.descriptor - found.descriptor).max() < 1e-2
-    assert len(np.unique(found.centre[:, 2])) > 1  # the step in the ground needs more than one layer
+    # the step in the ground needs more than one layer
+    assert len(np.unique(found.centre[:, 2])) > 1
 
 
 def test_a_finer_stride_contains_the_coarser_one() -> None:
-    state, encoder = world(), random_encoder("semantic")
+    state = world()
+    encoder = random_encoder("semantic")
     ground = (12 - 16) * V
     coarse, fine = (describe_map(state, LOW, ground, V, encoder, s, 40) for s in (8, 4))
     row = {tuple(c): i for i, c in enumerate(fine.centre.tolist())}
@@ -104,8 +129,11 @@ def test_what_is_described_holds_enough_and_starts_at_its_lowest_surface() -> No
 
 
 def test_a_map_described_in_other_words_of_its_own_position() -> None:
-    """Descriptors follow the content, not the coordinates; a shift by whole strides moves the centres."""
-    state, encoder = world(), random_encoder("geometric")
+    """Descriptors follow the content, not the coordinates; a shift by whole strides moves the
+    centres.
+    """
+    state = world()
+    encoder = random_encoder("geometric")
     a = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
     b = describe_map(state, LOW + np.array([800, -160, 24]), (12 - 16 + 24) * V, V, encoder, 8, 40)
     np.testing.assert_array_equal(a.descriptor, b.descriptor)
@@ -113,8 +141,11 @@ def test_a_map_described_in_other_words_of_its_own_position() -> None:
 
 
 def test_the_grid_is_that_of_the_map_wherever_the_content_starts() -> None:
-    """Positions are multiples of the stride from the map's corner, so that overlapping submaps describe the same places."""
-    state, encoder = world(), random_encoder("geometric")
+    """Positions are multiples of the stride from the map's corner, so that overlapping submaps
+    describe the same places.
+    """
+    state = world()
+    encoder = random_encoder("geometric")
     state[:5], state[:, :3] = 253, 253
     ground = (12 - 16) * V
     a = describe_map(state, LOW, ground, V, encoder, 8, 40)
@@ -127,7 +158,12 @@ def test_the_grid_is_that_of_the_map_wherever_the_content_starts() -> None:
 
 
 @pytest.mark.parametrize(
-    "state", [np.full((40, 40, 16), 254, np.uint8), np.full((16, 16, 16), 253, np.uint8), np.zeros((0, 0, 0), np.uint8)]
+    "state",
+    [
+        np.full((40, 40, 16), 254, np.uint8),
+        np.full((16, 16, 16), 253, np.uint8),
+        np.zeros((0, 0, 0), np.uint8),
+    ],
 )
 def test_maps_with_nothing_occupied(state: U8) -> None:
     found = describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 1)
@@ -138,7 +174,10 @@ def test_maps_with_nothing_occupied(state: U8) -> None:
 def test_a_single_voxel_and_a_small_map() -> None:
     state = np.full((16, 16, 16), 253, np.uint8)
     state[8, 8, 8] = 2
-    assert len(describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 2).centre) == 0
+    assert (
+        len(describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 2).centre)
+        == 0
+    )
     state[6:10, 6:10, 8:12] = 2
     found = describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 20)
     assert len(found.centre) > 0
@@ -163,17 +202,32 @@ def test_shapes_of_the_network() -> None:
     encoder = random_encoder("semantic")
     with torch.inference_mode():
         assert encoder(codes).shape == (2, 256, 1, 1)
-        assert encoder(torch.zeros((1, WIDE + 24, WIDE + 8, SIZE), dtype=torch.uint8)).shape == (1, 256, 4, 2)
+        assert encoder(torch.zeros((1, WIDE + 24, WIDE + 8, SIZE), dtype=torch.uint8)).shape == (
+            1,
+            256,
+            4,
+            2,
+        )
         assert Decoder("semantic")(torch.zeros(3, 256)).shape == (21, 8, 3, 16, 16, 16)
-        assert Completion("semantic").eval().complete(torch.zeros((2, 64, 64, 32), dtype=torch.uint8)).shape == (2, 21, 32, 32, 32)
-        logits, mu, log_variance = Completion("geometric").eval()(torch.zeros((2, 64, 64, 32), dtype=torch.uint8), None)
-    assert (logits.shape, mu.shape, log_variance.shape) == ((3, 8, 2, 16, 16, 16), (2, 256, 3, 3), (2, 256))
+        assert Completion("semantic").eval().complete(
+            torch.zeros((2, 64, 64, 32), dtype=torch.uint8)
+        ).shape == (2, 21, 32, 32, 32)
+        logits, mu, log_variance = Completion("geometric").eval()(
+            torch.zeros((2, 64, 64, 32), dtype=torch.uint8), None
+        )
+    assert (logits.shape, mu.shape, log_variance.shape) == (
+        (3, 8, 2, 16, 16, 16),
+        (2, 256, 3, 3),
+        (2, 256),
+    )
     parameters = sum(p.numel() for p in Completion("semantic").parameters())
     assert 0.5e6 < parameters < 3e6  # about one million, as in the paper
 
 
 def test_random_encoders_are_the_same_for_a_seed() -> None:
-    a, b, c = random_encoder("geometric", 1), random_encoder("geometric", 1), random_encoder("geometric", 2)
+    a = random_encoder("geometric", 1)
+    b = random_encoder("geometric", 1)
+    c = random_encoder("geometric", 2)
     assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
     assert not all(torch.equal(x, y) for x, y in zip(a.parameters(), c.parameters(), strict=True))
 
@@ -203,14 +257,19 @@ def test_weights_come_back_and_other_files_are_refused(tmp_path: Path) -> None:
 
 def test_the_encoder_turns_with_its_input() -> None:
     encoder = random_encoder("semantic", seed=4)
-    volume = torch.from_numpy(np.random.default_rng(5).integers(0, 21, (1, 64, 64, 32)).astype(np.uint8))
+    volume = torch.from_numpy(
+        np.random.default_rng(5).integers(0, 21, (1, 64, 64, 32)).astype(np.uint8)
+    )
     with torch.inference_mode():
         as_it_lies = encoder(volume)
         for turns in range(1, 4):
-            turned = torch.rot90(encoder(torch.rot90(volume, turns, (1, 2)).contiguous()), -turns, (2, 3))
+            turned = torch.rot90(
+                encoder(torch.rot90(volume, turns, (1, 2)).contiguous()), -turns, (2, 3)
+            )
             expected = quarter_turns(descriptors(as_it_lies).numpy(), turns)
             np.testing.assert_allclose(descriptors(turned).numpy(), expected, atol=1e-5)
-            assert np.abs(descriptors(as_it_lies).numpy() - expected).max() > 0.01  # a turn is no identity
+            # a turn is no identity
+            assert np.abs(descriptors(as_it_lies).numpy() - expected).max() > 0.01
 
 
 @pytest.mark.parametrize("yaw", [0.0, np.pi / 10, np.pi / 2, 4.0])
@@ -224,22 +283,29 @@ def test_centres_of_a_turned_map_are_those_of_the_map(yaw: float) -> None:
     assert len(away) >= 5
     assert np.abs(away).max() < 16 * np.sqrt(2) + 2
     assert np.abs(away.mean(0)).max() < 2.5
-    np.testing.assert_allclose(turned.from_map(turned.to_map(found.centre)[:, :2]), found.centre[:, :2], atol=1e-4)
+    np.testing.assert_allclose(
+        turned.from_map(turned.to_map(found.centre)[:, :2]), found.centre[:, :2], atol=1e-4
+    )
 
 
 def test_quarter_turns_of_the_query_meet_the_headings_of_the_map() -> None:
     """The descriptor of a query at yaw a + 90 degrees is that of the map at a, one quarter turned."""
-    encoder, state = random_encoder("geometric", seed=2), world()
+    encoder = random_encoder("geometric", seed=2)
+    state = world()
     turned = [turned_map(state, LOW, yaw) for yaw in (np.pi / 10, np.pi / 10 + np.pi / 2)]
     found = [describe_map(t.state, t.low, (12 - 16) * V, V, encoder, 8, 40) for t in turned]
     known, asked = (t.to_map(f.centre) for t, f in zip(turned, found, strict=True))
     i, j = np.nonzero(np.linalg.norm(known[:, None] - asked[None], axis=2) < 0.01)
     assert len(i) > 10
-    np.testing.assert_allclose(quarter_turns(found[1].descriptor[j], 1), found[0].descriptor[i], atol=0.05)
+    np.testing.assert_allclose(
+        quarter_turns(found[1].descriptor[j], 1), found[0].descriptor[i], atol=0.05
+    )
 
 
 def test_looking_up_cells_is_the_first_block() -> None:
-    """Sums of table rows, which describing uses, against embedding and matrix product, which training uses."""
+    """Sums of table rows, which describing uses, against embedding and matrix product, which
+    training uses.
+    """
     encoder = random_encoder("semantic", seed=3)
     codes = np.random.default_rng(1).integers(0, 22, (2, 12, 10, 8)).astype(np.uint8)
     codes[:, 4:] = 20  # nothing but unobserved voxels
@@ -247,4 +313,6 @@ def test_looking_up_cells_is_the_first_block() -> None:
     with torch.no_grad():
         first = encoder._layers()[0]
         expected = torch.relu(encoder.first_block(volume, *first))
-        np.testing.assert_allclose(encoder._looked_up(volume, *first).numpy(), expected.numpy(), atol=1e-6)
+        np.testing.assert_allclose(
+            encoder._looked_up(volume, *first).numpy(), expected.numpy(), atol=1e-6
+        )

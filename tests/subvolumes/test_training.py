@@ -20,7 +20,14 @@ from semloc_logs.training import network_training
 from semloc_logs.training.batches import batches
 from semloc_logs.training.completion_scores import completion_scores
 from semloc_logs.training.network_training import Progress, _seen, targets, train
-from semloc_logs.training.pairs import BROAD, SceneFrame, cut_pairs, occupied, read_shard, write_shard
+from semloc_logs.training.pairs import (
+    BROAD,
+    SceneFrame,
+    cut_pairs,
+    occupied,
+    read_shard,
+    write_shard,
+)
 from semloc_logs.training.schedule import learning_rate, scene_window
 
 U8 = NDArray[np.uint8]
@@ -32,7 +39,9 @@ def pair(rng: np.random.Generator) -> Pair:
     whole = np.full((BROAD, BROAD, SIZE), 254, np.uint8)
     whole[:, :, 4] = 0
     for _ in range(10):
-        x, y, h = rng.integers(0, BROAD - 8), rng.integers(0, BROAD - 8), rng.integers(6, 30)
+        x = rng.integers(0, BROAD - 8)
+        y = rng.integers(0, BROAD - 8)
+        h = rng.integers(6, 30)
         whole[x : x + 6, y : y + 6, 5:h] = rng.choice([2, 8])
     part = whole.copy()
     part[rng.random(part.shape) < 0.5] = 253
@@ -41,7 +50,8 @@ def pair(rng: np.random.Generator) -> Pair:
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    folder, rng = tmp_path_factory.mktemp("shards"), np.random.default_rng(0)
+    folder = tmp_path_factory.mktemp("shards")
+    rng = np.random.default_rng(0)
     paths = [folder / "a.parquet", folder / "b.parquet", folder / "empty.parquet"]
     for path, n in zip(paths, (5, 3, 0), strict=True):
         write_shard(path, [pair(rng) for _ in range(n)])
@@ -66,13 +76,18 @@ def test_the_three_views_of_a_batch_belong_together(tmp_path: Path) -> None:
         paths.append(tmp_path / f"{s}")
         rows = []
         for n in range(6):
-            views = [np.full(shape, 10 * s + n, np.uint8) for shape in ((BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE), (BROAD, BROAD, SIZE))]
+            views = [
+                np.full(shape, 10 * s + n, np.uint8)
+                for shape in ((BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE), (BROAD, BROAD, SIZE))
+            ]
             for view in views:
-                view[0, : len(view) // 2, 0] = 200  # half an edge: no quarter turn and no mirror image looks alike
+                # half an edge: no quarter turn and no mirror image looks alike
+                view[0, : len(view) // 2, 0] = 200
             rows.append((views[0], views[1], views[2]))
         write_shard(paths[-1], rows)
     settings = Training(batch=5, dropout=0.1)
-    turns, scenes = set(), set()
+    turns = set()
+    scenes = set()
     for batch in batches(paths, settings, 0, 40):
         a, b, c = (np.asarray(view) for view in batch)
         assert a.shape == (5, BROAD, BROAD, SIZE)
@@ -82,10 +97,18 @@ def test_the_three_views_of_a_batch_belong_together(tmp_path: Path) -> None:
             assert int(c[n, 9, 9, 9]) == value
             assert set(np.unique(a[n]).tolist()) == {value, 200, 253}
             marks = [
-                frozenset(map(tuple, (np.argwhere(view[n, :, :, 0] == 200) * 64 // len(view[n]) // 32).tolist())) for view in (a, b, c)
+                frozenset(
+                    map(
+                        tuple,
+                        (np.argwhere(view[n, :, :, 0] == 200) * 64 // len(view[n]) // 32).tolist(),
+                    )
+                )
+                for view in (a, b, c)
             ]
             assert marks[0] == marks[1] == marks[2]
-            turns.add(marks[0] | {(len(np.unique(np.argwhere(c[n, :, :, 0] == 200)[:, 0])) > 1, -1)})
+            turns.add(
+                marks[0] | {(len(np.unique(np.argwhere(c[n, :, :, 0] == 200)[:, 0])) > 1, -1)}
+            )
             scenes.add(value // 10)
         assert 0.05 < (a == 253).mean() < 0.15
         assert not (b == 253).any()
@@ -122,7 +145,9 @@ def short(steps: int, **more: float) -> Training:
     return Training.model_validate({"batch": 2, "samples": max(32, steps * 18), **more})
 
 
-def test_the_loss_goes_down(shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_loss_goes_down(
+    shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(network_training, "RATE", 0.1)  # of a warm-up over fifty steps
     seen: list[Progress] = []
     model = train("geometric", shards[:1], short(12), tmp_path / "checkpoint", seen.append)
@@ -132,7 +157,14 @@ def test_the_loss_goes_down(shards: list[Path], tmp_path: Path, monkeypatch: pyt
     assert all(np.isfinite([p.loss, p.contrastive, p.matched]).all() for p in seen)
     assert model is not None
     scores = completion_scores(model, tuple(a[:2] for a in read_shard(shards[0])))  # type: ignore[arg-type]
-    assert set(scores) == {"accuracy", "all_free", "copy_input", "unobserved_accuracy", "iou", "recall5"}
+    assert set(scores) == {
+        "accuracy",
+        "all_free",
+        "copy_input",
+        "unobserved_accuracy",
+        "iou",
+        "recall5",
+    }
     assert all(0 <= v <= 1 for v in scores.values())
     assert scores["all_free"] > 0.5
     assert scores["recall5"] == 1  # two of two are among the five nearest
@@ -142,7 +174,9 @@ class _Stop(Exception):
     pass
 
 
-def test_a_training_that_was_stopped_ends_where_an_unbroken_one_does(shards: list[Path], tmp_path: Path) -> None:
+def test_a_training_that_was_stopped_ends_where_an_unbroken_one_does(
+    shards: list[Path], tmp_path: Path
+) -> None:
     settings = short(4)
     whole = train("geometric", shards, settings, tmp_path / "whole")
 
@@ -171,14 +205,29 @@ def test_a_training_that_was_stopped_ends_where_an_unbroken_one_does(shards: lis
 
 
 def test_a_training_stops_in_time_and_leaves_snapshots(shards: list[Path], tmp_path: Path) -> None:
-    settings, checkpoint = short(4), tmp_path / "checkpoint"
+    settings = short(4)
+    checkpoint = tmp_path / "checkpoint"
     seen: list[Progress] = []
     for steps in (1, 2, 3):  # a deadline that is over allows one step each time
-        assert train("geometric", shards, settings, checkpoint, seen.append, deadline=0.0, snapshots=tmp_path) is None
+        assert (
+            train(
+                "geometric",
+                shards,
+                settings,
+                checkpoint,
+                seen.append,
+                deadline=0.0,
+                snapshots=tmp_path,
+            )
+            is None
+        )
         assert [p.samples for p in seen] == [18 * (i + 1) for i in range(steps)]
     assert train("geometric", shards, settings, checkpoint, seen.append, deadline=0.0) is not None
     assert len(seen) == 4
-    assert sorted(p.name for p in tmp_path.glob("geometric-*")) == ["geometric-000000018.safetensors", "geometric-000000036.safetensors"]
+    assert sorted(p.name for p in tmp_path.glob("geometric-*")) == [
+        "geometric-000000018.safetensors",
+        "geometric-000000036.safetensors",
+    ]
     assert load_encoder("geometric", tmp_path / "geometric-000000036.safetensors").latent == 256
 
 
@@ -192,7 +241,9 @@ def test_scenes_come_into_use_and_leave_again() -> None:
 
 
 def test_scenes_are_used_as_they_come(shards: list[Path]) -> None:
-    """A pool of 12 x 32 pairs, 3456 samples, begins with the first 12 scenes; one more is in use after 4000 samples."""
+    """A pool of 12 x 32 pairs, 3456 samples, begins with the first 12 scenes; one more is in use
+    after 4000 samples.
+    """
     read: list[int] = []
 
     class Scenes(Sequence[Path]):
@@ -217,13 +268,17 @@ def test_scenes_are_used_as_they_come(shards: list[Path]) -> None:
     assert sorted(read) == sorted(longer)  # whatever the length of the training
     read.clear()
     list(batches(Scenes(), Training(batch=48), 0, 1))
-    assert sorted(set(read[:48])) == list(range(12))  # a batch of more pairs takes several parts of each scene
+    # a batch of more pairs takes several parts of each scene
+    assert sorted(set(read[:48])) == list(range(12))
     assert len(read) >= 48
 
 
-def test_a_scene_that_comes_too_late_ends_the_training_in_time(shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_that_comes_too_late_ends_the_training_in_time(
+    shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("semloc_logs.training.batches.PATIENCE", 0.2)
-    late, begun = threading.Event(), time.monotonic()
+    late = threading.Event()
+    begun = time.monotonic()
 
     class Scenes(Sequence[Path]):
         def __len__(self) -> int:
@@ -234,7 +289,12 @@ def test_a_scene_that_comes_too_late_ends_the_training_in_time(shards: list[Path
             return shards[index]
 
     try:
-        assert train("geometric", Scenes(), short(4), tmp_path / "checkpoint", deadline=time.monotonic()) is None
+        assert (
+            train(
+                "geometric", Scenes(), short(4), tmp_path / "checkpoint", deadline=time.monotonic()
+            )
+            is None
+        )
     finally:
         late.set()
     assert time.monotonic() - begun < 10
@@ -251,7 +311,8 @@ def test_the_rate_rises_stays_and_falls() -> None:
 
 
 def test_a_training_can_be_made_longer_from_its_plateau(shards: list[Path], tmp_path: Path) -> None:
-    short_run, long_run = tmp_path / "short", tmp_path / "long"
+    short_run = tmp_path / "short"
+    long_run = tmp_path / "long"
     train("geometric", shards, short(4), short_run)
     whole = train("geometric", shards, short(8), long_run)
     with pytest.raises(WorkspaceError, match="settings"):
@@ -277,16 +338,24 @@ def test_a_batch_without_anything_to_describe_keeps_the_weights_finite(tmp_path:
     bare = np.full((BROAD, BROAD, SIZE), 254, np.uint8)
     bare[32, 32, :3] = 2
     write_shard(tmp_path / "shard", [(bare, bare[16:-16, 16:-16], bare)])
-    model = train("geometric", [tmp_path / "shard"], short(1), tmp_path / "checkpoint", save_every=1)
+    model = train(
+        "geometric", [tmp_path / "shard"], short(1), tmp_path / "checkpoint", save_every=1
+    )
     assert model is not None
     assert all(torch.isfinite(p).all() for p in model.parameters())
 
 
 def test_pairs_are_cut_from_the_same_place() -> None:
-    """A street of two fronts, driven along; the incomplete view never shows what the complete one does not know."""
+    """A street of two fronts, driven along; the incomplete view never shows what the complete one
+    does not know.
+    """
     rng = np.random.default_rng(0)
     fusion = Settings().resolved().fusion
-    front = np.c_[rng.uniform(-10, 10, 6000), rng.choice([-5.0, 5.0], 6000) + rng.normal(0, 0.02, 6000), rng.uniform(0, 5, 6000)]
+    front = np.c_[
+        rng.uniform(-10, 10, 6000),
+        rng.choice([-5.0, 5.0], 6000) + rng.normal(0, 0.02, 6000),
+        rng.uniform(0, 5, 6000),
+    ]
     road = np.c_[rng.uniform(-10, 10, 4000), rng.uniform(-5, 5, 4000), rng.normal(0, 0.02, 4000)]
     world = np.concatenate([front, road]).astype(np.float32)
     label = np.r_[np.full(6000, 2), np.full(4000, 0)].astype(np.uint8)
@@ -295,19 +364,35 @@ def test_pairs_are_cut_from_the_same_place() -> None:
         T = np.eye(4)
         T[:3, 3] = x, 0, 1.7
         some = rng.random(len(world)) < 0.4
-        frames.append(SceneFrame(world[some] - np.array([x, 0, 1.7], np.float32), np.zeros(3, np.float32), label[some], T))
+        frames.append(
+            SceneFrame(
+                world[some] - np.array([x, 0, 1.7], np.float32),
+                np.zeros(3, np.float32),
+                label[some],
+                T,
+            )
+        )
     settings = Training(shift=0.0, turn=0.0, tilt=0.0)
     pairs = cut_pairs(frames, fusion, settings, np.random.default_rng(1))
     assert len(pairs) > 10
     for part, whole, other in pairs:
-        assert (part.shape, whole.shape, other.shape) == ((BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE), (BROAD, BROAD, SIZE))
-        np.testing.assert_array_equal(other[16:-16, 16:-16], whole)  # without shift and turn the same view
+        assert (part.shape, whole.shape, other.shape) == (
+            (BROAD, BROAD, SIZE),
+            (SIZE, SIZE, SIZE),
+            (BROAD, BROAD, SIZE),
+        )
+        # without shift and turn the same view
+        np.testing.assert_array_equal(other[16:-16, 16:-16], whole)
         middle = part[16:-16, 16:-16]
         assert occupied(middle).sum() >= 40
         both = occupied(middle) & (whole != 253)
         assert (occupied(middle) & (whole == 253)).sum() == 0
         assert (middle[both] == whole[both]).mean() > 0.9
     again = cut_pairs(frames, fusion, settings, np.random.default_rng(1))
-    assert all(np.array_equal(a, b) for x, y in zip(pairs, again, strict=True) for a, b in zip(x, y, strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for x, y in zip(pairs, again, strict=True)
+        for a, b in zip(x, y, strict=True)
+    )
     moved = cut_pairs(frames, fusion, Training(), np.random.default_rng(1))
     assert any(not np.array_equal(o[16:-16, 16:-16], w) for _, w, o in moved)

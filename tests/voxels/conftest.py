@@ -19,24 +19,44 @@ def walk_rays(
     blocks: tuple[int, int, int] = (1, 1, 1),
     guard: int = 0,
 ) -> NDArray[np.uint8]:
-    """Marks (x, y, z) of rays in voxels: 0 nothing, 1 passed, 2 hit. ``guard`` bytes around the grid have to stay untouched."""
+    """Marks (x, y, z) of rays in voxels: 0 nothing, 1 passed, 2 hit. ``guard`` bytes around the
+    grid have to stay untouched.
+    """
     count = int(np.prod(blocks)) << 12
     room = np.zeros(count + 2 * guard, np.uint8)
-    marks, touched = room[guard : guard + count], np.zeros(count >> 12, np.uint8)
+    marks = room[guard : guard + count]
+    touched = np.zeros(count >> 12, np.uint8)
     tables = addresses(blocks)
     nothing = np.zeros(0, np.float32)
     for end, is_hit in zip(ends, hit, strict=True):
         # a limit of almost the length makes it a ray that ends at its end and does not hit
         limit = 1e9 if is_hit else float(np.linalg.norm(end - origin)) * (1 - 1e-15)
-        votes, label = np.zeros((1, CLASSES), np.uint32), np.zeros(1, np.uint8)
+        votes = np.zeros((1, CLASSES), np.uint32)
+        label = np.zeros(1, np.uint8)
         rays, length, low, high = to_rays(end[None], np.eye(4), origin, 1.0, limit)
         assert (low <= np.minimum(origin, origin + rays[0])).all()
         assert (high >= np.maximum(origin, origin + rays[0])).all()
-        _, carved = mark_ends(marks, touched, tables, rays, length, label, nothing, np.zeros(256, bool), origin, limit, votes)
+        _, carved = mark_ends(
+            marks,
+            touched,
+            tables,
+            rays,
+            length,
+            label,
+            nothing,
+            np.zeros(256, bool),
+            origin,
+            limit,
+            votes,
+        )
         carve(marks, touched, tables, origin, carved)
     assert not room[:guard].any()
     assert not room[guard + count :].any()
-    dense = marks.reshape(*blocks, BLOCK, BLOCK, BLOCK).transpose(0, 3, 1, 4, 2, 5).reshape(np.array(blocks) * BLOCK)
+    dense = (
+        marks.reshape(*blocks, BLOCK, BLOCK, BLOCK)
+        .transpose(0, 3, 1, 4, 2, 5)
+        .reshape(np.array(blocks) * BLOCK)
+    )
     assert set(np.flatnonzero(touched)) == set(np.flatnonzero(marks.reshape(-1, 4096).any(1)))
     return np.where(dense > 1, 2, dense).astype(np.uint8)
 

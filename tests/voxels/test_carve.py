@@ -9,7 +9,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.voxels.carve import CLASSES, add_votes, addresses, flush, mark_ends, rehash, to_rays
+from semloc_logs.voxels.carve import (
+    CLASSES,
+    add_votes,
+    addresses,
+    flush,
+    mark_ends,
+    rehash,
+    to_rays,
+)
 
 EDGE = 16
 FREE, HIT = 1, 2
@@ -19,16 +27,21 @@ Walk = Callable[..., NDArray[np.uint8]]
 
 
 def crossed(origin: F64, end: F64) -> tuple[set[tuple[int, ...]], set[tuple[int, ...]]]:
-    """Cells that the segment certainly passes (their inside, by a margin) and cells that it may touch, from its crossings of all planes."""
+    """Cells that the segment certainly passes (their inside, by a margin) and cells that it may
+    touch, from its crossings of all planes.
+    """
     d = end - origin
     times = {0.0, 1.0}
     for k in range(3):
         if d[k]:
             times |= {
-                float((plane - origin[k]) / d[k]) for plane in range(EDGE + 1) if min(origin[k], end[k]) < plane < max(origin[k], end[k])
+                float((plane - origin[k]) / d[k])
+                for plane in range(EDGE + 1)
+                if min(origin[k], end[k]) < plane < max(origin[k], end[k])
             }
     ordered = sorted(times)
-    sure, maybe = set(), set()
+    sure = set()
+    maybe = set()
     for a, b in itertools.pairwise(ordered):
         middle = origin + d * (a + b) / 2
         cell = tuple(np.floor(middle).astype(int).tolist())
@@ -53,7 +66,8 @@ def check(walk: Walk, origin: F64, end: F64) -> None:
     sure, maybe = crossed(origin, end)
     assert sure <= cells, "a crossed cell is missing"
     assert cells <= maybe | {last}, "a cell beside the ray is marked"
-    # from the start to the end in steps of one face: as many cells as the Manhattan distance, plus the first
+    # from the start to the end in steps of one face: as many cells as the Manhattan distance, plus
+    # the first
     assert len(cells) == 1 + sum(abs(np.floor(end) - np.floor(origin)))
 
 
@@ -63,15 +77,21 @@ place = st.tuples(*[inside | on_border] * 3)
 
 
 @given(origin=place, end=place)
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_ray_marks_the_cells_that_it_crosses(walk: Walk, origin: tuple[float, ...], end: tuple[float, ...]) -> None:
+@settings(
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+def test_a_ray_marks_the_cells_that_it_crosses(
+    walk: Walk, origin: tuple[float, ...], end: tuple[float, ...]
+) -> None:
     check(walk, np.array(origin), np.array(end))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("towards", [1, -1])
 @pytest.mark.parametrize("offset", [0.5, 0.0])
-def test_rays_along_an_axis_inside_cells_and_on_their_borders(walk: Walk, axis: int, towards: int, offset: float) -> None:
+def test_rays_along_an_axis_inside_cells_and_on_their_borders(
+    walk: Walk, axis: int, towards: int, offset: float
+) -> None:
     origin = np.full(3, 5.0 + offset)
     end = origin.copy()
     end[axis] += 4.0 * towards
@@ -82,9 +102,16 @@ def test_rays_along_an_axis_inside_cells_and_on_their_borders(walk: Walk, axis: 
     assert (np.delete(cells, axis, 1) == 5).all()
 
 
-@pytest.mark.parametrize(("x", "y", "last"), [(0.4045518398215282, 0.23064220899374743, 9), (0.5198330743342318, 0.3527434156964051, 8)])
-def test_rounding_does_not_carry_a_ray_past_its_last_cell(walk: Walk, x: float, y: float, last: int) -> None:
-    """The end lies just before a border in x and on one in y, whose crossing times add up to a little more than one."""
+@pytest.mark.parametrize(
+    ("x", "y", "last"),
+    [(0.4045518398215282, 0.23064220899374743, 9), (0.5198330743342318, 0.3527434156964051, 8)],
+)
+def test_rounding_does_not_carry_a_ray_past_its_last_cell(
+    walk: Walk, x: float, y: float, last: int
+) -> None:
+    """The end lies just before a border in x and on one in y, whose crossing times add up to a
+    little more than one.
+    """
     grid = walk(np.array([x, y, 0.5]), np.array([[np.nextafter(1, 0), float(last), 0.5]]), [True])
     assert np.argwhere(grid).tolist() == [[0, j, 0] for j in range(last + 1)]
 
@@ -108,9 +135,15 @@ def test_a_ray_beyond_the_limit_passes_and_does_not_hit(walk: Walk) -> None:
 
 
 @given(rays=st.lists(st.tuples(place, st.booleans()), min_size=1, max_size=20), origin=place)
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_nothing_is_written_outside_the_grid(walk: Walk, rays: list[tuple[tuple[float, ...], bool]], origin: tuple[float, ...]) -> None:
-    assert walk(np.array(origin), np.array([r[0] for r in rays]), [r[1] for r in rays], guard=8192).any()
+@settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+def test_nothing_is_written_outside_the_grid(
+    walk: Walk, rays: list[tuple[tuple[float, ...], bool]], origin: tuple[float, ...]
+) -> None:
+    assert walk(
+        np.array(origin), np.array([r[0] for r in rays]), [r[1] for r in rays], guard=8192
+    ).any()
 
 
 def test_addresses_are_block_by_block() -> None:
@@ -128,13 +161,32 @@ def test_addresses_are_block_by_block() -> None:
 
 @pytest.mark.parametrize(
     ("sigma", "weight", "carved_to"),
-    [(0.0, 16, 10.5), (0.5, 16, 10.5), (1.0, 8, 8.5), (2.0, 4, 6.5), (100.0, 1, 0.5)],  # voxels are 1 m: 2 sigma are 1, 2, 4, 200
+    # voxels are 1 m: 2 sigma are 1, 2, 4, 200
+    [(0.0, 16, 10.5), (0.5, 16, 10.5), (1.0, 8, 8.5), (2.0, 4, 6.5), (100.0, 1, 0.5)],
 )
-def test_an_uncertain_range_hits_less_and_carves_less(sigma: float, weight: int, carved_to: float) -> None:
-    marks, touched, votes = np.zeros(4096, np.uint8), np.zeros(1, np.uint8), np.zeros((1, CLASSES), np.uint32)
-    start, label, spread = np.full(3, 0.5), np.array([8], np.uint8), np.array([sigma], np.float32)
+def test_an_uncertain_range_hits_less_and_carves_less(
+    sigma: float, weight: int, carved_to: float
+) -> None:
+    marks = np.zeros(4096, np.uint8)
+    touched = np.zeros(1, np.uint8)
+    votes = np.zeros((1, CLASSES), np.uint32)
+    start = np.full(3, 0.5)
+    label = np.array([8], np.uint8)
+    spread = np.array([sigma], np.float32)
     ray, length, _, _ = to_rays(np.array([[10.5, 0.5, 0.5]]), np.eye(4), start, 1.0, 50.0)
-    ends, rays = mark_ends(marks, touched, addresses((1, 1, 1)), ray, length, label, spread, NOT_LEVEL, start, 50.0, votes)
+    ends, rays = mark_ends(
+        marks,
+        touched,
+        addresses((1, 1, 1)),
+        ray,
+        length,
+        label,
+        spread,
+        NOT_LEVEL,
+        start,
+        50.0,
+        votes,
+    )
     assert ends.tolist() == [2 * 2560 + 1]  # voxel (10, 0, 0), a hit
     assert marks[2560] == weight << 1
     assert votes[0, 8] == weight
@@ -143,7 +195,13 @@ def test_an_uncertain_range_hits_less_and_carves_less(sigma: float, weight: int,
 
 def test_flush_by_hand() -> None:
     marks = np.zeros(6 * 4096, np.uint8)
-    marks[0], marks[5 * 4096 + 4095], marks[5 * 4096 + 4094], marks[7], marks[8] = 1, 16 << 1 | 1, 1, 4 << 1, 1 << 1
+    marks[0], marks[5 * 4096 + 4095], marks[5 * 4096 + 4094], marks[7], marks[8] = (
+        1,
+        16 << 1 | 1,
+        1,
+        4 << 1,
+        1 << 1,
+    )
     log_odds = np.full((3, 4096), -128, np.int8)
     log_odds[2, 0], log_odds[0, 4095] = -35, 60
     flush(marks, np.array([0, 5]), np.array([2, 0]), log_odds, 17, 8, -40, 70)
@@ -155,10 +213,18 @@ def test_flush_by_hand() -> None:
     np.testing.assert_array_equal(log_odds, expected)
 
 
-@given(st.lists(st.tuples(st.integers(0, 40), st.integers(0, CLASSES - 1), st.integers(1, 70)), min_size=1, max_size=60))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 40), st.integers(0, CLASSES - 1), st.integers(1, 70)),
+        min_size=1,
+        max_size=60,
+    )
+)
 @settings(max_examples=50, deadline=None)
 def test_votes_are_what_a_dictionary_says(frames: list[tuple[int, int, int]]) -> None:
-    keys, counts, used = np.full(64, -1, np.int64), np.zeros(64, np.uint32), 0
+    keys = np.full(64, -1, np.int64)
+    counts = np.zeros(64, np.uint32)
+    used = 0
     expected: dict[int, int] = {}
     for cell, label, weight in frames:
         votes = np.zeros((1, CLASSES), np.uint32)
@@ -167,8 +233,11 @@ def test_votes_are_what_a_dictionary_says(frames: list[tuple[int, int, int]]) ->
         key = (3 * 4096 + cell) * 32 + label
         expected[key] = expected.get(key, 0) + -(-weight // 16)
         if used > 32:  # what the fuser does when the table is half full
-            old_keys, old_counts, size = keys, counts, 4 * len(keys)
-            keys, counts = np.full(size, -1, np.int64), np.zeros(size, np.uint32)
+            old_keys = keys
+            old_counts = counts
+            size = 4 * len(keys)
+            keys = np.full(size, -1, np.int64)
+            counts = np.zeros(size, np.uint32)
             rehash(old_keys, old_counts, keys, counts)
     filled = keys >= 0
     assert dict(zip(keys[filled].tolist(), counts[filled].tolist(), strict=True)) == expected

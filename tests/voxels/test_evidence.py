@@ -1,4 +1,6 @@
-"""Evidence of submaps against a dictionary of voxels; any split and any order of the submaps gives the same map."""
+"""Evidence of submaps against a dictionary of voxels; any split and any order of the submaps gives
+the same map.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,14 @@ Odds = dict[tuple[int, int, int], int]
 Votes = Counter[tuple[int, int, int, int]]
 Rows = tuple[Odds, Votes]
 
-voxels = st.tuples(*[st.integers(-2, 1).map(lambda i: i * 9)] * 3)  # eight blocks, voxels at both ends of each
+# eight blocks, voxels at both ends of each
+voxels = st.tuples(*[st.integers(-2, 1).map(lambda i: i * 9)] * 3)
 rows = st.tuples(
     st.dictionaries(voxels, st.integers(-40, 70), max_size=12),
     st.dictionaries(
-        st.tuples(*[st.integers(-2, 1).map(lambda i: i * 9)] * 3, st.sampled_from([0, 2, 8, 255])), st.integers(1, 300), max_size=12
+        st.tuples(*[st.integers(-2, 1).map(lambda i: i * 9)] * 3, st.sampled_from([0, 2, 8, 255])),
+        st.integers(1, 300),
+        max_size=12,
     ),
 ).map(lambda r: (r[0], Counter(r[1])))
 
@@ -32,11 +37,20 @@ def as_evidence(part: Rows) -> Evidence:
     odds, votes = part
     every = {v[:3] for v in (*odds, *votes)}
     keys = np.unique(pack(np.array([[i // 16 for i in v] for v in every]).reshape(-1, 3)))
-    place = {v: (int(np.searchsorted(keys, pack(np.array(v) // 16))), (v[0] % 16 * 16 + v[1] % 16) * 16 + v[2] % 16) for v in every}
+    place = {
+        v: (
+            int(np.searchsorted(keys, pack(np.array(v) // 16))),
+            (v[0] % 16 * 16 + v[1] % 16) * 16 + v[2] % 16,
+        )
+        for v in every
+    }
     log_odds = np.zeros((len(keys), CELLS), np.int32)
     for v, value in odds.items():
         log_odds[place[v]] = value
-    ballots = sorted(((place[(x, y, z)][0] * CELLS + place[(x, y, z)][1]) * CLASSES + c, n) for (x, y, z, c), n in votes.items())
+    ballots = sorted(
+        ((place[(x, y, z)][0] * CELLS + place[(x, y, z)][1]) * CLASSES + c, n)
+        for (x, y, z, c), n in votes.items()
+    )
     table = np.array(ballots, np.int64).reshape(-1, 2)
     return Evidence(keys, log_odds, table[:, 0], table[:, 1])
 
@@ -60,11 +74,16 @@ def reference(parts: list[Rows]) -> list[tuple[list[int], int, int, int]]:
 
 def resolved(found: Evidence) -> list[tuple[list[int], int, int, int]]:
     v = resolve(found, LOW, HIGH)
-    return list(zip(v.ijk.tolist(), v.label.tolist(), v.log_odds.tolist(), v.hits.tolist(), strict=True))
+    return list(
+        zip(v.ijk.tolist(), v.label.tolist(), v.log_odds.tolist(), v.hits.tolist(), strict=True)
+    )
 
 
 def same(a: Evidence, b: Evidence) -> bool:
-    return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("keys", "log_odds", "ballots", "votes"))
+    return all(
+        np.array_equal(getattr(a, n), getattr(b, n))
+        for n in ("keys", "log_odds", "ballots", "votes")
+    )
 
 
 @given(st.lists(rows, min_size=1, max_size=5), st.randoms(use_true_random=False))
@@ -81,15 +100,20 @@ def test_merging_is_the_sum_in_any_order_and_grouping(parts: list[Rows], random:
 
 
 def submap(free: list[int], occupied: dict[int, tuple[int, int, int]]) -> BlockMap:
-    """One block at the origin: cells that are free (log-odds -8), and cells with (class, log-odds, votes)."""
-    log_odds, state = np.full((1, CELLS), UNOBSERVED, np.int8), np.full((1, CELLS), UNOBSERVED_STATE, np.uint8)
+    """One block at the origin: cells that are free (log-odds -8), and cells with (class, log-odds,
+    votes).
+    """
+    log_odds = np.full((1, CELLS), UNOBSERVED, np.int8)
+    state = np.full((1, CELLS), UNOBSERVED_STATE, np.uint8)
     log_odds[0, free], state[0, free] = -8, FREE_STATE
     ballots = {}
     for cell, (label, odds, votes) in occupied.items():
         log_odds[0, cell], state[0, cell] = odds, label
         ballots[cell * 256 + label] = votes
     counted = np.array(sorted(ballots.items()), np.int64).reshape(-1, 2)
-    return BlockMap(np.array([pack(np.zeros(3, int))]), log_odds, state, counted[:, 0], counted[:, 1])
+    return BlockMap(
+        np.array([pack(np.zeros(3, int))]), log_odds, state, counted[:, 0], counted[:, 1]
+    )
 
 
 def test_free_in_one_submap_counts_against_occupied_in_another(tmp_path: Path) -> None:
@@ -99,8 +123,13 @@ def test_free_in_one_submap_counts_against_occupied_in_another(tmp_path: Path) -
     tiles.add(a)
     tiles.add(b)
     assert tiles.names() == {(0, 0)}
-    # 7 - 8 is free; 70 - 8; two classes, of which 8 has more votes; a known class beats any number of unlabelled votes
-    assert resolved(tiles.take((0, 0))) == [([0, 0, 1], 2, 62, 9), ([0, 0, 2], 8, 20, 9), ([0, 0, 3], 8, 20, 51)]
+    # 7 - 8 is free; 70 - 8; two classes, of which 8 has more votes; a known class beats any number
+    # of unlabelled votes
+    assert resolved(tiles.take((0, 0))) == [
+        ([0, 0, 1], 2, 62, 9),
+        ([0, 0, 2], 8, 20, 9),
+        ([0, 0, 3], 8, 20, 51),
+    ]
 
 
 def test_tiles_go_to_disk_and_come_back_and_do_not_grow(tmp_path: Path) -> None:
@@ -112,9 +141,13 @@ def test_tiles_go_to_disk_and_come_back_and_do_not_grow(tmp_path: Path) -> None:
         log_odds = rng.integers(-40, 70, (3, CELLS)).astype(np.int8)
         state = np.where(log_odds > 0, rng.integers(0, 19, (3, CELLS)), FREE_STATE).astype(np.uint8)
         voxel = np.flatnonzero(log_odds > 0)
-        return BlockMap(keys, log_odds, state, voxel * 256 + state.reshape(-1)[voxel], np.full(len(voxel), 3))
+        return BlockMap(
+            keys, log_odds, state, voxel * 256 + state.reshape(-1)[voxel], np.full(len(voxel), 3)
+        )
 
-    tiles, sizes, every = Tiles(tmp_path, 256), [], []
+    tiles = Tiles(tmp_path, 256)
+    sizes = []
+    every = []
     for _ in range(8):
         for x in (0, -1, 4):
             every.append((x, seen(x)))
@@ -122,7 +155,8 @@ def test_tiles_go_to_disk_and_come_back_and_do_not_grow(tmp_path: Path) -> None:
         assert len(tiles._open) == 1
         sizes.append(sum(p.stat().st_size for p in tmp_path.iterdir()))
     assert tiles.names() == {(0, 0), (-1, 0), (4, 0)}
-    assert sizes[-1] < 2.5 * sizes[1]  # classes are random here, so each round may add votes of a new one until all 19 have some
+    # classes are random here, so each round may add votes of a new one until all 19 have some
+    assert sizes[-1] < 2.5 * sizes[1]
     for x in (0, -1, 4):
         parts = [part for at, blocks in every if at == x for _, part in evidence(blocks, 256)]
         assert same(tiles.take((x, 0)), reduce(merge, parts))

@@ -15,7 +15,12 @@ from semloc_logs.voxels.store import Keyframe
 FUSION = Settings(fusion=Fusion(voxel_size=0.5, max_range=6.0)).resolved().fusion
 N = 9
 RNG = np.random.default_rng(0)
-KEYFRAMES = [Keyframe(RNG.uniform(-5, 5, (40, 3)).astype(np.float32), RNG.integers(0, 19, 40).astype(np.uint8)) for _ in range(N)]
+KEYFRAMES = [
+    Keyframe(
+        RNG.uniform(-5, 5, (40, 3)).astype(np.float32), RNG.integers(0, 19, 40).astype(np.uint8)
+    )
+    for _ in range(N)
+]
 POSES = np.tile(np.eye(4), (N, 1, 1))
 POSES[:, 0, 3] = np.arange(N)
 ORIGINS = [np.array([0.1, 0.2, 0.3], np.float32)] * N

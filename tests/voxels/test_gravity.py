@@ -24,15 +24,21 @@ SHARED = Path(__file__).resolve().parents[3] / "shared"
 def noisy(rng: np.random.Generator, direction: F64, n: int, degrees: float) -> F64:
     """Unit normals scattered around a direction, of random sign."""
     v = direction + rng.normal(0, np.radians(degrees), (n, 3))
-    return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True) * rng.choice([-1.0, 1.0], (n, 1)))
+    return np.asarray(
+        v / np.linalg.norm(v, axis=1, keepdims=True) * rng.choice([-1.0, 1.0], (n, 1))
+    )
 
 
 def degrees_between(a: F64, b: F64) -> float:
     return math.degrees(math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b)))
 
 
-def scene(seed: int, floor: int = 4000, walls: int = 6000, slanted: int = 1500, clutter: int = 3000) -> F64:
-    """Normals in a level frame: a floor, walls in two directions, a roof of 35 degrees, clutter everywhere."""
+def scene(
+    seed: int, floor: int = 4000, walls: int = 6000, slanted: int = 1500, clutter: int = 3000
+) -> F64:
+    """Normals in a level frame: a floor, walls in two directions, a roof of 35 degrees, clutter
+    everywhere.
+    """
     rng = np.random.default_rng(seed)
     roof = np.array([0.0, math.sin(math.radians(35)), math.cos(math.radians(35))])
     parts = [
@@ -90,20 +96,34 @@ def test_ground_height(scale: float) -> None:
     below = np.c_[rng.uniform(-20, 20, (40, 2)), rng.uniform(-4, -2, 40)]
     far = np.c_[rng.uniform(30, 40, (9000, 2)), np.full(9000, -3.0)]  # down the hill
     points = scale * np.concatenate([ground, house, below, far])
-    assert ground_height(points, np.zeros(3), scale) == pytest.approx(-1.73 * scale, abs=0.02 * scale)
+    assert ground_height(points, np.zeros(3), scale) == pytest.approx(
+        -1.73 * scale, abs=0.02 * scale
+    )
     there = np.array([40.0, -3.0, 7.0])
-    assert ground_height(points + there, there, scale) == pytest.approx(7 - 1.73 * scale, abs=0.02 * scale)
-    assert ground_height(np.zeros((0, 3)), np.array([0, 0, 2.0]), scale) == pytest.approx(2 - 1.7 * scale)
+    assert ground_height(points + there, there, scale) == pytest.approx(
+        7 - 1.73 * scale, abs=0.02 * scale
+    )
+    assert ground_height(np.zeros((0, 3)), np.array([0, 0, 2.0]), scale) == pytest.approx(
+        2 - 1.7 * scale
+    )
     few = scale * np.c_[np.zeros((50, 2)), np.linspace(-2, 0, 50)]
     assert ground_height(few, np.zeros(3), scale) == pytest.approx(np.percentile(few[:, 2], 2))
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="no folder shared beside the checkout")
 def test_two_drives_through_a_basement_agree_on_up() -> None:
-    """Both session frames are tilted, one of them by six degrees; the truth says how they lie to each other."""
+    """Both session frames are tilted, one of them by six degrees; the truth says how they lie to
+    each other.
+    """
     truth = json.loads((SHARED / "logs" / "basement_truth.json").read_text())
     ups = {}
-    settings = load(assignments={"fusion.voxel_size": "0.3", "fusion.keyframe_distance": "4", "fusion.keyframe_angle": "3.0"}).resolved()
+    settings = load(
+        assignments={
+            "fusion.voxel_size": "0.3",
+            "fusion.keyframe_distance": "4",
+            "fusion.keyframe_angle": "3.0",
+        }
+    ).resolved()
     for name in ("basement_a.mcap", "basement_b.bag"):
         scratch = Path(tempfile.mkdtemp())
         try:
@@ -112,7 +132,13 @@ def test_two_drives_through_a_basement_agree_on_up() -> None:
 
             session = open_session([SHARED / "logs" / name], {}, min_range=0.9, max_range=30.0)
             try:
-                collected = collect(session, Labeller(settings.labels, session), settings.fusion, scratch, lambda _: None)
+                collected = collect(
+                    session,
+                    Labeller(settings.labels, session),
+                    settings.fusion,
+                    scratch,
+                    lambda _: None,
+                )
                 session_T_map, _ = level(session, collected)
             finally:
                 session.close()

@@ -42,7 +42,13 @@ def as_dictionary(blocks: BlockMap) -> dict[Cell, tuple[int, int, int]]:
         votes[ballot // 256] += count
     for n in range(len(blocks.keys)):
         nothing = np.zeros(0, np.int64)
-        one = BlockMap(blocks.keys[n : n + 1], blocks.log_odds[n : n + 1], blocks.state[n : n + 1], nothing, nothing)
+        one = BlockMap(
+            blocks.keys[n : n + 1],
+            blocks.log_odds[n : n + 1],
+            blocks.state[n : n + 1],
+            nothing,
+            nothing,
+        )
         corner = one.bounds()[0]
         for cell in np.argwhere(one.log_odds.reshape(shape) != -128):
             at = tuple(cell)
@@ -55,7 +61,9 @@ def as_dictionary(blocks: BlockMap) -> dict[Cell, tuple[int, int, int]]:
 
 
 def slow_reference(walk: Walk, frames: list[Frame], f: Fusion) -> dict[Cell, tuple[int, int, int]]:
-    """A dictionary of voxels; each frame changes a voxel once, hits win over passes, votes are counted by point."""
+    """A dictionary of voxels; each frame changes a voxel once, hits win over passes, votes are
+    counted by point.
+    """
     assert f.max_range is not None
     odds: dict[Cell, int] = {}
     votes: dict[Cell, dict[int, int]] = defaultdict(lambda: defaultdict(int))
@@ -76,13 +84,17 @@ def slow_reference(walk: Walk, frames: list[Frame], f: Fusion) -> dict[Cell, tup
                 continue
             carved.add(ends_in)
             base = np.floor(np.minimum(end, origin) / f.voxel_size).astype(int) - 2
-            grid = walk(origin / f.voxel_size - base, (end / f.voxel_size - base)[None], [near], (5, 5, 5))
+            grid = walk(
+                origin / f.voxel_size - base, (end / f.voxel_size - base)[None], [near], (5, 5, 5)
+            )
             for cell in np.argwhere(grid):
                 key = tuple((cell + base).tolist())
                 marks[key] = max(marks.get(key, 0), int(grid[tuple(cell)]))
         for key, mark in marks.items():
             change = round(20 * f.hit) if mark == 2 else -round(20 * f.miss)
-            odds[key] = int(np.clip(odds.get(key, 0) + change, round(20 * f.clamp[0]), round(20 * f.clamp[1])))
+            odds[key] = int(
+                np.clip(odds.get(key, 0) + change, round(20 * f.clamp[0]), round(20 * f.clamp[1]))
+            )
             assert mark in (1, 2)
     out: dict[Cell, tuple[int, int, int]] = {}
     for key, value in odds.items():
@@ -100,7 +112,8 @@ def random_frames(seed: int, count: int = 6, points: int = 60) -> list[Frame]:
     out = []
     for _ in range(count):
         origin = rng.uniform(-1, 1, 3)
-        # few directions and distances, so that voxels are hit by several points and frames, and are passed too
+        # few directions and distances, so that voxels are hit by several points and frames, and are
+        # passed too
         p = rng.uniform(-5, 5, (points, 3)) * rng.choice([0.3, 1.0, 2.0], (points, 1))
         p[: points // 2] = np.array([4.0, 1.0, 0.2]) + rng.uniform(-0.6, 0.6, (points // 2, 3))
         out.append((p, rng.choice(np.array([4, 2, 8, 255], np.uint8), points), origin))
@@ -109,14 +122,22 @@ def random_frames(seed: int, count: int = 6, points: int = 60) -> list[Frame]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_fusion_is_what_the_dictionary_says(walk: Walk, seed: int) -> None:
-    frames, f = random_frames(seed), fusion()
+    frames = random_frames(seed)
+    f = fusion()
     found = as_dictionary(fused(frames, f))
     assert found == slow_reference(walk, frames, f)
-    assert {s for _, s, _ in found.values()} >= {2, 4, 8, FREE_STATE}  # the example has something of everything
+    # the example has something of everything
+    assert {s for _, s, _ in found.values()} >= {2, 4, 8, FREE_STATE}
 
 
-def one_point(label: int, count: int = 1, at: tuple[float, float, float] = (3.25, 0.25, 0.25)) -> Frame:
-    return np.tile(np.array(at), (count, 1)), np.full(count, label, np.uint8), np.array([0.25, 0.25, 0.25])
+def one_point(
+    label: int, count: int = 1, at: tuple[float, float, float] = (3.25, 0.25, 0.25)
+) -> Frame:
+    return (
+        np.tile(np.array(at), (count, 1)),
+        np.full(count, label, np.uint8),
+        np.array([0.25, 0.25, 0.25]),
+    )
 
 
 def state_at(blocks: BlockMap, cell: Cell) -> int:
@@ -139,8 +160,11 @@ def test_votes(labels: list[int], winner: int) -> None:
     ijk, label = blocks.occupied()
     assert ijk.tolist() == [[6, 0, 0]]
     assert label.tolist() == [winner]
-    assert {int(b % 256): int(n) for b, n in zip(blocks.ballots, blocks.votes, strict=True)} == Counter(labels)
-    assert blocks.log_odds[blocks.log_odds > 0].tolist() == [min(70, 17 * len(labels))]  # 0.85 each, clamped at 3.5
+    assert {
+        int(b % 256): int(n) for b, n in zip(blocks.ballots, blocks.votes, strict=True)
+    } == Counter(labels)
+    # 0.85 each, clamped at 3.5
+    assert blocks.log_odds[blocks.log_odds > 0].tolist() == [min(70, 17 * len(labels))]
 
 
 def test_votes_do_not_overflow() -> None:
@@ -153,7 +177,8 @@ def test_votes_do_not_overflow() -> None:
 def test_votes_do_not_depend_on_the_order_of_frames(order: list[int]) -> None:
     f = fusion(clamp=(-6.0, 6.0))  # nothing is clamped, so the log-odds add up in any order too
     frames = random_frames(7)
-    a, b = fused(frames, f), fused([frames[i] for i in order], f)
+    a = fused(frames, f)
+    b = fused([frames[i] for i in order], f)
     for name in ("keys", "log_odds", "state", "ballots", "votes"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
@@ -162,7 +187,8 @@ def test_what_drives_away_is_carved_free() -> None:
     car = one_point(13, 5)
     behind = one_point(2, 1, (5.25, 0.25, 0.25))
     assert state_at(fused([car], fusion()), (6, 0, 0)) == 13
-    carved = fused([car, car, behind, behind, behind, behind, behind], fusion())  # 2 * 0.85 - 5 * 0.4 < 0
+    # 2 * 0.85 - 5 * 0.4 < 0
+    carved = fused([car, car, behind, behind, behind, behind, behind], fusion())
     assert state_at(carved, (6, 0, 0)) == FREE_STATE
     assert state_at(carved, (10, 0, 0)) == 2
     assert carved.occupied()[0].tolist() == [[10, 0, 0]]
@@ -182,7 +208,10 @@ def test_no_frames_and_empty_frames() -> None:
         blocks = fused(frames, fusion())
         assert len(blocks.keys) == 0
         assert [len(a) for a in blocks.occupied()] == [0, 0]
-        assert blocks.dense(np.zeros(3, int), (2, 2, 2)).tolist() == np.full((2, 2, 2), UNOBSERVED_STATE).tolist()
+        assert (
+            blocks.dense(np.zeros(3, int), (2, 2, 2)).tolist()
+            == np.full((2, 2, 2), UNOBSERVED_STATE).tolist()
+        )
         assert [b.tolist() for b in blocks.bounds()] == [[0, 0, 0], [0, 0, 0]]
 
 
@@ -191,28 +220,40 @@ def test_points_that_are_not_finite_are_left_out() -> None:
     bad = np.array([[np.nan, 0, 0], [np.inf, 1, 1], [0, -np.inf, np.nan]])
     f = fusion()
     a = fused([(points, label, origin)], f)
-    b = fused([(np.concatenate([bad, points]), np.concatenate([np.full(3, 5, np.uint8), label]), origin)], f)
+    b = fused(
+        [(np.concatenate([bad, points]), np.concatenate([np.full(3, 5, np.uint8), label]), origin)],
+        f,
+    )
     assert as_dictionary(a) == as_dictionary(b)
     assert not len(fused([(bad, np.full(3, 5, np.uint8), origin)], f).keys)
     assert not len(fused([(points, label, np.array([0, np.nan, 0]))], f).keys)
 
 
 def test_an_origin_a_rounding_error_below_a_block_border() -> None:
-    """-1e-17 lies in block -1 and, taken from that block's corner, on its upper border: no write may leave the grid."""
+    """-1e-17 lies in block -1 and, taken from that block's corner, on its upper border: no write
+    may leave the grid.
+    """
     origin = np.array([0.0, 0.0, -1e-17])
     blocks = fused([(np.array([[1.2, 0.2, -0.7]]), np.zeros(1, np.uint8), origin)], fusion())
     seen = as_dictionary(blocks)
     assert seen[(2, 0, -2)][1] == 0
     assert len(seen) <= 6
-    ends = fused([(np.array([[1.2, 0.2, -1e-17]]), np.zeros(1, np.uint8), np.array([0.2, 0.2, -0.7]))], fusion())
+    ends = fused(
+        [(np.array([[1.2, 0.2, -1e-17]]), np.zeros(1, np.uint8), np.array([0.2, 0.2, -0.7]))],
+        fusion(),
+    )
     assert ends.votes.tolist() == [1]  # the vote lies where the hit does
 
 
 @pytest.mark.parametrize("far", [(500_000.0, 3_400_000.0, 300.0), (-2_000_000.0, 0.0, 0.0)])
 def test_a_map_far_from_the_origin_is_the_same_map(far: tuple[float, float, float]) -> None:
     """Hundreds of kilometres away; whole voxels of shift, so that rounding does not enter."""
-    f, shift = fusion(voxel=0.25), np.array(far)
-    frames = [(np.round(p * 64) / 64 + 1 / 128, label, np.round(o * 64) / 64) for p, label, o in random_frames(5)]
+    f = fusion(voxel=0.25)
+    shift = np.array(far)
+    frames = [
+        (np.round(p * 64) / 64 + 1 / 128, label, np.round(o * 64) / 64)
+        for p, label, o in random_frames(5)
+    ]
     near = as_dictionary(fused(frames, f))
     moved = as_dictionary(fused([(p + shift, label, o + shift) for p, label, o in frames], f))
     offset = (shift / 0.25).astype(int)
@@ -239,13 +280,18 @@ def test_unresolved_settings_are_refused() -> None:
 
 
 def test_uncertain_ranges_count_less_and_leave_room_before_them() -> None:
-    """A point at 5 m known to 1 m, in voxels of 0.5 m: a quarter of a hit, and free up to 3 m only; one more certain wins."""
+    """A point at 5 m known to 1 m, in voxels of 0.5 m: a quarter of a hit, and free up to 3 m only;
+    one more certain wins.
+    """
     f = fusion(reach=10.0)
-    points, origin = np.array([[5.25, 0.25, 0.25]]), np.array([0.25, 0.25, 0.25])
+    points = np.array([[5.25, 0.25, 0.25]])
+    origin = np.array([0.25, 0.25, 0.25])
     fuser = Fuser(f)
     fuser.add(points, np.array([2], np.uint8), origin, np.array([1.0], np.float32))
     blocks = fuser.finish()
-    assert blocks.dense(np.array([0, 0, 0]), (11, 1, 1))[:, 0, 0].tolist() == [FREE_STATE] * 6 + [UNOBSERVED_STATE] * 4 + [2]
+    assert blocks.dense(np.array([0, 0, 0]), (11, 1, 1))[:, 0, 0].tolist() == [FREE_STATE] * 6 + [
+        UNOBSERVED_STATE
+    ] * 4 + [2]
     assert blocks.log_odds.max() == round(20 * f.hit / 4)
     fuser.add(points + np.array([0, 0, 0.1]), np.array([8], np.uint8), origin)
     blocks = fuser.finish()
@@ -257,7 +303,8 @@ def test_a_pose_takes_the_points_into_the_map() -> None:
     points, label, origin = random_frames(3, count=1)[0]
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [7.125, -3.5, 0.25]
-    moved, there = Fuser(fusion()), points @ pose[:3, :3].T + pose[:3, 3]
+    moved = Fuser(fusion())
+    there = points @ pose[:3, :3].T + pose[:3, 3]
     moved.add(points, label, origin, map_T_points=pose)
     at = pose[:3, :3] @ origin + pose[:3, 3]
     assert as_dictionary(moved.finish()) == as_dictionary(fused([(there, label, at)], fusion()))
@@ -271,7 +318,9 @@ def test_rays_that_graze_the_ground_do_not_carve_it() -> None:
     def frames(label: int) -> list[Frame]:
         out = []
         for x in np.arange(0, 20, 1.0):
-            points = np.stack([x + ring * np.cos(angle), ring * np.sin(angle), np.full(ring.shape, 0.1)], -1).reshape(-1, 3)
+            points = np.stack(
+                [x + ring * np.cos(angle), ring * np.sin(angle), np.full(ring.shape, 0.1)], -1
+            ).reshape(-1, 3)
             out.append((points, np.full(len(points), label, np.uint8), np.array([x, 0.0, 1.9])))
         return out
 
@@ -286,8 +335,11 @@ def test_rays_that_graze_the_ground_do_not_carve_it() -> None:
 
 
 def test_maps_that_share_a_carved_frame_are_those_that_carve_it_themselves() -> None:
-    frames, f = random_frames(5, count=4), fusion()
-    carver, shared, late = Carver(f), Fuser(f), Fuser(f)
+    frames = random_frames(5, count=4)
+    f = fusion()
+    carver = Carver(f)
+    shared = Fuser(f)
+    late = Fuser(f)
     for i, frame in enumerate(frames):
         marks = carver.marks(*frame)
         shared.take(marks)

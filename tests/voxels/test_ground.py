@@ -19,11 +19,14 @@ def hill(xy: F64) -> F64:
 
 def sweep(rng: np.random.Generator, at: tuple[float, float], scale: float = 1.0) -> tuple[F64, F64]:
     """Ground within 20 m, a bridge 5 m above it, a hole of 3 m where nothing is seen."""
-    r, a = 20 * np.sqrt(rng.random(9000)), rng.uniform(0, 2 * np.pi, 9000)
+    r = 20 * np.sqrt(rng.random(9000))
+    a = rng.uniform(0, 2 * np.pi, 9000)
     xy = np.c_[r * np.cos(a), r * np.sin(a)] + at
     xy = xy[np.hypot(*(xy - [4.0, 4.0]).T) > 3]
     deck = rng.uniform((-30, 8), (60, 11), (3000, 2))
-    points = np.concatenate([np.c_[xy, hill(xy) + rng.normal(0, 0.01, len(xy))], np.c_[deck, hill(deck) + 5]])
+    points = np.concatenate(
+        [np.c_[xy, hill(xy) + rng.normal(0, 0.01, len(xy))], np.c_[deck, hill(deck) + 5]]
+    )
     eye = np.array([*at, hill(np.array([at]))[0] + 1.8])
     return points * scale, eye * scale
 
@@ -41,7 +44,13 @@ def test_a_hill_driven_over(scale: float) -> None:
     off = ground.ground_at(xy * scale) / scale - hill(xy)
     assert np.abs(off).max() < 0.25  # a cell of 1 m at slopes up to 14 %
     assert np.median(np.abs(off)) < 0.05
-    assert np.abs(ground.ground_at(np.array([[4.0, 4.0]]) * scale) / scale - hill(np.array([[4.0, 4.0]]))) < 0.2  # filled in
+    # filled in
+    assert (
+        np.abs(
+            ground.ground_at(np.array([[4.0, 4.0]]) * scale) / scale - hill(np.array([[4.0, 4.0]]))
+        )
+        < 0.2
+    )
     assert np.isnan(ground.ground_at(np.array([[300.0, 0.0], [np.nan, 0.0]]) * scale)).all()
 
 
@@ -71,10 +80,20 @@ def test_the_order_of_keyframes_does_not_matter() -> None:
 
 
 def test_written_and_read_again(tmp_path: Path) -> None:
-    ground = GroundMap(0.5, np.array([[-3, 2], [4, 5]], np.int32), np.array([1.25, -2.5]), np.array([1, 7], np.int32))
+    ground = GroundMap(
+        0.5,
+        np.array([[-3, 2], [4, 5]], np.int32),
+        np.array([1.25, -2.5]),
+        np.array([1, 7], np.int32),
+    )
     write_ground(tmp_path / "ground.parquet", ground, {"schema_version": 1})
     again = read_ground(tmp_path / "ground.parquet")
-    assert (again.cell, again.ij.tolist(), again.z.tolist(), again.frames.tolist()) == (0.5, [[-3, 2], [4, 5]], [1.25, -2.5], [1, 7])
+    assert (again.cell, again.ij.tolist(), again.z.tolist(), again.frames.tolist()) == (
+        0.5,
+        [[-3, 2], [4, 5]],
+        [1.25, -2.5],
+        [1, 7],
+    )
     assert again.ground_at(np.array([[-1.25, 1.25]]))[0] == pytest.approx(1.25, abs=0.01)
     with pytest.raises(SemlocError):
         read_ground(tmp_path / "missing.parquet")

@@ -12,7 +12,13 @@ from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.mapping.keyframes import Collected
 
 CLOUD = PosedCloud(
-    Header("/points", 1, 2, "lidar"), np.arange(12, dtype=np.float32).reshape(4, 3), np.zeros(3, np.float32), None, None, {}, None
+    Header("/points", 1, 2, "lidar"),
+    np.arange(12, dtype=np.float32).reshape(4, 3),
+    np.zeros(3, np.float32),
+    None,
+    None,
+    {},
+    None,
 )
 
 

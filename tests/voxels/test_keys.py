@@ -33,7 +33,8 @@ def test_morton_code_is_the_interleaved_bits(ijk: tuple[int, int, int]) -> None:
 
 
 def test_morton_order_of_a_small_cube_by_hand() -> None:
-    corner = np.array([[-8, 16, 0]])  # even coordinates: a cube of two lies in one cell of the next level
+    # even coordinates: a cube of two lies in one cell of the next level
+    corner = np.array([[-8, 16, 0]])
     cube = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)]) + corner
     codes = morton(cube)
     assert np.diff(codes.astype(np.int64)).tolist() == [1] * 7

@@ -1,4 +1,6 @@
-"""Segments of the index: what is found is what a fresh index finds, whatever was added, removed, merged, damaged or done at once."""
+"""Segments of the index: what is found is what a fresh index finds, whatever was added, removed,
+merged, damaged or done at once.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,14 @@ from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words import catalogue
 from semloc_logs.words.catalogue import Change, merged_blocks, segments, update
 from semloc_logs.words.index import SHORTLIST, Allowed, Index, Part
-from semloc_logs.words.segment import WORDS, Held, Segment, open_segment, segment_in_memory, write_segment
+from semloc_logs.words.segment import (
+    WORDS,
+    Held,
+    Segment,
+    open_segment,
+    segment_in_memory,
+    write_segment,
+)
 from semloc_logs.words.submap_words import write_words
 from semloc_logs.words.vocabulary import BITS, Vocabulary
 from semloc_logs.workspace import Workspace
@@ -35,7 +44,12 @@ def small_vocabulary() -> Vocabulary:
     rng = np.random.default_rng(1)
     cells = rng.standard_normal((4, BITS))
     cells = np.round(cells / np.linalg.norm(cells, axis=1, keepdims=True) * 2048) / 2048
-    children = np.round((cells[:, None] + 0.05 * rng.standard_normal((4, 256, BITS))).clip(-0.49, 0.49) * 256) / 256
+    children = (
+        np.round(
+            (cells[:, None] + 0.05 * rng.standard_normal((4, 256, BITS))).clip(-0.49, 0.49) * 256
+        )
+        / 256
+    )
     return Vocabulary(*(np.asarray(a, np.float32) for a in (cells, np.eye(BITS), cells, children)))
 
 
@@ -63,13 +77,20 @@ def make_session(work: Workspace, name: str, seed: int, counts: tuple[int, ...] 
     for submap, n in enumerate(counts):
         d = near_cells(100 * seed + submap, n)
         centre = np.random.default_rng(seed).uniform(-50, 50, (n, 3))
-        parts = [("semantic", 0.5, centre[:3], *V.words(d[:3])), (VARIANT, 0.25, centre, *V.words(d))]
+        parts = [
+            ("semantic", 0.5, centre[:3], *V.words(d[:3])),
+            (VARIANT, 0.25, centre, *V.words(d)),
+        ]
         write_words(blocks_path(folder.words, submap), submap, parts, {})
     write_json(folder.words_json, {"variants": [VARIANT, "semantic"], "fingerprint": seed})
 
 
 def groups(work: Workspace, names: list[str]) -> dict[tuple[str, int], int]:
-    listed = [(n, s["id"]) for n in names for s in json.loads(work.session(n).session_json.read_text())["submaps"]]
+    listed = [
+        (n, s["id"])
+        for n in names
+        for s in json.loads(work.session(n).session_json.read_text())["submaps"]
+    ]
     return {place: g for g, place in enumerate(listed)}
 
 
@@ -101,9 +122,20 @@ def files(work: Workspace) -> list[Path]:
 
 
 @pytest.mark.timeout(300)  # the first search is compiled
-@given(st.lists(st.tuples(st.sampled_from("abcdef"), st.sampled_from(["add", "add", "again", "remove"]), st.integers(0, 60)), max_size=7))
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from("abcdef"),
+            st.sampled_from(["add", "add", "again", "remove"]),
+            st.integers(0, 60),
+        ),
+        max_size=7,
+    )
+)
 @settings(max_examples=8, deadline=None)
-def test_adding_and_removing_is_a_fresh_index(tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int]]) -> None:
+def test_adding_and_removing_is_a_fresh_index(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int]]
+) -> None:
     tmp = tmp_path_factory.mktemp("work")
     work = Workspace(tmp / "work")
     names: set[str] = set()
@@ -120,7 +152,9 @@ def test_adding_and_removing_is_a_fresh_index(tmp_path_factory: pytest.TempPathF
         assert len(mine) == sum(len(s) for s, _ in segments(work, VARIANT, now)) - dead(work, now)
         if number + 1 == len(steps):
             for budget in (10**6, 60):
-                assert found(index(work, now, budget), len(groups(work, now))) == fresh(work, now, tmp / "fresh", budget)
+                assert found(index(work, now, budget), len(groups(work, now))) == fresh(
+                    work, now, tmp / "fresh", budget
+                )
         sizes = sorted((len(open_segment(p, VARIANT)) for p in files(work)), reverse=True)
         assert len(sizes) <= 2 + np.log2(max(1, sum(sizes)) + 1)
     shutil.rmtree(tmp)
@@ -150,13 +184,17 @@ def test_rows_are_those_of_the_variant_with_their_places(tmp_path: Path) -> None
     ((segment, served),) = segments(work, VARIANT, ["a"])
     assert served == {"a"}
     assert segment.places == [("a", 0), ("a", 1)]
-    assert sorted(zip(segment.place.tolist(), segment.row.tolist(), strict=True)) == [(0, r) for r in range(5)] + [(1, r) for r in range(4)]
+    assert sorted(zip(segment.place.tolist(), segment.row.tolist(), strict=True)) == [
+        (0, r) for r in range(5)
+    ] + [(1, r) for r in range(4)]
     word, code = V.words(near_cells(301, 4))
     at = [int(np.flatnonzero((segment.place == 1) & (segment.row == r))[0]) for r in range(4)]
     assert segment.code[at].tolist() == code.tolist()
     for r, w in zip(at, word.tolist(), strict=True):
         assert segment.starts[w] <= r < segment.starts[w + 1]
-    np.testing.assert_array_equal(segment.centre[at], np.random.default_rng(3).uniform(-50, 50, (4, 3)).astype(np.float32))
+    np.testing.assert_array_equal(
+        segment.centre[at], np.random.default_rng(3).uniform(-50, 50, (4, 3)).astype(np.float32)
+    )
     assert segment.yaw.tolist() == [0.25] * 9
 
 
@@ -169,26 +207,40 @@ def test_of_some_submaps_certain_rows_may_answer(tmp_path: Path) -> None:
     m = mine.search(near_cells(7, 30), 200, 4, Allowed(np.array([True, True, True, False]), rows))
     expected = [(0, e) for e in range(40)] + [(1, e) for e in range(0, 25, 3)]
     for q in range(30):
-        assert sorted(zip(m.group[m.query == q].tolist(), m.entry[m.query == q].tolist(), strict=True)) == expected
+        assert (
+            sorted(zip(m.group[m.query == q].tolist(), m.entry[m.query == q].tolist(), strict=True))
+            == expected
+        )
 
 
 def columns(seed: int, n: int, places: int) -> dict[str, NDArray[Any]]:
     rng = np.random.default_rng(seed)
-    word, place = rng.integers(0, 40, n) ** 2, rng.integers(0, places, n)
+    word = rng.integers(0, 40, n) ** 2
+    place = rng.integers(0, places, n)
     rest = {"code": rng.integers(0, 2**63, n).astype(np.uint64), "row": rng.permutation(n)}
-    return {"word": word, "place": place, "centre": rng.normal(size=(n, 3)), "yaw": rng.normal(size=n)} | rest
+    return {
+        "word": word,
+        "place": place,
+        "centre": rng.normal(size=(n, 3)),
+        "yaw": rng.normal(size=n),
+    } | rest
 
 
 def test_a_merge_is_the_file_of_a_fresh_segment(tmp_path: Path) -> None:
-    a, b = columns(0, 50, 3), columns(1, 31, 2)
+    a = columns(0, 50, 3)
+    b = columns(1, 31, 2)
     held = (Held("a", "x", (0, 4, 5), 50), Held("b", "y", (0, 1), 31))
     parts = [segment_in_memory((held[1],), b), segment_in_memory((held[0],), a)]
-    both = {name: np.concatenate([a[name], b[name] + 3 if name == "place" else b[name]]) for name in a}
+    both = {
+        name: np.concatenate([a[name], b[name] + 3 if name == "place" else b[name]]) for name in a
+    }
     for most in (1, 7, 10**6):
         blocks = list(merged_blocks(parts, [np.array([3, 4]), np.array([0, 1, 2])], most))
         assert most > 40 or len(blocks) > 5
         write_segment(tmp_path / "merged", VARIANT, held, blocks)
-        write_segment(tmp_path / "fresh", VARIANT, held, [segment_in_memory(held, both).block(0, WORDS)])
+        write_segment(
+            tmp_path / "fresh", VARIANT, held, [segment_in_memory(held, both).block(0, WORDS)]
+        )
         assert (tmp_path / "merged").read_bytes() == (tmp_path / "fresh").read_bytes()
     back = open_segment(tmp_path / "fresh", VARIANT, check=True)
     assert back.sessions == held
@@ -242,7 +294,9 @@ def test_damage_within_the_arrays_is_not_merged(tmp_path: Path) -> None:
     for seed, name in enumerate("bc", 2):  # the third makes them merge
         make_session(work, name, seed)
         index(work, [name])
-    assert found(index(work, ["a", "b", "c"]), 6) == fresh(work, ["a", "b", "c"], tmp_path / "fresh")
+    assert found(index(work, ["a", "b", "c"]), 6) == fresh(
+        work, ["a", "b", "c"], tmp_path / "fresh"
+    )
     for p in files(work):
         open_segment(p, VARIANT, check=True)
 
@@ -273,11 +327,15 @@ def test_places_beyond_the_list_are_never_found() -> None:
     c["word"][:] = 0
     c["place"][::2] = 77
     segment = segment_in_memory((Held("a", "", (0,), 30),), c)
-    m = Index(V, [Part(segment, np.array([0]))]).search(V.cells[:1], 50, 1, Allowed(np.array([True])))
+    m = Index(V, [Part(segment, np.array([0]))]).search(
+        V.cells[:1], 50, 1, Allowed(np.array([True]))
+    )
     assert sorted(m.entry.tolist()) == sorted(c["row"][1::2].tolist())
 
 
-def test_what_a_killed_process_leaves_is_cleared_and_another_session_is_no_hindrance(tmp_path: Path) -> None:
+def test_what_a_killed_process_leaves_is_cleared_and_another_session_is_no_hindrance(
+    tmp_path: Path,
+) -> None:
     work = Workspace(tmp_path)
     make_session(work, "a", 1)
     folder = work.path / "index" / VARIANT
@@ -290,7 +348,8 @@ def test_what_a_killed_process_leaves_is_cleared_and_another_session_is_no_hindr
         segments(work, VARIANT, ["a", "b"])
     make_session(work, "b", 2)
     write_json(work.session("b").words_json, {"variants": ["semantic"]})
-    assert [served for _, served in segments(work, VARIANT, ["a", "b"])] == [{"a"}]  # described in the other variant
+    # described in the other variant
+    assert [served for _, served in segments(work, VARIANT, ["a", "b"])] == [{"a"}]
 
 
 def test_sessions_without_words_are_remembered(tmp_path: Path) -> None:
@@ -303,7 +362,9 @@ def test_sessions_without_words_are_remembered(tmp_path: Path) -> None:
     assert str(change) == ""
 
 
-def test_a_workspace_that_cannot_be_written_is_searched_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_workspace_that_cannot_be_written_is_searched_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     work = Workspace(tmp_path / "work")
     make_session(work, "a", 1)
     make_session(work, "b", 2)
@@ -346,18 +407,27 @@ def test_an_open_index_outlives_its_files(tmp_path: Path) -> None:
     assert found(mine, 2) == before
 
 
-# -- the budget ------------------------------------------------------------------------------------------------------------------
+# -- the budget
+# ------------------------------------------------------------------------------------------------------------------
 
 
-def slow_candidates(segment: Segment, d: NDArray[np.float32], probes: int, budget: int) -> list[int]:
+def slow_candidates(
+    segment: Segment, d: NDArray[np.float32], probes: int, budget: int
+) -> list[int]:
     """Positions of the entries that one descriptor is compared with."""
     cells = V.nearest_cells(d[None], probes)[0].tolist()
     words = [c * 256 + k for c in cells for k in range(256)]
     count = np.diff(segment.starts.astype(int))
     if sum(count[w] for w in words) > budget:
         p = np.round(V.projected(d[None])[0].astype(float) * 2048) / 2048
-        distance = {w: ((p - V.children[w // 256, w % 256].astype(float)) ** 2).sum() for w in words}
-        farthest = next(x for x in sorted(distance.values()) if sum(count[w] for w in words if distance[w] <= x) >= budget)
+        distance = {
+            w: ((p - V.children[w // 256, w % 256].astype(float)) ** 2).sum() for w in words
+        }
+        farthest = next(
+            x
+            for x in sorted(distance.values())
+            if sum(count[w] for w in words if distance[w] <= x) >= budget
+        )
         words = [w for w in words if distance[w] <= farthest]
     return [i for w in words for i in range(segment.starts[w], segment.starts[w + 1])]
 
@@ -365,7 +435,8 @@ def slow_candidates(segment: Segment, d: NDArray[np.float32], probes: int, budge
 @given(st.integers(0, 100), st.integers(1, 400), st.integers(1, 4))
 @settings(max_examples=10, deadline=None)
 def test_a_budget_takes_the_nearest_words(seed: int, budget: int, probes: int) -> None:
-    d, queries = near_cells(seed, 500), near_cells(seed + 1, 6)
+    d = near_cells(seed, 500)
+    queries = near_cells(seed + 1, 6)
     index = Index.of_words(V, *V.words(d), np.zeros(500, int))
     index.budget = budget
     segment = index.parts[0].segment

@@ -18,7 +18,13 @@ from semloc_logs.errors import SettingsError
 from semloc_logs.numerics.bits import lowest_bit, popcount
 from semloc_logs.words.index import SHORTLIST, Allowed, Index
 from semloc_logs.words.kmeans import grid, kmeans, nearest_centroids
-from semloc_logs.words.vocabulary import BITS, Vocabulary, load_vocabulary, save_vocabulary, train_vocabulary
+from semloc_logs.words.vocabulary import (
+    BITS,
+    Vocabulary,
+    load_vocabulary,
+    save_vocabulary,
+    train_vocabulary,
+)
 
 F32 = NDArray[np.float32]
 ALL = Allowed(np.array([True]))
@@ -39,14 +45,18 @@ def vocabulary() -> Vocabulary:
 
 
 def test_the_shape_and_scale_of_a_vocabulary(vocabulary: Vocabulary) -> None:
-    assert [getattr(vocabulary, k).shape for k in ("cells", "projection", "thresholds", "children")] == [
+    assert [
+        getattr(vocabulary, k).shape for k in ("cells", "projection", "thresholds", "children")
+    ] == [
         (10, 256),
         (BITS, 256),
         (10, BITS),
         (10, 4, BITS),
     ]
     np.testing.assert_allclose(np.linalg.norm(vocabulary.cells, axis=1), 1, atol=0.01)
-    np.testing.assert_allclose(vocabulary.projection @ vocabulary.projection.T, np.eye(BITS), atol=0.02)
+    np.testing.assert_allclose(
+        vocabulary.projection @ vocabulary.projection.T, np.eye(BITS), atol=0.02
+    )
     for k, steps in (("cells", 2048), ("projection", 2048), ("children", 256)):
         a = getattr(vocabulary, k)
         assert (a * steps == np.round(a * steps)).all()
@@ -59,7 +69,9 @@ def test_cells_are_the_nearest_ones(vocabulary: Vocabulary) -> None:
     for probes in (1, 3, 10, 50):
         found = vocabulary.nearest_cells(d, probes)
         assert found.shape == (300, min(probes, 10))
-        np.testing.assert_allclose(np.take_along_axis(similarity, found, 1), ordered[:, :probes], atol=TOLERANCE)
+        np.testing.assert_allclose(
+            np.take_along_axis(similarity, found, 1), ordered[:, :probes], atol=TOLERANCE
+        )
         assert all(len(set(row)) == len(row) for row in found.tolist())
 
 
@@ -97,11 +109,15 @@ def test_bits_are_balanced_in_each_cell_and_say_something(vocabulary: Vocabulary
         if len(mine) >= 30:
             assert mine.mean(0).min() > 0.35
             assert mine.mean(0).max() < 0.65
-    near = np.clip(d + 0.01 * np.random.default_rng(0).standard_normal(d.shape), -1, 1).astype(np.float32)
+    near = np.clip(d + 0.01 * np.random.default_rng(0).standard_normal(d.shape), -1, 1).astype(
+        np.float32
+    )
     near /= np.linalg.norm(near, axis=1, keepdims=True)
     moved = vocabulary.codes(near, word // 256)
     distance = np.array([(int(a) ^ int(b)).bit_count() for a, b in zip(code, moved, strict=True)])
-    other = np.array([(int(a) ^ int(b)).bit_count() for a, b in zip(code, np.roll(code, 7), strict=True)])
+    other = np.array(
+        [(int(a) ^ int(b)).bit_count() for a, b in zip(code, np.roll(code, 7), strict=True)]
+    )
     assert distance.mean() < 12 < 25 < other.mean()
 
 
@@ -114,7 +130,9 @@ def slow_search(
     k: int,
     allowed: NDArray[np.bool_],
 ) -> list[tuple[float, int, int]]:
-    """Asymmetric and Hamming distances and rows of the k nearest ``allowed`` (n,) entries in the ``cells`` of one descriptor."""
+    """Asymmetric and Hamming distances and rows of the k nearest ``allowed`` (n,) entries in the
+    ``cells`` of one descriptor.
+    """
     found = []
     for e in np.flatnonzero(np.isin(word // 256, cells) & allowed):
         margin = v.projected(d[None])[0].astype(float) - v.thresholds[word[e] // 256]
@@ -125,11 +143,19 @@ def slow_search(
     return sorted(f for f in found if f[1] <= farthest)[:k]
 
 
-@given(st.integers(0, 1000), st.integers(1, 40), st.integers(1, 12), st.lists(st.booleans(), min_size=5, max_size=5))
+@given(
+    st.integers(0, 1000),
+    st.integers(1, 40),
+    st.integers(1, 12),
+    st.lists(st.booleans(), min_size=5, max_size=5),
+)
 @settings(max_examples=15, deadline=None)
-def test_the_nearest_words_are_those_of_brute_force(seed: int, k: int, probes: int, allow: list[bool]) -> None:
+def test_the_nearest_words_are_those_of_brute_force(
+    seed: int, k: int, probes: int, allow: list[bool]
+) -> None:
     v = TRAINED
-    d, q = unit(seed, 300), unit(seed + 1, 8)
+    d = unit(seed, 300)
+    q = unit(seed + 1, 8)
     word, code = v.words(d)
     group = np.random.default_rng(seed).integers(0, 5, 300)
     allowed = np.array(allow)
@@ -137,12 +163,19 @@ def test_the_nearest_words_are_those_of_brute_force(seed: int, k: int, probes: i
     cells = v.nearest_cells(q, probes)
     for i in range(len(q)):
         expected = slow_search(v, word, code, q[i], cells[i], k, allowed[group])
-        row = {e: (asymmetric, hamming) for asymmetric, hamming, e in slow_search(v, word, code, q[i], cells[i], 300, allowed[group])}
+        row = {
+            e: (asymmetric, hamming)
+            for asymmetric, hamming, e in slow_search(
+                v, word, code, q[i], cells[i], 300, allowed[group]
+            )
+        }
         mine = m.query == i
         entries = m.entry[mine].tolist()
         assert len(set(entries)) == len(entries) == len(expected)
         assert m.distance[mine].tolist() == [row[e][1] for e in entries]
-        np.testing.assert_allclose([row[e][0] for e in entries], [f[0] for f in expected], rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(
+            [row[e][0] for e in entries], [f[0] for f in expected], rtol=1e-6, atol=1e-7
+        )
 
 
 def _count(x: NDArray[np.uint64]) -> list[tuple[int, int]]:
@@ -155,11 +188,15 @@ _counted: Any = njit(_count)
 @given(st.lists(st.integers(1, 2**64 - 1), min_size=1, max_size=20))
 @settings(max_examples=30, deadline=None)
 def test_bits_are_counted(values: list[int]) -> None:
-    assert _counted(np.array(values, np.uint64)) == [(v.bit_count(), (v & -v).bit_length() - 1) for v in values]
+    assert _counted(np.array(values, np.uint64)) == [
+        (v.bit_count(), (v & -v).bit_length() - 1) for v in values
+    ]
 
 
 def test_what_is_found_does_not_depend_on_the_other_queries() -> None:
-    """The bound that a query begins with is the one before's: far and near queries in either order, and alone, find the same."""
+    """The bound that a query begins with is the one before's: far and near queries in either order,
+    and alone, find the same.
+    """
     near = unit(3, 400)
     far = unit(77, 30, centres=3, spread=3.0)
     word, code = TRAINED.words(near)
@@ -179,11 +216,15 @@ def test_a_bit_that_is_sure_outweighs_two_that_are_not() -> None:
     """One cell, thresholds 0: the query's projections are 0.5, -0.01, -0.01 and nothing else."""
     projection = np.eye(64, dtype=np.float32)
     cell = np.full((1, 64), 0.125, np.float32)
-    v = Vocabulary(cell, projection, np.zeros((1, 64), np.float32), np.zeros((1, 1, 64), np.float32))
+    v = Vocabulary(
+        cell, projection, np.zeros((1, 64), np.float32), np.zeros((1, 1, 64), np.float32)
+    )
     query = np.zeros((1, 64), np.float32)
     query[0, :3] = 0.5, -0.01, -0.01
     code = np.array([0b000, 0b111, 0b001], np.uint64)
-    m = Index.of_words(v, np.zeros(3, np.uint16), code, np.zeros(3, np.int64)).search(query, 3, 1, ALL)
+    m = Index.of_words(v, np.zeros(3, np.uint16), code, np.zeros(3, np.int64)).search(
+        query, 3, 1, ALL
+    )
     assert m.entry.tolist() == [2, 1, 0]
     assert m.distance.tolist() == [0, 2, 1]
 
@@ -219,9 +260,13 @@ def test_searches_with_nothing_to_find() -> None:
 def test_kmeans_finds_clusters_that_lie_apart() -> None:
     rng = np.random.default_rng(0)
     centres = np.array([[0.0, 0], [0.5, 0], [0, 0.5], [0.5, 0.5], [0.7, 0.7]])
-    data = np.concatenate([c + 0.005 * rng.standard_normal((40, 2)) for c in centres]).astype(np.float32)
+    data = np.concatenate([c + 0.005 * rng.standard_normal((40, 2)) for c in centres]).astype(
+        np.float32
+    )
     found = kmeans(data, 5, np.random.default_rng(3), 15)
-    assert (((data[:, None] - found) ** 2).sum(2).min(1)).sum() < 0.25 * ((data - data.mean(0)) ** 2).sum()
+    assert (((data[:, None] - found) ** 2).sum(2).min(1)).sum() < 0.25 * (
+        (data - data.mean(0)) ** 2
+    ).sum()
     assert np.isfinite(found).all()
 
 
@@ -243,13 +288,26 @@ def test_kmeans_is_lloyds_algorithm(seed: int, k: int, dimensions: int, rounds: 
     """Beside points one by one; the sums of rounded points are exact in any order."""
     rng = np.random.default_rng(seed)
     points = grid(rng.uniform(-0.4, 0.4, (40, dimensions)).astype(np.float32))
-    centroids = points[np.sort(np.random.default_rng(seed).choice(40, k, replace=False))].astype(float)
+    centroids = points[np.sort(np.random.default_rng(seed).choice(40, k, replace=False))].astype(
+        float
+    )
     for _ in range(rounds):
-        nearest = [min(range(k), key=lambda c: (float(((p - centroids[c]) ** 2).sum()), c)) for p in points.astype(float)]
-        distance = [float(((p - centroids[c]) ** 2).sum()) for p, c in zip(points.astype(float), nearest, strict=True)]
+        nearest = [
+            min(range(k), key=lambda c: (float(((p - centroids[c]) ** 2).sum()), c))
+            for p in points.astype(float)
+        ]
+        distance = [
+            float(((p - centroids[c]) ** 2).sum())
+            for p, c in zip(points.astype(float), nearest, strict=True)
+        ]
         farthest = sorted(range(40), key=lambda i: (-distance[i], i))
         moved = np.array(
-            [grid(points[np.array(nearest) == c].astype(float).mean(0)) if c in nearest else points[farthest.pop(0)] for c in range(k)]
+            [
+                grid(points[np.array(nearest) == c].astype(float).mean(0))
+                if c in nearest
+                else points[farthest.pop(0)]
+                for c in range(k)
+            ]
         )
         centroids = moved.astype(float)
     np.testing.assert_array_equal(kmeans(points, k, np.random.default_rng(seed), rounds), centroids)
@@ -257,14 +315,16 @@ def test_kmeans_is_lloyds_algorithm(seed: int, k: int, dimensions: int, rounds: 
 
 def test_the_nearest_of_equal_centroids_is_the_first() -> None:
     nearest, distance = nearest_centroids(
-        np.array([[0.5, 0], [0, 0.25]], np.float32), np.array([[0, 0], [0.5, 0], [0.5, 0], [0, 0]], np.float32)
+        np.array([[0.5, 0], [0, 0.25]], np.float32),
+        np.array([[0, 0], [0.5, 0], [0.5, 0], [0, 0]], np.float32),
     )
     assert nearest.tolist() == [1, 0]
     assert distance.tolist() == [0, 0.0625]
 
 
 def test_training_is_repeatable_and_small_data_give_fewer_words() -> None:
-    a, b = train_vocabulary(unit(0, 600), cells=9, children=3), TRAINED
+    a = train_vocabulary(unit(0, 600), cells=9, children=3)
+    b = TRAINED
     for k in ("cells", "projection", "thresholds", "children"):
         np.testing.assert_array_equal(getattr(a, k), getattr(b, k))
     assert len(train_vocabulary(unit(0, 512), cells=256, children=2).cells) == 8
@@ -283,7 +343,8 @@ def test_descriptors_may_have_64_dimensions_and_half_precision() -> None:
     word, code = v.words(d)
     m = Index.of_words(v, word, code, np.zeros(700, np.int64)).search(d[:50], 1, 1, ALL)
     assert (code[m.entry] == code[:50]).all()
-    again = train_vocabulary(d, cells=10, children=4)  # multiples of 2^-11 below 1 have no more digits than half precision holds
+    # multiples of 2^-11 below 1 have no more digits than half precision holds
+    again = train_vocabulary(d, cells=10, children=4)
     for k in ("cells", "projection", "thresholds", "children"):
         np.testing.assert_array_equal(getattr(v, k), getattr(again, k))
 
@@ -294,7 +355,8 @@ def test_a_cell_of_few_descriptors_has_half_as_many_words() -> None:
     words = v.words(d)[0]
     own = v.nearest_cells(d, 1)[:, 0]
     for cell in range(9):
-        mine, kids = int((own == cell).sum()), v.children[cell]
+        mine = int((own == cell).sum())
+        kids = v.children[cell]
         assert kids.shape == (256, BITS)
         assert len(np.unique(kids, axis=0)) <= max(1, mine // 2)
         assert (words[own == cell] % 256 < max(1, mine // 2)).all()
@@ -307,7 +369,11 @@ def test_children_of_more_words_lie_nearer() -> None:
     def miss(children: int) -> float:
         v = train_vocabulary(d, cells=4, children=children)
         word = v.words(d)[0]
-        return float(np.mean(np.linalg.norm(v.projected(d) - v.children[word // 256, word % 256], axis=1)[own]))
+        return float(
+            np.mean(
+                np.linalg.norm(v.projected(d) - v.children[word // 256, word % 256], axis=1)[own]
+            )
+        )
 
     assert miss(64) < miss(8) < miss(1)
 
@@ -331,9 +397,13 @@ def test_vocabularies_come_back_and_code_the_same(vocabulary: Vocabulary, tmp_pa
     assert again.read_bytes() == path.read_bytes()
 
 
-def test_children_of_half_precision_are_rounded_to_bytes(vocabulary: Vocabulary, tmp_path: Path) -> None:
+def test_children_of_half_precision_are_rounded_to_bytes(
+    vocabulary: Vocabulary, tmp_path: Path
+) -> None:
     """As vocabularies of fewer words had them."""
-    halves = {k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds")}
+    halves = {
+        k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds")
+    }
     children = np.array([[[0.1] * 64, [0.9] * 64]] * 10, np.float16)
     save_file(halves | {"children": children}, tmp_path / "old.safetensors")
     found = load_vocabulary("geometric", tmp_path / "old.safetensors").children
@@ -341,8 +411,12 @@ def test_children_of_half_precision_are_rounded_to_bytes(vocabulary: Vocabulary,
     assert found[:, 1].tolist() == [[127 / 256] * 64] * 10  # the end of the range
 
 
-def test_files_that_hold_no_vocabulary_are_refused_by_name(vocabulary: Vocabulary, tmp_path: Path) -> None:
-    arrays = {k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds")}
+def test_files_that_hold_no_vocabulary_are_refused_by_name(
+    vocabulary: Vocabulary, tmp_path: Path
+) -> None:
+    arrays = {
+        k: getattr(vocabulary, k).astype(np.float16) for k in ("cells", "projection", "thresholds")
+    }
     arrays["children"] = (vocabulary.children * 256).astype(np.int8)
     odd: dict[str, bytes | None] = {"missing": None, "bytes": b"x" * 50, "empty": b""}
     odd_arrays = {
@@ -352,7 +426,10 @@ def test_files_that_hold_no_vocabulary_are_refused_by_name(vocabulary: Vocabular
         "wide": arrays | {"children": arrays["children"].astype(np.float32)},
         "infinite": arrays | {"thresholds": np.full_like(arrays["thresholds"], np.inf)},
         "flat": arrays | {"children": arrays["children"].reshape(-1)},
-        "many": {k: v if k == "projection" else np.concatenate([v] * 26) for k, v in arrays.items()},  # 260 cells do not fit a byte
+        # 260 cells do not fit a byte
+        "many": {
+            k: v if k == "projection" else np.concatenate([v] * 26) for k, v in arrays.items()
+        },
     }
     for name, content in odd.items():
         if content is not None:
@@ -389,5 +466,13 @@ def test_words_do_not_depend_on_the_number_of_threads() -> None:
     found = set()
     for threads in ("1", "2", "3"):
         environment = os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
-        found.add(subprocess.run([sys.executable, "-c", SCRIPT], env=environment, check=True, capture_output=True, text=True).stdout)
+        found.add(
+            subprocess.run(
+                [sys.executable, "-c", SCRIPT],
+                env=environment,
+                check=True,
+                capture_output=True,
+                text=True,
+            ).stdout
+        )
     assert len(found) == 1

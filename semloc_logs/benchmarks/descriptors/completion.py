@@ -1,4 +1,6 @@
-"""`semloc benchmark completion`: how well the network completes subvolumes of streets that no training has seen (paper 4.3, figure 3)."""
+"""`semloc benchmark completion`: how well the network completes subvolumes of streets that no
+training has seen (paper 4.3, figure 3).
+"""
 
 from __future__ import annotations
 
@@ -33,13 +35,16 @@ PAPER = 0.87  # accuracy (4.3)
 SHOWN = 6  # subvolumes in the picture
 BATCH = 16
 COUNTED = Training().occupied_weight
-BALANCED = 3.0  # of 1, 2, 3, 5 and 10 the best mean IoU on a simulated street that is not among the SEEDS
+# of 1, 2, 3, 5 and 10 the best mean IoU on a simulated street that is not among the SEEDS
+BALANCED = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Completed:
-    """Network codes (n, 32, 32, 32) of the subvolumes as few frames saw them, as the network completes them, the same with the most
-    probable label of each voxel, and as all frames saw them; ``classes`` is the code of free voxels."""
+    """Network codes (n, 32, 32, 32) of the subvolumes as few frames saw them, as the network
+    completes them, the same with the most probable label of each voxel, and as all frames saw them;
+    ``classes`` is the code of free voxels.
+    """
 
     given: U8
     said: U8
@@ -49,14 +54,19 @@ class Completed:
 
 
 def load_completion(variant: str, weights: Path | None = None) -> Completion:
-    """The shipped network of ``variant`` with its decoder, or that of a file. Raises SettingsError when the file does not hold one."""
+    """The shipped network of ``variant`` with its decoder, or that of a file. Raises SettingsError
+    when the file does not hold one.
+    """
     return load_weights(Completion, "", variant, weights)
 
 
 @torch.inference_mode()
 def completed(model: Completion, pairs: tuple[U8, U8, U8]) -> Completed:
-    """What the network makes of the incomplete views of ``pairs``, of :func:`semloc_logs.training.pairs.read_shard`."""
-    table, classes = code_table(model.encoder.variant), CLASSES[model.encoder.variant]
+    """What the network makes of the incomplete views of ``pairs``, of
+    :func:`semloc_logs.training.pairs.read_shard`.
+    """
+    table = code_table(model.encoder.variant)
+    classes = CLASSES[model.encoder.variant]
     given = table[pairs[0]]
     said, probable = (np.zeros((len(given), SIZE, SIZE, SIZE), np.uint8) for _ in range(2))
     for i in range(0, len(given), BATCH):
@@ -65,17 +75,21 @@ def completed(model: Completion, pairs: tuple[U8, U8, U8]) -> Completed:
             # an occupied voxel counted so often in training: its odds are too large by that
             excess = torch.tensor([math.log(weight)] * classes + [0.0])
             out[i : i + BATCH] = (logits - excess[:, None, None, None]).argmax(1).numpy()
-    return Completed(np.ascontiguousarray(given[:, 16:-16, 16:-16]), said, probable, table[pairs[1]], classes)
+    return Completed(
+        np.ascontiguousarray(given[:, 16:-16, 16:-16]), said, probable, table[pairs[1]], classes
+    )
 
 
 def completion_figures(found: Completed) -> Figures:
-    """Over the voxels that the complete map observed, as classes or free; ``all_free`` and ``copy_input`` are the two trivial answers.
+    """Over the voxels that the complete map observed, as classes or free; ``all_free`` and
+    ``copy_input`` are the two trivial answers.
 
-    ``ours`` weighs what is occupied three times, ``most_probable`` says the likeliest label of each voxel, ``input_completed`` keeps what
-    the input observed and is ours elsewhere.
+    ``ours`` weighs what is occupied three times, ``most_probable`` says the likeliest label of each
+    voxel, ``input_completed`` keeps what the input observed and is ours elsewhere.
 
-    ``accuracy``: share of right labels (the paper's figure); ``unobserved_accuracy``: the same where the input observed nothing;
-    ``mean_iou``: mean over the occupied classes that occur; ``occupied_iou``, ``free_iou``: of occupied and free whatever the class.
+    ``accuracy``: share of right labels (the paper's figure); ``unobserved_accuracy``: the same
+    where the input observed nothing; ``mean_iou``: mean over the occupied classes that occur;
+    ``occupied_iou``, ``free_iou``: of occupied and free whatever the class.
     """
     known = found.truth <= found.classes
     truth = found.truth[known]
@@ -89,9 +103,13 @@ def completion_figures(found: Completed) -> Figures:
     answers["input_completed"] = np.where(hidden, answers["ours"], answers["copy_input"])
     figures: Figures = {}
     for who, said in answers.items():
-        confusion = np.bincount(truth.astype(np.int64) * 32 + said, minlength=32 * 32).reshape(32, 32)
+        confusion = np.bincount(truth.astype(np.int64) * 32 + said, minlength=32 * 32).reshape(
+            32, 32
+        )
         scores = _scores(confusion, found.classes)
-        scores["unobserved_accuracy"] = float((said == truth)[hidden].mean()) if hidden.any() else 0.0
+        scores["unobserved_accuracy"] = (
+            float((said == truth)[hidden].mean()) if hidden.any() else 0.0
+        )
         for name, value in scores.items():
             figures.setdefault(name, {})[who] = value
     figures["accuracy"]["paper"] = PAPER
@@ -106,7 +124,8 @@ def _scores(confusion: I64, classes: int) -> dict[str, float]:
     right = np.diag(confusion)
     union = confusion.sum(0) + confusion.sum(1) - right
     occurs = np.flatnonzero(confusion.sum(1)[:classes])
-    unknown = classes + 2  # occupied, class unknown: as good as any class for whether something is there
+    # occupied, class unknown: as good as any class for whether something is there
+    unknown = classes + 2
     filled = np.isin(np.arange(32), [*range(classes), unknown])
     both = int(confusion[filled][:, filled].sum())
     either = int(confusion[filled].sum() + confusion[:, filled].sum()) - both
@@ -126,14 +145,23 @@ def completion_benchmark(
     picture: Path | None = None,
     note: Callable[[str], None] = lambda _: None,
 ) -> Figures:
-    """Figures on held-out streets, whose pairs are kept in the folder ``work``; ``picture`` is a PNG of some of them to look at."""
+    """Figures on held-out streets, whose pairs are kept in the folder ``work``; ``picture`` is a
+    PNG of some of them to look at.
+    """
     settings = settings.resolved()
     model = load_completion(variant, weights)
     with ExitStack() as stack:
-        folder = work or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="semloc-completion-")))
+        folder = work or Path(
+            stack.enter_context(tempfile.TemporaryDirectory(prefix="semloc-completion-"))
+        )
         parts = []
         for number, seed in enumerate(SEEDS):
-            shard = folder / "pairs" / simulation_version() / f"street-{seed}-{settings.fingerprint('fusion', 'training')}.parquet"
+            shard = (
+                folder
+                / "pairs"
+                / simulation_version()
+                / f"street-{seed}-{settings.fingerprint('fusion', 'training')}.parquet"
+            )
             shard.parent.mkdir(parents=True, exist_ok=True)
             pairs = read_shard(make_shard(SceneTask(seed, shard, settings)))
             rows = np.random.default_rng(seed).permutation(len(pairs[0]))[:PAIRS]
@@ -143,14 +171,20 @@ def completion_benchmark(
     found = completed(model, (a, b, c))
     if picture is not None:
         rows = _worth_seeing(found)
-        draw_completions(picture, variant, *(states_of(v[rows], found.classes) for v in (found.given, found.said, found.truth)))
+        draw_completions(
+            picture,
+            variant,
+            *(states_of(v[rows], found.classes) for v in (found.given, found.said, found.truth)),
+        )
     return completion_figures(found)
 
 
 def _worth_seeing(found: Completed) -> I64:
     """Rows with much to complete and many classes, far from each other in the list."""
     occupied = found.truth < found.classes
-    hidden = (occupied & (found.given == found.classes + 1)).sum((1, 2, 3)) / np.maximum(occupied.sum((1, 2, 3)), 1)
+    hidden = (occupied & (found.given == found.classes + 1)).sum((1, 2, 3)) / np.maximum(
+        occupied.sum((1, 2, 3)), 1
+    )
     kinds = np.array([len(np.unique(t[t < found.classes])) for t in found.truth])
     score = kinds + 5 * hidden + 5 * np.minimum(occupied.mean((1, 2, 3)) / 0.1, 1)
     groups = np.array_split(np.arange(len(score)), min(SHOWN, len(score)))

@@ -1,9 +1,12 @@
-"""Streets of simulated towns that no training has seen, mapped by a camera and by a LIDAR, with queries from other drives through them.
+"""Streets of simulated towns that no training has seen, mapped by a camera and by a LIDAR, with
+queries from other drives through them.
 
-What the retrieval benchmark asks. Databases are fused from a drive along each street in summer, by a camera that looks ahead and by a
-LIDAR. Queries are fused from one or five frames of another drive: another line in the lane, other parked cars and traffic; with the
-camera turned by 0, 90 or 180 degrees, or with the LIDAR in snow. Each query map is turned by the paper's heading that is nearest to
-the true one, of a frame of unknown heading, so that what is left is anything up to half a step. Streets are kept in a folder.
+What the retrieval benchmark asks. Databases are fused from a drive along each street in summer, by
+a camera that looks ahead and by a LIDAR. Queries are fused from one or five frames of another
+drive: another line in the lane, other parked cars and traffic; with the camera turned by 0, 90 or
+180 degrees, or with the LIDAR in snow. Each query map is turned by the paper's heading that is
+nearest to the true one, of a frame of unknown heading, so that what is left is anything up to half
+a step. Streets are kept in a folder.
 """
 
 from __future__ import annotations
@@ -19,7 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs import simulation
-from semloc_logs.benchmarks.descriptors.places import HEADINGS, Place, Street, asked_place, map_place, read_street, write_street
+from semloc_logs.benchmarks.descriptors.places import (
+    HEADINGS,
+    Place,
+    Street,
+    asked_place,
+    map_place,
+    read_street,
+    write_street,
+)
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 from semloc_logs.settings import Settings
@@ -38,22 +49,28 @@ from semloc_logs.voxels.grid import BlockMap, Fuser
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
-Cloud = tuple[F32, F32, U8, F32 | None]  # points and sensor (base frame, m), labels, standard deviation of the range
+# points and sensor (base frame, m), labels, standard deviation of the range
+Cloud = tuple[F32, F32, U8, F32 | None]
 
 TOWNS = 9001  # seed of the first town: those of training count from 0
 APART = 10_000.0  # m between the towns in the common frame
 SENSORS = ("camera", "lidar")
-SCENARIOS = {"0": "camera", "90": "camera", "180": "camera", "season": "lidar"}  # and the sensor that asks
+# and the sensor that asks
+SCENARIOS = {"0": "camera", "90": "camera", "180": "camera", "season": "lidar"}
 SPACING, QUERY_SPACING = 1.5, 1.0  # m between frames
 FRAMES = (1, 5)  # of queries
-LIDAR, COLUMNS = MODELS["hdl64"], 900
-SUMMER, LATER, SNOW = Condition(0), Condition(1), Condition(2, "snow")
+LIDAR = MODELS["hdl64"]
+COLUMNS = 900
+SUMMER = Condition(0)
+LATER = Condition(1)
+SNOW = Condition(2, "snow")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
-    """Held-out streets in a folder, as many as give ``database`` descriptors of each sensor, and others in memory; ``queries`` words of
-    each scenario."""
+    """Held-out streets in a folder, as many as give ``database`` descriptors of each sensor, and
+    others in memory; ``queries`` words of each scenario.
+    """
 
     paths: tuple[Path, ...]
     settings: Settings  # resolved
@@ -69,7 +86,9 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """How large the held-out towns are: crossings of a side, metres between them, queries of each kind and number of frames a street."""
+    """How large the held-out towns are: crossings of a side, metres between them, queries of each
+    kind and number of frames a street.
+    """
 
     side: int = 4
     block: float = 85.0
@@ -85,12 +104,19 @@ def held_out(
     extent: Extent = Extent(),
     on_progress: Callable[[str], None] = lambda _: None,
 ) -> HeldOut:
-    """As many streets as give ``database`` descriptors of each sensor by ``count``, simulated where ``folder`` lacks them.
+    """As many streets as give ``database`` descriptors of each sensor by ``count``, simulated where
+    ``folder`` lacks them.
 
-    Another version of the simulation has files of its own. SettingsError when so many cannot be had.
+    Another version of the simulation has files of its own. SettingsError when so many cannot be
+    had.
     """
     folder = folder / simulation_version()
-    note = {"schema_version": 1, "fusion": settings.fingerprint("fusion"), "headings": HEADINGS, "extent": repr(extent)}
+    note = {
+        "schema_version": 1,
+        "fusion": settings.fingerprint("fusion"),
+        "headings": HEADINGS,
+        "extent": repr(extent),
+    }
     paths: list[Path] = []
     counts = dict.fromkeys(SENSORS, 0)
     for town in range(8):
@@ -106,17 +132,23 @@ def held_out(
             for kind, held in read_metadata(path)["count"].items():
                 counts[kind] += held
             paths.append(path)
-            on_progress(f"{min(min(counts.values()), database)} of {database} descriptors' streets are simulated")
+            on_progress(
+                f"{min(min(counts.values()), database)} of {database} descriptors' streets are simulated"
+            )
     _scene.cache_clear()  # a town takes hundreds of megabytes
     if min(counts.values()) < database:
-        raise SettingsError(f"{database} held-out descriptors cannot be had: {min(counts.values())} at most.")
+        raise SettingsError(
+            f"{database} held-out descriptors cannot be had: {min(counts.values())} at most."
+        )
     return HeldOut(tuple(paths), settings, database, queries)
 
 
 def simulation_version() -> str:
     """Of the simulation: a hash of its modules."""
     package = Path(simulation.__file__).parent
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(package.glob("*.py")))).hexdigest()[:12]
+    return hashlib.sha256(
+        b"".join(path.read_bytes() for path in sorted(package.glob("*.py")))
+    ).hexdigest()[:12]
 
 
 def _is_made(path: Path, note: dict[str, Any]) -> bool:
@@ -132,7 +164,9 @@ def _is_made(path: Path, note: dict[str, Any]) -> bool:
 
 @lru_cache(maxsize=8)
 def _network(town: int, extent: Extent) -> RoadNetwork:
-    return grid_network(np.random.default_rng([TOWNS + town, 61]), extent.side, extent.side, extent.block)
+    return grid_network(
+        np.random.default_rng([TOWNS + town, 61]), extent.side, extent.side, extent.block
+    )
 
 
 @lru_cache(maxsize=1)
@@ -163,12 +197,22 @@ class _Drive:
         return poses_along(self.line, at, self.height, self.rng)
 
     def camera(self, pose: F64, yaw: float) -> Cloud:
-        return camera_points(self.scene, pose, self.rng, CAMERAS["stereo"], yaw=yaw, traffic=self._moving(pose))
+        return camera_points(
+            self.scene, pose, self.rng, CAMERAS["stereo"], yaw=yaw, traffic=self._moving(pose)
+        )
 
     def lidar(self, pose: F64) -> Cloud:
         mounted = np.eye(4)
         mounted[2, 3] = LIDAR.height
-        seen = full_sweep(self.scene, pose @ mounted, self.rng, LIDAR, columns=COLUMNS, max_range=60.0, traffic=self._moving(pose))
+        seen = full_sweep(
+            self.scene,
+            pose @ mounted,
+            self.rng,
+            LIDAR,
+            columns=COLUMNS,
+            max_range=60.0,
+            traffic=self._moving(pose),
+        )
         origin = mounted[:3, 3].astype(np.float32)
         return seen.points + origin, origin, seen.labels, None
 
@@ -190,7 +234,11 @@ def simulate_street(town: int, road: int, settings: Settings, extent: Extent = E
         ground = _ground(town, extent)
         line = lane + beside * across
         return _Drive(
-            _scene(town, extent, condition), line, ground.slope_height, random_traffic(rng, ground, [line], 0.4), np.random.default_rng(rng)
+            _scene(town, extent, condition),
+            line,
+            ground.slope_height,
+            random_traffic(rng, ground, [line], 0.4),
+            np.random.default_rng(rng),
         )
 
     first = drive(SUMMER, 0.0)
@@ -201,21 +249,32 @@ def simulate_street(town: int, road: int, settings: Settings, extent: Extent = E
     ]
     queries: dict[str, list[Place]] = {}
     for name, sensor in SCENARIOS.items():
-        again = drive(SNOW if name == "season" else LATER, float(rng.choice([-1, 1]) * rng.uniform(0.4, 1.2)))
+        again = drive(
+            SNOW if name == "season" else LATER, float(rng.choice([-1, 1]) * rng.uniform(0.4, 1.2))
+        )
         found = queries.setdefault(name, [])
         for frames in FRAMES:
             for _ in range(extent.queries):
                 middle = rng.uniform(0.2, 0.8) * again.length
-                poses = again.poses(middle + QUERY_SPACING * (np.arange(frames, dtype=np.float64) - frames // 2))
+                poses = again.poses(
+                    middle + QUERY_SPACING * (np.arange(frames, dtype=np.float64) - frames // 2)
+                )
                 yaw = np.radians(float(name)) * rng.choice([-1, 1]) if sensor == "camera" else 0.0
-                clouds = [again.camera(p, yaw) if sensor == "camera" else again.lidar(p) for p in poses]
-                found.append(_asked(settings, clouds, poses, common, float(rng.uniform(0, 2 * np.pi))))
+                clouds = [
+                    again.camera(p, yaw) if sensor == "camera" else again.lidar(p) for p in poses
+                ]
+                found.append(
+                    _asked(settings, clouds, poses, common, float(rng.uniform(0, 2 * np.pi)))
+                )
     return Street(database, queries)
 
 
-def _fuse(settings: Settings, clouds: list[Cloud], poses: F64, radius: float = np.inf) -> tuple[BlockMap, F64]:
+def _fuse(
+    settings: Settings, clouds: list[Cloud], poses: F64, radius: float = np.inf
+) -> tuple[BlockMap, F64]:
     """The map of some clouds and the sensor's places (n, 3)."""
-    fuser, track = Fuser(settings.fusion), []
+    fuser = Fuser(settings.fusion)
+    track = []
     for (points, origin, labels, sigma), pose in zip(clouds, poses, strict=True):
         near = np.linalg.norm(points - origin, axis=1) < radius
         fuser.add(points[near], labels[near], origin, None if sigma is None else sigma[near], pose)
@@ -228,8 +287,12 @@ def _mapped(settings: Settings, clouds: list[Cloud], poses: F64, common_T_map: F
     return map_place(blocks, track, float(np.median(poses[:, 2, 3])), common_T_map)
 
 
-def _asked(settings: Settings, clouds: list[Cloud], poses: F64, common_T_map: F64, heading: float) -> Place:
+def _asked(
+    settings: Settings, clouds: list[Cloud], poses: F64, common_T_map: F64, heading: float
+) -> Place:
     """A query in a frame of some ``heading`` in the map, its origin in the middle of the drive."""
     map_T_query = yaw_transform(heading, tuple(poses[len(poses) // 2][:3, 3]))
-    blocks, track = _fuse(settings, clouds, inverse(map_T_query) @ poses, settings.query.radius or 24.0)
+    blocks, track = _fuse(
+        settings, clouds, inverse(map_T_query) @ poses, settings.query.radius or 24.0
+    )
     return asked_place(blocks, track, 0.0, common_T_map @ map_T_query, settings)

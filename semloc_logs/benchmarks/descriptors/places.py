@@ -26,8 +26,10 @@ HEADINGS = 18  # of the paper: a query comes turned by the nearest of them
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """A map: voxel states ``state`` (x, y, z) whose corner is voxel ``low`` (3,) of its frame, height of the ground there (m), the
-    sensor's places ``track`` (n, 3) in it (m), and its frame in the common one, ``common_T_map`` (4, 4)."""
+    """A map: voxel states ``state`` (x, y, z) whose corner is voxel ``low`` (3,) of its frame,
+    height of the ground there (m), the sensor's places ``track`` (n, 3) in it (m), and its frame in
+    the common one, ``common_T_map`` (4, 4).
+    """
 
     state: U8
     low: I64
@@ -38,7 +40,9 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Street:
-    """The maps of one street, by name of the database that they belong to, and the queries of each scenario."""
+    """The maps of one street, by name of the database that they belong to, and the queries of each
+    scenario.
+    """
 
     database: list[tuple[str, Place]]
     queries: dict[str, list[Place]]
@@ -47,11 +51,20 @@ class Street:
 def map_place(blocks: BlockMap, track: F64, ground_z: float, common_T_map: F64) -> Place:
     """A map for a database."""
     low, high = blocks.bounds()
-    return Place(blocks.dense(low, tuple((high - low).tolist())), low.astype(np.int64), ground_z, track, common_T_map)
+    return Place(
+        blocks.dense(low, tuple((high - low).tolist())),
+        low.astype(np.int64),
+        ground_z,
+        track,
+        common_T_map,
+    )
 
 
-def asked_place(blocks: BlockMap, track: F64, ground_z: float, common_T_query: F64, settings: Settings) -> Place:
-    """A query map about the origin of its level frame, turned by that heading of the paper that is nearest to the true one.
+def asked_place(
+    blocks: BlockMap, track: F64, ground_z: float, common_T_query: F64, settings: Settings
+) -> Place:
+    """A query map about the origin of its level frame, turned by that heading of the paper that is
+    nearest to the true one.
 
     ``track`` (n, 3) and ``ground_z`` are in the query's frame, metres. ``settings`` are resolved.
     """
@@ -63,7 +76,13 @@ def asked_place(blocks: BlockMap, track: F64, ground_z: float, common_T_query: F
     state = blocks.dense(low, tuple((high - low).tolist()))
     turn(state, low.astype(np.int64), -yaw, np.array([0.0, 0.0, (low[2] + high[2]) / 2]), box)
     turned = yaw_transform(yaw)
-    return Place(box, np.array([-half, -half, low[2]], np.int64), ground_z, apply(turned, track), common_T_query @ inverse(turned))
+    return Place(
+        box,
+        np.array([-half, -half, low[2]], np.int64),
+        ground_z,
+        apply(turned, track),
+        common_T_query @ inverse(turned),
+    )
 
 
 def write_street(path: Path, street: Street, metadata: dict[str, Any]) -> None:
@@ -77,7 +96,9 @@ def write_street(path: Path, street: Street, metadata: dict[str, Any]) -> None:
         "low": pa.array([r[2].low.tolist() for r in rows], pa.list_(pa.int64())),
         "ground_z": pa.array([r[2].ground_z for r in rows]),
         "track": pa.array([r[2].track.ravel().tolist() for r in rows], pa.list_(pa.float64())),
-        "common_T_map": pa.array([r[2].common_T_map.ravel().tolist() for r in rows], pa.list_(pa.float64())),
+        "common_T_map": pa.array(
+            [r[2].common_T_map.ravel().tolist() for r in rows], pa.list_(pa.float64())
+        ),
         "state": pa.array([r[2].state.tobytes() for r in rows], pa.large_binary()),
     }
     write_table(path, pa.table(columns), metadata)
@@ -102,4 +123,6 @@ def read_street(path: Path) -> Street:
                 queries.setdefault(row["kind"], []).append(place)
         return Street(database, queries)
     except (KeyError, ValueError, TypeError, OverflowError):
-        raise WorkspaceError(f"{path} is no street of the retrieval benchmark: remove it, and it is simulated again.") from None
+        raise WorkspaceError(
+            f"{path} is no street of the retrieval benchmark: remove it, and it is simulated again."
+        ) from None

@@ -1,7 +1,8 @@
-"""Are descriptors found again? The share of query subvolumes whose true place is among the nearest descriptors of a database.
+"""Are descriptors found again? The share of query subvolumes whose true place is among the nearest
+descriptors of a database.
 
-What is asked: :mod:`semloc_logs.benchmarks.descriptors.held_out`. Whatever describes a place can be measured: the network, trained or not, or a
-descriptor of a peer.
+What is asked: :mod:`semloc_logs.benchmarks.descriptors.held_out`. Whatever describes a place can be
+measured: the network, trained or not, or a descriptor of a peer.
 """
 
 from __future__ import annotations
@@ -26,9 +27,17 @@ from semloc_logs.subvolumes.network import LATENT
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
-Describe = Callable[[Place, bool], Described]  # a place and whether it is a query -> centres (voxels of its frame) and descriptors
+# a place and whether it is a query -> centres (voxels of its frame) and descriptors
+Describe = Callable[[Place, bool], Described]
 
-DATABASES = {"0": ("camera",), "90": ("camera",), "180": ("camera",), "season": ("lidar",), "sensor": ("lidar",)}  # of each scenario
+# of each scenario
+DATABASES = {
+    "0": ("camera",),
+    "90": ("camera",),
+    "180": ("camera",),
+    "season": ("lidar",),
+    "sensor": ("lidar",),
+}
 NEAREST = 5
 RADIUS = 1.5  # m at 0.30 m voxels
 LAYER = 8  # voxels between the layers of a map
@@ -56,12 +65,17 @@ class NoEncoder(nn.Module):
 
     def forward(self, codes: Tensor) -> Tensor:
         """Ones (b, 256, i, j) for codes (b, x, y, 32)."""
-        return torch.ones(len(codes), self.latent, *((n - 2 * MARGIN - SIZE) // 8 + 1 for n in codes.shape[1:3]))
+        return torch.ones(
+            len(codes), self.latent, *((n - 2 * MARGIN - SIZE) // 8 + 1 for n in codes.shape[1:3])
+        )
 
 
 def network_describes(encoder: nn.Module, settings: Settings) -> Describe:
-    """Describes places by the network, as ``semloc describe`` and ``semloc close`` do. ``settings`` are resolved."""
-    d, v = settings.descriptor, settings.fusion.voxel_size
+    """Describes places by the network, as ``semloc describe`` and ``semloc close`` do. ``settings``
+    are resolved.
+    """
+    d = settings.descriptor
+    v = settings.fusion.voxel_size
 
     def describe(place: Place, is_query: bool) -> Described:
         road = None if is_query else place.track[:, :2]
@@ -88,7 +102,8 @@ def count_subvolumes(settings: Settings) -> Callable[[Place], int]:
 
 
 def retrieval_recall(world: HeldOut, encoder: nn.Module) -> dict[str, float]:
-    """Recall at 5 of each scenario, in [0, 1], of a network that maps codes to mu as :class:`~semloc_logs.subvolumes.network.Encoder` does.
+    """Recall at 5 of each scenario, in [0, 1], of a network that maps codes to mu as
+    :class:`~semloc_logs.subvolumes.network.Encoder` does.
 
     See :func:`recalls`.
     """
@@ -98,9 +113,11 @@ def retrieval_recall(world: HeldOut, encoder: nn.Module) -> dict[str, float]:
 def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:
     """Recall of each scenario by whatever describes places.
 
-    The share of query words whose true place is among the 5 nearest (L2) of exactly ``world.database`` database words: one of those is
-    within the larger of 1.5 m (at 0.30 m voxels) and half a cell's diagonal of it. Query words without any such database word do not count.
-    Scenarios other than the five have a database of their own name, filled up with that of the LIDAR.
+    The share of query words whose true place is among the 5 nearest (L2) of exactly
+    ``world.database`` database words: one of those is within the larger of 1.5 m (at 0.30 m voxels)
+    and half a cell's diagonal of it. Query words without any such database word do not count.
+    Scenarios other than the five have a database of their own name, filled up with that of the
+    LIDAR.
     """
     v = world.settings.fusion.voxel_size
     found: dict[str, list[Words]] = {}
@@ -121,29 +138,48 @@ def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:
     out = {}
     for name, parts in asked.items():
         kinds = DATABASES.get(name, (name, "lidar"))
-        out[name] = _recall(_joined(parts), _joined([databases[kind] for kind in kinds if kind in databases]), world, radius)
+        out[name] = _recall(
+            _joined(parts),
+            _joined([databases[kind] for kind in kinds if kind in databases]),
+            world,
+            radius,
+        )
     return out
 
 
 def true_radius(settings: Settings) -> float:
-    """Metres within which a database word is the true one: the larger of 1.5 m (at 0.30 m voxels) and half a cell's diagonal."""
-    v, stride = settings.fusion.voxel_size, settings.descriptor.stride
+    """Metres within which a database word is the true one: the larger of 1.5 m (at 0.30 m voxels)
+    and half a cell's diagonal.
+    """
+    v = settings.fusion.voxel_size
+    stride = settings.descriptor.stride
     return v * max(RADIUS / 0.30, 0.5 * float(np.linalg.norm([stride, stride, LAYER])))
 
 
 def _words(place: Place, described: Described, voxel_size: float) -> Words:
-    return Words(apply(place.common_T_map, described.centre.astype(np.float64) * voxel_size), described.descriptor)
+    return Words(
+        apply(place.common_T_map, described.centre.astype(np.float64) * voxel_size),
+        described.descriptor,
+    )
 
 
 def _joined(parts: list[Words]) -> Words:
     parts = [p for p in parts if len(p.centre)] or parts[:1]
-    return Words(np.concatenate([p.centre for p in parts]), np.concatenate([p.descriptor for p in parts]))
+    return Words(
+        np.concatenate([p.centre for p in parts]), np.concatenate([p.descriptor for p in parts])
+    )
 
 
 def _recall(asked: Words, database: Words, world: HeldOut, radius: float) -> float:
-    """Of as many query words as are wanted, on as large a database as is wanted; drawn at random, always the same."""
+    """Of as many query words as are wanted, on as large a database as is wanted; drawn at random,
+    always the same.
+    """
     rng = np.random.default_rng(1)
-    away = cKDTree(database.centre).query(asked.centre)[0] if len(database.centre) and len(asked.centre) else np.zeros(0)
+    away = (
+        cKDTree(database.centre).query(asked.centre)[0]
+        if len(database.centre) and len(asked.centre)
+        else np.zeros(0)
+    )
     possible = rng.permutation(np.flatnonzero(away < radius))[: world.queries]
     asked = asked[np.sort(possible)]
     if not len(asked.centre):
@@ -154,8 +190,12 @@ def _recall(asked: Words, database: Words, world: HeldOut, radius: float) -> flo
     return float(found_again(asked, database, radius).mean())
 
 
-def found_again(asked: Words, database: Words, radius: float, nearest: int = NEAREST) -> NDArray[np.bool_]:
-    """Which words (m,) have one of their ``nearest`` descriptors (L2) within ``radius`` metres of where they truly are."""
+def found_again(
+    asked: Words, database: Words, radius: float, nearest: int = NEAREST
+) -> NDArray[np.bool_]:
+    """Which words (m,) have one of their ``nearest`` descriptors (L2) within ``radius`` metres of
+    where they truly are.
+    """
     out = np.zeros(len(asked.centre), bool)
     length = np.einsum("nd,nd->n", database.descriptor, database.descriptor)
     k = min(nearest, len(length))

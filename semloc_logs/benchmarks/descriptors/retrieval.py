@@ -1,4 +1,6 @@
-"""`semloc benchmark retrieval`: is the true place of a subvolume among its nearest descriptors, trained beside random and FPFH?"""
+"""`semloc benchmark retrieval`: is the true place of a subvolume among its nearest descriptors,
+trained beside random and FPFH?
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,13 @@ import numpy as np
 
 from semloc_logs.benchmarks.descriptors.held_out import HeldOut, held_out
 from semloc_logs.benchmarks.descriptors.places import Place, Street
-from semloc_logs.benchmarks.descriptors.recall import NoEncoder, count_subvolumes, network_describes, recalls, retrieval_recall
+from semloc_logs.benchmarks.descriptors.recall import (
+    NoEncoder,
+    count_subvolumes,
+    network_describes,
+    recalls,
+    retrieval_recall,
+)
 from semloc_logs.benchmarks.peers.fpfh import fpfh_describes
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings
@@ -21,13 +29,16 @@ from semloc_logs.subvolumes.describe import load_encoder, random_encoder
 Figures = dict[str, dict[str, float | str]]
 Note = Callable[[str], None]
 SEEDS = 3
-REAL = {"real_log": "semantic", "real_geometry_labels": "semantic", "real_geometric": "geometric"}  # scenarios and their network
+# scenarios and their network
+REAL = {"real_log": "semantic", "real_geometry_labels": "semantic", "real_geometric": "geometric"}
 
 
 @dataclass(frozen=True, slots=True)
 class RetrievalChoice:
-    """What is measured: ``variants`` of the network, ``weights`` instead of the shipped ones, descriptors of the database and words
-    that ask in each scenario, ``work``: a folder that keeps the simulated streets."""
+    """What is measured: ``variants`` of the network, ``weights`` instead of the shipped ones,
+    descriptors of the database and words that ask in each scenario, ``work``: a folder that keeps
+    the simulated streets.
+    """
 
     variants: tuple[str, ...] = ("semantic",)
     weights: Path | None = None
@@ -43,41 +54,73 @@ def retrieval_benchmark(
     real: Mapping[str, Street] | None = None,
     note: Note = lambda _: None,
 ) -> Figures:
-    """Recall at 5 of each scenario: ``trained``, ``random`` (mean of three seeds) and ``fpfh``, where ``peers`` says which Python has it.
+    """Recall at 5 of each scenario: ``trained``, ``random`` (mean of three seeds) and ``fpfh``,
+    where ``peers`` says which Python has it.
 
-    ``real`` streets, by name of their scenario, are asked for among the simulated ones: those of ``REAL``.
-    SettingsError for another peer, or weights of one variant for both.
+    ``real`` streets, by name of their scenario, are asked for among the simulated ones: those of
+    ``REAL``. SettingsError for another peer, or weights of one variant for both.
     """
     if set(peers) - {"fpfh"}:
-        raise SettingsError(f"Descriptors of '{next(iter(set(peers) - {'fpfh'}))}' cannot be compared with: give --peer fpfh=PYTHON.")
+        raise SettingsError(
+            f"Descriptors of '{next(iter(set(peers) - {'fpfh'}))}' cannot be compared with: give --peer fpfh=PYTHON."
+        )
     if choice.weights is not None and len(choice.variants) > 1:
-        raise SettingsError("One file of weights is for one variant: give --variant semantic or --variant geometric.")
+        raise SettingsError(
+            "One file of weights is for one variant: give --variant semantic or --variant geometric."
+        )
     settings = densely(settings).resolved()
     with ExitStack() as stack:
-        work = choice.work or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="semloc-retrieval-")))
-        streets = held_out(work / "streets", settings, count_subvolumes(settings), choice.database, choice.queries, on_progress=note)
+        work = choice.work or Path(
+            stack.enter_context(tempfile.TemporaryDirectory(prefix="semloc-retrieval-"))
+        )
+        streets = held_out(
+            work / "streets",
+            settings,
+            count_subvolumes(settings),
+            choice.database,
+            choice.queries,
+            on_progress=note,
+        )
         figures: Figures = {}
         fpfh: dict[str, float] = {}
         for variant in choice.variants:
-            world = replace(streets, others=tuple(street for name, street in (real or {}).items() if REAL[name] == variant))
+            world = replace(
+                streets,
+                others=tuple(
+                    street for name, street in (real or {}).items() if REAL[name] == variant
+                ),
+            )
             columns = {"trained": retrieval_recall(world, load_encoder(variant, choice.weights))}
             note(f"{variant}: trained weights are measured")
-            found = [retrieval_recall(world, random_encoder(variant, seed)) for seed in range(SEEDS)]
-            columns["random"] = {name: float(np.mean([f[name] for f in found])) for name in found[0]}
+            found = [
+                retrieval_recall(world, random_encoder(variant, seed)) for seed in range(SEEDS)
+            ]
+            columns["random"] = {
+                name: float(np.mean([f[name] for f in found])) for name in found[0]
+            }
             note(f"{variant}: random weights are measured")
             if "fpfh" in peers:
                 fpfh |= _fpfh(world, peers["fpfh"], work / "fpfh")
                 columns["fpfh"] = fpfh
             for name in columns["trained"]:
-                row = name if variant == "semantic" or name.startswith("real") else f"{variant}_{name}"
-                figures[row] = {who: column[name] for who, column in columns.items()} | {"unit": "recall at 5"}
+                row = (
+                    name
+                    if variant == "semantic" or name.startswith("real")
+                    else f"{variant}_{name}"
+                )
+                figures[row] = {who: column[name] for who, column in columns.items()} | {
+                    "unit": "recall at 5"
+                }
         return figures
 
 
 def densely(settings: Settings) -> Settings:
-    """Databases have descriptors at a stride of four voxels here: finer than `semloc describe` by default, so that 1.5 m tell right from
-    wrong."""
-    return settings.model_copy(update={"descriptor": settings.descriptor.model_copy(update={"stride": 4})})
+    """Databases have descriptors at a stride of four voxels here: finer than `semloc describe` by
+    default, so that 1.5 m tell right from wrong.
+    """
+    return settings.model_copy(
+        update={"descriptor": settings.descriptor.model_copy(update={"stride": 4})}
+    )
 
 
 def _fpfh(world: HeldOut, python: str, folder: Path) -> dict[str, float]:
@@ -87,4 +130,6 @@ def _fpfh(world: HeldOut, python: str, folder: Path) -> dict[str, float]:
             yield from ((place, True) for asked in street.queries.values() for place in asked)
 
     same = network_describes(NoEncoder().eval(), world.settings)
-    return recalls(world, fpfh_describes(python, folder, places(), same, world.settings.fusion.voxel_size))
+    return recalls(
+        world, fpfh_describes(python, folder, places(), same, world.settings.fusion.voxel_size)
+    )

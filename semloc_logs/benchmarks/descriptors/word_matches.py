@@ -1,4 +1,6 @@
-"""Does the descriptor earn its place? Recall of word matches between two maps whose true alignment is known."""
+"""Does the descriptor earn its place? Recall of word matches between two maps whose true alignment
+is known.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,10 @@ FAR = 1e6
 
 @dataclass(frozen=True, slots=True)
 class WordRecall:
-    """Share of query words with a true place among their 5 nearest database words: by descriptor (``exact``) and by vocabulary and
-    code (``coded``); of ``words`` query words that have a database word within ``radius`` metres of their true place."""
+    """Share of query words with a true place among their 5 nearest database words: by descriptor
+    (``exact``) and by vocabulary and code (``coded``); of ``words`` query words that have a
+    database word within ``radius`` metres of their true place.
+    """
 
     exact: float
     coded: float
@@ -48,17 +52,26 @@ def word_recall(
     radius: float = 1.5,
     k: int = 5,
 ) -> WordRecall:
-    """Recall at ``k`` of the words of the query at ``keyframe``, in the search's heading nearest to the true one.
+    """Recall at ``k`` of the words of the query at ``keyframe``, in the search's heading nearest to
+    the true one.
 
     Without a ``vocabulary`` one is trained on the database's own descriptors.
     """
     v = settings.fusion.voxel_size
-    parts = [d for s in target.submaps for d in describe_submap(target.folder, s["id"], s["ground_z"], target.road(s), encoder, settings)]
+    parts = [
+        d
+        for s in target.submaps
+        for d in describe_submap(
+            target.folder, s["id"], s["ground_z"], target.road(s), encoder, settings
+        )
+    ]
     centre = np.concatenate([p.centre for p in parts]) * v
     descriptor = np.concatenate([p.descriptor for p in parts])
     place = query_place(query, keyframe, targetmap_T_querymap, settings)
     d = settings.descriptor
-    asked = describe_map(place.state, place.low, place.ground_z, v, encoder, d.query_stride, d.min_occupied)
+    asked = describe_map(
+        place.state, place.low, place.ground_z, v, encoder, d.query_stride, d.min_occupied
+    )
     true = apply(place.common_T_map, asked.centre.astype(np.float64) * v)
     distance = np.linalg.norm(true[:, None, :] - centre[None], axis=2)
     possible = distance.min(1) < radius
@@ -72,22 +85,40 @@ def word_recall(
     matches = index.search(asked.descriptor, k, settings.closures.probes, Allowed(np.ones(1, bool)))
     coded = np.zeros(len(true), bool)
     np.logical_or.at(coded, matches.query, distance[matches.query, matches.entry] < radius)
-    return WordRecall(float(exact[possible].mean()), float(coded[possible].mean()), int(possible.sum()), len(centre), radius)
+    return WordRecall(
+        float(exact[possible].mean()),
+        float(coded[possible].mean()),
+        int(possible.sum()),
+        len(centre),
+        radius,
+    )
 
 
-def query_place(query: SessionMap, keyframe: int, targetmap_T_querymap: F64, settings: Settings) -> Place:
-    """The query at ``keyframe``, turned to the nearest heading of the search, and its place in the target's map frame."""
+def query_place(
+    query: SessionMap, keyframe: int, targetmap_T_querymap: F64, settings: Settings
+) -> Place:
+    """The query at ``keyframe``, turned to the nearest heading of the search, and its place in the
+    target's map frame.
+    """
     asked = build_query(query, keyframe, settings)[0].blocks
     querymap_T_query = np.eye(4)
     querymap_T_query[:3, 3] = query.map_T_base[keyframe][:3, 3]
     ground = float(query.ground_z[keyframe] - query.map_T_base[keyframe][2, 3])
     members = query_members(query, keyframe, settings)
-    track = np.stack([apply(inverse(querymap_T_query) @ query.map_T_base[i], query.origins[i][None])[0] for i in members])
+    track = np.stack(
+        [
+            apply(inverse(querymap_T_query) @ query.map_T_base[i], query.origins[i][None])[0]
+            for i in members
+        ]
+    )
     return asked_place(asked, track, ground, targetmap_T_querymap @ querymap_T_query, settings)
 
 
-def true_queries(query: SessionMap, target: SessionMap, tracks: Mapping[str, TrueTrack], settings: Settings) -> list[tuple[int, F64]]:
-    """Keyframes of ``query`` that ask within 10 m of the target's road, each with the true ``targetmap_T_querymap`` (4, 4) there.
+def true_queries(
+    query: SessionMap, target: SessionMap, tracks: Mapping[str, TrueTrack], settings: Settings
+) -> list[tuple[int, F64]]:
+    """Keyframes of ``query`` that ask within 10 m of the target's road, each with the true
+    ``targetmap_T_querymap`` (4, 4) there.
 
     Maps drift: the transform is that of the target's keyframe that is nearest.
     """
@@ -103,8 +134,16 @@ def true_queries(query: SessionMap, target: SessionMap, tracks: Mapping[str, Tru
     return out
 
 
-def real_street(query: SessionMap, target: SessionMap, tracks: Mapping[str, TrueTrack], name: str, settings: Settings) -> Street:
-    """The submaps of ``target`` as a database and the queries of ``query``, both called ``name``; far away from every simulated street."""
+def real_street(
+    query: SessionMap,
+    target: SessionMap,
+    tracks: Mapping[str, TrueTrack],
+    name: str,
+    settings: Settings,
+) -> Street:
+    """The submaps of ``target`` as a database and the queries of ``query``, both called ``name``;
+    far away from every simulated street.
+    """
     common_T_map = np.eye(4)
     common_T_map[1, 3] = -FAR
     database = []
@@ -113,5 +152,8 @@ def real_street(query: SessionMap, target: SessionMap, tracks: Mapping[str, True
         frames = range(submap["first"], submap["last"] + 1)
         track = np.stack([apply(target.map_T_base[i], target.origins[i][None])[0] for i in frames])
         database.append((name, map_place(blocks, track, submap["ground_z"], common_T_map)))
-    places = [query_place(query, k, common_T_map @ T, settings) for k, T in true_queries(query, target, tracks, settings)]
+    places = [
+        query_place(query, k, common_T_map @ T, settings)
+        for k, T in true_queries(query, target, tracks, settings)
+    ]
     return Street(database, {name: places})

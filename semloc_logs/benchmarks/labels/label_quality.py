@@ -1,8 +1,10 @@
 """How good are classes from geometry, against the labels of a log or of simulated sweeps?
 
-The truth is the log's own label in the coarse set: road, sidewalk and terrain (parking and lane marking too) are ground; building, wall
-and fence construction; vegetation and, as in Cityscapes, tree trunks vegetation; poles, signs and lights poles. Vehicles and people have no
-class in geometry: calling them anything but unlabelled counts against that class. Points without a label in the log do not count.
+The truth is the log's own label in the coarse set: road, sidewalk and terrain (parking and lane
+marking too) are ground; building, wall and fence construction; vegetation and, as in Cityscapes,
+tree trunks vegetation; poles, signs and lights poles. Vehicles and people have no class in
+geometry: calling them anything but unlabelled counts against that class. Points without a label in
+the log do not count.
 """
 
 from __future__ import annotations
@@ -47,9 +49,12 @@ def _index() -> U8:
 
 
 def confusion(truth: U8, found: U8) -> I64:
-    """Counts (5, 5) of train ids (n,): rows ground, construction, vegetation, pole, other; columns these four and unlabelled."""
+    """Counts (5, 5) of train ids (n,): rows ground, construction, vegetation, pole, other; columns
+    these four and unlabelled.
+    """
     table = _index()
-    row, column = table[truth], np.minimum(table[found], 4)
+    row = table[truth]
+    column = np.minimum(table[found], 4)
     known = row < 5
     return np.bincount(row[known].astype(np.int64) * 5 + column[known], minlength=25).reshape(5, 5)
 
@@ -62,20 +67,28 @@ def intersection_over_union(counts: I64) -> NDArray[np.float64]:
 
 
 def _compare_maps(truth: BlockMap, found: BlockMap) -> I64:
-    """Confusion of the voxels that are occupied in both maps, which classes decide a little: what is ground is carved less."""
+    """Confusion of the voxels that are occupied in both maps, which classes decide a little: what
+    is ground is carved less.
+    """
     (ours, our_class, *_), (theirs, their_class, *_) = found.occupied(), truth.occupied()
-    _, at, true_at = np.intersect1d(pack(ours), pack(theirs), assume_unique=True, return_indices=True)
+    _, at, true_at = np.intersect1d(
+        pack(ours), pack(theirs), assume_unique=True, return_indices=True
+    )
     return confusion(their_class[true_at], our_class[at])
 
 
 def measure_labels(logs: Sequence[Path], settings: Settings) -> Figures:
-    """Classes from geometry against the labels of ``logs``, on keyframe points within the fused range and on fused voxels.
+    """Classes from geometry against the labels of ``logs``, on keyframe points within the fused
+    range and on fused voxels.
 
     LogError when a log has no labels.
     """
     settings = settings.resolved()
-    fused = settings.model_copy(update={"labels": settings.labels.model_copy(update={"source": "log"})})
-    points, voxels = np.zeros((5, 5), np.int64), np.zeros((5, 5), np.int64)
+    fused = settings.model_copy(
+        update={"labels": settings.labels.model_copy(update={"source": "log"})}
+    )
+    points = np.zeros((5, 5), np.int64)
+    voxels = np.zeros((5, 5), np.int64)
     taken: list[float] = []
     sizes: list[int] = []
     with tempfile.TemporaryDirectory(prefix="semloc-labels-") as folder:
@@ -85,21 +98,32 @@ def measure_labels(logs: Sequence[Path], settings: Settings) -> Figures:
             if session.posed:
                 voxels += _measure_session(session, settings, points, taken, sizes)
             else:
-                raise LogError(f"{log} has no poses, so its labels cannot be fused: give a log with a pose stream.")
+                raise LogError(
+                    f"{log} has no poses, so its labels cannot be fused: give a log with a pose stream."
+                )
     figures: Figures = {}
     for what, counts in (("points", points), ("voxels", voxels)):
         figures |= _rows(what, counts)
-    figures["time"] = {"ours": float(np.median(taken)), "unit": f"ms of one core a keyframe of {np.mean(sizes):.0f} points, median"}
+    figures["time"] = {
+        "ours": float(np.median(taken)),
+        "unit": f"ms of one core a keyframe of {np.mean(sizes):.0f} points, median",
+    }
     return figures
 
 
-def _measure_session(session: SessionMap, settings: Settings, points: I64, taken: list[float], sizes: list[int]) -> I64:
-    """Adds to the confusion of ``points``, to times (ms) and numbers of points; returns the confusion of the voxels."""
-    scale, far = settings.fusion.voxel_size / STREET_VOXEL, settings.fusion.max_range or 50.0
+def _measure_session(
+    session: SessionMap, settings: Settings, points: I64, taken: list[float], sizes: list[int]
+) -> I64:
+    """Adds to the confusion of ``points``, to times (ms) and numbers of points; returns the
+    confusion of the voxels.
+    """
+    scale = settings.fusion.voxel_size / STREET_VOXEL
+    far = settings.fusion.max_range or 50.0
     maps = Fuser(settings.fusion), Fuser(settings.fusion)
     for k, pose in enumerate(session.map_T_base):
         frame = read_keyframe(session.folder.keyframes, k)
-        level, origin = apply(pose, frame.points), apply(pose, session.origins[k][None])[0]
+        level = apply(pose, frame.points)
+        origin = apply(pose, session.origins[k][None])[0]
         if not taken:
             classify(level, origin, scale)  # compiles
         start = time.process_time()
@@ -116,11 +140,20 @@ def _measure_session(session: SessionMap, settings: Settings, points: I64, taken
 def _rows(what: str, counts: I64) -> Figures:
     """A row for each true class: its IoU and what share of it was called what; and the mean IoU."""
     iou = intersection_over_union(counts)
-    out: Figures = {f"{what}: mean": {"ours": float(np.nanmean(iou)) if np.isfinite(iou).any() else float("nan"), "unit": "IoU"}}
+    out: Figures = {
+        f"{what}: mean": {
+            "ours": float(np.nanmean(iou)) if np.isfinite(iou).any() else float("nan"),
+            "unit": "IoU",
+        }
+    }
     for i, name in enumerate((*CLASSES, OTHERS)):
         total = int(counts[i].sum())
         if total:
-            shares: dict[str, float | str] = {c: float(counts[i, k] / total) for k, c in enumerate((*CLASSES, NONE))}
+            shares: dict[str, float | str] = {
+                c: float(counts[i, k] / total) for k, c in enumerate((*CLASSES, NONE))
+            }
             row: dict[str, float | str] = {"ours": float(iou[i])} if i < 4 else {}
-            out[f"{what}: {name}"] = row | {"unit": f"{'IoU; ' if i < 4 else ''}share called each, of {total}"} | shares
+            out[f"{what}: {name}"] = (
+                row | {"unit": f"{'IoU; ' if i < 4 else ''}share called each, of {total}"} | shares
+            )
     return out

@@ -1,8 +1,9 @@
 """How like real sweeps are simulated ones? Shares, distances and heights of both, side by side.
 
-A distance between two histograms is their total variation: half the sum of the absolute differences, the share that would have to move.
-That of a real sweep from the other real ones says how much places differ anyway. Everything is measured in the sensor's axes, level to a
-degree or two, one sweep at a time, and then averaged over sweeps.
+A distance between two histograms is their total variation: half the sum of the absolute
+differences, the share that would have to move. That of a real sweep from the other real ones says
+how much places differ anyway. Everything is measured in the sensor's axes, level to a degree or
+two, one sweep at a time, and then averaged over sweeps.
 """
 
 from __future__ import annotations
@@ -27,9 +28,18 @@ Figures = dict[str, dict[str, float | str]]
 
 ROAD, SIDEWALK, BUILDING, VEGETATION, TERRAIN, UNLABELLED = 0, 1, 2, 8, 9, 255
 RANGES = np.concatenate([np.arange(0.0, 20.0, 1.0), np.arange(20.0, 81.0, 5.0)])  # m
-HEIGHTS = np.concatenate([[-4.0, -1.0, -0.5, -0.25], np.arange(-0.15, 0.5, 0.1), np.arange(0.5, 4.0, 0.5), np.arange(4.0, 17.0, 2.0)])  # m
+# m
+HEIGHTS = np.concatenate(
+    [
+        [-4.0, -1.0, -0.5, -0.25],
+        np.arange(-0.15, 0.5, 0.1),
+        np.arange(0.5, 4.0, 0.5),
+        np.arange(4.0, 17.0, 2.0),
+    ]
+)
 OPEN = np.concatenate([np.arange(0.0, 30.0, 2.0), np.arange(30.0, 81.0, 10.0)])  # m
-FILLED = np.concatenate([np.arange(0.0, 4000.0, 200.0), [32_768.0]])  # occupied voxels of a subvolume
+# occupied voxels of a subvolume
+FILLED = np.concatenate([np.arange(0.0, 4000.0, 200.0), [32_768.0]])
 _FAR = 79.0  # m: there is nothing in this direction
 _LABELLED = 50.0  # m: people label no further
 _NEAR = 30.0  # m: voxels further away than that are too few to compare
@@ -38,7 +48,9 @@ _SECTORS = 180
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Portrait:
-    """What one sweep looks like: ``histograms`` by name, each of sum 1, and ``numbers`` by name, NaN where there is nothing to measure."""
+    """What one sweep looks like: ``histograms`` by name, each of sum 1, and ``numbers`` by name,
+    NaN where there is nothing to measure.
+    """
 
     histograms: dict[str, F64]
     numbers: dict[str, float]
@@ -50,15 +62,23 @@ def total_variation(a: F64, b: F64) -> float:
 
 
 def portrait(scan: Scan, fusion: Fusion) -> Portrait:
-    """Measure a labelled sweep. LogError when none of its points near the sensor is on a road or pavement."""
-    points, label = scan.points.astype(np.float64), scan.label
+    """Measure a labelled sweep. LogError when none of its points near the sensor is on a road or
+    pavement.
+    """
+    points = scan.points.astype(np.float64)
+    label = scan.label
     flat = np.hypot(points[:, 0], points[:, 1])
     on_ground = (label == ROAD) | (label == SIDEWALK)
     if not (on_ground & (flat < 12)).any():
-        raise LogError("a sweep has no point of a road or pavement within 12 m, so its heights cannot be compared: give labelled sweeps")
+        raise LogError(
+            "a sweep has no point of a road or pavement within 12 m, so its heights cannot be compared: give labelled sweeps"
+        )
     height = points[:, 2] - float(np.median(points[on_ground & (flat < 12), 2]))
     distance = np.linalg.norm(points, axis=1)
-    histograms = {"ranges": _histogram(distance, RANGES), "heights over ground": _histogram(height, HEIGHTS)}
+    histograms = {
+        "ranges": _histogram(distance, RANGES),
+        "heights over ground": _histogram(height, HEIGHTS),
+    }
     histograms["classes of points within 50 m"] = _classes(label[distance < _LABELLED])
     numbers = {"points a sweep": float(len(points))}
     for q in (10, 50, 90, 99):
@@ -80,17 +100,26 @@ def _classes(label: U8) -> F64:
     return np.asarray(counts / max(1.0, counts.sum()))
 
 
-def _openness(flat: F64, height: F64, points: F64, label: U8, histograms: dict[str, F64]) -> dict[str, float]:
-    """How far one can go in each of 180 directions until something stands 1 to 2.5 m over the ground, and of which class it is."""
+def _openness(
+    flat: F64, height: F64, points: F64, label: U8, histograms: dict[str, F64]
+) -> dict[str, float]:
+    """How far one can go in each of 180 directions until something stands 1 to 2.5 m over the
+    ground, and of which class it is.
+    """
     stands = np.flatnonzero((height > 1.0) & (height < 2.5) & (flat > 2.0))
-    sector = (np.arctan2(points[stands, 1], points[stands, 0]) / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
+    sector = (np.arctan2(points[stands, 1], points[stands, 0]) / (2 * np.pi) * _SECTORS).astype(
+        np.int64
+    ) % _SECTORS
     order = np.lexsort((flat[stands], sector))
     first = order[np.unique(sector[order], return_index=True)[1]]
     nearest = np.full(_SECTORS, _FAR)
     nearest[sector[first]] = flat[stands[first]]
     histograms["distance to what stands in a direction"] = _histogram(nearest, OPEN)
     histograms["class of what stands in a direction"] = _classes(label[stands[first]])
-    return {f"first thing in a direction, {q} %: m": float(np.percentile(nearest, q)) for q in (25, 50, 75)}
+    return {
+        f"first thing in a direction, {q} %: m": float(np.percentile(nearest, q))
+        for q in (25, 50, 75)
+    }
 
 
 def _street(points: F64, flat: F64, height: F64, label: U8) -> dict[str, float]:
@@ -98,19 +127,31 @@ def _street(points: F64, flat: F64, height: F64, label: U8) -> dict[str, float]:
     beside = np.abs(points[:, 0]) < 12
     out = {}
     road = points[beside & (label == ROAD), 1]
-    out["road beside the sensor, width: m"] = float(np.ptp(np.percentile(road, (2, 98)))) if len(road) > 50 else np.nan
+    out["road beside the sensor, width: m"] = (
+        float(np.ptp(np.percentile(road, (2, 98)))) if len(road) > 50 else np.nan
+    )
     upright = beside & (height > 1.0) & (height < 2.5)
-    for name, ids in (("house", (BUILDING,)), ("vegetation", (VEGETATION,)), ("wall, fence or hedge", (3, 4))):
+    for name, ids in (
+        ("house", (BUILDING,)),
+        ("vegetation", (VEGETATION,)),
+        ("wall, fence or hedge", (3, 4)),
+    ):
         y = points[upright & np.isin(label, ids), 1]
         sides = [np.percentile(side, 10) for side in (y[y > 0], -y[y < 0]) if len(side) > 30]
         out[f"{name} beside the sensor, distance: m"] = float(np.mean(sides)) if sides else np.nan
     for name, ids in (("houses", (BUILDING,)), ("vegetation", (VEGETATION,))):
         z = height[np.isin(label, ids) & (flat < 40)]
         for q in (50, 95):
-            out[f"height of {name} within 40 m, {q} %: m"] = float(np.percentile(z, q)) if len(z) > 50 else np.nan
+            out[f"height of {name} within 40 m, {q} %: m"] = (
+                float(np.percentile(z, q)) if len(z) > 50 else np.nan
+            )
     ground = np.isin(label, (ROAD, SIDEWALK, TERRAIN))
-    out["height of ground at 20-40 m, spread: m"] = _spread(height[ground & (flat > 20) & (flat < 40)])
-    out["height of pavement and terrain within 15 m, spread: m"] = _spread(height[(ground & (label != ROAD)) & (flat < 15)])
+    out["height of ground at 20-40 m, spread: m"] = _spread(
+        height[ground & (flat > 20) & (flat < 40)]
+    )
+    out["height of pavement and terrain within 15 m, spread: m"] = _spread(
+        height[(ground & (label != ROAD)) & (flat < 15)]
+    )
     out["points more than 6 m over ground: share"] = float((height > 6).mean())
     return out
 
@@ -119,7 +160,9 @@ def _spread(z: F64) -> float:
     return float(np.ptp(np.percentile(z, (5, 95)))) if len(z) > 50 else np.nan
 
 
-def _voxels(scan: Scan, height: F64, fusion: Fusion, histograms: dict[str, F64], numbers: dict[str, float]) -> None:
+def _voxels(
+    scan: Scan, height: F64, fusion: Fusion, histograms: dict[str, F64], numbers: dict[str, float]
+) -> None:
     """The map of the sweep alone: classes of its voxels, and what subvolumes near the sensor hold."""
     fuser = Fuser(fusion)
     fuser.add(scan.points, scan.label, np.zeros(3))
@@ -137,7 +180,9 @@ def _voxels(scan: Scan, height: F64, fusion: Fusion, histograms: dict[str, F64],
     floor = float(np.median(scan.points[np.abs(height) < 0.3, 2])) - 1.0
     low[2] = int(np.floor(floor / v))
     dense = blocks.dense(low, (256, 256, SIZE))
-    filled, free, unseen = [], [], []
+    filled = []
+    free = []
+    unseen = []
     for i in range(-64, 65, 16):
         for j in range(-64, 65, 16):
             cube = dense[128 + i - 16 : 128 + i + 16, 128 + j - 16 : 128 + j + 16]
@@ -154,8 +199,14 @@ def _voxels(scan: Scan, height: F64, fusion: Fusion, histograms: dict[str, F64],
         numbers["subvolumes within 20 m: share unobserved"] = float(np.median(unseen))
 
 
-def measure_realism(logs: Sequence[Path], settings: Settings, seeds: Sequence[int] = tuple(range(8)), sweeps: int = 3) -> Figures:
-    """Simulated sweeps of a sensor of 64 beams beside the labelled ones of ``logs``: (``ours`` simulated, ``real``, ``difference``).
+def measure_realism(
+    logs: Sequence[Path],
+    settings: Settings,
+    seeds: Sequence[int] = tuple(range(8)),
+    sweeps: int = 3,
+) -> Figures:
+    """Simulated sweeps of a sensor of 64 beams beside the labelled ones of ``logs``: (``ours``
+    simulated, ``real``, ``difference``).
 
     LogError when a log has no labelled sweep.
     """
@@ -164,33 +215,52 @@ def measure_realism(logs: Sequence[Path], settings: Settings, seeds: Sequence[in
     for log in logs:
         for scan in log_sweeps(log, 4, repeat=False):
             if (scan.label == UNLABELLED).all():
-                raise LogError(f"{log} has no labels, so its classes cannot be compared: give a log with a label field.")
+                raise LogError(
+                    f"{log} has no labels, so its classes cannot be compared: give a log with a label field."
+                )
             real.append(portrait(scan, fusion))
     simulated = [portrait(scan, fusion) for seed in seeds for scan in town_sweeps(seed, sweeps)]
     return compare(simulated, real)
 
 
 def compare(simulated: Sequence[Portrait], real: Sequence[Portrait]) -> Figures:
-    """Rows of both: distances of histograms, shares of classes, and medians of numbers with the range of the middle half."""
+    """Rows of both: distances of histograms, shares of classes, and medians of numbers with the
+    range of the middle half.
+    """
     out: Figures = {}
     for name in real[0].histograms:
-        ours, theirs = _pooled(simulated, name), _pooled(real, name)
+        ours = _pooled(simulated, name)
+        theirs = _pooled(real, name)
         others = [
             total_variation(real[k].histograms[name], _pooled([*real[:k], *real[k + 1 :]], name))
             for k in range(len(real) if len(real) > 1 else 0)
         ]
-        row: dict[str, float | str] = {"ours": total_variation(ours, theirs), "unit": "total variation from real; real: from one another"}
+        row: dict[str, float | str] = {
+            "ours": total_variation(ours, theirs),
+            "unit": "total variation from real; real: from one another",
+        }
         out[f"distance: {name}"] = row | ({"real": float(np.mean(others))} if others else {})
     names = [*cityscapes().names, "unlabelled"]
-    for name in ("classes of points within 50 m", "classes of voxels within 30 m", "class of what stands in a direction"):
-        ours, theirs = _pooled(simulated, name), _pooled(real, name)
+    for name in (
+        "classes of points within 50 m",
+        "classes of voxels within 30 m",
+        "class of what stands in a direction",
+    ):
+        ours = _pooled(simulated, name)
+        theirs = _pooled(real, name)
         for k in np.flatnonzero(np.maximum(ours, theirs) > 0.003):
-            out[f"{name}: {names[min(int(k), 19)]}"] = _row(float(ours[k]), float(theirs[k]), "share")
+            out[f"{name}: {names[min(int(k), 19)]}"] = _row(
+                float(ours[k]), float(theirs[k]), "share"
+            )
     for name in real[0].numbers:
         a, b = (np.array([p.numbers.get(name, np.nan) for p in side]) for side in (simulated, real))
         if np.isfinite(a).any() and np.isfinite(b).any():
             spread = "{:.3g} to {:.3g}".format(*np.nanpercentile(a, (25, 75)))
-            out[name] = _row(float(np.nanmedian(a)), float(np.nanmedian(b)), f"median; middle half of ours {spread}")
+            out[name] = _row(
+                float(np.nanmedian(a)),
+                float(np.nanmedian(b)),
+                f"median; middle half of ours {spread}",
+            )
     return out
 
 

@@ -1,7 +1,9 @@
-"""Localisation, judged: which keyframes ask under a condition, how far off an answer is, and the figures of many of them.
+"""Localisation, judged: which keyframes ask under a condition, how far off an answer is, and the
+figures of many of them.
 
-Every system gives for each query the pose that it ranks first, in the database's map, and a score of its own. It is judged against the
-database keyframe nearest to that pose, so that the drift of the map does not count.
+Every system gives for each query the pose that it ranks first, in the database's map, and a score
+of its own. It is judged against the database keyframe nearest to that pose, so that the drift of
+the map does not count.
 """
 
 from __future__ import annotations
@@ -15,7 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.benchmarks.localisation.city import CROSSING, DATABASE, OPPOSITE, UNSEEN, WorldDrive
+from semloc_logs.benchmarks.localisation.city import (
+    CROSSING,
+    DATABASE,
+    OPPOSITE,
+    UNSEEN,
+    WorldDrive,
+)
 from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.evaluation.truth import read_tum
 from semloc_logs.numerics.transforms import inverse, rotation_angle
@@ -26,13 +34,16 @@ F64 = NDArray[np.float64]
 NEAR_M = {CROSSING: 10.0}  # of the database's road; elsewhere:
 LANE_M = 5.0
 WINDOW = np.radians(30.0)  # about the heading of the condition
-LIMITS = {"1 m": (1.0, 5.0), "5 m": (5.0, 20.0)}  # metres and degrees within which an answer is right
+# metres and degrees within which an answer is right
+LIMITS = {"1 m": (1.0, 5.0), "5 m": (5.0, 20.0)}
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a system said to the query at ``keyframe``: errors of its first pose (None: it found none), its score, seconds, and errors of
-    the pose that it accepted after it had heard all queries (None: it accepted none), if it ``decides`` at all."""
+    """What a system said to the query at ``keyframe``: errors of its first pose (None: it found
+    none), its score, seconds, and errors of the pose that it accepted after it had heard all
+    queries (None: it accepted none), if it ``decides`` at all.
+    """
 
     keyframe: int
     seconds: float
@@ -63,7 +74,9 @@ class Answer:
 
 def _within(limit: str, error_m: float | None, error_deg: float | None) -> bool:
     metres, degrees = LIMITS[limit]
-    return error_m is not None and error_deg is not None and error_m <= metres and error_deg <= degrees
+    return (
+        error_m is not None and error_deg is not None and error_m <= metres and error_deg <= degrees
+    )
 
 
 @dataclass(eq=False)
@@ -93,7 +106,9 @@ class World:
         return read_tum(database.truth).at(self.database.stamps_ns)[0]
 
     def keyframes(self, settings: Settings, most: int) -> list[int]:
-        """At most ``most`` keyframes that ask, evenly among those that are where the condition says."""
+        """At most ``most`` keyframes that ask, evenly among those that are where the condition
+        says.
+        """
         possible = [k for k in query_keyframes(self.query, settings) if self._asks(k)]
         if len(possible) <= most:
             return possible
@@ -104,7 +119,9 @@ class World:
         return [int(i) for i in np.argsort(self._away(keyframe), kind="stable")[:count]]
 
     def _away(self, keyframe: int) -> F64:
-        return np.asarray(np.linalg.norm(self.true_database[:, :3, 3] - self.true_query[keyframe, :3, 3], axis=1))
+        return np.asarray(
+            np.linalg.norm(self.true_database[:, :3, 3] - self.true_query[keyframe, :3, 3], axis=1)
+        )
 
     def _asks(self, keyframe: int) -> bool:
         condition = self.drive.condition
@@ -118,10 +135,16 @@ class World:
         return bool(away[near] <= NEAR_M.get(condition, LANE_M) and abs(between - wanted) < WINDOW)
 
     def errors(self, keyframe: int, map_T_base: F64) -> tuple[float, float]:
-        """Metres and degrees by which ``map_T_base`` (4, 4), the base at ``keyframe`` in the database's map, is wrong."""
+        """Metres and degrees by which ``map_T_base`` (4, 4), the base at ``keyframe`` in the
+        database's map, is wrong.
+        """
         if self.drive.condition == UNSEEN:
             return float("inf"), 180.0
-        near = int(np.argmin(np.linalg.norm(self.database.map_T_base[:, :3, 3] - map_T_base[:3, 3], axis=1)))
+        near = int(
+            np.argmin(
+                np.linalg.norm(self.database.map_T_base[:, :3, 3] - map_T_base[:3, 3], axis=1)
+            )
+        )
         found = inverse(self.database.map_T_base[near]) @ map_T_base
         rest = inverse(inverse(self.true_database[near]) @ self.true_query[keyframe]) @ found
         return float(np.linalg.norm(rest[:3, 3])), float(np.degrees(rotation_angle(rest[:3, :3])))
@@ -132,15 +155,23 @@ def read_world(work: Path, drive: WorldDrive) -> World:
     return World(Workspace(work), drive)
 
 
-def recall_at_full_precision(answers: Sequence[Answer], elsewhere: Sequence[Answer], limit: str = "5 m") -> float:
-    """Share of ``answers`` that are right and score above every wrong one, among those from ``elsewhere`` too, which are all wrong."""
-    wrong = [a.score for a in (*answers, *elsewhere) if a.error_m is not None and not a.right(limit)]
+def recall_at_full_precision(
+    answers: Sequence[Answer], elsewhere: Sequence[Answer], limit: str = "5 m"
+) -> float:
+    """Share of ``answers`` that are right and score above every wrong one, among those from
+    ``elsewhere`` too, which are all wrong.
+    """
+    wrong = [
+        a.score for a in (*answers, *elsewhere) if a.error_m is not None and not a.right(limit)
+    ]
     worst = max(wrong, default=-np.inf)
     return float(np.mean([a.right(limit) and a.score > worst for a in answers])) if answers else 0.0
 
 
 def figures_of(answers: Sequence[Answer], elsewhere: Sequence[Answer]) -> dict[str, float]:
-    """The figures of one system under one condition, by name; of no ``answers`` only those that count."""
+    """The figures of one system under one condition, by name; of no ``answers`` only those that
+    count.
+    """
     if not answers:
         return {}
     out = {f"recall {limit}": float(np.mean([a.right(limit) for a in answers])) for limit in LIMITS}
@@ -151,7 +182,9 @@ def figures_of(answers: Sequence[Answer], elsewhere: Sequence[Answer]) -> dict[s
     out["time"] = float(np.median([a.seconds for a in answers]))
     if answers[0].decides:
         out["accepted and right"] = float(np.mean([a.accepted_right for a in answers]))
-        out["accepted and wrong"] = float(sum(a.accepted and not a.accepted_right for a in (*answers, *elsewhere)))
+        out["accepted and wrong"] = float(
+            sum(a.accepted and not a.accepted_right for a in (*answers, *elsewhere))
+        )
     return out
 
 

@@ -1,7 +1,8 @@
-"""`semloc benchmark localisation`: whole localisation beside its peers, on the same keyframes of an unseen simulated city.
+"""`semloc benchmark localisation`: whole localisation beside its peers, on the same keyframes of an
+unseen simulated city.
 
-Worlds, clouds and answers are kept in a folder, so that a run goes on where it was stopped; other weights, or another version of what a
-system consists of, have answers of their own.
+Worlds, clouds and answers are kept in a folder, so that a run goes on where it was stopped; other
+weights, or another version of what a system consists of, have answers of their own.
 """
 
 from __future__ import annotations
@@ -16,8 +17,24 @@ from typing import Any, Protocol
 import semloc_logs
 from semloc_logs.benchmarks.descriptors.held_out import simulation_version
 from semloc_logs.benchmarks.localisation.answers import UNITS, Answer, figures_of, read_world
-from semloc_logs.benchmarks.localisation.city import CONDITIONS, DATABASE, SENSORS, UNSEEN, WorldDrive, simulate_drive_log, world_drives
-from semloc_logs.benchmarks.localisation.our_method import OURS, WHOLE, OurSystem, OurTask, link_workspace, settings_of, write_random
+from semloc_logs.benchmarks.localisation.city import (
+    CONDITIONS,
+    DATABASE,
+    SENSORS,
+    UNSEEN,
+    WorldDrive,
+    simulate_drive_log,
+    world_drives,
+)
+from semloc_logs.benchmarks.localisation.our_method import (
+    OURS,
+    WHOLE,
+    OurSystem,
+    OurTask,
+    link_workspace,
+    settings_of,
+    write_random,
+)
 from semloc_logs.benchmarks.localisation.peer_methods import PEERS, PeerSystem, PeerTask
 from semloc_logs.benchmarks.peers.peer_process import runner
 from semloc_logs.errors import SettingsError
@@ -78,7 +95,9 @@ def profile_unit(unit: Unit) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Localisation:
-    """The benchmark in the folder ``work`` with ``queries`` for each condition, run by an engine; ``peers``: the Python of each runner."""
+    """The benchmark in the folder ``work`` with ``queries`` for each condition, run by an engine;
+    ``peers``: the Python of each runner.
+    """
 
     work: Path
     queries: int
@@ -89,11 +108,15 @@ class Localisation:
     note: Note
 
     def figures(self) -> Figures:
-        """Everything that is missing is made; then the figures of all. SettingsError for unknown peers."""
+        """Everything that is missing is made; then the figures of all. SettingsError for unknown
+        peers.
+        """
         unknown = set(self.peers) - {p.runner for p in PEERS}
         if unknown:
             known = ", ".join(sorted({p.runner for p in PEERS}))
-            raise SettingsError(f"There is no peer '{min(unknown)}' to localise with: there are {known}.")
+            raise SettingsError(
+                f"There is no peer '{min(unknown)}' to localise with: there are {known}."
+            )
         for name in self.engine.map(simulate_drive_log, self.drives):
             self.note(f"{name} is simulated")
         self._map()
@@ -105,7 +128,10 @@ class Localisation:
     @cached_property
     def folder(self) -> Path:
         """Of this version of the simulation and of fusion."""
-        return self.work / f"localisation-{simulation_version()}-{self.settings.fingerprint('fusion')[:8]}"
+        return (
+            self.work
+            / f"localisation-{simulation_version()}-{self.settings.fingerprint('fusion')[:8]}"
+        )
 
     @cached_property
     def drives(self) -> list[WorldDrive]:
@@ -124,13 +150,17 @@ class Localisation:
             self.note(f"{system.name}: the database is described")
 
     def _workspace(self, system: OurSystem) -> Workspace:
-        return Workspace(self.folder / f"described-{system.labels}-{system.weights}-{our_version()}")
+        return Workspace(
+            self.folder / f"described-{system.labels}-{system.weights}-{our_version()}"
+        )
 
     def _fused(self, system: OurSystem) -> Workspace:
         return Workspace(self.folder / f"fused-{system.labels}-{code_version(FUSION)}")
 
     def units(self) -> list[Unit]:
-        """Every system under every condition; all systems of one condition after each other, so that times compare."""
+        """Every system under every condition; all systems of one condition after each other, so
+        that times compare.
+        """
         reference = self._fused(OURS[0]).path
         out = []
         for drive in self.drives[1:]:
@@ -146,26 +176,48 @@ class Localisation:
                     python = self.peers[peer.runner]
                     out.append(
                         self._unit(
-                            PeerTask(reference, self.folder, drive, peer, python, keyframes, self.settings), _hash([runner(peer.runner)])
+                            PeerTask(
+                                reference,
+                                self.folder,
+                                drive,
+                                peer,
+                                python,
+                                keyframes,
+                                self.settings,
+                            ),
+                            _hash([runner(peer.runner)]),
                         )
                     )
         return out
 
     def _unit(self, task: Task, version: str) -> Unit:
         name = "".join(c if c.isalnum() else "-" for c in task.system.name)
-        return Unit(task, self.folder / f"answers-{self.queries}" / f"{task.drive.name}-{name}-{version}.json")
+        return Unit(
+            task,
+            self.folder / f"answers-{self.queries}" / f"{task.drive.name}-{name}-{version}.json",
+        )
 
     def _summary(self, units: Sequence[Unit]) -> Figures:
-        answers = {(u.task.drive.condition, u.task.drive.sensor, u.task.system.name): read_unit(u) for u in units}
+        answers = {
+            (u.task.drive.condition, u.task.drive.sensor, u.task.system.name): read_unit(u)
+            for u in units
+        }
         systems: list[OurSystem | PeerSystem] = [*OURS, *PEERS]
         figures: Figures = {}
         for sensor in SENSORS:
             for condition in CONDITIONS:
                 for system in systems:
                     elsewhere = answers.get((UNSEEN, sensor, system.name), [])
-                    found = figures_of(answers.get((condition, sensor, system.name), []), elsewhere) if condition != UNSEEN else {}
+                    found = (
+                        figures_of(answers.get((condition, sensor, system.name), []), elsewhere)
+                        if condition != UNSEEN
+                        else {}
+                    )
                     for figure, value in found.items():
-                        row = figures.setdefault(f"{condition}, {sensor}: {figure}", {"unit": UNITS.get(figure, "share of queries")})
+                        row = figures.setdefault(
+                            f"{condition}, {sensor}: {figure}",
+                            {"unit": UNITS.get(figure, "share of queries")},
+                        )
                         row[system.name] = value
         return figures | self._speed(units)
 
@@ -179,17 +231,39 @@ class Localisation:
         jobs = self.engine.jobs
         for sensor in SENSORS:
             for system in (s for s in OURS if s.name in TIMED):
-                mine = [u for u in units if u.task.system == system and u.task.drive.sensor == sensor and u.task.drive.condition != UNSEEN]
+                mine = [
+                    u
+                    for u in units
+                    if u.task.system == system
+                    and u.task.drive.sensor == sensor
+                    and u.task.drive.condition != UNSEEN
+                ]
                 seconds = [a.seconds for u in mine for a in read_unit(u)]
                 if not seconds:
                     continue
                 said = list(self.engine.map(profile_unit, mine[:1] * jobs))  # all at once
-                apart, along = len(seconds) / sum(seconds), jobs / sum(parts[WHOLE] for parts in said)
-                say(f"{sensor}: queries far apart a second", f"with {jobs} processes", system.name, jobs * apart)
-                say(f"{sensor}: queries along the road a second", f"with {jobs} processes", system.name, jobs * along)
+                apart = len(seconds) / sum(seconds)
+                along = jobs / sum(parts[WHOLE] for parts in said)
+                say(
+                    f"{sensor}: queries far apart a second",
+                    f"with {jobs} processes",
+                    system.name,
+                    jobs * apart,
+                )
+                say(
+                    f"{sensor}: queries along the road a second",
+                    f"with {jobs} processes",
+                    system.name,
+                    jobs * along,
+                )
                 for part in (p for p in said[0] if p != WHOLE):
                     taken = sum(parts[part] for parts in said) / jobs
-                    say(f"{sensor}: {part}", "s a query along the road, under the profiler", system.name, taken)
+                    say(
+                        f"{sensor}: {part}",
+                        "s a query along the road, under the profiler",
+                        system.name,
+                        taken,
+                    )
         return figures
 
 
@@ -201,7 +275,12 @@ def our_version() -> str:
 def code_version(packages: Sequence[str]) -> str:
     """A hash of the files of some of our packages."""
     folders = [Path(semloc_logs.__file__).parent / name for name in packages]
-    return _hash(path for folder in folders for path in sorted(folder.rglob("*")) if path.suffix in (".py", ".json", ".safetensors"))
+    return _hash(
+        path
+        for folder in folders
+        for path in sorted(folder.rglob("*"))
+        if path.suffix in (".py", ".json", ".safetensors")
+    )
 
 
 def _hash(paths: Iterable[Path]) -> str:

@@ -50,8 +50,10 @@ PARTS = {  # of a query, by the functions that do them
 
 @dataclass(frozen=True, slots=True)
 class OurSystem:
-    """A way of asking: ``labels`` of the log or from geometry; how a query is fused, ``weights`` trained or random; ``hypotheses`` by
-    words, by words of the query described again in every heading, of a grid over all of the road, or as many of that grid as words give."""
+    """A way of asking: ``labels`` of the log or from geometry; how a query is fused, ``weights``
+    trained or random; ``hypotheses`` by words, by words of the query described again in every
+    heading, of a grid over all of the road, or as many of that grid as words give.
+    """
 
     name: str
     query: tuple[tuple[str, Any], ...] = (("length", 20.0),)
@@ -91,10 +93,15 @@ class OurTask:
         maps = {self.drive.name: world.query, DATABASE: world.database}
         decided = decide([a for _, found in asked for a in found], maps, self.settings)
         accepted = {a.query_keyframe: a for a in decided if a.accepted}
-        return [self._answer(world, k, *said, accepted.get(k)) for k, said in zip(self.keyframes, asked, strict=True)]
+        return [
+            self._answer(world, k, *said, accepted.get(k))
+            for k, said in zip(self.keyframes, asked, strict=True)
+        ]
 
     def profile(self) -> dict[str, float]:
-        """Seconds of a query when they come one after the other, as `semloc close` asks, and of its parts, under the profiler."""
+        """Seconds of a query when they come one after the other, as `semloc close` asks, and of its
+        parts, under the profiler.
+        """
         world = read_world(self.work, self.drive)
         database = Database(world.work, (DATABASE,), self.settings)
         every = query_keyframes(world.query, self.settings)
@@ -108,7 +115,9 @@ class OurTask:
             whole = (time.perf_counter() - begin) / len(asked)
             for keyframe in asked:
                 profiler.runcall(matching.close_query, database, world.query, keyframe)
-        return {WHOLE: whole} | {part: seconds / len(asked) for part, seconds in _parts(profiler).items()}
+        return {WHOLE: whole} | {
+            part: seconds / len(asked) for part, seconds in _parts(profiler).items()
+        }
 
     def _hypotheses(self) -> Any:
         if self.system.hypotheses == "words":
@@ -118,24 +127,45 @@ class OurTask:
         most = self.settings.closures.hypotheses if self.system.hypotheses == "some" else None
         return patch.object(matching, "find_hypotheses", partial(grid_hypotheses, most=most))
 
-    def _ask(self, database: Database, world: World, keyframe: int) -> tuple[float, list[matching.Alignment]]:
+    def _ask(
+        self, database: Database, world: World, keyframe: int
+    ) -> tuple[float, list[matching.Alignment]]:
         begin = time.perf_counter()
         found = matching.close_query(database, world.query, keyframe)
         return time.perf_counter() - begin, found
 
     def _answer(
-        self, world: World, keyframe: int, seconds: float, found: list[matching.Alignment], accepted: matching.Alignment | None
+        self,
+        world: World,
+        keyframe: int,
+        seconds: float,
+        found: list[matching.Alignment],
+        accepted: matching.Alignment | None,
     ) -> Answer:
-        """First is what is most probable by itself, which is its score; accepted may be another one, that other queries agree with."""
+        """First is what is most probable by itself, which is its score; accepted may be another
+        one, that other queries agree with.
+        """
 
         def errors(alignment: matching.Alignment | None) -> tuple[float, float] | tuple[None, None]:
             if alignment is None:
                 return None, None
-            return world.errors(keyframe, world.database.map_T_base[alignment.target_keyframe] @ alignment.target_T_query)
+            return world.errors(
+                keyframe,
+                world.database.map_T_base[alignment.target_keyframe] @ alignment.target_T_query,
+            )
 
         first = found[0] if found else None
         (m, deg), (accepted_m, accepted_deg) = errors(first), errors(accepted)
-        return Answer(keyframe, seconds, first.probability if first else -np.inf, m, deg, True, accepted_m, accepted_deg)
+        return Answer(
+            keyframe,
+            seconds,
+            first.probability if first else -np.inf,
+            m,
+            deg,
+            True,
+            accepted_m,
+            accepted_deg,
+        )
 
 
 def _parts(profiler: cProfile.Profile) -> dict[str, float]:
@@ -148,33 +178,62 @@ def _parts(profiler: cProfile.Profile) -> dict[str, float]:
     return out | {"rest": max(0.0, total.get("closing.py close_query", 0.0) - sum(out.values()))}
 
 
-def sweep_words(database: Database, variant: str, allowed: Allowed, query: Query, ground_z: float) -> tuple[Described, Matches]:
-    """What :func:`semloc_logs.closures.matching.match_words` finds when the query is turned into every heading and described there, as by
-    the paper (4), instead of once: what an encoder that turns with its input saves."""
+def sweep_words(
+    database: Database, variant: str, allowed: Allowed, query: Query, ground_z: float
+) -> tuple[Described, Matches]:
+    """What :func:`semloc_logs.closures.matching.match_words` finds when the query is turned into
+    every heading and described there, as by the paper (4), instead of once: what an encoder that
+    turns with its input saves.
+    """
     settings = database.settings
-    descriptor, closures, v = settings.descriptor, settings.closures, settings.fusion.voxel_size
+    descriptor = settings.descriptor
+    closures = settings.closures
+    v = settings.fusion.voxel_size
     low, high = query.blocks.bounds()
     state = query.blocks.dense(low, tuple((high - low).tolist()))
     encoder = load_encoder(variant, descriptor.weights)
     step = 2 * np.pi / descriptor.headings
-    words, found, rows = [], [], 0
+    words = []
+    found = []
+    rows = 0
     for heading in range(descriptor.headings):
         turned = turned_map(state, low, heading * step)
-        d = describe_map(turned.state, turned.low, ground_z, v, encoder, descriptor.query_stride, descriptor.min_occupied)
-        m = database.words(variant).search(d.descriptor, closures.neighbours, closures.probes, allowed)
+        d = describe_map(
+            turned.state,
+            turned.low,
+            ground_z,
+            v,
+            encoder,
+            descriptor.query_stride,
+            descriptor.min_occupied,
+        )
+        m = database.words(variant).search(
+            d.descriptor, closures.neighbours, closures.probes, allowed
+        )
         yaw = (np.round(m.yaw / step).astype(int) - heading) % descriptor.headings * step
         found.append(replace(m, query=m.query + np.int32(rows), yaw=yaw))
         words.append(Described(turned.to_map(d.centre), d.descriptor))
         rows += len(d.descriptor)
-    described = Described(*(np.concatenate([getattr(d, f.name) for d in words]) for f in fields(Described)))
-    return described, Matches(*(np.concatenate([getattr(m, f.name) for m in found]) for f in fields(Matches)))
+    described = Described(
+        *(np.concatenate([getattr(d, f.name) for d in words]) for f in fields(Described))
+    )
+    return described, Matches(
+        *(np.concatenate([getattr(m, f.name) for m in found]) for f in fields(Matches))
+    )
 
 
-def grid_hypotheses(database: Database, session: SessionMap, keyframe: int, query: Query, most: int | None = None) -> list[Hypothesis]:
-    """Instead of word matches: every heading every few metres along and across the database's road, or ``most`` of these at random."""
+def grid_hypotheses(
+    database: Database, session: SessionMap, keyframe: int, query: Query, most: int | None = None
+) -> list[Hypothesis]:
+    """Instead of word matches: every heading every few metres along and across the database's road,
+    or ``most`` of these at random.
+    """
     settings = database.settings
     step = STEP * settings.fusion.voxel_size / STREET_VOXEL
-    yaws = np.split(2 * np.pi * np.arange(settings.descriptor.headings) / settings.descriptor.headings, [settings.descriptor.headings // 2])
+    yaws = np.split(
+        2 * np.pi * np.arange(settings.descriptor.headings) / settings.descriptor.headings,
+        [settings.descriptor.headings // 2],
+    )
     out: list[Hypothesis] = []
     for group, place in enumerate(database.places):
         target = database.sessions[place.session]
@@ -183,8 +242,12 @@ def grid_hypotheses(database: Database, session: SessionMap, keyframe: int, quer
         _, first = np.unique(np.floor(target.distance[ids] / step), return_index=True)
         for pose in target.map_T_base[ids[first]]:
             for across in (-step, 0.0, step):
-                for half in (0, 1):  # opposite headings lie between each other: the search takes two at one place for the same
-                    x, y, z = (pose[:3, 3] + across * pose[:3, 1] + half * step / 2 * pose[:3, 0]).tolist()
+                # opposite headings lie between each other: the search takes two at one place for
+                # the same
+                for half in (0, 1):
+                    x, y, z = (
+                        pose[:3, 3] + across * pose[:3, 1] + half * step / 2 * pose[:3, 0]
+                    ).tolist()
                     out += [Hypothesis(group, (float(yaw), x, y, z), 0, 0.0) for yaw in yaws[half]]
     if most is None or len(out) <= most:
         return out
@@ -199,14 +262,20 @@ def settings_of(system: OurSystem, settings: Settings, folder: Path) -> Settings
         "labels": settings.labels.model_copy(update={"source": system.labels}),
     }
     if system.weights == "random":
-        files = {"weights": folder / "random-weights.safetensors", "vocabulary": folder / "random-vocabulary.safetensors"}
+        files = {
+            "weights": folder / "random-weights.safetensors",
+            "vocabulary": folder / "random-vocabulary.safetensors",
+        }
         update["descriptor"] = settings.descriptor.model_copy(update=files)
     return settings.model_copy(update=update)
 
 
 def write_random(work: Workspace, settings: Settings) -> None:
-    """Random weights and a vocabulary of the database's descriptors by them, where ``settings`` (see :func:`settings_of`) name them."""
-    weights, vocabulary = settings.descriptor.weights, settings.descriptor.vocabulary
+    """Random weights and a vocabulary of the database's descriptors by them, where ``settings``
+    (see :func:`settings_of`) name them.
+    """
+    weights = settings.descriptor.weights
+    vocabulary = settings.descriptor.vocabulary
     if weights is None or vocabulary is None or vocabulary.exists():
         return
     weights.parent.mkdir(parents=True, exist_ok=True)
@@ -214,16 +283,29 @@ def write_random(work: Workspace, settings: Settings) -> None:
     save_weights(weights, Completion("semantic").eval(), {"note": "random"})
     database = SessionMap(work.session(DATABASE))
     encoder = load_encoder("semantic", weights)
-    parts = [describe_submap(database.folder, s["id"], s["ground_z"], database.road(s), encoder, settings) for s in database.submaps]
-    save_vocabulary(vocabulary, train_vocabulary(np.concatenate([d.descriptor for part in parts for d in part])), {"note": "random"})
+    parts = [
+        describe_submap(
+            database.folder, s["id"], s["ground_z"], database.road(s), encoder, settings
+        )
+        for s in database.submaps
+    ]
+    save_vocabulary(
+        vocabulary,
+        train_vocabulary(np.concatenate([d.descriptor for part in parts for d in part])),
+        {"note": "random"},
+    )
 
 
 def link_workspace(source: Workspace, target: Workspace) -> None:
-    """The sessions of ``source`` without their words, as hard links in ``target``, unless they are there."""
+    """The sessions of ``source`` without their words, as hard links in ``target``, unless they are
+    there.
+    """
     for session in source.sessions():
         goal = target.session(session.name)
         if not goal.session_json.exists():
             shutil.rmtree(goal.path, ignore_errors=True)
-            left_out: Callable[[str, list[str]], set[str]] = shutil.ignore_patterns("words", "words.json", "session.json")
+            left_out: Callable[[str, list[str]], set[str]] = shutil.ignore_patterns(
+                "words", "words.json", "session.json"
+            )
             shutil.copytree(session.path, goal.path, copy_function=os.link, ignore=left_out)
             os.link(session.session_json, goal.session_json)

@@ -1,8 +1,10 @@
-"""Others' localisation in the benchmark: the same keyframes as clouds, asked of each peer in a Python environment of its own.
+"""Others' localisation in the benchmark: the same keyframes as clouds, asked of each peer in a
+Python environment of its own.
 
-A cloud is what the keyframes within some length of road saw, in the level frame of its middle one, x along the drive. The database has
-one every quarter of that length. Peers that register pairs get their candidates from Scan Context, with its heading, and once more,
-as "NAME, place told", the database's clouds that are truly nearest: what they could do with a perfect retrieval.
+A cloud is what the keyframes within some length of road saw, in the level frame of its middle one,
+x along the drive. The database has one every quarter of that length. Peers that register pairs get
+their candidates from Scan Context, with its heading, and once more, as "NAME, place told", the
+database's clouds that are truly nearest: what they could do with a perfect retrieval.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ CANDIDATES, TOLD = 5, 3
 
 @dataclass(frozen=True, slots=True)
 class PeerSystem:
-    """A peer: the script ``runner``, metres of road in a cloud, whether it looks for the place itself or is ``told``."""
+    """A peer: the script ``runner``, metres of road in a cloud, whether it looks for the place
+    itself or is ``told``.
+    """
 
     name: str
     runner: str
@@ -77,27 +81,55 @@ class PeerTask:
         write_clouds(folder, world.database, centres, self.system.length, self.settings)
         write_clouds(folder, world.query, self.keyframes, self.system.length, self.settings)
         candidates, seconds = self._candidates(world, folder, centres)
-        queries = [{"cloud": _cloud_name(world.query, k), "candidates": found} for k, found in zip(self.keyframes, candidates, strict=True)]
-        job = {"folder": str(folder.absolute()), "database": [_cloud_name(world.database, k) for k in centres], "queries": queries}
-        path = folder / f"{self.system.runner}-{self.drive.name}{'-told' if self.system.told else ''}.json"
+        queries = [
+            {"cloud": _cloud_name(world.query, k), "candidates": found}
+            for k, found in zip(self.keyframes, candidates, strict=True)
+        ]
+        job = {
+            "folder": str(folder.absolute()),
+            "database": [_cloud_name(world.database, k) for k in centres],
+            "queries": queries,
+        }
+        path = (
+            folder
+            / f"{self.system.runner}-{self.drive.name}{'-told' if self.system.told else ''}.json"
+        )
         path.write_text(json.dumps(job))
         said = run_peer(self.system.runner, self.python, [str(path)], SECONDS)
         try:
             found = json.loads(said.splitlines()[-1])["queries"]
-            return [self._answer(world, centres, k, f, s) for k, f, s in zip(self.keyframes, found, seconds, strict=True)]
+            return [
+                self._answer(world, centres, k, f, s)
+                for k, f, s in zip(self.keyframes, found, seconds, strict=True)
+            ]
         except (ValueError, KeyError, IndexError, TypeError) as problem:
-            raise SemlocError(f"Peer {self.system.runner} answered {said[-200:]!r} ({problem}): see benchmarks/README.md.") from None
+            raise SemlocError(
+                f"Peer {self.system.runner} answered {said[-200:]!r} ({problem}): see benchmarks/README.md."
+            ) from None
 
-    def _candidates(self, world: World, folder: Path, centres: Sequence[int]) -> tuple[list[list[tuple[int, float]]], list[float]]:
-        """For each query numbers of the database's clouds and headings, and the seconds that finding them took."""
+    def _candidates(
+        self, world: World, folder: Path, centres: Sequence[int]
+    ) -> tuple[list[list[tuple[int, float]]], list[float]]:
+        """For each query numbers of the database's clouds and headings, and the seconds that
+        finding them took.
+        """
         if not self.system.needs_candidates:
             return [[] for _ in self.keyframes], [0.0] * len(self.keyframes)
         if self.system.told:
-            order = [[centres.index(min(centres, key=lambda c: abs(c - near))) for near in self._near(world, k)] for k in self.keyframes]
-            return [[(k, 0.0) for k in dict.fromkeys(found)][:TOLD] for found in order], [0.0] * len(self.keyframes)
+            order = [
+                [
+                    centres.index(min(centres, key=lambda c: abs(c - near)))
+                    for near in self._near(world, k)
+                ]
+                for k in self.keyframes
+            ]
+            return [[(k, 0.0) for k in dict.fromkeys(found)][:TOLD] for found in order], [
+                0.0
+            ] * len(self.keyframes)
         database = [scan_context(_load(folder, world.database, k)) for k in centres]
         nearest_contexts(database[0], database, CANDIDATES)
-        out, seconds = [], []
+        out = []
+        seconds = []
         for k in self.keyframes:
             cloud = _load(folder, world.query, k)
             begin = time.perf_counter()
@@ -108,14 +140,27 @@ class PeerTask:
     def _near(self, world: World, keyframe: int) -> list[int]:
         return world.nearest(keyframe, 6 * TOLD)
 
-    def _answer(self, world: World, centres: Sequence[int], keyframe: int, said: dict[str, Any], extra: float) -> Answer:
+    def _answer(
+        self,
+        world: World,
+        centres: Sequence[int],
+        keyframe: int,
+        said: dict[str, Any],
+        extra: float,
+    ) -> Answer:
         seconds = float(said["seconds"]) + extra
         if not said["found"]:
             return Answer(keyframe, seconds)
         number, score, pose = said["found"][0]
-        map_T_cloud = cloud_frame(world.database, centres[number]) @ np.array(pose, float).reshape(4, 4)
-        query_T_base = inverse(cloud_frame(world.query, keyframe)) @ world.query.map_T_base[keyframe]
-        return Answer(keyframe, seconds, float(score), *world.errors(keyframe, map_T_cloud @ query_T_base))
+        map_T_cloud = cloud_frame(world.database, centres[number]) @ np.array(pose, float).reshape(
+            4, 4
+        )
+        query_T_base = (
+            inverse(cloud_frame(world.query, keyframe)) @ world.query.map_T_base[keyframe]
+        )
+        return Answer(
+            keyframe, seconds, float(score), *world.errors(keyframe, map_T_cloud @ query_T_base)
+        )
 
 
 def database_keyframes(session: SessionMap, every: float) -> list[int]:
@@ -133,17 +178,24 @@ def cloud_frame(session: SessionMap, keyframe: int) -> F64:
     return out
 
 
-def write_clouds(folder: Path, session: SessionMap, keyframes: Sequence[int], length: float, settings: Settings) -> None:
+def write_clouds(
+    folder: Path, session: SessionMap, keyframes: Sequence[int], length: float, settings: Settings
+) -> None:
     """The clouds about ``keyframes`` as NAME.npy, (n, 3) float32, where they are missing."""
     folder.mkdir(parents=True, exist_ok=True)
-    stretch = settings.model_copy(update={"query": settings.query.model_copy(update={"length": length})})
+    stretch = settings.model_copy(
+        update={"query": settings.query.model_copy(update={"length": length})}
+    )
     for keyframe in keyframes:
         path = folder / f"{_cloud_name(session, keyframe)}.npy"
         if path.exists():
             continue
         cloud_T_map = inverse(cloud_frame(session, keyframe))
         parts = [
-            apply(cloud_T_map @ session.map_T_base[i], read_keyframe(session.folder.keyframes, i).points)
+            apply(
+                cloud_T_map @ session.map_T_base[i],
+                read_keyframe(session.folder.keyframes, i).points,
+            )
             for i in query_members(session, keyframe, stretch)
         ]
         with replacing_file(path) as temporary, temporary.open("wb") as file:

@@ -1,7 +1,9 @@
-"""FPFH beside our descriptor: the same subvolumes of the same maps, described by Open3D in a Python environment of its own.
+"""FPFH beside our descriptor: the same subvolumes of the same maps, described by Open3D in a Python
+environment of its own.
 
-Rusu et al., Fast Point Feature Histograms, ICRA 2009. The points are the centres of the occupied voxels, the support is a sphere as
-wide as a subvolume about the occupied voxel nearest to its centre. FPFH does not depend on the heading, so it is told none.
+Rusu et al., Fast Point Feature Histograms, ICRA 2009. The points are the centres of the occupied
+voxels, the support is a sphere as wide as a subvolume about the occupied voxel nearest to its
+centre. FPFH does not depend on the heading, so it is told none.
 """
 
 from __future__ import annotations
@@ -20,11 +22,20 @@ from semloc_logs.subvolumes.describe import Described
 from semloc_logs.training.pairs import occupied
 
 SECONDS = 6 * 3600.0
-CELLS = 2  # voxels along the edge of the cells that points are thinned to: with all points it takes four times as long
+# voxels along the edge of the cells that points are thinned to: with all points it takes four times
+# as long
+CELLS = 2
 
 
-def fpfh_describes(python: str, folder: Path, places: Iterable[tuple[Place, bool]], described: Describe, voxel_size: float) -> Describe:
-    """Describes those ``places`` (and whether each is a query) where ``described`` does; features are kept in ``folder``.
+def fpfh_describes(
+    python: str,
+    folder: Path,
+    places: Iterable[tuple[Place, bool]],
+    described: Describe,
+    voxel_size: float,
+) -> Describe:
+    """Describes those ``places`` (and whether each is a query) where ``described`` does; features
+    are kept in ``folder``.
 
     SettingsError when ``python`` cannot be started, SemlocError when Open3D fails.
     """
@@ -53,12 +64,22 @@ def fpfh_describes(python: str, folder: Path, places: Iterable[tuple[Place, bool
 
 def _key(place: Place, is_query: bool) -> str:
     content = hashlib.sha256(place.state.tobytes())
-    content.update(place.low.tobytes() + np.float64(place.ground_z).tobytes() + place.track.tobytes() + bytes([is_query]))
+    content.update(
+        place.low.tobytes()
+        + np.float64(place.ground_z).tobytes()
+        + place.track.tobytes()
+        + bytes([is_query])
+    )
     return content.hexdigest()[:24]
 
 
 def _run(python: str, folder: Path, voxel_size: float) -> None:
-    run_peer("fpfh", python, [str(folder), repr(SIZE / 2 * voxel_size), repr(CELLS * voxel_size)], SECONDS)
+    run_peer(
+        "fpfh",
+        python,
+        [str(folder), repr(SIZE / 2 * voxel_size), repr(CELLS * voxel_size)],
+        SECONDS,
+    )
     for name in ("points", "centres", "track"):
         for path in folder.glob(f"{name}_*.npy"):
             path.unlink()

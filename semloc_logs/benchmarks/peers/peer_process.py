@@ -1,8 +1,10 @@
-"""Mappers to compare with: each runs in a process of a Python environment of its own and is asked for one round after the other.
+"""Mappers to compare with: each runs in a process of a Python environment of its own and is asked
+for one round after the other.
 
-A peer NAME is the script ``benchmarks/peers/NAME_runner.py`` of the source checkout. It gets a folder with ``points_K.npy`` ((n, 3)
-float32, sensor frame), ``poses.npy`` ((m, 4, 4)), voxel size and range; for every line on its stdin it integrates all scans into a
-new map and answers with a line of JSON, the fields of :class:`Round`.
+A peer NAME is the script ``benchmarks/peers/NAME_runner.py`` of the source checkout. It gets a
+folder with ``points_K.npy`` ((n, 3) float32, sensor frame), ``poses.npy`` ((m, 4, 4)), voxel size
+and range; for every line on its stdin it integrates all scans into a new map and answers with a
+line of JSON, the fields of :class:`Round`.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """All scans in one new map: milliseconds (and of processor time) of each, of what is due at the end; voxels of the map."""
+    """All scans in one new map: milliseconds (and of processor time) of each, of what is due at the
+    end; voxels of the map.
+    """
 
     ms: list[float]
     cpu_ms: list[float]
@@ -42,7 +46,11 @@ def runner(name: str) -> Path:
     folder = Path(semloc_logs.__file__).resolve().parents[1] / "benchmarks" / "peers"
     known = sorted(p.name.removesuffix("_runner.py") for p in folder.glob("*_runner.py"))
     if name not in known:
-        there = f"there are {', '.join(known)}" if known else "their scripts are in benchmarks/peers of the source checkout"
+        there = (
+            f"there are {', '.join(known)}"
+            if known
+            else "their scripts are in benchmarks/peers of the source checkout"
+        )
         raise SettingsError(f"There is no peer '{name}' to compare with: {there}.")
     return folder / f"{name}_runner.py"
 
@@ -61,12 +69,23 @@ def run_peer(name: str, python: str, arguments: Sequence[str], seconds: float) -
     """
     command = [python, "-I", str(runner(name)), *arguments]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment(1), timeout=seconds)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            check=False,
+            env=environment(1),
+            timeout=seconds,
+        )
     except (OSError, subprocess.TimeoutExpired) as problem:
-        raise SettingsError(f"Peer {name} cannot be had from {python} ({problem}): give --peer {name}=PYTHON.") from None
+        raise SettingsError(
+            f"Peer {name} cannot be had from {python} ({problem}): give --peer {name}=PYTHON."
+        ) from None
     if done.returncode:
         said = done.stderr.strip().splitlines()
-        raise SemlocError(f"Peer {name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md.")
+        raise SemlocError(
+            f"Peer {name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md."
+        )
     return done.stdout
 
 
@@ -80,17 +99,32 @@ def write_scans(folder: Path, scans: Sequence[Scan]) -> None:
 class Peer:
     """One peer at work on the scans of ``folder`` with so many ``threads``; a context manager."""
 
-    def __init__(self, name: str, python: str, folder: Path, voxel_size: float, max_range: float, threads: int) -> None:
+    def __init__(
+        self,
+        name: str,
+        python: str,
+        folder: Path,
+        voxel_size: float,
+        max_range: float,
+        threads: int,
+    ) -> None:
         self.name = name
         command = [python, "-I", str(runner(name)), str(folder), repr(voxel_size), repr(max_range)]
         self._errors = (folder / f"{name}-{threads}.err").open("w+")
         try:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True, env=environment(threads)
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                text=True,
+                env=environment(threads),
             )
         except OSError as problem:
             self._errors.close()
-            raise SettingsError(f"Peer {name} cannot be started with {python} ({problem.strerror}): give --peer {name}=PYTHON.") from None
+            raise SettingsError(
+                f"Peer {name} cannot be started with {python} ({problem.strerror}): give --peer {name}=PYTHON."
+            ) from None
 
     def __enter__(self) -> Peer:
         return self
@@ -101,11 +135,14 @@ class Peer:
         self._errors.close()
 
     def round(self) -> Round:
-        """Everything once, into a new map. SemlocError when the peer fails or does not answer within ten minutes."""
+        """Everything once, into a new map. SemlocError when the peer fails or does not answer
+        within ten minutes.
+        """
         watch = threading.Timer(_ANSWER_SECONDS, self._process.kill)
         watch.start()
         try:
-            ask, answer = self._process.stdin, self._process.stdout
+            ask = self._process.stdin
+            answer = self._process.stdout
             if ask is not None and answer is not None:
                 ask.write("round\n")
                 ask.flush()
@@ -117,16 +154,27 @@ class Peer:
             watch.cancel()
         self._errors.seek(0)
         said = self._errors.read().strip().splitlines()
-        raise SemlocError(f"Peer {self.name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md.")
+        raise SemlocError(
+            f"Peer {self.name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md."
+        )
 
 
 def open_peers(
-    stack: ExitStack, peers: Mapping[str, str], folder: Path, voxel_size: float, max_range: float, cores: int
+    stack: ExitStack,
+    peers: Mapping[str, str],
+    folder: Path,
+    voxel_size: float,
+    max_range: float,
+    cores: int,
 ) -> dict[str, Peer]:
-    """Each of ``peers`` (name -> Python) with one thread as NAME and, where there are more cores, with two as NAME_2."""
+    """Each of ``peers`` (name -> Python) with one thread as NAME and, where there are more cores,
+    with two as NAME_2.
+    """
     out = {}
     for name, python in peers.items():
         for threads in (1, 2) if cores > 1 else (1,):
             label = name if threads == 1 else f"{name}_{threads}"
-            out[label] = stack.enter_context(Peer(name, python, folder, voxel_size, max_range, threads))
+            out[label] = stack.enter_context(
+                Peer(name, python, folder, voxel_size, max_range, threads)
+            )
     return out

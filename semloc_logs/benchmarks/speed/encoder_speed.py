@@ -1,9 +1,11 @@
-"""Speed of the encoder: one subvolume after the other, over a whole map at once, on one and on all cores, beside what the machine allows.
+"""Speed of the encoder: one subvolume after the other, over a whole map at once, on one and on all
+cores, beside what the machine allows.
 
-Multiply-accumulates are counted where they happen, layer by layer, on the shapes that pass; so whatever the encoder's blocks are, the
-figures hold. The machine's peak is a plain matrix product in bf16 with one thread. With one thread processor time counts, which other
-programs disturb less; on all cores the clock on the wall. A dense descriptor needs fewer multiplications than a
-single one, because neighbouring subvolumes share their first layers.
+Multiply-accumulates are counted where they happen, layer by layer, on the shapes that pass; so
+whatever the encoder's blocks are, the figures hold. The machine's peak is a plain matrix product in
+bf16 with one thread. With one thread processor time counts, which other programs disturb less; on
+all cores the clock on the wall. A dense descriptor needs fewer multiplications than a single one,
+because neighbouring subvolumes share their first layers.
 """
 
 from __future__ import annotations
@@ -39,34 +41,61 @@ ROUNDING = 0.01  # of a coordinate of a unit descriptor: bf16 has 8 binary digit
 
 
 def encoder_speed(settings: Settings) -> Figures:
-    """ms a descriptor, multiply-accumulates a descriptor, their rate, the difference between ways, and the share of each layer."""
+    """ms a descriptor, multiply-accumulates a descriptor, their rate, the difference between ways,
+    and the share of each layer.
+    """
     threads = torch.get_num_threads()
     cores = os.cpu_count() or 1
     try:
         torch.set_num_threads(1)
-        network, codes = random_encoder("semantic"), _piece(settings)
+        network = random_encoder("semantic")
+        codes = _piece(settings)
         size = (EDGE - WIDE) // 8 + 1
         corners = np.stack(
-            np.unravel_index(np.random.default_rng(0).choice(size * size, min(SINGLES, size * size), False), (size, size)), 1
+            np.unravel_index(
+                np.random.default_rng(0).choice(size * size, min(SINGLES, size * size), False),
+                (size, size),
+            ),
+            1,
         )
         whole = encode(network, codes).reshape(size, size, -1)
         alone = one_by_one(network, codes, corners)
-        work = {"one by one": macs(network, codes[:WIDE, :WIDE]), "dense": macs(network, codes) / size**2}
+        work = {
+            "one by one": macs(network, codes[:WIDE, :WIDE]),
+            "dense": macs(network, codes) / size**2,
+        }
         taken = {"one by one": _median(lambda: one_by_one(network, codes, corners)) / len(corners)}
         taken["dense"] = _median(lambda: encode(network, codes)) / size**2
         peak = MATRIX**3 / _median(_product()) / 1e9
         figures: Figures = {}
         for way, seconds in taken.items():
             rate = work[way] / seconds / 1e9
-            figures[way] = {"ours": 1e3 * seconds, "unit": "ms a descriptor, one thread", "mega_macs": work[way] / 1e6}
-            figures[way] |= {"giga_macs_a_second": rate, "share_of_peak": rate / peak, "least_ms": work[way] / peak / 1e6}
-        figures["bf16 matrix product"] = {"ours": peak, "unit": "10^9 multiply-accumulates a second, one thread"}
+            figures[way] = {
+                "ours": 1e3 * seconds,
+                "unit": "ms a descriptor, one thread",
+                "mega_macs": work[way] / 1e6,
+            }
+            figures[way] |= {
+                "giga_macs_a_second": rate,
+                "share_of_peak": rate / peak,
+                "least_ms": work[way] / peak / 1e6,
+            }
+        figures["bf16 matrix product"] = {
+            "ours": peak,
+            "unit": "10^9 multiply-accumulates a second, one thread",
+        }
         figures |= _on_cores(network, codes, whole.reshape(size**2, -1), cores)
         apart = float(np.abs(whole[corners[:, 0], corners[:, 1]] - alone).max())
         unlike = float(np.abs(np.roll(alone, 1, axis=0) - alone).max())
-        figures["dense beside one by one"] = {"ours": apart, "unit": "largest difference of a coordinate", "other_subvolumes": unlike}
+        figures["dense beside one by one"] = {
+            "ours": apart,
+            "unit": "largest difference of a coordinate",
+            "other_subvolumes": unlike,
+        }
         if max(apart, *(float(row.get("difference", 0.0)) for row in figures.values())) > ROUNDING:
-            raise SemlocError(f"Descriptors of one map differ by {apart:.3f} between ways to encode it, more than bf16 rounds.")
+            raise SemlocError(
+                f"Descriptors of one map differ by {apart:.3f} between ways to encode it, more than bf16 rounds."
+            )
         figures |= layers(network, codes)
         return figures
     finally:
@@ -78,7 +107,9 @@ def _piece(settings: Settings) -> NDArray[np.uint8]:
     blocks = fuse([scene_frame(frame) for frame in training_scene(4, 24).mapped], settings.fusion)
     low, high = blocks.bounds()
     middle = (low + high) // 2
-    state = blocks.dense(np.array([middle[0] - EDGE // 2, middle[1] - EDGE // 2, -8]), (EDGE, EDGE, 32))
+    state = blocks.dense(
+        np.array([middle[0] - EDGE // 2, middle[1] - EDGE // 2, -8]), (EDGE, EDGE, 32)
+    )
     return np.ascontiguousarray(code_table("semantic")[state])
 
 
@@ -86,12 +117,20 @@ def _piece(settings: Settings) -> NDArray[np.uint8]:
 def encode(network: Encoder, codes: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Unit descriptors (i * j, N) of codes (x, y, 32), margin included, as maps are described."""
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        return np.asarray(descriptors(network(torch.from_numpy(np.ascontiguousarray(codes))[None])).numpy())
+        return np.asarray(
+            descriptors(network(torch.from_numpy(np.ascontiguousarray(codes))[None])).numpy()
+        )
 
 
-def one_by_one(network: Encoder, codes: NDArray[np.uint8], corners: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Unit descriptors (n, N) of the subvolumes at ``corners`` (n, 2), in steps of 8 voxels, each by itself."""
-    return np.concatenate([encode(network, codes[8 * i : 8 * i + WIDE, 8 * j : 8 * j + WIDE]) for i, j in corners])
+def one_by_one(
+    network: Encoder, codes: NDArray[np.uint8], corners: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Unit descriptors (n, N) of the subvolumes at ``corners`` (n, 2), in steps of 8 voxels, each
+    by itself.
+    """
+    return np.concatenate(
+        [encode(network, codes[8 * i : 8 * i + WIDE, 8 * j : 8 * j + WIDE]) for i, j in corners]
+    )
 
 
 class _Watched(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -105,12 +144,16 @@ class _Watched(TorchDispatchMode):  # type: ignore[no-untyped-call]
         start = time.process_time()
         output = func(*args, **(kwargs or {}))
         if func in (torch.ops.aten.conv2d.default, torch.ops.aten.conv3d.default):
-            self.seen.append((time.process_time() - start, output.numel() * math.prod(args[1].shape[1:])))
+            self.seen.append(
+                (time.process_time() - start, output.numel() * math.prod(args[1].shape[1:]))
+            )
         return output
 
 
 def watch(network: Encoder, codes: NDArray[np.uint8]) -> dict[str, tuple[float, int]]:
-    """Seconds and multiply-accumulates of each convolution, and of all between them ("between"), in one run over ``codes``."""
+    """Seconds and multiply-accumulates of each convolution, and of all between them ("between"), in
+    one run over ``codes``.
+    """
     with _Watched() as watched:
         start = time.process_time()
         encode(network, codes)
@@ -125,27 +168,41 @@ def macs(network: Encoder, codes: NDArray[np.uint8]) -> int:
 
 
 def layers(network: Encoder, codes: NDArray[np.uint8]) -> Figures:
-    """ms, share of the multiplications and rate of each layer, medians; what lies between them is the first block, pooling and ReLU."""
+    """ms, share of the multiplications and rate of each layer, medians; what lies between them is
+    the first block, pooling and ReLU.
+    """
     runs = [watch(network, codes) for _ in range(REPEATS + 1)][1:]
     total = sum(count for _, count in runs[0].values())
     out: Figures = {}
     for name in runs[0]:
-        seconds, count = float(np.median([run[name][0] for run in runs])), runs[0][name][1]
-        out[name] = {"ours": 1e3 * seconds, "unit": "ms of a dense run", "share_of_macs": count / total}
+        seconds = float(np.median([run[name][0] for run in runs]))
+        count = runs[0][name][1]
+        out[name] = {
+            "ours": 1e3 * seconds,
+            "unit": "ms of a dense run",
+            "share_of_macs": count / total,
+        }
         if count:
             out[name]["giga_macs_a_second"] = count / max(seconds, 1e-9) / 1e9
     return out
 
 
-def _on_cores(network: Encoder, codes: NDArray[np.uint8], expected: NDArray[np.float32], cores: int) -> Figures:
-    """The dense run on all cores by threads and by processes, and how far descriptors differ from those of one thread."""
+def _on_cores(
+    network: Encoder, codes: NDArray[np.uint8], expected: NDArray[np.float32], cores: int
+) -> Figures:
+    """The dense run on all cores by threads and by processes, and how far descriptors differ from
+    those of one thread.
+    """
     torch.set_num_threads(cores)
     by_threads = _median(lambda: encode(network, codes), time.perf_counter) / len(expected)
     other = float(np.abs(encode(network, codes) - expected).max())
     torch.set_num_threads(1)
     weights = {k: v.numpy() for k, v in network.state_dict().items()}
     with ProcessPoolExecutor(
-        cores, mp_context=get_context("spawn"), initializer=_begin, initargs=(network.variant, weights, codes)
+        cores,
+        mp_context=get_context("spawn"),
+        initializer=_begin,
+        initargs=(network.variant, weights, codes),
     ) as pool:
         list(pool.map(_run, [1] * cores))
         start = time.perf_counter()
@@ -176,7 +233,10 @@ def _run(times: int) -> NDArray[np.float32]:
 
 
 def _product() -> Callable[[], Any]:
-    a, b = (torch.randn(MATRIX, MATRIX, generator=torch.Generator().manual_seed(k)).bfloat16() for k in range(2))
+    a, b = (
+        torch.randn(MATRIX, MATRIX, generator=torch.Generator().manual_seed(k)).bfloat16()
+        for k in range(2)
+    )
     return lambda: a @ b
 
 

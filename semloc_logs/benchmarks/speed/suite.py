@@ -1,6 +1,7 @@
 """Figures of speed on data made here and now, each beside what else does the same in the same run.
 
-Every benchmark returns ``{figure: {"ours": number, "unit": ..., PEER: number, ...}}``; a peer that is not installed is left out.
+Every benchmark returns ``{figure: {"ours": number, "unit": ..., PEER: number, ...}}``; a peer that
+is not installed is left out.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ def _drive(folder: Path, length_m: float = 120.0, seed: int = 3) -> Path:
 
 
 def reading(settings: Settings) -> Figures:
-    """All messages of a simulated MCAP log, undecoded: MB of payload a second; and clouds decoded and posed."""
+    """All messages of a simulated MCAP log, undecoded: MB of payload a second; and clouds decoded
+    and posed.
+    """
     from mcap.reader import make_reader
 
     from semloc_logs.logs.containers.open import open_log
@@ -70,23 +73,32 @@ def reading(settings: Settings) -> Figures:
             finally:
                 session.close()
 
-        payload, count = ours(), clouds()
+        payload = ours()
+        count = clouds()
         megabytes = payload / 1e6
         return {
-            "messages": {"ours": megabytes / _seconds(ours), "unit": "MB/s", "mcap-python": megabytes / _seconds(peer)},
+            "messages": {
+                "ours": megabytes / _seconds(ours),
+                "unit": "MB/s",
+                "mcap-python": megabytes / _seconds(peer),
+            },
             "clouds": {"ours": 1e3 * _seconds(clouds) / max(count, 1), "unit": "ms a sweep"},
         }
 
 
 def fusion(settings: Settings) -> Figures:
-    """Sweeps and depth images into the semantic map, free space carved; see :mod:`semloc_logs.benchmarks.speed.fusion_speed`."""
+    """Sweeps and depth images into the semantic map, free space carved; see
+    :mod:`semloc_logs.benchmarks.speed.fusion_speed`.
+    """
     from semloc_logs.benchmarks.speed.fusion_speed import fusion_speed
 
     return fusion_speed(settings)
 
 
 def encoder(settings: Settings) -> Figures:
-    """Descriptors of a map, densely and one by one; see :mod:`semloc_logs.benchmarks.speed.encoder_speed`."""
+    """Descriptors of a map, densely and one by one; see
+    :mod:`semloc_logs.benchmarks.speed.encoder_speed`.
+    """
     from semloc_logs.benchmarks.speed.encoder_speed import encoder_speed
 
     return encoder_speed(settings)
@@ -100,14 +112,18 @@ def search(settings: Settings) -> Figures:
 
 
 def verification(settings: Settings) -> Figures:
-    """Hypotheses searched, fitted and judged; see :mod:`semloc_logs.benchmarks.speed.verification_speed`."""
+    """Hypotheses searched, fitted and judged; see
+    :mod:`semloc_logs.benchmarks.speed.verification_speed`.
+    """
     from semloc_logs.benchmarks.speed.verification_speed import verification_speed
 
     return verification_speed(settings)
 
 
 def annotate(settings: Settings) -> Figures:
-    """A hundred closures into a simulated MCAP log in place, beside rewriting the log with mcap-python."""
+    """A hundred closures into a simulated MCAP log in place, beside rewriting the log with
+    mcap-python.
+    """
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
@@ -120,7 +136,25 @@ def annotate(settings: Settings) -> Figures:
         stamps = [times[i * (len(times) - 1) // 99] for i in range(100)]
         covariance = tuple(np.eye(6).ravel().tolist())
         records = [
-            ClosureRecord("session_0", "other", s, s, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, covariance, 0.5, 0.999, 100, 10) for s in stamps
+            ClosureRecord(
+                "session_0",
+                "other",
+                s,
+                s,
+                1.0,
+                0.0,
+                0.0,
+                0.0,
+                0.0,
+                0.0,
+                1.0,
+                covariance,
+                0.5,
+                0.999,
+                100,
+                10,
+            )
+            for s in stamps
         ]
 
         def rewrite() -> None:
@@ -130,21 +164,38 @@ def annotate(settings: Settings) -> Figures:
                 channels: dict[int, int] = {}
                 for schema, channel, m in make_reader(source).iter_messages():
                     if channel.id not in channels:
-                        known = writer.register_schema(schema.name, schema.encoding, schema.data) if schema else 0
-                        channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known, channel.metadata)
-                    writer.add_message(channels[channel.id], m.log_time, m.data, m.publish_time, m.sequence)
+                        known = (
+                            writer.register_schema(schema.name, schema.encoding, schema.data)
+                            if schema
+                            else 0
+                        )
+                        channels[channel.id] = writer.register_channel(
+                            channel.topic, channel.message_encoding, known, channel.metadata
+                        )
+                    writer.add_message(
+                        channels[channel.id], m.log_time, m.data, m.publish_time, m.sequence
+                    )
                 writer.finish()  # type: ignore[no-untyped-call]
 
         size = log.stat().st_size / 1e6
         taken = [_annotated(log, records[: 100 - i]) for i in range(REPEATS)]
-        return {"in_place": {"ours": float(np.median(taken)), "unit": f"s for a log of {size:.0f} MB", "mcap-python": _seconds(rewrite, 2)}}
+        return {
+            "in_place": {
+                "ours": float(np.median(taken)),
+                "unit": f"s for a log of {size:.0f} MB",
+                "mcap-python": _seconds(rewrite, 2),
+            }
+        }
 
 
 def _annotated(log: Path, records: Sequence[ClosureRecord]) -> float:
     from semloc_logs.logs.annotation.annotate import Results, annotate_in_place
 
     start = time.perf_counter()
-    annotate_in_place(log, Results(records, "session_0", {}, {r.query_stamp_ns: r.query_stamp_ns for r in records}))
+    annotate_in_place(
+        log,
+        Results(records, "session_0", {}, {r.query_stamp_ns: r.query_stamp_ns for r in records}),
+    )
     return time.perf_counter() - start
 
 

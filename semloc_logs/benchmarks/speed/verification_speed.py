@@ -1,4 +1,6 @@
-"""Speed of verification by its parts, on a drawn place with a known transform, beside the paper's ratio for every hypothesis."""
+"""Speed of verification by its parts, on a drawn place with a known transform, beside the paper's
+ratio for every hypothesis.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +21,20 @@ from semloc_logs.voxels.grid import BlockMap, Fuser
 Figures = dict[str, dict[str, float | str]]
 F64 = NDArray[np.float64]
 ROAD, BUILDING, POLE, TREE = 0, 2, 5, 8
-FRONTS = ((-20.0, 9.0, -3.0, 9.0, 6.0), (6.0, 8.0, 20.0, 10.0, 8.0), (-18.0, -8.0, -2.0, -8.0, 5.0), (6.0, -9.0, 6.0, -20.0, 7.0))
+FRONTS = (
+    (-20.0, 9.0, -3.0, 9.0, 6.0),
+    (6.0, 8.0, 20.0, 10.0, 8.0),
+    (-18.0, -8.0, -2.0, -8.0, 5.0),
+    (6.0, -9.0, 6.0, -20.0, 7.0),
+)
 TRUTH = np.array([0.6, 5.0, -3.0, 0.2])  # target_T_query of the place: yaw, x, y, z
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A place seen twice: ``target`` and its points, the ``query`` in its own frame, hypotheses of which the first is near TRUTH."""
+    """A place seen twice: ``target`` and its points, the ``query`` in its own frame, hypotheses of
+    which the first is near TRUTH.
+    """
 
     target: Target
     points: F64
@@ -34,15 +43,29 @@ class Scene:
 
 
 def place(rng: np.random.Generator, density: float) -> tuple[F64, NDArray[np.uint8]]:
-    """Points (n, 3) and classes (n,) of a crossing with fronts, poles and trees, about ``density`` points a square metre."""
+    """Points (n, 3) and classes (n,) of a crossing with fronts, poles and trees, about ``density``
+    points a square metre.
+    """
     parts: list[tuple[F64, int]] = []
 
     def wall(a: tuple[float, float], b: tuple[float, float], height: float, label: int) -> None:
         n = int(density * np.hypot(b[0] - a[0], b[1] - a[1]) * height)
         along = rng.uniform(0, 1, (n, 1))
-        parts.append((np.c_[np.array(a) + along * np.subtract(b, a), rng.uniform(-1.7, height - 1.7, n)], label))
+        parts.append(
+            (
+                np.c_[np.array(a) + along * np.subtract(b, a), rng.uniform(-1.7, height - 1.7, n)],
+                label,
+            )
+        )
 
-    parts.append((np.c_[rng.uniform(-22, 22, (int(density * 1936), 2)), np.full(int(density * 1936), -1.7)], ROAD))
+    parts.append(
+        (
+            np.c_[
+                rng.uniform(-22, 22, (int(density * 1936), 2)), np.full(int(density * 1936), -1.7)
+            ],
+            ROAD,
+        )
+    )
     for a, b, height in (
         ((-20, 9), (-3, 9), 6),
         ((6, 8), (20, 10), 8),
@@ -56,13 +79,16 @@ def place(rng: np.random.Generator, density: float) -> tuple[F64, NDArray[np.uin
     for x, y in ((-15.0, -5.5), (4.0, 14.0)):
         parts.append((rng.normal((x, y, 2.0), 0.8, (int(30 * density), 3)), TREE))
     points = np.concatenate([p for p, _ in parts])
-    return points + rng.normal(0, 0.02, points.shape), np.repeat(np.array([c for _, c in parts], np.uint8), [len(p) for p, _ in parts])
+    return points + rng.normal(0, 0.02, points.shape), np.repeat(
+        np.array([c for _, c in parts], np.uint8), [len(p) for p, _ in parts]
+    )
 
 
 def scene(settings: Settings, density: float = 25.0, hypotheses: int = 96) -> Scene:
     """The place fused twice, each time from points of its own."""
     rng = np.random.default_rng(0)
-    truth, v = pose_matrix(TRUTH), settings.fusion.voxel_size
+    truth = pose_matrix(TRUTH)
+    v = settings.fusion.voxel_size
 
     def fused(points: F64, label: NDArray[np.uint8]) -> BlockMap:
         fuser = Fuser(settings.fusion)
@@ -75,21 +101,38 @@ def scene(settings: Settings, density: float = 25.0, hypotheses: int = 96) -> Sc
     again = apply(inverse(truth), again)
     poses = [
         TRUTH + np.array([0.05, 0.5, -0.4, 0.2]),
-        *(np.r_[rng.uniform(-np.pi, np.pi), rng.uniform(-12, 12, 2), rng.uniform(-0.5, 0.5)] for _ in range(hypotheses - 1)),
+        *(
+            np.r_[rng.uniform(-np.pi, np.pi), rng.uniform(-12, 12, 2), rng.uniform(-0.5, 0.5)]
+            for _ in range(hypotheses - 1)
+        ),
     ]
-    found = [Hypothesis(0, (float(p[0]), float(p[1]), float(p[2]), float(p[3])), 1, 1.0) for p in poses]
-    return Scene(Target(fused(there, label), v), there, Query(fused(again, label_again), again, v), found)
+    found = [
+        Hypothesis(0, (float(p[0]), float(p[1]), float(p[2]), float(p[3])), 1, 1.0) for p in poses
+    ]
+    return Scene(
+        Target(fused(there, label), v), there, Query(fused(again, label_again), again, v), found
+    )
 
 
 def verification_speed(settings: Settings) -> Figures:
-    """Processor milliseconds of the search, of a fit, of what they need of a place, and of the paper's ratio for all hypotheses."""
+    """Processor milliseconds of the search, of a fit, of what they need of a place, and of the
+    paper's ratio for all hypotheses.
+    """
     s = scene(settings)
-    v, blocks = settings.fusion.voxel_size, s.target.blocks
+    v = settings.fusion.voxel_size
+    blocks = s.target.blocks
 
     def search() -> list[F64]:
-        return [c.target_T_query for c in search_hypotheses(s.hypotheses, {0: s.target}, s.query, settings.descriptor.headings, 6)]
+        return [
+            c.target_T_query
+            for c in search_hypotheses(
+                s.hypotheses, {0: s.target}, s.query, settings.descriptor.headings, 6
+            )
+        ]
 
-    best = search_hypotheses(s.hypotheses, {0: s.target}, s.query, settings.descriptor.headings, 6)[0]
+    best = search_hypotheses(s.hypotheses, {0: s.target}, s.query, settings.descriptor.headings, 6)[
+        0
+    ]
     surface = surface_of(s.points, 2 * v)
     start = coarse_fit(best, s.target, s.query).target_T_query
     kappa = settings.closures.kappa * v
@@ -100,7 +143,8 @@ def verification_speed(settings: Settings) -> Figures:
         "surface of a place": lambda: surface_of(s.points, 2 * v),
         "fine fit": lambda: fine_fit(start, surface, s.query),
         f"tau, {len(s.hypotheses)} hypotheses": lambda: [
-            tau(s.query.occupied, blocks, v, pose_matrix(np.array(h.pose)), kappa) for h in s.hypotheses
+            tau(s.query.occupied, blocks, v, pose_matrix(np.array(h.pose)), kappa)
+            for h in s.hypotheses
         ],
     }
     figures: Figures = {}

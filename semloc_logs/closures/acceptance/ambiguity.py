@@ -1,8 +1,8 @@
 """Streets that look like others: where whatever agrees may as well agree in a copy of the place.
 
-Two drives through copies of a street, one block apart, agree in every query, and nothing in them tells. What gives copies away is a
-third place: a session that came through several copies has two places with support for one query, or what three sessions say of each
-other does not close.
+Two drives through copies of a street, one block apart, agree in every query, and nothing in them
+tells. What gives copies away is a third place: a session that came through several copies has two
+places with support for one query, or what three sessions say of each other does not close.
 """
 
 from __future__ import annotations
@@ -19,71 +19,103 @@ from semloc_logs.settings import STREET_VOXEL
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-APART = 20.0  # m between a place and its copy, at voxels of 0.30 m: nearer ones lie in one view, whose free space tells them apart
+# m between a place and its copy, at voxels of 0.30 m: nearer ones lie in one view, whose free space
+# tells them apart
+APART = 20.0
 BEYOND_DOUBT = 0.7  # support of alignments that may contradict others
 
 
-def lookalike(placed: Placed, pairs: Pairs, asked: Mapping[str, F64], support: F64, voxel_size: float) -> F64:
-    """How much the streets about either end of each alignment look like others (n,), in [0, 1]; ``support`` (n,) is how probable an
-    alignment would be without rivals, times the share of near neighbours that agree.
+def lookalike(
+    placed: Placed, pairs: Pairs, asked: Mapping[str, F64], support: F64, voxel_size: float
+) -> F64:
+    """How much the streets about either end of each alignment look like others (n,), in [0, 1];
+    ``support`` (n,) is how probable an alignment would be without rivals, times the share of near
+    neighbours that agree.
 
-    It is the mean over the queries about an end of the support of a second place in one session, or the share of them that three sessions
-    contradict each other about; the session that shows it most counts.
+    It is the mean over the queries about an end of the support of a second place in one session, or
+    the share of them that three sessions contradict each other about; the session that shows it
+    most counts.
     """
     reach = FAR * voxel_size / STREET_VOXEL
-    shown: dict[str, list[tuple[F64, F64, F64]]] = {}  # by session: roads of all queries that can show it; where some do, and how much
+    # by session: roads of all queries that can show it; where some do, and how much
+    shown: dict[str, list[tuple[F64, F64, F64]]] = {}
     for (query, target), rows in pairs.items():
         first, second, much = _second_places(placed, rows, support, voxel_size)
         shown.setdefault(query, []).append((asked[query], placed.road[first], much))
         if target != query:  # of what it was asked too: at both places
             both = np.concatenate([first, second[much > 0]])
-            shown.setdefault(target, []).append((placed.target_road[first], placed.target_road[both], np.r_[much, much[much > 0]]))
+            shown.setdefault(target, []).append(
+                (placed.target_road[first], placed.target_road[both], np.r_[much, much[much > 0]])
+            )
     for session, road in _contradicted(placed, pairs, support, voxel_size).items():
         shown.setdefault(session, []).append((asked[session], road, np.ones(len(road))))
     out = np.zeros(len(placed))
-    for sessions, roads in ((placed.query_session, placed.road), (placed.target_session, placed.target_road)):
+    for sessions, roads in (
+        (placed.query_session, placed.road),
+        (placed.target_session, placed.target_road),
+    ):
         for session in sorted(set(sessions)):
             mine = np.flatnonzero(sessions == session)
             of_all = _about(asked.get(session, np.zeros(0)), roads[mine], reach)
             for everyone, at, much in shown.get(session, []):
-                share = _about(at, roads[mine], reach, much) / np.maximum(np.maximum(of_all, _about(everyone, roads[mine], reach)), 1.0)
+                share = _about(at, roads[mine], reach, much) / np.maximum(
+                    np.maximum(of_all, _about(everyone, roads[mine], reach)), 1.0
+                )
                 out[mine] = np.maximum(out[mine], np.minimum(share, 1.0))
     return out
 
 
 def _about(at: F64, road: F64, reach: float, much: F64 | None = None) -> F64:
-    """How many of ``at`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,); or the sums of how ``much`` (m,) they show."""
+    """How many of ``at`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,); or the
+    sums of how ``much`` (m,) they show.
+    """
     order = np.argsort(at, kind="stable")
-    sums, at = np.r_[0.0, np.cumsum(np.ones(len(at)) if much is None else much[order])], at[order]
-    return np.asarray(sums[np.searchsorted(at, road + reach, "right")] - sums[np.searchsorted(at, road - reach, "left")])
+    sums = np.r_[0.0, np.cumsum(np.ones(len(at)) if much is None else much[order])]
+    at = at[order]
+    return np.asarray(
+        sums[np.searchsorted(at, road + reach, "right")]
+        - sums[np.searchsorted(at, road - reach, "left")]
+    )
 
 
-def _second_places(placed: Placed, rows: I64, support: F64, voxel_size: float) -> tuple[I64, I64, F64]:
-    """Of each query in one target the rows of two places, a view apart, of which the second has as much support as possible, and how much.
+def _second_places(
+    placed: Placed, rows: I64, support: F64, voxel_size: float
+) -> tuple[I64, I64, F64]:
+    """Of each query in one target the rows of two places, a view apart, of which the second has as
+    much support as possible, and how much.
 
-    Where a session is asked about itself, the first place is where it is by odometry, so any other one is a second place.
+    Where a session is asked about itself, the first place is where it is by odometry, so any other
+    one is a second place.
     """
     apart = APART * voxel_size / STREET_VOXEL
     astray = strays(placed.part(rows), voxel_size)
     cuts = np.flatnonzero(np.diff(placed.query[rows])) + 1
     found = []
     for places, wrong in zip(np.split(rows, cuts), np.split(astray, cuts), strict=True):
-        at, road, mine = placed.target_T_query[places, :3, 3], placed.target_road[places], support[places]
+        at = placed.target_T_query[places, :3, 3]
+        road = placed.target_road[places]
+        mine = support[places]
         off = np.linalg.norm(at[:, None] - at, axis=2)
-        lesser = np.where(off > apart + DRIFT * np.abs(road[:, None] - road), np.minimum(mine[:, None], mine), 0.0)
+        lesser = np.where(
+            off > apart + DRIFT * np.abs(road[:, None] - road), np.minimum(mine[:, None], mine), 0.0
+        )
         a, b = np.unravel_index(int(np.argmax(lesser)), lesser.shape)
         best = int(np.argmax(mine))
         much = max(float(lesser[a, b]), float(mine[wrong].max(initial=0.0)))
-        found.append((places[a], places[b], much) if lesser[a, b] > 0 else (places[best], places[best], much))
+        found.append(
+            (places[a], places[b], much) if lesser[a, b] > 0 else (places[best], places[best], much)
+        )
     first, second, most = zip(*found, strict=True)
     return np.array(first), np.array(second), np.array(most)
 
 
 def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float) -> dict[str, F64]:
-    """Roads of the queries whose place in one session is not where it has to be by another's: by what the latter says of the former.
+    """Roads of the queries whose place in one session is not where it has to be by another's: by
+    what the latter says of the former.
 
-    Of three sessions a, g, h those alignments are compared that hardly anybody doubts: a query of a in g, the nearest one of a in h, and
-    the nearest one of g in h; odometry leads from one to the next.
+    Of three sessions a, g, h those alignments are compared that hardly anybody doubts: a query of a
+    in g, the nearest one of a in h, and the nearest one of g in h; odometry leads from one to the
+    next.
     """
     scale = voxel_size / STREET_VOXEL
     sure: Pairs = {}
@@ -103,16 +135,27 @@ def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float)
                 continue
             y = sure[a, h][_nearest(placed.road[sure[a, h]], placed.road[x])]
             z = sure[g, h][_nearest(placed.road[sure[g, h]], placed.target_road[x])]
-            along = np.abs(placed.road[y] - placed.road[x]), np.abs(placed.road[z] - placed.target_road[x])
-            g_T_y = placed.target_T_query[x] @ inverse(placed.map_T_query[x]) @ placed.map_T_query[y]
+            along = (
+                np.abs(placed.road[y] - placed.road[x]),
+                np.abs(placed.road[z] - placed.target_road[x]),
+            )
+            g_T_y = (
+                placed.target_T_query[x] @ inverse(placed.map_T_query[x]) @ placed.map_T_query[y]
+            )
             h_T_y = placed.target_T_query[z] @ inverse(placed.map_T_query[z]) @ g_T_y
             off = np.linalg.norm(h_T_y[:, :3, 3] - placed.target_T_query[y, :3, 3], axis=1)
             way = along[0] + along[1] + np.abs(placed.target_road[z] - placed.target_road[y])
-            wrong = (off > APART * scale + (DRIFT + ARM) * way) & (np.maximum(*along) <= FAR * scale)
+            wrong = (off > APART * scale + (DRIFT + ARM) * way) & (
+                np.maximum(*along) <= FAR * scale
+            )
             found.setdefault(a, set()).update(placed.road[x[wrong]].tolist())
-    return {session: np.sort(np.fromiter(roads, float, len(roads))) for session, roads in found.items()}
+    return {
+        session: np.sort(np.fromiter(roads, float, len(roads))) for session, roads in found.items()
+    }
 
 
 def _nearest(values: F64, wanted: F64) -> I64:
-    """Numbers (n,) of the ascending ``values`` nearest to the ``wanted`` ones (n,), of equally near ones the first."""
+    """Numbers (n,) of the ascending ``values`` nearest to the ``wanted`` ones (n,), of equally near
+    ones the first.
+    """
     return np.searchsorted((values[1:] + values[:-1]) / 2, wanted)

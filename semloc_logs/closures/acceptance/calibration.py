@@ -1,4 +1,6 @@
-"""The probability that an alignment is right: from its own features, then together with what neighbouring queries say."""
+"""The probability that an alignment is right: from its own features, then together with what
+neighbouring queries say.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +23,11 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """What other queries of the session say about an alignment; see ``schemas/parquet/rejected.json``.
+    """What other queries of the session say about an alignment; see
+    ``schemas/parquet/rejected.json``.
 
-    ``alone`` is the probability from the alignment's own features; the sums are of the ``alone`` of other queries' alignments.
+    ``alone`` is the probability from the alignment's own features; the sums are of the ``alone`` of
+    other queries' alignments.
     """
 
     alone: float
@@ -35,18 +39,38 @@ class Agreement:
     lookalike: float = 0.0
 
 
-AGREEMENT = ("alone", "neighbours", "agreeing", "opposing", "far_agreeing", "far_opposing", "lookalike")
-SUPPORT, DISTINCT = FEATURES.index("support"), FEATURES.index("distinct")
-TOGETHER = ("log_odds", "log_agreeing", "share", "log_opposing", "log_far_agreeing", "log_far_opposing")
+AGREEMENT = (
+    "alone",
+    "neighbours",
+    "agreeing",
+    "opposing",
+    "far_agreeing",
+    "far_opposing",
+    "lookalike",
+)
+SUPPORT = FEATURES.index("support")
+DISTINCT = FEATURES.index("distinct")
+TOGETHER = (
+    "log_odds",
+    "log_agreeing",
+    "share",
+    "log_opposing",
+    "log_far_agreeing",
+    "log_far_opposing",
+)
 AS_GOOD = 0.7  # of the best rank: what looks like a copy of the best place
 CLOSE, HOPELESS = 0.8, 0.3  # of the best rank, and rank: below them nothing is right
 RIGHT_WITHIN = 1.0  # m, at voxels of 0.30 m: what a right closure is (DESIGN: closures.parquet)
-MARGIN = 1.2  # standard deviations that count as one: from 0.2 m on 99 % of errors in simulated towns are within 2.2, of normal ones 2.6
-LOOSE_FIT, LOOSE_STIFFNESS = 0.12, 0.3  # below both the points hold nothing: the right place, but a metre off
+# standard deviations that count as one: from 0.2 m on 99 % of errors in simulated towns are within
+# 2.2, of normal ones 2.6
+MARGIN = 1.2
+# below both the points hold nothing: the right place, but a metre off
+LOOSE_FIT, LOOSE_STIFFNESS = 0.12, 0.3
 
 
 def precise(sigma: F64 | float, voxel_size: float) -> F64:
-    """Probability that positions of standard deviation ``sigma`` (n,) in their worst direction, metres, are within the bound of right ones.
+    """Probability that positions of standard deviation ``sigma`` (n,) in their worst direction,
+    metres, are within the bound of right ones.
 
     A place may be right, and where in it not known: 1 m at voxels of 0.30 m.
     """
@@ -60,7 +84,9 @@ def own_values(features: Features) -> F64:
 
 
 def may_be_right(values: F64) -> NDArray[np.bool_]:
-    """Whether alignments with features (..., 8) are close to the best of their query, not hopeless and held by their points."""
+    """Whether alignments with features (..., 8) are close to the best of their query, not hopeless
+    and held by their points.
+    """
     of = {name: values[..., k] for k, name in enumerate(FEATURES)}
     hopeful = rank(of["structure"], of["coverage"], of["contradiction"]) >= HOPELESS
     loose = (of["fit"] < LOOSE_FIT) & (of["stiffness"] < LOOSE_STIFFNESS)
@@ -68,21 +94,29 @@ def may_be_right(values: F64) -> NDArray[np.bool_]:
 
 
 def unrivalled(own: Callable[[F64], F64], values: F64) -> F64:
-    """What ``own`` would say of features (..., 8) if no other place fitted; 0 where another one fits better by far."""
+    """What ``own`` would say of features (..., 8) if no other place fitted; 0 where another one
+    fits better by far.
+    """
     alone = np.where(np.arange(len(FEATURES)) == DISTINCT, 0.0, values)
     return np.where(values[..., DISTINCT] > 1 / AS_GOOD, 0.0, own(alone))
 
 
 def together_values(columns: Sequence[F64]) -> F64:
     """Values (n, 6) in the order of ``TOGETHER`` from the columns (7, n) of ``AGREEMENT``."""
-    alone, neighbours, agreeing, opposing, far_agreeing, far_opposing, _ = (np.asarray(c, float) for c in columns)
+    alone, neighbours, agreeing, opposing, far_agreeing, far_opposing, _ = (
+        np.asarray(c, float) for c in columns
+    )
     p = np.clip(alone, 1e-6, 1 - 1e-6)
     counts = [np.log1p(c) for c in (agreeing, opposing, far_agreeing, far_opposing)]
-    return np.stack([np.log(p / (1 - p)), counts[0], agreeing / np.maximum(neighbours, 1), *counts[1:]], axis=-1)
+    return np.stack(
+        [np.log(p / (1 - p)), counts[0], agreeing / np.maximum(neighbours, 1), *counts[1:]], axis=-1
+    )
 
 
 def has_far(columns: Sequence[F64]) -> NDArray[np.bool_]:
-    """Where queries far along the road have been placed at all (n,), by the columns (7, n) of ``AGREEMENT``."""
+    """Where queries far along the road have been placed at all (n,), by the columns (7, n) of
+    ``AGREEMENT``.
+    """
     return np.asarray(columns[4]) + np.asarray(columns[5]) > 0
 
 
@@ -118,11 +152,13 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """``alone`` of an alignment's own features; ``near`` of that probability's log-odds and near neighbours, ``together`` of far ones too.
+    """``alone`` of an alignment's own features; ``near`` of that probability's log-odds and near
+    neighbours, ``together`` of far ones too.
 
-    A short log has no far ones, and that says nothing against it. With less support than ``least_support`` hardly any right alignment was
-    ever seen: a handful of voxels fits anywhere, and the probability is 0. Where streets look like others by more than ``most_alike`` the
-    drive may as well have been in a copy: whatever agrees, the probability is at most a half.
+    A short log has no far ones, and that says nothing against it. With less support than
+    ``least_support`` hardly any right alignment was ever seen: a handful of voxels fits anywhere,
+    and the probability is 0. Where streets look like others by more than ``most_alike`` the drive
+    may as well have been in a copy: whatever agrees, the probability is at most a half.
     """
 
     alone: Calibration
@@ -132,14 +168,24 @@ class Model:
     most_alike: float
 
     def own(self, values: F64) -> F64:
-        """Probability of an alignment by its own features, values (..., 8) in the order of ``FEATURES``."""
-        return np.where(values[..., SUPPORT] < self.least_support, 0.0, self.alone.probability(values))
+        """Probability of an alignment by its own features, values (..., 8) in the order of
+        ``FEATURES``.
+        """
+        return np.where(
+            values[..., SUPPORT] < self.least_support, 0.0, self.alone.probability(values)
+        )
 
     def agreed(self, columns: Sequence[F64]) -> F64:
-        """Probabilities (n,) from the columns (7, n) of ``AGREEMENT``: that of the alignment alone where there are no neighbours."""
+        """Probabilities (n,) from the columns (7, n) of ``AGREEMENT``: that of the alignment alone
+        where there are no neighbours.
+        """
         values = together_values(columns)
-        by_neighbours = np.where(has_far(columns), self.together.probability(values), self.near.probability(values))
-        return np.where((np.asarray(columns[1]) > 0) & (np.asarray(columns[0]) > 0), by_neighbours, columns[0])
+        by_neighbours = np.where(
+            has_far(columns), self.together.probability(values), self.near.probability(values)
+        )
+        return np.where(
+            (np.asarray(columns[1]) > 0) & (np.asarray(columns[0]) > 0), by_neighbours, columns[0]
+        )
 
     def decided(self, columns: Sequence[F64]) -> F64:
         """The same, at most a half where streets look like others."""
@@ -154,7 +200,9 @@ class Model:
 @cache
 def shipped() -> Model:
     """The calibration in the package; ``benchmarks/calibrate.py`` makes it."""
-    content = json.loads(files("semloc_logs.closures.acceptance").joinpath("calibration.json").read_text())
+    content = json.loads(
+        files("semloc_logs.closures.acceptance").joinpath("calibration.json").read_text()
+    )
     return Model(
         Calibration.from_json(content["alone"], FEATURES),
         Calibration.from_json(content["near"], TOGETHER),
@@ -173,15 +221,18 @@ def reason(
     precision: float = 1.0,
     share: float = 1.0,
 ) -> str:
-    """One sentence that says why a hypothesis was rejected; ``precision`` is that of :func:`precise` for ``sigma`` (m), ``share`` what it
-    is worth beside other poses in the same place."""
+    """One sentence that says why a hypothesis was rejected; ``precision`` is that of
+    :func:`precise` for ``sigma`` (m), ``share`` what it is worth beside other poses in the same
+    place.
+    """
     f, a = features, agreement
     of_place = probability / max(precision * share, 1e-9)
     if of_place >= least and share < precision:
         why = f"of the poses in this place it is right with {share:.0%}"
     elif of_place >= least:
         why = f"where in this place is known to {sigma:.2f} m only"
-    elif a.lookalike > shipped().most_alike and 2 * of_place >= least:  # else it would be rejected anyway
+    elif a.lookalike > shipped().most_alike and 2 * of_place >= least:
+        # else it would be rejected anyway
         why = f"streets about it look like others ({a.lookalike:.0%})"
     elif a.alone >= least and a.neighbours:
         why = f"of {a.neighbours} neighbouring queries {a.agreeing:.1f} agree and {a.opposing:.1f} lie elsewhere"
@@ -199,14 +250,20 @@ def reason(
 
 
 def fit_logistic(
-    x: F64, right: NDArray[np.bool_], ridge: float = 1.0, counts: F64 | None = None, offset: F64 | float = 0.0
+    x: F64,
+    right: NDArray[np.bool_],
+    ridge: float = 1.0,
+    counts: F64 | None = None,
+    offset: F64 | float = 0.0,
 ) -> tuple[F64, float]:
-    """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d), by Newton's method.
+    """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d), by
+    Newton's method.
 
     Row i counts ``counts`` (n,) times; ``offset`` (n,) is added to its log-odds.
     """
     counts = np.ones(len(x)) if counts is None else counts
-    mean, scale = x.mean(0), x.std(0) + 1e-9
+    mean = x.mean(0)
+    scale = x.std(0) + 1e-9
     a = np.c_[(x - mean) / scale, np.ones(len(x))]
     w = np.zeros(a.shape[1])
     penalty = np.r_[np.full(x.shape[1], ridge), 1e-6]

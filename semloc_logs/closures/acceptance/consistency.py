@@ -1,8 +1,10 @@
-"""Neighbouring queries of a session against each other: together they lie where odometry and one transform of the sessions put them.
+"""Neighbouring queries of a session against each other: together they lie where odometry and one
+transform of the sessions put them.
 
-Two alignments of a session with the same target agree when the first one and the odometry between the two queries predict the
-second one, to within their standard deviations and what odometry may drift (pairwise consistency as in Mangelson et al., PCM, ICRA
-2018, section III, over a stretch of road instead of all pairs).
+Two alignments of a session with the same target agree when the first one and the odometry between
+the two queries predict the second one, to within their standard deviations and what odometry may
+drift (pairwise consistency as in Mangelson et al., PCM, ICRA 2018, section III, over a stretch of
+road instead of all pairs).
 """
 
 from __future__ import annotations
@@ -15,8 +17,25 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.closures.acceptance.ambiguity import lookalike
-from semloc_logs.closures.acceptance.calibration import AGREEMENT, Agreement, may_be_right, precise, reason, shipped
-from semloc_logs.closures.acceptance.placements import ARM, DRIFT, FAR, Placed, asked_roads, features_of, pairs_of, place, strays
+from semloc_logs.closures.acceptance.calibration import (
+    AGREEMENT,
+    Agreement,
+    may_be_right,
+    precise,
+    reason,
+    shipped,
+)
+from semloc_logs.closures.acceptance.placements import (
+    ARM,
+    DRIFT,
+    FAR,
+    Placed,
+    asked_roads,
+    features_of,
+    pairs_of,
+    place,
+    strays,
+)
 from semloc_logs.closures.matching import Alignment
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import inverse
@@ -26,8 +45,11 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 NEAR = 25.0  # m of road from a query to its neighbours, at voxels of 0.30 m
-SLACK, MOST_SLACK = 1.7, 3.3  # voxels between two alignments of one place, without and with their standard deviations
-TURN, TURN_DRIFT = np.radians(4.0), np.radians(0.02)  # rad, and rad a metre
+# voxels between two alignments of one place, without and with their standard deviations
+SLACK, MOST_SLACK = 1.7, 3.3
+# rad, and rad a metre
+TURN = np.radians(4.0)
+TURN_DRIFT = np.radians(0.02)
 LEAST = 0.02  # alignments less probable than this say nothing about others
 
 
@@ -38,30 +60,56 @@ def agree(placed: Placed, voxel_size: float) -> list[F64]:
     pairs = pairs_of(placed)
     asked = asked_roads(placed)
     for (query, _), rows in pairs.items():
-        group, road = placed.part(rows), asked[query]
+        group = placed.part(rows)
+        road = asked[query]
         near = NEAR * voxel_size / STREET_VOXEL
-        out[1][rows] = np.searchsorted(road, group.road + near, "right") - np.searchsorted(road, group.road - near, "left") - 1.0
-        (out[2][rows], out[3][rows], out[4][rows], out[5][rows]), alike = _sums(group, (group.alone, group.unrivalled), voxel_size)
+        out[1][rows] = (
+            np.searchsorted(road, group.road + near, "right")
+            - np.searchsorted(road, group.road - near, "left")
+            - 1.0
+        )
+        (out[2][rows], out[3][rows], out[4][rows], out[5][rows]), alike = _sums(
+            group, (group.alone, group.unrivalled), voxel_size
+        )
         support[rows] = group.unrivalled * alike[0] / np.maximum(out[1][rows], 1)
     out[6] = lookalike(placed, pairs, asked, support, voxel_size)
     return out
 
 
 def _sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> list[F64]:
-    """For each of the ``probabilities`` (n,) those of other queries' alignments that agree with each and that do not, near it and far
-    from it (4, n); the ``group`` is ordered by query, and so by road.
+    """For each of the ``probabilities`` (n,) those of other queries' alignments that agree with
+    each and that do not, near it and far from it (4, n); the ``group`` is ordered by query, and so
+    by road.
 
-    Of each query the most probable alignment of either kind counts, and as opposing only if it is more probable than an agreeing one.
+    Of each query the most probable alignment of either kind counts, and as opposing only if it is
+    more probable than an agreeing one.
     """
     scale = voxel_size / STREET_VOXEL
     p = np.where(np.array(probabilities) >= LEAST, np.array(probabilities), 0.0)
     loud = np.flatnonzero(p.max(axis=0) >= LEAST)
     v = group.part(loud)
-    first, end = np.searchsorted(v.road, group.road - FAR * scale, "left"), np.searchsorted(v.road, group.road + FAR * scale, "right")
+    first = np.searchsorted(v.road, group.road - FAR * scale, "left")
+    end = np.searchsorted(v.road, group.road + FAR * scale, "right")
     out = np.zeros((len(p), 4, len(group)))
     target_T_map = group.target_T_query @ inverse(group.map_T_query)  # as each alignment has it
-    voices = v.query, v.road, v.target_road, v.map_T_query, v.target_T_query, v.sigma, np.ascontiguousarray(p[:, loud])
-    _add_voices(out, (group.query, group.road, group.target_road, target_T_map, group.sigma), voices, first, end, voxel_size, scale)
+    voices = (
+        v.query,
+        v.road,
+        v.target_road,
+        v.map_T_query,
+        v.target_T_query,
+        v.sigma,
+        np.ascontiguousarray(p[:, loud]),
+    )
+    _add_voices(
+        out,
+        (group.query, group.road, group.target_road, target_T_map, group.sigma),
+        voices,
+        first,
+        end,
+        voxel_size,
+        scale,
+    )
     return list(out)
 
 
@@ -75,17 +123,28 @@ def _add_voices(
     voxel_size: float,
     scale: float,
 ) -> None:
-    """Add to ``out`` (probabilities, 4, n) the voices ``first`` to ``end`` of each alignment's stretch of road."""
+    """Add to ``out`` (probabilities, 4, n) the voices ``first`` to ``end`` of each alignment's
+    stretch of road.
+    """
     query, road, target_road, target_T_map, sigma = group
     by, at, target_at, map_T_query, target_T_query, doubt, said = voices
-    for_it, against = np.zeros(len(said)), np.zeros(len(said))
+    for_it = np.zeros(len(said))
+    against = np.zeros(len(said))
     for k in range(len(query)):
         for n in range(first[k], end[k]):
             if by[n] != query[k]:
                 along = abs(at[n] - road[k])
                 drift = DRIFT * (along + abs(target_at[n] - target_road[k])) + ARM * along
-                slack = min(SLACK * voxel_size + 2 * np.hypot(sigma[k], doubt[n]), MOST_SLACK * voxel_size)
-                agrees = _agrees(target_T_map[k], map_T_query[n], target_T_query[n], slack + drift, TURN + TURN_DRIFT * along / scale)
+                slack = min(
+                    SLACK * voxel_size + 2 * np.hypot(sigma[k], doubt[n]), MOST_SLACK * voxel_size
+                )
+                agrees = _agrees(
+                    target_T_map[k],
+                    map_T_query[n],
+                    target_T_query[n],
+                    slack + drift,
+                    TURN + TURN_DRIFT * along / scale,
+                )
                 for i in range(len(said)):
                     if agrees:
                         for_it[i] = max(for_it[i], said[i, n])
@@ -100,8 +159,12 @@ def _add_voices(
 
 
 @njit(cache=True, nogil=True)
-def _agrees(target_T_map: F64, map_T_query: F64, target_T_query: F64, most: float, turn: float) -> bool:
-    """Whether the query lies where ``target_T_map`` and its odometry put it, to within ``most`` metres and ``turn`` radians."""
+def _agrees(
+    target_T_map: F64, map_T_query: F64, target_T_query: F64, most: float, turn: float
+) -> bool:
+    """Whether the query lies where ``target_T_map`` and its odometry put it, to within ``most``
+    metres and ``turn`` radians.
+    """
     off, trace = 0.0, 0.0
     for i in range(3):
         p = target_T_map[i, 3] - target_T_query[i, 3]
@@ -116,31 +179,44 @@ def _agrees(target_T_map: F64, map_T_query: F64, target_T_query: F64, most: floa
 
 
 def shares(placed: Placed, voxel_size: float) -> F64:
-    """Share (n,) of each alignment in the odds that the poses of its query beside it have alone, its own included: one of them is right.
+    """Share (n,) of each alignment in the odds that the poses of its query beside it have alone,
+    its own included: one of them is right.
 
-    Neighbours tell which place is right, not which of two poses that they agree with as well: a metre along the road, where each camera
-    saw the other sides of things. That only the alignments themselves tell.
+    Neighbours tell which place is right, not which of two poses that they agree with as well: a
+    metre along the road, where each camera saw the other sides of things. That only the alignments
+    themselves tell.
     """
     alone = np.clip(placed.alone, 0.0, 1 - 1e-6)
     odds = alone / (1 - alone)
     out = np.ones(len(placed))
     for rows in pairs_of(placed).values():
         group = placed.part(rows)
-        out[rows] = _shares(group.query, group.target_T_query, odds[rows], 2 * MOST_SLACK * voxel_size, 2 * TURN)
+        out[rows] = _shares(
+            group.query, group.target_T_query, odds[rows], 2 * MOST_SLACK * voxel_size, 2 * TURN
+        )
     return out
 
 
 @njit(cache=True, nogil=True)
 def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float) -> F64:
-    """Of alignments ordered by ``query`` (n,); beside each other are those within ``most`` metres and ``turn`` radians about z."""
-    out, first = np.ones(len(query)), 0
+    """Of alignments ordered by ``query`` (n,); beside each other are those within ``most`` metres
+    and ``turn`` radians about z.
+    """
+    out = np.ones(len(query))
+    first = 0
     for k in range(len(query)):
         first = first if query[first] == query[k] else k
-        n, total, T = first, 0.0, target_T_query[k]
+        n = first
+        total = 0.0
+        T = target_T_query[k]
         while n < len(query) and query[n] == query[k]:
             U = target_T_query[n]
-            off = np.sqrt((T[0, 3] - U[0, 3]) ** 2 + (T[1, 3] - U[1, 3]) ** 2 + (T[2, 3] - U[2, 3]) ** 2)
-            turned = np.arctan2(T[0, 0] * U[1, 0] - T[1, 0] * U[0, 0], T[0, 0] * U[0, 0] + T[1, 0] * U[1, 0])
+            off = np.sqrt(
+                (T[0, 3] - U[0, 3]) ** 2 + (T[1, 3] - U[1, 3]) ** 2 + (T[2, 3] - U[2, 3]) ** 2
+            )
+            turned = np.arctan2(
+                T[0, 0] * U[1, 0] - T[1, 0] * U[0, 0], T[0, 0] * U[0, 0] + T[1, 0] * U[1, 0]
+            )
             if off <= most and abs(turned) <= turn:
                 total += odds[n]
             n += 1
@@ -148,16 +224,24 @@ def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float
     return out
 
 
-def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Settings) -> list[Alignment]:
-    """The alignments of all queries, best first for each query: at most one accepted for each target session, the others with a reason."""
-    v, least = settings.fusion.voxel_size, settings.closures.min_probability
+def decide(
+    alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Settings
+) -> list[Alignment]:
+    """The alignments of all queries, best first for each query: at most one accepted for each
+    target session, the others with a reason.
+    """
+    v = settings.fusion.voxel_size
+    least = settings.closures.min_probability
     placed = place(alignments, maps)
     columns = agree(placed, v)
     astray = strays(placed, v)
     fitted = may_be_right(features_of(alignments))
-    precision, share = precise(placed.sigma, v), shares(placed, v)
+    precision = precise(placed.sigma, v)
+    share = shares(placed, v)
     probability = np.where(astray | ~fitted, 0.0, shipped().decided(columns) * precision * share)
-    order = sorted(range(len(alignments)), key=lambda k: _rank(alignments[k], float(probability[k])))
+    order = sorted(
+        range(len(alignments)), key=lambda k: _rank(alignments[k], float(probability[k]))
+    )
     answered: set[tuple[str, int, str]] = set()
     out = []
     for k in order:
@@ -167,9 +251,13 @@ def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], sett
         asked = (a.query_session, a.query_keyframe, a.target_session)
         p = float(probability[k])
         if astray[k]:
-            why = f"probability {p:.3f} below {least:g}: the session's own odometry puts it elsewhere"
+            why = (
+                f"probability {p:.3f} below {least:g}: the session's own odometry puts it elsewhere"
+            )
         elif not p >= least:  # nor what is no number
-            why = reason(a.features, p, least, agreement, a.sigma, float(precision[k]), float(share[k]))
+            why = reason(
+                a.features, p, least, agreement, a.sigma, float(precision[k]), float(share[k])
+            )
         else:
             why = "another place of the same session fits better" if asked in answered else ""
         answered.add(asked)
@@ -179,4 +267,11 @@ def decide(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], sett
 
 def _rank(a: Alignment, probability: float) -> tuple[str, int, float, float, str, int]:
     """Order of the alignments: by query, then the most probable first."""
-    return a.query_session, a.query_stamp_ns, -probability, -a.features.structure, a.target_session, a.target_stamp_ns
+    return (
+        a.query_session,
+        a.query_stamp_ns,
+        -probability,
+        -a.features.structure,
+        a.target_session,
+        a.target_stamp_ns,
+    )

@@ -19,17 +19,20 @@ Bools = NDArray[np.bool_]
 
 FAR = 200.0  # m of road, at voxels of 0.30 m: odometry still ties together what lies so far apart
 DRIFT, ARM = 0.01, 0.015  # of the way: odometry, and an alignment's error of heading (rad)
-OWN_DRIFT, OWN_SLACK = 0.05, 10.0  # of the way, and voxels: farther off in its own map no query can be
+# of the way, and voxels: farther off in its own map no query can be
+OWN_DRIFT, OWN_SLACK = 0.05, 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """Alignments (n) as agreement sees them: which query of which session lies where in which target's map.
+    """Alignments (n) as agreement sees them: which query of which session lies where in which
+    target's map.
 
-    ``query`` (n,) numbers a session's queries, ``road`` and ``target_road`` (n,) are metres along the two drives, ``map_T_query`` and
-    ``target_T_query`` (n, 4, 4) the query's base in its own map by odometry and in the target's by alignment, ``sigma`` (n,) the standard
-    deviation of the latter's position in metres, ``alone`` (n,) its probability by itself and ``unrivalled`` (n,) the same if no other
-    place fitted nearly as well. ``posed``: whether odometry is known.
+    ``query`` (n,) numbers a session's queries, ``road`` and ``target_road`` (n,) are metres along
+    the two drives, ``map_T_query`` and ``target_T_query`` (n, 4, 4) the query's base in its own map
+    by odometry and in the target's by alignment, ``sigma`` (n,) the standard deviation of the
+    latter's position in metres, ``alone`` (n,) its probability by itself and ``unrivalled`` (n,)
+    the same if no other place fitted nearly as well. ``posed``: whether odometry is known.
     """
 
     query_session: NDArray[np.object_]
@@ -59,7 +62,10 @@ def features_of(alignments: Sequence[Alignment]) -> F64:
 
 def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Placed:
     """Where alignments put their queries."""
-    ends = [(maps[a.query_session], a.query_keyframe, maps[a.target_session], a.target_keyframe) for a in alignments]
+    ends = [
+        (maps[a.query_session], a.query_keyframe, maps[a.target_session], a.target_keyframe)
+        for a in alignments
+    ]
 
     def stack(poses: list[F64]) -> F64:
         return np.array(poses).reshape(-1, 4, 4)
@@ -71,7 +77,12 @@ def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Pl
         np.array([q.distance[k] for q, k, _, _ in ends], float),
         np.array([t.distance[k] for _, _, t, k in ends], float),
         stack([q.map_T_base[k] for q, k, _, _ in ends]),
-        stack([t.map_T_base[k] @ a.target_T_query for a, (_, _, t, k) in zip(alignments, ends, strict=True)]),
+        stack(
+            [
+                t.map_T_base[k] @ a.target_T_query
+                for a, (_, _, t, k) in zip(alignments, ends, strict=True)
+            ]
+        ),
         np.array([a.sigma for a in alignments], float),
         np.array([a.agreement.alone for a in alignments], float),
         unrivalled(shipped().own, features_of(alignments)),
@@ -83,26 +94,45 @@ Pairs = dict[tuple[str, str], I64]
 
 
 def pairs_of(placed: Placed) -> Pairs:
-    """Rows of each query session and target session with odometry, by query and then by place, in the order of names."""
-    names, number = np.unique(np.concatenate([placed.query_session, placed.target_session]).astype(str), return_inverse=True)
-    query, target = number[: len(placed)], number[len(placed) :]
+    """Rows of each query session and target session with odometry, by query and then by place, in
+    the order of names.
+    """
+    names, number = np.unique(
+        np.concatenate([placed.query_session, placed.target_session]).astype(str),
+        return_inverse=True,
+    )
+    query = number[: len(placed)]
+    target = number[len(placed) :]
     at = placed.target_T_query[:, :3, 3]
     rows = np.lexsort((at[:, 2], at[:, 1], at[:, 0], placed.query, target, query))
     rows = rows[placed.posed[rows]]
     cuts = np.flatnonzero(np.diff(query[rows] * len(names) + target[rows])) + 1
-    return {(str(names[query[r[0]]]), str(names[target[r[0]]])): r for r in np.split(rows, cuts) if len(r)}
+    return {
+        (str(names[query[r[0]]]), str(names[target[r[0]]])): r
+        for r in np.split(rows, cuts)
+        if len(r)
+    }
 
 
 def asked_roads(placed: Placed) -> dict[str, F64]:
     """The roads, ascending, of the queries of each session that have an alignment with any target."""
     out: dict[str, dict[int, float]] = {}
-    for session, query, road in zip(placed.query_session, placed.query.tolist(), placed.road.tolist(), strict=True):
+    for session, query, road in zip(
+        placed.query_session, placed.query.tolist(), placed.road.tolist(), strict=True
+    ):
         out.setdefault(str(session), {})[query] = road
-    return {session: np.sort(np.fromiter(found.values(), float, len(found))) for session, found in out.items()}
+    return {
+        session: np.sort(np.fromiter(found.values(), float, len(found)))
+        for session, found in out.items()
+    }
 
 
 def strays(placed: Placed, voxel_size: float) -> Bools:
-    """Which alignments of a session with itself (n,) are farther from where the odometry is than it can have drifted."""
+    """Which alignments of a session with itself (n,) are farther from where the odometry is than it
+    can have drifted.
+    """
     own = (placed.query_session == placed.target_session) & placed.posed
     off = np.linalg.norm(placed.map_T_query[:, :3, 3] - placed.target_T_query[:, :3, 3], axis=1)
-    return np.asarray(own & (off > OWN_SLACK * voxel_size + OWN_DRIFT * np.abs(placed.road - placed.target_road)))
+    return np.asarray(
+        own & (off > OWN_SLACK * voxel_size + OWN_DRIFT * np.abs(placed.road - placed.target_road))
+    )

@@ -1,4 +1,6 @@
-"""Loop closures as messages of a log, in the log's own encoding: one foreign channel would make it unreadable for some readers."""
+"""Loop closures as messages of a log, in the log's own encoding: one foreign channel would make it
+unreadable for some readers.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,9 @@ TOPICS = ("/semloc/loop_closures", "/semloc/pose", "/semloc/markers")
 class ClosureRecord:
     """A row of closures.parquet, and where it lies for those who look at the log.
 
-    ``covariance`` has 36 numbers. ``session_T_query`` (4, 4) is the pose of the query's base frame in the *target's* session frame, None
-    when the target has no poses. ``session_position`` (3,) is the place of this log's end in this log's session frame, None without poses.
+    ``covariance`` has 36 numbers. ``session_T_query`` (4, 4) is the pose of the query's base frame
+    in the *target's* session frame, None when the target has no poses. ``session_position`` (3,) is
+    the place of this log's end in this log's session frame, None without poses.
     """
 
     query_session: str
@@ -49,9 +52,15 @@ class ClosureRecord:
 
     @classmethod
     def from_row(
-        cls, row: Mapping[str, object], *, session_T_query: F64 | None = None, session_position: F64 | None = None
+        cls,
+        row: Mapping[str, object],
+        *,
+        session_T_query: F64 | None = None,
+        session_position: F64 | None = None,
     ) -> ClosureRecord:
-        """From a row of the table as plain Python values; ``ContractError`` when a column is missing or has another type."""
+        """From a row of the table as plain Python values; ``ContractError`` when a column is
+        missing or has another type.
+        """
         try:
             values: dict[str, object] = {}
             for name in COLUMNS:
@@ -74,10 +83,15 @@ class ClosureRecord:
 
     def target_T_query(self) -> F64:
         """Pose of the query's base frame in the target's base frame (4, 4)."""
-        return transform(np.array([self.t_x, self.t_y, self.t_z]), np.array([self.q_x, self.q_y, self.q_z, self.q_w]))
+        return transform(
+            np.array([self.t_x, self.t_y, self.t_z]),
+            np.array([self.q_x, self.q_y, self.q_z, self.q_w]),
+        )
 
     def covariance_in_session(self) -> F64:
-        """(6, 6) covariance of ``session_T_query`` due to the closure: the same errors along the axes of the target's session frame."""
+        """(6, 6) covariance of ``session_T_query`` due to the closure: the same errors along the
+        axes of the target's session frame.
+        """
         session_T_query = np.eye(4) if self.session_T_query is None else self.session_T_query
         session_R_target = session_T_query[:3, :3] @ self.target_T_query()[:3, :3].T
         turn = np.kron(np.eye(2), session_R_target)
@@ -86,13 +100,20 @@ class ClosureRecord:
 
 COLUMNS = tuple(f.name for f in fields(ClosureRecord) if not f.name.startswith("session_"))
 _TYPES: dict[str, type] = {
-    name: str if name.endswith("_session") else int if name.endswith("_ns") or name in ("inliers", "words") else float for name in COLUMNS
+    name: str
+    if name.endswith("_session")
+    else int
+    if name.endswith("_ns") or name in ("inliers", "words")
+    else float
+    for name in COLUMNS
 } | {"covariance": tuple}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mark:
-    """What is drawn at this log's end of a closure, in the frame ``frame_id``: a sphere, a text and, within one session, a line."""
+    """What is drawn at this log's end of a closure, in the frame ``frame_id``: a sphere, a text
+    and, within one session, a line.
+    """
 
     stamp_ns: int
     frame_id: str
@@ -109,7 +130,9 @@ class Mark:
 
 
 class Encoder(Protocol):
-    """The three messages in one encoding: their channels in the order of ``TOPICS``, and their bytes."""
+    """The three messages in one encoding: their channels in the order of ``TOPICS``, and their
+    bytes.
+    """
 
     def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]: ...
     def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes: ...
@@ -119,9 +142,11 @@ class Encoder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LogFacts:
-    """What has to be known of a log to write into it: encoding, profile, metadata for new channels, first and last receive time.
+    """What has to be known of a log to write into it: encoding, profile, metadata for new channels,
+    first and last receive time.
 
-    ``old_markers``: the log defines visualization_msgs/Marker as ROS 2 did before Humble; readers know one definition of a type.
+    ``old_markers``: the log defines visualization_msgs/Marker as ROS 2 did before Humble; readers
+    know one definition of a type.
     """
 
     encoding: Encoding
@@ -136,11 +161,17 @@ class LogFacts:
 def is_old_marker(name: str, definition: bytes) -> bool:
     """Whether a ROS 2 definition contains visualization_msgs/Marker as it was before Humble."""
     own = name.startswith("visualization_msgs/msg/Marker")
-    return (own or b"MSG: visualization_msgs/Marker\n" in definition) and b"mesh_file" not in definition
+    return (
+        own or b"MSG: visualization_msgs/Marker\n" in definition
+    ) and b"mesh_file" not in definition
 
 
-def run_id(closures: Sequence[ClosureRecord], session: str, settings: Mapping[str, str], version: str) -> str:
-    """Sixteen hexadecimal digits that name this result: the same closures, settings and version give the same."""
+def run_id(
+    closures: Sequence[ClosureRecord], session: str, settings: Mapping[str, str], version: str
+) -> str:
+    """Sixteen hexadecimal digits that name this result: the same closures, settings and version
+    give the same.
+    """
     rows = [list(c.columns().values()) for c in closures]
     content = json.dumps([version, session, sorted(settings.items()), rows], allow_nan=True)
     return hashlib.sha256(content.encode()).hexdigest()[:16]
@@ -158,15 +189,28 @@ def encode(
 ) -> tuple[list[NewChannel], list[NewMessage]]:
     """Channels and messages for the closures in which ``session`` takes part, in log-time order.
 
-    ``log_times`` maps the stamp of an end to the receive time of the log at that frame; an end without one takes its stamp, moved into
-    the log's time range. ``size`` is the diameter of the markers in metres; ``metadata`` goes to the channels. Channels without messages
-    are left out.
+    ``log_times`` maps the stamp of an end to the receive time of the log at that frame; an end
+    without one takes its stamp, moved into the log's time range. ``size`` is the diameter of the
+    markers in metres; ``metadata`` goes to the channels. Channels without messages are left out.
     """
     encoder = _encoder(facts)
     messages: list[NewMessage] = []
     mine = [c for c in closures if session in (c.query_session, c.target_session)]
     for c in mine:
-        if not np.isfinite([*c.covariance, c.t_x, c.t_y, c.t_z, c.q_x, c.q_y, c.q_z, c.q_w, c.overlap, c.probability]).all():
+        if not np.isfinite(
+            [
+                *c.covariance,
+                c.t_x,
+                c.t_y,
+                c.t_z,
+                c.q_x,
+                c.q_y,
+                c.q_z,
+                c.q_w,
+                c.overlap,
+                c.probability,
+            ]
+        ).all():
             raise ContractError(
                 f"The closure of {c.query_session} at {c.query_stamp_ns} ns has a number that is not finite; run `semloc close`."
             )
@@ -176,9 +220,15 @@ def encode(
         log_time = min(max(log_times.get(stamp, _clip(stamp, facts)), 0), (1 << 64) - 1)
         messages.append(NewMessage(0, log_time, encoder.loop_closure(closure, stamp)))
         if is_query and closure.session_T_query is not None:
-            messages.append(NewMessage(1, log_time, encoder.pose(closure, f"semloc/{closure.target_session}")))
+            messages.append(
+                NewMessage(1, log_time, encoder.pose(closure, f"semloc/{closure.target_session}"))
+            )
         if closure.session_position is not None:
-            messages.append(NewMessage(2, log_time, encoder.mark(_mark(closure, is_query, stamp, key, frame_id, size))))
+            messages.append(
+                NewMessage(
+                    2, log_time, encoder.mark(_mark(closure, is_query, stamp, key, frame_id, size))
+                )
+            )
     messages.sort(key=lambda m: m.log_time_ns)  # stable: closures of one frame stay in their order
     return _used(encoder.channels({**facts.channel_metadata, **metadata}), messages)
 
@@ -200,26 +250,51 @@ def _encoder(facts: LogFacts) -> Encoder:
 
 
 def _order(closure: ClosureRecord) -> tuple[str, int, str, int]:
-    return closure.query_session, closure.query_stamp_ns, closure.target_session, closure.target_stamp_ns
+    return (
+        closure.query_session,
+        closure.query_stamp_ns,
+        closure.target_session,
+        closure.target_stamp_ns,
+    )
 
 
 def _clip(stamp: int, facts: LogFacts) -> int:
     return min(max(stamp, facts.start_ns), facts.end_ns) if facts.messages else stamp
 
 
-def _mark(closure: ClosureRecord, is_query: bool, stamp: int, key: int, frame_id: str, size: float) -> Mark:
+def _mark(
+    closure: ClosureRecord, is_query: bool, stamp: int, key: int, frame_id: str, size: float
+) -> Mark:
     position = np.asarray(closure.session_position, float)
-    other, name = None, closure.target_session if is_query else closure.query_session
+    other = None
+    name = closure.target_session if is_query else closure.query_session
     if closure.query_session == closure.target_session:
-        name = "an earlier place" if closure.target_stamp_ns <= closure.query_stamp_ns else "a later place"
+        name = (
+            "an earlier place"
+            if closure.target_stamp_ns <= closure.query_stamp_ns
+            else "a later place"
+        )
         if closure.session_T_query is not None:
             other = (closure.session_T_query @ inverse(closure.target_T_query()))[:3, 3]
     good = min(1.0, max(0.0, 2 * closure.probability - 1))  # red at 0.5 and below, green at 1
-    return Mark(stamp, frame_id, key, position, other, size, f"{name} {closure.probability:.2f}", (1 - good, good, 0.1, 0.9))
+    return Mark(
+        stamp,
+        frame_id,
+        key,
+        position,
+        other,
+        size,
+        f"{name} {closure.probability:.2f}",
+        (1 - good, good, 0.1, 0.9),
+    )
 
 
-def _used(channels: list[NewChannel], messages: list[NewMessage]) -> tuple[list[NewChannel], list[NewMessage]]:
+def _used(
+    channels: list[NewChannel], messages: list[NewMessage]
+) -> tuple[list[NewChannel], list[NewMessage]]:
     """Without channels that have no message."""
     used = sorted({m.channel for m in messages})
     number = {old: new for new, old in enumerate(used)}
-    return [channels[k] for k in used], [NewMessage(number[m.channel], m.log_time_ns, m.data) for m in messages]
+    return [channels[k] for k in used], [
+        NewMessage(number[m.channel], m.log_time_ns, m.data) for m in messages
+    ]

@@ -24,19 +24,32 @@ from semloc_logs.logs.annotation.mcap_append import NewChannel
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 
-_STRING, _INT64, _INT32, _DOUBLE = (
-    FieldDescriptor.TYPE_STRING,
-    FieldDescriptor.TYPE_INT64,
-    FieldDescriptor.TYPE_INT32,
-    FieldDescriptor.TYPE_DOUBLE,
-)
-# the fields of schemas/messages/LoopClosure.proto after the timestamp, in the order of their numbers
+_STRING = FieldDescriptor.TYPE_STRING
+_INT64 = FieldDescriptor.TYPE_INT64
+_INT32 = FieldDescriptor.TYPE_INT32
+_DOUBLE = FieldDescriptor.TYPE_DOUBLE
+# the fields of schemas/messages/LoopClosure.proto after the timestamp, in the order of their
+# numbers
 _FIELDS = (
     ("query_session", _STRING),
     ("target_session", _STRING),
     ("query_stamp_ns", _INT64),
     ("target_stamp_ns", _INT64),
-    *((name, _DOUBLE) for name in ("t_x", "t_y", "t_z", "q_x", "q_y", "q_z", "q_w", "covariance", "overlap", "probability")),
+    *(
+        (name, _DOUBLE)
+        for name in (
+            "t_x",
+            "t_y",
+            "t_z",
+            "q_x",
+            "q_y",
+            "q_z",
+            "q_w",
+            "covariance",
+            "overlap",
+            "probability",
+        )
+    ),
     ("inliers", _INT32),
     ("words", _INT32),
 )
@@ -50,14 +63,19 @@ class FoxgloveEncoder:
 
     def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]:
         out = []
-        for topic, kind in zip(TOPICS, (loop_closure_class(), PoseInFrame, SceneUpdate), strict=True):
+        for topic, kind in zip(
+            TOPICS, (loop_closure_class(), PoseInFrame, SceneUpdate), strict=True
+        ):
             name = kind.DESCRIPTOR.full_name
             if self.encoding == "protobuf":
-                data, schema_encoding = build_file_descriptor_set(kind).SerializeToString(deterministic=True), "protobuf"
+                data = build_file_descriptor_set(kind).SerializeToString(deterministic=True)
+                schema_encoding = "protobuf"
             elif topic == TOPICS[0]:
-                data, schema_encoding = read_text("messages/LoopClosure.json").encode(), "jsonschema"
+                data = read_text("messages/LoopClosure.json").encode()
+                schema_encoding = "jsonschema"
             else:
-                data, schema_encoding = json.dumps({"title": name, **json_schema(kind.DESCRIPTOR)}).encode(), "jsonschema"
+                data = json.dumps({"title": name, **json_schema(kind.DESCRIPTOR)}).encode()
+                schema_encoding = "jsonschema"
             out.append(NewChannel(topic, self.encoding, name, schema_encoding, data, metadata))
         return out
 
@@ -72,7 +90,9 @@ class FoxgloveEncoder:
 
     def mark(self, mark: Mark) -> bytes:
         update = SceneUpdate()
-        entity = update.entities.add(timestamp=_time(mark.stamp_ns), frame_id=mark.frame_id, id=f"semloc/{mark.key}")
+        entity = update.entities.add(
+            timestamp=_time(mark.stamp_ns), frame_id=mark.frame_id, id=f"semloc/{mark.key}"
+        )
         entity.lifetime.SetInParent()  # zero: stays
         color = dict(zip("rgba", mark.color, strict=True))
         sphere = entity.spheres.add(size=dict.fromkeys("xyz", mark.size), color=color)
@@ -80,8 +100,13 @@ class FoxgloveEncoder:
         text = entity.texts.add(billboard=True, font_size=mark.size, color=color, text=mark.text)
         _set_pose(text.pose, mark.text_position())
         if mark.other is not None:
-            points = [Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in (mark.position, mark.other)]
-            line = entity.lines.add(type=LinePrimitive.LINE_LIST, thickness=mark.size / 5, points=points, color=color)
+            points = [
+                Point3(x=float(x), y=float(y), z=float(z))
+                for x, y, z in (mark.position, mark.other)
+            ]
+            line = entity.lines.add(
+                type=LinePrimitive.LINE_LIST, thickness=mark.size / 5, points=points, color=color
+            )
             _set_pose(line.pose, np.zeros(3))
         return self._bytes(update)
 
@@ -94,23 +119,40 @@ class FoxgloveEncoder:
 @cache
 def loop_closure_class() -> Any:
     """The protobuf class of schemas/messages/LoopClosure.proto."""
-    file = descriptor_pb2.FileDescriptorProto(name="semloc/LoopClosure.proto", package="semloc", syntax="proto3")
+    file = descriptor_pb2.FileDescriptorProto(
+        name="semloc/LoopClosure.proto", package="semloc", syntax="proto3"
+    )
     file.dependency.append(timestamp_pb2.DESCRIPTOR.name)
     message = file.message_type.add(name="LoopClosure")
-    once, many = FieldDescriptor.LABEL_OPTIONAL, FieldDescriptor.LABEL_REPEATED
-    message.field.add(name="timestamp", number=1, label=once, type=FieldDescriptor.TYPE_MESSAGE, type_name=".google.protobuf.Timestamp")
+    once = FieldDescriptor.LABEL_OPTIONAL
+    many = FieldDescriptor.LABEL_REPEATED
+    message.field.add(
+        name="timestamp",
+        number=1,
+        label=once,
+        type=FieldDescriptor.TYPE_MESSAGE,
+        type_name=".google.protobuf.Timestamp",
+    )
     for number, (name, kind) in enumerate(_FIELDS, 2):
-        message.field.add(name=name, number=number, label=many if name == "covariance" else once, type=kind)
+        message.field.add(
+            name=name, number=number, label=many if name == "covariance" else once, type=kind
+        )
     pool = descriptor_pool.Default()
     pool.AddSerializedFile(file.SerializeToString())
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("semloc.LoopClosure"))
 
 
 def json_schema(descriptor: Descriptor) -> dict[str, Any]:
-    """JSON Schema of a protobuf message in Foxglove's JSON: times as sec and nsec, enumerations as numbers, bytes as base64."""
+    """JSON Schema of a protobuf message in Foxglove's JSON: times as sec and nsec, enumerations as
+    numbers, bytes as base64.
+    """
     if descriptor.full_name in ("google.protobuf.Timestamp", "google.protobuf.Duration"):
         title = "time" if descriptor.name == "Timestamp" else "duration"
-        return {"type": "object", "title": title, "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
+        return {
+            "type": "object",
+            "title": title,
+            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+        }
     properties = {}
     for field in descriptor.fields:
         one = _json_field_schema(field)
@@ -147,7 +189,9 @@ def _json_value(message: Message) -> dict[str, Any]:
     out = {}
     for field in message.DESCRIPTOR.fields:
         value = getattr(message, field.name)
-        out[field.name] = [_json_item(v) for v in value] if _is_repeated(field) else _json_item(value)
+        out[field.name] = (
+            [_json_item(v) for v in value] if _is_repeated(field) else _json_item(value)
+        )
     return out
 
 
@@ -162,7 +206,9 @@ def _time(stamp_ns: int) -> timestamp_pb2.Timestamp:
     return timestamp_pb2.Timestamp(seconds=sec, nanos=nanos)
 
 
-def _set_pose(pose: Pose, position: F64, quaternion: F64 | tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)) -> None:
+def _set_pose(
+    pose: Pose, position: F64, quaternion: F64 | tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+) -> None:
     pose.position.x, pose.position.y, pose.position.z = (float(v) for v in position)
     q = pose.orientation
     q.x, q.y, q.z, q.w = (float(v) for v in quaternion)

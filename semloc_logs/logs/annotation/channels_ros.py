@@ -18,7 +18,8 @@ from semloc_logs.schemas import read_text
 CLOSURE = "semloc_msgs/msg/LoopClosure"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 MARKERS = "visualization_msgs/msg/MarkerArray"
-_SPHERE, _LINE_LIST, _TEXT = 2, 5, 9  # values of visualization_msgs/Marker.type, equal in ROS 1 and 2
+# values of visualization_msgs/Marker.type, equal in ROS 1 and 2
+_SPHERE, _LINE_LIST, _TEXT = 2, 5, 9
 
 
 class RosEncoder:
@@ -26,14 +27,29 @@ class RosEncoder:
 
     def __init__(self, version: int, *, old_markers: bool = False) -> None:
         self.version = version
-        self.store = _store(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_FOXY if old_markers else Stores.ROS2_HUMBLE)
+        self.store = _store(
+            Stores.ROS1_NOETIC
+            if version == 1
+            else Stores.ROS2_FOXY
+            if old_markers
+            else Stores.ROS2_HUMBLE
+        )
 
     def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]:
         encoding, schema_encoding = ("ros1", "ros1msg") if self.version == 1 else ("cdr", "ros2msg")
         out = []
         for topic, name in zip(TOPICS, (CLOSURE, POSE, MARKERS), strict=True):
             shown = name if self.version == 2 else name.replace("/msg/", "/")
-            out.append(NewChannel(topic, encoding, shown, schema_encoding, self._definition(name).encode(), metadata))
+            out.append(
+                NewChannel(
+                    topic,
+                    encoding,
+                    shown,
+                    schema_encoding,
+                    self._definition(name).encode(),
+                    metadata,
+                )
+            )
         return out
 
     def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes:
@@ -47,18 +63,45 @@ class RosEncoder:
             pose=self._pose(*translation_quaternion(session_T_query)),
             covariance=closure.covariance_in_session().reshape(36),
         )
-        return self._bytes(self._new(POSE, header=self._header(closure.query_stamp_ns, frame_id), pose=pose))
+        return self._bytes(
+            self._new(POSE, header=self._header(closure.query_stamp_ns, frame_id), pose=pose)
+        )
 
     def mark(self, mark: Mark) -> bytes:
         markers = [self._marker(mark, _SPHERE, "semloc/places", mark.position, (mark.size,) * 3)]
         if mark.other is not None:
             ends = [self._point(mark.position), self._point(mark.other)]
-            markers.append(self._marker(mark, _LINE_LIST, "semloc/closures", np.zeros(3), (mark.size / 5, 0.0, 0.0), points=ends))
-        markers.append(self._marker(mark, _TEXT, "semloc/names", mark.text_position(), (0.0, 0.0, mark.size), text=mark.text))
+            markers.append(
+                self._marker(
+                    mark,
+                    _LINE_LIST,
+                    "semloc/closures",
+                    np.zeros(3),
+                    (mark.size / 5, 0.0, 0.0),
+                    points=ends,
+                )
+            )
+        markers.append(
+            self._marker(
+                mark,
+                _TEXT,
+                "semloc/names",
+                mark.text_position(),
+                (0.0, 0.0, mark.size),
+                text=mark.text,
+            )
+        )
         return self._bytes(self._new(MARKERS, markers=markers))
 
     def _marker(
-        self, mark: Mark, kind: int, ns: str, position: F64, scale: tuple[float, ...], points: list[Any] | None = None, text: str = ""
+        self,
+        mark: Mark,
+        kind: int,
+        ns: str,
+        position: F64,
+        scale: tuple[float, ...],
+        points: list[Any] | None = None,
+        text: str = "",
     ) -> Any:
         given = {
             "header": self._header(mark.stamp_ns, mark.frame_id),
@@ -67,7 +110,9 @@ class RosEncoder:
             "type": kind,
             "pose": self._pose(position, np.array([0.0, 0.0, 0.0, 1.0])),
             "scale": self._new("geometry_msgs/msg/Vector3", x=scale[0], y=scale[1], z=scale[2]),
-            "color": self._new("std_msgs/msg/ColorRGBA", **dict(zip("rgba", mark.color, strict=True))),
+            "color": self._new(
+                "std_msgs/msg/ColorRGBA", **dict(zip("rgba", mark.color, strict=True))
+            ),
             "points": points or [],
             "text": text,
         }
@@ -76,7 +121,9 @@ class RosEncoder:
     def _pose(self, position: F64, quaternion: F64) -> Any:
         x, y, z, w = (float(v) for v in quaternion)
         turned = self._new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-        return self._new("geometry_msgs/msg/Pose", position=self._point(position), orientation=turned)
+        return self._new(
+            "geometry_msgs/msg/Pose", position=self._point(position), orientation=turned
+        )
 
     def _point(self, position: F64) -> Any:
         x, y, z = (float(v) for v in position)
@@ -84,13 +131,20 @@ class RosEncoder:
 
     def _header(self, stamp_ns: int, frame_id: str) -> Any:
         sec, nanosec = divmod(max(0, stamp_ns), 10**9)  # the exact stamps are in the columns
-        stamp = self._new("builtin_interfaces/msg/Time", sec=min(sec, (1 << 31) - 1), nanosec=nanosec)
+        stamp = self._new(
+            "builtin_interfaces/msg/Time", sec=min(sec, (1 << 31) - 1), nanosec=nanosec
+        )
         return self._new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
     def _new(self, name: str, **values: Any) -> Any:
         """A message with the given fields; what the definition has beyond them is empty or zero."""
         fields = self.store.fielddefs[name][1]
-        return self.store.types[name](**{field: values[field] if field in values else self._empty(*kind) for field, kind in fields})
+        return self.store.types[name](
+            **{
+                field: values[field] if field in values else self._empty(*kind)
+                for field, kind in fields
+            }
+        )
 
     def _empty(self, kind: int, detail: Any) -> Any:
         if kind == Nodetype.NAME:
@@ -111,7 +165,11 @@ class RosEncoder:
         if name != CLOSURE:
             return str(text)
         separator = "=" * 80
-        return str(read_text("messages/LoopClosure.msg")) + separator + str(text).split(separator, 1)[1]
+        return (
+            str(read_text("messages/LoopClosure.msg"))
+            + separator
+            + str(text).split(separator, 1)[1]
+        )
 
 
 @cache

@@ -1,4 +1,6 @@
-"""ROS bags that are no MCAP files, as raw messages: what has to be known to write beside them, and a copy of them as MCAP."""
+"""ROS bags that are no MCAP files, as raw messages: what has to be known to write beside them, and
+a copy of them as MCAP.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ QOS_KEY = "offered_qos_profiles"
 
 @contextlib.contextmanager
 def opened(log: Path) -> Iterator[Sequence[Any]]:
-    """Open rosbags readers of a .bag, a .db3, or a ROS 2 bag folder (the .db3 or .mcap files in it where metadata.yaml is missing)."""
+    """Open rosbags readers of a .bag, a .db3, or a ROS 2 bag folder (the .db3 or .mcap files in it
+    where metadata.yaml is missing).
+    """
     with contextlib.ExitStack() as stack:
         with _told(log):
             readers = [stack.enter_context(r) for r in _readers(log)]
@@ -33,15 +37,31 @@ def bag_facts(log: Path, readers: Sequence[Any]) -> LogFacts:
     """Encoding, QoS and time range of an open bag."""
     with _told(log):
         used = [r for r in readers if r.message_count]
-        start, end = min((r.start_time for r in used), default=0), max((r.end_time - 1 for r in used), default=0)
+        start = min((r.start_time for r in used), default=0)
+        end = max((r.end_time - 1 for r in used), default=0)
         ros1 = isinstance(readers[0], Reader1)
-        profiles = [] if ros1 else [dump_qos_v8(c.ext.offered_qos_profiles) for r in readers for c in r.connections]
+        profiles = (
+            []
+            if ros1
+            else [dump_qos_v8(c.ext.offered_qos_profiles) for r in readers for c in r.connections]
+        )
     metadata = {} if ros1 else {QOS_KEY: next(filter(None, profiles), "")}
     name = "ros1" if ros1 else "ros2"
     old_markers = not ros1 and any(
-        is_old_marker(c.msgtype, c.msgdef.data.encode()) for r in readers for c in r.connections if c.msgdef.data
+        is_old_marker(c.msgtype, c.msgdef.data.encode())
+        for r in readers
+        for c in r.connections
+        if c.msgdef.data
     )
-    return LogFacts("ros1" if ros1 else "ros2", name, metadata, start, end, sum(r.message_count for r in readers), old_markers)
+    return LogFacts(
+        "ros1" if ros1 else "ros2",
+        name,
+        metadata,
+        start,
+        end,
+        sum(r.message_count for r in readers),
+        old_markers,
+    )
 
 
 def write_copy(log: Path, readers: Sequence[Any], file: BinaryIO, library: str) -> int:
@@ -61,7 +81,9 @@ def write_copy(log: Path, readers: Sequence[Any], file: BinaryIO, library: str) 
             if schema not in schemas:
                 schemas[schema] = writer.register_schema(schema[0], schema[1], schema[2].encode())
             encoding, metadata = _channel(connection, ros1)
-            channels[connection.id] = writer.register_channel(connection.topic, encoding, schemas[schema], metadata)
+            channels[connection.id] = writer.register_channel(
+                connection.topic, encoding, schemas[schema], metadata
+            )
         for connection, time, data in _guarded(log, reader):
             writer.add_message(channels[connection.id], max(0, time), bytes(data), max(0, time))
             written += 1
@@ -84,7 +106,9 @@ def _readers(log: Path) -> list[Any]:
         return [Reader2(folder)]
     files = sorted(f for f in folder.iterdir() if f.suffix in (".db3", ".mcap"))
     if not files:
-        raise LogError(f"{folder} holds no ROS 2 bag: neither metadata.yaml nor .db3 or .mcap files; give the folder of a bag.")
+        raise LogError(
+            f"{folder} holds no ROS 2 bag: neither metadata.yaml nor .db3 or .mcap files; give the folder of a bag."
+        )
     return [Reader2(f) for f in files]
 
 
@@ -102,7 +126,9 @@ def _guarded(log: Path, reader: Any) -> Iterator[tuple[Any, int, bytes]]:
 
 @contextlib.contextmanager
 def _told(log: Path) -> Iterator[None]:
-    """Whatever the library raises on a damaged bag (it is of many types, AssertionError among them) becomes a LogError."""
+    """Whatever the library raises on a damaged bag (it is of many types, AssertionError among them)
+    becomes a LogError.
+    """
     try:
         yield
     except LogError:
@@ -114,8 +140,11 @@ def _told(log: Path) -> Iterator[None]:
 
 
 def _schema(connection: Any, ros1: bool) -> tuple[str, str, str]:
-    """Name, encoding and text of a connection's definition; a ROS 2 type that is not defined is looked up among the standard ones."""
-    name, definition = connection.msgtype, connection.msgdef
+    """Name, encoding and text of a connection's definition; a ROS 2 type that is not defined is
+    looked up among the standard ones.
+    """
+    name = connection.msgtype
+    definition = connection.msgdef
     if ros1:
         return name.replace("/msg/", "/"), "ros1msg", definition.data
     if definition.format == MessageDefinitionFormat.IDL:
@@ -131,7 +160,9 @@ def _schema(connection: Any, ros1: bool) -> tuple[str, str, str]:
 def _channel(connection: Any, ros1: bool) -> tuple[str, dict[str, str]]:
     if not ros1:
         metadata = {QOS_KEY: dump_qos_v8(connection.ext.offered_qos_profiles)}
-        return connection.ext.serialization_format, metadata | ({"topic_type_hash": connection.digest} if connection.digest else {})
+        return connection.ext.serialization_format, metadata | (
+            {"topic_type_hash": connection.digest} if connection.digest else {}
+        )
     metadata = {"md5sum": connection.digest, "topic": connection.topic}
     if connection.ext.callerid is not None:
         metadata["callerid"] = connection.ext.callerid

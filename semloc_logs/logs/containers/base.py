@@ -1,4 +1,6 @@
-"""What all containers share: problems by topic, messages of several parts in log-time order, careful decompression."""
+"""What all containers share: problems by topic, messages of several parts in log-time order,
+careful decompression.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ from semloc_logs.logs.log import Message, Stream
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problems
 
-MAX_CHUNK = 2 << 30  # no recorder writes chunks of 2 GiB; a larger claim is damage or a decompression bomb
+# no recorder writes chunks of 2 GiB; a larger claim is damage or a decompression bomb
+MAX_CHUNK = 2 << 30
 _STEP = 1 << 22
 
 
@@ -66,7 +69,9 @@ def open_file(path: Path) -> BinaryIO:
 
 @contextmanager
 def closed_on_error(file: BinaryIO, path: Path) -> Iterator[None]:
-    """Closes ``file`` when it turns out to be no log, and says so as a LogError that names ``path``."""
+    """Closes ``file`` when it turns out to be no log, and says so as a LogError that names
+    ``path``.
+    """
     try:
         yield
     except (LogError, OSError) as error:
@@ -85,18 +90,28 @@ class SizedFile(Protocol):
 
 
 def encoding_of(streams: Iterable[Stream]) -> str:
-    """``ros2``, ``ros1``, ``protobuf`` or ``json``: what most streams are recorded in, "" without streams that are."""
+    """``ros2``, ``ros1``, ``protobuf`` or ``json``: what most streams are recorded in, "" without
+    streams that are.
+    """
     names = {"cdr": "ros2", "ros1": "ros1", "protobuf": "protobuf", "json": "json"}
     found = [names[s.encoding] for s in streams if s.encoding in names]
     return max(sorted(set(found)), key=found.count, default="")
 
 
-def in_log_time_order(parts: Iterable[tuple[int, Callable[[], Iterator[Message]]]]) -> Iterator[Message]:
-    """Merges parts, each (a lower bound of its log times, a function that opens it), each in log-time order by itself.
+def in_log_time_order(
+    parts: Iterable[tuple[int, Callable[[], Iterator[Message]]]],
+) -> Iterator[Message]:
+    """Merges parts, each (a lower bound of its log times, a function that opens it), each in
+    log-time order by itself.
 
-    A part is opened when its time has come, so memory holds only parts that overlap; equal times keep the order of the parts.
+    A part is opened when its time has come, so memory holds only parts that overlap; equal times
+    keep the order of the parts.
     """
-    waiting = sorted(((start, k, part) for k, (start, part) in enumerate(parts)), key=lambda w: w[:2], reverse=True)
+    waiting = sorted(
+        ((start, k, part) for k, (start, part) in enumerate(parts)),
+        key=lambda w: w[:2],
+        reverse=True,
+    )
     heap: list[tuple[int, int, Message, Iterator[Message]]] = []
     while waiting or heap:
         while waiting and (not heap or waiting[-1][0] <= heap[0][0]):
@@ -108,7 +123,8 @@ def in_log_time_order(parts: Iterable[tuple[int, Callable[[], Iterator[Message]]
             continue
         _, order, message, opened = heap[0]
         yield message
-        if len(heap) == 1:  # nearly always: parts rarely overlap, so run through this one until the next is due
+        # nearly always: parts rarely overlap, so run through this one until the next is due
+        if len(heap) == 1:
             due = waiting[-1][0] if waiting else None
             for message in opened:
                 if due is not None and message.log_time_ns >= due:
@@ -124,9 +140,13 @@ def in_log_time_order(parts: Iterable[tuple[int, Callable[[], Iterator[Message]]
 
 
 def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> bytes:
-    """``size`` bytes at ``offset``; LogError when the file does not have them (nothing is allocated for the claim)."""
+    """``size`` bytes at ``offset``; LogError when the file does not have them (nothing is allocated
+    for the claim).
+    """
     if offset < 0 or size < 0 or offset + size > file_size:
-        raise LogError(f"{size} bytes are claimed at byte {offset}, but the file ends at byte {file_size}")
+        raise LogError(
+            f"{size} bytes are claimed at byte {offset}, but the file ends at byte {file_size}"
+        )
     file.seek(offset)
     data = file.read(size)
     if len(data) != size:
@@ -135,7 +155,9 @@ def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> byt
 
 
 def decompress(data: bytes, compression: str, size: int) -> bytes:
-    """The ``size`` bytes that ``data`` holds; LogError for another size, a claim beyond reason or damaged data."""
+    """The ``size`` bytes that ``data`` holds; LogError for another size, a claim beyond reason or
+    damaged data.
+    """
     if compression in ("", "none"):
         unpacked = data
     elif compression not in ("zstd", "lz4", "bz2"):
@@ -145,7 +167,14 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
     else:
         try:
             unpacked = _unpack(data, compression, size)
-        except (zstandard.ZstdError, RuntimeError, EOFError, OSError, ValueError, MemoryError) as error:
+        except (
+            zstandard.ZstdError,
+            RuntimeError,
+            EOFError,
+            OSError,
+            ValueError,
+            MemoryError,
+        ) as error:
             raise LogError(f"its {compression} data are damaged ({error})") from error
     if len(unpacked) != size:
         raise LogError(f"it holds {len(unpacked)} bytes where {size} are claimed")
@@ -158,7 +187,9 @@ def _unpack(data: bytes, compression: str, size: int) -> bytes:
     if compression == "zstd":
         if plausible and zstandard.frame_content_size(data) in (size, -1):
             return bytes(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
-        return _gather(zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True).read, size)
+        return _gather(
+            zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True).read, size
+        )
     if compression == "bz2":
         engine = bz2.BZ2Decompressor()
         return _gather(_feed(engine, data), size)
@@ -185,7 +216,8 @@ def _feed(engine: _Engine, data: bytes) -> Callable[[int], bytes]:
 
 def _gather(read: Callable[[int], bytes], size: int) -> bytes:
     """At most ``size + 1`` bytes: one too many shows that the claim was too small."""
-    pieces, have = [], 0
+    pieces = []
+    have = 0
     while have <= size and (piece := read(min(_STEP, size + 1 - have))):
         pieces.append(piece)
         have += len(piece)

@@ -31,7 +31,9 @@ SUMMARY_ORDER = (
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Raw summary records by opcode, the statistics, and the number of messages that lie outside of chunks."""
+    """Raw summary records by opcode, the statistics, and the number of messages that lie outside of
+    chunks.
+    """
 
     groups: dict[int, list[bytes]]
     statistics: Statistics
@@ -65,9 +67,11 @@ class _Found:
 def scan(file: BinaryIO, data_end: int, path: Path) -> Summary:
     """Walk the records of the data section, which ends at ``data_end``.
 
-    Chunks are decompressed one at a time and their checksums verified. Raises ``LogError`` where a record does not fit or is damaged.
+    Chunks are decompressed one at a time and their checksums verified. Raises ``LogError`` where a
+    record does not fit or is damaged.
     """
-    found, at = _Found(), len(b"\x89MCAP0\r\n")
+    found = _Found()
+    at = len(b"\x89MCAP0\r\n")
     try:
         while at < data_end:
             file.seek(at)
@@ -77,7 +81,15 @@ def scan(file: BinaryIO, data_end: int, path: Path) -> Summary:
                 raise ValueError("record reaches beyond the data section")
             _visit(found, file, opcode, at, length, head)
             at += 9 + length
-    except (struct.error, ValueError, KeyError, EOFError, RuntimeError, zstandard.ZstdError, McapError) as error:
+    except (
+        struct.error,
+        ValueError,
+        KeyError,
+        EOFError,
+        RuntimeError,
+        zstandard.ZstdError,
+        McapError,
+    ) as error:
         raise LogError(
             f"{path} is damaged at offset {at} ({error}) and has no complete summary; recover it with `mcap recover {path} -o OUT.mcap`."
         ) from error
@@ -95,15 +107,20 @@ def _visit(found: _Found, file: BinaryIO, opcode: int, at: int, length: int, hea
     elif opcode == Opcode.MESSAGE_INDEX and found.chunks:
         channel, size = struct.unpack("<HI", file.read(6))
         chunk = found.chunks[-1]
-        # writers differ on whether a channel without messages in the chunk gets an index; one without entries says nothing
+        # writers differ on whether a channel without messages in the chunk gets an index; one
+        # without entries says nothing
         if size:
             chunk.message_index_offsets[channel] = at
         chunk.message_index_length = at + 9 + length - chunk.chunk_start_offset - chunk.chunk_length
     elif opcode == Opcode.ATTACHMENT:
         stream = ReadDataStream(BytesIO(file.read(min(length, 1 << 16))))
-        log_time, create_time = stream.read8(), stream.read8()
-        name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
-        found.attachments.append(AttachmentIndex(at, 9 + length, log_time, create_time, stream.read8(), name, media_type))
+        log_time = stream.read8()
+        create_time = stream.read8()
+        name = stream.read_prefixed_string()
+        media_type = stream.read_prefixed_string()
+        found.attachments.append(
+            AttachmentIndex(at, 9 + length, log_time, create_time, stream.read8(), name, media_type)
+        )
     elif opcode == Opcode.METADATA:
         name = ReadDataStream(BytesIO(file.read(min(length, 1 << 16)))).read_prefixed_string()
         found.metadata.append(MetadataIndex(at, 9 + length, name))

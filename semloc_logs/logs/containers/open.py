@@ -16,7 +16,8 @@ _SQLITE = b"SQLite format 3\0"
 
 
 def open_log(path: str | Path) -> Log:
-    """The log at ``path``: an MCAP file, a ROS 1 bag, a ROS 2 bag directory, its metadata.yaml, or one of its files.
+    """The log at ``path``: an MCAP file, a ROS 1 bag, a ROS 2 bag directory, its metadata.yaml, or
+    one of its files.
 
     LogError says what it is instead, or what is wrong with it.
     """
@@ -29,7 +30,9 @@ def open_log(path: str | Path) -> Log:
     except FileNotFoundError as error:
         raise LogError(f"{path} does not exist.") from error
     except (OSError, ValueError) as error:
-        raise LogError(f"{path} cannot be opened: {getattr(error, 'strerror', None) or error}.") from error
+        raise LogError(
+            f"{path} cannot be opened: {getattr(error, 'strerror', None) or error}."
+        ) from error
     if path.name == "metadata.yaml":
         return Rosbag2Log(path.parent)
     if head.startswith(mcap.MAGIC):
@@ -47,7 +50,9 @@ def _what_it_is(head: bytes) -> str:
     if head.startswith(b"version https://git-lfs"):
         return "is a Git LFS pointer, not the log itself; fetch it with 'git lfs pull'."
     if head.startswith(b"\x28\xb5\x2f\xfd"):
-        return "is zstd-compressed; decompress it with 'unzstd', or give the folder of its ROS 2 bag."
+        return (
+            "is zstd-compressed; decompress it with 'unzstd', or give the folder of its ROS 2 bag."
+        )
     if head.startswith((b"\x1f\x8b", b"PK\x03\x04", b"BZh", b"\xfd7zXZ")):
         return "is an archive; unpack it first."
     if mcap.MAGIC.startswith(head) or rosbag1.MAGIC.startswith(head):

@@ -1,4 +1,6 @@
-"""ROS 1 bags (format 2.0): by their index, or, when it is missing or damaged, by walking over the chunks that are readable."""
+"""ROS 1 bags (format 2.0): by their index, or, when it is missing or damaged, by walking over the
+chunks that are readable.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.containers.base import BaseLog, closed_on_error, decompress, in_log_time_order, open_file, read_exactly
+from semloc_logs.logs.containers.base import (
+    BaseLog,
+    closed_on_error,
+    decompress,
+    in_log_time_order,
+    open_file,
+    read_exactly,
+)
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
 
@@ -46,10 +55,16 @@ class Rosbag1Log(BaseLog):
             self._open()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
-        """The messages of ``topics`` (None: of all) in log-time order; a damaged chunk is skipped and named in ``problems``."""
+        """The messages of ``topics`` (None: of all) in log-time order; a damaged chunk is skipped
+        and named in ``problems``.
+        """
         wanted = None if topics is None else frozenset(topics)
-        ids = {c for c, (topic, _, _) in self._connections.items() if wanted is None or topic in wanted}
-        return in_log_time_order((p.start_ns, partial(self._load, p, ids)) for p in self._parts if p.connections & ids)
+        ids = {
+            c for c, (topic, _, _) in self._connections.items() if wanted is None or topic in wanted
+        }
+        return in_log_time_order(
+            (p.start_ns, partial(self._load, p, ids)) for p in self._parts if p.connections & ids
+        )
 
     def close(self) -> None:
         """Releases the file."""
@@ -62,7 +77,9 @@ class Rosbag1Log(BaseLog):
         if magic != MAGIC:
             known = magic.startswith(b"#ROSBAG V")
             raise LogError(
-                "only bags of format 2.0 are supported; convert it with rosbag migrate" if known else "it does not start like a ROS 1 bag"
+                "only bags of format 2.0 are supported; convert it with rosbag migrate"
+                if known
+                else "it does not start like a ROS 1 bag"
             )
         counts = None
         try:
@@ -71,15 +88,22 @@ class Rosbag1Log(BaseLog):
                 raise LogError("the bag is encrypted")
             counts = self._read_index(head)
         except _DamageError as error:
-            self._problems.add(f"{self.path.name}: the index is damaged ({error}), so the whole file was walked.")
+            self._problems.add(
+                f"{self.path.name}: the index is damaged ({error}), so the whole file was walked."
+            )
         if counts is None:
             counts = self._scan()
         grouped: Counter[tuple[str, str]] = Counter()
         for connection, (topic, type_, _) in self._connections.items():
             grouped[topic, type_] += counts.get(connection, 0)
-        self.streams = [Stream(topic, type_, "ros1", count) for (topic, type_), count in sorted(grouped.items())]
+        self.streams = [
+            Stream(topic, type_, "ros1", count) for (topic, type_), count in sorted(grouped.items())
+        ]
         if self._parts:
-            self.start_ns, self.end_ns = min(p.start_ns for p in self._parts), max(p.end_ns for p in self._parts)
+            self.start_ns, self.end_ns = (
+                min(p.start_ns for p in self._parts),
+                max(p.end_ns for p in self._parts),
+            )
 
     def _read_index(self, head: Fields) -> Counter[int] | None:
         """Message counts by connection; None when the bag was not closed."""
@@ -108,11 +132,17 @@ class Rosbag1Log(BaseLog):
         count = _number(fields, b"count", "<I")
         if end - start != 8 * count:
             raise _DamageError("a chunk info has the wrong size")
-        pairs = dict(struct.iter_unpack("<II", read_exactly(self._file, start, end - start, self._size)))
+        pairs = dict(
+            struct.iter_unpack("<II", read_exactly(self._file, start, end - start, self._size))
+        )
         offset = _number(fields, b"chunk_pos", "<Q")
         if offset >= self._size:
-            raise _DamageError(f"a chunk is claimed at byte {offset}, but the file ends at byte {self._size}")
-        self._parts.append(Part(offset, _time(fields, b"start_time"), _time(fields, b"end_time"), frozenset(pairs)))
+            raise _DamageError(
+                f"a chunk is claimed at byte {offset}, but the file ends at byte {self._size}"
+            )
+        self._parts.append(
+            Part(offset, _time(fields, b"start_time"), _time(fields, b"end_time"), frozenset(pairs))
+        )
         counts.update(pairs)
 
     def _connect(self, fields: Fields, start: int, end: int) -> None:
@@ -120,10 +150,14 @@ class Rosbag1Log(BaseLog):
             return
         connection = _number(fields, b"conn", "<I")
         if connection not in self._connections:
-            self._connections[connection] = _connection(fields, read_exactly(self._file, start, end - start, self._size))
+            self._connections[connection] = _connection(
+                fields, read_exactly(self._file, start, end - start, self._size)
+            )
 
     def _scan(self) -> Counter[int]:
-        """Walks over all records and decompresses every chunk once: parts and counts of what can be read."""
+        """Walks over all records and decompresses every chunk once: parts and counts of what can be
+        read.
+        """
         self._parts.clear()
         counts: Counter[int] = Counter()
         position = len(MAGIC)
@@ -149,7 +183,9 @@ class Rosbag1Log(BaseLog):
         try:
             found = self._walk(self._unpack_chunk(offset), offset)
         except LogError as error:
-            self._problems.add(f"{self.path.name}: the chunk at byte {offset} was skipped: {error}.")
+            self._problems.add(
+                f"{self.path.name}: the chunk at byte {offset} was skipped: {error}."
+            )
             return
         found = [f for f in found if f[1] in self._connections]
         if found:
@@ -163,7 +199,9 @@ class Rosbag1Log(BaseLog):
         try:
             data = self._unpack_chunk(part.offset)
         except (LogError, OSError) as error:
-            self._problems.add(f"{self.path.name}: the chunk at byte {part.offset} was skipped: {error}.")
+            self._problems.add(
+                f"{self.path.name}: the chunk at byte {part.offset} was skipped: {error}."
+            )
             return
         view = memoryview(data)
         found = self._walk(data, part.offset)
@@ -178,18 +216,27 @@ class Rosbag1Log(BaseLog):
         if _number(fields, b"op", "<B") != _CHUNK:
             raise _DamageError("it is not the chunk that the index claims")
         compression = fields.get(b"compression", b"none").decode(errors="replace")
-        return decompress(read_exactly(self._file, start, end - start, self._size), compression, _number(fields, b"size", "<I"))
+        return decompress(
+            read_exactly(self._file, start, end - start, self._size),
+            compression,
+            _number(fields, b"size", "<I"),
+        )
 
     def _walk(self, data: bytes, offset: int) -> list[tuple[int, int, int, int]]:
-        """(log time, connection, start, end) of the messages in ``data``; learns of connections on the way."""
+        """(log time, connection, start, end) of the messages in ``data``; learns of connections on
+        the way.
+        """
         found = []
-        position, size = 0, len(data)
+        position = 0
+        size = len(data)
         try:
             while position < size:
                 fields, start, end = _split(data, position)
                 op = fields.get(b"op")
                 if op == b"\x02":
-                    found.append((_time(fields, b"time"), _number(fields, b"conn", "<I"), start, end))
+                    found.append(
+                        (_time(fields, b"time"), _number(fields, b"conn", "<I"), start, end)
+                    )
                 elif op == b"\x07":
                     connection = _number(fields, b"conn", "<I")
                     if connection not in self._connections:
@@ -239,7 +286,8 @@ def _split(data: bytes, position: int) -> tuple[Fields, int, int]:
 
 def _fields(head: bytes) -> Fields:
     fields: Fields = {}
-    position, size = 0, len(head)
+    position = 0
+    size = len(head)
     while position + 4 <= size:
         end = position + 4 + _U32.unpack_from(head, position)[0]
         name, equals, value = head[position + 4 : end].partition(b"=")
@@ -254,14 +302,18 @@ def _number(fields: Fields, name: bytes, layout: str) -> int:
     try:
         return int(struct.unpack(layout, fields[name])[0])
     except (KeyError, struct.error) as error:
-        raise _DamageError(f"the field {name.decode()} of a record is missing or damaged") from error
+        raise _DamageError(
+            f"the field {name.decode()} of a record is missing or damaged"
+        ) from error
 
 
 def _time(fields: Fields, name: bytes) -> int:
     try:
         seconds, nanoseconds = _TIME.unpack(fields[name])
     except (KeyError, struct.error) as error:
-        raise _DamageError(f"the field {name.decode()} of a record is missing or damaged") from error
+        raise _DamageError(
+            f"the field {name.decode()} of a record is missing or damaged"
+        ) from error
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 

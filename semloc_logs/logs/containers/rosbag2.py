@@ -1,4 +1,6 @@
-"""ROS 2 bags: directories of sqlite3 or MCAP files, split or not, compressed or not, with or without metadata.yaml; or one file."""
+"""ROS 2 bags: directories of sqlite3 or MCAP files, split or not, compressed or not, with or
+without metadata.yaml; or one file.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,11 @@ class Rosbag2Log(BaseLog):
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` (None: of all) of all files in log-time order."""
-        parts = [(f.start_ns, partial(self._load, f, topics)) for f in self._files if f.start_ns is not None]
+        parts = [
+            (f.start_ns, partial(self._load, f, topics))
+            for f in self._files
+            if f.start_ns is not None
+        ]
         return in_log_time_order(parts)
 
     def close(self) -> None:
@@ -59,7 +65,11 @@ class Rosbag2Log(BaseLog):
             except LogError as error:
                 failures.append(str(error))
         if not self._files:
-            raise LogError(failures[0] if failures else f"{self.path} holds no .db3, .mcap or compressed file of a ROS 2 bag.")
+            raise LogError(
+                failures[0]
+                if failures
+                else f"{self.path} holds no .db3, .mcap or compressed file of a ROS 2 bag."
+            )
         for failure in failures:
             self._problems.add(failure)
         counts: Counter[tuple[str, str, str]] = Counter()
@@ -85,12 +95,24 @@ class Rosbag2Log(BaseLog):
                 text = file.read(_MAX_METADATA)
             if b"<<" in text:
                 raise ValueError("it merges mappings")  # a few such lines can expand without end
-            information = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))["rosbag2_bagfile_information"]
+            information = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))[
+                "rosbag2_bagfile_information"
+            ]
         except FileNotFoundError:
             return {}
-        except (OSError, yaml.YAMLError, ValueError, TypeError, LookupError, RecursionError, AttributeError) as error:
+        except (
+            OSError,
+            yaml.YAMLError,
+            ValueError,
+            TypeError,
+            LookupError,
+            RecursionError,
+            AttributeError,
+        ) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            self._problems.add(f"{path} cannot be used ({reason}); all files of the folder were read instead.")
+            self._problems.add(
+                f"{path} cannot be used ({reason}); all files of the folder were read instead."
+            )
             return {}
         if not isinstance(information, dict):
             self._problems.add(f"{path} cannot be used; all files of the folder were read instead.")
@@ -98,19 +120,31 @@ class Rosbag2Log(BaseLog):
         return information
 
     def _listed(self, metadata: dict[str, Any]) -> list[Path]:
-        """The files that metadata.yaml names and that are there, whatever folder they were recorded in."""
+        """The files that metadata.yaml names and that are there, whatever folder they were recorded
+        in.
+        """
         listed = metadata.get("relative_file_paths")
-        names = [PurePosixPath(p).name for p in listed if isinstance(p, str)] if isinstance(listed, list) else []
+        names = (
+            [PurePosixPath(p).name for p in listed if isinstance(p, str)]
+            if isinstance(listed, list)
+            else []
+        )
         found = self._found()
         if not names:
             return found
         paths = []
         for name in dict.fromkeys(names):
-            candidates = [c for c in (name, f"{name}.zstd", name.removesuffix(".zstd")) if (self.path / c).is_file()]
+            candidates = [
+                c
+                for c in (name, f"{name}.zstd", name.removesuffix(".zstd"))
+                if (self.path / c).is_file()
+            ]
             if candidates:
                 paths.append(self.path / candidates[0])
             else:
-                self._problems.add(f"{self.path / name} is missing although metadata.yaml names it; the other files were read.")
+                self._problems.add(
+                    f"{self.path / name} is missing although metadata.yaml names it; the other files were read."
+                )
         if not paths:
             return found
         for path in found:
@@ -119,13 +153,21 @@ class Rosbag2Log(BaseLog):
         return paths
 
     def _found(self) -> list[Path]:
-        """All files that may belong to the bag; of a file that is there twice, the one that is not compressed."""
+        """All files that may belong to the bag; of a file that is there twice, the one that is not
+        compressed.
+        """
         try:
             every = sorted(p for p in self.path.iterdir() if p.is_file())
         except OSError as error:
             raise LogError(f"{self.path} cannot be read: {error.strerror}.") from error
         plain = [p for p in every if p.suffix in _SUFFIXES]
-        packed = [p for p in every if p.suffix == ".zstd" and Path(p.stem).suffix in _SUFFIXES and p.with_suffix("") not in plain]
+        packed = [
+            p
+            for p in every
+            if p.suffix == ".zstd"
+            and Path(p.stem).suffix in _SUFFIXES
+            and p.with_suffix("") not in plain
+        ]
         return sorted([*plain, *packed], key=_natural)
 
     def _open_file(self, path: Path) -> Log:

@@ -1,4 +1,6 @@
-"""One sqlite3 file of a ROS 2 bag, read without its metadata.yaml; messages may be zstd-compressed one by one."""
+"""One sqlite3 file of a ROS 2 bag, read without its metadata.yaml; messages may be zstd-compressed
+one by one.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ class SqliteLog(BaseLog):
         try:
             self._database = _connect(path)
         except (*_DAMAGE, OSError) as error:
-            raise LogError(f"{path} cannot be read as a sqlite3 bag: {error}; try to recover it with 'sqlite3 FILE .recover'.") from error
+            raise LogError(
+                f"{path} cannot be read as a sqlite3 bag: {error}; try to recover it with 'sqlite3 FILE .recover'."
+            ) from error
         try:
             self._open()
         except (*_DAMAGE, ValueError, TypeError) as error:
@@ -44,7 +48,9 @@ class SqliteLog(BaseLog):
         self._name_undefined()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
-        """The messages of ``topics`` (None: of all) in log-time order; damage ends the iteration with a sentence."""
+        """The messages of ``topics`` (None: of all) in log-time order; damage ends the iteration
+        with a sentence.
+        """
         wanted = [i for i, (topic, *_) in self._topics.items() if topics is None or topic in topics]
         if not wanted:
             return
@@ -56,7 +62,9 @@ class SqliteLog(BaseLog):
                 topic, type_, encoding, definition = self._topics[topic_id]
                 read += 1
                 if not isinstance(data, bytes) or not isinstance(log_time, int):
-                    self._problems.skip(stage, topic, f"row {read} of {self._name} holds no bytes or no time")
+                    self._problems.skip(
+                        stage, topic, f"row {read} of {self._name} holds no bytes or no time"
+                    )
                     continue
                 if data.startswith(ZSTD_MAGIC):
                     try:
@@ -66,19 +74,28 @@ class SqliteLog(BaseLog):
                         continue
                 yield Message(topic, type_, encoding, log_time, data, definition)
         except _DAMAGE as error:
-            self._problems.add(f"{self._name}: reading ended after {read} messages because the file is damaged ({error}).")
+            self._problems.add(
+                f"{self._name}: reading ended after {read} messages because the file is damaged ({error})."
+            )
 
     def _rows(self, topic_ids: list[int]) -> Iterator[tuple[int, Any, Any]]:
-        """(topic id, log time, data) in log-time order; the order of recording breaks ties, so that two readings agree."""
+        """(topic id, log time, data) in log-time order; the order of recording breaks ties, so that
+        two readings agree.
+        """
         marks = ",".join("?" * len(topic_ids))
-        columns, where = "SELECT topic_id, timestamp, data FROM messages", f"WHERE topic_id IN ({marks})"
+        columns = "SELECT topic_id, timestamp, data FROM messages"
+        where = f"WHERE topic_id IN ({marks})"
         if not self._damaged:
-            yield from self._database.execute(f"{columns} {where} ORDER BY timestamp, id", topic_ids)
+            yield from self._database.execute(
+                f"{columns} {where} ORDER BY timestamp, id", topic_ids
+            )
             return
         # an index may be what is damaged: without it, and only as far as the table can be read
         times: list[tuple[int, int]] = []
         with contextlib.suppress(*_DAMAGE):
-            for time, row in self._database.execute(f"SELECT timestamp, id FROM messages NOT INDEXED {where}", topic_ids):
+            for time, row in self._database.execute(
+                f"SELECT timestamp, id FROM messages NOT INDEXED {where}", topic_ids
+            ):
                 if isinstance(time, int):
                     times.append((time, row))
         for _, row in sorted(times):
@@ -91,13 +108,22 @@ class SqliteLog(BaseLog):
 
     def _open(self) -> None:
         execute = self._database.execute
-        tables = {name for (name,) in execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        tables = {
+            name for (name,) in execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+        }
         if not {"topics", "messages"} <= tables:
             raise ValueError("it has no tables topics and messages")
         definitions = self._definitions() if "message_definitions" in tables else {}
-        for id_, topic, type_, format_ in execute("SELECT id, name, type, serialization_format FROM topics"):
+        for id_, topic, type_, format_ in execute(
+            "SELECT id, name, type, serialization_format FROM topics"
+        ):
             type_ = ros2_type(str(type_))
-            self._topics[int(id_)] = (str(topic), type_, str(format_), definitions.get(type_, Definition(type_, "", b"")))
+            self._topics[int(id_)] = (
+                str(topic),
+                type_,
+                str(format_),
+                definitions.get(type_, Definition(type_, "", b"")),
+            )
         counts: Counter[tuple[str, str, str]] = Counter()
         try:
             for id_, count in execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"):
@@ -109,20 +135,28 @@ class SqliteLog(BaseLog):
             self.start_ns, self.end_ns = start, end
         except _DAMAGE as error:
             self._recount(counts, error)
-        self.streams = [Stream(*kind, counts[kind]) for kind in sorted({t[:3] for t in self._topics.values()})]
+        self.streams = [
+            Stream(*kind, counts[kind]) for kind in sorted({t[:3] for t in self._topics.values()})
+        ]
         self.encoding = "ros2"
 
     def _name_undefined(self) -> None:
-        """Bags of old distributions hold no definitions: what is not a standard type cannot be decoded by anybody."""
+        """Bags of old distributions hold no definitions: what is not a standard type cannot be
+        decoded by anybody.
+        """
         for topic, type_, encoding, definition in self._topics.values():
             counted = any(s.count for s in self.streams if (s.topic, s.type) == (topic, type_))
             if counted and encoding == "cdr" and not definition.text and not is_standard(type_):
-                self._problems.add(f"{topic}: messages of type {type_} cannot be decoded because the log does not define the type.")
+                self._problems.add(
+                    f"{topic}: messages of type {type_} cannot be decoded because the log does not define the type."
+                )
 
     def _recount(self, counts: Counter[tuple[str, str, str]], error: BaseException) -> None:
         """Counts what a damaged file still gives away."""
         self._damaged = True
-        self._problems.add(f"{self._name}: the file is damaged ({error}); what can be read of it is used.")
+        self._problems.add(
+            f"{self._name}: the file is damaged ({error}); what can be read of it is used."
+        )
         counts.clear()
         self.start_ns = self.end_ns = None
         for message in self.messages():
@@ -132,7 +166,9 @@ class SqliteLog(BaseLog):
 
     def _definitions(self) -> dict[str, Definition]:
         found = {}
-        rows = self._database.execute("SELECT topic_type, encoding, encoded_message_definition FROM message_definitions")
+        rows = self._database.execute(
+            "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        )
         for type_, encoding, text in rows:
             name = ros2_type(str(type_))
             if isinstance(text, str) and text.strip():
@@ -141,7 +177,9 @@ class SqliteLog(BaseLog):
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    """Opens for reading only; a bag in a folder that cannot be written needs ``immutable``, one with a journal must not have it."""
+    """Opens for reading only; a bag in a folder that cannot be written needs ``immutable``, one
+    with a journal must not have it.
+    """
     _refuse_cut_off(path)
     address = f"file:{quote(str(path.absolute()))}"
     for mode in ("mode=ro", "mode=ro&immutable=1"):
@@ -165,11 +203,15 @@ def _connect(path: Path) -> sqlite3.Connection:
 def _refuse_cut_off(path: Path) -> None:
     """sqlite3 only says that such a file is malformed."""
     with path.open("rb") as file:
-        head, size = file.read(100), file.seek(0, 2)
+        head = file.read(100)
+        size = file.seek(0, 2)
     page = int.from_bytes(head[16:18], "big")
     claimed = int.from_bytes(head[28:32], "big") * (65536 if page == 1 else page)
-    if len(head) < 100 or (claimed > size and head[24:28] == head[92:96]):  # the count is valid if the two agree
-        raise LogError(f"{path} is cut off: it has {size} of {claimed} bytes; copy or record it again.")
+    # the count is valid if the two agree
+    if len(head) < 100 or (claimed > size and head[24:28] == head[92:96]):
+        raise LogError(
+            f"{path} is cut off: it has {size} of {claimed} bytes; copy or record it again."
+        )
 
 
 def _decompress(data: bytes) -> bytes:

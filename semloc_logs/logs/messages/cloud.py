@@ -16,26 +16,40 @@ from semloc_logs.logs.messages.point_fields import Field, Layout, decode_points
 from semloc_logs.logs.messages.point_times import SWEEP_NS
 from semloc_logs.numerics import transforms
 
-_POINT_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
-_FOXGLOVE_KINDS = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}  # foxglove.PackedElementField
+# sensor_msgs/PointField
+_POINT_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+# foxglove.PackedElementField
+_FOXGLOVE_KINDS = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}
 
 
 def _point_cloud2(header: Header, m: Any) -> Iterator[Frame]:
-    fields = [Field(f.name, f.offset, _POINT_KINDS[f.datatype]) for f in m.fields if f.datatype in _POINT_KINDS]
+    fields = [
+        Field(f.name, f.offset, _POINT_KINDS[f.datatype])
+        for f in m.fields
+        if f.datatype in _POINT_KINDS
+    ]
     layout = Layout(m.width, m.height, m.point_step, m.row_step, bool(m.is_bigendian))
     p = decode_points(binary(m.data), layout, fields, header.stamp_ns)
-    yield LidarFrame(header, p.points, p.label, p.offset_ns, p.ring, p.not_finite if m.is_dense else 0, p.remark)
+    yield LidarFrame(
+        header, p.points, p.label, p.offset_ns, p.ring, p.not_finite if m.is_dense else 0, p.remark
+    )
 
 
 def _foxglove_cloud(header: Header, m: Any) -> Iterator[Frame]:
-    step, data = int(m.point_stride or 0), binary(m.data)
-    fields = [Field(str(f.name), int(f.offset or 0), _FOXGLOVE_KINDS[f.type]) for f in m.fields or () if f.type in _FOXGLOVE_KINDS]
+    step = int(m.point_stride or 0)
+    data = binary(m.data)
+    fields = [
+        Field(str(f.name), int(f.offset or 0), _FOXGLOVE_KINDS[f.type])
+        for f in m.fields or ()
+        if f.type in _FOXGLOVE_KINDS
+    ]
     count = len(data) // step if step > 0 else 0
     p = decode_points(data, Layout(count, 1, step, 0), fields, header.stamp_ns)
     points = p.points
     if m.pose is not None and m.pose.orientation is not None and m.pose.position is not None:
         rotation = m.pose.orientation
-        if any((rotation.x, rotation.y, rotation.z, rotation.w)):  # left out by writers that mean the identity
+        # left out by writers that mean the identity
+        if any((rotation.x, rotation.y, rotation.z, rotation.w)):
             frame_T_cloud = transform(m.pose.position, rotation)
             if not np.array_equal(frame_T_cloud, np.eye(4)):
                 points = transforms.apply(frame_T_cloud, points).astype(np.float32)
@@ -43,15 +57,28 @@ def _foxglove_cloud(header: Header, m: Any) -> Iterator[Frame]:
 
 
 def _livox(m: Any, message: Message) -> Iterator[Frame]:
-    header = Header(message.topic, check_time(m.sec * 1_000_000_000 + m.nanosec), message.log_time_ns, m.frame_id)
+    header = Header(
+        message.topic,
+        check_time(m.sec * 1_000_000_000 + m.nanosec),
+        message.log_time_ns,
+        m.frame_id,
+    )
     offset = m.points["offset_time"].astype(np.int64)
-    start = m.timebase_ns - header.stamp_ns  # the base of the times is the stamp unless the sensor has a clock of its own
+    # the base of the times is the stamp unless the sensor has a clock of its own
+    start = m.timebase_ns - header.stamp_ns
     if abs(start) < SWEEP_NS:
         offset += start
     xyz = np.stack([m.points[axis] for axis in "xyz"], axis=1).astype(np.float32)
     finite = np.isfinite(xyz).all(axis=1)
     kept = finite & ((xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0))
-    yield LidarFrame(header, xyz[kept], None, offset[kept], m.points["line"][kept].astype(np.uint16), int((~finite).sum()))
+    yield LidarFrame(
+        header,
+        xyz[kept],
+        None,
+        offset[kept],
+        m.points["line"][kept].astype(np.uint16),
+        int((~finite).sum()),
+    )
 
 
 def _old_cloud(header: Header, m: Any) -> Iterator[Frame]:
@@ -63,7 +90,9 @@ def _old_cloud(header: Header, m: Any) -> Iterator[Frame]:
     rows[:, :3] = np.array([(p.x, p.y, p.z) for p in m.points], float).reshape(-1, 3)
     for k, values in enumerate(columns.values()):
         rows[:, 3 + k] = values
-    p = decode_points(rows.tobytes(), Layout(len(rows), 1, 4 * len(fields), 0), fields, header.stamp_ns)
+    p = decode_points(
+        rows.tobytes(), Layout(len(rows), 1, 4 * len(fields), 0), fields, header.stamp_ns
+    )
     yield LidarFrame(header, p.points, p.label, p.offset_ns, p.ring, remark=p.remark)
 
 

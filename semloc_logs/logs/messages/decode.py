@@ -1,4 +1,6 @@
-"""Messages to frames: one small function for each message type, found in a table by the type's name."""
+"""Messages to frames: one small function for each message type, found in a table by the type's
+name.
+"""
 
 from __future__ import annotations
 
@@ -25,21 +27,33 @@ class Decoder:
         self._times = PointTimes()
 
     def frames(self, message: Message) -> list[Frame]:
-        """The frames in ``message``; none when its type is of no use here, or when it cannot be decoded."""
-        convert = CONVERTERS.get(json_type(message.type) if message.encoding in ("protobuf", "json") else message.type)
-        if convert is None or (convert is _text and not message.topic.endswith("/label_space")):  # any other text is of no use here
+        """The frames in ``message``; none when its type is of no use here, or when it cannot be
+        decoded.
+        """
+        convert = CONVERTERS.get(
+            json_type(message.type) if message.encoding in ("protobuf", "json") else message.type
+        )
+        # any other text is of no use here
+        if convert is None or (convert is _text and not message.topic.endswith("/label_space")):
             return []
         found: list[Frame] = []  # keeps what a message gives before its damaged part
         try:
             check_time(message.log_time_ns)
             frames = convert(self._parse(message), message)
-            found.extend(self._times.checked(frame) if isinstance(frame, LidarFrame) else frame for frame in frames)
+            found.extend(
+                self._times.checked(frame) if isinstance(frame, LidarFrame) else frame
+                for frame in frames
+            )
             return found
         except UndecodableError as error:
             reason = str(error)
         except BAD_VALUES as error:
             reason = f"its values make no sense ({type(error).__name__}: {str(error)[:120]})"
-        self._problems.skip("decoding", message.topic, f"{message.type} at log time {message.log_time_ns} ns: {reason}")
+        self._problems.skip(
+            "decoding",
+            message.topic,
+            f"{message.type} at log time {message.log_time_ns} ns: {reason}",
+        )
         return found
 
     def _parse(self, message: Message) -> Any:
@@ -66,7 +80,10 @@ def _label_info(header: Header, m: Any) -> Iterator[Frame]:
 
 
 def _text(m: Any, message: Message) -> Iterator[Frame]:
-    yield LabelNames(Header(message.topic, message.log_time_ns, message.log_time_ns, ""), space=str(m.data).strip())
+    yield LabelNames(
+        Header(message.topic, message.log_time_ns, message.log_time_ns, ""),
+        space=str(m.data).strip(),
+    )
 
 
 CONVERTERS: dict[str, Convert] = {

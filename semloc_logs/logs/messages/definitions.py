@@ -1,4 +1,6 @@
-"""From a stream's definition to a function that turns its bytes into an object with the fields as attributes."""
+"""From a stream's definition to a function that turns its bytes into an object with the fields as
+attributes.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,10 @@ from semloc_logs.logs.messages.type_names import ros2_type
 Parser = Callable[[bytes | memoryview], Any]
 _MAX_TEXT = 1 << 20  # a definition with all that it depends on has some kilobytes
 _MAX_ARRAY = 4096  # fixed arrays of strings or messages are unrolled into code
-_IDL_NOISE = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/|^[ \t]*#[^\n]*', re.DOTALL | re.MULTILINE)  # texts, comments, includes
+# texts, comments, includes
+_IDL_NOISE = re.compile(
+    r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/|^[ \t]*#[^\n]*', re.DOTALL | re.MULTILINE
+)
 _IDL_SEPARATOR = "=" * 80 + "\n"
 
 
@@ -30,43 +35,60 @@ class UndecodableError(Exception):
 
 
 def parser(encoding: str, type_: str, definition: Definition) -> Parser:
-    """Parses messages of ``encoding``. Raises UndecodableError where that is not possible; so may the parser."""
+    """Parses messages of ``encoding``. Raises UndecodableError where that is not possible; so may
+    the parser.
+    """
     if encoding in ("cdr", "ros1"):
         return _ros_parser(encoding, type_, definition)
     if encoding == "protobuf":
         return _protobuf_parser(definition)
     if encoding == "json":
         return _parse_json
-    raise UndecodableError(f"the encoding {encoding[:40]!r} is not supported" if encoding else "the log does not say its encoding")
+    raise UndecodableError(
+        f"the encoding {encoding[:40]!r} is not supported"
+        if encoding
+        else "the log does not say its encoding"
+    )
 
 
 def _ros_parser(encoding: str, type_: str, definition: Definition) -> Parser:
     store = get_typestore(Stores.EMPTY)
     types = ros_types(encoding, type_, definition)
     try:
-        store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
+        store.register(
+            {name: fields for name, fields in types.items() if name not in store.fielddefs}
+        )
         store.get_msgdef(type_)
-    except Exception as error:  # the text is hostile, and the parser of another project answers with any exception
-        raise UndecodableError(f"its definition in the log cannot be parsed ({_short(error)})") from error
+    except Exception as error:
+        # the text is hostile, and the parser of another project answers with any exception
+        raise UndecodableError(
+            f"its definition in the log cannot be parsed ({_short(error)})"
+        ) from error
     deserialize = store.deserialize_cdr if encoding == "cdr" else store.deserialize_ros1
 
     def parse(data: bytes | memoryview) -> Any:
         try:
             return deserialize(data, type_)
         except Exception as error:  # as above, here for the bytes
-            raise UndecodableError(f"its bytes do not match its definition ({_short(error)})") from error
+            raise UndecodableError(
+                f"its bytes do not match its definition ({_short(error)})"
+            ) from error
 
     return parse
 
 
 def ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, Any]:
-    """The definitions that ``type_`` needs: from the log where it has them, else the standard ones. UndecodableError without."""
+    """The definitions that ``type_`` needs: from the log where it has them, else the standard ones.
+    UndecodableError without.
+    """
     try:
         return _ros_types(encoding, type_, definition)
     except UndecodableError:
         raise
     except Exception as error:  # as above: the text is hostile
-        raise UndecodableError(f"its definition in the log cannot be parsed ({_short(error)})") from error
+        raise UndecodableError(
+            f"its definition in the log cannot be parsed ({_short(error)})"
+        ) from error
 
 
 def _ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, Any]:
@@ -83,7 +105,9 @@ def _ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, A
     elif definition.encoding in ("ros2idl", "omgidl"):
         recorded = _idl_types(text)
     else:
-        raise UndecodableError(f"its definition is written in {definition.encoding[:40]!r}, which is not supported")
+        raise UndecodableError(
+            f"its definition is written in {definition.encoding[:40]!r}, which is not supported"
+        )
     needed: dict[str, Any] = {}
     missing = [type_]
     while missing:
@@ -102,7 +126,11 @@ def _refuse_lists_of_nothing(types: dict[str, Any]) -> None:
     empty: set[str] = set()
     grown = True
     while grown:
-        found = {name for name, (_, fields) in types.items() if all(_has_no_bytes(kind, empty) for _, kind in fields)}
+        found = {
+            name
+            for name, (_, fields) in types.items()
+            if all(_has_no_bytes(kind, empty) for _, kind in fields)
+        }
         grown = found != empty
         empty = found
     for name, (_, fields) in types.items():
@@ -123,7 +151,8 @@ def _idl_types(text: str) -> dict[str, Any]:
     for section in text.split(_IDL_SEPARATOR):
         body = section.partition("\n")[2] if section.startswith("IDL: ") else section
         body = _IDL_NOISE.sub(lambda found: '""' if found[0][0] == '"' else " ", body)
-        if "<<" in body or "*" in body:  # constants are computed by the parser, and a few lines could ask for a number without end
+        # constants are computed by the parser, and a few lines could ask for a number without end
+        if "<<" in body or "*" in body:
             raise UndecodableError("its definition computes constants, which is not supported")
         if body.strip():
             types.update(get_types_from_idl(body))
@@ -131,14 +160,20 @@ def _idl_types(text: str) -> dict[str, Any]:
 
 
 def _names(field: Any) -> list[str]:
-    """The message types that a field refers to; UndecodableError for arrays that would be unrolled without end."""
+    """The message types that a field refers to; UndecodableError for arrays that would be unrolled
+    without end.
+    """
     kind, content = field
     if kind == Nodetype.NAME:
         return [content]
     if kind == Nodetype.BASE:
         return []
     inner, length = content
-    if kind == Nodetype.ARRAY and length > _MAX_ARRAY and (inner[0] != Nodetype.BASE or inner[1][0] == "string"):
+    if (
+        kind == Nodetype.ARRAY
+        and length > _MAX_ARRAY
+        and (inner[0] != Nodetype.BASE or inner[1][0] == "string")
+    ):
         raise UndecodableError(f"its definition has an array of {length} elements")
     return _names(inner)
 
@@ -152,7 +187,8 @@ def is_standard(type_: str) -> bool:
 def _standard_types(generation: str) -> dict[str, Any]:
     types: dict[str, Any] = dict(get_typestore(Stores.ROS2_HUMBLE).fielddefs)
     if generation == "ros1":
-        types |= get_typestore(Stores.ROS1_NOETIC).fielddefs  # has no tf2_msgs, which are laid out the same in both
+        # has no tf2_msgs, which are laid out the same in both
+        types |= get_typestore(Stores.ROS1_NOETIC).fielddefs
         types["tf/msg/tfMessage"] = types["tf2_msgs/msg/TFMessage"]
     types |= get_types_from_msg("uint16 class_id\nstring class_name", "vision_msgs/msg/VisionClass")
     label_info = "std_msgs/Header header\nVisionClass[] class_map\nfloat32 threshold"
@@ -165,8 +201,11 @@ def _protobuf_parser(definition: Definition) -> Parser:
     try:
         schema = Schema(id=1, name=definition.name, encoding="protobuf", data=definition.text)
         decode = DecoderFactory().decoder_for("protobuf", schema)
-    except Exception as error:  # descriptors are hostile, and building them raises whatever it likes
-        raise UndecodableError(f"its definition in the log cannot be parsed ({_short(error)})") from error
+    except Exception as error:
+        # descriptors are hostile, and building them raises whatever it likes
+        raise UndecodableError(
+            f"its definition in the log cannot be parsed ({_short(error)})"
+        ) from error
     if decode is None:
         raise UndecodableError("its protobuf definition cannot be used")
 
@@ -174,7 +213,9 @@ def _protobuf_parser(definition: Definition) -> Parser:
         try:
             return decode(bytes(data))
         except (ProtobufError, ValueError, RecursionError, MemoryError) as error:
-            raise UndecodableError(f"its bytes do not match its definition ({_short(error)})") from error
+            raise UndecodableError(
+                f"its bytes do not match its definition ({_short(error)})"
+            ) from error
 
     return parse
 
@@ -219,7 +260,9 @@ def binary(value: Any) -> bytes | memoryview:
 
 
 def json_type(type_: str) -> str:
-    """``foxglove.PointCloud`` for the names under which Foxglove's messages are found in JSON and protobuf streams."""
+    """``foxglove.PointCloud`` for the names under which Foxglove's messages are found in JSON and
+    protobuf streams.
+    """
     name = ros2_type(type_)
     for prefix in ("foxglove_msgs/msg/", "foxglove/msg/", "foxglove_schemas."):
         if name.startswith(prefix):

@@ -1,4 +1,6 @@
-"""Parts that messages of several types share, headers above all, and how a converter of one type comes about."""
+"""Parts that messages of several types share, headers above all, and how a converter of one type
+comes about.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,21 @@ from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.numerics import transforms
 
-Convert = Callable[[Any, Message], Iterator[Frame]]  # a parsed message and the one it was parsed from -> frames
-Body = Callable[[Header, Any], Iterator[Frame]]  # the same where the header is all that is needed of the latter
+# a parsed message and the one it was parsed from -> frames
+Convert = Callable[[Any, Message], Iterator[Frame]]
+# the same where the header is all that is needed of the latter
+Body = Callable[[Header, Any], Iterator[Frame]]
 
 # what hostile values in a well-formed message may raise in converters
-BAD_VALUES = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, MemoryError, cv2.error)
+BAD_VALUES = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    TypeError,
+    ValueError,
+    MemoryError,
+    cv2.error,
+)
 
 
 def ros(body: Body) -> Convert:
@@ -39,11 +51,14 @@ def check_time(time_ns: int) -> int:
 
 
 def stamp_ns(time: Any, message: Message) -> int:
-    """Nanoseconds of a ROS time, a protobuf timestamp or a JSON {sec, nsec}; log time where a message has none."""
+    """Nanoseconds of a ROS time, a protobuf timestamp or a JSON {sec, nsec}; log time where a
+    message has none.
+    """
     if time is None:
         return message.log_time_ns
     for seconds, nanoseconds in (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec")):
-        s, n = getattr(time, seconds, None), getattr(time, nanoseconds, None)
+        s = getattr(time, seconds, None)
+        n = getattr(time, nanoseconds, None)
         if s is not None and n is not None:
             return check_time(int(s) * 1_000_000_000 + int(n))
     raise UndecodableError("its time stamp has neither seconds nor nanoseconds")
@@ -51,7 +66,9 @@ def stamp_ns(time: Any, message: Message) -> int:
 
 def ros_header(m: Any, message: Message) -> Header:
     """The header of a message with a std_msgs/Header."""
-    return Header(message.topic, stamp_ns(m.header.stamp, message), message.log_time_ns, m.header.frame_id)
+    return Header(
+        message.topic, stamp_ns(m.header.stamp, message), message.log_time_ns, m.header.frame_id
+    )
 
 
 def foxglove_header(m: Any, message: Message, frame_id: Any) -> Header:
@@ -73,7 +90,8 @@ def quaternion(q: Any) -> F64:
 
 def transform(translation: Any, rotation: Any) -> F64:
     """A pose (4, 4) in metres. UndecodableError when it is not finite or its quaternion is zero."""
-    t, q = vector(translation), quaternion(rotation)
+    t = vector(translation)
+    q = quaternion(rotation)
     norm = math.hypot(*q)
     if not (np.isfinite(t).all() and math.isfinite(norm)):
         raise UndecodableError("its pose has values that are not finite")

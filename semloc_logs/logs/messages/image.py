@@ -23,7 +23,14 @@ def _picture(header: Header, pixels: Any, encoding: str, depth: bool) -> Iterato
 def _raw(header: Header, m: Any) -> Iterator[Frame]:
     encoding = str(m.encoding)
     big_endian = bool(getattr(m, "is_bigendian", False))
-    pixels = image_codecs.decode_raw(binary(m.data), int(m.width or 0), int(m.height or 0), int(m.step or 0), encoding, big_endian)
+    pixels = image_codecs.decode_raw(
+        binary(m.data),
+        int(m.width or 0),
+        int(m.height or 0),
+        int(m.step or 0),
+        encoding,
+        big_endian,
+    )
     yield from _picture(header, pixels, encoding, image_codecs.is_depth(header.topic, encoding))
 
 
@@ -35,7 +42,8 @@ def _compressed(header: Header, m: Any) -> Iterator[Frame]:
         return
     pixels = image_codecs.decode_compressed(data)
     depth = pixels.ndim == 2 and pixels.dtype == np.uint16
-    recorded = format_.partition(";")[0].strip()  # image_transport names the encoding before compression first
+    # image_transport names the encoding before compression first
+    recorded = format_.partition(";")[0].strip()
     depth = depth and image_codecs.is_depth(header.topic, recorded if ";" in format_ else "mono16")
     yield from _picture(header, pixels, format_, depth)
 
@@ -51,7 +59,10 @@ def _camera(header: Header, m: Any) -> Iterator[Frame]:
             return array.reshape(-1)
         return array.reshape(shape) if array.size else np.zeros(shape)
 
-    K, D, R, P = values("K", (3, 3)), values("D", None), values("R", (3, 3)), values("P", (3, 4))
+    K = values("K", (3, 3))
+    D = values("D", None)
+    R = values("R", (3, 3))
+    P = values("P", (3, 4))
     if not (K[0, 0] > 0 and K[1, 1] > 0):
         raise UndecodableError("its camera is not calibrated (the focal length is zero)")
     if len(D) > 14:  # no model of the field has more
@@ -60,7 +71,9 @@ def _camera(header: Header, m: Any) -> Iterator[Frame]:
         R = np.eye(3)
     if not P.any():
         P = np.hstack([K, np.zeros((3, 1))])
-    yield Camera(header, int(m.width or 0), int(m.height or 0), K, D, R, P, str(m.distortion_model or ""))
+    yield Camera(
+        header, int(m.width or 0), int(m.height or 0), K, D, R, P, str(m.distortion_model or "")
+    )
 
 
 CONVERTERS: dict[str, Convert] = {

@@ -54,8 +54,12 @@ _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type; a palette beco
 _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
 
 
-def decode_raw(data: bytes | memoryview, width: int, height: int, step: int, encoding: str, big_endian: bool) -> Image | F32:
-    """(h, w), (h, w, 3) RGB, or float32 (h, w) for 32FC1. UndecodableError when the size does not fit the data."""
+def decode_raw(
+    data: bytes | memoryview, width: int, height: int, step: int, encoding: str, big_endian: bool
+) -> Image | F32:
+    """(h, w), (h, w, 3) RGB, or float32 (h, w) for 32FC1. UndecodableError when the size does not
+    fit the data.
+    """
     try:
         kind, channels, conversion = _RAW[encoding.strip().lower()]
     except KeyError:
@@ -64,8 +68,11 @@ def decode_raw(data: bytes | memoryview, width: int, height: int, step: int, enc
     row = width * channels * value.itemsize
     step = max(step, row) if height > 1 else row
     if width <= 0 or height <= 0 or (height - 1) * step + row > len(data):
-        raise UndecodableError(f"{width} x {height} pixels of {encoding} do not fit its {len(data)} bytes")
-    shape, strides = (height, width, channels), (step, channels * value.itemsize, value.itemsize)
+        raise UndecodableError(
+            f"{width} x {height} pixels of {encoding} do not fit its {len(data)} bytes"
+        )
+    shape = (height, width, channels)
+    strides = (step, channels * value.itemsize, value.itemsize)
     strided = np.ndarray(shape, value, buffer=data, strides=strides)
     pixels: Any = np.ascontiguousarray(strided, value.newbyteorder("="))
     if channels == 1:
@@ -75,7 +82,9 @@ def decode_raw(data: bytes | memoryview, width: int, height: int, step: int, enc
     try:
         return cast("Image", cv2.cvtColor(pixels, conversion))
     except cv2.error as error:
-        raise UndecodableError(f"{width} x {height} pixels of {encoding} cannot be converted") from error
+        raise UndecodableError(
+            f"{width} x {height} pixels of {encoding} cannot be converted"
+        ) from error
 
 
 def decode_compressed(data: bytes | memoryview) -> Image:
@@ -92,11 +101,16 @@ def decode_compressed(data: bytes | memoryview) -> Image:
         return cast("Image", pixels)
     if pixels.shape[2] == 2:  # grey with opacity
         return cast("Image", np.ascontiguousarray(pixels[:, :, 0]))
-    return cast("Image", cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB))
+    return cast(
+        "Image",
+        cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGB),
+    )
 
 
 def decode_compressed_depth(data: bytes | memoryview, format_: str) -> F32:
-    """Metres of ROS's compressedDepth: 12 bytes of quantisation parameters, then a PNG or RVL picture of 16 bits."""
+    """Metres of ROS's compressedDepth: 12 bytes of quantisation parameters, then a PNG or RVL
+    picture of 16 bits.
+    """
     if len(data) < _COMPRESSED_DEPTH_HEAD.size:
         raise UndecodableError("its depth image is cut off")
     _, quant_a, quant_b = _COMPRESSED_DEPTH_HEAD.unpack_from(data)
@@ -124,8 +138,11 @@ def depth_metres(raw: Image | F32) -> F32:
 
 
 def is_depth(topic: str, encoding: str) -> bool:
-    """Whether a raw picture is depth: 32FC1, and 16 bits unless they are called labels; mono16 only if called depth."""
-    name, encoding = topic.lower(), encoding.strip().lower()
+    """Whether a raw picture is depth: 32FC1, and 16 bits unless they are called labels; mono16 only
+    if called depth.
+    """
+    name = topic.lower()
+    encoding = encoding.strip().lower()
     if encoding == "32fc1":
         return True
     if encoding == "16uc1":
@@ -134,7 +151,9 @@ def is_depth(topic: str, encoding: str) -> bool:
 
 
 def _check_claim(data: bytes) -> None:
-    """UndecodableError when the size in the head of a JPEG or PNG cannot be true, before anything is allocated for it."""
+    """UndecodableError when the size in the head of a JPEG or PNG cannot be true, before anything
+    is allocated for it.
+    """
     if data.startswith(b"\x89PNG\r\n\x1a\n"):
         if len(data) < 33 or data[12:16] != b"IHDR" or data[25] not in _PNG_CHANNELS:
             raise UndecodableError("its PNG picture is damaged")
@@ -153,7 +172,9 @@ def _check_claim(data: bytes) -> None:
 
 
 def _check_chunks(data: bytes) -> None:
-    """UndecodableError when a chunk of a PNG claims more bytes than there are: the decoder would make room for them."""
+    """UndecodableError when a chunk of a PNG claims more bytes than there are: the decoder would
+    make room for them.
+    """
     position = 8
     while position + 12 <= len(data):
         length = int.from_bytes(data[position : position + 4], "big")

@@ -1,4 +1,6 @@
-"""Livox's CustomMsg, a header and a list of 19-byte points, read as one array instead of an object a point."""
+"""Livox's CustomMsg, a header and a list of 19-byte points, read as one array instead of an object
+a point.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +18,25 @@ from semloc_logs.logs.messages.definitions import Parser, UndecodableError, ros_
 PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
 TYPES = tuple(f"{package}/msg/CustomMsg" for package in PACKAGES)
 # fields of CustomPoint in the drivers of both generations
-_POINT = (("offset_time", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"))
+_POINT = (
+    ("offset_time", "u4"),
+    ("x", "f4"),
+    ("y", "f4"),
+    ("z", "f4"),
+    ("reflectivity", "u1"),
+    ("tag", "u1"),
+    ("line", "u1"),
+)
 _NAMES = {"u1": "uint8", "u4": "uint32", "f4": "float32"}
-_CDR_STEP = 20  # a point begins with 4 bytes of time, so each but the last is padded to a multiple of 4
+# a point begins with 4 bytes of time, so each but the last is padded to a multiple of 4
+_CDR_STEP = 20
 
 
 @dataclass(frozen=True, slots=True)
 class CustomMsg:
-    """``points`` (n,) records with offset_time in ns since ``timebase_ns``, x, y, z in metres, line."""
+    """``points`` (n,) records with offset_time in ns since ``timebase_ns``, x, y, z in metres,
+    line.
+    """
 
     sec: int
     nanosec: int
@@ -37,9 +50,16 @@ def livox_parser(encoding: str, type_: str, definition: Definition) -> Parser:
     if definition.text.strip():
         types = ros_types(encoding, type_, definition)
         fields = [n for n, _ in types[type_][1]]
-        point = [(n, d[1][0]) for n, d in types.get(type_.replace("CustomMsg", "CustomPoint"), ("", ()))[1] if d[0] == Nodetype.BASE]
+        point = [
+            (n, d[1][0])
+            for n, d in types.get(type_.replace("CustomMsg", "CustomPoint"), ("", ()))[1]
+            if d[0] == Nodetype.BASE
+        ]
         known = [(n, _NAMES[kind]) for n, kind in _POINT]
-        if fields != ["header", "timebase", "point_num", "lidar_id", "rsvd", "points"] or point != known:
+        if (
+            fields != ["header", "timebase", "point_num", "lidar_id", "rsvd", "points"]
+            or point != known
+        ):
             raise UndecodableError("its definition in the log is not that of the Livox drivers")
     if encoding not in ("ros1", "cdr"):
         raise UndecodableError(f"Livox messages in {encoding} are not supported")
@@ -74,9 +94,17 @@ def _parse(data: bytes | memoryview, *, is_cdr: bool) -> CustomMsg:
     step = _CDR_STEP if is_cdr else size
     needed = (count - 1) * step + size if count else 0
     if needed > len(body) - at:
-        raise UndecodableError(f"{count} points of {step} bytes need {needed} bytes, but it has {len(body) - at}")
+        raise UndecodableError(
+            f"{count} points of {step} bytes need {needed} bytes, but it has {len(body) - at}"
+        )
     formats = [order + kind for _, kind in _POINT]
     offsets = np.cumsum([0, *(int(kind[1]) for _, kind in _POINT)])[:-1].tolist()
-    dtype = np.dtype({"names": [n for n, _ in _POINT], "formats": formats, "offsets": offsets, "itemsize": size})
-    points = np.ndarray((count,), dtype, buffer=body[at:], strides=(step,)) if count else np.empty(0, dtype)
+    dtype = np.dtype(
+        {"names": [n for n, _ in _POINT], "formats": formats, "offsets": offsets, "itemsize": size}
+    )
+    points = (
+        np.ndarray((count,), dtype, buffer=body[at:], strides=(step,))
+        if count
+        else np.empty(0, dtype)
+    )
     return CustomMsg(sec, nanosec, frame_id, timebase, points)

@@ -1,4 +1,6 @@
-"""Point clouds as recorded, a block of bytes and a list of fields, to arrays; without a loop over points."""
+"""Point clouds as recorded, a block of bytes and a list of fields, to arrays; without a loop over
+points.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ class Field:
 class Points:
     """``points`` (n, 3) with label, time (relative to the header stamp) and ring where recorded.
 
-    ``not_finite`` counts the positions with NaN or infinity, ``remark`` says what is wrong with the times.
+    ``not_finite`` counts the positions with NaN or infinity, ``remark`` says what is wrong with the
+    times.
     """
 
     points: F32
@@ -56,19 +59,29 @@ class Layout:
     big_endian: bool = False
 
 
-def decode_points(data: bytes | memoryview, layout: Layout, fields: Sequence[Field], stamp_ns: int) -> Points:
-    """Points whose position is finite and not exactly zero. UndecodableError when the layout does not fit the data."""
+def decode_points(
+    data: bytes | memoryview, layout: Layout, fields: Sequence[Field], stamp_ns: int
+) -> Points:
+    """Points whose position is finite and not exactly zero. UndecodableError when the layout does
+    not fit the data.
+    """
     if layout.width == 0 or layout.height == 0:
-        return Points(np.empty((0, 3), np.float32), None, None, None)  # its fields may be missing too
+        # its fields may be missing too
+        return Points(np.empty((0, 3), np.float32), None, None, None)
     rows = _rows(data, layout, fields)
     columns = {name.lower(): name for name in reversed(rows.dtype.names or ())}
     for axis in "xyz":
         if axis not in columns:
-            raise UndecodableError(f"it has no field {axis} within the {layout.point_step} bytes of a point")
+            raise UndecodableError(
+                f"it has no field {axis} within the {layout.point_step} bytes of a point"
+            )
         if rows.dtype[columns[axis]].kind != "f":
-            raise UndecodableError(f"its field {axis} is no floating point number but {rows.dtype[columns[axis]].name}")
+            raise UndecodableError(
+                f"its field {axis} is no floating point number but {rows.dtype[columns[axis]].name}"
+            )
     xyz = np.empty((rows.size, 3), np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes infinite and is dropped below
+    # float64 beyond float32 becomes infinite and is dropped below
+    with np.errstate(over="ignore", invalid="ignore"):
         for k, axis in enumerate("xyz"):
             xyz[:, k].reshape(rows.shape)[...] = rows[columns[axis]]
     valid = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
@@ -83,7 +96,9 @@ def decode_points(data: bytes | memoryview, layout: Layout, fields: Sequence[Fie
                 return values if everything else values[valid]
         return None
 
-    label, ring, time = column(LABELS, "iu"), column(RINGS, "iu"), column(TIMES, "iuf")
+    label = column(LABELS, "iu")
+    ring = column(RINGS, "iu")
+    time = column(TIMES, "iuf")
     offset, remark = _offsets(time, stamp_ns)
     return Points(
         points=xyz if everything else xyz[valid],
@@ -95,7 +110,9 @@ def decode_points(data: bytes | memoryview, layout: Layout, fields: Sequence[Fie
     )
 
 
-def _offsets(time: NDArray[np.generic] | None, stamp_ns: int) -> tuple[NDArray[np.int64] | None, str]:
+def _offsets(
+    time: NDArray[np.generic] | None, stamp_ns: int
+) -> tuple[NDArray[np.int64] | None, str]:
     """Times relative to ``stamp_ns`` where they make sense, and a remark where they do not at once."""
     if time is None:
         return None, ""
@@ -105,15 +122,24 @@ def _offsets(time: NDArray[np.generic] | None, stamp_ns: int) -> tuple[NDArray[n
 
 def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> NDArray[np.void]:
     """A view (height, width) of the points as records."""
-    width, height, step, row = layout.width, layout.height, layout.point_step, layout.row_step
+    width = layout.width
+    height = layout.height
+    step = layout.point_step
+    row = layout.row_step
     if height <= 1 or row < width * step:
         row = width * step  # often left at zero, or wrong where it does not matter
     needed = (height - 1) * row + width * step
     if step <= 0 or needed > len(data):
-        raise UndecodableError(f"{width} x {height} points of {step} bytes need {needed} bytes, but it has {len(data)}")
+        raise UndecodableError(
+            f"{width} x {height} points of {step} bytes need {needed} bytes, but it has {len(data)}"
+        )
     names: dict[str, Field] = {}
     for field in fields:
-        if field.name.lower() in _USED and field.offset >= 0 and field.offset + np.dtype(field.kind).itemsize <= step:
+        if (
+            field.name.lower() in _USED
+            and field.offset >= 0
+            and field.offset + np.dtype(field.kind).itemsize <= step
+        ):
             names.setdefault(field.name, field)
     order = ">" if layout.big_endian else "<"
     dtype = np.dtype(

@@ -1,4 +1,6 @@
-"""When each point of a sweep was measured: units and origins of recorded point times, and whether they can be believed."""
+"""When each point of a sweep was measured: units and origins of recorded point times, and whether
+they can be believed.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,12 @@ from numpy.typing import NDArray
 from semloc_logs.frames import F32, LidarFrame
 
 SWEEP_NS = 1_000_000_000  # no time of a point is further from its header than a second
-_LEAST_SPAN_NS = 5_000_000  # a sweep takes longer than this, which tells milliseconds from microseconds
+# a sweep takes longer than this, which tells milliseconds from microseconds
+_LEAST_SPAN_NS = 5_000_000
 _PERIODS_PER_SWEEP = 1.5  # a sweep is over when the next one begins, give or take
 _PERIODS_KEPT = 16
-_ORDERED = 0.5  # the share of neighbours measured nearly together: above 0.9 in sweeps, 0.1 where times are noise
+# the share of neighbours measured nearly together: above 0.9 in sweeps, 0.1 where times are noise
+_ORDERED = 0.5
 _NEARLY = 0.05  # of the sweep's span
 _LOOKED_AT = 20_000  # points that are compared
 _CELLS = 180  # cells of azimuth of 2 degrees
@@ -24,22 +28,33 @@ OTHER_CLOCK = "clock"
 
 
 def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int64] | None, bool]:
-    """Times of points relative to ``stamp_ns``, whatever their unit and origin, and whether the origin is that of another clock.
+    """Times of points relative to ``stamp_ns``, whatever their unit and origin, and whether the
+    origin is that of another clock.
 
-    None when nothing makes sense of them. The unit (s, ms, us, ns) and origin (the stamp, or the epoch) are those with which the
-    points span more than 5 ms and stay within a second of the stamp; failing that the unit with which they span as much on a clock
-    of their own (such as seconds since power-on), whose first point is taken to be measured at the stamp; failing that (a flash
-    sensor) those that keep them within a second at all.
+    None when nothing makes sense of them. The unit (s, ms, us, ns) and origin (the stamp, or the
+    epoch) are those with which the points span more than 5 ms and stay within a second of the
+    stamp; failing that the unit with which they span as much on a clock of their own (such as
+    seconds since power-on), whose first point is taken to be measured at the stamp; failing that (a
+    flash sensor) those that keep them within a second at all.
     """
     if time.size == 0:
         return np.zeros(0, np.int64), False
-    low, high = time.min().item(), time.max().item()
+    low = time.min().item()
+    high = time.max().item()
     if not (np.isfinite(low) and np.isfinite(high)):
         return None, False
-    # in integers, because nanoseconds since 1970 do not fit a float64; the parts of a second are exact enough as float
+    # in integers, because nanoseconds since 1970 do not fit a float64; the parts of a second are
+    # exact enough as float
     ranges = [(unit, _to_ns(low, unit), _to_ns(high, unit)) for unit in _units(time)]
-    near = [(u, o) for u, first, last in ranges for o in (0, stamp_ns) if max(abs(first - o), abs(last - o)) < SWEEP_NS]
-    sweeps = {u: first for u, first, last in ranges if _LEAST_SPAN_NS <= last - first < 2 * SWEEP_NS}
+    near = [
+        (u, o)
+        for u, first, last in ranges
+        for o in (0, stamp_ns)
+        if max(abs(first - o), abs(last - o)) < SWEEP_NS
+    ]
+    sweeps = {
+        u: first for u, first, last in ranges if _LEAST_SPAN_NS <= last - first < 2 * SWEEP_NS
+    }
     for unit, origin in near:
         if unit in sweeps:
             return _shift(time, unit, origin), False
@@ -50,7 +65,11 @@ def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int
 
 def _units(time: NDArray[np.generic]) -> tuple[int, ...]:
     """Nanoseconds of the units to try, the usual ones of the type first."""
-    return (1, 1_000, 1_000_000, 1_000_000_000) if time.dtype.kind in "iu" else (1_000_000_000, 1_000_000, 1_000, 1)
+    return (
+        (1, 1_000, 1_000_000, 1_000_000_000)
+        if time.dtype.kind in "iu"
+        else (1_000_000_000, 1_000_000, 1_000, 1)
+    )
 
 
 def _to_ns(value: float, unit: int) -> int:
@@ -61,7 +80,8 @@ def _shift(time: NDArray[np.generic], unit: int, origin: int) -> NDArray[np.int6
     """``time * unit - origin`` as int64; only called where every result is below a second."""
     if time.dtype.kind in "iu":
         whole, rest = divmod(origin, unit)
-        # unsigned 64-bit arithmetic wraps, so the small difference is right even where the times are not
+        # unsigned 64-bit arithmetic wraps, so the small difference is right even where the times
+        # are not
         difference = time.astype(np.uint64) - np.uint64(whole % (1 << 64))
         return difference.view(np.int64) * np.int64(unit) - np.int64(rest)
     seconds = time.astype(np.float64)
@@ -80,10 +100,12 @@ class PointTimes:
     def checked(self, frame: LidarFrame) -> LidarFrame:
         """The sweep as it is, or without times and remarked when they cannot be believed.
 
-        A sweep does not take much longer than the time to the next one; clouds gathered from several sweeps do. And points recorded
-        one after the other, or seen in the same direction, were measured nearly together; where they were not, it is no time.
+        A sweep does not take much longer than the time to the next one; clouds gathered from
+        several sweeps do. And points recorded one after the other, or seen in the same direction,
+        were measured nearly together; where they were not, it is no time.
         """
-        key, stamp_ns = (frame.header.topic, frame.header.frame_id), frame.header.stamp_ns
+        key = (frame.header.topic, frame.header.frame_id)
+        stamp_ns = frame.header.stamp_ns
         periods = self._periods.setdefault(key, deque(maxlen=_PERIODS_KEPT))
         step = stamp_ns - self._newest.get(key, stamp_ns)
         if step > 0:
@@ -100,7 +122,9 @@ class PointTimes:
 
 
 def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:
-    """Whether neighbours among ``points`` (n, 3), as recorded or by their direction, have nearly the same time."""
+    """Whether neighbours among ``points`` (n, 3), as recorded or by their direction, have nearly
+    the same time.
+    """
     span = int(offset_ns.max()) - int(offset_ns.min())
     if span == 0 or len(offset_ns) < 100:
         return True
@@ -109,7 +133,9 @@ def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:
     if float(np.mean(np.abs(np.diff(offset_ns[some])) < near)) > _ORDERED:
         return True
     every = max(1, len(offset_ns) // _LOOKED_AT)
-    cell = ((np.arctan2(points[::every, 1], points[::every, 0]) + np.pi) * (_CELLS / (2 * np.pi))).astype(np.int64)
+    cell = (
+        (np.arctan2(points[::every, 1], points[::every, 0]) + np.pi) * (_CELLS / (2 * np.pi))
+    ).astype(np.int64)
     time = offset_ns[::every]
     order = np.lexsort((time, cell))
     starts = np.flatnonzero(np.diff(cell[order], prepend=-1))

@@ -8,10 +8,26 @@ from typing import Any
 
 import numpy as np
 
-from semloc_logs.frames import F64, Frame, Header, ImuSample, NavSatSample, PoseSample, TransformSample
+from semloc_logs.frames import (
+    F64,
+    Frame,
+    Header,
+    ImuSample,
+    NavSatSample,
+    PoseSample,
+    TransformSample,
+)
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages.definitions import UndecodableError
-from semloc_logs.logs.messages.headers import BAD_VALUES, Convert, foxglove, quaternion, ros, transform, vector
+from semloc_logs.logs.messages.headers import (
+    BAD_VALUES,
+    Convert,
+    foxglove,
+    quaternion,
+    ros,
+    transform,
+    vector,
+)
 
 # -- poses and transforms
 
@@ -35,7 +51,12 @@ def _transform(header: Header, m: Any) -> Iterator[Frame]:
 
 
 def _foxglove_transform(header: Header, m: Any) -> Iterator[Frame]:
-    yield TransformSample(header, str(m.child_frame_id or ""), transform(m.translation, m.rotation), _is_static(header))
+    yield TransformSample(
+        header,
+        str(m.child_frame_id or ""),
+        transform(m.translation, m.rotation),
+        _is_static(header),
+    )
 
 
 def _is_static(header: Header) -> bool:
@@ -43,7 +64,9 @@ def _is_static(header: Header) -> bool:
 
 
 def _each(convert: Convert) -> Convert:
-    """The transforms that make sense, and then the error of the first that does not: one bad edge does not cost the others."""
+    """The transforms that make sense, and then the error of the first that does not: one bad edge
+    does not cost the others.
+    """
 
     def convert_all(m: Any, message: Message) -> Iterator[Frame]:
         transforms = m.transforms or ()
@@ -54,7 +77,9 @@ def _each(convert: Convert) -> Convert:
             except (UndecodableError, *BAD_VALUES) as error:
                 damage.append(error)
         if damage:
-            raise UndecodableError(f"{len(damage)} of its {len(transforms)} transforms cannot be used ({damage[0]})")
+            raise UndecodableError(
+                f"{len(damage)} of its {len(transforms)} transforms cannot be used ({damage[0]})"
+            )
 
     return convert_all
 
@@ -63,15 +88,19 @@ def _each(convert: Convert) -> Convert:
 
 
 def _imu(header: Header, m: Any) -> Iterator[Frame]:
-    acceleration, rate = vector(m.linear_acceleration), vector(m.angular_velocity)
+    acceleration = vector(m.linear_acceleration)
+    rate = vector(m.angular_velocity)
     if not (np.isfinite(acceleration).all() and np.isfinite(rate).all()):
         raise UndecodableError("its measurements are not finite")
     yield ImuSample(header, acceleration, rate, _imu_orientation(m))
 
 
 def _imu_orientation(m: Any) -> F64 | None:
-    """The quaternion of an IMU that reports one: without, the first element of its covariance is -1, or it is no unit quaternion."""
-    q, covariance = getattr(m, "orientation", None), getattr(m, "orientation_covariance", None)
+    """The quaternion of an IMU that reports one: without, the first element of its covariance is
+    -1, or it is no unit quaternion.
+    """
+    q = getattr(m, "orientation", None)
+    covariance = getattr(m, "orientation_covariance", None)
     if q is None or (covariance is not None and len(covariance) and float(covariance[0]) == -1.0):
         return None
     orientation = quaternion(q)
@@ -79,7 +108,9 @@ def _imu_orientation(m: Any) -> F64 | None:
 
 
 def _nav_sat(header: Header, m: Any) -> Iterator[Frame]:
-    latitude, longitude, altitude = float(m.latitude or 0.0), float(m.longitude or 0.0), float(m.altitude or 0.0)
+    latitude = float(m.latitude or 0.0)
+    longitude = float(m.longitude or 0.0)
+    altitude = float(m.altitude or 0.0)
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and math.isfinite(altitude)):
         raise UndecodableError("its latitude, longitude or altitude is no number on Earth")
     yield NavSatSample(header, latitude, longitude, altitude, _fix_covariance(m))
@@ -91,7 +122,9 @@ def _fix_covariance(m: Any) -> F64 | None:
     if not getattr(m, "position_covariance_type", 0) or recorded is None or len(recorded) != 9:
         return None
     covariance = np.array(recorded, float).reshape(3, 3)
-    return covariance if np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all() else None
+    return (
+        covariance if np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all() else None
+    )
 
 
 def _nav_sat_fix(header: Header, m: Any) -> Iterator[Frame]:

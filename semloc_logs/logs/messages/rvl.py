@@ -1,4 +1,6 @@
-"""RVL, the run-length code of ROS's compressedDepth: runs of zeros, then runs of differences as variable-length numbers."""
+"""RVL, the run-length code of ROS's compressedDepth: runs of zeros, then runs of differences as
+variable-length numbers.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,8 @@ from numpy.typing import NDArray
 
 from semloc_logs.logs.messages.definitions import UndecodableError
 
-_MAX_PIXELS = 1 << 24  # four times the largest depth camera; an empty picture is a dozen bytes whatever its size
+# four times the largest depth camera; an empty picture is a dozen bytes whatever its size
+_MAX_PIXELS = 1 << 24
 
 
 def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
@@ -20,18 +23,25 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
     pixels = width * height
     if pixels > _MAX_PIXELS:
         raise UndecodableError(f"its RVL picture claims {width} x {height} pixels")
-    numbers = _numbers(data[8 : 8 + 16 * pixels + 4])  # a pixel needs two numbers at most, of a nibble or many
+    # a pixel needs two numbers at most, of a nibble or many
+    numbers = _numbers(data[8 : 8 + 16 * pixels + 4])
     starts, firsts, counts = (np.array(part, np.int64) for part in _runs(numbers, pixels))
-    inside = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)  # 0, 1, ... within each run
+    # 0, 1, ... within each run
+    inside = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
     coded = numbers[np.repeat(firsts, counts) + inside]
     out = np.zeros(pixels, np.uint16)
-    # the last bit is the sign of the difference, which is to the value before, also across the zeros between two runs
-    out[np.repeat(starts, counts) + inside] = np.cumsum((coded >> 1) ^ -(coded & 1)).astype(np.uint16)
+    # the last bit is the sign of the difference, which is to the value before, also across the
+    # zeros between two runs
+    out[np.repeat(starts, counts) + inside] = np.cumsum((coded >> 1) ^ -(coded & 1)).astype(
+        np.uint16
+    )
     return out.reshape(height, width)
 
 
 def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[list[int], list[int], list[int]]:
-    """For each run of values its first pixel, the place of its first number, and how many there are."""
+    """For each run of values its first pixel, the place of its first number, and how many there
+    are.
+    """
     starts: list[int] = []
     firsts: list[int] = []
     counts: list[int] = []
@@ -39,7 +49,8 @@ def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[list[int], list[int]
     while position < pixels:
         if at + 2 > len(numbers):
             raise UndecodableError("its RVL picture is cut off")
-        zeros, values = int(numbers[at]), int(numbers[at + 1])
+        zeros = int(numbers[at])
+        values = int(numbers[at + 1])
         position += zeros
         if zeros + values == 0 or position + values > pixels or at + 2 + values > len(numbers):
             raise UndecodableError("its RVL picture is damaged")
@@ -52,7 +63,9 @@ def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[list[int], list[int]
 
 
 def _numbers(code: bytes | memoryview) -> NDArray[np.int64]:
-    """All numbers of the code: 3 bits a nibble, low ones first, the fourth says that another nibble follows."""
+    """All numbers of the code: 3 bits a nibble, low ones first, the fourth says that another nibble
+    follows.
+    """
     words = np.frombuffer(code, "<u4", count=len(code) // 4)
     shifts = np.arange(28, -1, -4, dtype=np.uint32)  # the first nibble of a word is its highest
     nibbles = ((words[:, None] >> shifts) & 15).astype(np.int64).reshape(-1)
@@ -64,4 +77,6 @@ def _numbers(code: bytes | memoryview) -> NDArray[np.int64]:
     if int(lengths.max()) > 11:  # 33 bits: no number of a picture is that large
         raise UndecodableError("its RVL picture is damaged")
     place = np.arange(last[-1] + 1) - np.repeat(first, lengths)
-    return np.asarray(np.add.reduceat((nibbles[: last[-1] + 1] & 7) << (3 * place), first), np.int64)
+    return np.asarray(
+        np.add.reduceat((nibbles[: last[-1] + 1] & 7) << (3 * place), first), np.int64
+    )

@@ -1,4 +1,6 @@
-"""Whether the time of a stream goes on: stamps that leap and come back are outliers, stamps that fall back for good are another clock."""
+"""Whether the time of a stream goes on: stamps that leap and come back are outliers, stamps that
+fall back for good are another clock.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +18,20 @@ class StampOrder:
 
     def accepts(self, stamp_ns: int) -> bool:
         """False for a stamp that lies more than a second before what the stream had reached."""
-        newest, ahead, self._ahead = self._newest, self._ahead, None
-        is_lone = self._run == 1 and newest is not None and stamp_ns < newest - LEAP_NS  # the first stamp itself leapt
+        newest = self._newest
+        ahead = self._ahead
+        self._ahead = None
+        # the first stamp itself leapt
+        is_lone = self._run == 1 and newest is not None and stamp_ns < newest - LEAP_NS
         if newest is None or is_lone:
             self._newest, self._run = stamp_ns, 1
             return True
-        if stamp_ns > newest + LEAP_NS and (ahead is None or not ahead <= stamp_ns <= ahead + LEAP_NS):
+        if stamp_ns > newest + LEAP_NS and (
+            ahead is None or not ahead <= stamp_ns <= ahead + LEAP_NS
+        ):
             self._ahead = stamp_ns
             return True
         if stamp_ns >= newest:
-            self._newest, self._run = stamp_ns, self._run + 1
+            self._newest = stamp_ns
+            self._run = self._run + 1
         return stamp_ns >= newest - _REORDERED_NS

@@ -23,8 +23,8 @@ _LATE_TF_NS = 1_000_000_000  # a pose waits so long for the transform that leads
 class BaseFrame:
     """``name`` of the base frame; ``pose_frame`` whose pose the stream gives (None without poses).
 
-    ``assumed`` is the one sensor frame that nothing connects with the base and that is therefore taken to be the base itself.
-    ``notes`` say in sentences what was assumed.
+    ``assumed`` is the one sensor frame that nothing connects with the base and that is therefore
+    taken to be the base itself. ``notes`` say in sentences what was assumed.
     """
 
     name: str
@@ -33,14 +33,19 @@ class BaseFrame:
     notes: tuple[str, ...] = ()
 
 
-def choose_base_frame(tree: TransformTree, sensors: Sequence[str], pose_child: str | None, pose_topic: str | None) -> BaseFrame:
-    """The base frame as documented: ``base_link`` where TF connects it with a sensor and the pose; else the frame that the pose is of;
-    the sensor's own frame where the pose does not say (``pose_child`` ""), or there is none (None).
+def choose_base_frame(
+    tree: TransformTree, sensors: Sequence[str], pose_child: str | None, pose_topic: str | None
+) -> BaseFrame:
+    """The base frame as documented: ``base_link`` where TF connects it with a sensor and the pose;
+    else the frame that the pose is of; the sensor's own frame where the pose does not say
+    (``pose_child`` ""), or there is none (None).
 
     ``sensors``: frame ids of the range sensors, the most important first.
     """
     sensors = [frame_name(s) for s in sensors]
-    reachable = any(tree.connected(BASE_LINK, s) for s in sensors) or (not sensors and BASE_LINK in tree.frames)
+    reachable = any(tree.connected(BASE_LINK, s) for s in sensors) or (
+        not sensors and BASE_LINK in tree.frames
+    )
     first = sensors[0] if sensors else (BASE_LINK if reachable else "")
     if pose_child is None:
         return BaseFrame(BASE_LINK if reachable else first, None)
@@ -66,8 +71,9 @@ def choose_base_frame(tree: TransformTree, sensors: Sequence[str], pose_child: s
 class PoseSource(Protocol):
     """Poses that are not a stream of the log: of a file, or made from what the log has.
 
-    ``name`` is what sentences call it; ``child`` the frame that its poses are of, "" for the base frame, None while nobody knows;
-    ``is_over`` says that no more poses will come. ``problems`` are about poses that are missing, ``notes`` about what was assumed.
+    ``name`` is what sentences call it; ``child`` the frame that its poses are of, "" for the base
+    frame, None while nobody knows; ``is_over`` says that no more poses will come. ``problems`` are
+    about poses that are missing, ``notes`` about what was assumed.
     """
 
     @property
@@ -87,7 +93,9 @@ class PoseSource(Protocol):
         """A frame of the log, in the order of recording."""
 
     def poses(self, base_T: Callable[[str, int], F64 | None]) -> Iterator[tuple[int, F64]]:
-        """Stamps (ns) and ``session_T_child`` (4, 4) that are new since the last call; ``base_T`` gives ``base_T_frame`` at a time."""
+        """Stamps (ns) and ``session_T_child`` (4, 4) that are new since the last call; ``base_T``
+        gives ``base_T_frame`` at a time.
+        """
 
     def finish(self) -> None:
         """All frames of the log have been seen."""
@@ -99,12 +107,19 @@ class PoseSource(Protocol):
 class BasePoses:
     """Poses and transforms of a log as they come -> ``session_T_base`` and ``base_T_sensor``.
 
-    Poses stay raw until :meth:`settle` has chosen the base frame. ``static_count``: static TF messages that are still to come, from
-    the log's own statistics; once they are all there, nobody has to wait for more. ``source`` gives the poses instead of the log's
-    pose topic and TF, ``fallback`` gives them when neither has any.
+    Poses stay raw until :meth:`settle` has chosen the base frame. ``static_count``: static TF
+    messages that are still to come, from the log's own statistics; once they are all there, nobody
+    has to wait for more. ``source`` gives the poses instead of the log's pose topic and TF,
+    ``fallback`` gives them when neither has any.
     """
 
-    def __init__(self, roles: Roles, static_count: int = 0, source: PoseSource | None = None, fallback: PoseSource | None = None) -> None:
+    def __init__(
+        self,
+        roles: Roles,
+        static_count: int = 0,
+        source: PoseSource | None = None,
+        fallback: PoseSource | None = None,
+    ) -> None:
         self.tree = TransformTree()
         self.track = PoseTrack()
         self.base: BaseFrame | None = None
@@ -112,7 +127,11 @@ class BasePoses:
         self._roles = roles
         self.source = source
         self._fallback = fallback
-        self._has_topic = source is None and roles.pose is not None and roles.pose not in (*roles.tf, *roles.tf_static)
+        self._has_topic = (
+            source is None
+            and roles.pose is not None
+            and roles.pose not in (*roles.tf, *roles.tf_static)
+        )
         self._child: str | None = None
         self._edge: Edge | None = None
         self._raw: deque[tuple[int, F64]] = deque()
@@ -124,7 +143,10 @@ class BasePoses:
         header = sample.header
         if self._has_topic and header.topic == self._roles.pose:
             if self._child is None:
-                self._child, self.session_frame = frame_name(sample.child_frame_id), frame_name(header.frame_id)
+                self._child, self.session_frame = (
+                    frame_name(sample.child_frame_id),
+                    frame_name(header.frame_id),
+                )
             self._raw.append((header.stamp_ns, sample.frame_T_child))
             self._move()
         elif isinstance(sample, TransformSample):
@@ -132,15 +154,20 @@ class BasePoses:
                 sample = replace(sample, static=True)
                 self._static_times.add((header.topic, header.log_time_ns))
             self.tree.add(sample)
-            if self._edge == (frame_name(header.frame_id), frame_name(sample.child_frame_id)) and not sample.static:
+            if (
+                self._edge == (frame_name(header.frame_id), frame_name(sample.child_frame_id))
+                and not sample.static
+            ):
                 self._raw.append((header.stamp_ns, sample.frame_T_child))
                 self._move()
 
     def settle(self, sensors: Sequence[str], *, is_patient: bool, must: bool) -> bool:
-        """Chooses the base frame once the transforms that decide it are there, or now if it ``must``; False: not yet.
+        """Chooses the base frame once the transforms that decide it are there, or now if it
+        ``must``; False: not yet.
 
-        ``is_patient``: a pose edge in TF that is not called odom may still be topped by a better one. With a pose topic that has
-        nothing yet, the answer stays False even if it must: its frame is unknown.
+        ``is_patient``: a pose edge in TF that is not called odom may still be topped by a better
+        one. With a pose topic that has nothing yet, the answer stays False even if it must: its
+        frame is unknown.
         """
         edge = None
         if self.source is not None:
@@ -153,7 +180,11 @@ class BasePoses:
                 return False
         else:
             edge = self._pose_edge(sensors)
-            if not must and self._roles.tf and (edge is None or (is_patient and not edge[0].endswith("odom"))):
+            if (
+                not must
+                and self._roles.tf
+                and (edge is None or (is_patient and not edge[0].endswith("odom")))
+            ):
                 return False
             child = edge[1] if edge else None
             if edge is None and self._fallback is not None:
@@ -165,7 +196,8 @@ class BasePoses:
         self._fallback = None
         self.base = self._choose(sensors, child)
         if edge is not None:
-            self._edge, self.session_frame = edge, edge[0]
+            self._edge = edge
+            self.session_frame = edge[0]
             track = self.tree.track(*edge)
             if track is not None:
                 self._raw.extend(zip(track.stamps_ns.tolist(), track.poses, strict=True))
@@ -230,11 +262,15 @@ class BasePoses:
         """Whether :meth:`base_T` has its final answer."""
         if self.base is None:
             return False
-        return frame_name(frame_id) == self.base.assumed or self.tree.has_passed(self.base.name, frame_id, stamp_ns)
+        return frame_name(frame_id) == self.base.assumed or self.tree.has_passed(
+            self.base.name, frame_id, stamp_ns
+        )
 
     def _pose_edge(self, sensors: Sequence[str]) -> Edge | None:
         frames = [*sensors, BASE_LINK, "base_footprint"]
-        return next((edge for frame in frames if (edge := self.tree.pose_edge(frame)) is not None), None)
+        return next(
+            (edge for frame in frames if (edge := self.tree.pose_edge(frame)) is not None), None
+        )
 
     def _is_settled(self, sensors: Sequence[str], child: str | None) -> bool:
         if (child == "" and self._has_topic) or not (self._roles.tf or self._roles.tf_static):
@@ -244,7 +280,9 @@ class BasePoses:
         return not self._roles.tf and len(self._static_times) >= self._static_count
 
     def _move(self, is_end: bool = False) -> None:
-        """Raw poses -> poses of the base frame, as soon as the transform between the two is known at their time."""
+        """Raw poses -> poses of the base frame, as soon as the transform between the two is known
+        at their time.
+        """
         base = self.base
         if base is None or base.pose_frame is None:
             return

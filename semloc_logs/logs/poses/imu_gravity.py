@@ -1,4 +1,6 @@
-"""Which way is up, from the accelerometer: at rest and on average it feels nothing but the ground's push."""
+"""Which way is up, from the accelerometer: at rest and on average it feels nothing but the ground's
+push.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,11 @@ from semloc_logs.frames import F64, ImuSample
 from semloc_logs.logs.poses.base_frame import BasePoses
 from semloc_logs.logs.poses.track import is_time
 
-MAX_SAMPLES = 16_384  # beyond, every second sample is forgotten and only every 2nd (4th, ...) taken: the whole log at bounded memory
-_MIN_FORCE, _MAX_FORCE = 0.5, 30.0  # of the mean; some drivers report g instead of m/s^2, linear acceleration without gravity is near 0
+# beyond, every second sample is forgotten and only every 2nd (4th, ...) taken: the whole log at
+# bounded memory
+MAX_SAMPLES = 16_384
+# of the mean; some drivers report g instead of m/s^2, linear acceleration without gravity is near 0
+_MIN_FORCE, _MAX_FORCE = 0.5, 30.0
 
 
 class Accelerometer:
@@ -41,10 +46,15 @@ class Accelerometer:
             del self._stamps[::2], self._forces[::2]
             self._every *= 2
 
-    def up(self, rotations_at: Callable[[NDArray[np.int64]], tuple[F64, NDArray[np.bool_]]] | None = None) -> F64 | None:
-        """Unit vector (3,) of the mean force in the IMU frame, or in a frame that ``rotations_at`` turns the samples into.
+    def up(
+        self,
+        rotations_at: Callable[[NDArray[np.int64]], tuple[F64, NDArray[np.bool_]]] | None = None,
+    ) -> F64 | None:
+        """Unit vector (3,) of the mean force in the IMU frame, or in a frame that ``rotations_at``
+        turns the samples into.
 
-        ``rotations_at`` gives rotations (m, 3, 3) at stamps (m,) and which are known. None without enough to say.
+        ``rotations_at`` gives rotations (m, 3, 3) at stamps (m,) and which are known. None without
+        enough to say.
         """
         if not self._stamps:
             return None
@@ -56,13 +66,18 @@ class Accelerometer:
 
 
 def up_in_base(accelerometer: Accelerometer, where: BasePoses) -> F64 | None:
-    """Unit vector (3,) that points up in the base frame: the robust mean of the accelerometer; None without a usable IMU."""
-    base_T_imu, up = _base_T_imu(accelerometer, where), accelerometer.up()
+    """Unit vector (3,) that points up in the base frame: the robust mean of the accelerometer; None
+    without a usable IMU.
+    """
+    base_T_imu = _base_T_imu(accelerometer, where)
+    up = accelerometer.up()
     return None if base_T_imu is None or up is None else base_T_imu[:3, :3] @ up
 
 
 def up_in_session(accelerometer: Accelerometer, where: BasePoses) -> F64 | None:
-    """As :func:`up_in_base`, in the session frame: every sample is turned by the pose at its time, so the base may tilt."""
+    """As :func:`up_in_base`, in the session frame: every sample is turned by the pose at its time,
+    so the base may tilt.
+    """
     base_T_imu = _base_T_imu(accelerometer, where)
     if base_T_imu is None or not len(where.track):
         return None

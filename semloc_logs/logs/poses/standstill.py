@@ -10,12 +10,18 @@ from semloc_logs.numerics.transforms import Array, apply
 
 _EVERY = 4  # clouds; a vehicle is not looked at more often
 _KEPT, _COMPARED = 4000, 500  # points of the first cloud, and of each that is compared with it
-_TIMES, _MARGIN = 2.0, 0.1  # a cloud has moved when it lies so many times as far from the first as the second did, and so far (m)
-_QUANTILE = 0.8  # of its points' distances: along a street most surfaces slide over themselves, and a fifth may be traffic
+# a cloud has moved when it lies so many times as far from the first as the second did, and so far
+# (m)
+_TIMES, _MARGIN = 2.0, 0.1
+# of its points' distances: along a street most surfaces slide over themselves, and a fifth may be
+# traffic
+_QUANTILE = 0.8
 
 
 class Standstill:
-    """Compares clouds with the first one, in the session frame, as long as the poses say that the vehicle stands."""
+    """Compares clouds with the first one, in the session frame, as long as the poses say that the
+    vehicle stands.
+    """
 
     def __init__(self) -> None:
         self._first: cKDTree | None = None
@@ -25,7 +31,9 @@ class Standstill:
 
     @property
     def shift(self) -> float:
-        """How far (m) points have come from the first cloud's, if at least half of the clouds have moved; else 0."""
+        """How far (m) points have come from the first cloud's, if at least half of the clouds have
+        moved; else 0.
+        """
         least = _TIMES * (self._noise or 0.0) + _MARGIN
         moved = [d for d in self._distances if d > least]
         return max(moved) if 2 * len(moved) >= max(len(self._distances), 4) else 0.0

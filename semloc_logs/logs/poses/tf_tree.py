@@ -1,7 +1,8 @@
 """The TF tree of a log: which frame is where in which other frame, at any time.
 
-Frame names are compared without leading slash. Edges form an undirected graph, so that a log whose publishers contradict the rule
-"one parent each" (loops, two parents) still gives an answer, and disconnected frames give None.
+Frame names are compared without leading slash. Edges form an undirected graph, so that a log whose
+publishers contradict the rule "one parent each" (loops, two parents) still gives an answer, and
+disconnected frames give None.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from semloc_logs.frames import F64, TransformSample
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.numerics import transforms
 
-HISTORY_SECONDS = 60.0  # how far back a moving edge remembers: frames wait for their transforms by far less
+# how far back a moving edge remembers: frames wait for their transforms by far less
+HISTORY_SECONDS = 60.0
 MAX_EDGES = 10_000  # a log with more frames than this is broken; the rest is ignored and counted
 
 Edge = tuple[str, str]  # (parent, child)
@@ -39,7 +41,8 @@ class TransformTree:
 
     def add(self, sample: TransformSample) -> None:
         """Takes one edge; dynamic samples of an edge overrule static ones."""
-        parent, child = frame_name(sample.header.frame_id), frame_name(sample.child_frame_id)
+        parent = frame_name(sample.header.frame_id)
+        child = frame_name(sample.child_frame_id)
         edge = (parent, child)
         is_new = edge not in self._static and edge not in self._moving
         usable = parent and child and parent != child and np.isfinite(sample.frame_T_child).all()
@@ -65,7 +68,9 @@ class TransformTree:
     @property
     def edges(self) -> list[tuple[str, str, bool]]:
         """(parent, child, static) of every edge, sorted."""
-        return sorted([(*edge, True) for edge in self._static] + [(*edge, False) for edge in self._moving])
+        return sorted(
+            [(*edge, True) for edge in self._static] + [(*edge, False) for edge in self._moving]
+        )
 
     def connected(self, target: str, source: str) -> bool:
         """Whether edges lead from one frame to the other; a frame is always connected with itself."""
@@ -77,7 +82,9 @@ class TransformTree:
         return path is not None and not any(self._moving_edge(a, b) for a, b in pairwise(path))
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
-        """``target_T_source`` (4, 4), dynamic edges interpolated at ``stamp_ns``; None when unconnected or unknown at that time."""
+        """``target_T_source`` (4, 4), dynamic edges interpolated at ``stamp_ns``; None when
+        unconnected or unknown at that time.
+        """
         path = self._path(frame_name(target), frame_name(source))
         if path is None:
             return None
@@ -90,9 +97,13 @@ class TransformTree:
         return result
 
     def has_passed(self, target: str, source: str, stamp_ns: int) -> bool:
-        """Whether the frames are connected and all dynamic edges between them have reached ``stamp_ns``: a lookup will not change."""
+        """Whether the frames are connected and all dynamic edges between them have reached
+        ``stamp_ns``: a lookup will not change.
+        """
         path = self._path(frame_name(target), frame_name(source))
-        edges = [] if path is None else [edge for a, b in pairwise(path) for edge in ((a, b), (b, a))]
+        edges = (
+            [] if path is None else [edge for a, b in pairwise(path) for edge in ((a, b), (b, a))]
+        )
         ends = [self._moving[edge].end_ns for edge in edges if edge in self._moving]
         return path is not None and all(end is not None and end >= stamp_ns for end in ends)
 
@@ -101,19 +112,24 @@ class TransformTree:
         return self._moving.get((frame_name(parent), frame_name(child)))
 
     def pose_edge(self, frame: str) -> Edge | None:
-        """The dynamic edge that says where ``frame`` drives: below ``odom`` if there is one above it, else the topmost dynamic edge.
+        """The dynamic edge that says where ``frame`` drives: below ``odom`` if there is one above
+        it, else the topmost dynamic edge.
 
-        ``odom`` first, because odometry is continuous, whereas ``map`` -> ``odom`` jumps with every correction.
+        ``odom`` first, because odometry is continuous, whereas ``map`` -> ``odom`` jumps with every
+        correction.
         """
         chain: list[Edge] = []
-        here, seen = frame_name(frame), {frame_name(frame)}
+        here = frame_name(frame)
+        seen = {frame_name(frame)}
         while parents := [p for p in self._parents.get(here, []) if p not in seen]:
             parent = next((p for p in parents if p.endswith("odom")), parents[0])
             if (parent, here) in self._moving:
                 chain.append((parent, here))
             seen.add(parent)
             here = parent
-        return next((edge for edge in chain if edge[0].endswith("odom")), chain[-1] if chain else None)
+        return next(
+            (edge for edge in chain if edge[0].endswith("odom")), chain[-1] if chain else None
+        )
 
     def _moving_edge(self, here: str, there: str) -> bool:
         return (here, there) in self._moving or (there, here) in self._moving
@@ -142,7 +158,9 @@ class TransformTree:
                     if there not in came_from:
                         came_from[there] = here
                         queue.append(there)
-            self._paths[target, source] = _walk_back(came_from, target, source) if source in came_from else None
+            self._paths[target, source] = (
+                _walk_back(came_from, target, source) if source in came_from else None
+            )
         return self._paths[target, source]
 
 

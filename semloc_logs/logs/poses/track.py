@@ -9,10 +9,14 @@ from semloc_logs.frames import F64, PoseSample, TransformSample
 from semloc_logs.numerics import transforms
 
 EDGE_NS = 100_000_000  # a stamp may lie this far outside of the stream: the nearest pose serves
-PERIODS_PER_GAP = 3.0  # a stream slower than max_gap / 3 may skip two poses before its hole counts as a gap
-LONGEST_GAP = 5.0  # s; nothing that drives is interpolated over more than this, however slow its stream
+# a stream slower than max_gap / 3 may skip two poses before its hole counts as a gap
+PERIODS_PER_GAP = 3.0
+# s; nothing that drives is interpolated over more than this, however slow its stream
+LONGEST_GAP = 5.0
 _FARTHEST = 1e8  # m; positions in Earth-centred frames are below 1e7
-_FIRST_NS, _LAST_NS = -(1 << 60), 1 << 62  # the years 1933 to 2116: sums and differences still fit 64 bits
+# the years 1933 to 2116: sums and differences still fit 64 bits
+_FIRST_NS = -(1 << 60)
+_LAST_NS = 1 << 62
 _AHEAD_NS = 10_000_000_000  # clocks that are adjusted while recording jump less
 _GLITCH = 3  # poses that a glitch of the clock may stamp in a row
 _PERIOD_WINDOW = 256  # poses that the period is estimated from: the newest ones
@@ -26,9 +30,11 @@ def is_time(stamp_ns: int) -> bool:
 class PoseTrack:
     """Poses at strictly increasing stamps, which may still grow.
 
-    ``max_gap`` (s) is the longest hole that is interpolated, or three median periods of a slow stream. With ``keep_seconds`` only the
-    newest stretch is remembered (at least that long), so memory is bounded. ``duplicates``, ``backwards`` and ``invalid`` count what
-    was refused: equal stamps, stamps before the newest one, and matrices that are no rigid transforms; ``ahead`` what was taken back.
+    ``max_gap`` (s) is the longest hole that is interpolated, or three median periods of a slow
+    stream. With ``keep_seconds`` only the newest stretch is remembered (at least that long), so
+    memory is bounded. ``duplicates``, ``backwards`` and ``invalid`` count what was refused: equal
+    stamps, stamps before the newest one, and matrices that are no rigid transforms; ``ahead`` what
+    was taken back.
     """
 
     def __init__(self, max_gap: float = 1.0, keep_seconds: float | None = None) -> None:
@@ -48,7 +54,9 @@ class PoseTrack:
         return self._n
 
     def add(self, sample: PoseSample | TransformSample) -> bool:
-        """Appends the sample's ``frame_T_child`` at its header stamp; False when it was refused and counted."""
+        """Appends the sample's ``frame_T_child`` at its header stamp; False when it was refused and
+        counted.
+        """
         return self.append(sample.header.stamp_ns, sample.frame_T_child)
 
     def append(self, stamp_ns: int, pose: F64) -> bool:
@@ -61,7 +69,9 @@ class PoseTrack:
             else:
                 self.backwards += 1
             return False
-        is_number = np.isfinite(pose).all() and np.abs(pose[:3, 3]).max() < _FARTHEST and is_time(stamp_ns)
+        is_number = (
+            np.isfinite(pose).all() and np.abs(pose[:3, 3]).max() < _FARTHEST and is_time(stamp_ns)
+        )
         if not is_number or abs(np.linalg.det(pose[:3, :3]) - 1.0) > 1e-3:
             self.invalid += 1
             return False
@@ -74,7 +84,8 @@ class PoseTrack:
         return True
 
     def _drop_ahead(self, stamp_ns: int) -> None:
-        """Takes back the newest poses, a few at most, when they lie so far ahead of ``stamp_ns`` that a glitch of the clock stamped them.
+        """Takes back the newest poses, a few at most, when they lie so far ahead of ``stamp_ns``
+        that a glitch of the clock stamped them.
 
         One pose from the next century would otherwise make all that follow it too old.
         """
@@ -92,7 +103,8 @@ class PoseTrack:
             first = int(np.searchsorted(self._stamps, self._stamps[self._n - 1] - self._keep_ns))
         kept = self._n - first
         size = max(16, 2 * kept)
-        stamps, rows = np.empty(size, np.int64), np.empty((size, 3, 4))
+        stamps = np.empty(size, np.int64)
+        rows = np.empty((size, 3, 4))
         stamps[:kept], rows[:kept] = self._stamps[first : self._n], self._rows[first : self._n]
         self._stamps, self._rows, self._n = stamps, rows, kept
 
@@ -117,9 +129,14 @@ class PoseTrack:
         return int(self._stamps[self._n - 1]) if self._n else None
 
     def gap_limit_ns(self) -> int:
-        """The longest hole between two poses that is interpolated: ``max_gap`` or three median periods, at most 5 s."""
-        # the estimate is renewed now and then: a median for every frame would cost more than the interpolation
-        if self._limit is None or not self._limit[0] <= self._n < self._limit[0] + max(1, self._limit[0] // 4):
+        """The longest hole between two poses that is interpolated: ``max_gap`` or three median
+        periods, at most 5 s.
+        """
+        # the estimate is renewed now and then: a median for every frame would cost more than the
+        # interpolation
+        if self._limit is None or not self._limit[0] <= self._n < self._limit[0] + max(
+            1, self._limit[0] // 4
+        ):
             limit = self.max_gap
             if self._n > 2:
                 period = float(np.median(np.diff(self.stamps_ns[-_PERIOD_WINDOW:]))) * 1e-9
@@ -135,20 +152,27 @@ class PoseTrack:
         return poses[0] if known[0] else None
 
     def at_many(self, stamps_ns: NDArray[np.int64]) -> tuple[F64, NDArray[np.bool_]]:
-        """Poses (m, 4, 4) at ``stamps_ns`` (m,) and which of them are known (m,); unknown ones are identity."""
+        """Poses (m, 4, 4) at ``stamps_ns`` (m,) and which of them are known (m,); unknown ones are
+        identity.
+        """
         at = np.asarray(stamps_ns, np.int64)
         poses = np.tile(np.eye(4), (len(at), 1, 1))
         if self._n == 0:
             return poses, np.zeros(len(at), bool)
         stamps = self.stamps_ns
         right = np.searchsorted(stamps, at, side="left")
-        left = np.clip(np.where(stamps[np.minimum(right, self._n - 1)] == at, right, right - 1), 0, self._n - 1)
+        left = np.clip(
+            np.where(stamps[np.minimum(right, self._n - 1)] == at, right, right - 1), 0, self._n - 1
+        )
         right = np.clip(right, 0, self._n - 1)
         known = (at >= stamps[0] - EDGE_NS) & (at <= stamps[-1] + EDGE_NS)
         known &= stamps[right] - stamps[left] <= self.gap_limit_ns()
         if known.any():
-            first, last = int(left[known].min()), int(right[known].max()) + 1
-            poses[known] = transforms.interpolate(stamps[first:last], self._matrices(first, last), at[known])
+            first = int(left[known].min())
+            last = int(right[known].max()) + 1
+            poses[known] = transforms.interpolate(
+                stamps[first:last], self._matrices(first, last), at[known]
+            )
         return poses, known
 
     def gaps(self) -> list[tuple[int, int]]:
@@ -159,7 +183,8 @@ class PoseTrack:
 
     def length(self) -> float:
         """Metres travelled, gaps left out."""
-        rows, stamps = self._rows[: self._n], self.stamps_ns
+        rows = self._rows[: self._n]
+        stamps = self.stamps_ns
         steps = np.linalg.norm(np.diff(rows[:, :, 3], axis=0), axis=1)
         return float(steps[np.diff(stamps) <= self.gap_limit_ns()].sum())
 

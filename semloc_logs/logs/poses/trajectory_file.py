@@ -1,8 +1,10 @@
-"""Trajectories that come as a file beside the log: TUM (a stamp and a pose a line) or KITTI (twelve numbers a line, stamps elsewhere).
+"""Trajectories that come as a file beside the log: TUM (a stamp and a pose a line) or KITTI (twelve
+numbers a line, stamps elsewhere).
 
-TUM: ``stamp t_x t_y t_z q_x q_y q_z q_w``, seconds and metres, lines that start with ``#`` are comments (TUM RGB-D benchmark, file
-formats). KITTI: the upper 3 x 4 of the pose, row-major (KITTI odometry development kit); line i belongs to the i-th frame of the main
-range sensor, unless a file of times, one number of seconds a line, says when each pose was.
+TUM: ``stamp t_x t_y t_z q_x q_y q_z q_w``, seconds and metres, lines that start with ``#`` are
+comments (TUM RGB-D benchmark, file formats). KITTI: the upper 3 x 4 of the pose, row-major (KITTI
+odometry development kit); line i belongs to the i-th frame of the main range sensor, unless a file
+of times, one number of seconds a line, says when each pose was.
 """
 
 from __future__ import annotations
@@ -24,12 +26,15 @@ from semloc_logs.numerics import transforms
 TUM, KITTI = 8, 12  # numbers a line
 _LONGEST_LINE = 4096  # characters; a line of either format has about 150
 _MOST_POSES = 50_000_000  # a kilohertz over half a day; more is no trajectory
-_UNIT = 0.05  # a quaternion's length may be off by so much, a rotation matrix' R R^T from the identity
+# a quaternion's length may be off by so much, a rotation matrix' R R^T from the identity
+_UNIT = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryFile:
-    """Where poses are: ``path``, for KITTI poses perhaps ``times``, and ``frame``, the frame that they are the poses of ("": the base)."""
+    """Where poses are: ``path``, for KITTI poses perhaps ``times``, and ``frame``, the frame that
+    they are the poses of ("": the base).
+    """
 
     path: Path
     times: Path | None = None
@@ -40,7 +45,8 @@ class TrajectoryFile:
         digest = hashlib.sha256(self.frame.encode())
         for path in (self.path, *([self.times] if self.times else [])):
             if path.exists() and not path.is_file():
-                raise LogError(f"{path} is no regular file: give the path of a file of poses.")  # a pipe can be read only once
+                # a pipe can be read only once
+                raise LogError(f"{path} is no regular file: give the path of a file of poses.")
             try:
                 with path.open("rb") as file:
                     digest.update(hashlib.file_digest(file, "sha256").digest())
@@ -51,9 +57,11 @@ class TrajectoryFile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """``poses`` (n, 4, 4) at ``stamps_ns`` (n,), in the order of the file; no stamps: one pose for each frame of the main sensor.
+    """``poses`` (n, 4, 4) at ``stamps_ns`` (n,), in the order of the file; no stamps: one pose for
+    each frame of the main sensor.
 
-    ``is_relative``: the stamps count from the first frame's, as KITTI's ``times.txt`` does, whose first number is zero.
+    ``is_relative``: the stamps count from the first frame's, as KITTI's ``times.txt`` does, whose
+    first number is zero.
     """
 
     poses: F64
@@ -62,7 +70,9 @@ class Trajectory:
 
 
 def read_trajectory(source: TrajectoryFile) -> Trajectory:
-    """Reads TUM or KITTI poses, told apart by the numbers a line; LogError names the file and line that cannot be read."""
+    """Reads TUM or KITTI poses, told apart by the numbers a line; LogError names the file and line
+    that cannot be read.
+    """
     stamps: list[int] = []
     rows: list[list[float]] = []
     lines: list[int] = []
@@ -70,36 +80,54 @@ def read_trajectory(source: TrajectoryFile) -> Trajectory:
     for number, words in _lines(source.path):
         width = width or len(words)
         if width not in (TUM, KITTI) or len(words) != width:
-            wanted = f"{width} numbers like the lines before" if rows else f"{TUM} (TUM) or {KITTI} (KITTI) numbers"
-            raise LogError(f"{source.path}, line {number} has {len(words)} numbers: give a file with {wanted} in each line.")
+            wanted = (
+                f"{width} numbers like the lines before"
+                if rows
+                else f"{TUM} (TUM) or {KITTI} (KITTI) numbers"
+            )
+            raise LogError(
+                f"{source.path}, line {number} has {len(words)} numbers: give a file with {wanted} in each line."
+            )
         if width == TUM:
             stamps.append(seconds_to_ns(words[0], source.path, number))
         rows.append(_floats(words[1:] if width == TUM else words, source.path, number))
         lines.append(number)
         if len(rows) > _MOST_POSES:
-            raise LogError(f"{source.path} has more than {_MOST_POSES} poses: that is no trajectory.")
+            raise LogError(
+                f"{source.path} has more than {_MOST_POSES} poses: that is no trajectory."
+            )
     if not rows:
         raise LogError(f"{source.path} has no poses: give a file in TUM or KITTI format.")
     values = np.array(rows)
     if width == TUM:
         if source.times is not None:
-            raise LogError(f"{source.path} has stamps of its own (TUM format): leave --pose-times {source.times} out.")
+            raise LogError(
+                f"{source.path} has stamps of its own (TUM format): leave --pose-times {source.times} out."
+            )
         return Trajectory(_from_quaternions(values, source.path, lines), np.array(stamps, np.int64))
     poses = _from_matrices(values, source.path, lines)
     if source.times is None:
         return Trajectory(poses, None)
     times = _read_times(source.times)
     if len(times) != len(poses):
-        raise LogError(f"{source.times} has {len(times)} times but {source.path} has {len(poses)} poses: give one time for each pose.")
+        raise LogError(
+            f"{source.times} has {len(times)} times but {source.path} has {len(poses)} poses: give one time for each pose."
+        )
     return Trajectory(poses, times, is_relative=bool(times[0] == 0))
 
 
 def seconds_to_ns(text: str, path: Path, line: int) -> int:
-    """Integer nanoseconds of a decimal number of seconds, exactly: a float64 is 0.2 us off since 1970."""
+    """Integer nanoseconds of a decimal number of seconds, exactly: a float64 is 0.2 us off since
+    1970.
+    """
     try:
         seconds = Decimal(text)
         # what is far too large is refused by its exponent, before anyone writes it out
-        stamp_ns = int((seconds * 1_000_000_000).to_integral_value()) if seconds.is_finite() and seconds.adjusted() < 12 else None
+        stamp_ns = (
+            int((seconds * 1_000_000_000).to_integral_value())
+            if seconds.is_finite() and seconds.adjusted() < 12
+            else None
+        )
     except InvalidOperation:
         stamp_ns = None
     if stamp_ns is None or not is_time(stamp_ns):
@@ -108,7 +136,8 @@ def seconds_to_ns(text: str, path: Path, line: int) -> int:
 
 
 class FilePoses:
-    """The poses of a file as a source of poses for a session; ``topic`` is the main range sensor, of which ``count`` frames are to come.
+    """The poses of a file as a source of poses for a session; ``topic`` is the main range sensor,
+    of which ``count`` frames are to come.
 
     LogError when KITTI poses and frames cannot be told to belong together.
     """
@@ -139,7 +168,9 @@ class FilePoses:
 
     def take(self, frame: Frame) -> None:
         """A frame of the log: those of the main sensor date poses that have no stamps."""
-        if frame.header.topic == self._topic and isinstance(frame, LidarFrame | DepthFrame | ImageFrame):
+        if frame.header.topic == self._topic and isinstance(
+            frame, LidarFrame | DepthFrame | ImageFrame
+        ):
             if not self._frames:
                 self._start_ns = frame.header.stamp_ns
             self._frames += 1
@@ -154,7 +185,11 @@ class FilePoses:
         elif trajectory.is_relative and not self._frames:
             return
         else:
-            ready = (trajectory.stamps_ns + (self._start_ns if trajectory.is_relative else 0)).tolist() if not self.is_over else []
+            ready = (
+                (trajectory.stamps_ns + (self._start_ns if trajectory.is_relative else 0)).tolist()
+                if not self.is_over
+                else []
+            )
         while self._given < min(len(ready), len(trajectory.poses)):
             self._given += 1
             yield ready[self._given - 1], trajectory.poses[self._given - 1]
@@ -186,7 +221,9 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             while line := file.readline(_LONGEST_LINE):
                 number += 1
                 if len(line) >= _LONGEST_LINE:
-                    raise LogError(f"{path}, line {number} is longer than {_LONGEST_LINE} characters: that is no file of poses.")
+                    raise LogError(
+                        f"{path}, line {number} is longer than {_LONGEST_LINE} characters: that is no file of poses."
+                    )
                 words = line.split("#", 1)[0].split()
                 if words:
                     yield number, words
@@ -197,7 +234,9 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _unreadable(path: Path, problem: OSError) -> LogError:
-    return LogError(f"{path} cannot be read ({problem.strerror}): give the path of a file of poses.")
+    return LogError(
+        f"{path} cannot be read ({problem.strerror}): give the path of a file of poses."
+    )
 
 
 def _floats(words: list[str], path: Path, line: int) -> list[float]:
@@ -206,7 +245,9 @@ def _floats(words: list[str], path: Path, line: int) -> list[float]:
     except ValueError:
         values = [np.nan]
     if not np.isfinite(values).all():
-        raise LogError(f"{path}, line {line} has something that is no number: give a file in TUM or KITTI format.")
+        raise LogError(
+            f"{path}, line {line} has something that is no number: give a file in TUM or KITTI format."
+        )
     return values
 
 
@@ -214,7 +255,9 @@ def _from_quaternions(values: F64, path: Path, lines: list[int]) -> F64:
     length = np.linalg.norm(values[:, 3:], axis=1)
     bad = np.flatnonzero(np.abs(length - 1.0) > _UNIT)
     if len(bad):
-        raise LogError(f"{path}, line {lines[bad[0]]}: the quaternion (x y z w) has the length {length[bad[0]]:.3g}, not 1.")
+        raise LogError(
+            f"{path}, line {lines[bad[0]]}: the quaternion (x y z w) has the length {length[bad[0]]:.3g}, not 1."
+        )
     return transforms.transform(values[:, :3], values[:, 3:])
 
 
@@ -227,13 +270,16 @@ def _from_matrices(values: F64, path: Path, lines: list[int]) -> F64:
         bad = np.flatnonzero(~((off <= _UNIT) & (np.linalg.det(rotation) > 0)))
     if len(bad):
         raise LogError(f"{path}, line {lines[bad[0]]}: the 3 x 3 part is no rotation.")
-    return transforms.transform(*transforms.translation_quaternion(poses))  # as written with six digits it is nearly one
+    # as written with six digits it is nearly one
+    return transforms.transform(*transforms.translation_quaternion(poses))
 
 
 def _read_times(path: Path) -> NDArray[np.int64]:
     times = []
     for number, words in _lines(path):
         if len(words) != 1:
-            raise LogError(f"{path}, line {number} has {len(words)} numbers: give one time in seconds a line.")
+            raise LogError(
+                f"{path}, line {number} has {len(words)} numbers: give one time in seconds a line."
+            )
         times.append(seconds_to_ns(words[0], path, number))
     return np.array(times, np.int64)

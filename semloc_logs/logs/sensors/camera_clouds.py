@@ -4,22 +4,39 @@ from __future__ import annotations
 
 from semloc_logs.frames import Camera, DepthFrame, ImageFrame
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.sensors.depth import USUAL_NOISE, DepthClouds, LabelImages, RangeNoise, RangePoints
+from semloc_logs.logs.sensors.depth import (
+    USUAL_NOISE,
+    DepthClouds,
+    LabelImages,
+    RangeNoise,
+    RangePoints,
+)
 from semloc_logs.logs.sensors.stereo_pairs import RightTLeft, StereoClouds
 
 
 class PictureClouds:
-    """Depth images and stereo pairs -> points with labels, by the calibrations and label images that came with them.
+    """Depth images and stereo pairs -> points with labels, by the calibrations and label images
+    that came with them.
 
-    ``cameras``: the newest calibration by CameraInfo topic; ``labels``: the label images; ``right_T_left`` as in StereoClouds.
+    ``cameras``: the newest calibration by CameraInfo topic; ``labels``: the label images;
+    ``right_T_left`` as in StereoClouds.
     """
 
-    def __init__(self, roles: Roles, right_T_left: RightTLeft, *, stride: int | None = None, noise: RangeNoise = USUAL_NOISE) -> None:
+    def __init__(
+        self,
+        roles: Roles,
+        right_T_left: RightTLeft,
+        *,
+        stride: int | None = None,
+        noise: RangeNoise = USUAL_NOISE,
+    ) -> None:
         self._roles = roles
         self._depth = DepthClouds(roles, stride, noise)
         self.labels: LabelImages = self._depth.labels
         self.cameras: dict[str, Camera] = self._depth.cameras
-        self._stereo = StereoClouds(roles, self.cameras, self.labels, right_T_left, stride=stride, noise=noise)
+        self._stereo = StereoClouds(
+            roles, self.cameras, self.labels, right_T_left, stride=stride, noise=noise
+        )
 
     @property
     def lost(self) -> list[str]:
@@ -48,8 +65,16 @@ class PictureClouds:
             return self._depth.has_all(frame)
         return not isinstance(frame, ImageFrame) or self._stereo.has_all(frame)
 
-    def points(self, frame: DepthFrame | ImageFrame, min_range: float, max_range: float) -> RangePoints | str:
-        """Points in the optical frame between the ranges (m, along the ray); or the reason why there are none."""
+    def points(
+        self, frame: DepthFrame | ImageFrame, min_range: float, max_range: float
+    ) -> RangePoints | str:
+        """Points in the optical frame between the ranges (m, along the ray); or the reason why
+        there are none.
+        """
         if frame.header.topic != self._roles.stereo_left:
             return self._depth.points(frame, min_range, max_range)
-        return self._stereo.points(frame, min_range, max_range) if isinstance(frame, ImageFrame) else "no picture"
+        return (
+            self._stereo.points(frame, min_range, max_range)
+            if isinstance(frame, ImageFrame)
+            else "no picture"
+        )

@@ -1,8 +1,11 @@
-"""A pair of calibrated cameras turned, in the computer, until the rows of their pictures correspond.
+"""A pair of calibrated cameras turned, in the computer, until the rows of their pictures
+correspond.
 
-A raw pair is rectified by the R and P of its CameraInfos where these carry a baseline (sensor_msgs/CameraInfo: P[0, 3] = -f * baseline),
-else by the transform between the cameras, with the rotations of Bouguet's method as in OpenCV's stereoRectify: half of the rotation
-between the cameras each, then both alike until the baseline is the x axis. The distortion model may be any that OpenCV can undo.
+A raw pair is rectified by the R and P of its CameraInfos where these carry a baseline
+(sensor_msgs/CameraInfo: P[0, 3] = -f * baseline), else by the transform between the cameras, with
+the rotations of Bouguet's method as in OpenCV's stereoRectify: half of the rotation between the
+cameras each, then both alike until the baseline is the x axis. The distortion model may be any that
+OpenCV can undo.
 """
 
 from __future__ import annotations
@@ -23,8 +26,11 @@ FISHEYE = ("equidistant", "kannala_brandt", "fisheye")
 _SHORTEST_BASELINE = 1e-3  # m; below, the two frames are one
 SMALLEST = 32  # px, sides of a picture
 _LARGEST_NUMBER = 1e6  # in K (px), D and P
-_WIDEST_ANGLE = np.deg2rad(40.0)  # between the optical axes, or the baseline and the rows: more is no stereo pair
-_WIDER = 0.6  # of the focal length, at least: rectified pictures see more than the middle, at the cost of resolution there
+# between the optical axes, or the baseline and the rows: more is no stereo pair
+_WIDEST_ANGLE = np.deg2rad(40.0)
+# of the focal length, at least: rectified pictures see more than the middle, at the cost of
+# resolution there
+_WIDER = 0.6
 _SAME = 0.02  # focal lengths of rectified pictures differ by no more than this share
 
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
@@ -32,11 +38,14 @@ Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectification:
-    """How to rectify both pictures of a pair, and what a disparity d (pixels) means then: z = focal * baseline / (d - offset).
+    """How to rectify both pictures of a pair, and what a disparity d (pixels) means then: z = focal
+    * baseline / (d - offset).
 
-    ``focal`` (px), ``centre`` (x, y) of the left rectified picture (px), ``baseline`` (m), ``left_R_rect`` (3, 3) from the rectified to
-    the left optical frame. ``maps`` are what cv2.remap takes, None where the pictures come rectified. ``valid`` (h, w) of left and right:
-    pixels that lie on the recorded picture. ``pixels`` (h, w): flat index of the nearest pixel of the recorded left picture.
+    ``focal`` (px), ``centre`` (x, y) of the left rectified picture (px), ``baseline`` (m),
+    ``left_R_rect`` (3, 3) from the rectified to the left optical frame. ``maps`` are what cv2.remap
+    takes, None where the pictures come rectified. ``valid`` (h, w) of left and right: pixels that
+    lie on the recorded picture. ``pixels`` (h, w): flat index of the nearest pixel of the recorded
+    left picture.
     """
 
     focal: float
@@ -49,14 +58,25 @@ class Rectification:
     pixels: NDArray[np.intp]
 
 
-def rectification(left: Camera, right: Camera, shape: tuple[int, int], right_T_left: F64 | None, *, rectified: bool) -> Rectification:
-    """The rectification of pictures (h, w) of these cameras; ``rectified``: they come so, and P holds.
+def rectification(
+    left: Camera,
+    right: Camera,
+    shape: tuple[int, int],
+    right_T_left: F64 | None,
+    *,
+    rectified: bool,
+) -> Rectification:
+    """The rectification of pictures (h, w) of these cameras; ``rectified``: they come so, and P
+    holds.
 
-    ``right_T_left`` (4, 4) between the optical frames, None where nothing says it. LogError where the calibrations do not allow it.
+    ``right_T_left`` (4, 4) between the optical frames, None where nothing says it. LogError where
+    the calibrations do not allow it.
     """
     names = f"{left.header.topic}, {right.header.topic}"
     if min(shape) < SMALLEST:
-        raise LogError(f"The pictures of {names} have {shape[1]} x {shape[0]} pixels: too few to be matched.")
+        raise LogError(
+            f"The pictures of {names} have {shape[1]} x {shape[0]} pixels: too few to be matched."
+        )
     for camera in (left, right):
         if camera.width and camera.height and (camera.height, camera.width) != shape:
             raise LogError(
@@ -65,13 +85,15 @@ def rectification(left: Camera, right: Camera, shape: tuple[int, int], right_T_l
             )
     _check_numbers(left, right, names)
     if right_T_left is not None and np.linalg.norm(right_T_left[:3, 3]) < _SHORTEST_BASELINE:
-        right_T_left = None  # the frame ids of both pictures are the same, as stereo_image_proc wants them
+        # the frame ids of both pictures are the same, as stereo_image_proc wants them
+        right_T_left = None
     if rectified:
         return _as_recorded(left, right, shape, right_T_left, names)
     recorded = _baseline_of_infos(left, right)
     is_turned = any(not np.allclose(camera.R, np.eye(3), atol=1e-9) for camera in (left, right))
     if recorded != 0.0 and (is_turned or right_T_left is None):
-        rotations, matrices = (left.R, right.R), (left.P[:, :3], right.P[:, :3])
+        rotations = (left.R, right.R)
+        matrices = (left.P[:, :3], right.P[:, :3])
         _check_sides(recorded, names)
         return _of_maps(left, right, shape, rotations, matrices, recorded, names)
     if right_T_left is None:
@@ -82,11 +104,21 @@ def rectification(left: Camera, right: Camera, shape: tuple[int, int], right_T_l
     _check_angles(right_T_left, names)
     rotations = bouguet_rotations(right_T_left)
     matrix = _common_matrix(left, right, shape, rotations, names)
-    return _of_maps(left, right, shape, rotations, (matrix, matrix), float(np.linalg.norm(right_T_left[:3, 3])), names)
+    return _of_maps(
+        left,
+        right,
+        shape,
+        rotations,
+        (matrix, matrix),
+        float(np.linalg.norm(right_T_left[:3, 3])),
+        names,
+    )
 
 
 def bouguet_rotations(right_T_left: F64) -> tuple[F64, F64]:
-    """Rotations (3, 3) of the left and the right optical frame into rectified ones whose x axis is the baseline, left to right."""
+    """Rotations (3, 3) of the left and the right optical frame into rectified ones whose x axis is
+    the baseline, left to right.
+    """
     rotation = Rotation.from_matrix(right_T_left[:3, :3])
     half = Rotation.from_rotvec(rotation.as_rotvec() / 2)
     axis = -(half.inv().as_matrix() @ right_T_left[:3, 3])
@@ -95,16 +127,28 @@ def bouguet_rotations(right_T_left: F64) -> tuple[F64, F64]:
 
 
 def _check_numbers(left: Camera, right: Camera, names: str) -> None:
-    """OpenCV computes with anything; what follows from numbers that no lens has would be garbage, or a crash."""
+    """OpenCV computes with anything; what follows from numbers that no lens has would be garbage,
+    or a crash.
+    """
     for camera in (left, right):
         numbers = np.concatenate([camera.K.ravel(), camera.P.ravel(), np.ravel(camera.D)])
-        is_rotation = np.allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-2) and np.linalg.det(camera.R) > 0
-        if not is_rotation or not np.isfinite(numbers).all() or np.abs(numbers).max() > _LARGEST_NUMBER:
-            raise LogError(f"The calibrations of {names} make no sense; name others with --topic camera_info=TOPIC,TOPIC.")
+        is_rotation = (
+            np.allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-2) and np.linalg.det(camera.R) > 0
+        )
+        if (
+            not is_rotation
+            or not np.isfinite(numbers).all()
+            or np.abs(numbers).max() > _LARGEST_NUMBER
+        ):
+            raise LogError(
+                f"The calibrations of {names} make no sense; name others with --topic camera_info=TOPIC,TOPIC."
+            )
 
 
 def _check_angles(right_T_left: F64, names: str) -> None:
-    """A pair that does not look the same way, or sits one above the other, gives no useful pictures when turned into rows."""
+    """A pair that does not look the same way, or sits one above the other, gives no useful pictures
+    when turned into rows.
+    """
     centre = -right_T_left[:3, :3].T @ right_T_left[:3, 3]
     from_rows = float(np.arccos(np.clip(abs(centre[0]) / np.linalg.norm(centre), 0.0, 1.0)))
     turned = max(rotation_angle(right_T_left[:3, :3]), from_rows)
@@ -131,7 +175,9 @@ def _baseline_of_infos(left: Camera, right: Camera) -> float:
     return baseline if abs(baseline) >= _SHORTEST_BASELINE and np.isfinite(baseline) else 0.0
 
 
-def _as_recorded(left: Camera, right: Camera, shape: tuple[int, int], right_T_left: F64 | None, names: str) -> Rectification:
+def _as_recorded(
+    left: Camera, right: Camera, shape: tuple[int, int], right_T_left: F64 | None, names: str
+) -> Rectification:
     baseline = _baseline_of_infos(left, right)
     if baseline == 0.0 and right_T_left is not None:
         baseline = float(-right_T_left[0, 3])
@@ -144,35 +190,62 @@ def _as_recorded(left: Camera, right: Camera, shape: tuple[int, int], right_T_le
     _check_projections(left.P[:, :3], right.P[:, :3], names)
     valid = np.ones(shape, bool)
     pixels = np.arange(shape[0] * shape[1], dtype=np.intp).reshape(shape)
-    focal, centre = float(left.P[0, 0]), (float(left.P[0, 2]), float(left.P[1, 2]))
-    return Rectification(focal, baseline, centre, centre[0] - float(right.P[0, 2]), np.eye(3), None, (valid, valid), pixels)
+    focal = float(left.P[0, 0])
+    centre = (float(left.P[0, 2]), float(left.P[1, 2]))
+    return Rectification(
+        focal,
+        baseline,
+        centre,
+        centre[0] - float(right.P[0, 2]),
+        np.eye(3),
+        None,
+        (valid, valid),
+        pixels,
+    )
 
 
 def _check_projections(left: F64, right: F64, names: str) -> None:
     ok = left[0, 0] > 0 and right[0, 0] > 0 and np.isfinite(left).all() and np.isfinite(right).all()
-    if not ok or abs(left[0, 0] - right[0, 0]) > _SAME * left[0, 0] or abs(left[1, 2] - right[1, 2]) > _SAME * left[0, 0]:
+    if (
+        not ok
+        or abs(left[0, 0] - right[0, 0]) > _SAME * left[0, 0]
+        or abs(left[1, 2] - right[1, 2]) > _SAME * left[0, 0]
+    ):
         raise LogError(
             f"The projections P of the CameraInfos {names} are not those of one rectified pair: their focal lengths or rows differ; "
             f"name the right ones with --topic camera_info=TOPIC,TOPIC."
         )
 
 
-def _common_matrix(left: Camera, right: Camera, shape: tuple[int, int], rotations: tuple[F64, F64], names: str) -> F64:
-    """One K for both rectified pictures: the ends of the middle row and column stay in them where the field of view allows it."""
+def _common_matrix(
+    left: Camera, right: Camera, shape: tuple[int, int], rotations: tuple[F64, F64], names: str
+) -> F64:
+    """One K for both rectified pictures: the ends of the middle row and column stay in them where
+    the field of view allows it.
+    """
     height, width = shape
     half = np.array([(width - 1) / 2, (height - 1) / 2])
     cross = half + half * [[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]]
     own = float(np.mean([left.K[0, 0], left.K[1, 1], right.K[0, 0], right.K[1, 1]]))
-    middles, focal = [], own
+    middles = []
+    focal = own
     for camera, rotation in ((left, rotations[0]), (right, rotations[1])):
         rays = np.hstack([_undistorted(camera, cross), np.ones((5, 1))]) @ rotation.T
         seen = rays[:, :2] / rays[:, 2:]
         if not np.isfinite(seen[0]).all() or np.abs(seen[0]).max() > 2.0:
-            raise LogError(f"The calibrations of {names} make no sense; name others with --topic camera_info=TOPIC,TOPIC.")
+            raise LogError(
+                f"The calibrations of {names} make no sense; name others with --topic camera_info=TOPIC,TOPIC."
+            )
         middles.append(seen[0])
         reach = np.array([seen[2, 0] - seen[1, 0], seen[4, 1] - seen[3, 1]])
         # beyond 90 degrees from the axis of a fisheye the numbers mean nothing
-        focal = min(focal, *(2 * h / r if np.isfinite(r) and r > 0 else 0.0 for h, r in zip(half, reach, strict=True)))
+        focal = min(
+            focal,
+            *(
+                2 * h / r if np.isfinite(r) and r > 0 else 0.0
+                for h, r in zip(half, reach, strict=True)
+            ),
+        )
     focal = max(focal, _WIDER * own)
     cx, cy = half - focal * np.mean(middles, axis=0)
     return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
@@ -186,7 +259,8 @@ def _undistorted(camera: Camera, pixels: F64) -> F64:
 
 def _coefficients(camera: Camera) -> F64:
     """D as OpenCV takes it; LogError for a model that it does not have."""
-    D, model = np.atleast_1d(np.asarray(camera.D, float)), camera.model.lower()
+    D = np.atleast_1d(np.asarray(camera.D, float))
+    model = camera.model.lower()
     if not D.any():
         return np.zeros(4)
     if (model in PINHOLE and len(D) in (4, 5, 8, 12, 14)) or (model in FISHEYE and len(D) == 4):
@@ -208,7 +282,8 @@ def _of_maps(
 ) -> Rectification:
     _check_projections(*matrices, names)
     (left_maps, left_valid, pixels), (right_maps, right_valid, _) = (
-        _lookup(camera, shape, rotation, matrix) for camera, rotation, matrix in zip((left, right), rotations, matrices, strict=True)
+        _lookup(camera, shape, rotation, matrix)
+        for camera, rotation, matrix in zip((left, right), rotations, matrices, strict=True)
     )
     if not (left_valid.any() and right_valid.any()):
         raise LogError(
@@ -219,24 +294,47 @@ def _of_maps(
     offset = float(matrix[0, 2] - matrices[1][0, 2])
     centre = (float(matrix[0, 2]), float(matrix[1, 2]))
     valid = (left_valid, right_valid)
-    return Rectification(float(matrix[0, 0]), baseline, centre, offset, rotations[0].T, (left_maps, right_maps), valid, pixels)
+    return Rectification(
+        float(matrix[0, 0]),
+        baseline,
+        centre,
+        offset,
+        rotations[0].T,
+        (left_maps, right_maps),
+        valid,
+        pixels,
+    )
 
 
-def _lookup(camera: Camera, shape: tuple[int, int], rotation: F64, matrix: F64) -> tuple[Maps, NDArray[np.bool_], NDArray[np.intp]]:
-    """Where each rectified pixel is in the recorded picture: for cv2.remap, whether it is there at all, and as flat index."""
-    D, size = _coefficients(camera), (shape[1], shape[0])
+def _lookup(
+    camera: Camera, shape: tuple[int, int], rotation: F64, matrix: F64
+) -> tuple[Maps, NDArray[np.bool_], NDArray[np.intp]]:
+    """Where each rectified pixel is in the recorded picture: for cv2.remap, whether it is there at
+    all, and as flat index.
+    """
+    D = _coefficients(camera)
+    size = (shape[1], shape[0])
     is_fisheye = camera.model.lower() in FISHEYE
     make = cv2.fisheye.initUndistortRectifyMap if is_fisheye else cv2.initUndistortRectifyMap
-    x, y = (np.asarray(m, np.float32) for m in make(camera.K, D, rotation, matrix, size, cv2.CV_32FC1))
+    x, y = (
+        np.asarray(m, np.float32) for m in make(camera.K, D, rotation, matrix, size, cv2.CV_32FC1)
+    )
     with np.errstate(invalid="ignore"):
-        valid = (x >= 0) & (x <= shape[1] - 1) & (y >= 0) & (y <= shape[0] - 1) & _is_one_to_one(x, y)
-    x, y = np.where(valid, x, -1).astype(np.float32), np.where(valid, y, -1).astype(np.float32)
-    pixels = np.rint(np.clip(y, 0, None)).astype(np.intp) * shape[1] + np.rint(np.clip(x, 0, None)).astype(np.intp)
+        valid = (
+            (x >= 0) & (x <= shape[1] - 1) & (y >= 0) & (y <= shape[0] - 1) & _is_one_to_one(x, y)
+        )
+    x = np.where(valid, x, -1).astype(np.float32)
+    y = np.where(valid, y, -1).astype(np.float32)
+    pixels = np.rint(np.clip(y, 0, None)).astype(np.intp) * shape[1] + np.rint(
+        np.clip(x, 0, None)
+    ).astype(np.intp)
     fixed = cv2.convertMaps(x, y, cv2.CV_16SC2)
     return (np.asarray(fixed[0], np.int16), np.asarray(fixed[1], np.uint16)), valid, pixels
 
 
 def _is_one_to_one(x: F32, y: F32) -> NDArray[np.bool_]:
-    """A distortion polynomial beyond the picture that it was fitted to may turn back; there the map mirrors the picture."""
+    """A distortion polynomial beyond the picture that it was fitted to may turn back; there the map
+    mirrors the picture.
+    """
     forward: NDArray[np.bool_] = (np.gradient(x, axis=1) > 0) & (np.gradient(y, axis=0) > 0)
     return forward

@@ -1,4 +1,6 @@
-"""One LIDAR published twice, as measured and filtered: found by points that are the same, whatever the topics are called."""
+"""One LIDAR published twice, as measured and filtered: found by points that are the same, whatever
+the topics are called.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from semloc_logs.frames import F32
 _REMEMBERED = 4  # clouds of all topics that a new one is compared with
 _TRIES = 8  # comparisons of two topics before they count as two sensors
 _SAMPLE = 300
-_SAME = 2e-3  # m; two sensors do not measure the same point so closely, a filter passes it on unchanged
+# m; two sensors do not measure the same point so closely, a filter passes it on unchanged
+_SAME = 2e-3
 _SHARE = 0.2  # of the points are the same; a voxel filter moves those of full cells
 _NEAR_NS = 500_000_000
 
@@ -26,7 +29,9 @@ class Copies:
         self._tries: dict[tuple[str, str], int] = {}
 
     def is_copy(self, topic: str, stamp_ns: int, points: F32) -> bool:
-        """Whether ``topic`` is known to be a copy, after a look at ``points`` (n, 3): a cloud of it in the base frame."""
+        """Whether ``topic`` is known to be a copy, after a look at ``points`` (n, 3): a cloud of it
+        in the base frame.
+        """
         if topic in self.original:
             return True
         for other, stamp, theirs in self._newest:
@@ -52,5 +57,7 @@ def _shares_points(a: F32, b: F32) -> bool:
     few, many = (a, b) if len(a) <= len(b) else (b, a)
     if len(few) < 10:
         return False
-    distance, _ = cKDTree(many).query(few[:: max(1, len(few) // _SAMPLE)], distance_upper_bound=_SAME)
+    distance, _ = cKDTree(many).query(
+        few[:: max(1, len(few) // _SAMPLE)], distance_upper_bound=_SAME
+    )
     return float(np.mean(np.isfinite(distance))) > _SHARE

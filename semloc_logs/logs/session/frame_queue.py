@@ -1,4 +1,6 @@
-"""Range frames that wait for their poses and transforms, in the order of recording and in bounded memory."""
+"""Range frames that wait for their poses and transforms, in the order of recording and in bounded
+memory.
+"""
 
 from __future__ import annotations
 
@@ -36,27 +38,39 @@ class WaitingFrames:
 
     def add(self, frame: RangeFrame) -> None:
         """The next frame of the recording."""
-        is_set_back = not self._order.setdefault(frame.header.topic, StampOrder()).accepts(frame.header.stamp_ns)
+        is_set_back = not self._order.setdefault(frame.header.topic, StampOrder()).accepts(
+            frame.header.stamp_ns
+        )
         self._frames.append((frame, is_set_back))
         self.nbytes += _size(frame)
 
     def pop(self) -> tuple[RangeFrame, bool]:
-        """Takes the first frame out, and whether its stamp falls back behind those of earlier frames of its topic."""
+        """Takes the first frame out, and whether its stamp falls back behind those of earlier
+        frames of its topic.
+        """
         frame, is_set_back = self._frames.popleft()
         self.nbytes -= _size(frame)
         return frame, is_set_back
 
     def sensors(self, pose_topic: str | None) -> list[str]:
-        """Their frame ids, first those of topics that share the namespace of the pose stream: a pose without child frame is theirs."""
+        """Their frame ids, first those of topics that share the namespace of the pose stream: a
+        pose without child frame is theirs.
+        """
         own = (pose_topic or "").strip("/").split("/")[:-1]
 
         def importance(frame: RangeFrame) -> int:
             return 0 if own and frame.header.topic.strip("/").split("/")[: len(own)] == own else 1
 
-        return list(dict.fromkeys(f.header.frame_id for f in sorted((f for f, _ in self._frames), key=importance)))
+        return list(
+            dict.fromkeys(
+                f.header.frame_id for f in sorted((f for f, _ in self._frames), key=importance)
+            )
+        )
 
 
 def _size(frame: RangeFrame) -> int:
     if isinstance(frame, LidarFrame):
-        return frame.points.nbytes + sum(a.nbytes for a in (frame.label, frame.offset_ns, frame.ring) if a is not None)
+        return frame.points.nbytes + sum(
+            a.nbytes for a in (frame.label, frame.offset_ns, frame.ring) if a is not None
+        )
     return frame.depth.nbytes if isinstance(frame, DepthFrame) else frame.image.nbytes

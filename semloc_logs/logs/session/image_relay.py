@@ -19,7 +19,9 @@ class ShownPictures:
 
     def __init__(self, on_image: OnImage | None = None, topics: Collection[str] = ()) -> None:
         self._on_image = on_image
-        self._stamps: dict[str, deque[int]] = {topic: deque(maxlen=4 * MAX_WAITING) for topic in sorted(topics)} if on_image else {}
+        self._stamps: dict[str, deque[int]] = (
+            {topic: deque(maxlen=4 * MAX_WAITING) for topic in sorted(topics)} if on_image else {}
+        )
 
     @property
     def topics(self) -> list[str]:
@@ -32,10 +34,17 @@ class ShownPictures:
         if self._on_image is None or topic not in self._stamps:
             return
         self._stamps[topic].append(frame.header.stamp_ns)
-        if isinstance(frame, DepthFrame):  # labels in 16 bits that were decoded as if they were depth
-            frame = ImageFrame(frame.header, np.minimum(label_ids(frame), 0xFFFF).astype(np.uint16), "mono16")
+        # labels in 16 bits that were decoded as if they were depth
+        if isinstance(frame, DepthFrame):
+            frame = ImageFrame(
+                frame.header, np.minimum(label_ids(frame), 0xFFFF).astype(np.uint16), "mono16"
+            )
         self._on_image(frame)
 
     def following(self, stamp_ns: int) -> list[int | None]:
-        """For each topic the stamp (ns) of the first picture that is not earlier; None where it has yet to come."""
-        return [next((s for s in stamps if s >= stamp_ns), None) for stamps in self._stamps.values()]
+        """For each topic the stamp (ns) of the first picture that is not earlier; None where it has
+        yet to come.
+        """
+        return [
+            next((s for s in stamps if s >= stamp_ns), None) for stamps in self._stamps.values()
+        ]

@@ -1,7 +1,9 @@
-"""What is in a log, at a glance: streams and their roles, calibration, pose coverage, and what stands in the way of using it.
+"""What is in a log, at a glance: streams and their roles, calibration, pose coverage, and what
+stands in the way of using it.
 
-One pass counts all messages and decodes the small ones (poses, transforms, calibrations). Clouds and pictures stay undecoded, apart
-from the first of each range sensor, whose frame decides the base frame.
+One pass counts all messages and decodes the small ones (poses, transforms, calibrations). Clouds
+and pictures stay undecoded, apart from the first of each range sensor, whose frame decides the base
+frame.
 """
 
 from __future__ import annotations
@@ -11,7 +13,17 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from semloc_logs.errors import LogError
-from semloc_logs.frames import Camera, DepthFrame, Frame, ImageFrame, ImuSample, LidarFrame, NavSatSample, PoseSample, TransformSample
+from semloc_logs.frames import (
+    Camera,
+    DepthFrame,
+    Frame,
+    ImageFrame,
+    ImuSample,
+    LidarFrame,
+    NavSatSample,
+    PoseSample,
+    TransformSample,
+)
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log, Message
 from semloc_logs.logs.messages.decode import Decoder
@@ -25,15 +37,18 @@ from semloc_logs.logs.sensors.stereo_pairs import is_rectified
 from semloc_logs.logs.session.tally import never_moves, no_poses, span, without_unused
 
 _TRIES = 5  # messages of a range sensor that are decoded in search of a good one
-_OTHER_CLOCK_NS = 60_000_000_000  # a sensor that starts so far outside of the poses has another clock
+# a sensor that starts so far outside of the poses has another clock
+_OTHER_CLOCK_NS = 60_000_000_000
 
 
 def inspect_log(path: str | Path, topics: Mapping[str, str] | None = None) -> dict[str, object]:
     """The answer of ``semloc inspect --json`` for one log; ``topics`` overrules roles.
 
-    Keys: ``path``, ``format``, ``encoding``, ``start_ns``, ``end_ns``, ``duration_s``, ``streams`` (topic, type, role, count as found),
-    ``problems`` (sentences), ``skipped`` (those of them that are about lost data), ``base_frame``, ``session_frame``, ``poses``,
-    ``cameras``, ``sensors``, ``frames`` (of the TF tree). LogError when it is no log, RoleError when an override is impossible.
+    Keys: ``path``, ``format``, ``encoding``, ``start_ns``, ``end_ns``, ``duration_s``, ``streams``
+    (topic, type, role, count as found), ``problems`` (sentences), ``skipped`` (those of them that
+    are about lost data), ``base_frame``, ``session_frame``, ``poses``, ``cameras``, ``sensors``,
+    ``frames`` (of the TF tree). LogError when it is no log, RoleError when an override is
+    impossible.
     """
     log = open_log(path)
     try:
@@ -47,7 +62,9 @@ class _Inspection:
         self.log = log
         self.roles = guess_roles(log.streams, topics)
         navsat = navsat_poses(self.roles, log.streams)
-        self.where = BasePoses(self.roles, 0, navsat if self.roles.pose is not None else None, navsat)
+        self.where = BasePoses(
+            self.roles, 0, navsat if self.roles.pose is not None else None, navsat
+        )
         self._makes_poses = navsat is not None
         self.cameras: dict[str, Camera] = {}
         self.first: dict[str, LidarFrame | DepthFrame | ImageFrame] = {}
@@ -58,7 +75,8 @@ class _Inspection:
         self._undecodable = Problems()
         self._decoder = Decoder(self._undecodable)
         self._pass()
-        right = self.first.pop(self.roles.stereo_right or "", None)  # says nothing about the base frame
+        # says nothing about the base frame
+        right = self.first.pop(self.roles.stereo_right or "", None)
         self.right = right if isinstance(right, ImageFrame) else None
         sensors = list(dict.fromkeys(frame.header.frame_id for frame in self.first.values()))
         self.where.settle(sensors, is_patient=False, must=True)
@@ -73,7 +91,11 @@ class _Inspection:
         for message in self.log.messages():
             topic = message.topic
             self.counts[topic, message.type, message.encoding] += 1
-            if topic in small or (topic in ranged and topic not in self.first) or (topic == roles.imu and self.imu_frame is None):
+            if (
+                topic in small
+                or (topic in ranged and topic not in self.first)
+                or (topic == roles.imu and self.imu_frame is None)
+            ):
                 self._look_at(message, is_large=topic in ranged)
 
     def _look_at(self, message: Message, *, is_large: bool) -> None:
@@ -99,10 +121,16 @@ class _Inspection:
             self.first[frame.header.topic] = frame
 
     def to_json(self) -> dict[str, object]:
-        log, base = self.log, self.where.base
+        log = self.log
+        base = self.where.base
         is_timed = log.start_ns is not None and log.end_ns is not None
         streams = [
-            {"topic": s.topic, "type": s.type, "role": self.roles.role_of(s.topic), "count": self.counts[s.topic, s.type, s.encoding]}
+            {
+                "topic": s.topic,
+                "type": s.type,
+                "role": self.roles.role_of(s.topic),
+                "count": self.counts[s.topic, s.type, s.encoding],
+            }
             for s in log.streams
         ]
         return {
@@ -111,10 +139,20 @@ class _Inspection:
             "encoding": log.encoding,
             "start_ns": log.start_ns,
             "end_ns": log.end_ns,
-            "duration_s": round(((log.end_ns or 0) - (log.start_ns or 0)) * 1e-9, 3) if is_timed else 0.0,
+            "duration_s": round(((log.end_ns or 0) - (log.start_ns or 0)) * 1e-9, 3)
+            if is_timed
+            else 0.0,
             "streams": streams,
             "problems": list(
-                dict.fromkeys([*self._skipped(), *self._obstacles(), *log.problems, *self.roles.notes, *(base.notes if base else ())])
+                dict.fromkeys(
+                    [
+                        *self._skipped(),
+                        *self._obstacles(),
+                        *log.problems,
+                        *self.roles.notes,
+                        *(base.notes if base else ()),
+                    ]
+                )
             ),
             "skipped": self._skipped(),
             "base_frame": base.name if base else "",
@@ -131,12 +169,15 @@ class _Inspection:
         for s in self.log.streams:
             found = self.counts[s.topic, s.type, s.encoding]
             if found < s.count:
-                skipped.append(f"{s.topic}: only {found} of {s.count} messages can be read; what the others held is lost.")
+                skipped.append(
+                    f"{s.topic}: only {found} of {s.count} messages can be read; what the others held is lost."
+                )
         return list(dict.fromkeys(skipped))
 
     def _obstacles(self) -> list[str]:
         """What keeps the log from being fused, or only part of it."""
-        roles, told = self.roles, list(self.roles.problems)
+        roles = self.roles
+        told = list(self.roles.problems)
         if not self.counts:
             return [f"{self.log.path.name} holds no messages."]
         if not roles.ranging:
@@ -144,7 +185,9 @@ class _Inspection:
         if not len(self.where.track) and not roles.problems:
             told.append(no_poses(self.log.path.name))
         for topic, count in sorted(self.empty.items()):
-            told.append(f"{topic}: no point with a position in the first {count} cloud{'s' if count > 1 else ''}.")
+            told.append(
+                f"{topic}: no point with a position in the first {count} cloud{'s' if count > 1 else ''}."
+            )
         for topic in roles.depth:
             told.extend(self._depth_obstacles(topic))
         told.extend(self._stereo_obstacles())
@@ -152,9 +195,12 @@ class _Inspection:
         return told
 
     def _depth_obstacles(self, topic: str) -> list[str]:
-        info, frame = self.roles.info_of.get(topic), self.first.get(topic)
+        info = self.roles.info_of.get(topic)
+        frame = self.first.get(topic)
         if info is None or info not in self.cameras:
-            return [f"{topic} has no CameraInfo: it cannot become points; record it, or name it with --topic camera_info=TOPIC."]
+            return [
+                f"{topic} has no CameraInfo: it cannot become points; record it, or name it with --topic camera_info=TOPIC."
+            ]
         if isinstance(frame, DepthFrame):
             try:
                 Unprojector(self.cameras[info], *frame.depth.shape, rectified="rect" in topic)
@@ -174,36 +220,66 @@ class _Inspection:
             if camera is None
         ]
         left, (left_camera, right_camera) = self.first.get(pair[0]), cameras.values()
-        if left_camera is None or right_camera is None or not isinstance(left, ImageFrame) or self.right is None:
+        if (
+            left_camera is None
+            or right_camera is None
+            or not isinstance(left, ImageFrame)
+            or self.right is None
+        ):
             return told
         if left.image.shape[:2] != self.right.image.shape[:2]:
-            sizes = " and ".join(f"{i.shape[1]} x {i.shape[0]}" for i in (left.image, self.right.image))
-            return [f"{pair[0]}, {pair[1]} have pictures of {sizes} pixels: a stereo pair needs the same size."]
-        right_T_left = self.where.tree.lookup(self.right.header.frame_id, left.header.frame_id, left.header.stamp_ns)
+            sizes = " and ".join(
+                f"{i.shape[1]} x {i.shape[0]}" for i in (left.image, self.right.image)
+            )
+            return [
+                f"{pair[0]}, {pair[1]} have pictures of {sizes} pixels: a stereo pair needs the same size."
+            ]
+        right_T_left = self.where.tree.lookup(
+            self.right.header.frame_id, left.header.frame_id, left.header.stamp_ns
+        )
         try:
-            rectification(left_camera, right_camera, left.image.shape[:2], right_T_left, rectified=is_rectified(roles))
+            rectification(
+                left_camera,
+                right_camera,
+                left.image.shape[:2],
+                right_T_left,
+                rectified=is_rectified(roles),
+            )
         except LogError as error:
             told.append(str(error))
         return told
 
     def _pose_obstacles(self) -> list[str]:
-        track, base = self.where.track, self.where.base
+        track = self.where.track
+        base = self.where.base
         source = self.where.source
         told = [*source.problems, *source.notes] if source else []
         told += never_moves(source.name if source else self.roles.pose or "TF", track)
         if gaps := track.gaps():
             longest = max(gaps, key=lambda gap: gap[1] - gap[0])
             count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
-            told.append(f"The poses have {count} from {span(*longest)}: frames in it get no pose and are left out.")
+            told.append(
+                f"The poses have {count} from {span(*longest)}: frames in it get no pose and are left out."
+            )
         for topic, frame in self.first.items():
-            stamp_ns, frame_id = frame.header.stamp_ns, frame.header.frame_id
-            if base is not None and not self.where.tree.connected(base.name, frame_id) and base.assumed != frame_id.lstrip("/"):
+            stamp_ns = frame.header.stamp_ns
+            frame_id = frame.header.frame_id
+            if (
+                base is not None
+                and not self.where.tree.connected(base.name, frame_id)
+                and base.assumed != frame_id.lstrip("/")
+            ):
                 told.append(
                     f"No transform leads from '{frame_id}', the frame of {topic}, to the base frame '{base.name}': "
                     f"its frames are left out; record /tf_static."
                 )
-            start_ns, end_ns = track.start_ns, track.end_ns
-            if start_ns is not None and end_ns is not None and not start_ns - _OTHER_CLOCK_NS < stamp_ns < end_ns + _OTHER_CLOCK_NS:
+            start_ns = track.start_ns
+            end_ns = track.end_ns
+            if (
+                start_ns is not None
+                and end_ns is not None
+                and not start_ns - _OTHER_CLOCK_NS < stamp_ns < end_ns + _OTHER_CLOCK_NS
+            ):
                 told.append(
                     f"{topic} starts at {span(stamp_ns, stamp_ns)} but the poses cover {span(start_ns, end_ns)}: "
                     f"their header stamps come from different clocks; record both with the same."
@@ -217,7 +293,11 @@ class _Inspection:
             "base_T_sensor": None if base_T_sensor is None else base_T_sensor.tolist(),
         }
         if isinstance(frame, LidarFrame):
-            return told | {"points": len(frame.points), "labels": frame.label is not None, "point_times": frame.offset_ns is not None}
+            return told | {
+                "points": len(frame.points),
+                "labels": frame.label is not None,
+                "point_times": frame.offset_ns is not None,
+            }
         height, width = (frame.depth if isinstance(frame, DepthFrame) else frame.image).shape[:2]
         return told | {"width": width, "height": height}
 

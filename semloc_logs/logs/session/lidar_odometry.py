@@ -1,6 +1,8 @@
-"""LIDAR odometry for logs without usable poses: KISS-ICP (Vizzo et al., RA-L 2023), the extra ``odometry``.
+"""LIDAR odometry for logs without usable poses: KISS-ICP (Vizzo et al., RA-L 2023), the extra
+``odometry``.
 
-Every sweep of one LIDAR is registered, in the pass that reads the log. The trajectory begins at the identity of the base frame.
+Every sweep of one LIDAR is registered, in the pass that reads the log. The trajectory begins at the
+identity of the base frame.
 """
 
 from __future__ import annotations
@@ -20,13 +22,16 @@ from semloc_logs.logs.session.tally import span
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 
 MAX_SPEED = 100.0  # m/s; nothing on wheels is faster
-MAX_SPEED_CHANGE = 12.0  # m/s from one sweep to the next beyond what 30 m/s^2 explain: no brake and no crash survivor does that
+# m/s from one sweep to the next beyond what 30 m/s^2 explain: no brake and no crash survivor does
+# that
+MAX_SPEED_CHANGE = 12.0
 _MAX_ACCELERATION = 30.0  # m/s^2
 MAX_TURN = 10.0  # rad/s
 _FEWEST = 100  # points of a sweep that can be registered
 _VOXELS_PER_RANGE = 100.0  # KISS-ICP's own choice: the map's voxels are a hundredth of the range
 _LONGEST_RANGE = 100.0  # m; its default
-# A sweep lies on the one before it: in a hall 0.67 to 0.9 of its points, on a street 0.76 and more, 0.25 to 0.45 once track is lost
+# A sweep lies on the one before it: in a hall 0.67 to 0.9 of its points, on a street 0.76 and more,
+# 0.25 to 0.45 once track is lost
 LEAST_OVERLAP = 0.6  # of the median overlap so far
 _MOST_COMPARED = 20_000  # points of the sweep before
 
@@ -34,8 +39,9 @@ _MOST_COMPARED = 20_000  # points of the sweep before
 class LidarOdometry:
     """Poses of the LIDAR on ``topic`` from its sweeps. LogError when KISS-ICP is not installed.
 
-    ``max_range`` and ``min_range`` (m): points that are used. After a jump that no vehicle can make, or once a sweep does not lie on the
-    one before any more, there are no more poses, and ``problems`` says so. Slow drift goes unnoticed.
+    ``max_range`` and ``min_range`` (m): points that are used. After a jump that no vehicle can
+    make, or once a sweep does not lie on the one before any more, there are no more poses, and
+    ``problems`` says so. Slow drift goes unnoticed.
     """
 
     name = "LIDAR odometry"
@@ -48,7 +54,9 @@ class LidarOdometry:
         self.notes: list[str] = []
         self.is_over = False
         self._voxel = min(max_range, _LONGEST_RANGE) / _VOXELS_PER_RANGE
-        self._engine, self._version = _kiss_icp(min_range, min(max_range, _LONGEST_RANGE), self._voxel)
+        self._engine, self._version = _kiss_icp(
+            min_range, min(max_range, _LONGEST_RANGE), self._voxel
+        )
         self._before: cKDTree | None = None  # the sweep before
         self._overlaps: list[float] = []
         self._start: F64 | None = None  # base_T_sensor of the first sweep
@@ -71,7 +79,9 @@ class LidarOdometry:
             return
         whole, some = self._engine.register_frame(frame.points.astype(np.float64), offsets)
         pose = np.array(self._engine.last_pose, float)
-        if self._last is not None and (self._is_jump(stamp_ns, pose) or self._is_apart(pose, np.asarray(some))):
+        if self._last is not None and (
+            self._is_jump(stamp_ns, pose) or self._is_apart(pose, np.asarray(some))
+        ):
             self.is_over = True
             self.problems.append(
                 f"LIDAR odometry lost track at {span(stamp_ns, stamp_ns).split(' to ')[0]}: frames after that are left out; "
@@ -79,7 +89,8 @@ class LidarOdometry:
             )
             return
         if self._count == 1 and self._last is not None and len(offsets):
-            # the first sweep was measured on the way to its pose: the same motion as in the next step leads there
+            # the first sweep was measured on the way to its pose: the same motion as in the next
+            # step leads there
             first_ns, first = self._last
             self._new.insert(0, (2 * first_ns - stamp_ns, first @ inverse(pose) @ first))
         self._new.append((stamp_ns, pose))
@@ -88,13 +99,16 @@ class LidarOdometry:
         self._count += 1
 
     def poses(self, base_T: Callable[[str, int], F64 | None]) -> Iterator[tuple[int, F64]]:
-        """Stamps and ``session_T_sensor`` that are new since the last call; the first waits for the second."""
+        """Stamps and ``session_T_sensor`` that are new since the last call; the first waits for the
+        second.
+        """
         if self._count < 2 and not self.is_over:
             return
         if self._start is None and self._new and self.child is not None:
             known = base_T(self.child, self._new[0][0])
             self._start = np.eye(4) if known is None else known
-        ready, self._new = self._new, []
+        ready = self._new
+        self._new = []
         for stamp_ns, pose in ready:
             yield stamp_ns, (np.eye(4) if self._start is None else self._start) @ pose
 
@@ -102,11 +116,18 @@ class LidarOdometry:
         """No more sweeps will come: a single one has the identity as its pose."""
         self.is_over = True
         if self._poor:
-            self.problems.append(f"{self.topic}: {self._poor} sweeps are too sparse or out of order for LIDAR odometry and were left out.")
+            self.problems.append(
+                f"{self.topic}: {self._poor} sweeps are too sparse or out of order for LIDAR odometry and were left out."
+            )
 
     def to_json(self) -> dict[str, object]:
         """For session.json."""
-        return {"kind": "lidar_odometry", "topic": self.topic, "sweeps": self._count, "kiss_icp": self._version}
+        return {
+            "kind": "lidar_odometry",
+            "topic": self.topic,
+            "sweeps": self._count,
+            "kiss_icp": self._version,
+        }
 
     def _is_jump(self, stamp_ns: int, pose: F64) -> bool:
         """Whether the step to ``pose`` is none that a vehicle can make."""
@@ -115,16 +136,23 @@ class LidarOdometry:
         seconds = (stamp_ns - self._last[0]) * 1e-9
         step = inverse(self._last[1]) @ pose
         speed = step[:3, 3] / seconds
-        before, self._speed = self._speed, speed
+        before = self._speed
+        self._speed = speed
         if np.linalg.norm(speed) > MAX_SPEED or rotation_angle(step[:3, :3]) / seconds > MAX_TURN:
             return True
-        return before is not None and bool(np.linalg.norm(speed - before) > MAX_SPEED_CHANGE + _MAX_ACCELERATION * seconds)
+        return before is not None and bool(
+            np.linalg.norm(speed - before) > MAX_SPEED_CHANGE + _MAX_ACCELERATION * seconds
+        )
 
     def _is_apart(self, pose: F64, points: F64) -> bool:
-        """Whether ``points`` (n, 3) of the newest sweep at ``pose`` lie on fewer of the sweep before than sweeps have done so far."""
+        """Whether ``points`` (n, 3) of the newest sweep at ``pose`` lie on fewer of the sweep
+        before than sweeps have done so far.
+        """
         if self._last is None or self._before is None or not len(points):
             return False
-        near, _ = self._before.query(apply(inverse(self._last[1]) @ pose, points), distance_upper_bound=self._voxel / 2)
+        near, _ = self._before.query(
+            apply(inverse(self._last[1]) @ pose, points), distance_upper_bound=self._voxel / 2
+        )
         overlap = float(np.isfinite(near).mean())
         usual = float(np.median(self._overlaps)) if self._overlaps else overlap
         self._overlaps.append(overlap)
@@ -132,18 +160,23 @@ class LidarOdometry:
 
 
 def _pose_time(frame: LidarFrame) -> tuple[int, F64]:
-    """When KISS-ICP's pose is, and point times from 0 to 1: it moves the points of a sweep to the time of the last one."""
+    """When KISS-ICP's pose is, and point times from 0 to 1: it moves the points of a sweep to the
+    time of the last one.
+    """
     offset_ns = frame.offset_ns
     if offset_ns is None or not len(offset_ns):
         return frame.header.stamp_ns, np.zeros(0)
-    first, last = int(offset_ns.min()), int(offset_ns.max())
+    first = int(offset_ns.min())
+    last = int(offset_ns.max())
     if not 0 < last - first <= LONGEST_SWEEP_NS or abs(last) > LONGEST_SWEEP_NS:
         return frame.header.stamp_ns, np.zeros(0)
     return frame.header.stamp_ns + last, (offset_ns - first) / (last - first)
 
 
 def _kiss_icp(min_range: float, max_range: float, voxel_size: float) -> tuple[Any, str]:
-    """An odometry and the version of the library. One thread, because more of them sum in another order each time."""
+    """An odometry and the version of the library. One thread, because more of them sum in another
+    order each time.
+    """
     try:
         version = str(import_module("kiss_icp").__version__)
         config = import_module("kiss_icp.config.config")

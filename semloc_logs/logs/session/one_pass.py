@@ -1,4 +1,6 @@
-"""One pass over the frames of a session: what is learned on the way, and the clouds that come of it."""
+"""One pass over the frames of a session: what is learned on the way, and the clouds that come of
+it.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +31,20 @@ _TF_PATIENCE = 16  # frames to wait for a better pose edge in TF than one that i
 
 
 class CloudPass:
-    """All that is known as far as the pass has come: ``where`` the vehicle is, ``tally`` of frames, ``meanings`` of labels by topic.
+    """All that is known as far as the pass has come: ``where`` the vehicle is, ``tally`` of frames,
+    ``meanings`` of labels by topic.
 
     ``made`` makes the clouds, ``shown`` are the pictures to be handed on.
     """
 
-    def __init__(self, roles: Roles, where: BasePoses, pictures: PictureClouds, made: BaseClouds, shown: ShownPictures) -> None:
+    def __init__(
+        self,
+        roles: Roles,
+        where: BasePoses,
+        pictures: PictureClouds,
+        made: BaseClouds,
+        shown: ShownPictures,
+    ) -> None:
         self.where = where
         self.pictures = pictures
         self.made = made
@@ -49,9 +59,25 @@ class CloudPass:
     def topics(self) -> set[str]:
         """What has to be decoded."""
         roles = self._roles
-        topics = {*roles.ranging, *roles.topics("stereo_right"), *roles.label_of.values(), *roles.tf, *roles.tf_static}
-        topics |= {roles.info_of[t] for t in (*topics, *roles.image, *roles.label_image) if t in roles.info_of}
-        return topics | {*roles.topics("pose"), *roles.topics("imu"), *roles.topics("gnss"), *roles.label_info, *self._shown.topics}
+        topics = {
+            *roles.ranging,
+            *roles.topics("stereo_right"),
+            *roles.label_of.values(),
+            *roles.tf,
+            *roles.tf_static,
+        }
+        topics |= {
+            roles.info_of[t]
+            for t in (*topics, *roles.image, *roles.label_image)
+            if t in roles.info_of
+        }
+        return topics | {
+            *roles.topics("pose"),
+            *roles.topics("imu"),
+            *roles.topics("gnss"),
+            *roles.label_info,
+            *self._shown.topics,
+        }
 
     def clouds(self, frames: Iterable[Frame]) -> Iterator[PosedCloud]:
         """The clouds of all ``frames``, given in the order of recording."""
@@ -113,15 +139,23 @@ class CloudPass:
                 yield cloud
 
     def _has_all(self, frame: RangeFrame) -> bool:
-        stamp_ns, where = frame.header.stamp_ns, self.where
-        if any(self._roles.info_of.get(t) not in {None, *self.pictures.cameras} for t in self._shown.topics):
+        stamp_ns = frame.header.stamp_ns
+        where = self.where
+        if any(
+            self._roles.info_of.get(t) not in {None, *self.pictures.cameras}
+            for t in self._shown.topics
+        ):
             return False
         # poses have to reach the first picture that is not earlier
-        if not all(s is not None and where.poses_have_passed(s) for s in self._shown.following(stamp_ns)):
+        if not all(
+            s is not None and where.poses_have_passed(s) for s in self._shown.following(stamp_ns)
+        ):
             return False
         if not isinstance(frame, LidarFrame) and not self.pictures.has_all(frame):
             return False
-        return where.poses_have_passed(stamp_ns + _sweep_ns(frame)) and where.transforms_have_passed(frame.header.frame_id, stamp_ns)
+        return where.poses_have_passed(
+            stamp_ns + _sweep_ns(frame)
+        ) and where.transforms_have_passed(frame.header.frame_id, stamp_ns)
 
 
 def _sweep_ns(frame: RangeFrame) -> int:

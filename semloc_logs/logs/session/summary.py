@@ -17,9 +17,13 @@ class Conclusion:
 
 
 def conclude(done: CloudPass, session: str, pose_topic: str | None) -> Conclusion:
-    """The sentences on a pass that is over; ``session`` and ``pose_topic`` are what they call it and its poses."""
-    where, made = done.where, done.made
-    track, source = where.track, where.source
+    """The sentences on a pass that is over; ``session`` and ``pose_topic`` are what they call it
+    and its poses.
+    """
+    where = done.where
+    made = done.made
+    track = where.track
+    source = where.source
     lost = done.tally.sentences((track.start_ns, track.end_ns))
     notes = done.tally.remarks()
     if made.copies is not None:
@@ -31,7 +35,9 @@ def conclude(done: CloudPass, session: str, pose_topic: str | None) -> Conclusio
         notes += source.notes
     name = source.name if source else pose_topic or "TF"
     # every publisher of TF may repeat what others said: nothing is lost by that
-    (notes if name == "TF" and not track.backwards + track.ahead else lost).extend(refused(name, track))
+    (notes if name == "TF" and not track.backwards + track.ahead else lost).extend(
+        refused(name, track)
+    )
     if made.standstill.shift and not track.moves:
         lost.append(smeared(name, made.standstill.shift))
     else:

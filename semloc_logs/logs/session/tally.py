@@ -9,7 +9,8 @@ from datetime import UTC, datetime
 from semloc_logs.frames import LidarFrame
 from semloc_logs.logs.poses.track import PoseTrack
 
-_STANDSTILL_NS = 10_000_000_000  # a vehicle may well stand so long, but a log of nothing else is worth a sentence
+# a vehicle may well stand so long, but a log of nothing else is worth a sentence
+_STANDSTILL_NS = 10_000_000_000
 COPY = "copy"  # nothing is lost with the frames of a topic that repeats another's
 BACK_IN_TIME = "back in time"
 _WHY = {
@@ -66,23 +67,34 @@ class Tally:
 
     def remarks(self) -> list[str]:
         """One sentence for each topic and remark on its sweeps: what was assumed, nothing was lost."""
-        return [f"{topic}: {count} of {self.seen[topic]} {_REMARKS[key]}." for (topic, key), count in sorted(self._remarks.items())]
+        return [
+            f"{topic}: {count} of {self.seen[topic]} {_REMARKS[key]}."
+            for (topic, key), count in sorted(self._remarks.items())
+        ]
 
     def left_out(self, topic: str) -> dict[str, int]:
         """Reason -> frames of ``topic``."""
-        return {reason: count for (t, reason), count in sorted(self._left_out.items()) if t == topic}
+        return {
+            reason: count for (t, reason), count in sorted(self._left_out.items()) if t == topic
+        }
 
     def sentences(self, poses: tuple[int | None, int | None]) -> list[str]:
-        """One sentence for each topic and reason; ``poses``: the first and last stamp of the pose stream."""
+        """One sentence for each topic and reason; ``poses``: the first and last stamp of the pose
+        stream.
+        """
         told = []
         for (topic, reason), count in sorted(self._left_out.items()):
             if reason == COPY:
                 continue
             spans = f"frames {span(*self._spans[topic])}, poses {span(*poses)}"
-            told.append(f"{topic}: {count} of {self.seen[topic]} frames are left out: {_WHY[reason].format(spans=spans)}.")
+            told.append(
+                f"{topic}: {count} of {self.seen[topic]} frames are left out: {_WHY[reason].format(spans=spans)}."
+            )
         for topic, count in sorted((+self._lost_points).items()):
             of = f"{count} of {self._points[topic]} points"
-            told.append(f"{topic}: {of} are left out: they are not finite, although their clouds call themselves dense.")
+            told.append(
+                f"{topic}: {of} are left out: they are not finite, although their clouds call themselves dense."
+            )
         return told
 
 
@@ -96,13 +108,19 @@ def no_poses(name: str) -> str:
 
 def refused(topic: str, track: PoseTrack) -> list[str]:
     """A sentence about poses whose stamps make no sense. Empty when all is well."""
-    kinds = ((track.duplicates, "repeated"), (track.backwards, "back in time"), (track.ahead, "far ahead in time"))
+    kinds = (
+        (track.duplicates, "repeated"),
+        (track.backwards, "back in time"),
+        (track.ahead, "far ahead in time"),
+    )
     counts = [f"{count} {what}" for count, what in kinds if count]
     return [f"{topic}: poses that are {' and '.join(counts)} were left out."] if counts else []
 
 
 def smeared(topic: str, shift: float) -> str:
-    """What follows from poses that stand still while the surroundings move by ``shift`` metres or more."""
+    """What follows from poses that stand still while the surroundings move by ``shift`` metres or
+    more.
+    """
     return (
         f"{topic} gives the same position all the time, but the surroundings move by {shift:.1f} m or more: its poses, and what is mapped "
         f"with them, are wrong; use --odometry lidar, give poses with --poses FILE, or name a topic with --topic pose=TOPIC."
@@ -110,16 +128,28 @@ def smeared(topic: str, shift: float) -> str:
 
 
 def never_moves(topic: str, track: PoseTrack) -> list[str]:
-    """A sentence about a pose stream whose position is constant: odometry that was never filled in. Empty when all is well."""
-    start_ns, end_ns = track.start_ns, track.end_ns
-    if start_ns is None or end_ns is None or end_ns - start_ns < _STANDSTILL_NS or track.length() > 0.0:
+    """A sentence about a pose stream whose position is constant: odometry that was never filled in.
+    Empty when all is well.
+    """
+    start_ns = track.start_ns
+    end_ns = track.end_ns
+    if (
+        start_ns is None
+        or end_ns is None
+        or end_ns - start_ns < _STANDSTILL_NS
+        or track.length() > 0.0
+    ):
         return []
     seconds = (end_ns - start_ns) * 1e-9
-    return [f"{topic} gives the same position for {seconds:.0f} s: name another with --topic pose=TOPIC if the vehicle moved."]
+    return [
+        f"{topic} gives the same position for {seconds:.0f} s: name another with --topic pose=TOPIC if the vehicle moved."
+    ]
 
 
 def without_unused(problems: Sequence[str], unused: Collection[str]) -> list[str]:
-    """The problems of a log apart from those of topics that nobody asks for: they begin with the topic's name."""
+    """The problems of a log apart from those of topics that nobody asks for: they begin with the
+    topic's name.
+    """
     return [p for p in problems if p.partition(": ")[0] not in unused]
 
 
@@ -130,6 +160,8 @@ def span(start_ns: int | None, end_ns: int | None) -> str:
 
 def _time(stamp_ns: int) -> str:
     try:
-        return datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+        return (
+            datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+        )
     except (OverflowError, ValueError, OSError):
         return f"{stamp_ns} ns"

@@ -1,4 +1,6 @@
-"""What the cameras of a vehicle record while it drives through a world: pairs of pictures, or pictures with depth, and label images."""
+"""What the cameras of a vehicle record while it drives through a world: pairs of pictures, or
+pictures with depth, and label images.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,15 @@ from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drives.traffic import Traffic
 from semloc_logs.simulation.drives.trajectory import Trajectory
 from semloc_logs.simulation.meshes.world import F64, Scene, World
-from semloc_logs.simulation.sensors.camera import CAMERAS, CameraModel, Hits, base_T_camera, first_hits, measure, pixel_rays
+from semloc_logs.simulation.sensors.camera import (
+    CAMERAS,
+    CameraModel,
+    Hits,
+    base_T_camera,
+    first_hits,
+    measure,
+    pixel_rays,
+)
 from semloc_logs.simulation.sensors.label_errors import corrupt_labels
 from semloc_logs.simulation.sensors.rendered_images import Painter
 
@@ -26,8 +36,10 @@ _SHIFT = 2.0  # px by which masks miss edges at a share of 0.1 of wrong labels
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraShot:
-    """What the cameras record at ``stamp_ns``: RGB pictures (h, w, 3) of the left or only camera and of the right one, which sits
-    ``model.baseline`` further right, or depth (h, w) in metres with 0 for holes; ``labels`` (h, w) Cityscapes train ids of the left."""
+    """What the cameras record at ``stamp_ns``: RGB pictures (h, w, 3) of the left or only camera
+    and of the right one, which sits ``model.baseline`` further right, or depth (h, w) in metres
+    with 0 for holes; ``labels`` (h, w) Cityscapes train ids of the left.
+    """
 
     stamp_ns: int
     model: CameraModel
@@ -49,12 +61,16 @@ def simulate_cameras(
     traffic: Traffic | None = None,
     label_noise: float = 0.0,
 ) -> Iterator[CameraShot]:
-    """Shots at ``rate_hz`` along a trajectory of a ``stereo`` pair or a camera with ``depth`` (names in ``camera.CAMERAS``), one at a time.
+    """Shots at ``rate_hz`` along a trajectory of a ``stereo`` pair or a camera with ``depth``
+    (names in ``camera.CAMERAS``), one at a time.
 
     ``condition`` gives light and season of the pictures, ``label_noise`` the share of wrong labels.
     """
-    model, mounted = CAMERAS[sensor], base_T_camera(CAMERAS[sensor])
-    painter, rng, rays = Painter(Scene(world), condition), np.random.default_rng([seed, 43]), pixel_rays(model)
+    model = CAMERAS[sensor]
+    mounted = base_T_camera(CAMERAS[sensor])
+    painter = Painter(Scene(world), condition)
+    rng = np.random.default_rng([seed, 43])
+    rays = pixel_rays(model)
     stamps = trajectory.stamps_ns
     first = int(stamps[0])
     for number, stamp in enumerate(range(first, int(stamps[-1]) + 1, round(1e9 / rate_hz))):
@@ -74,9 +90,13 @@ def simulate_cameras(
         yield CameraShot(stamp, model, mounted, picture, right, depth, labels)
 
 
-def wrong_label_image(hits: Hits, rays: F32, world_T_camera: F64, seed: int, rate: float, frame: int) -> U8:
-    """The label image (h, w), sky 10, as a network makes it that is wrong about a share ``rate`` of the pixels: objects taken for others
-    by patches of the world, and masks whose edges miss those of the picture by some pixels."""
+def wrong_label_image(
+    hits: Hits, rays: F32, world_T_camera: F64, seed: int, rate: float, frame: int
+) -> U8:
+    """The label image (h, w), sky 10, as a network makes it that is wrong about a share ``rate`` of
+    the pixels: objects taken for others by patches of the world, and masks whose edges miss those
+    of the picture by some pixels.
+    """
     seen = np.isfinite(hits.depth)
     labels = np.where(seen, hits.labels, np.uint8(SKY))
     if rate <= 0:
@@ -85,7 +105,18 @@ def wrong_label_image(hits: Hits, rays: F32, world_T_camera: F64, seed: int, rat
     labels[seen] = corrupt_labels(points, labels[seen], seed, 0.85 * rate, frame=frame)
     rng = np.random.default_rng([seed, 44, frame])
     height, width = labels.shape
-    coarse = rng.standard_normal((2, height // 16 + 2, width // 16 + 2), np.float32) * np.float32(_SHIFT * min(1.0, rate / 0.1))
+    coarse = rng.standard_normal((2, height // 16 + 2, width // 16 + 2), np.float32) * np.float32(
+        _SHIFT * min(1.0, rate / 0.1)
+    )
     shift = [cv2.resize(c, (width, height), interpolation=cv2.INTER_CUBIC) for c in coarse]
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
-    return np.asarray(cv2.remap(labels, columns + shift[0], rows + shift[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    return np.asarray(
+        cv2.remap(
+            labels,
+            columns + shift[0],
+            rows + shift[1],
+            cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_REPLICATE,
+        ),
+        np.uint8,
+    )

@@ -1,4 +1,6 @@
-"""Simulated drives: what sensor and odometry of a vehicle give while it drives through a world, one sweep after the other."""
+"""Simulated drives: what sensor and odometry of a vehicle give while it drives through a world, one
+sweep after the other.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ TURN_NS = 100_000_000  # duration of a sweep
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveFrame:
-    """A sweep that began at ``stamp_ns``; points in the moving sensor's frame, ``base_T_lidar`` and the poses (4, 4) at the beginning."""
+    """A sweep that began at ``stamp_ns``; points in the moving sensor's frame, ``base_T_lidar`` and
+    the poses (4, 4) at the beginning.
+    """
 
     stamp_ns: int
     world_T_base: F64
@@ -52,23 +56,44 @@ def simulate_drive(
     label_noise: float = 0.0,
     wet: float = 0.0,
 ) -> Iterator[DriveFrame]:
-    """Sweeps at ``rate_hz`` along a trajectory, one at a time; ``label_noise`` is the share of wrong labels.
+    """Sweeps at ``rate_hz`` along a trajectory, one at a time; ``label_noise`` is the share of
+    wrong labels.
 
-    About half of these errors are fixed to places, the others belong to one sweep. ``wet`` in [0, 1] is how wet the road is.
+    About half of these errors are fixed to places, the others belong to one sweep. ``wet`` in [0,
+    1] is how wet the road is.
     """
-    scene, base_T_lidar, rng = Scene(world), mounting(model), np.random.default_rng([seed, 41])
+    scene = Scene(world)
+    base_T_lidar = mounting(model)
+    rng = np.random.default_rng([seed, 41])
     stamps = trajectory.stamps_ns
     first = int(stamps[0])
-    for number, stamp in enumerate(range(first, int(stamps[-1]) - TURN_NS + 1, round(1e9 / rate_hz))):
-        start, end = interpolate(stamps, trajectory.world_T_base, np.array([stamp, stamp + TURN_NS]))
+    for number, stamp in enumerate(
+        range(first, int(stamps[-1]) - TURN_NS + 1, round(1e9 / rate_hz))
+    ):
+        start, end = interpolate(
+            stamps, trajectory.world_T_base, np.array([stamp, stamp + TURN_NS])
+        )
         moment = (stamp - first) * 1e-9
         moving = traffic.scene(moment, start) if traffic else None
         lidar = start @ base_T_lidar
         turn = full_sweep(
-            scene, lidar, rng, model, columns=columns, traffic=moving, world_T_end=end @ base_T_lidar, moment=moment + 0.37 * seed, wet=wet
+            scene,
+            lidar,
+            rng,
+            model,
+            columns=columns,
+            traffic=moving,
+            world_T_end=end @ base_T_lidar,
+            moment=moment + 0.37 * seed,
+            wet=wet,
         )
         if label_noise > 0:
             where = apply(lidar, turn.points)
-            turn = replace(turn, labels=corrupt_labels(where, turn.labels, seed, label_noise, frame=number, beyond=turn.beyond))
+            turn = replace(
+                turn,
+                labels=corrupt_labels(
+                    where, turn.labels, seed, label_noise, frame=number, beyond=turn.beyond
+                ),
+            )
         odom = interpolate(stamps, trajectory.odom_T_base, np.array([stamp]))[0]
         yield DriveFrame(stamp, start, odom, base_T_lidar, turn)

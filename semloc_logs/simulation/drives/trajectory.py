@@ -1,4 +1,6 @@
-"""Vehicle trajectories along driven lines, and the odometry that a drifting estimator would make of them."""
+"""Vehicle trajectories along driven lines, and the odometry that a drifting estimator would make of
+them.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from semloc_logs.simulation.meshes.world import F64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Poses of the base frame (on the ground under the vehicle): true ``world_T_base`` and drifting ``odom_T_base`` (n, 4, 4)."""
+    """Poses of the base frame (on the ground under the vehicle): true ``world_T_base`` and drifting
+    ``odom_T_base`` (n, 4, 4).
+    """
 
     stamps_ns: NDArray[np.int64]
     world_T_base: F64
@@ -25,21 +29,39 @@ class Trajectory:
 
 
 def smooth_line(line: F64, sigma: float = 2.5) -> F64:
-    """A driven line (n, 2) with corners rounded over about ``sigma`` metres, points about every half metre."""
+    """A driven line (n, 2) with corners rounded over about ``sigma`` metres, points about every
+    half metre.
+    """
     points = resample(line, 0.5)
-    return np.column_stack([gaussian_filter1d(points[:, k], sigma / 0.5, mode="nearest") for k in (0, 1)])
+    return np.column_stack(
+        [gaussian_filter1d(points[:, k], sigma / 0.5, mode="nearest") for k in (0, 1)]
+    )
 
 
-def poses_along(line: F64, at: F64, height: Callable[[F64, F64], F64], rng: np.random.Generator, shake: float = 0.004) -> F64:
-    """``world_T_base`` (m, 4, 4) at arc lengths ``at`` (m,) of a smooth line: yaw from the tangent, roll and pitch from ``height``."""
+def poses_along(
+    line: F64,
+    at: F64,
+    height: Callable[[F64, F64], F64],
+    rng: np.random.Generator,
+    shake: float = 0.004,
+) -> F64:
+    """``world_T_base`` (m, 4, 4) at arc lengths ``at`` (m,) of a smooth line: yaw from the tangent,
+    roll and pitch from ``height``.
+    """
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     position = np.column_stack([np.interp(at, along, line[:, k]) for k in (0, 1)])
-    ahead = np.column_stack([np.interp(np.minimum(at + 0.6, along[-1]), along, line[:, k]) for k in (0, 1)])
-    behind = np.column_stack([np.interp(np.maximum(at - 0.6, 0), along, line[:, k]) for k in (0, 1)])
+    ahead = np.column_stack(
+        [np.interp(np.minimum(at + 0.6, along[-1]), along, line[:, k]) for k in (0, 1)]
+    )
+    behind = np.column_stack(
+        [np.interp(np.maximum(at - 0.6, 0), along, line[:, k]) for k in (0, 1)]
+    )
     yaw = np.arctan2(*(ahead - behind).T[::-1])
     heading = np.column_stack([np.cos(yaw), np.sin(yaw)])
     left = np.column_stack([-heading[:, 1], heading[:, 0]])
-    z, rise, tilt = height(*position.T), _slope(height, position, heading), _slope(height, position, left)
+    z = height(*position.T)
+    rise = _slope(height, position, heading)
+    tilt = _slope(height, position, left)
     noise = gaussian_filter1d(rng.normal(size=(len(at), 2)), 2.0, axis=0) * 2.5 * shake
     out = np.tile(np.eye(4), (len(at), 1, 1))
     euler = np.column_stack([yaw, -np.arctan(rise) + noise[:, 0], np.arctan(tilt) + noise[:, 1]])
@@ -48,8 +70,11 @@ def poses_along(line: F64, at: F64, height: Callable[[F64, F64], F64], rng: np.r
     return out
 
 
-def _slope(height: Callable[[F64, F64], F64], position: F64, direction: F64, step: float = 1.3) -> F64:
-    ahead, behind = position + step * direction, position - step * direction
+def _slope(
+    height: Callable[[F64, F64], F64], position: F64, direction: F64, step: float = 1.3
+) -> F64:
+    ahead = position + step * direction
+    behind = position - step * direction
     return (height(*ahead.T) - height(*behind.T)) / (2 * step)
 
 
@@ -63,7 +88,8 @@ def drive(
     speed: float = 7.0,
     drift: float = 0.007,
 ) -> Trajectory:
-    """A car drives all of a smooth line at about ``speed`` m/s, slower in bends; poses at ``rate_hz`` from ``start_ns`` on.
+    """A car drives all of a smooth line at about ``speed`` m/s, slower in bends; poses at
+    ``rate_hz`` from ``start_ns`` on.
 
     ``drift`` is that of the odometry (:func:`drifting_odometry`).
     """
@@ -71,7 +97,9 @@ def drive(
     tangent = np.gradient(line, along, axis=0)
     bend = np.linalg.norm(gaussian_filter1d(np.gradient(tangent, along, axis=0), 4, axis=0), axis=1)
     wander = gaussian_filter1d(rng.normal(size=len(along)), 60, mode="nearest") * 2.0
-    pace = np.clip(np.minimum(speed + wander, np.sqrt(1.8 / np.maximum(bend, 1e-3))), 2.0, 1.5 * speed)
+    pace = np.clip(
+        np.minimum(speed + wander, np.sqrt(1.8 / np.maximum(bend, 1e-3))), 2.0, 1.5 * speed
+    )
     pace = gaussian_filter1d(pace, 8, mode="nearest")
     seconds = np.concatenate([[0.0], np.cumsum(np.diff(along) / pace[1:])])
     at = np.arange(0.0, seconds[-1], 1.0 / rate_hz)
@@ -81,19 +109,31 @@ def drive(
 
 
 def drifting_odometry(world_T_base: F64, rng: np.random.Generator, drift: float = 0.007) -> F64:
-    """``odom_T_base`` (n, 4, 4) starting at identity, wrong by about ``drift`` of the way after some hundred metres.
+    """``odom_T_base`` (n, 4, 4) starting at identity, wrong by about ``drift`` of the way after
+    some hundred metres.
 
-    The scale is wrong by a constant, the heading by a rate that wanders over 40 m, and every step by a little of its own.
+    The scale is wrong by a constant, the heading by a rate that wanders over 40 m, and every step
+    by a little of its own.
     """
     steps = inverse(world_T_base[:-1]) @ world_T_base[1:]
     length = np.linalg.norm(steps[:, :3, 3], axis=1, keepdims=True)
     way = np.cumsum(length)
     nodes = np.arange(0.0, (way[-1] if len(way) else 0.0) + 2.0)
-    rate = gaussian_filter1d(rng.normal(size=(len(nodes), 3)), 40, axis=0, mode="nearest") * np.sqrt(2 * np.sqrt(np.pi) * 40)
-    bias = np.column_stack([np.interp(way, nodes, rate[:, k]) for k in range(3)]) * [0.15, 0.15, 1.0]
-    turn = 0.01 * drift * bias * length + 0.004 * drift * rng.normal(size=bias.shape) * np.sqrt(length)
+    rate = gaussian_filter1d(
+        rng.normal(size=(len(nodes), 3)), 40, axis=0, mode="nearest"
+    ) * np.sqrt(2 * np.sqrt(np.pi) * 40)
+    bias = np.column_stack([np.interp(way, nodes, rate[:, k]) for k in range(3)]) * [
+        0.15,
+        0.15,
+        1.0,
+    ]
+    turn = 0.01 * drift * bias * length + 0.004 * drift * rng.normal(size=bias.shape) * np.sqrt(
+        length
+    )
     wrong = steps.copy()
-    wrong[:, :3, 3] = steps[:, :3, 3] * (1 + 0.6 * drift * rng.normal()) + 0.3 * drift * rng.normal(size=bias.shape) * np.sqrt(length)
+    wrong[:, :3, 3] = steps[:, :3, 3] * (1 + 0.6 * drift * rng.normal()) + 0.3 * drift * rng.normal(
+        size=bias.shape
+    ) * np.sqrt(length)
     wrong[:, :3, :3] = steps[:, :3, :3] @ Rotation.from_rotvec(turn).as_matrix()
     out = np.tile(np.eye(4), (len(steps) + 1, 1, 1))
     for k, step in enumerate(wrong):

@@ -1,4 +1,6 @@
-"""What an inertial sensor and a satellite receiver of the vehicle measure along its true trajectory."""
+"""What an inertial sensor and a satellite receiver of the vehicle measure along its true
+trajectory.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,19 @@ I64 = NDArray[np.int64]
 GRAVITY = 9.80665  # m/s^2
 ANTENNA = np.array([-0.6, 0.0, 1.5])  # in the base frame (m)
 DATUM = 49.01, 8.42, 115.0  # degrees, degrees, m: where the world's origin lies; x is east, y north
-_SEMI_MAJOR, _FLATTENING = 6378137.0, 1.0 / 298.257223563  # WGS 84
+# WGS 84
+_SEMI_MAJOR = 6378137.0
+_FLATTENING = 1.0 / 298.257223563
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleSensors:
     """How well the vehicle measures itself; standard deviations.
 
-    Samples of the IMU a second (None: one for each pose), its noise and constant bias (m/s^2, rad/s); fixes a second (0: no receiver),
-    their horizontal error (m), which wanders over ``fix_seconds`` and is half as large again in height, and kilometres between outages of
-    50 to 200 m.
+    Samples of the IMU a second (None: one for each pose), its noise and constant bias (m/s^2,
+    rad/s); fixes a second (0: no receiver), their horizontal error (m), which wanders over
+    ``fix_seconds`` and is half as large again in height, and kilometres between outages of 50 to
+    200 m.
     """
 
     imu_hz: float | None = None
@@ -43,7 +48,9 @@ class VehicleSensors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inertial:
-    """Specific force (n, 3) in m/s^2, at rest +9.81 upwards, and angular rate (n, 3) in rad/s of the base frame at ``stamps_ns`` (n,)."""
+    """Specific force (n, 3) in m/s^2, at rest +9.81 upwards, and angular rate (n, 3) in rad/s of
+    the base frame at ``stamps_ns`` (n,).
+    """
 
     stamps_ns: I64
     force: F64
@@ -52,7 +59,9 @@ class Inertial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fixes:
-    """Latitude and longitude in degrees and height in metres (n, 3) of the antenna; ``status`` (n,) as in NavSatFix: 0 fix, -1 none."""
+    """Latitude and longitude in degrees and height in metres (n, 3) of the antenna; ``status`` (n,)
+    as in NavSatFix: 0 fix, -1 none.
+    """
 
     stamps_ns: I64
     geodetic: F64
@@ -60,13 +69,17 @@ class Fixes:
 
 
 def motion(trajectory: Trajectory) -> tuple[F64, F64, F64]:
-    """Specific force (m/s^2), angular rate (rad/s) and velocity (m/s), (n, 3) each, in the base frame at every pose."""
+    """Specific force (m/s^2), angular rate (rad/s) and velocity (m/s), (n, 3) each, in the base
+    frame at every pose.
+    """
     seconds = (trajectory.stamps_ns - trajectory.stamps_ns[0]) * 1e-9
     pose = trajectory.world_T_base
     velocity = np.gradient(pose[:, :3, 3], seconds, axis=0)
     acceleration = np.gradient(velocity, seconds, axis=0) + np.array([0.0, 0.0, GRAVITY])
     back = np.swapaxes(pose[:, :3, :3], 1, 2)
-    step = Rotation.from_matrix(back[:-1] @ pose[1:, :3, :3]).as_rotvec() / np.diff(seconds)[:, None]
+    step = (
+        Rotation.from_matrix(back[:-1] @ pose[1:, :3, :3]).as_rotvec() / np.diff(seconds)[:, None]
+    )
     force, speed = (np.einsum("nij,nj->ni", back, v) for v in (acceleration, velocity))
     return force, np.concatenate([step, step[-1:]]), speed
 
@@ -77,28 +90,49 @@ def inertial(trajectory: Trajectory, sensors: VehicleSensors, rng: np.random.Gen
     stamps = trajectory.stamps_ns
     if sensors.imu_hz is not None:
         at = np.arange(stamps[0], stamps[-1] + 1, round(1e9 / sensors.imu_hz), dtype=np.int64)
-        seconds, known = (at - stamps[0]) * 1e-9, (stamps - stamps[0]) * 1e-9
-        force, rate = (np.column_stack([np.interp(seconds, known, v[:, k]) for k in range(3)]) for v in (force, rate))
+        seconds = (at - stamps[0]) * 1e-9
+        known = (stamps - stamps[0]) * 1e-9
+        force, rate = (
+            np.column_stack([np.interp(seconds, known, v[:, k]) for k in range(3)])
+            for v in (force, rate)
+        )
         stamps = at
-    force = force + rng.normal(size=3) * sensors.force_bias + rng.normal(size=force.shape) * sensors.force_noise
-    rate = rate + rng.normal(size=3) * sensors.rate_bias + rng.normal(size=rate.shape) * sensors.rate_noise
+    force = (
+        force
+        + rng.normal(size=3) * sensors.force_bias
+        + rng.normal(size=force.shape) * sensors.force_noise
+    )
+    rate = (
+        rate
+        + rng.normal(size=3) * sensors.rate_bias
+        + rng.normal(size=rate.shape) * sensors.rate_noise
+    )
     return Inertial(stamps, force, rate)
 
 
 def fixes(trajectory: Trajectory, sensors: VehicleSensors, rng: np.random.Generator) -> Fixes:
-    """Fixes of a receiver whose error wanders, and that hears nothing along some stretches of the road."""
+    """Fixes of a receiver whose error wanders, and that hears nothing along some stretches of the
+    road.
+    """
     stamps = trajectory.stamps_ns
     at = np.arange(stamps[0], stamps[-1] + 1, round(1e9 / sensors.fix_hz), dtype=np.int64)
     pose = interpolate(stamps, trajectory.world_T_base, at)
     antenna = pose[:, :3, 3] + pose[:, :3, :3] @ ANTENNA
     slow = sensors.fix_seconds * sensors.fix_hz
-    # white noise smoothed by a Gaussian of that width, brought back to a standard deviation of one; padded, so that the ends are alike
+    # white noise smoothed by a Gaussian of that width, brought back to a standard deviation of one;
+    # padded, so that the ends are alike
     pad = int(4 * slow) + 1
-    wander = gaussian_filter1d(rng.normal(size=(len(at) + 2 * pad, 3)), slow, axis=0)[pad : pad + len(at)] * np.sqrt(
-        2 * np.sqrt(np.pi) * slow
+    wander = gaussian_filter1d(rng.normal(size=(len(at) + 2 * pad, 3)), slow, axis=0)[
+        pad : pad + len(at)
+    ] * np.sqrt(2 * np.sqrt(np.pi) * slow)
+    error = (
+        (0.95 * wander + 0.31 * rng.normal(size=wander.shape))
+        * sensors.fix_noise
+        * [0.707, 0.707, 1.5]
     )
-    error = (0.95 * wander + 0.31 * rng.normal(size=wander.shape)) * sensors.fix_noise * [0.707, 0.707, 1.5]
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1))])
+    way = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1))]
+    )
     status = np.zeros(len(at), np.int8)
     begin = float(rng.exponential(1000.0 * sensors.outage_km))
     while begin < way[-1]:
@@ -109,17 +143,22 @@ def fixes(trajectory: Trajectory, sensors: VehicleSensors, rng: np.random.Genera
 
 
 def geodetic(enu: F64, datum: tuple[float, float, float] = DATUM) -> F64:
-    """East, north, up (n, 3) about ``datum`` -> latitude, longitude (degrees) and height over the ellipsoid (m) of WGS 84, (n, 3).
+    """East, north, up (n, 3) about ``datum`` -> latitude, longitude (degrees) and height over the
+    ellipsoid (m) of WGS 84, (n, 3).
 
-    Heights by repeated substitution (Hofmann-Wellenhof et al., GNSS, 2008, section 8.2.1): exact to a micrometre near the ground.
+    Heights by repeated substitution (Hofmann-Wellenhof et al., GNSS, 2008, section 8.2.1): exact to
+    a micrometre near the ground.
     """
     e2 = _FLATTENING * (2.0 - _FLATTENING)
-    lat, lon = np.radians(datum[0]), np.radians(datum[1])
+    lat = np.radians(datum[0])
+    lon = np.radians(datum[1])
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
     up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
     north = np.cross(up, east)
     n = _SEMI_MAJOR / np.sqrt(1 - e2 * np.sin(lat) ** 2)
-    origin = np.array([(n + datum[2]) * up[0], (n + datum[2]) * up[1], (n * (1 - e2) + datum[2]) * up[2]])
+    origin = np.array(
+        [(n + datum[2]) * up[0], (n + datum[2]) * up[1], (n * (1 - e2) + datum[2]) * up[2]]
+    )
     x, y, z = (origin + enu @ np.stack([east, north, up])).T
     around = np.hypot(x, y)
     latitude = np.full(len(enu), lat)

@@ -1,4 +1,6 @@
-"""Fences, walls and guard rails along plan paths (n, 2); they stand on z = 0 and are draped over the ground."""
+"""Fences, walls and guard rails along plan paths (n, 2); they stand on z = 0 and are draped over
+the ground.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +15,29 @@ FENCES = ("picket", "board", "rails", "bars", "mesh", "lattice", "gabions")
 def fence(rng: Rng, path: F64, kind: str | None = None) -> Parts:
     """A fence of one of ``FENCES``, at random by default; wire mesh lets most rays pass."""
     drawn = str(rng.choice(FENCES[:-1]))
-    kind, height = kind or drawn, float(rng.uniform(0.8, 1.9))
+    kind = kind or drawn
+    height = float(rng.uniform(0.8, 1.9))
     pitch = 2.5 if kind in ("mesh", "board") else 2.0
     posts = resample(path, pitch)
     meshes = [_posts(posts, 0.06 if kind in ("mesh", "bars") else 0.1, height + 0.08)]
-    a, b = posts[:-1], posts[1:]
+    a = posts[:-1]
+    b = posts[1:]
     if kind == "board":
         gap = rng.uniform(0.0, 0.1)
-        meshes += [upright_quads(a, b, float(z), min(float(z) + 0.3 - gap, height)) for z in np.arange(0.05, height - 0.1, 0.3)]
+        meshes += [
+            upright_quads(a, b, float(z), min(float(z) + 0.3 - gap, height))
+            for z in np.arange(0.05, height - 0.1, 0.3)
+        ]
         return [(joined(*meshes), FENCE)]
     if kind == "gabions":
-        return [(ribbon(posts, np.array([[-0.25, -0.2], [0.25, -0.2], [0.25, height], [-0.25, height]])), WALL)]
+        return [
+            (
+                ribbon(
+                    posts, np.array([[-0.25, -0.2], [0.25, -0.2], [0.25, height], [-0.25, height]])
+                ),
+                WALL,
+            )
+        ]
     levels: F64 = {
         "rails": np.linspace(0.35, height, 3, dtype=np.float64),
         "mesh": np.arange(0.08, height, 0.2),
@@ -35,12 +49,27 @@ def fence(rng: Rng, path: F64, kind: str | None = None) -> Parts:
         step, width = {"picket": (0.19, 0.1), "bars": (0.14, 0.03), "mesh": (0.25, 0.012)}[kind]
         fine = resample(path, step)
         along = np.diff(fine, axis=0) * min(1.0, width / step)
-        meshes.append(upright_quads(fine[:-1], fine[:-1] + along, 0.05, height + 0.03 * np.arange(len(along), dtype=np.float64) % 0.06))
+        meshes.append(
+            upright_quads(
+                fine[:-1],
+                fine[:-1] + along,
+                0.05,
+                height + 0.03 * np.arange(len(along), dtype=np.float64) % 0.06,
+            )
+        )
     if kind == "lattice":
         fine = resample(path, 0.3)
         bottom = np.column_stack([fine, np.full(len(fine), 0.1)])
         top = np.column_stack([fine, np.full(len(fine), height)])
-        meshes.append(tubes(np.concatenate([bottom[:-3], top[:-3]]), np.concatenate([top[3:], bottom[3:]]), 0.015, 0.015, 3))
+        meshes.append(
+            tubes(
+                np.concatenate([bottom[:-3], top[:-3]]),
+                np.concatenate([top[3:], bottom[3:]]),
+                0.015,
+                0.015,
+                3,
+            )
+        )
     return [(joined(*meshes), FENCE)]
 
 
@@ -52,17 +81,37 @@ def _posts(points: F64, width: float, height: float) -> Mesh:
 
 def garden_wall(rng: Rng, path: F64) -> Parts:
     """A wall, sometimes with pillars, a coping or a railing on top."""
-    height, b = float(rng.uniform(0.4, 2.1)), float(rng.uniform(0.1, 0.2))
+    height = float(rng.uniform(0.4, 2.1))
+    b = float(rng.uniform(0.1, 0.2))
     points = resample(path, 2.5)
-    parts: Parts = [(ribbon(points, np.array([[-b, -0.3], [b, -0.3], [b, height], [-b, height]])), WALL)]
+    parts: Parts = [
+        (ribbon(points, np.array([[-b, -0.3], [b, -0.3], [b, height], [-b, height]])), WALL)
+    ]
     if rng.random() < 0.4:
         parts.append((_posts(points, 2 * b + 0.16, height + float(rng.uniform(0.1, 0.35))), WALL))
     if rng.random() < 0.5:
         c = b + 0.06
-        parts.append((ribbon(points, np.array([[-c, height], [c, height], [0.4 * c, height + 0.09], [-0.4 * c, height + 0.09]])), WALL))
+        parts.append(
+            (
+                ribbon(
+                    points,
+                    np.array(
+                        [
+                            [-c, height],
+                            [c, height],
+                            [0.4 * c, height + 0.09],
+                            [-0.4 * c, height + 0.09],
+                        ]
+                    ),
+                ),
+                WALL,
+            )
+        )
     if height < 1.0 and rng.random() < 0.4:
         fine = resample(path, 0.15)
-        bars = upright_quads(fine[:-1], fine[:-1] + np.diff(fine, axis=0) * 0.25, height, height + 0.8)
+        bars = upright_quads(
+            fine[:-1], fine[:-1] + np.diff(fine, axis=0) * 0.25, height, height + 0.8
+        )
         rail = upright_quads(points[:-1], points[1:], height + 0.76, height + 0.82)
         parts.append((joined(bars, rail), FENCE))
     return parts
@@ -77,11 +126,17 @@ def retaining_wall(rng: Rng, path: F64) -> Parts:
 
 
 def guard_rail(rng: Rng, path: F64) -> Parts:
-    """A steel rail on posts at 0.75 m, or a low concrete barrier; Cityscapes counts rails as no class and networks as a fence."""
+    """A steel rail on posts at 0.75 m, or a low concrete barrier; Cityscapes counts rails as no
+    class and networks as a fence.
+    """
     points = resample(path, 2.0)
     if rng.random() < 0.25:
-        return [(ribbon(points, np.array([[-0.3, -0.1], [0.3, -0.1], [0.1, 0.85], [-0.1, 0.85]])), WALL)]
-    rail = ribbon(points, np.array([[-0.05, 0.45], [0.05, 0.45], [0.09, 0.6], [0.05, 0.75], [-0.05, 0.75]]))
+        return [
+            (ribbon(points, np.array([[-0.3, -0.1], [0.3, -0.1], [0.1, 0.85], [-0.1, 0.85]])), WALL)
+        ]
+    rail = ribbon(
+        points, np.array([[-0.05, 0.45], [0.05, 0.45], [0.09, 0.6], [0.05, 0.75], [-0.05, 0.75]])
+    )
     return [(joined(rail, _posts(points, 0.1, 0.75)), FENCE)]
 
 
@@ -90,4 +145,11 @@ def pedestrian_rail(rng: Rng, path: F64) -> Parts:
     posts = resample(path, 1.5)
     height = float(rng.uniform(0.9, 1.1))
     lines = [np.column_stack([posts, np.full(len(posts), z)]) for z in (0.5 * height, height)]
-    return [(joined(_posts(posts, 0.05, height), *(tubes(x[:-1], x[1:], 0.025, 0.025, 4) for x in lines)), FENCE)]
+    return [
+        (
+            joined(
+                _posts(posts, 0.05, height), *(tubes(x[:-1], x[1:], 0.025, 0.025, 4) for x in lines)
+            ),
+            FENCE,
+        )
+    ]

@@ -1,8 +1,16 @@
-"""What stands in a street, by name; each maker gives a list of (mesh, label) about its foot, the front along +x or +y as it says."""
+"""What stands in a street, by name; each maker gives a list of (mesh, label) about its foot, the
+front along +x or +y as it says.
+"""
 
 from __future__ import annotations
 
-from semloc_logs.simulation.meshes.fences import fence, garden_wall, guard_rail, pedestrian_rail, retaining_wall
+from semloc_logs.simulation.meshes.fences import (
+    fence,
+    garden_wall,
+    guard_rail,
+    pedestrian_rail,
+    retaining_wall,
+)
 from semloc_logs.simulation.meshes.furniture import person, pole, shelter, street_clutter, wires
 from semloc_logs.simulation.meshes.greenery import bush, hedge, ivy, tufts
 from semloc_logs.simulation.meshes.shapes import Parts, Rng, resample, snow_cover
@@ -58,7 +66,9 @@ __all__ = [
 
 
 def parked_vehicle(rng: Rng) -> Parts:
-    """What stands on a parking place: mostly cars, now and then a van, a camper, a trailer, a motorcycle or a lorry."""
+    """What stands on a parking place: mostly cars, now and then a van, a camper, a trailer, a
+    motorcycle or a lorry.
+    """
     kind = rng.random()
     for share, make in ((0.83, car), (0.94, van), (0.955, camper), (0.97, trailer)):
         if kind < share:

@@ -1,9 +1,11 @@
 """Simulated drives as logs: MCAP with ROS 2 or protobuf messages, ROS 1 bag or ROS 2 bag directory.
 
-Topics: ``/lidar/points`` (x y z float32, ``label`` uint16 Cityscapes train ids, ``ring`` uint16, ``t`` uint32 nanoseconds since the stamp),
-``/odometry`` (frame ``odom``, child ``base_link``, drifting), ``/imu`` (in ``base_link``), ``/gnss`` (of an antenna ``gnss``),
-``/tf_static`` (``base_link`` to ``lidar`` and ``gnss``) and ``/lidar/label_space``, one std_msgs/String that names the label space of the
-points. In protobuf the odometry is a foxglove.FrameTransform on ``/tf``, and there is neither an IMU nor a label space.
+Topics: ``/lidar/points`` (x y z float32, ``label`` uint16 Cityscapes train ids, ``ring`` uint16,
+``t`` uint32 nanoseconds since the stamp), ``/odometry`` (frame ``odom``, child ``base_link``,
+drifting), ``/imu`` (in ``base_link``), ``/gnss`` (of an antenna ``gnss``), ``/tf_static``
+(``base_link`` to ``lidar`` and ``gnss``) and ``/lidar/label_space``, one std_msgs/String that names
+the label space of the points. In protobuf the odometry is a foxglove.FrameTransform on ``/tf``, and
+there is neither an IMU nor a label space.
 """
 
 from __future__ import annotations
@@ -19,7 +21,14 @@ import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapFile
 from mcap_protobuf.schema import build_file_descriptor_set
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag1 import Writer as BagFile
 from rosbags.rosbag2 import Writer as BagFolder
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -31,9 +40,17 @@ from semloc_logs.simulation.drives.drive import TURN_NS, DriveFrame
 from semloc_logs.simulation.drives.trajectory import Trajectory
 from semloc_logs.simulation.drives.vehicle_sensors import VehicleSensors, fixes, inertial, motion
 from semloc_logs.simulation.output.camera_log import camera_events
-from semloc_logs.simulation.output.drive_messages import LATCHED, FoxgloveMessages, Made, Messages, RosMessages, antenna
+from semloc_logs.simulation.output.drive_messages import (
+    LATCHED,
+    FoxgloveMessages,
+    Made,
+    Messages,
+    RosMessages,
+    antenna,
+)
 
-FORMATS = {"mcap": ".mcap", "protobuf": ".mcap", "bag": ".bag", "ros2": ""}  # endings; a ROS 2 bag is a directory
+# endings; a ROS 2 bag is a directory
+FORMATS = {"mcap": ".mcap", "protobuf": ".mcap", "bag": ".bag", "ros2": ""}
 _LATENCY_NS = 4_000_000  # from the end of a measurement to the log
 _LATCHED_TEXT = "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
 _LATCHED_QOS = Qos(
@@ -61,7 +78,9 @@ class _Mcap:
 
     def __init__(self, file: Any, *, protobuf: bool) -> None:
         self._store = None if protobuf else get_typestore(Stores.ROS2_HUMBLE)
-        self.messages: Messages = FoxgloveMessages() if self._store is None else RosMessages(self._store, ros1=False)
+        self.messages: Messages = (
+            FoxgloveMessages() if self._store is None else RosMessages(self._store, ros1=False)
+        )
         self._file = McapFile(file, compression=CompressionType.ZSTD)
         self._file.start(profile="" if protobuf else "ros2", library="semloc_logs")
         self._channels: dict[str, int] = {}
@@ -70,14 +89,26 @@ class _Mcap:
     def write(self, topic: str, type_: str, log_time_ns: int, message: Any) -> None:
         if topic not in self._channels:
             if self._store is None:
-                schema = self._file.register_schema(type_, "protobuf", build_file_descriptor_set(type(message)).SerializeToString())
+                schema = self._file.register_schema(
+                    type_, "protobuf", build_file_descriptor_set(type(message)).SerializeToString()
+                )
             else:
                 text = self._store.generate_msgdef(type_, ros_version=2)[0]
                 schema = self._file.register_schema(type_, "ros2msg", text.encode())
-            latched = {"offered_qos_profiles": _LATCHED_TEXT} if topic in LATCHED and self._store is not None else {}
+            latched = (
+                {"offered_qos_profiles": _LATCHED_TEXT}
+                if topic in LATCHED and self._store is not None
+                else {}
+            )
             encoding = "protobuf" if self._store is None else "cdr"
-            self._channels[topic] = self._file.register_channel(topic, encoding, schema, metadata=latched)
-        data = message.SerializeToString() if self._store is None else bytes(self._store.serialize_cdr(message, type_))
+            self._channels[topic] = self._file.register_channel(
+                topic, encoding, schema, metadata=latched
+            )
+        data = (
+            message.SerializeToString()
+            if self._store is None
+            else bytes(self._store.serialize_cdr(message, type_))
+        )
         count = self._count[topic] = self._count.get(topic, -1) + 1
         self._file.add_message(self._channels[topic], log_time_ns, data, log_time_ns, count)
 
@@ -90,7 +121,11 @@ class _Bag:
 
     def __init__(self, file: BagFile) -> None:
         self._store = get_typestore(Stores.ROS1_NOETIC)
-        self._store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+        self._store.register(
+            get_types_from_msg(
+                "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
+            )
+        )
         self.messages: Messages = RosMessages(self._store, ros1=True)
         self._file = file
         self._connections: dict[str, Any] = {}
@@ -98,8 +133,12 @@ class _Bag:
     def write(self, topic: str, type_: str, log_time_ns: int, message: Any) -> None:
         if topic not in self._connections:
             latching = 1 if topic in LATCHED else None
-            self._connections[topic] = self._file.add_connection(topic, type_, typestore=self._store, latching=latching)
-        self._file.write(self._connections[topic], log_time_ns, self._store.serialize_ros1(message, type_))
+            self._connections[topic] = self._file.add_connection(
+                topic, type_, typestore=self._store, latching=latching
+            )
+        self._file.write(
+            self._connections[topic], log_time_ns, self._store.serialize_ros1(message, type_)
+        )
 
 
 class _Bag2:
@@ -114,8 +153,12 @@ class _Bag2:
     def write(self, topic: str, type_: str, log_time_ns: int, message: Any) -> None:
         if topic not in self._connections:
             latched = [_LATCHED_QOS] if topic in LATCHED else []
-            self._connections[topic] = self._folder.add_connection(topic, type_, typestore=self._store, offered_qos_profiles=latched)
-        self._folder.write(self._connections[topic], log_time_ns, self._store.serialize_cdr(message, type_))
+            self._connections[topic] = self._folder.add_connection(
+                topic, type_, typestore=self._store, offered_qos_profiles=latched
+            )
+        self._folder.write(
+            self._connections[topic], log_time_ns, self._store.serialize_cdr(message, type_)
+        )
 
 
 @contextmanager
@@ -144,7 +187,9 @@ def _sink(path: Path, format_: str) -> Iterator[_Sink]:
             _remove(path)  # an earlier bag: a directory is not replaced by renaming
         whole.replace(path)
     except OSError as error:
-        raise LogError(f"{path} cannot be written ({error.strerror or error}): choose another folder or make room") from error
+        raise LogError(
+            f"{path} cannot be written ({error.strerror or error}): choose another folder or make room"
+        ) from error
     finally:
         _remove(part)
 
@@ -165,16 +210,21 @@ def write_session(
     sensors: VehicleSensors | None = None,
     shots: Iterable[CameraShot] = (),
 ) -> int:
-    """Write a drive as the log ``path``, sweep by sweep; the number of sweeps. LogError when that is not possible.
+    """Write a drive as the log ``path``, sweep by sweep; the number of sweeps. LogError when that
+    is not possible.
 
-    ``shots`` are what cameras record (:mod:`semloc_logs.simulation.output.camera_log` has their topics).
+    ``shots`` are what cameras record (:mod:`semloc_logs.simulation.output.camera_log` has their
+    topics).
 
-    ``format`` is a name in ``FORMATS``; without, the ending says it: .mcap (ROS 2 messages), .bag, or none for a ROS 2 bag directory.
+    ``format`` is a name in ``FORMATS``; without, the ending says it: .mcap (ROS 2 messages), .bag,
+    or none for a ROS 2 bag directory.
     """
     if format is None:
         format = next((name for name, suffix in FORMATS.items() if suffix == path.suffix), None)
     if format is None or FORMATS.get(format) != path.suffix:
-        raise LogError(f"{path} is neither .mcap nor .bag nor a directory: give the simulated log the ending of its format")
+        raise LogError(
+            f"{path} is neither .mcap nor .bag nor a directory: give the simulated log the ending of its format"
+        )
     sweeps = 0
     with _sink(path, format) as sink:
         first = int(trajectory.stamps_ns[0])
@@ -191,7 +241,9 @@ def write_session(
 
 
 def write_truth(path: Path, trajectory: Trajectory) -> None:
-    """``world_T_base`` as a TUM file: seconds with 9 decimals, translation in metres, quaternion xyzw."""
+    """``world_T_base`` as a TUM file: seconds with 9 decimals, translation in metres, quaternion
+    xyzw.
+    """
     translation, quaternion = translation_quaternion(trajectory.world_T_base)
     rows = [
         f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{v:.9f}" for v in (*t, *q))
@@ -212,7 +264,9 @@ def _lidar(messages: Messages, frames: Iterable[DriveFrame], first_ns: int) -> I
         yield frame.stamp_ns + TURN_NS + _LATENCY_NS, messages.cloud(frame)
 
 
-def _vehicle(messages: Messages, trajectory: Trajectory, sensors: VehicleSensors) -> list[Iterator[Event]]:
+def _vehicle(
+    messages: Messages, trajectory: Trajectory, sensors: VehicleSensors
+) -> list[Iterator[Event]]:
     """Odometry at every pose of the trajectory, samples of the IMU, and fixes."""
     rng = np.random.default_rng([len(trajectory.stamps_ns), 51])
     imu = inertial(trajectory, sensors, rng)
@@ -220,7 +274,10 @@ def _vehicle(messages: Messages, trajectory: Trajectory, sensors: VehicleSensors
 
     def odometry() -> Iterator[Event]:
         for k, stamp in enumerate(trajectory.stamps_ns.tolist()):
-            yield stamp + _LATENCY_NS, messages.odometry(stamp, trajectory.odom_T_base[k], speed[k], rate[k])
+            yield (
+                stamp + _LATENCY_NS,
+                messages.odometry(stamp, trajectory.odom_T_base[k], speed[k], rate[k]),
+            )
 
     def samples() -> Iterator[Event]:
         for k, stamp in enumerate(imu.stamps_ns.tolist()):

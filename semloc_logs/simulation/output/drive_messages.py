@@ -19,22 +19,42 @@ from semloc_logs.simulation.meshes.world import F64
 LABEL_SPACE = "cityscapes"
 LATCHED = ("/tf_static", "/lidar/label_space", "/camera/label_space")
 Made = tuple[str, str, Any]
-_FIELDS = (("x", "<f4", 0), ("y", "<f4", 4), ("z", "<f4", 8), ("label", "<u2", 12), ("ring", "<u2", 14), ("t", "<u4", 16))  # kind, offset
+# kind, offset
+_FIELDS = (
+    ("x", "<f4", 0),
+    ("y", "<f4", 4),
+    ("z", "<f4", 8),
+    ("label", "<u2", 12),
+    ("ring", "<u2", 14),
+    ("t", "<u4", 16),
+)
 _POINT = np.dtype([(name, kind) for name, kind, _ in _FIELDS])
 _ROS_KINDS = {"<f4": 7, "<u2": 4, "<u4": 6}  # sensor_msgs/PointField
 _FOXGLOVE_KINDS = {"<f4": 7, "<u2": 3, "<u4": 5}  # foxglove.PackedElementField
 
 
 class Messages(Protocol):
-    """Makes messages of what the vehicle measures; frames ``odom``, ``base_link``, ``lidar`` and ``gnss``; times in nanoseconds."""
+    """Makes messages of what the vehicle measures; frames ``odom``, ``base_link``, ``lidar`` and
+    ``gnss``; times in nanoseconds.
+    """
 
     def mounted(self, stamp_ns: int, child: str, base_T_child: F64) -> Made: ...
 
     def label_space(self, topic: str = ...) -> Made | None: ...
 
-    def picture(self, topic: str, stamp_ns: int, frame_id: str, format_: str, data: bytes) -> Made: ...
+    def picture(
+        self, topic: str, stamp_ns: int, frame_id: str, format_: str, data: bytes
+    ) -> Made: ...
 
-    def calibration(self, topic: str, stamp_ns: int, frame_id: str, size: tuple[int, int], matrix: F64, baseline: float) -> Made: ...
+    def calibration(
+        self,
+        topic: str,
+        stamp_ns: int,
+        frame_id: str,
+        size: tuple[int, int],
+        matrix: F64,
+        baseline: float,
+    ) -> Made: ...
 
     def cloud(self, frame: DriveFrame) -> Made: ...
 
@@ -46,7 +66,9 @@ class Messages(Protocol):
 
 
 def _matrices(matrix: F64, baseline: float) -> tuple[F64, F64, F64]:
-    """K, R and P of a camera without distortion that sits ``baseline`` metres to the right of its partner."""
+    """K, R and P of a camera without distortion that sits ``baseline`` metres to the right of its
+    partner.
+    """
     return matrix, np.eye(3), np.column_stack([matrix, [-matrix[0, 0] * baseline, 0.0, 0.0]])
 
 
@@ -62,7 +84,11 @@ def _records(frame: DriveFrame) -> NDArray[np.void]:
     points = np.zeros(len(sweep.points), _POINT)
     for k, axis in enumerate("xyz"):
         points[axis] = sweep.points[:, k]
-    points["label"], points["ring"], points["t"] = sweep.labels, sweep.ring, np.round(sweep.turn * TURN_NS)
+    points["label"], points["ring"], points["t"] = (
+        sweep.labels,
+        sweep.ring,
+        np.round(sweep.turn * TURN_NS),
+    )
     return points
 
 
@@ -77,7 +103,9 @@ class RosMessages:
         return self._types[type_](**fields)
 
     def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        stamp = self._make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        stamp = self._make(
+            "builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9
+        )
         extra = {"seq": 0} if self._ros1 else {}
         return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id, **extra)
 
@@ -86,14 +114,31 @@ class RosMessages:
         return self._make(f"geometry_msgs/msg/{type_}", x=x, y=y, z=z)
 
     def _quaternion(self, q: F64) -> Any:
-        return self._make("geometry_msgs/msg/Quaternion", x=float(q[0]), y=float(q[1]), z=float(q[2]), w=float(q[3]))
+        return self._make(
+            "geometry_msgs/msg/Quaternion",
+            x=float(q[0]),
+            y=float(q[1]),
+            z=float(q[2]),
+            w=float(q[3]),
+        )
 
     def mounted(self, stamp_ns: int, child: str, base_T_child: F64) -> Made:
         t, q = translation_quaternion(base_T_child)
-        pose = self._make("geometry_msgs/msg/Transform", translation=self._vector(t), rotation=self._quaternion(q))
+        pose = self._make(
+            "geometry_msgs/msg/Transform", translation=self._vector(t), rotation=self._quaternion(q)
+        )
         header = self._header(stamp_ns, "base_link")
-        edge = self._make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=pose)
-        return "/tf_static", "tf2_msgs/msg/TFMessage", self._make("tf2_msgs/msg/TFMessage", transforms=[edge])
+        edge = self._make(
+            "geometry_msgs/msg/TransformStamped",
+            header=header,
+            child_frame_id=child,
+            transform=pose,
+        )
+        return (
+            "/tf_static",
+            "tf2_msgs/msg/TFMessage",
+            self._make("tf2_msgs/msg/TFMessage", transforms=[edge]),
+        )
 
     def label_space(self, topic: str = "/lidar/label_space") -> Made:
         return topic, "std_msgs/msg/String", self._make("std_msgs/msg/String", data=LABEL_SPACE)
@@ -101,11 +146,29 @@ class RosMessages:
     def picture(self, topic: str, stamp_ns: int, frame_id: str, format_: str, data: bytes) -> Made:
         kind = "sensor_msgs/msg/CompressedImage"
         header = self._header(stamp_ns, frame_id)
-        return topic, kind, self._make(kind, header=header, format=format_, data=np.frombuffer(data, np.uint8))
+        return (
+            topic,
+            kind,
+            self._make(kind, header=header, format=format_, data=np.frombuffer(data, np.uint8)),
+        )
 
-    def calibration(self, topic: str, stamp_ns: int, frame_id: str, size: tuple[int, int], matrix: F64, baseline: float) -> Made:
+    def calibration(
+        self,
+        topic: str,
+        stamp_ns: int,
+        frame_id: str,
+        size: tuple[int, int],
+        matrix: F64,
+        baseline: float,
+    ) -> Made:
         kind = "sensor_msgs/msg/CameraInfo"
-        matrices = dict(zip("KRPD", (*(m.ravel() for m in _matrices(matrix, baseline)), np.zeros(5)), strict=True))
+        matrices = dict(
+            zip(
+                "KRPD",
+                (*(m.ravel() for m in _matrices(matrix, baseline)), np.zeros(5)),
+                strict=True,
+            )
+        )
         info = self._make(
             kind,
             header=self._header(stamp_ns, frame_id),
@@ -114,7 +177,14 @@ class RosMessages:
             distortion_model="plumb_bob",
             binning_x=0,
             binning_y=0,
-            roi=self._make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
+            roi=self._make(
+                "sensor_msgs/msg/RegionOfInterest",
+                x_offset=0,
+                y_offset=0,
+                height=0,
+                width=0,
+                do_rectify=False,
+            ),
             **{name if self._ros1 else name.lower(): value for name, value in matrices.items()},
         )
         return topic, kind, info
@@ -122,7 +192,13 @@ class RosMessages:
     def cloud(self, frame: DriveFrame) -> Made:
         points = _records(frame)
         fields = [
-            self._make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=_ROS_KINDS[kind], count=1)
+            self._make(
+                "sensor_msgs/msg/PointField",
+                name=name,
+                offset=offset,
+                datatype=_ROS_KINDS[kind],
+                count=1,
+            )
             for name, kind, offset in _FIELDS
         ]
         cloud = self._make(
@@ -142,8 +218,14 @@ class RosMessages:
     def odometry(self, stamp_ns: int, odom_T_base: F64, speed: F64, rate: F64) -> Made:
         t, q = translation_quaternion(odom_T_base)
         none = np.zeros(36)
-        where = self._make("geometry_msgs/msg/Pose", position=self._vector(t, "Point"), orientation=self._quaternion(q))
-        twist = self._make("geometry_msgs/msg/Twist", linear=self._vector(speed), angular=self._vector(rate))
+        where = self._make(
+            "geometry_msgs/msg/Pose",
+            position=self._vector(t, "Point"),
+            orientation=self._quaternion(q),
+        )
+        twist = self._make(
+            "geometry_msgs/msg/Twist", linear=self._vector(speed), angular=self._vector(rate)
+        )
         odometry = self._make(
             "nav_msgs/msg/Odometry",
             header=self._header(stamp_ns, "odom"),
@@ -182,7 +264,9 @@ class RosMessages:
 
 
 class FoxgloveMessages:
-    """Messages of Foxglove's schemas as protobuf: there is none for an IMU, nor for the name of a label space."""
+    """Messages of Foxglove's schemas as protobuf: there is none for an IMU, nor for the name of a
+    label space.
+    """
 
     def mounted(self, stamp_ns: int, child: str, base_T_child: F64) -> Made:
         return self._edge("/tf_static", stamp_ns, "base_link", child, base_T_child)
@@ -197,18 +281,30 @@ class FoxgloveMessages:
         picture.timestamp.FromNanoseconds(stamp_ns)
         return topic, "foxglove.CompressedImage", picture
 
-    def calibration(self, topic: str, stamp_ns: int, frame_id: str, size: tuple[int, int], matrix: F64, baseline: float) -> Made:
+    def calibration(
+        self,
+        topic: str,
+        stamp_ns: int,
+        frame_id: str,
+        size: tuple[int, int],
+        matrix: F64,
+        baseline: float,
+    ) -> Made:
         from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
         K, R, P = (m.ravel().tolist() for m in _matrices(matrix, baseline))
-        calibration = CameraCalibration(frame_id=frame_id, width=size[0], height=size[1], K=K, R=R, P=P)
+        calibration = CameraCalibration(
+            frame_id=frame_id, width=size[0], height=size[1], K=K, R=R, P=P
+        )
         calibration.timestamp.FromNanoseconds(stamp_ns)
         return topic, "foxglove.CameraCalibration", calibration
 
     def cloud(self, frame: DriveFrame) -> Made:
         from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 
-        cloud = PointCloud(frame_id="lidar", point_stride=_POINT.itemsize, data=_records(frame).tobytes())
+        cloud = PointCloud(
+            frame_id="lidar", point_stride=_POINT.itemsize, data=_records(frame).tobytes()
+        )
         cloud.timestamp.FromNanoseconds(frame.stamp_ns)
         cloud.pose.orientation.w = 1.0
         for name, kind, offset in _FIELDS:
@@ -239,7 +335,9 @@ class FoxgloveMessages:
         fix.timestamp.FromNanoseconds(stamp_ns)
         return "/gnss", "foxglove.LocationFix", fix
 
-    def _edge(self, topic: str, stamp_ns: int, parent: str, child: str, parent_T_child: F64) -> Made:
+    def _edge(
+        self, topic: str, stamp_ns: int, parent: str, child: str, parent_T_child: F64
+    ) -> Made:
         from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 
         t, q = translation_quaternion(parent_T_child)

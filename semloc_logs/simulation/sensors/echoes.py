@@ -1,6 +1,8 @@
-"""What becomes of the true range of a ray before a lidar reports it: weak echoes, mixed edges, bias and noise.
+"""What becomes of the true range of a ray before a lidar reports it: weak echoes, mixed edges, bias
+and noise.
 
-Ranges come as a grid (columns, beams), inf where nothing is hit; a beam's next measurement is the next row.
+Ranges come as a grid (columns, beams), inf where nothing is hit; a beam's next measurement is the
+next row.
 """
 
 from __future__ import annotations
@@ -16,8 +18,30 @@ I64 = NDArray[np.int64]
 
 # share of the light of 905 nm that comes back from a surface of each class that faces the sensor
 _REFLECTANCE = np.full(256, 0.3)
-_REFLECTANCE[:19] = 0.18, 0.3, 0.35, 0.35, 0.3, 0.3, 0.3, 0.9, 0.45, 0.35, 0.3, 0.35, 0.35, 0.3, 0.35, 0.35, 0.35, 0.2, 0.2
-_FAINTEST = 1.2e-6  # of reflectance * cosine / range^2 (1/m^2), for two echoes of three: asphalt at 64 m from a height of 1.8 m
+_REFLECTANCE[:19] = (
+    0.18,
+    0.3,
+    0.35,
+    0.35,
+    0.3,
+    0.3,
+    0.3,
+    0.9,
+    0.45,
+    0.35,
+    0.3,
+    0.35,
+    0.35,
+    0.3,
+    0.35,
+    0.35,
+    0.35,
+    0.2,
+    0.2,
+)
+# of reflectance * cosine / range^2 (1/m^2), for two echoes of three: asphalt at 64 m from a height
+# of 1.8 m
+_FAINTEST = 1.2e-6
 _LEAVES = 0.3  # the least cosine: a beam that meets leaves meets many
 _LOST = 0.002  # of all measurements, for no reason that one could see
 _PULSE = 1.5  # m: echoes nearer to each other than that are one
@@ -34,7 +58,8 @@ def hash_cells(cells: I64, seed: int = 0) -> I64:
 
 
 def reflectance(world_points: F64, labels: U8, wet: float = 0.0) -> F64:
-    """Share of light that points (n, 3) send back (n,): by class, varied by place; paint of vehicles from white to black; panes hardly any.
+    """Share of light that points (n, 3) send back (n,): by class, varied by place; paint of
+    vehicles from white to black; panes hardly any.
 
     ``wet`` in [0, 1] darkens roads and pavements as a film of water does.
     """
@@ -50,46 +75,70 @@ def reflectance(world_points: F64, labels: U8, wet: float = 0.0) -> F64:
 
 
 def is_pane(world_points: F64, labels: U8) -> NDArray[np.bool_]:
-    """Which points (n, 3) lie on panes that let light through: fixed patches of facades and of vehicles."""
+    """Which points (n, 3) lie on panes that let light through: fixed patches of facades and of
+    vehicles.
+    """
     patch = hash_cells(np.floor(world_points / [0.6, 0.6, 0.5]).astype(np.int64)) % 1000
-    pane: NDArray[np.bool_] = ((labels == BUILDING) & (patch < 12)) | ((labels >= CAR) & (labels <= CAR + 2) & (patch < 110))
+    pane: NDArray[np.bool_] = ((labels == BUILDING) & (patch < 12)) | (
+        (labels >= CAR) & (labels <= CAR + 2) & (patch < 110)
+    )
     return pane
 
 
 def is_heard(
-    rng: np.random.Generator, distance: NDArray[np.floating], cosine: F64, reflected: F64, labels: U8 | None = None
+    rng: np.random.Generator,
+    distance: NDArray[np.floating],
+    cosine: F64,
+    reflected: F64,
+    labels: U8 | None = None,
 ) -> NDArray[np.bool_]:
-    """Which echoes (n,) are strong enough: strength falls with the square of the range and with the cosine of incidence."""
+    """Which echoes (n,) are strong enough: strength falls with the square of the range and with the
+    cosine of incidence.
+    """
     least = 0.01 if labels is None else np.where(labels == VEGETATION, _LEAVES, 0.01)
     strength = reflected * np.clip(cosine, least, 1.0) / np.maximum(distance, 3.0) ** 2
-    return np.asarray(rng.random(len(distance)) < (1.0 - _LOST) * (1.0 - np.exp(-1.1 * strength / _FAINTEST)))
+    return np.asarray(
+        rng.random(len(distance)) < (1.0 - _LOST) * (1.0 - np.exp(-1.1 * strength / _FAINTEST))
+    )
 
 
 def mixed_ranges(rng: np.random.Generator, distance: F32, gap: float, divergence: float) -> F32:
-    """Ranges (columns, beams) where beams that are cut by an edge report something between the near and the far surface.
+    """Ranges (columns, beams) where beams that are cut by an edge report something between the near
+    and the far surface.
 
-    ``gap`` is the angle between columns and ``divergence`` that of a beam (rad): their ratio is the share of beams that an edge cuts.
-    Surfaces further apart than the pulse is long give two echoes, of which one is reported, so mixed ranges become rare with the step.
+    ``gap`` is the angle between columns and ``divergence`` that of a beam (rad): their ratio is the
+    share of beams that an edge cuts. Surfaces further apart than the pulse is long give two echoes,
+    of which one is reported, so mixed ranges become rare with the step.
     """
     out = distance.copy()
     cut = min(1.0, divergence / gap)
-    near, far = np.minimum(distance[:-1], distance[1:]), np.maximum(distance[:-1], distance[1:])
+    near = np.minimum(distance[:-1], distance[1:])
+    far = np.maximum(distance[:-1], distance[1:])
     with np.errstate(invalid="ignore"):
         step = np.where(np.isfinite(far), far - near, 0.0)
     is_edge = step > np.maximum(0.15, 0.02 * near)
-    i, j = np.nonzero(is_edge & (rng.random(step.shape, np.float32) < cut * _PULSE / (_PULSE + step)))
+    i, j = np.nonzero(
+        is_edge & (rng.random(step.shape, np.float32) < cut * _PULSE / (_PULSE + step))
+    )
     which = i + (rng.random(len(i)) < 0.5)
     out[which, j] = near[i, j] + rng.random(len(i)) * step[i, j]
     return out
 
 
 def beyond_edges(distance: F32, labels: U8, reach: int = 2) -> U8:
-    """For every point (columns, beams) the class on the other side of a depth edge within ``reach`` columns, else its own."""
+    """For every point (columns, beams) the class on the other side of a depth edge within ``reach``
+    columns, else its own.
+    """
     out = labels.copy()
     for shift in range(reach, 0, -1):
         for here, there in ((np.s_[shift:], np.s_[:-shift]), (np.s_[:-shift], np.s_[shift:])):
-            a, b = distance[here], distance[there]
+            a = distance[here]
+            b = distance[there]
             with np.errstate(invalid="ignore"):
-                other = np.isfinite(b) & (np.abs(a - b) > np.maximum(0.4, 0.03 * a)) & (labels[here] != labels[there])
+                other = (
+                    np.isfinite(b)
+                    & (np.abs(a - b) > np.maximum(0.4, 0.03 * a))
+                    & (labels[here] != labels[there])
+                )
             out[here] = np.where(other, labels[there], out[here])
     return out

@@ -1,4 +1,6 @@
-"""The errors that a labelling network makes: wrong patches that stay in place or come and go, and classes that bleed over edges."""
+"""The errors that a labelling network makes: wrong patches that stay in place or come and go, and
+classes that bleed over edges.
+"""
 
 from __future__ import annotations
 
@@ -42,19 +44,31 @@ def _table() -> U8:
 
 
 def corrupt_labels(
-    points: NDArray[np.floating], labels: U8, seed: int, rate: float, *, frame: int | None = None, beyond: U8 | None = None
+    points: NDArray[np.floating],
+    labels: U8,
+    seed: int,
+    rate: float,
+    *,
+    frame: int | None = None,
+    beyond: U8 | None = None,
 ) -> U8:
-    """The labels (n,) with about the share ``rate`` of them wrong as a network's are: in patches of 0.5 m and 2.5 m and single points.
+    """The labels (n,) with about the share ``rate`` of them wrong as a network's are: in patches of
+    0.5 m and 2.5 m and single points.
 
-    Patches follow from ``points`` (n, 3) and ``seed``: points in a fixed frame and the same seed give the same errors in every sweep. With
-    the number of a ``frame`` about half of them belong to that frame alone. ``beyond`` (n,) is the class across the nearest edge
-    (:func:`semloc_logs.simulation.sensors.echoes.beyond_edges`), which bleeds over as that of masks that are laid over a scan does.
+    Patches follow from ``points`` (n, 3) and ``seed``: points in a fixed frame and the same seed
+    give the same errors in every sweep. With the number of a ``frame`` about half of them belong to
+    that frame alone. ``beyond`` (n,) is the class across the nearest edge
+    (:func:`semloc_logs.simulation.sensors.echoes.beyond_edges`), which bleeds over as that of masks
+    that are laid over a scan does.
     """
-    table, out = _table(), labels.copy()
+    table = _table()
+    out = labels.copy()
     exact = np.asarray(points, np.float64)
     if beyond is not None:
         at = np.flatnonzero(beyond != labels)
-        patch = hash_cells(np.floor(exact[at] / 0.7).astype(np.int64), seed * 3 + 7 + 65_537 * (frame or 0))
+        patch = hash_cells(
+            np.floor(exact[at] / 0.7).astype(np.int64), seed * 3 + 7 + 65_537 * (frame or 0)
+        )
         bleeds = at[patch % 4096 < 4096 * min(1.0, _BLEED * rate / 0.15)]
         out[bleeds] = beyond[bleeds]
         rate = max(0.0, rate - len(bleeds) / max(1, len(labels)))
@@ -62,7 +76,8 @@ def corrupt_labels(
     kinds = [(2.5, 0.45, 0), (0.5, 0.4, 0)]  # size (m), share of the errors, of which frame
     if frame is not None:
         kinds = [(2.5, 0.25, 0), (0.5, 0.2, 0), (1.5, 0.25, passing), (0.4, 0.15, passing)]
-    # errors of several kinds fall on the same points, so that each kind has to make a little more of them
+    # errors of several kinds fall on the same points, so that each kind has to make a little more
+    # of them
     more = -np.log1p(-min(rate, 0.999)) / rate if rate > 0 else 0.0
     for k, (size, share, of_frame) in enumerate([*kinds, (0.0, 0.15, passing)]):
         if size:

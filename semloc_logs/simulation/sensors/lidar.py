@@ -1,4 +1,6 @@
-"""Lidar sweeps through a triangle world, with what a sensor adds to them: lost echoes, mixed edges, bias and noise."""
+"""Lidar sweeps through a triangle world, with what a sensor adds to them: lost echoes, mixed edges,
+bias and noise.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ U8 = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
-    """Points (n, 3) float32 in the sensor frame in metres, Cityscapes train ids (n,), ring (n,), share of the turn (n,).
+    """Points (n, 3) float32 in the sensor frame in metres, Cityscapes train ids (n,), ring (n,),
+    share of the turn (n,).
 
     ``beyond`` (n,): the class on the other side of a depth edge beside the point, else its own.
     """
@@ -50,35 +53,57 @@ def full_sweep(
     moment: float | None = None,
     wet: float = 0.0,
 ) -> Sweep:
-    """One turn of the sensor standing at ``world_T_lidar`` (4, 4); fewer ``columns``, a shorter range, an azimuth ``sector`` if asked.
+    """One turn of the sensor standing at ``world_T_lidar`` (4, 4); fewer ``columns``, a shorter
+    range, an azimuth ``sector`` if asked.
 
-    ``traffic`` is a second scene, of what moves, that hides the first where it is nearer.
-    With ``world_T_end`` the sensor moves during the turn and each point is in the frame of its own moment, as real ones are.
-    ``moment`` in seconds says where in its pattern the sensor begins (any, if not given); ``wet`` in [0, 1] how wet the road is.
+    ``traffic`` is a second scene, of what moves, that hides the first where it is nearer. With
+    ``world_T_end`` the sensor moves during the turn and each point is in the frame of its own
+    moment, as real ones are. ``moment`` in seconds says where in its pattern the sensor begins
+    (any, if not given); ``wet`` in [0, 1] how wet the road is.
     """
     moment = float(rng.uniform(0, 1000)) if moment is None else moment
     count = columns or model.columns
     directions, ring, turn = beam_directions(model, count, sector, moment)
-    beams, far = len(model.elevations_deg), min(max_range or model.max_range, model.max_range)
+    beams = len(model.elevations_deg)
+    far = min(max_range or model.max_range, model.max_range)
     lift = np.zeros((beams, 3), np.float32)
     if model.lift:
         lift[:, 2] = model.lift
-    rays, origin = _rays(_pointed(rng, directions, beams, model.pointing_deg), lift, ring, turn, world_T_lidar, world_T_end)
+    rays, origin = _rays(
+        _pointed(rng, directions, beams, model.pointing_deg),
+        lift,
+        ring,
+        turn,
+        world_T_lidar,
+        world_T_end,
+    )
     distance, labels, normal = _cast(scene, traffic, origin, rays)
     distance[is_blocked(model, directions)] = np.inf
     grid = distance.reshape(-1, beams)
-    # an edge is cut by the beams of the columns on both sides of it; in a rosette columns follow each other at about a third of a degree
+    # an edge is cut by the beams of the columns on both sides of it; in a rosette columns follow
+    # each other at about a third of a degree
     gap = np.radians(0.35 if model.pattern == "rosette" else model.width_deg / count)
     beyond = beyond_edges(grid, labels.reshape(-1, beams)).reshape(-1)
-    measured = mixed_ranges(rng, grid, float(gap), model.divergence).reshape(-1) if model.divergence > 0 else distance
+    measured = (
+        mixed_ranges(rng, grid, float(gap), model.divergence).reshape(-1)
+        if model.divergence > 0
+        else distance
+    )
     hit = np.flatnonzero((measured > model.min_range) & (measured < far))
-    ray, normal, seen = rays[hit], normal[hit], labels[hit]
-    cosine = np.abs(np.einsum("ij,ij->i", normal, ray)) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    ray = rays[hit]
+    normal = normal[hit]
+    seen = labels[hit]
+    cosine = np.abs(np.einsum("ij,ij->i", normal, ray)) / np.maximum(
+        np.linalg.norm(normal, axis=1), 1e-12
+    )
     end = origin[hit] + ray * measured[hit, None]
     kept = is_heard(rng, measured[hit], cosine, reflectance(end, seen, wet), seen)
-    hit, cosine = hit[kept], cosine[kept]
+    hit = hit[kept]
+    cosine = cosine[kept]
     noise = rng.normal(size=len(hit)) * model.noise * (1 + 0.5 * (1 - cosine))
-    bias = np.random.default_rng(zlib.crc32(model.name.encode())).normal(size=beams) * model.beam_bias
+    bias = (
+        np.random.default_rng(zlib.crc32(model.name.encode())).normal(size=beams) * model.beam_bias
+    )
     reported = measured[hit] + noise + bias[ring[hit]]
     points = (directions[hit] * reported[:, None] + lift[ring[hit]]).astype(np.float32)
     return Sweep(points, labels[hit], ring[hit], turn[hit], beyond[hit])
@@ -91,7 +116,8 @@ def _cast(scene: Scene, traffic: Scene | None, origin: F32, rays: F32) -> tuple[
     if traffic is not None:
         nearer, moving, moving_normal = traffic.cast(origin, rays)
         first = nearer < distance
-        distance, labels = np.where(first, nearer, distance), np.where(first, traffic.labels[moving], labels)
+        distance = np.where(first, nearer, distance)
+        labels = np.where(first, traffic.labels[moving], labels)
         normal = np.where(first[:, None], moving_normal, normal)
     return distance, labels, normal
 
@@ -100,12 +126,19 @@ def _pointed(rng: np.random.Generator, directions: F32, beams: int, sigma_deg: f
     """Where the beams really point when their columns are reported at ``directions`` (n, 3)."""
     if sigma_deg <= 0:
         return directions
-    off = np.repeat(np.radians(sigma_deg) * rng.normal(size=len(directions) // beams), beams).astype(np.float32)
-    return directions + np.stack([-directions[:, 1] * off, directions[:, 0] * off, np.zeros_like(off)], 1)
+    off = np.repeat(
+        np.radians(sigma_deg) * rng.normal(size=len(directions) // beams), beams
+    ).astype(np.float32)
+    return directions + np.stack(
+        [-directions[:, 1] * off, directions[:, 0] * off, np.zeros_like(off)], 1
+    )
 
 
-def _rays(directions: F32, lift: F32, ring: NDArray[np.uint16], turn: F64, start: F64, end: F64 | None) -> tuple[F32, F32]:
-    """Directions and origins (n, 3) in the world for rays of a sensor that stands at ``start`` or moves from there to ``end``.
+def _rays(
+    directions: F32, lift: F32, ring: NDArray[np.uint16], turn: F64, start: F64, end: F64 | None
+) -> tuple[F32, F32]:
+    """Directions and origins (n, 3) in the world for rays of a sensor that stands at ``start`` or
+    moves from there to ``end``.
 
     ``lift`` (beams, 3) are the origins of the beams in the sensor frame.
     """
@@ -114,13 +147,21 @@ def _rays(directions: F32, lift: F32, ring: NDArray[np.uint16], turn: F64, start
         return directions @ rotation.T, (lift @ rotation.T + start[:3, 3].astype(np.float32))[ring]
     # poses are a hundred microseconds apart at most: half a millimetre at 5 m/s
     moments = np.linspace(0, 1, 1001)
-    poses = interpolate(np.array([0, 10**9]), np.stack([start, end]), (moments * 1e9).astype(np.int64)).astype(np.float32)
+    poses = interpolate(
+        np.array([0, 10**9]), np.stack([start, end]), (moments * 1e9).astype(np.int64)
+    ).astype(np.float32)
     poses = poses[np.round(turn * 1000).astype(np.int64)]
     rotation = poses[:, :3, :3]
-    return np.einsum("nij,nj->ni", rotation, directions), rotation[:, :, 2] * lift[ring, 2:] + poses[:, :3, 3]
+    return np.einsum("nij,nj->ni", rotation, directions), rotation[:, :, 2] * lift[
+        ring, 2:
+    ] + poses[:, :3, 3]
 
 
-def sweep(scene: Scene, world_T_lidar: F64, rng: np.random.Generator, model: LidarModel, **options: object) -> tuple[F32, U8]:
-    """Points (n, 3) in the sensor frame and labels (n,) of :func:`full_sweep`, which has the options."""
+def sweep(
+    scene: Scene, world_T_lidar: F64, rng: np.random.Generator, model: LidarModel, **options: object
+) -> tuple[F32, U8]:
+    """Points (n, 3) in the sensor frame and labels (n,) of :func:`full_sweep`, which has the
+    options.
+    """
     result = full_sweep(scene, world_T_lidar, rng, model, **options)  # type: ignore[arg-type]
     return result.points, result.labels

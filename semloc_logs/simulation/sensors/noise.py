@@ -21,12 +21,15 @@ def _number(a: int, b: int, c: int, seed: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def octaves(points: F32, footprint: F32, size: float, count: int, keep: float, stretch: float, seed: int) -> F32:
-    """Value noise (n,) at ``points`` (n, 3) of ``count`` octaves from lumps of ``size`` metres on (Ebert et al., Texturing and Modeling,
-    chapter 2).
+def octaves(
+    points: F32, footprint: F32, size: float, count: int, keep: float, stretch: float, seed: int
+) -> F32:
+    """Value noise (n,) at ``points`` (n, 3) of ``count`` octaves from lumps of ``size`` metres on
+    (Ebert et al., Texturing and Modeling, chapter 2).
 
-    An octave is ``keep`` as strong and 0.47 as large as the one before and fades where its lumps are as small as ``footprint`` (n,), so
-    that pictures do not flicker. ``stretch`` is a factor on z.
+    An octave is ``keep`` as strong and 0.47 as large as the one before and fades where its lumps
+    are as small as ``footprint`` (n,), so that pictures do not flicker. ``stretch`` is a factor on
+    z.
     """
     out = np.zeros(len(points), np.float32)
     for n in range(len(points)):
@@ -35,15 +38,24 @@ def octaves(points: F32, footprint: F32, size: float, count: int, keep: float, s
             visible = min(1.0, 0.6 * lump / footprint[n] - 0.5)
             if visible <= 0.0:
                 break
-            x, y, z = points[n, 0] / lump, points[n, 1] / lump, points[n, 2] * stretch / lump
-            i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-            u, v, w = x - i, y - j, z - k
-            u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
+            x = points[n, 0] / lump
+            y = points[n, 1] / lump
+            z = points[n, 2] * stretch / lump
+            i = int(np.floor(x))
+            j = int(np.floor(y))
+            k = int(np.floor(z))
+            u = x - i
+            v = y - j
+            w = z - k
+            u = u * u * (3 - 2 * u)
+            v = v * v * (3 - 2 * v)
+            w = w * w * (3 - 2 * w)
             value = 0.0
             for c in range(2):
                 for b in range(2):
                     weight = (w if c else 1 - w) * (v if b else 1 - v)
-                    low, high = _number(i, j + b, k + c, seed + octave), _number(i + 1, j + b, k + c, seed + octave)
+                    low = _number(i, j + b, k + c, seed + octave)
+                    high = _number(i + 1, j + b, k + c, seed + octave)
                     value += weight * (low + (high - low) * u)
             total += strength * visible * (2 * value - 1)
             strength *= keep
@@ -54,7 +66,9 @@ def octaves(points: F32, footprint: F32, size: float, count: int, keep: float, s
 
 def number(a: I64 | int, b: I64 | int, seed: I64 | int) -> F32:
     """Numbers in [0, 1) that follow from integers; arrays are broadcast."""
-    h = (np.multiply(a, 73856093) ^ np.multiply(b, 19349663) ^ np.multiply(seed, 40503)) & 0xFFFFFFFF
+    h = (
+        np.multiply(a, 73856093) ^ np.multiply(b, 19349663) ^ np.multiply(seed, 40503)
+    ) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
     return np.asarray((h ^ (h >> 16)) / 4294967296.0, np.float32)
@@ -65,27 +79,47 @@ def cell(value: NDArray[np.floating], size: Real) -> I64:
     return np.asarray(np.floor(value / size), np.int64)
 
 
-def within(value: NDArray[np.floating], low: Real, high: Real, footprint: NDArray[np.floating]) -> F32:
+def within(
+    value: NDArray[np.floating], low: Real, high: Real, footprint: NDArray[np.floating]
+) -> F32:
     """How much of a pixel lies between two edges, from 0 to 1."""
     soft = np.maximum(footprint, np.float32(1e-3))
-    return np.asarray(np.clip((value - low) / soft + 0.5, 0, 1) * np.clip((high - value) / soft + 0.5, 0, 1), np.float32)
+    return np.asarray(
+        np.clip((value - low) / soft + 0.5, 0, 1) * np.clip((high - value) / soft + 0.5, 0, 1),
+        np.float32,
+    )
 
 
 def stones(
-    u: NDArray[np.floating], v: NDArray[np.floating], length: float, height: float, joint: float, footprint: F32, seed: I64 | int
+    u: NDArray[np.floating],
+    v: NDArray[np.floating],
+    length: float,
+    height: float,
+    joint: float,
+    footprint: F32,
+    seed: I64 | int,
 ) -> tuple[F32, F32]:
-    """Courses of stones in the plane (u, v) in metres: how much joint (0 to 1) a pixel holds, and the tone (-1 to 1) of the stone."""
+    """Courses of stones in the plane (u, v) in metres: how much joint (0 to 1) a pixel holds, and
+    the tone (-1 to 1) of the stone.
+    """
     row = cell(v, height)
     shifted = u + 0.5 * length * (row & 1)
     column = cell(shifted, length)
-    a, b = shifted - column * length, v - row * height
-    inside = within(a, joint / 2, length - joint / 2, footprint) * within(b, joint / 2, height - joint / 2, footprint)
+    a = shifted - column * length
+    b = v - row * height
+    inside = within(a, joint / 2, length - joint / 2, footprint) * within(
+        b, joint / 2, height - joint / 2, footprint
+    )
     sharp = np.clip(2.0 - 2.0 * footprint / height, 0, 1)
     inside = sharp * inside + (1 - sharp) * (1 - joint / height)
-    return np.asarray(1 - inside, np.float32), np.asarray(sharp * (2 * number(column, row, seed) - 1), np.float32)
+    return np.asarray(1 - inside, np.float32), np.asarray(
+        sharp * (2 * number(column, row, seed) - 1), np.float32
+    )
 
 
-def letters(u: NDArray[np.floating], v: NDArray[np.floating], size: float, footprint: F32, seed: I64 | int) -> F32:
+def letters(
+    u: NDArray[np.floating], v: NDArray[np.floating], size: float, footprint: F32, seed: I64 | int
+) -> F32:
     """Blocks like those of letters and numbers: 1 where there is ink."""
     ink = number(cell(u, size), cell(v, size), seed) < 0.45
     return np.where(footprint > 0.7 * size, np.float32(0.4), ink.astype(np.float32))

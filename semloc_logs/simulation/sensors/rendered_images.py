@@ -1,4 +1,6 @@
-"""Colour pictures of a simulated world: surfaces lit by sun and sky, cast shadows, haze, and what a camera makes of them."""
+"""Colour pictures of a simulated world: surfaces lit by sun and sky, cast shadows, haze, and what a
+camera makes of them.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ _NOISE = 1.6  # grey levels of 255 in the middle tones
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """The sun's direction (azimuth, elevation in radians) and the colours of sun, sky overhead and horizon, linear."""
+    """The sun's direction (azimuth, elevation in radians) and the colours of sun, sky overhead and
+    horizon, linear.
+    """
 
     azimuth: float
     elevation: float
@@ -36,7 +40,9 @@ class Light:
     def direction(self) -> F32:
         """Unit vector (3,) to the sun."""
         c = np.cos(self.elevation)
-        return np.array([c * np.cos(self.azimuth), c * np.sin(self.azimuth), np.sin(self.elevation)], np.float32)
+        return np.array(
+            [c * np.cos(self.azimuth), c * np.sin(self.azimuth), np.sin(self.elevation)], np.float32
+        )
 
 
 LIGHTS = {
@@ -47,7 +53,9 @@ LIGHTS = {
 
 
 class Painter:
-    """Pictures of one scene under one condition. Surfaces look the same in all of them; light, season and clouds are the condition's."""
+    """Pictures of one scene under one condition. Surfaces look the same in all of them; light,
+    season and clouds are the condition's.
+    """
 
     def __init__(self, scene: Scene, condition: Condition | None = None) -> None:
         self.scene, self.condition = scene, condition or Condition()
@@ -55,24 +63,37 @@ class Painter:
         self._surfaces, self._plan = surfaces(scene.world), road_plan(scene.world)
 
     def picture(
-        self, world_T_camera: F64, rng: np.random.Generator, model: CameraModel, *, traffic: Scene | None = None, hits: Hits | None = None
+        self,
+        world_T_camera: F64,
+        rng: np.random.Generator,
+        model: CameraModel,
+        *,
+        traffic: Scene | None = None,
+        hits: Hits | None = None,
     ) -> U8:
-        """RGB (h, w, 3) as seen by the camera at ``world_T_camera`` (4, 4, optical frame); ``hits``: :func:`camera.first_hits`."""
+        """RGB (h, w, 3) as seen by the camera at ``world_T_camera`` (4, 4, optical frame);
+        ``hits``: :func:`camera.first_hits`.
+        """
         rays = pixel_rays(model)
         if hits is None:
             hits = first_hits(self.scene, world_T_camera, rays, traffic)
         linear = self._radiance(hits, rays, world_T_camera, model, traffic)
         return expose(linear, rng)
 
-    def _radiance(self, hits: Hits, rays: F32, world_T_camera: F64, model: CameraModel, traffic: Scene | None) -> F32:
+    def _radiance(
+        self, hits: Hits, rays: F32, world_T_camera: F64, model: CameraModel, traffic: Scene | None
+    ) -> F32:
         """Linear colours (h, w, 3)."""
-        turn, place = world_T_camera[:3, :3].astype(np.float32), world_T_camera[:3, 3].astype(np.float32)
+        turn = world_T_camera[:3, :3].astype(np.float32)
+        place = world_T_camera[:3, 3].astype(np.float32)
         out = np.zeros((hits.depth.size, 3), np.float32)
         seen = np.isfinite(hits.depth).ravel()
-        at, open_ = np.flatnonzero(seen), np.flatnonzero(~seen)
+        at = np.flatnonzero(seen)
+        open_ = np.flatnonzero(~seen)
         out[open_] = self._sky(rays.reshape(-1, 3)[open_] @ turn.T)
         ray = rays.reshape(-1, 3)[at]
-        depth, ray = hits.depth.ravel()[at], ray @ turn.T
+        depth = hits.depth.ravel()[at]
+        ray = ray @ turn.T
         points = ray * depth[:, None] + place
         normals = hits.normal.reshape(-1, 3)[at].astype(np.float32)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -91,19 +112,36 @@ class Painter:
         return out.reshape(*rays.shape)
 
     def _colours(
-        self, hits: Hits, pixels: NDArray[np.intp], points: F32, normals: F32, footprint: F32, traffic: Scene | None
+        self,
+        hits: Hits,
+        pixels: NDArray[np.intp],
+        points: F32,
+        normals: F32,
+        footprint: F32,
+        traffic: Scene | None,
     ) -> tuple[F32, F32]:
-        labels, triangle, moving = hits.labels.ravel()[pixels], hits.triangle.ravel()[pixels], hits.moving.ravel()[pixels]
+        labels = hits.labels.ravel()[pixels]
+        triangle = hits.triangle.ravel()[pixels]
+        moving = hits.moving.ravel()[pixels]
         paint = np.zeros(len(pixels), np.float32)
         road = np.flatnonzero((labels == ROAD) & ~moving)
         if len(road):
             paint[road] = markings(self._plan, points[road], footprint[road])
-        colour, gloss = np.zeros((len(pixels), 3), np.float32), np.zeros(len(pixels), np.float32)
+        colour = np.zeros((len(pixels), 3), np.float32)
+        gloss = np.zeros(len(pixels), np.float32)
         groups: list[tuple[NDArray[np.bool_], Surfaces]] = [(~moving, self._surfaces)]
         if traffic is not None and moving.any():
             groups.append((moving, surfaces(traffic.world, moving=True)))
         for mask, known in groups:
-            at = spots(known, triangle[mask], points[mask], normals[mask], labels[mask], footprint[mask], paint[mask])
+            at = spots(
+                known,
+                triangle[mask],
+                points[mask],
+                normals[mask],
+                labels[mask],
+                footprint[mask],
+                paint[mask],
+            )
             colour[mask], gloss[mask] = colours(at, self.condition.season)
         return colour, gloss
 
@@ -111,7 +149,10 @@ class Painter:
         """Light (n, 3) that falls on points with normals towards the camera."""
         light = self.light
         up = (0.5 + 0.5 * normals[:, 2:3]).astype(np.float32)
-        ambient = 0.75 * (up * np.asarray(light.zenith, np.float32) + (1 - up) * 0.35 * np.asarray(light.horizon, np.float32))
+        ambient = 0.75 * (
+            up * np.asarray(light.zenith, np.float32)
+            + (1 - up) * 0.35 * np.asarray(light.horizon, np.float32)
+        )
         if not any(light.sun):
             return np.asarray(ambient * 1.25, np.float32)
         sun = np.maximum(normals @ light.direction, 0)
@@ -128,17 +169,34 @@ class Painter:
         """Colour (n, 3) of the sky in world directions (n, 3) of any length."""
         d = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
         high = np.clip(d[:, 2:3], 0, 1) ** 0.6
-        sky = high * np.asarray(self.light.zenith, np.float32) + (1 - high) * np.asarray(self.light.horizon, np.float32)
+        sky = high * np.asarray(self.light.zenith, np.float32) + (1 - high) * np.asarray(
+            self.light.horizon, np.float32
+        )
         white = 0.35 if self.condition.daytime == "overcast" else 0.9
-        flat = d / np.maximum(d[:, 2:3], 0.04) * np.array([1, 1, 0], np.float32)  # clouds are a plane overhead
-        wisps = octaves(flat, 0.02 / np.maximum(d[:, 2], 0.04), 1.8, 5, 0.55, 1.0, 211 + 31 * self.condition.number)
+        # clouds are a plane overhead
+        flat = d / np.maximum(d[:, 2:3], 0.04) * np.array([1, 1, 0], np.float32)
+        wisps = octaves(
+            flat,
+            0.02 / np.maximum(d[:, 2], 0.04),
+            1.8,
+            5,
+            0.55,
+            1.0,
+            211 + 31 * self.condition.number,
+        )
         cover = white * np.clip(0.9 * wisps - 0.1, 0, 1)[:, None]
-        tone = np.float32(0.6) if self.condition.daytime == "overcast" else np.asarray(self.light.horizon, np.float32) * np.float32(1.15)
+        tone = (
+            np.float32(0.6)
+            if self.condition.daytime == "overcast"
+            else np.asarray(self.light.horizon, np.float32) * np.float32(1.15)
+        )
         return np.asarray(sky + cover * (tone - sky), np.float32)
 
 
 def expose(linear: F32, rng: np.random.Generator) -> U8:
-    """The picture (h, w, 3) uint8 that a camera takes of linear colours: exposure by the mean, lens blur, noise, gamma."""
+    """The picture (h, w, 3) uint8 that a camera takes of linear colours: exposure by the mean, lens
+    blur, noise, gamma.
+    """
     grey = linear.mean(axis=2)
     gain = 0.20 / max(float(np.exp(np.mean(np.log(np.maximum(grey, 0.01))))), 0.02)
     exposed = cv2.GaussianBlur(linear * np.float32(np.clip(gain, 0.3, 6.0)), (0, 0), _BLUR)

@@ -1,4 +1,5 @@
-"""Colours of simulated surfaces, from the place in the world alone: the same from everywhere and in every session.
+"""Colours of simulated surfaces, from the place in the world alone: the same from everywhere and in
+every session.
 
 Colours are linear reflectances (n, 3).
 """
@@ -29,7 +30,15 @@ from semloc_logs.simulation.meshes.world import (
     VEGETATION,
     WALL,
 )
-from semloc_logs.simulation.sensors.noise import Real, cell, letters, number, octaves, stones, within
+from semloc_logs.simulation.sensors.noise import (
+    Real,
+    cell,
+    letters,
+    number,
+    octaves,
+    stones,
+    within,
+)
 from semloc_logs.simulation.sensors.surface_colours import Surfaces
 
 F32 = NDArray[np.float32]
@@ -39,9 +48,10 @@ U8 = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots:
-    """What is looked at: points and unit normals of the triangles (n, 3), labels (n,), of the pieces they belong to the numbers (n,) and
-    boxes (n, 3), of the triangles whether they are ``bark`` and numbers, sizes (n,) of the pixels in metres, ``paint`` (n,) share of
-    road marking."""
+    """What is looked at: points and unit normals of the triangles (n, 3), labels (n,), of the
+    pieces they belong to the numbers (n,) and boxes (n, 3), of the triangles whether they are
+    ``bark`` and numbers, sizes (n,) of the pixels in metres, ``paint`` (n,) share of road marking.
+    """
 
     points: F32
     normals: F32
@@ -61,7 +71,9 @@ class Spots:
             self.own[some], self.footprint[some], self.paint[some],
         )  # fmt: skip
 
-    def noise(self, size: float, count: int, keep: float, *, stretch: float = 1.0, seed: int = 0) -> F32:
+    def noise(
+        self, size: float, count: int, keep: float, *, stretch: float = 1.0, seed: int = 0
+    ) -> F32:
         """:func:`noise.octaves` at the spots."""
         return np.asarray(octaves(self.points, self.footprint, size, count, keep, stretch, seed))
 
@@ -69,22 +81,43 @@ class Spots:
         """Metres along the level direction of the surface, whichever way the triangle is turned."""
         level = np.stack([-self.normals[:, 1], self.normals[:, 0]], axis=1)
         level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-6)
-        level *= np.where(level @ np.array([0.83, 0.56], np.float32) < 0, np.float32(-1), np.float32(1))[:, None]
+        level *= np.where(
+            level @ np.array([0.83, 0.56], np.float32) < 0, np.float32(-1), np.float32(1)
+        )[:, None]
         return np.asarray(np.einsum("ij,ij->i", level, self.points[:, :2]), np.float32)
 
 
-def spots(surfaces: Surfaces, triangle: I64, points: F32, normals: F32, labels: U8, footprint: F32, paint: F32) -> Spots:
+def spots(
+    surfaces: Surfaces,
+    triangle: I64,
+    points: F32,
+    normals: F32,
+    labels: U8,
+    footprint: F32,
+    paint: F32,
+) -> Spots:
     """The spots at ``points`` on ``triangle`` (n,) of a world."""
     piece = surfaces.piece[triangle]
-    low, high = surfaces.low[piece], surfaces.high[piece]
+    low = surfaces.low[piece]
+    high = surfaces.high[piece]
     return Spots(
-        points, normals, labels, surfaces.seed[piece], low, high, surfaces.bark[triangle], surfaces.own[triangle], footprint, paint
+        points,
+        normals,
+        labels,
+        surfaces.seed[piece],
+        low,
+        high,
+        surfaces.bark[triangle],
+        surfaces.own[triangle],
+        footprint,
+        paint,
     )
 
 
 def colours(at: Spots, season: str) -> tuple[F32, F32]:
     """Reflectances (n, 3) and how much is mirrored (n,), both from 0 to 1."""
-    colour, gloss = np.zeros((len(at.points), 3), np.float32), np.zeros(len(at.points), np.float32)
+    colour = np.zeros((len(at.points), 3), np.float32)
+    gloss = np.zeros(len(at.points), np.float32)
     for label in np.unique(at.labels).tolist():
         some = np.flatnonzero(at.labels == label)
         colour[some], gloss[some] = _PAINTERS.get(label, _thing)(at.take(some), season)
@@ -115,40 +148,68 @@ def _painted(seed: I64, salt: I64 | int) -> F32:
 
 def _wall(at: Spots, u: F32, h: F32) -> F32:
     """Brick, plaster or panels, with dirt and what was sprayed onto them."""
-    seed, f, rough = at.seed, at.footprint, at.noise(1.7, 7, 0.85)
-    style, warm = number(seed, 1, 7), number(seed, 2, 7)
+    seed = at.seed
+    f = at.footprint
+    rough = at.noise(1.7, 7, 0.85)
+    style = number(seed, 1, 7)
+    warm = number(seed, 2, 7)
     joint, tone = stones(u, h, 0.24, 0.083, 0.014, f, seed)
-    brick = _tone(_mix(_rgb(0.30, 0.11, 0.07), _rgb(0.42, 0.30, 0.17), warm**2), 1 + 0.38 * tone + 0.24 * rough)
+    brick = _tone(
+        _mix(_rgb(0.30, 0.11, 0.07), _rgb(0.42, 0.30, 0.17), warm**2),
+        1 + 0.38 * tone + 0.24 * rough,
+    )
     brick = _mix(brick, _rgb(0.42, 0.40, 0.36), 0.8 * joint)
     r, g, b = (number(seed, k, 7) for k in (3, 4, 5))
-    plaster = _tone(_rgb(0.42 + 0.22 * r, 0.36 + 0.2 * r * g + 0.08 * b, 0.26 + 0.24 * b), 1 + 0.26 * rough)
+    plaster = _tone(
+        _rgb(0.42 + 0.22 * r, 0.36 + 0.2 * r * g + 0.08 * b, 0.26 + 0.24 * b), 1 + 0.26 * rough
+    )
     joint, tone = stones(u, h, 1.8, 0.9, 0.03, f, seed)
-    panel = _mix(_tone(_rgb(0.34, 0.33, 0.31), 1 + 0.1 * tone + 0.28 * rough), _rgb(0.1, 0.1, 0.1), 0.8 * joint)
-    wall = np.where((style < 0.35)[:, None], brick, np.where((style < 0.8)[:, None], plaster, panel))
+    panel = _mix(
+        _tone(_rgb(0.34, 0.33, 0.31), 1 + 0.1 * tone + 0.28 * rough),
+        _rgb(0.1, 0.1, 0.1),
+        0.8 * joint,
+    )
+    wall = np.where(
+        (style < 0.35)[:, None], brick, np.where((style < 0.8)[:, None], plaster, panel)
+    )
     streak = np.maximum(at.noise(0.7, 1, 1.0, stretch=0.1, seed=5), 0)
     wall = _tone(wall, 1 - 0.35 * np.clip(1 - h / 0.8, 0, 1) - 0.1 * streak)
-    i, j = cell(u, 1.7), cell(h, 1.1)
+    i = cell(u, 1.7)
+    j = cell(h, 1.1)
     sprayed = (number(i, j, seed) < 0.03) & (h < 2.2)
     return _mix(wall, _painted(seed, i), sprayed * letters(u, h, 0.09, f, seed))
 
 
 def _facade(at: Spots) -> tuple[F32, F32]:
     """A wall of a house with its windows and doors."""
-    seed, f, u = at.seed, at.footprint, at.along()
+    seed = at.seed
+    f = at.footprint
+    u = at.along()
     h = at.points[:, 2] - at.low[:, 2] - np.float32(1.5)  # houses reach that far into the ground
     wall = _wall(at, u, h)
-    storey, pitch = 2.6 + 0.6 * number(seed, 6, 7), 1.7 + 1.9 * number(seed, 7, 7)
-    i, j = cell(u, pitch), cell(h, storey)
-    a, b = u - i * pitch, h - j * storey
-    width, low, high = 0.75 + 0.5 * number(seed, 8, 7), 0.85, 2.15
+    storey = 2.6 + 0.6 * number(seed, 6, 7)
+    pitch = 1.7 + 1.9 * number(seed, 7, 7)
+    i = cell(u, pitch)
+    j = cell(h, storey)
+    a = u - i * pitch
+    b = h - j * storey
+    width = 0.75 + 0.5 * number(seed, 8, 7)
+    low = 0.85
+    high = 2.15
     left = (pitch - width) / 2
     is_open = (j >= 0) & (number(i, j, seed + 1) > 0.15)
     is_door = is_open & (j == 0) & (number(i, 0, seed + 2) < 0.25)
     door = is_door * within(a, left, left + width, f) * within(b, -0.1, 2.1, f)
-    panel = within(b % np.float32(0.7), 0.1, 0.6, f) * within(a, left + 0.12, left + width - 0.12, f)
+    panel = within(b % np.float32(0.7), 0.1, 0.6, f) * within(
+        a, left + 0.12, left + width - 0.12, f
+    )
     colour = _mix(wall, _tone(_painted(seed + i, 77), 0.6 + 0.4 * panel), door)
     has_window = is_open & ~is_door
-    frame = has_window * within(a, left - 0.08, left + width + 0.08, f) * within(b, low - 0.1, high + 0.06, f)
+    frame = (
+        has_window
+        * within(a, left - 0.08, left + width + 0.08, f)
+        * within(b, low - 0.1, high + 0.06, f)
+    )
     light = np.where(number(seed, 9, 7) < 0.7, np.float32(0.6), np.float32(0.08))
     colour = _mix(colour, _rgb(light, light, 0.97 * light), frame)
     pane = has_window * within(a, left, left + width, f) * within(b, low, high, f)
@@ -156,8 +217,14 @@ def _facade(at: Spots) -> tuple[F32, F32]:
     pane *= 1 - np.maximum(within(a, middle - 0.03, middle + 0.03, f), within(b, 1.77, 1.83, f))
     curtain = number(i, j, seed + 4)
     folds = 0.75 + 0.25 * np.sin(u * (24 + 14 * curtain)) * (f < 0.08)
-    hang = within(b, low + 1.2 * (curtain - 0.5), high, f) * (1 - within(a, left + 0.3 * width, left + 0.7 * width * curtain, f))
-    inside = _mix(_rgb(0.04, 0.045, 0.05), _rgb(0.45 * folds, 0.42 * folds, 0.36 * folds), hang * (curtain > 0.5))
+    hang = within(b, low + 1.2 * (curtain - 0.5), high, f) * (
+        1 - within(a, left + 0.3 * width, left + 0.7 * width * curtain, f)
+    )
+    inside = _mix(
+        _rgb(0.04, 0.045, 0.05),
+        _rgb(0.45 * folds, 0.42 * folds, 0.36 * folds),
+        hang * (curtain > 0.5),
+    )
     poster = ((curtain > 0.35) & (curtain <= 0.5)) * letters(u, h, 0.12, f, seed + 3)
     inside = _mix(inside, _painted(seed + i, j), poster)
     return _mix(colour, inside, pane), np.asarray(0.55 * pane, np.float32)
@@ -165,19 +232,28 @@ def _facade(at: Spots) -> tuple[F32, F32]:
 
 def _roof(at: Spots) -> F32:
     """Tiles, or gravel where it is flat."""
-    rough, up = at.noise(1.5, 7, 0.85, seed=13), np.abs(at.normals[:, 2])
+    rough = at.noise(1.5, 7, 0.85, seed=13)
+    up = np.abs(at.normals[:, 2])
     slope = np.sqrt(np.maximum(1 - up**2, 0.05))
-    joint, tone = stones(at.along(), at.points[:, 2] / slope, 0.22, 0.34, 0.03, at.footprint, at.seed)
+    joint, tone = stones(
+        at.along(), at.points[:, 2] / slope, 0.22, 0.34, 0.03, at.footprint, at.seed
+    )
     kind = number(at.seed, 12, 7)[:, None]
-    tile = np.where(kind < 0.5, _rgb(0.30, 0.11, 0.07), np.where(kind < 0.8, _rgb(0.09, 0.09, 0.1), _rgb(0.2, 0.13, 0.1)))
+    tile = np.where(
+        kind < 0.5,
+        _rgb(0.30, 0.11, 0.07),
+        np.where(kind < 0.8, _rgb(0.09, 0.09, 0.1), _rgb(0.2, 0.13, 0.1)),
+    )
     tiles = _mix(_tone(tile, 1 + 0.35 * tone + 0.3 * rough), _rgb(0.03, 0.03, 0.03), 0.7 * joint)
     return np.where((up > 0.97)[:, None], _tone(_rgb(0.22, 0.21, 0.2), 1 + 0.35 * rough), tiles)
 
 
 def _building(at: Spots, season: str) -> tuple[F32, F32]:
-    colour, gloss = np.zeros((len(at.points), 3), np.float32), np.zeros(len(at.points), np.float32)
+    colour = np.zeros((len(at.points), 3), np.float32)
+    gloss = np.zeros(len(at.points), np.float32)
     is_wall = np.abs(at.normals[:, 2]) < 0.25
-    walls, roofs = np.flatnonzero(is_wall), np.flatnonzero(~is_wall)
+    walls = np.flatnonzero(is_wall)
+    roofs = np.flatnonzero(~is_wall)
     colour[walls], gloss[walls] = _facade(at.take(walls))
     colour[roofs] = _roof(at.take(roofs))
     return colour, gloss
@@ -185,14 +261,28 @@ def _building(at: Spots, season: str) -> tuple[F32, F32]:
 
 def _road(at: Spots, season: str) -> tuple[F32, F32]:
     """Asphalt with mended patches, cracks, covers and worn markings."""
-    x, y, f = at.points[:, 0], at.points[:, 1], at.footprint
-    grain, lines = at.noise(0.35, 6, 0.9, stretch=0.0, seed=17), at.noise(1.6, 4, 0.6, stretch=0.0, seed=29)
+    x = at.points[:, 0]
+    y = at.points[:, 1]
+    f = at.footprint
+    grain = at.noise(0.35, 6, 0.9, stretch=0.0, seed=17)
+    lines = at.noise(1.6, 4, 0.6, stretch=0.0, seed=29)
     tone = 1 + 0.32 * grain + 0.1 * lines
-    i, j = cell(x, 4.7), cell(y, 3.9)
-    mend, a, b = number(i, j, 23), x - i * np.float32(4.7), y - j * np.float32(3.9)
+    i = cell(x, 4.7)
+    j = cell(y, 3.9)
+    mend = number(i, j, 23)
+    a = x - i * np.float32(4.7)
+    b = y - j * np.float32(3.9)
     is_mended = mend < 0.2
-    inner = within(a, 1.5 - 5 * mend, 2.6 + 8 * mend, f) * within(b, 0.6, 1.4 + 11 * mend, f) * is_mended
-    outer = within(a, 1.45 - 5 * mend, 2.65 + 8 * mend, f) * within(b, 0.55, 1.45 + 11 * mend, f) * is_mended
+    inner = (
+        within(a, 1.5 - 5 * mend, 2.6 + 8 * mend, f)
+        * within(b, 0.6, 1.4 + 11 * mend, f)
+        * is_mended
+    )
+    outer = (
+        within(a, 1.45 - 5 * mend, 2.65 + 8 * mend, f)
+        * within(b, 0.55, 1.45 + 11 * mend, f)
+        * is_mended
+    )
     tone = tone * (1 - 0.3 * inner) * (1 - 0.5 * np.maximum(outer - inner, 0))
     cracked = number(cell(x, 6.0), cell(y, 6.0), 24) < 0.6
     tone = tone * (1 - 0.55 * cracked * within(np.abs(lines), -1.0, 0.018, 0.02 + 0.5 * f))
@@ -202,11 +292,14 @@ def _road(at: Spots, season: str) -> tuple[F32, F32]:
     cover = (mend > 0.955) * within(r, -1.0, 0.36, f)
     colour = _mix(colour, _tone(_rgb(0.1, 0.085, 0.07), 0.6 + 0.9 * grid), cover)
     colour = _tone(colour, 1 - 0.6 * (mend > 0.955) * within(r, 0.35, 0.4, f))
-    return _mix(colour, _rgb(0.62, 0.62, 0.6), at.paint * (0.85 - 0.35 * np.maximum(grain, 0))), np.zeros(len(x), np.float32)
+    return _mix(
+        colour, _rgb(0.62, 0.62, 0.6), at.paint * (0.85 - 0.35 * np.maximum(grain, 0))
+    ), np.zeros(len(x), np.float32)
 
 
 def _sidewalk(at: Spots, season: str) -> tuple[F32, F32]:
-    x, y = at.points[:, 0], at.points[:, 1]
+    x = at.points[:, 0]
+    y = at.points[:, 1]
     joint, tone = stones(x + 0.13 * y, y - 0.13 * x, 0.6, 0.4, 0.015, at.footprint, 67)
     colour = _tone(_rgb(0.3, 0.29, 0.27), 1 + 0.16 * tone + 0.22 * at.noise(0.9, 7, 0.85, seed=71))
     return _mix(colour, _rgb(0.1, 0.1, 0.09), 0.6 * joint), np.zeros(len(x), np.float32)
@@ -217,24 +310,31 @@ def _terrain(at: Spots, season: str) -> tuple[F32, F32]:
     grass = _mix(_rgb(0.2, 0.16, 0.09), _rgb(0.09, 0.16, 0.04), 0.25 + 0.75 * bare)
     grass = _tone(grass, 1 + 0.38 * at.noise(0.5, 6, 0.9, seed=79))
     if season == "autumn":
-        fallen = (number(cell(at.points[:, 0], 0.12), cell(at.points[:, 1], 0.12), 83) < 0.16) & (at.footprint < 0.2)
+        fallen = (number(cell(at.points[:, 0], 0.12), cell(at.points[:, 1], 0.12), 83) < 0.16) & (
+            at.footprint < 0.2
+        )
         grass = np.where(fallen[:, None], _rgb(0.4, 0.22, 0.04), grass)
     return grass, np.zeros(len(grass), np.float32)
 
 
 def _plant(at: Spots, season: str) -> tuple[F32, F32]:
-    kind, leaf = number(at.seed, 1, 43), number(at.own, 2, 43)
+    kind = number(at.seed, 1, 43)
+    leaf = number(at.own, 2, 43)
     green = _mix(_rgb(0.07, 0.15, 0.03), _rgb(0.16, 0.2, 0.05), kind)
     if season == "autumn":
         turned = _mix(_rgb(0.42, 0.24, 0.03), _rgb(0.35, 0.08, 0.03), number(at.seed, 3, 43))
-        green = np.where((kind < 0.8)[:, None], _mix(turned, _rgb(0.2, 0.2, 0.05), 0.6 * leaf), green)
+        green = np.where(
+            (kind < 0.8)[:, None], _mix(turned, _rgb(0.2, 0.2, 0.05), 0.6 * leaf), green
+        )
     elif season in ("winter", "snow"):
         green = _mix(green, _rgb(0.12, 0.1, 0.06), np.full(len(kind), 0.5))
     colour = _tone(green, 0.55 + 0.9 * leaf + 0.35 * at.noise(0.3, 5, 0.85, seed=47))
     some = np.flatnonzero(at.bark)
     if len(some):
         stem = at.take(some)
-        ridges = 0.4 * stem.noise(0.12, 3, 0.8, stretch=0.25, seed=37) + 0.25 * stem.noise(0.6, 4, 0.8, seed=41)
+        ridges = 0.4 * stem.noise(0.12, 3, 0.8, stretch=0.25, seed=37) + 0.25 * stem.noise(
+            0.6, 4, 0.8, seed=41
+        )
         colour[some] = _tone(_rgb(0.16, 0.12, 0.085), 1 + ridges)
     return colour, np.zeros(len(colour), np.float32)
 
@@ -242,7 +342,8 @@ def _plant(at: Spots, season: str) -> tuple[F32, F32]:
 def _vehicle(at: Spots, season: str) -> tuple[F32, F32]:
     """Paint, panes and tyres by height; nothing that would stay in place while the vehicle drives."""
     size = at.high[:, 2] - at.low[:, 2]
-    share, up = (at.points[:, 2] - at.low[:, 2]) / np.maximum(size, 0.1), np.abs(at.normals[:, 2])
+    share = (at.points[:, 2] - at.low[:, 2]) / np.maximum(size, 0.1)
+    up = np.abs(at.normals[:, 2])
     is_car = (at.labels == CAR) & (size < 2.1)
     glazed = (at.labels != TRUCK) & (up < 0.5) & (share > 0.52) & (share < 0.8)
     pane = np.where(is_car, (up < 0.8) & (share > 0.58) & (share < 0.92), glazed)
@@ -269,21 +370,31 @@ def _pole(at: Spots, season: str) -> tuple[F32, F32]:
     x, y, z = at.points.T
     metal = _mix(_rgb(0.2, 0.21, 0.21), _rgb(0.05, 0.08, 0.06), number(at.seed, 4, 57))
     metal = _tone(metal, 1 + 0.2 * at.noise(0.8, 6, 0.85, seed=53))
-    row, h = cell(z, 0.23), z - at.low[:, 2]
+    row = cell(z, 0.23)
+    h = z - at.low[:, 2]
     stuck = (number(row, at.seed, 58) < 0.22) & (h > 0.5) & (h < 2.2)
-    note = _mix(_painted(at.seed, row), _rgb(0.6, 0.6, 0.6), letters(x + 1.3 * y, z, 0.035, at.footprint, at.seed))
+    note = _mix(
+        _painted(at.seed, row),
+        _rgb(0.6, 0.6, 0.6),
+        letters(x + 1.3 * y, z, 0.035, at.footprint, at.seed),
+    )
     return np.where(stuck[:, None], note, metal), np.zeros(len(x), np.float32)
 
 
 def _sign(at: Spots, season: str) -> tuple[F32, F32]:
     """A face with a rim and something written on it."""
-    offset, f = at.points - (at.low + at.high) / 2, at.footprint
+    offset = at.points - (at.low + at.high) / 2
+    f = at.footprint
     r = np.linalg.norm(offset, axis=1) / np.maximum(0.5 * (at.high - at.low)[:, 2], 0.1)
     kind = number(at.seed, 5, 57)[:, None]
     rim = np.where(kind < 0.6, _rgb(0.5, 0.02, 0.02), _rgb(0.02, 0.08, 0.4))
     face = np.where(kind < 0.75, _rgb(0.65, 0.65, 0.65), _rgb(0.6, 0.45, 0.03))
-    ink = letters(offset[:, 0] + 1.3 * offset[:, 1], offset[:, 2], 0.09, f, at.seed) * within(r, -1.0, 0.62, f)
-    return _mix(_mix(face, rim, within(r, 0.72, 99.0, f)), _rgb(0.02, 0.02, 0.02), ink), np.zeros(len(r), np.float32)
+    ink = letters(offset[:, 0] + 1.3 * offset[:, 1], offset[:, 2], 0.09, f, at.seed) * within(
+        r, -1.0, 0.62, f
+    )
+    return _mix(_mix(face, rim, within(r, 0.72, 99.0, f)), _rgb(0.02, 0.02, 0.02), ink), np.zeros(
+        len(r), np.float32
+    )
 
 
 def _person(at: Spots, season: str) -> tuple[F32, F32]:
@@ -294,7 +405,9 @@ def _person(at: Spots, season: str) -> tuple[F32, F32]:
 
 
 def _lamp(at: Spots, season: str) -> tuple[F32, F32]:
-    return np.tile(_rgb(0.03, 0.03, 0.03), (len(at.points), 1)), np.full(len(at.points), 0.1, np.float32)
+    return np.tile(_rgb(0.03, 0.03, 0.03), (len(at.points), 1)), np.full(
+        len(at.points), 0.1, np.float32
+    )
 
 
 def _thing(at: Spots, season: str) -> tuple[F32, F32]:
@@ -311,9 +424,15 @@ def _snow(at: Spots, colour: F32, gloss: F32) -> None:
     some = np.flatnonzero((up > 0.35) & ((at.labels < PERSON) | (at.labels > MOTORCYCLE)))
     lying = at.take(some)
     road = lying.noise(2.5, 5, 0.7, stretch=0.0, seed=97)
-    cover = np.where(lying.labels == ROAD, 1.6 * road - 0.2, 0.9 + 0.7 * lying.noise(2.5, 4, 0.6, seed=89))
+    cover = np.where(
+        lying.labels == ROAD, 1.6 * road - 0.2, 0.9 + 0.7 * lying.noise(2.5, 4, 0.6, seed=89)
+    )
     share = np.clip(cover, 0, 1) * np.clip(2 * (up[some] - 0.35), 0, 1)
-    colour[some] = _mix(colour[some], _tone(_rgb(0.75, 0.78, 0.82), 1 + 0.1 * lying.noise(0.5, 6, 0.8, seed=101)), share)
+    colour[some] = _mix(
+        colour[some],
+        _tone(_rgb(0.75, 0.78, 0.82), 1 + 0.1 * lying.noise(0.5, 6, 0.8, seed=101)),
+        share,
+    )
     gloss[some] *= 1 - share
 
 

@@ -1,4 +1,6 @@
-"""A road or a track through a forest: trunks, undergrowth and rough ground, and hardly a wall anywhere."""
+"""A road or a track through a forest: trunks, undergrowth and rough ground, and hardly a wall
+anywhere.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,11 @@ MAX_TREES = 900
 
 
 def build_forest(network: RoadNetwork, seed: int, condition: Condition) -> World:
-    """A forest along the roads of ``network``; the ground is the one of ``street_ground(network, seed)``.
+    """A forest along the roads of ``network``; the ground is the one of ``street_ground(network,
+    seed)``.
 
-    A stand has one or two species of trees of a similar age. The same arguments give the same bytes.
+    A stand has one or two species of trees of a similar age. The same arguments give the same
+    bytes.
     """
     ground = street_ground(network, seed)
     setting = Setting(ground, seed, condition)
@@ -37,7 +41,9 @@ def build_forest(network: RoadNetwork, seed: int, condition: Condition) -> World
         kind = kinds[int(rng.random() < 0.2)]
         setting.put_tree(float(x), float(y), float(age * rng.uniform(0.6, 1.2)), kind)
     undergrowth = rng.uniform(0.0, 0.6)
-    for x, y in places[: int(undergrowth * len(places))] + rng.normal(0.0, 2.0, (int(undergrowth * len(places)), 2)):
+    for x, y in places[: int(undergrowth * len(places))] + rng.normal(
+        0.0, 2.0, (int(undergrowth * len(places)), 2)
+    ):
         plant = objects.bush(rng, bare=condition.bare) if rng.random() < 0.6 else objects.tufts(rng)
         setting.put(plant, float(x), float(y), float(rng.uniform(0, 6.3)), aside=True)
     mesh, labels = ground.mesh(setting.snow)

@@ -19,7 +19,9 @@ from semloc_logs.simulation.town.works import scaffolding, shell
 
 @dataclass(frozen=True, slots=True)
 class _House:
-    """A house to build: the numbers that it follows from, its size in metres, its roof, and whether it is its neighbours' mirror image."""
+    """A house to build: the numbers that it follows from, its size in metres, its roof, and whether
+    it is its neighbours' mirror image.
+    """
 
     state: int
     width: float
@@ -30,10 +32,15 @@ class _House:
 
     def parts(self) -> Parts:
         """Its meshes, the front near y = 0 looking along -y."""
-        parts = building(np.random.default_rng(self.state), self.width, self.depth, self.height, self.roof)
+        parts = building(
+            np.random.default_rng(self.state), self.width, self.depth, self.height, self.roof
+        )
         if not self.mirrored:
             return parts
-        return [(Mesh(mesh.vertices * [-1.0, 1.0, 1.0], mesh.triangles[:, ::-1]), label) for mesh, label in parts]
+        return [
+            (Mesh(mesh.vertices * [-1.0, 1.0, 1.0], mesh.triangles[:, ::-1]), label)
+            for mesh, label in parts
+        ]
 
 
 def plots(setting: Setting, side: Side, style: Style) -> None:
@@ -42,16 +49,20 @@ def plots(setting: Setting, side: Side, style: Style) -> None:
     walk = side.road.sidewalk + (0.2 if side.road.sidewalk else 1.0)
     model = _drawn_house(setting.rng, style, float(np.clip(style.plot, 5, 45)))
     apart = style.gap
-    u, number = edge + setting.rng.uniform(0, 4), 0
+    u = edge + setting.rng.uniform(0, 4)
+    number = 0
     while u < side.length - edge + 2:
         if style.copies == "none":
             width = float(np.clip(style.plot * setting.rng.uniform(0.7, 1.35), 5, 45))
-            house, gap = _drawn_house(setting.rng, style, width), style.gap * setting.rng.uniform(0.3, 1.7)
+            house = _drawn_house(setting.rng, style, width)
+            gap = style.gap * setting.rng.uniform(0.3, 1.7)
         else:
             odd = style.copies == "mirror" and number % 2 == 1
-            house, gap = replace(model, mirrored=odd), 0.0 if style.copies == "mirror" and not odd else apart
+            house = replace(model, mirrored=odd)
+            gap = 0.0 if style.copies == "mirror" and not odd else apart
         _plot(setting, side, style, u, gap, walk, house)
-        u, number = u + house.width + gap, number + 1
+        u = u + house.width + gap
+        number = number + 1
 
 
 def _drawn_house(rng: Rng, style: Style, width: float) -> _House:
@@ -60,17 +71,29 @@ def _drawn_house(rng: Rng, style: Style, width: float) -> _House:
     return _House(int(rng.integers(2**31)), width, depth, height, str(rng.choice(style.roofs)))
 
 
-def _plot(setting: Setting, side: Side, style: Style, u: float, gap: float, walk: float, house: _House) -> None:
+def _plot(
+    setting: Setting, side: Side, style: Style, u: float, gap: float, walk: float, house: _House
+) -> None:
     """A plot of land: a house perhaps, its garden, frontage and drive."""
-    rng, width, depth = setting.rng, house.width, house.depth
-    setback = walk + max(0.3, style.setback * (rng.uniform(0.85, 1.15) if style.copies == "none" else 1.0))
-    gx, gy = np.meshgrid(np.arange(-width / 2 + 0.2, width / 2, 0.5), np.arange(0.2, depth + 0.1, 0.5))
+    rng = setting.rng
+    width = house.width
+    depth = house.depth
+    setback = walk + max(
+        0.3, style.setback * (rng.uniform(0.85, 1.15) if style.copies == "none" else 1.0)
+    )
+    gx, gy = np.meshgrid(
+        np.arange(-width / 2 + 0.2, width / 2, 0.5), np.arange(0.2, depth + 0.1, 0.5)
+    )
     built = bool(rng.random() < style.built)
     for further in (0.0, 0.8, 2.0, 4.0):  # where the road bends a house has to stand further back
         x, y, yaw = side.at(u + width / 2, setback + further)
-        c, s = np.cos(yaw), np.sin(yaw)
-        # the house's +y looks away from the road, which lies to the left of the traffic on this side
-        cells = np.column_stack([x + c * gx.ravel() + s * gy.ravel(), y + s * gx.ravel() - c * gy.ravel()])
+        c = np.cos(yaw)
+        s = np.sin(yaw)
+        # the house's +y looks away from the road, which lies to the left of the traffic on this
+        # side
+        cells = np.column_stack(
+            [x + c * gx.ravel() + s * gy.ravel(), y + s * gx.ravel() - c * gy.ravel()]
+        )
         if setting.ground.allowed(cells):
             setback += further
             break
@@ -88,12 +111,25 @@ def _plot(setting: Setting, side: Side, style: Style, u: float, gap: float, walk
         setting.parked(side, u + width + gap / 2, walk + rng.uniform(2.8, 7.0), 0.6, across=True)
     if style.setback > 1.2:
         _frontage(setting, side, style, u - gap / 2, u + width + gap / 2, walk, built)
-    _garden(setting, side, style, u - gap / 2, width + gap, walk, setback + (depth if built else 0.0), built)
+    _garden(
+        setting,
+        side,
+        style,
+        u - gap / 2,
+        width + gap,
+        walk,
+        setback + (depth if built else 0.0),
+        built,
+    )
 
 
 def _put_house(setting: Setting, house: _House, x: float, y: float, yaw: float) -> None:
-    """The house, or what has become of it: an empty plot, a shell or another house, or scaffolds before it."""
-    draw, kind, other = setting.works.random(), setting.works.random(), int(setting.works.integers(2**31))
+    """The house, or what has become of it: an empty plot, a shell or another house, or scaffolds
+    before it.
+    """
+    draw = setting.works.random()
+    kind = setting.works.random()
+    other = int(setting.works.integers(2**31))
     if draw >= setting.condition.rebuilt:
         setting.put(house.parts(), x, y, yaw)
         return
@@ -104,13 +140,21 @@ def _put_house(setting: Setting, house: _House, x: float, y: float, yaw: float) 
         setting.put(scaffolding(house.width, house.depth, house.height), x, y, yaw, moving=True)
     elif kind < 0.75:
         storeys = house.height * (0.5 + (other % 100) / 70)
-        setting.put(replace(house, state=other, height=max(2.9, storeys), roof="flat").parts(), x, y, yaw, moving=True)
+        setting.put(
+            replace(house, state=other, height=max(2.9, storeys), roof="flat").parts(),
+            x,
+            y,
+            yaw,
+            moving=True,
+        )
     else:
         setting.put(house.parts(), x, y, yaw)
         setting.put(scaffolding(house.width, house.depth, house.height), x, y, yaw, moving=True)
 
 
-def _car_park(setting: Setting, side: Side, u: float, width: float, walk: float, depth: float) -> None:
+def _car_park(
+    setting: Setting, side: Side, u: float, width: float, walk: float, depth: float
+) -> None:
     """Rows of parked cars, and lamps between them."""
     share = float(setting.rng.uniform(0.2, 0.95))
     room = side.area(u, u + width, walk + 1.0, depth - 2.0)
@@ -125,10 +169,13 @@ def _car_park(setting: Setting, side: Side, u: float, width: float, walk: float,
         setting.put(objects.pole(setting.rng, "double"), x, y, yaw, aside=True)
 
 
-def _square(setting: Setting, side: Side, u: float, width: float, walk: float, depth: float) -> None:
+def _square(
+    setting: Setting, side: Side, u: float, width: float, walk: float, depth: float
+) -> None:
     """Trees in rows on stone, a few benches, perhaps something in the middle."""
     rng = setting.rng
-    size, kind = rng.uniform(0.5, 0.8), str(rng.choice(["round", "column"]))
+    size = rng.uniform(0.5, 0.8)
+    kind = str(rng.choice(["round", "column"]))
     pitch = rng.uniform(6.0, 9.0)
     for v in np.arange(walk + 3.0, depth - 4.0, pitch):
         for along in np.arange(u + 1.5, u + width, pitch):
@@ -140,16 +187,24 @@ def _square(setting: Setting, side: Side, u: float, width: float, walk: float, d
     setting.ground.take(side.area(u, u + width, walk + 1.0, depth - 2.0))
 
 
-def _pave(setting: Setting, side: Side, style: Style, u: float, width: float, walk: float, setback: float) -> None:
+def _pave(
+    setting: Setting, side: Side, style: Style, u: float, width: float, walk: float, setback: float
+) -> None:
     """Stone between the pavement and the house: all of it, or a drive beside the house."""
     drive = setting.rng.uniform(2.4, 4.5)
     whole = setting.rng.random() < style.paved
-    a, b, far = (u, u + width, setback + 1.0) if whole else (u + width - drive, u + width, setback + setting.rng.uniform(2, 9))
+    a, b, far = (
+        (u, u + width, setback + 1.0)
+        if whole
+        else (u + width - drive, u + width, setback + setting.rng.uniform(2, 9))
+    )
     if whole or setting.rng.random() < 0.6:
         setting.ground.pave(side.area(a, b, walk - 0.5, far))
 
 
-def _frontage(setting: Setting, side: Side, style: Style, u0: float, u1: float, walk: float, house: bool) -> None:
+def _frontage(
+    setting: Setting, side: Side, style: Style, u0: float, u1: float, walk: float, house: bool
+) -> None:
     rng = setting.rng
     if style.frontage == "none" or rng.random() < (0.12 if house else 0.5):
         return
@@ -158,7 +213,11 @@ def _frontage(setting: Setting, side: Side, style: Style, u0: float, u1: float, 
     hedge = partial(objects.hedge, bare=setting.condition.bare)
     makers: list[Callable[[Rng, F64], Parts]] = [hedge, objects.fence, objects.garden_wall]
     makers += [objects.retaining_wall, objects.guard_rail]
-    make = makers[{"fence": 1, "wall": 3, "rail": 4}[style.frontage] if style.frontage != "any" else int(rng.integers(3))]
+    make = makers[
+        {"fence": 1, "wall": 3, "rail": 4}[style.frontage]
+        if style.frontage != "any"
+        else int(rng.integers(3))
+    ]
     state = int(rng.integers(2**31))
     for a, b in ((u0, start), (start + opening, u1)):
         line = side.line(a + 0.4, b - 0.4, walk + 0.6)
@@ -168,18 +227,35 @@ def _frontage(setting: Setting, side: Side, style: Style, u0: float, u1: float, 
     if rng.random() < 0.5 and style.setback > 5:
         setting.parked(side, start + opening / 2, walk + 3.2, 0.5, across=True)
     if rng.random() < 0.4 and style.gap > 1:
-        line = np.array([side.at(u0, v)[:2] for v in np.linspace(walk + 1, walk + style.setback + 8, 8)])
+        line = np.array(
+            [side.at(u0, v)[:2] for v in np.linspace(walk + 1, walk + style.setback + 8, 8)]
+        )
         if setting.ground.allowed(line):
             setting.put_line(objects.fence(rng, line) if rng.random() < 0.5 else hedge(rng, line))
 
 
-def _garden(setting: Setting, side: Side, style: Style, u: float, width: float, walk: float, behind: float, house: bool) -> None:
+def _garden(
+    setting: Setting,
+    side: Side,
+    style: Style,
+    u: float,
+    width: float,
+    walk: float,
+    behind: float,
+    house: bool,
+) -> None:
     rng = setting.rng
     for _ in range(rng.poisson(style.garden * width / 4)):
         near = rng.random() < (0.5 if house else 0.7)
-        v = rng.uniform(walk + 0.8, max(walk + 1.0, walk + style.setback)) if near else behind + rng.uniform(1, 22)
+        v = (
+            rng.uniform(walk + 0.8, max(walk + 1.0, walk + style.setback))
+            if near
+            else behind + rng.uniform(1, 22)
+        )
         x, y, _ = side.at(u + rng.uniform(0, width), v)
-        if not setting.ground.allowed(np.array([[x, y], [x + 0.6, y], [x - 0.6, y], [x, y + 0.6], [x, y - 0.6]])):
+        if not setting.ground.allowed(
+            np.array([[x, y], [x + 0.6, y], [x - 0.6, y], [x, y + 0.6], [x, y - 0.6]])
+        ):
             continue
         if rng.random() < (0.2 if near else 0.5):
             setting.put_tree(x, y, rng.uniform(0.3, 1.1))

@@ -1,4 +1,6 @@
-"""A furnished room for hand-held depth cameras: walls, doors, tables, chairs, shelves, sofas and clutter, in true size."""
+"""A furnished room for hand-held depth cameras: walls, doors, tables, chairs, shelves, sofas and
+clutter, in true size.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,12 @@ Rng = np.random.Generator
 
 
 def build_room(seed: int, condition: int = 0) -> World:
-    """A room of 3 to 9 m; ``condition`` moves chairs and clutter. The same arguments give the same bytes."""
+    """A room of 3 to 9 m; ``condition`` moves chairs and clutter. The same arguments give the same
+    bytes.
+    """
     size, height = _size(seed)
-    rng, change = np.random.default_rng([seed, 32]), np.random.default_rng([seed, 33, condition])
+    rng = np.random.default_rng([seed, 32])
+    change = np.random.default_rng([seed, 33, condition])
     builder = MeshBuilder(lambda x, y: np.zeros_like(x))
     _shell(builder, size, height, rng)
     _along_walls(builder, size, height, rng)
@@ -39,15 +44,20 @@ def build_room(seed: int, condition: int = 0) -> World:
 
 
 def room_walk(seed: int, length: float) -> F64:
-    """A line (n, 2) of at least ``length`` metres round the room, 0.6 to 1.3 m from its walls, in turn closer and farther."""
+    """A line (n, 2) of at least ``length`` metres round the room, 0.6 to 1.3 m from its walls, in
+    turn closer and farther.
+    """
     size, _ = _size(seed)
     rng = np.random.default_rng([seed, 34])
     points: list[F64] = []
     walked = 0.0
     while walked < length:
         margin = np.minimum(rng.uniform(0.6, 1.3, 2), size / 3)
-        low, high = margin, size - margin
-        lap = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) + rng.normal(0.0, 0.1, (4, 2))
+        low = margin
+        high = size - margin
+        lap = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) + rng.normal(
+            0.0, 0.1, (4, 2)
+        )
         walked += float(np.linalg.norm(np.diff(lap, axis=0), axis=1).sum())
         points.append(lap)
     return np.concatenate(points)
@@ -81,16 +91,29 @@ def _shell(builder: MeshBuilder, size: F64, height: float, rng: Rng) -> None:
 def _along_walls(builder: MeshBuilder, size: F64, height: float, rng: Rng) -> None:
     """Shelves, cupboards and sofas with their backs to the walls."""
     w, d = size
-    for length, yaw, x, y in ((w, 0.0, 0.0, 0.0), (d, np.pi / 2, w, 0.0), (w, np.pi, w, d), (d, -np.pi / 2, 0.0, d)):
+    for length, yaw, x, y in (
+        (w, 0.0, 0.0, 0.0),
+        (d, np.pi / 2, w, 0.0),
+        (w, np.pi, w, d),
+        (d, -np.pi / 2, 0.0, d),
+    ):
         u = float(rng.uniform(0.2, 1.0))
         while u < length - 1.2:
             wide = float(rng.uniform(0.5, 1.8))
             kind = rng.choice(["shelf", "cupboard", "sofa", "desk", "gap"])
             if kind != "gap" and u + wide < length - 0.2:
                 mesh = _piece(str(kind), wide, height, rng)
-                across, along = np.array([-np.sin(yaw), np.cos(yaw)]), np.array([np.cos(yaw), np.sin(yaw)])
+                across = np.array([-np.sin(yaw), np.cos(yaw)])
+                along = np.array([np.cos(yaw), np.sin(yaw)])
                 middle = np.array([x, y]) + (u + wide / 2) * along + 0.3 * across
-                _add(builder, mesh, float(middle[0]), float(middle[1]), yaw, FENCE if kind == "shelf" else WALL)
+                _add(
+                    builder,
+                    mesh,
+                    float(middle[0]),
+                    float(middle[1]),
+                    yaw,
+                    FENCE if kind == "shelf" else WALL,
+                )
             u += wide + float(rng.uniform(0.0, 0.8))
 
 
@@ -99,21 +122,33 @@ def _piece(kind: str, wide: float, height: float, rng: Rng) -> Mesh:
     if kind == "cupboard":
         return box(wide, float(rng.uniform(0.4, 0.6)), float(rng.uniform(0.7, height - 0.2)))
     if kind == "sofa":
-        seat, back = box(wide, 0.8, 0.42, y=0.1), box(wide, 0.2, float(rng.uniform(0.7, 0.95)), y=-0.2)
+        seat = box(wide, 0.8, 0.42, y=0.1)
+        back = box(wide, 0.2, float(rng.uniform(0.7, 0.95)), y=-0.2)
         return merge(seat, back)
     if kind == "desk":
-        return merge(_table(wide, 0.7, 0.73), box(0.5, 0.05, 0.35, y=-0.15, z=0.85), box(0.2, 0.2, 0.12, y=-0.15, z=0.73))
-    top, deep = float(rng.uniform(1.0, height - 0.2)), float(rng.uniform(0.25, 0.45))
+        return merge(
+            _table(wide, 0.7, 0.73),
+            box(0.5, 0.05, 0.35, y=-0.15, z=0.85),
+            box(0.2, 0.2, 0.12, y=-0.15, z=0.73),
+        )
+    top = float(rng.uniform(1.0, height - 0.2))
+    deep = float(rng.uniform(0.25, 0.45))
     parts = [box(0.03, deep, top, side * wide / 2) for side in (-1.0, 1.0)]
     for z in np.arange(0.05, top, rng.uniform(0.28, 0.45)):
         parts.append(box(wide, deep, 0.025, z=float(z)))
         books = np.arange(-wide / 2 + 0.1, wide / 2 - 0.05, 0.15)
-        parts += [box(0.12, deep * 0.7, float(rng.uniform(0.1, 0.26)), float(u), z=float(z)) for u in books if rng.random() < 0.7]
+        parts += [
+            box(0.12, deep * 0.7, float(rng.uniform(0.1, 0.26)), float(u), z=float(z))
+            for u in books
+            if rng.random() < 0.7
+        ]
     return merge(*parts)
 
 
 def _table(length: float, width: float, height: float) -> Mesh:
-    corners = [(sx * (length / 2 - 0.05), sy * (width / 2 - 0.05)) for sx in (-1, 1) for sy in (-1, 1)]
+    corners = [
+        (sx * (length / 2 - 0.05), sy * (width / 2 - 0.05)) for sx in (-1, 1) for sy in (-1, 1)
+    ]
     legs = [box(0.05, 0.05, height, x, y) for x, y in corners]
     return merge(*legs, box(length, width, 0.04, z=height - 0.04))
 
@@ -121,7 +156,9 @@ def _table(length: float, width: float, height: float) -> Mesh:
 def _chair(rng: Rng) -> Mesh:
     back = box(0.04, 0.42, 0.45, -0.2, z=0.45)
     if rng.random() < 0.4:
-        return merge(cylinder(0.03, 0.45, 6), cylinder(0.25, 0.05, 8), box(0.45, 0.45, 0.06, z=0.45), back)
+        return merge(
+            cylinder(0.03, 0.45, 6), cylinder(0.25, 0.05, 8), box(0.45, 0.45, 0.06, z=0.45), back
+        )
     return merge(_table(0.42, 0.42, 0.45), back)
 
 
@@ -129,11 +166,20 @@ def _in_the_middle(builder: MeshBuilder, size: F64, rng: Rng, change: Rng) -> No
     """Tables with chairs about them; the chairs move between sessions."""
     for _ in range(int(rng.integers(1, 1 + int(size.prod() / 8)))):
         x, y = rng.uniform(1.2, size - 1.2) if (size > 2.5).all() else size / 2
-        length, width = float(rng.uniform(0.7, 1.8)), float(rng.uniform(0.6, 0.9))
+        length = float(rng.uniform(0.7, 1.8))
+        width = float(rng.uniform(0.6, 0.9))
         yaw = float(rng.choice([0.0, np.pi / 2]) + rng.normal(0.0, 0.1))
-        _add(builder, _table(length, width, float(rng.uniform(0.4, 0.75))), float(x), float(y), yaw, WALL)
+        _add(
+            builder,
+            _table(length, width, float(rng.uniform(0.4, 0.75))),
+            float(x),
+            float(y),
+            yaw,
+            WALL,
+        )
         for _ in range(int(rng.integers(0, 5))):
             angle = change.uniform(0, 2 * np.pi)
             distance = 0.7 + change.uniform(0.0, 0.4)
-            chair_x, chair_y = x + distance * np.cos(angle), y + distance * np.sin(angle)
+            chair_x = x + distance * np.cos(angle)
+            chair_y = y + distance * np.sin(angle)
             _add(builder, _chair(rng), float(chair_x), float(chair_y), float(angle), FENCE)

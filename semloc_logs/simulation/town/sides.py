@@ -16,7 +16,8 @@ Rng = np.random.Generator
 class Style:
     """How one side of a road is built up; lengths in metres, shares in [0, 1].
 
-    ``copies``: every plot has its own house (``none``), the very same one (``same``), or one and its mirror image in turn (``mirror``).
+    ``copies``: every plot has its own house (``none``), the very same one (``same``), or one and
+    its mirror image in turn (``mirror``).
     """
 
     kind: str
@@ -49,7 +50,20 @@ _KINDS = {  # setback, storeys, plot, gap, share with a house, garden, share tha
     "car park": (24.0, 1.8, 32.0, 4.0, 0.9, 0.1, 1.0),
     "square": (22.0, 4.0, 14.0, 0.0, 0.95, 0.0, 1.0),
 }
-_USUAL = ("suburb", "suburb", "suburb", "twins", "rows", "rows", "terrace", "city", "city", "park", "country", "yards")
+_USUAL = (
+    "suburb",
+    "suburb",
+    "suburb",
+    "twins",
+    "rows",
+    "rows",
+    "terrace",
+    "city",
+    "city",
+    "park",
+    "country",
+    "yards",
+)
 _SOMETIMES = (*_USUAL, "open", "car park", "square")
 
 
@@ -58,7 +72,15 @@ def drawn_style(rng: Rng, town: Rng) -> Style:
     favourite = _USUAL[int(town.integers(len(_USUAL)))]
     kind = favourite if rng.random() < 0.7 else _SOMETIMES[int(rng.integers(len(_SOMETIMES)))]
     setback, storeys, plot, gap, built, garden, paved = _KINDS[kind]
-    frontage = {"city": "none", "park": "none", "yards": "fence", "open": "rail", "country": "rail", "car park": "none", "square": "none"}
+    frontage = {
+        "city": "none",
+        "park": "none",
+        "yards": "fence",
+        "open": "rail",
+        "country": "rail",
+        "car park": "none",
+        "square": "none",
+    }
     roofs = {
         "city": ("flat", "gable", "hip"),
         "square": ("flat", "gable", "hip"),
@@ -86,18 +108,23 @@ def drawn_style(rng: Rng, town: Rng) -> Style:
 
 
 class Side:
-    """One side of a road, with coordinates along it (u) and outwards from the edge of the carriageway (v)."""
+    """One side of a road, with coordinates along it (u) and outwards from the edge of the
+    carriageway (v).
+    """
 
     def __init__(self, road: Road, sign: int) -> None:
         self.road, self.sign = road, sign
         self.path = road.path
-        self.along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(road.path, axis=0), axis=1))])
+        self.along = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(road.path, axis=0), axis=1))]
+        )
         self.length = float(self.along[-1])
 
     def at(self, u: float, v: float) -> tuple[float, float, float]:
         """x, y and the yaw of the road (of the right-hand traffic on this side) at (u, v)."""
         k = int(np.clip(np.searchsorted(self.along, u) - 1, 0, len(self.path) - 2))
-        a, b = self.path[max(k - 2, 0)], self.path[min(k + 3, len(self.path) - 1)]
+        a = self.path[max(k - 2, 0)]
+        b = self.path[min(k + 3, len(self.path) - 1)]
         t = (b - a) / np.linalg.norm(b - a)
         out = self.sign * np.array([t[1], -t[0]])
         p = self.path[k] + t * (u - self.along[k]) + out * (self.road.half_width + v)
@@ -105,10 +132,17 @@ class Side:
 
     def line(self, u0: float, u1: float, v: float) -> F64:
         """A plan line at distance v from u0 to u1."""
-        return np.array([self.at(u, v)[:2] for u in np.linspace(u0, u1, max(2, int((u1 - u0) / 2) + 1))])
+        return np.array(
+            [self.at(u, v)[:2] for u in np.linspace(u0, u1, max(2, int((u1 - u0) / 2) + 1))]
+        )
 
     def area(self, u0: float, u1: float, v0: float, v1: float, step: float = 0.3) -> F64:
         """Plan points (n, 2) all over u0 to u1, v0 to v1."""
-        us, vs = np.arange(u0, u1, step), np.arange(v0, v1, step)
-        rows = np.array([[self.at(float(p), 0.0)[:2], self.at(float(p), 10.0)[:2]] for p in us]).reshape(-1, 2, 2)
-        return np.asarray((rows[:, :1] + (rows[:, 1:] - rows[:, :1]) * (vs / 10.0)[None, :, None]).reshape(-1, 2))
+        us = np.arange(u0, u1, step)
+        vs = np.arange(v0, v1, step)
+        rows = np.array(
+            [[self.at(float(p), 0.0)[:2], self.at(float(p), 10.0)[:2]] for p in us]
+        ).reshape(-1, 2, 2)
+        return np.asarray(
+            (rows[:, :1] + (rows[:, 1:] - rows[:, :1]) * (vs / 10.0)[None, :, None]).reshape(-1, 2)
+        )

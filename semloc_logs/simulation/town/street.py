@@ -1,4 +1,6 @@
-"""A street world along a road network: what is static follows from the seed, what changes between sessions from the condition."""
+"""A street world along a road network: what is static follows from the seed, what changes between
+sessions from the condition.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +19,25 @@ from semloc_logs.simulation.town.works import put_roadworks
 
 
 def street_ground(network: RoadNetwork, seed: int) -> Ground:
-    """The ground alone of the world that :func:`build_street` makes of the same network and seed; trajectories take heights from it."""
+    """The ground alone of the world that :func:`build_street` makes of the same network and seed;
+    trajectories take heights from it.
+    """
     return Ground(network, np.random.default_rng([seed, 10]))
 
 
 def build_street(path: F64 | RoadNetwork, seed: int, condition: Condition | int = 0) -> World:
     """A street world along a driven path (n, 2 or 3) in metres or a road network.
 
-    The same seed and condition give the same bytes; the condition's number changes parked cars, people, bins and a few trees, and is
-    enough where nothing else differs. In other seasons the same houses and trunks stand in the same places.
+    The same seed and condition give the same bytes; the condition's number changes parked cars,
+    people, bins and a few trees, and is enough where nothing else differs. In other seasons the
+    same houses and trunks stand in the same places.
     """
     condition = condition if isinstance(condition, Condition) else Condition(condition)
-    network = path if isinstance(path, RoadNetwork) else path_network(np.random.default_rng([seed, 9]), path)
+    network = (
+        path
+        if isinstance(path, RoadNetwork)
+        else path_network(np.random.default_rng([seed, 9]), path)
+    )
     ground = street_ground(network, seed)
     setting = Setting(ground, seed, condition)
     for k, road in enumerate(network.roads):

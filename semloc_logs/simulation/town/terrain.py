@@ -1,4 +1,6 @@
-"""The ground of a street world: smooth slopes, carriageways, kerbs, pavements and lawns on a raster of half a metre."""
+"""The ground of a street world: smooth slopes, carriageways, kerbs, pavements and lawns on a raster
+of half a metre.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,11 @@ class Ground:
     rng: np.random.Generator
     corner: F64 = field(init=False)
     kind: NDArray[np.uint8] = field(init=False)  # ROAD, SIDEWALK, TERRAIN; 255 = no ground
-    beside: NDArray[np.float32] = field(init=False)  # metres from the edge of the carriageway, negative on it
+    # metres from the edge of the carriageway, negative on it
+    beside: NDArray[np.float32] = field(init=False)
     free: NDArray[np.bool_] = field(init=False)
-    paved: NDArray[np.bool_] = field(init=False)  # terrain that is stone or asphalt: drives, yards, squares
+    # terrain that is stone or asphalt: drives, yards, squares
+    paved: NDArray[np.bool_] = field(init=False)
     dug: NDArray[np.bool_] = field(init=False)  # dug up by roadworks
     closed: NDArray[np.bool_] = field(init=False)  # sites of roadworks
     covered: NDArray[np.bool_] = field(init=False)  # under bridges
@@ -43,7 +47,9 @@ class Ground:
 
     def __post_init__(self) -> None:
         lines = [r.path for r in (*self.network.roads, *self.network.stubs)]
-        everything = np.concatenate([*lines, *([self.network.survey[:, :2]] if self.network.survey is not None else [])])
+        everything = np.concatenate(
+            [*lines, *([self.network.survey[:, :2]] if self.network.survey is not None else [])]
+        )
         self.corner = everything.min(0) - MARGIN
         shape = np.ceil((everything.max(0) + MARGIN - self.corner) / CELL).astype(int)
         beside = np.full(shape, np.inf, np.float32)
@@ -55,7 +61,9 @@ class Ground:
             walk[window] = np.minimum(walk[window], distance - road.half_width - road.sidewalk)
             self.clear[window] |= np.abs(distance - road.lane) < CLEAR
         if self.network.survey is not None:
-            for line in np.array_split(self.network.survey[:, :2], max(1, len(self.network.survey) // 200)):
+            for line in np.array_split(
+                self.network.survey[:, :2], max(1, len(self.network.survey) // 200)
+            ):
                 window, distance = self._near(line, shape)
                 beside[window] = np.minimum(beside[window], distance - CLEAR - 0.4)
                 self.clear[window] |= distance < CLEAR
@@ -65,16 +73,25 @@ class Ground:
                 beside[window] = np.minimum(beside[window], distance - circle.outer)
                 walk[window] = np.minimum(walk[window], distance - circle.outer - 2.0)
         self.beside = _rounded_corners(beside)
-        for circle, window, distance in rounds:  # islands last, for rounding the corners would close small ones
+        # islands last, for rounding the corners would close small ones
+        for circle, window, distance in rounds:
             if circle.inner:
                 self.beside[window] = np.maximum(self.beside[window], circle.inner - distance)
-                walk[window] = np.where(distance < circle.inner, 1.0 if circle.inner > 1.5 else -1.0, walk[window])
+                walk[window] = np.where(
+                    distance < circle.inner, 1.0 if circle.inner > 1.5 else -1.0, walk[window]
+                )
             if circle.outer and circle.inner:
-                self.clear[window] = np.where(distance < circle.outer, np.abs(distance - circle.lane) < CLEAR, self.clear[window])
+                self.clear[window] = np.where(
+                    distance < circle.outer,
+                    np.abs(distance - circle.lane) < CLEAR,
+                    self.clear[window],
+                )
         kind = np.where(self.beside < 0, ROAD, np.where(walk < 0, SIDEWALK, TERRAIN))
         self.kind = np.where(self.beside > MARGIN, 255, kind).astype(np.uint8)
         self.free = self.kind == TERRAIN
-        self.paved, self.dug, self.closed, self.covered = (np.zeros_like(self.free) for _ in range(4))
+        self.paved, self.dug, self.closed, self.covered = (
+            np.zeros_like(self.free) for _ in range(4)
+        )
         wavelength = self.rng.uniform([25, 60, 90, 150], [60, 120, 200, 400])
         slope = self.rng.uniform(0, [0.006, 0.012, 0.02, 0.03])
         angle, phase = self.rng.uniform(0, 2 * np.pi, (2, 4))
@@ -82,23 +99,43 @@ class Ground:
         slope *= min(steep, STEEPEST / slope.sum())
         k = 2 * np.pi / wavelength
         self._waves = np.stack([k * np.cos(angle), k * np.sin(angle), phase, slope / k])
-        self._bank = (float(self.rng.uniform(4, 14)), 0.0 if self.network.level else float(self.rng.choice(_BANKS)))
-        self._relief = None if self.network.survey is None else Relief(self.network.survey, self.corner, everything.max(0) + MARGIN)
+        self._bank = (
+            float(self.rng.uniform(4, 14)),
+            0.0 if self.network.level else float(self.rng.choice(_BANKS)),
+        )
+        self._relief = (
+            None
+            if self.network.survey is None
+            else Relief(self.network.survey, self.corner, everything.max(0) + MARGIN)
+        )
 
-    def _near(self, line: F64, shape: NDArray[np.int64]) -> tuple[tuple[slice, slice], NDArray[np.float32]]:
-        """The part of the raster around a plan line, and the distances of its cells from the line (infinite beyond the margin)."""
+    def _near(
+        self, line: F64, shape: NDArray[np.int64]
+    ) -> tuple[tuple[slice, slice], NDArray[np.float32]]:
+        """The part of the raster around a plan line, and the distances of its cells from the line
+        (infinite beyond the margin).
+        """
         low = np.clip(((line.min(0) - MARGIN - 8 - self.corner) / CELL).astype(int), 0, shape)
         high = np.clip(((line.max(0) + MARGIN + 8 - self.corner) / CELL).astype(int), 0, shape)
-        x, y = np.meshgrid(*(self.corner[k] + CELL * (np.arange(low[k], high[k]) + 0.5) for k in (0, 1)), indexing="ij")
-        distance = cKDTree(line).query(np.column_stack([x.ravel(), y.ravel()]), distance_upper_bound=MARGIN + 8)[0]
-        return np.s_[low[0] : high[0], low[1] : high[1]], distance.astype(np.float32).reshape(x.shape)
+        x, y = np.meshgrid(
+            *(self.corner[k] + CELL * (np.arange(low[k], high[k]) + 0.5) for k in (0, 1)),
+            indexing="ij",
+        )
+        distance = cKDTree(line).query(
+            np.column_stack([x.ravel(), y.ravel()]), distance_upper_bound=MARGIN + 8
+        )[0]
+        return np.s_[low[0] : high[0], low[1] : high[1]], distance.astype(np.float32).reshape(
+            x.shape
+        )
 
     def slope_height(self, x: F64, y: F64) -> F64:
         """Height of the carriageway's surface in metres at plan positions (n,)."""
         if self._relief is not None:
             return self._relief(x, y)
         kx, ky, phase, size = self._waves
-        return np.asarray((np.sin(np.multiply.outer(x, kx) + np.multiply.outer(y, ky) + phase) * size).sum(-1))
+        return np.asarray(
+            (np.sin(np.multiply.outer(x, kx) + np.multiply.outer(y, ky) + phase) * size).sum(-1)
+        )
 
     def cell(self, x: F64, y: F64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Raster cells of plan positions (n,), kept inside."""
@@ -121,10 +158,16 @@ class Ground:
         rise = bank * np.clip(beside - start, 0, 12.0) * (1 + 0.5 * np.sin(0.03 * x + 0.05 * y))
         return np.where(kind == ROAD, 0.0, KERB + np.where(kind == TERRAIN, rough + rise, 0.0))
 
-    def _snow(self, x: F64, y: F64, kind: NDArray[np.uint8], beside: NDArray[np.float32], deep: float) -> F64:
+    def _snow(
+        self, x: F64, y: F64, kind: NDArray[np.uint8], beside: NDArray[np.float32], deep: float
+    ) -> F64:
         """How thick the snow lies: as good as cleared off the road, heaped up along the kerb."""
         drift = 1 + 0.25 * np.sin(0.9 * x - 0.6 * y) + 0.15 * np.sin(1.7 * y + 0.4 * x)
-        bank = 0.45 * np.clip(0.5 + np.sin(0.21 * x + 0.17 * y), 0, 1) * np.clip(1 - np.abs(beside - 0.5) / 0.7, 0, 1)
+        bank = (
+            0.45
+            * np.clip(0.5 + np.sin(0.21 * x + 0.17 * y), 0, 1)
+            * np.clip(1 - np.abs(beside - 0.5) / 0.7, 0, 1)
+        )
         return np.where(kind == ROAD, 0.02, deep * drift + bank)
 
     def allowed(self, points: F64) -> bool:
@@ -149,8 +192,12 @@ class Ground:
         self.closed[self.cell(points[:, 0], points[:, 1])] = True
 
     def passable(self, parts: list[tuple[Mesh, int]], headroom: float = 2.6) -> bool:
-        """Whether lanes stay clear below ``headroom`` metres when a thing, z counted from the ground, stands where it is."""
-        low = np.concatenate([mesh.vertices[mesh.vertices[:, 2] < headroom, :2] for mesh, _ in parts])
+        """Whether lanes stay clear below ``headroom`` metres when a thing, z counted from the
+        ground, stands where it is.
+        """
+        low = np.concatenate(
+            [mesh.vertices[mesh.vertices[:, 2] < headroom, :2] for mesh, _ in parts]
+        )
         return not self.clear[self.cell(low[:, 0], low[:, 1])].any()
 
     def pave(self, points: F64) -> None:
@@ -167,40 +214,72 @@ class Ground:
         self.dug[cell] = ~self.clear[cell]
 
     def mesh(self, snow: float = 0.0) -> tuple[Mesh, NDArray[np.uint8]]:
-        """The ground with its kerbs, heights absolute, and the label of each triangle; ``snow`` metres deep where nobody drives."""
+        """The ground with its kerbs, heights absolute, and the label of each triangle; ``snow``
+        metres deep where nobody drives.
+        """
         i, j = np.nonzero(self.kind != 255)
-        kind, dug = self.kind[i, j], self.dug[i, j]
+        kind = self.kind[i, j]
+        dug = self.dug[i, j]
         label = np.where(self.paved[i, j] & (kind == TERRAIN), SIDEWALK, kind)
         label = np.where(dug, TERRAIN, label)
         slope = [np.asarray(np.gradient(self.beside, CELL, axis=k), np.float32) for k in (0, 1)]
         corners = np.zeros((len(i), 4, 3))
         for k, (di, dj) in enumerate(((0, 0), (1, 0), (1, 1), (0, 1))):
-            x, y = self.corner[0] + CELL * (i + di), self.corner[1] + CELL * (j + dj)
+            x = self.corner[0] + CELL * (i + di)
+            y = self.corner[1] + CELL * (j + dj)
             at = _at_corners(self.beside, i + di, j + dj)
             # corners next to the kerb move onto it, so that it runs smooth across the raster
             near = np.where(np.abs(at) < 0.6 * CELL, at, 0.0)
-            x, y = (c - near * _at_corners(g, i + di, j + dj) for c, g in zip((x, y), slope, strict=True))
-            up = self._step(x, y, kind, at) - _DEPTH * dug + (self._snow(x, y, kind, at, snow) if snow else 0.0)
+            x, y = (
+                c - near * _at_corners(g, i + di, j + dj)
+                for c, g in zip((x, y), slope, strict=True)
+            )
+            up = (
+                self._step(x, y, kind, at)
+                - _DEPTH * dug
+                + (self._snow(x, y, kind, at, snow) if snow else 0.0)
+            )
             corners[:, k] = np.column_stack([x, y, self.slope_height(x, y) + up])
         start = 4 * np.arange(len(i), dtype=np.int64)[:, None]
         triangles = [start + np.array([0, 1, 2]), start + np.array([0, 2, 3])]
         labels = [label, label]
         number = np.full(self.kind.shape, -1, np.int64)
         number[i, j] = np.arange(len(i))
-        for (a, b), (c, d), here, there in (((1, 2), (0, 3), np.s_[:-1, :], np.s_[1:, :]), ((3, 2), (0, 1), np.s_[:, :-1], np.s_[:, 1:])):
-            step = ((self.kind[here] == ROAD) != (self.kind[there] == ROAD)) | (self.dug[here] != self.dug[there])
+        for (a, b), (c, d), here, there in (
+            ((1, 2), (0, 3), np.s_[:-1, :], np.s_[1:, :]),
+            ((3, 2), (0, 1), np.s_[:, :-1], np.s_[:, 1:]),
+        ):
+            step = ((self.kind[here] == ROAD) != (self.kind[there] == ROAD)) | (
+                self.dug[here] != self.dug[there]
+            )
             step &= (number[here] >= 0) & (number[there] >= 0)
-            p, q = 4 * number[here][step], 4 * number[there][step]
-            triangles += [np.column_stack([p + a, p + b, q + d]), np.column_stack([p + a, q + d, q + c])]
+            p = 4 * number[here][step]
+            q = 4 * number[there][step]
+            triangles += [
+                np.column_stack([p + a, p + b, q + d]),
+                np.column_stack([p + a, q + d, q + c]),
+            ]
             labels += [np.full(len(p), SIDEWALK, np.uint8)] * 2
-        return Mesh(corners.reshape(-1, 3), np.concatenate(triangles)), np.concatenate(labels).astype(np.uint8)
+        return Mesh(corners.reshape(-1, 3), np.concatenate(triangles)), np.concatenate(
+            labels
+        ).astype(np.uint8)
 
 
-def _at_corners(raster: NDArray[np.float32], i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float32]:
+def _at_corners(
+    raster: NDArray[np.float32], i: NDArray[np.int64], j: NDArray[np.int64]
+) -> NDArray[np.float32]:
     """A raster at the corners (i, j) of its cells: the mean of the cells around."""
     n, m = raster.shape
-    low_i, high_i, low_j, high_j = np.maximum(i - 1, 0), np.minimum(i, n - 1), np.maximum(j - 1, 0), np.minimum(j, m - 1)
-    mean = (raster[low_i, low_j] + raster[low_i, high_j] + raster[high_i, low_j] + raster[high_i, high_j]) / 4
+    low_i = np.maximum(i - 1, 0)
+    high_i = np.minimum(i, n - 1)
+    low_j = np.maximum(j - 1, 0)
+    high_j = np.minimum(j, m - 1)
+    mean = (
+        raster[low_i, low_j]
+        + raster[low_i, high_j]
+        + raster[high_i, low_j]
+        + raster[high_i, high_j]
+    ) / 4
     return np.asarray(mean, np.float32)
 
 
@@ -208,4 +287,6 @@ def _rounded_corners(beside: NDArray[np.float32], radius: float = 3.0) -> NDArra
     """Close the carriageway by ``radius`` metres, so that kerbs turn round corners in an arc."""
     inside = cv2.distanceTransform((beside < radius).astype(np.uint8), cv2.DIST_L2, 5) * CELL
     closed = (inside > radius) & (beside < radius)
-    return np.where(closed & (beside >= 0), np.float32(-0.01), np.minimum(beside, 1e3)).astype(np.float32)
+    return np.where(closed & (beside >= 0), np.float32(-0.01), np.minimum(beside, 1e3)).astype(
+        np.float32
+    )
