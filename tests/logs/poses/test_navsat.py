@@ -18,7 +18,7 @@ from semloc_logs.numerics.transforms import inverse, yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
-ODD = Path(__file__).resolve().parents[3] / "shared" / "odd_logs"
+ODD = Path(__file__).resolve().parents[4] / "shared" / "odd_logs"
 A, B = 6378137.0, 6356752.314245  # m, WGS 84
 LATITUDE, LONGITUDE, HEIGHT = 48.0, 11.0, 500.0
 RADIUS, SPEED = 40.0, 5.0

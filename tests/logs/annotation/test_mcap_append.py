@@ -31,7 +31,7 @@ from semloc_logs.logs.annotation.annotate import (
 )
 from semloc_logs.logs.annotation.mcap_append import read_ending
 
-SHARED = Path(__file__).resolve().parents[2].parent / "shared"
+SHARED = Path(__file__).resolve().parents[4] / "shared"
 CONFORMANCE = SHARED / "odd_logs" / "mcap_conformance"
 NO_TIMES: dict[int, int] = {}
 

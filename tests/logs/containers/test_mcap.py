@@ -5,7 +5,7 @@ from __future__ import annotations
 import bz2
 import json
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 

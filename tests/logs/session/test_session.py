@@ -28,7 +28,7 @@ from semloc_logs.numerics.transforms import Array, rotation_angle, yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
-REAL = Path(__file__).resolve().parents[3] / "shared" / "logs"
+REAL = Path(__file__).resolve().parents[4] / "shared" / "logs"
 TYPES = {
     LidarFrame: "sensor_msgs/msg/PointCloud2", DepthFrame: "sensor_msgs/msg/Image", ImageFrame: "sensor_msgs/msg/Image",
     Camera: "sensor_msgs/msg/CameraInfo", TransformSample: "tf2_msgs/msg/TFMessage", ImuSample: "sensor_msgs/msg/Imu",

@@ -30,7 +30,7 @@ from semloc_logs.logs.annotation.annotate import (
     recover,
 )
 
-SHARED = Path(__file__).resolve().parents[2].parent / "shared"
+SHARED = Path(__file__).resolve().parents[4] / "shared"
 TEXT = "std_msgs/msg/String"
 
 

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from semloc_logs.errors import LogError, RoleError
 from semloc_logs.logs.session.inspect import inspect_log
 
-SHARED = Path(__file__).resolve().parents[3] / "shared"
+SHARED = Path(__file__).resolve().parents[4] / "shared"
 needs_logs = pytest.mark.skipif(
     not SHARED.is_dir(), reason="the folder ../shared with recorded logs is missing"
 )

@@ -16,7 +16,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.settings import Settings
 
 FUSION = Settings().resolved().fusion
-KITTI = Path(__file__).parents[3] / "shared" / "logs" / "kitti00_000052.mcap"
+KITTI = Path(__file__).parents[4] / "shared" / "logs" / "kitti00_000052.mcap"
 
 
 def street(half_width: float = 5.0, facade: float = 9.0) -> Scan:

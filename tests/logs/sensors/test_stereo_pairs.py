@@ -24,7 +24,7 @@ from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.numerics.transforms import apply, exp_se3
 
 MS = 1_000_000
-REAL = Path(__file__).resolve().parents[3] / "shared" / "logs" / "euroc_v101_stereo.bag"
+REAL = Path(__file__).resolve().parents[4] / "shared" / "logs" / "euroc_v101_stereo.bag"
 LEFT, RIGHT = "/left/image_rect", "/right/image_rect"
 ROLES = Roles(
     image=(LEFT,), stereo_left=LEFT, stereo_right=RIGHT, camera_info=("/l", "/r"), info_of={LEFT: "/l", RIGHT: "/r"},

@@ -13,7 +13,7 @@ from semloc_logs.frames import DepthFrame, LidarFrame
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log
 
-SHARED = Path(__file__).resolve().parents[3] / "shared"
+SHARED = Path(__file__).resolve().parents[4] / "shared"
 ODD = SHARED / "odd_logs"
 pytestmark = pytest.mark.skipif(not SHARED.is_dir(), reason="no folder shared beside the checkout")
 
