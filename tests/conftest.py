@@ -2,12 +2,15 @@
 the checkout.
 """
 
+import os
 import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+# small arrays: a second thread costs more than it brings, and much more on a busy machine
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 # `python -m pytest` in the repository root would find the checkout's semloc_logs, which has no cli
 # and no schemas inside
 sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != ROOT]
