@@ -35,7 +35,7 @@ from semloc_logs.subvolumes.network import (
     halve,
     latent_mean,
 )
-from semloc_logs.training.checkpoints import save_weights
+from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.completion_scores import completion_scores
 from semloc_logs.training.network_training import Progress, train
 from semloc_logs.training.pairs import read_shard

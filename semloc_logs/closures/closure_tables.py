@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import FEATURES
 from semloc_logs.closures.acceptance.calibration import AGREEMENT
-from semloc_logs.closures.matching import Alignment
+from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_table

@@ -27,13 +27,8 @@ from semloc_logs.alignment.verify import (
     search_hypotheses,
     structure_scores,
 )
-from semloc_logs.closures.acceptance.calibration import (
-    CLOSE,
-    HOPELESS,
-    Agreement,
-    own_values,
-    shipped,
-)
+from semloc_logs.closures.acceptance.calibration import CLOSE, HOPELESS, own_values, shipped
+from semloc_logs.closures.closure import Agreement, Alignment
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.query import SessionMap, build_query
 from semloc_logs.labels.space import cityscapes
@@ -81,40 +76,6 @@ class CloseTask:
     keyframes: tuple[int, ...]
     targets: tuple[str, ...]
     settings_json: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Alignment:
-    """A verified hypothesis with everything that is reported; ``accepted`` or with a ``reason``.
-
-    ``probability`` is that of the alignment alone until
-    :func:`semloc_logs.closures.acceptance.consistency.decide` has compared all queries.
-    """
-
-    query_session: str
-    target_session: str
-    query_keyframe: int
-    target_keyframe: int
-    query_stamp_ns: int
-    target_stamp_ns: int
-    target_T_query: F64
-    covariance: F64
-    overlap: float
-    probability: float
-    inliers: int
-    words: int
-    features: Features
-    agreement: Agreement
-    reason: str = "not yet compared with other queries"
-
-    @property
-    def accepted(self) -> bool:
-        return not self.reason
-
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of the position in its worst direction, metres."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
 
 def close_queries(task: CloseTask) -> list[list[Alignment]]:

@@ -30,7 +30,6 @@ from semloc_logs.mapping.selection import road_distance, submap_ranges
 from semloc_logs.mapping.up_direction import ground_height
 from semloc_logs.numerics.prefetch import ahead
 from semloc_logs.numerics.transforms import apply
-from semloc_logs.pictures.map_picture import Caption, draw_map
 from semloc_logs.settings import STREET_VOXEL, Fusion, Settings
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import replacing_folder, write_json, write_table
@@ -64,9 +63,12 @@ class FuseTask:
 
 
 def fuse_session(
-    task: FuseTask, on_progress: Callable[[str], None] = lambda _: None
+    task: FuseTask,
+    on_progress: Callable[[str], None] = lambda _: None,
+    on_tables: Callable[[dict[str, Any]], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Write every table, map.png and, last, session.json; returns the latter.
+    """Write every table and, last, session.json; returns the latter. ``on_tables`` is called with
+    its content just before that, when all tables are there.
 
     Raises LogError when the log has nothing to fuse, RoleError when its streams leave open what to
     use.
@@ -118,6 +120,7 @@ def fuse_session(
             **content,
             "skipped": session.skipped,
         }
+        on_tables(content)
         write_json(task.folder.session_json, content)
         return content
     finally:
@@ -154,9 +157,7 @@ class _Fused:
     submaps: list[dict[str, Any]] = field(default_factory=list)
 
     def write(self) -> dict[str, Any]:
-        """Write every table but the trajectory, and the picture; returns what session.json says of
-        them.
-        """
+        """Write every table but the trajectory; returns what session.json says of them."""
         folder = self.task.folder
         fusion = self.task.settings.fusion
         n = len(self.collected)
@@ -200,13 +201,6 @@ class _Fused:
         }
         write_table(folder.frames, contracts.table("frames", frames), self.metadata, ("keyframe",))
         write_ground(folder.ground, ground.finish(), self.metadata)
-        caption = Caption(folder.name, self.labeller.source, fusion.voxel_size)
-        draw_map(
-            folder.voxels,
-            self.poses[:, :3, 3] if posed else np.zeros((0, 3)),
-            caption,
-            folder.picture,
-        )
         return {"posed": posed, "keyframes": n, "submaps": self.submaps, "voxels": voxels}
 
     def _labelled(self, ground: GroundMapper) -> Iterator[Keyframe]:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Query, Target
-from semloc_logs.benchmarks.descriptors.completion import completed, load_completion, states_of
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import allowed_places, match_words
@@ -21,6 +20,7 @@ from semloc_logs.closures.query import SessionMap, build_query, query_members
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import inverse, turned_about_z
 from semloc_logs.settings import Settings
+from semloc_logs.subvolumes.completed import completed, load_completion, states_of
 from semloc_logs.subvolumes.cut import SIZE, turn
 from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.voxels.grid import UNOBSERVED_STATE

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.matching import Alignment
+from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.tables.table import read_table, replacing_file

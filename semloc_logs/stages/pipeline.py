@@ -19,6 +19,7 @@ import numpy as np
 
 import semloc_logs
 from semloc_logs.closures.acceptance.consistency import decide
+from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.closure_tables import (
     keyframe_at,
     read_closures,
@@ -26,7 +27,7 @@ from semloc_logs.closures.closure_tables import (
     write_closures,
     write_rejected,
 )
-from semloc_logs.closures.matching import Alignment, CloseTask, close_queries
+from semloc_logs.closures.matching import CloseTask, close_queries
 from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.engines import Engine, Serial
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError

@@ -22,7 +22,7 @@ from semloc_logs.errors import SettingsError
 from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, code_table
 from semloc_logs.subvolumes.network import Encoder, descriptors
-from semloc_logs.training.checkpoints import load_weights
+from semloc_logs.subvolumes.weight_files import load_weights
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 U8 = NDArray[np.uint8]

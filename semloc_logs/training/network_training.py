@@ -24,8 +24,9 @@ from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.cut import CLASSES, code_table
 from semloc_logs.subvolumes.network import Completion, descriptors, in_eights
+from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.batches import Batch, OutOfTime, batches
-from semloc_logs.training.checkpoints import resume, save_checkpoint, save_weights
+from semloc_logs.training.checkpoints import resume, save_checkpoint
 from semloc_logs.training.schedule import learning_rate, plateau_end, samples_after, steps_of
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 

@@ -21,7 +21,7 @@ from semloc_logs.engines.streamed import Growing
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings, Training
 from semloc_logs.subvolumes.describe import load_encoder
-from semloc_logs.training.checkpoints import save_weights
+from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.completion_scores import completion_scores
 from semloc_logs.training.descriptor_samples import shard_descriptors
 from semloc_logs.training.network_training import Progress, train

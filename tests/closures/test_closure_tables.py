@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from semloc_logs.alignment.verify import FEATURES, Features
-from semloc_logs.closures.acceptance.calibration import AGREEMENT, Agreement
+from semloc_logs.closures.acceptance.calibration import AGREEMENT
+from semloc_logs.closures.closure import Agreement, Alignment
 from semloc_logs.closures.closure_tables import (
     read_closures,
     unique_closures,
     write_closures,
     write_rejected,
 )
-from semloc_logs.closures.matching import Alignment
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_metadata, read_table

@@ -29,7 +29,7 @@ from semloc_logs.subvolumes.network import (
     from_eights,
     in_eights,
 )
-from semloc_logs.training.checkpoints import save_weights
+from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.pairs import occupied
 
 U8 = NDArray[np.uint8]

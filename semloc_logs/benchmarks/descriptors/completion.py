@@ -4,26 +4,20 @@ training has seen (paper 4.3, figure 3).
 
 from __future__ import annotations
 
-import math
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from semloc_logs.benchmarks.descriptors.held_out import simulation_version
 from semloc_logs.pictures.completion_picture import draw_completions
-from semloc_logs.settings import Settings, Training
-from semloc_logs.subvolumes.cut import CLASSES, SIZE, code_table
-from semloc_logs.subvolumes.network import Completion
-from semloc_logs.training.checkpoints import load_weights
+from semloc_logs.settings import Settings
+from semloc_logs.subvolumes.completed import Completed, completed, load_completion, states_of
 from semloc_logs.training.pairs import read_shard
 from semloc_logs.training.scene_shards import SceneTask, make_shard
-from semloc_logs.voxels.grid import FREE_STATE
 
 U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
@@ -33,51 +27,6 @@ SEEDS = (9001, 9002, 9003, 9004)  # of held-out streets: those of training count
 PAIRS = 150  # of a street at most
 PAPER = 0.87  # accuracy (4.3)
 SHOWN = 6  # subvolumes in the picture
-BATCH = 16
-COUNTED = Training().occupied_weight
-# of 1, 2, 3, 5 and 10 the best mean IoU on a simulated street that is not among the SEEDS
-BALANCED = 3.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Completed:
-    """Network codes (n, 32, 32, 32) of the subvolumes as few frames saw them, as the network
-    completes them, the same with the most probable label of each voxel, and as all frames saw them;
-    ``classes`` is the code of free voxels.
-    """
-
-    given: U8
-    said: U8
-    probable: U8
-    truth: U8
-    classes: int
-
-
-def load_completion(variant: str, weights: Path | None = None) -> Completion:
-    """The shipped network of ``variant`` with its decoder, or that of a file. Raises SettingsError
-    when the file does not hold one.
-    """
-    return load_weights(Completion, "", variant, weights)
-
-
-@torch.inference_mode()
-def completed(model: Completion, pairs: tuple[U8, U8, U8]) -> Completed:
-    """What the network makes of the incomplete views of ``pairs``, of
-    :func:`semloc_logs.training.pairs.read_shard`.
-    """
-    table = code_table(model.encoder.variant)
-    classes = CLASSES[model.encoder.variant]
-    given = table[pairs[0]]
-    said, probable = (np.zeros((len(given), SIZE, SIZE, SIZE), np.uint8) for _ in range(2))
-    for i in range(0, len(given), BATCH):
-        logits = model.complete(torch.from_numpy(given[i : i + BATCH]))[:, : classes + 1]
-        for out, weight in ((said, BALANCED), (probable, COUNTED)):
-            # an occupied voxel counted so often in training: its odds are too large by that
-            excess = torch.tensor([math.log(weight)] * classes + [0.0])
-            out[i : i + BATCH] = (logits - excess[:, None, None, None]).argmax(1).numpy()
-    return Completed(
-        np.ascontiguousarray(given[:, 16:-16, 16:-16]), said, probable, table[pairs[1]], classes
-    )
 
 
 def completion_figures(found: Completed) -> Figures:
@@ -189,12 +138,3 @@ def _worth_seeing(found: Completed) -> I64:
     score = kinds + 5 * hidden + 5 * np.minimum(occupied.mean((1, 2, 3)) / 0.1, 1)
     groups = np.array_split(np.arange(len(score)), min(SHOWN, len(score)))
     return np.array([g[np.argmax(score[g])] for g in groups if len(g)], np.int64)
-
-
-def states_of(codes: U8, classes: int) -> U8:
-    """Voxel states of codes: classes, 254 free, 253 unobserved, 255 occupied of no known class."""
-    table = np.full(256, 255, np.uint8)
-    if classes > 1:
-        table[:classes] = np.arange(classes)
-    table[[classes, classes + 1]] = FREE_STATE, 253
-    return table[codes]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from semloc_logs.benchmarks.descriptors.fpfh import fpfh_describes
 from semloc_logs.benchmarks.descriptors.held_out import HeldOut, held_out
 from semloc_logs.benchmarks.descriptors.places import Place, Street
 from semloc_logs.benchmarks.descriptors.recall import (
@@ -21,7 +22,6 @@ from semloc_logs.benchmarks.descriptors.recall import (
     recalls,
     retrieval_recall,
 )
-from semloc_logs.benchmarks.peers.fpfh import fpfh_describes
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.benchmarks.speed.scans import Scan, log_sweeps, town_sweeps
+from semloc_logs.benchmarks.scans import Scan, log_sweeps, town_sweeps
 from semloc_logs.errors import LogError
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.settings import Fusion, Settings

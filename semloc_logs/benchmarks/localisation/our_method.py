@@ -22,6 +22,7 @@ from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.verify import Query
 from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
 from semloc_logs.benchmarks.localisation.city import DATABASE, WorldDrive
+from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures import matching
 from semloc_logs.closures.acceptance.consistency import decide
 from semloc_logs.closures.database import Database
@@ -31,7 +32,7 @@ from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
 from semloc_logs.subvolumes.network import Completion
 from semloc_logs.subvolumes.submap_descriptors import describe_submap
-from semloc_logs.training.checkpoints import save_weights
+from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import Workspace
@@ -129,7 +130,7 @@ class OurTask:
 
     def _ask(
         self, database: Database, world: World, keyframe: int
-    ) -> tuple[float, list[matching.Alignment]]:
+    ) -> tuple[float, list[Alignment]]:
         begin = time.perf_counter()
         found = matching.close_query(database, world.query, keyframe)
         return time.perf_counter() - begin, found
@@ -139,14 +140,14 @@ class OurTask:
         world: World,
         keyframe: int,
         seconds: float,
-        found: list[matching.Alignment],
-        accepted: matching.Alignment | None,
+        found: list[Alignment],
+        accepted: Alignment | None,
     ) -> Answer:
         """First is what is most probable by itself, which is its score; accepted may be another
         one, that other queries agree with.
         """
 
-        def errors(alignment: matching.Alignment | None) -> tuple[float, float] | tuple[None, None]:
+        def errors(alignment: Alignment | None) -> tuple[float, float] | tuple[None, None]:
             if alignment is None:
                 return None, None
             return world.errors(

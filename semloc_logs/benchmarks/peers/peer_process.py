@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import semloc_logs
-from semloc_logs.benchmarks.speed.scans import Scan
+from semloc_logs.benchmarks.scans import Scan
 from semloc_logs.errors import SemlocError, SettingsError
 
 _ANSWER_SECONDS = 600.0

@@ -33,7 +33,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.benchmarks.peers.peer_process import Round, open_peers, write_scans
-from semloc_logs.benchmarks.speed.scans import Scan, depth_images, log_sweeps, street_sweeps
+from semloc_logs.benchmarks.scans import Scan, depth_images, log_sweeps, street_sweeps
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Fusion, Settings
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser

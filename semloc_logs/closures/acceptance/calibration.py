@@ -16,27 +16,10 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from semloc_logs.alignment.verify import FEATURES, Features, rank
+from semloc_logs.closures.closure import Agreement
 from semloc_logs.settings import STREET_VOXEL
 
 F64 = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Agreement:
-    """What other queries of the session say about an alignment; see
-    ``schemas/parquet/rejected.json``.
-
-    ``alone`` is the probability from the alignment's own features; the sums are of the ``alone`` of
-    other queries' alignments.
-    """
-
-    alone: float
-    neighbours: int = 0
-    agreeing: float = 0.0
-    opposing: float = 0.0
-    far_agreeing: float = 0.0
-    far_opposing: float = 0.0
-    lookalike: float = 0.0
 
 
 AGREEMENT = (

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from semloc_logs.closures.acceptance.ambiguity import lookalike
 from semloc_logs.closures.acceptance.calibration import (
     AGREEMENT,
-    Agreement,
     may_be_right,
     precise,
     reason,
@@ -36,7 +35,7 @@ from semloc_logs.closures.acceptance.placements import (
     place,
     strays,
 )
-from semloc_logs.closures.matching import Alignment
+from semloc_logs.closures.closure import Agreement, Alignment
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL, Settings

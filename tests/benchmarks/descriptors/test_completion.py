@@ -7,16 +7,11 @@ import numpy as np
 import pytest
 
 from semloc_logs.benchmarks.descriptors import completion as module
-from semloc_logs.benchmarks.descriptors.completion import (
-    Completed,
-    completed,
-    completion_benchmark,
-    completion_figures,
-    load_completion,
-)
+from semloc_logs.benchmarks.descriptors.completion import completion_benchmark, completion_figures
 from semloc_logs.errors import SettingsError
 from semloc_logs.pictures.completion_picture import colours, draw_completions, render
 from semloc_logs.settings import Settings
+from semloc_logs.subvolumes.completed import Completed, completed, load_completion
 from semloc_logs.training.pairs import BROAD, write_shard
 from semloc_logs.training.scene_shards import SceneTask
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.benchmarks.descriptors import held_out as module
 from semloc_logs.benchmarks.descriptors import retrieval as benchmark
+from semloc_logs.benchmarks.descriptors.fpfh import fpfh_describes
 from semloc_logs.benchmarks.descriptors.held_out import SCENARIOS, Extent, HeldOut, held_out
 from semloc_logs.benchmarks.descriptors.places import Place, Street, read_street, write_street
 from semloc_logs.benchmarks.descriptors.recall import (
@@ -28,7 +29,6 @@ from semloc_logs.benchmarks.descriptors.retrieval import (
     densely,
     retrieval_benchmark,
 )
-from semloc_logs.benchmarks.peers.fpfh import fpfh_describes
 from semloc_logs.errors import SemlocError, SettingsError, WorkspaceError
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import Settings

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from semloc_logs.benchmarks.labels.realism import compare, portrait, total_variation
-from semloc_logs.benchmarks.speed.scans import Scan, town_sweeps
+from semloc_logs.benchmarks.scans import Scan, town_sweeps
 from semloc_logs.cli.main import program
 from semloc_logs.errors import LogError
 from semloc_logs.settings import Settings

@@ -8,8 +8,8 @@ import pytest
 
 from semloc_logs.benchmarks.peers import peer_process
 from semloc_logs.benchmarks.peers.peer_process import Peer, runner, write_scans
+from semloc_logs.benchmarks.scans import Scan, depth_images, log_sweeps, street_sweeps
 from semloc_logs.benchmarks.speed.fusion_speed import Case, clock_rate, measure, walk_all
-from semloc_logs.benchmarks.speed.scans import Scan, depth_images, log_sweeps, street_sweeps
 from semloc_logs.errors import LogError, SemlocError, SettingsError
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Settings

@@ -10,7 +10,6 @@ from semloc_logs.alignment.verify import FEATURES, Features
 from semloc_logs.closures.acceptance.calibration import (
     AGREEMENT,
     TOGETHER,
-    Agreement,
     Calibration,
     fit_logistic,
     may_be_right,
@@ -21,6 +20,7 @@ from semloc_logs.closures.acceptance.calibration import (
     together_values,
     unrivalled,
 )
+from semloc_logs.closures.closure import Agreement
 
 GOOD = Features(
     structure=0.95,

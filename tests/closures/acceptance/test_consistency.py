@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.verify import Features
-from semloc_logs.closures.acceptance.calibration import AGREEMENT, Agreement
+from semloc_logs.closures.acceptance.calibration import AGREEMENT
 from semloc_logs.closures.acceptance.consistency import (
     LEAST,
     MOST_SLACK,
@@ -26,7 +26,7 @@ from semloc_logs.closures.acceptance.consistency import (
     shares,
 )
 from semloc_logs.closures.acceptance.placements import ARM, DRIFT, FAR, Placed, place, strays
-from semloc_logs.closures.matching import Alignment
+from semloc_logs.closures.closure import Agreement, Alignment
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import STREET_VOXEL, Settings

@@ -1,0 +1,59 @@
+"""Weights of the network as files: bf16 tensors with a model card, in safetensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from semloc_logs.errors import SettingsError
+from semloc_logs.subvolumes.network import Completion
+from semloc_logs.tables.table import replacing_file
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
+    """The network in bf16 with a model card in the file's metadata."""
+    tensors = {
+        k: v.to("cpu", torch.bfloat16).contiguous()
+        for k, v in model.state_dict().items()
+        if v.is_floating_point()
+    }
+    with replacing_file(path) as temporary:
+        save_file(tensors, temporary, metadata={**card, "variant": model.encoder.variant})
+
+
+def load_weights(
+    build: Callable[[str, int], Network], part: str, variant: str, weights: Path | None = None
+) -> Network:
+    """The network that ``build(variant, latent)`` makes, with the shipped weights of ``variant`` or
+    those of a file.
+
+    ``part`` is ``encoder.`` for the encoder alone, empty for all. Raises SettingsError when the
+    file does not hold them.
+    """
+    try:
+        if weights is not None:
+            tensors = load_file(weights)
+        else:
+            with as_file(
+                files("semloc_logs.subvolumes") / "weights" / f"{variant}.safetensors"
+            ) as path:
+                tensors = load_file(path)
+        network = build(variant, len(tensors["encoder.log_variance.bias"]))
+        network.load_state_dict(
+            {k.removeprefix(part): v.float() for k, v in tensors.items() if k.startswith(part)}
+        )
+    except (OSError, SafetensorError, KeyError, RuntimeError) as problem:
+        said = str(problem).splitlines()[0]
+        raise SettingsError(
+            f"{weights or 'The shipped weights'}: no weights of the {variant} {part.strip('.') or 'network'} ({said})."
+        ) from None
+    return network.eval()
