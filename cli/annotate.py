@@ -19,7 +19,7 @@ from .options import (
 )
 
 if TYPE_CHECKING:
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
 
 
 @click.command(cls=Command)
@@ -48,7 +48,7 @@ def command(
     session: str | None,
     overwrite: bool,
     as_json: bool,
-    settings: Settings,
+    settings: Resolved,
 ) -> int:
     """Closures -> channels of the log, in its own encoding: /semloc/loop_closures, /semloc/pose and
     /semloc/markers.

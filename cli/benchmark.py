@@ -11,7 +11,7 @@ from .console import console
 from .options import Command, console_options, json_option, pairs, path_option, settings_options
 
 if TYPE_CHECKING:
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
 
 Rows = list[tuple[float, int, str]]
 
@@ -90,7 +90,7 @@ def command(
     picture: Path | None,
     work: Path | None,
     as_json: bool,
-    settings: Settings,
+    settings: Resolved,
 ) -> int:
     """Figures of speed and quality, measured here and now, beside what else does the same.
 
@@ -187,7 +187,7 @@ def _measure(
     truth: Path | None,
     peers: dict[str, str],
     lengths: tuple[int, ...],
-    settings: Settings,
+    settings: Resolved,
 ) -> tuple[dict[str, dict[str, Any]], Rows]:
     """The figures of benchmark ``name`` and, where it profiles, the functions that took most time."""
     if name == "pipeline":

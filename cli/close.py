@@ -12,7 +12,7 @@ from .options import Command, EngineChoice, query_options, stage_options, work_o
 from .results import finish, report_json, show_closures
 
 if TYPE_CHECKING:
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
 
 
 @click.command(cls=Command)
@@ -42,7 +42,7 @@ def command(
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
-    settings: Settings,
+    settings: Resolved,
 ) -> int:
     """Words -> loop closures: every session asks all others, and itself apart from what is near in
     time; writes closures.parquet.

@@ -13,7 +13,7 @@ from .options import Command, EngineChoice, stage_options
 from .results import finish, report_json, session_logs
 
 if TYPE_CHECKING:
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
 
 QUERY_EVERY = 20.0  # m; a demonstration need not ask every two metres
 
@@ -29,7 +29,7 @@ QUERY_EVERY = 20.0  # m; a demonstration need not ask every two metres
 )
 @stage_options
 def command(
-    output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, settings: Settings
+    output: Path, overwrite: bool, as_json: bool, engine: EngineChoice, settings: Resolved
 ) -> int:
     """Everything once: two drives round a simulated block on two days, their maps, closures, the
     truth, and an annotated log to look at.

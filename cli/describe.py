@@ -12,7 +12,7 @@ from .options import Command, EngineChoice, stage_options, work_option
 from .results import finish, report_json, show_report
 
 if TYPE_CHECKING:
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
 
 
 @click.command(cls=Command)
@@ -25,7 +25,7 @@ def command(
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
-    settings: Settings,
+    settings: Resolved,
 ) -> int:
     """Maps -> semantic words: every occupied subvolume of the sessions' submaps (all sessions by
     default) becomes a word and a 64-bit code.

@@ -21,7 +21,7 @@ from .results import SHOWN
 
 if TYPE_CHECKING:
     from semloc_logs.evaluation.truth import Evaluation
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
 
 
 @click.command(cls=Command)
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @json_option
 @settings_options
 @console_options
-def command(work: Path, truth: Path, no_self: bool, as_json: bool, settings: Settings) -> int:
+def command(work: Path, truth: Path, no_self: bool, as_json: bool, settings: Resolved) -> int:
     """Closures against the truth: a closure is correct within 1 m and 5 degrees.
 
     Recall is the share of the queries near a database keyframe (5 m) that have a correct closure.

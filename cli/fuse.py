@@ -20,7 +20,7 @@ from .options import (
 from .results import checked_name, finish, report_json, show_report
 
 if TYPE_CHECKING:
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
 
 
 @click.command(cls=Command)
@@ -42,7 +42,7 @@ def command(
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
-    settings: Settings,
+    settings: Resolved,
 ) -> int:
     """Logs -> the semantic map of one session: keyframes, submaps, voxels, trajectory. Several logs
     are one session, recorded back to back.

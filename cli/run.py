@@ -21,7 +21,7 @@ from .options import (
 from .results import finish, report_json, session_logs, show_closures
 
 if TYPE_CHECKING:
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
 
 
 @click.command(cls=Command)
@@ -47,7 +47,7 @@ def command(
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
-    settings: Settings,
+    settings: Resolved,
 ) -> int:
     """Logs -> loop closures, all of it: fuse, describe, close and, if asked for, annotate. Each LOG
     is a session.

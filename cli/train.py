@@ -23,7 +23,7 @@ from .options import (
 
 if TYPE_CHECKING:
     from semloc_logs.engines import Engine
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
     from semloc_logs.training.runs import Packed
 
 
@@ -81,7 +81,7 @@ def command(
     snapshots: Path | None,
     as_json: bool,
     engine: EngineChoice,
-    settings: Settings,
+    settings: Resolved,
 ) -> int:
     """Learn the descriptor, self-supervised: an encoder-decoder completes what few frames saw to
     what all frames saw.
@@ -150,7 +150,7 @@ def command(
 
 
 def packed_shards(
-    folder: Path, work: Path | None, settings: Settings, engine: Engine, samples: int = 0
+    folder: Path, work: Path | None, settings: Resolved, engine: Engine, samples: int = 0
 ) -> Packed:
     """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes;
     ``samples`` have been seen of them.

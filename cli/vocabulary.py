@@ -20,7 +20,7 @@ from .options import (
 from .train import packed_shards
 
 if TYPE_CHECKING:
-    from semloc_logs.settings import Settings
+    from semloc_logs.settings import Resolved
 
 
 @click.command(cls=Command)
@@ -63,7 +63,7 @@ def command(
     pairs: int | None,
     as_json: bool,
     engine: EngineChoice,
-    settings: Settings,
+    settings: Resolved,
 ) -> int:
     """Learn the words: descriptors of subvolumes are clustered, and each cluster gets thresholds
     for 64-bit codes.

@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
 
 from semloc_logs.errors import SettingsError
 
@@ -246,12 +245,37 @@ class Training(_Section):
     seed: int = 0
 
 
-class Settings(BaseSettings):
-    """The whole configuration; see each section."""
+class ResolvedFusion(Fusion):
+    """The same with every length."""
 
-    model_config = SettingsConfigDict(
-        extra="forbid", frozen=True, env_prefix="SEMLOC_", env_nested_delimiter="__"
-    )
+    min_range: float
+    max_range: float
+    keyframe_distance: float
+    keyframe_resolution: float
+    submap_length: float
+
+
+class ResolvedDescriptor(Descriptor):
+    """The same with every length."""
+
+    reach: float
+
+
+class ResolvedQuery(Query):
+    """The same with every length but ``length``, without which ``frames`` counts."""
+
+    every: float
+    radius: float
+
+
+class ResolvedClosures(Closures):
+    """The same with every length."""
+
+    exclude_distance: float
+
+
+class Settings(_Section):
+    """The whole configuration as given; see each section."""
 
     fusion: Fusion = Fusion()
     labels: Labels = Labels()
@@ -260,52 +284,38 @@ class Settings(BaseSettings):
     closures: Closures = Closures()
     training: Training = Training()
 
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        # files, environment and flags are merged by load(), so that each level can be refused by
-        # name
-        return (init_settings,)
+    def resolved(self) -> Resolved:
+        """The same settings with every ``None`` length filled in from the voxel size.
 
-    def resolved(self) -> Settings:
-        """The same settings with every ``None`` length filled in from the voxel size."""
-        v = self.fusion.voxel_size
+        Raises SettingsError where lengths do not go together.
+        """
+        fusion = self.fusion
+        v = fusion.voxel_size
         scale = v / STREET_VOXEL
-
-        def fill(section: _Section, **derived: float) -> dict[str, Any]:
-            return {k: x for k, x in derived.items() if getattr(section, k) is None}
-
-        fusion = fill(
-            self.fusion,
-            min_range=3 * v,
-            max_range=50 * scale,
-            keyframe_distance=2 * v,
-            keyframe_resolution=v / 3,
-            submap_length=100 * scale,
-        )
-        query = fill(self.query, every=2 * scale, radius=24 * scale)
-        submap = self.fusion.submap_length or 100 * scale
-        if self.query.length is not None and self.query.length > 2 * submap:
+        submap_length = _given(fusion.submap_length, 100 * scale)
+        if self.query.length is not None and self.query.length > 2 * submap_length:
             raise SettingsError(
-                f"Setting 'query.length' cannot be {self.query.length:g} m: a query is looked for in submaps of {submap:g} m, and may be "
-                f"twice as long; make fusion.submap_length larger, too."
+                f"Setting 'query.length' cannot be {self.query.length:g} m: a query is looked for"
+                f" in submaps of {submap_length:g} m, and may be twice as long; make"
+                " fusion.submap_length larger, too."
             )
-        descriptor = fill(self.descriptor, reach=30 * scale)
-        closures = fill(self.closures, exclude_distance=50 * scale)
-        return self.model_copy(
-            update={
-                "fusion": self.fusion.model_copy(update=fusion),
-                "descriptor": self.descriptor.model_copy(update=descriptor),
-                "query": self.query.model_copy(update=query),
-                "closures": self.closures.model_copy(update=closures),
-            }
-        )
+        lengths: dict[str, dict[str, float]] = {
+            "fusion": {
+                "min_range": 3 * v,
+                "max_range": 50 * scale,
+                "keyframe_distance": 2 * v,
+                "keyframe_resolution": v / 3,
+                "submap_length": 100 * scale,
+            },
+            "descriptor": {"reach": 30 * scale},
+            "query": {"every": 2 * scale, "radius": 24 * scale},
+            "closures": {"exclude_distance": 50 * scale},
+        }
+        content = self.model_dump()
+        for section, defaults in lengths.items():
+            for name, length in defaults.items():
+                content[section][name] = _given(content[section][name], length)
+        return Resolved.model_validate(content)
 
     def fingerprint(self, *sections: str) -> str:
         """Hash of the named sections: what a stage's outputs depend on."""
@@ -315,6 +325,22 @@ class Settings(BaseSettings):
     def dump(self) -> str:
         """YAML that :func:`load` reads back to the same settings."""
         return str(yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False))
+
+
+class Resolved(Settings):
+    """The configuration as the stages use it: every length is there."""
+
+    fusion: ResolvedFusion
+    descriptor: ResolvedDescriptor
+    query: ResolvedQuery
+    closures: ResolvedClosures
+
+    def resolved(self) -> Resolved:
+        return self
+
+
+def _given(value: float | None, default: float) -> float:
+    return default if value is None else value
 
 
 class _Loader(yaml.SafeLoader):

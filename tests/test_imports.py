@@ -60,7 +60,7 @@ INNER_ORDER = {
         "demo",
     ],
     "closures": ["query", "acceptance", "database", "matching", "closure_tables"],
-    "benchmarks": ["peers", "descriptors", "labels", "localisation", "speed"],
+    "benchmarks": ["scans", "peers", "descriptors", "labels", "localisation", "speed"],
 }
 SOURCES = sorted((ROOT / "semloc_logs").rglob("*.py"))
 CLI = sorted((ROOT / "cli").rglob("*.py"))

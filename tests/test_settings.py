@@ -3,10 +3,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.settings import Settings, load
+from semloc_logs.settings import Resolved, Settings, load
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_dump_and_load(tmp_path: Path) -> None:
     }
     for settings in (Settings(), load(assignments=changed), load(assignments=changed).resolved()):
         path.write_text(settings.dump())
-        assert load(path) == settings
+        assert load(path).model_dump() == settings.model_dump()
 
 
 def test_lengths_follow_the_voxel_size() -> None:
@@ -190,3 +190,21 @@ def test_fingerprints_are_of_the_named_sections_only() -> None:
     assert a.fingerprint("fusion", "labels") == b.fingerprint("fusion", "labels")
     assert a.fingerprint("fusion", "query") != b.fingerprint("fusion", "query")
     assert a.fingerprint("fusion") == load().fingerprint("fusion")
+
+
+def test_resolved_settings_hold_every_length_and_stay_as_they_are() -> None:
+    resolved = load(assignments={"fusion.voxel_size": "0.1", "query.every": "3"}).resolved()
+    assert resolved.query.every == 3
+    assert resolved.fusion.submap_length == pytest.approx(100 / 3)
+    assert resolved.resolved() is resolved
+    assert Resolved.model_validate(resolved.model_dump()) == resolved
+    assert hash(resolved) == hash(Resolved.model_validate(resolved.model_dump()))
+    for section in (resolved.fusion, resolved.closures):
+        assert None not in section.model_dump().values()
+    with pytest.raises(ValidationError):
+        Resolved.model_validate(Settings().model_dump())
+
+
+def test_the_environment_is_read_by_load_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SEMLOC_FUSION__VOXEL_SIZE", "0.7")
+    assert Settings().fusion.voxel_size == 0.3

@@ -26,7 +26,7 @@ from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SemlocError
 from semloc_logs.evaluation.truth import read_truth
 from semloc_logs.logs.session.session import open_session
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.stages.pipeline import describe, fuse, run, session_name
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
 from semloc_logs.subvolumes.network import Encoder
@@ -67,7 +67,7 @@ _PARTS: dict[str, tuple[tuple[str, ...], str]] = {
 
 
 def profile_pipeline(
-    logs: Sequence[Path], settings: Settings, functions: int = 12
+    logs: Sequence[Path], settings: Resolved, functions: int = 12
 ) -> tuple[Figures, Rows]:
     """Run the pipeline on ``logs`` in this process in a fresh workspace.
 
@@ -101,7 +101,7 @@ def profile_pipeline(
 
 
 def profile_fuse(
-    logs: Sequence[Path], settings: Settings, rounds: int = 3, functions: int = 12
+    logs: Sequence[Path], settings: Resolved, rounds: int = 3, functions: int = 12
 ) -> tuple[Figures, Rows]:
     """`semloc fuse` of ``logs`` (one session) beside what it cannot do without: reading all clouds,
     and integrating all keyframes once.
@@ -111,7 +111,6 @@ def profile_fuse(
     thread and under the profiler, which adds some percent, as do the returned ``functions``, those
     that took most time themselves.
     """
-    settings = settings.resolved()
     fusion = settings.fusion
     times: dict[str, list[tuple[float, float]]] = {"whole": [], "reading": [], "integrating": []}
 
@@ -125,8 +124,8 @@ def profile_fuse(
         session = open_session(
             [*logs],
             {},
-            min_range=fusion.min_range or 0.0,
-            max_range=2.0 * (fusion.max_range or 50.0),
+            min_range=fusion.min_range,
+            max_range=2.0 * fusion.max_range,
         )
         try:
             return sum(1 for _ in session.clouds())
@@ -187,11 +186,11 @@ def _since(start: tuple[float, float]) -> tuple[float, float]:
     return wall - start[0], processor - start[1]
 
 
-def _integrating(session: SessionMap, settings: Settings) -> tuple[float, float]:
+def _integrating(session: SessionMap, settings: Resolved) -> tuple[float, float]:
     """Seconds (wall clock, processor) of Fuser.add for every keyframe once, a new map every submap
     length of road.
     """
-    length = settings.fusion.submap_length or 100.0
+    length = settings.fusion.submap_length
     taken = np.zeros(2)
     begun = np.floor(np.asarray(session.frames["distance"].to_numpy()) / length)
     fuser = Fuser(settings.fusion)
@@ -239,7 +238,7 @@ def _parts(
     return parts
 
 
-def memory_curve(lengths: Sequence[int], settings: Settings) -> Figures:
+def memory_curve(lengths: Sequence[int], settings: Resolved) -> Figures:
     """Peak resident memory of `semloc fuse`, in a process of its own, for a drive of 250 m and its
     multiples ``lengths``.
 
@@ -300,7 +299,7 @@ def _place(where: tuple[str, int, str]) -> str:
     return name if line == 0 else f"{'/'.join(Path(path).parts[-2:])}:{line} {name}"
 
 
-def word_recalls(logs: Sequence[Path], truth: Path, settings: Settings) -> Figures:
+def word_recalls(logs: Sequence[Path], truth: Path, settings: Resolved) -> Figures:
     """Recall at 5 of word matches within 1.5 m between two logs whose true alignment is known:
     trained weights beside random ones.
 
@@ -310,7 +309,6 @@ def word_recalls(logs: Sequence[Path], truth: Path, settings: Settings) -> Figur
     """
     with tempfile.TemporaryDirectory(prefix="semloc-words-") as folder:
         work = Workspace(Path(folder))
-        settings = settings.resolved()
         sessions = {session_name(log): [log] for log in logs}
         fuse(sessions, work, settings, {}, make_engine("serial"), lambda _: None)
         maps = {name: SessionMap(work.session(name)) for name in sessions}
@@ -350,12 +348,11 @@ def word_recalls(logs: Sequence[Path], truth: Path, settings: Settings) -> Figur
         return figures
 
 
-def real_streets(logs: Sequence[Path], truth: Path, settings: Settings) -> dict[str, Street]:
+def real_streets(logs: Sequence[Path], truth: Path, settings: Resolved) -> dict[str, Street]:
     """For `semloc benchmark retrieval`: what the first log's queries and the second one's map are,
     with the log's labels and with those from geometry, by the names of
     :data:`semloc_logs.benchmarks.descriptors.retrieval.REAL`.
     """
-    settings = settings.resolved()
     out: dict[str, Street] = {}
     for source, names in (
         ("auto", ("real_log", "real_geometric")),
@@ -381,7 +378,7 @@ class _Prepare:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
 
-    def fuse(self, logs: Mapping[str, Path], work: Workspace, settings: Settings) -> None:
+    def fuse(self, logs: Mapping[str, Path], work: Workspace, settings: Resolved) -> None:
         fuse(
             {name: [log] for name, log in logs.items()},
             work,
@@ -391,7 +388,7 @@ class _Prepare:
             lambda _: None,
         )
 
-    def describe(self, work: Workspace, names: Sequence[str], settings: Settings) -> None:
+    def describe(self, work: Workspace, names: Sequence[str], settings: Resolved) -> None:
         describe(work, names, settings, self._engine, lambda _: None)
 
 
@@ -399,7 +396,7 @@ def localisation(
     work: Path | None,
     queries: int,
     peers: Mapping[str, str],
-    settings: Settings,
+    settings: Resolved,
     note: Callable[[str], None],
 ) -> Figures:
     """Whole localisation beside ``peers`` (runner -> Python), ``queries`` for each condition, on

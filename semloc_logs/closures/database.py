@@ -21,7 +21,7 @@ from semloc_logs.alignment.surface import Surface
 from semloc_logs.alignment.verify import Target, is_uncertain, looked_at, points_surface
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import Keyframe, blocks_path, read_blocks, read_keyframe
 from semloc_logs.words.catalogue import read_words, segments
@@ -69,7 +69,7 @@ class Database:
     :attr:`places`.
     """
 
-    def __init__(self, workspace: Workspace, targets: tuple[str, ...], settings: Settings) -> None:
+    def __init__(self, workspace: Workspace, targets: tuple[str, ...], settings: Resolved) -> None:
         self._workspace = workspace
         self.sessions = {name: SessionMap(workspace.session(name)) for name in targets}
         self.settings = settings
@@ -113,9 +113,7 @@ class Database:
         near = (
             np.abs(session.stamps_ns - session.stamps_ns[keyframe]) < closures.exclude_seconds * 1e9
         )
-        near |= np.abs(session.distance - session.distance[keyframe]) < (
-            closures.exclude_distance or 0.0
-        )
+        near |= np.abs(session.distance - session.distance[keyframe]) < (closures.exclude_distance)
         near[keyframe] = True
         # several queries share what is made without it
         stretch = session.distance // (UNIT * self.settings.fusion.voxel_size)
@@ -164,7 +162,7 @@ class Database:
     @property
     def _reach(self) -> float:
         """How far from its origin a query may see, metres, and a fifth more."""
-        return 1.2 * (self.settings.query.radius or 24.0)
+        return 1.2 * self.settings.query.radius
 
     def allowed(self, variant: str, groups: NDArray[np.bool_]) -> Allowed:
         """Which words of submaps ``groups`` (g,) may answer: in squares near keyframes that the
@@ -218,7 +216,7 @@ class Database:
         apart = np.linalg.norm(session.map_T_base[seen, :3, 3] - self._asking, axis=1)
         is_whole = (
             len(seen) == len(self._submap_ids(group))
-            or not (apart < 1.5 * (self.settings.query.radius or 24.0)).any()
+            or not (apart < 1.5 * self.settings.query.radius).any()
         )
 
         def make() -> Target:
@@ -279,7 +277,7 @@ class Database:
         session = self.sessions[place.session]
         query = self.settings.query
         v = self.settings.fusion.voxel_size
-        radius = query.radius or 24.0
+        radius = query.radius
         stretch = session.distance[seen] // (UNIT * v)
         topic = session.topics[seen]
         at = np.searchsorted(seen, keyframe)
@@ -339,6 +337,6 @@ class Database:
 
 
 @lru_cache(maxsize=2)
-def open_database(work: Path, targets: tuple[str, ...], settings_json: str) -> Database:
+def open_database(work: Path, targets: tuple[str, ...], settings: Resolved) -> Database:
     """The database of a worker process, kept between its tasks."""
-    return Database(Workspace(work), targets, Settings.model_validate_json(settings_json))
+    return Database(Workspace(work), targets, settings)

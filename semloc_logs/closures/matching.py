@@ -33,7 +33,7 @@ from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.query import SessionMap, build_query
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.numerics.transforms import apply, inverse, turned_about_z
-from semloc_logs.settings import STREET_VOXEL
+from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns
 from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.workspace import Workspace
@@ -75,12 +75,12 @@ class CloseTask:
     session: str
     keyframes: tuple[int, ...]
     targets: tuple[str, ...]
-    settings_json: str
+    settings: Resolved
 
 
 def close_queries(task: CloseTask) -> list[list[Alignment]]:
     """For each keyframe of the task the alignments found, best first; not yet accepted or rejected."""
-    database = open_database(task.work, task.targets, task.settings_json)
+    database = open_database(task.work, task.targets, task.settings)
     session = SessionMap(Workspace(task.work).session(task.session))
     return [close_query(database, session, k) for k in task.keyframes]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.verify import Query, thin_points
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.submap_descriptors import KNOWS_CLASSES
 from semloc_logs.tables.table import read_json, read_table
 from semloc_logs.voxels.grid import Fuser
@@ -105,13 +105,13 @@ class SessionMap:
         return self.json["label_source"] in KNOWS_CLASSES
 
 
-def query_keyframes(session: SessionMap, settings: Settings) -> list[int]:
+def query_keyframes(session: SessionMap, settings: Resolved) -> list[int]:
     """Keyframes that ask: every ``query.every`` metres or ``query.every_angle`` of turning; all of
     them in a log without poses.
     """
     if not session.posed:
         return list(range(len(session.stamps_ns)))
-    every = settings.query.every or 2.0
+    every = settings.query.every
     angle = settings.query.every_angle
     chosen: list[int] = []
     for i, pose in enumerate(session.map_T_base):
@@ -123,7 +123,7 @@ def query_keyframes(session: SessionMap, settings: Settings) -> list[int]:
     return chosen
 
 
-def query_members(session: SessionMap, keyframe: int, settings: Settings) -> list[int]:
+def query_members(session: SessionMap, keyframe: int, settings: Resolved) -> list[int]:
     """The keyframes fused into the query of ``keyframe``: ``query.frames`` around it, or all within
     ``query.length`` of road.
 
@@ -138,10 +138,10 @@ def query_members(session: SessionMap, keyframe: int, settings: Settings) -> lis
         return np.flatnonzero(away <= settings.query.length / 2).tolist()
     count = min(settings.query.frames, n)
     first = min(max(0, keyframe - count // 2), n - count)
-    return [i for i in range(first, first + count) if away[i] <= (settings.query.radius or 24.0)]
+    return [i for i in range(first, first + count) if away[i] <= settings.query.radius]
 
 
-def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple[Query, F64]:
+def build_query(session: SessionMap, keyframe: int, settings: Resolved) -> tuple[Query, F64]:
     """The query map in a level frame whose origin is the base at ``keyframe``, and the level
     ``query_T_base`` (4, 4) of it.
 
@@ -151,7 +151,7 @@ def build_query(session: SessionMap, keyframe: int, settings: Settings) -> tuple
     query_T_map = np.eye(4)
     query_T_map[:3, 3] = -session.map_T_base[keyframe][:3, 3]
     poses = query_T_map @ session.map_T_base
-    radius = settings.query.radius or 24.0
+    radius = settings.query.radius
     fuser = Fuser(settings.fusion)
     clouds = []
     spreads = []

@@ -19,7 +19,7 @@ from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.errors import TruthError, WorkspaceError
 from semloc_logs.numerics.transforms import interpolate, inverse, rotation_angle, transform
-from semloc_logs.settings import Closures, Query, Settings
+from semloc_logs.settings import Resolved, ResolvedClosures, ResolvedQuery
 from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
@@ -129,7 +129,7 @@ def _median(values: Iterable[float | None]) -> float | None:
 
 
 def evaluate_closures(
-    work: Workspace, truth: Path, settings: Settings, *, self_closures: bool = True
+    work: Workspace, truth: Path, settings: Resolved, *, self_closures: bool = True
 ) -> Evaluation:
     """The closures of a workspace against the file ``truth``; queries are counted with the settings
     that the closures were made with.
@@ -147,15 +147,15 @@ def evaluate_closures(
     return Evaluation(rows, queries, possible, answered)
 
 
-def _settings_of(work: Workspace, settings: Settings) -> Settings:
+def _settings_of(work: Workspace, settings: Resolved) -> Resolved:
     """``settings`` with the sections that closures.parquet was made with, where it says so."""
     recorded = read_metadata(work.closures).get("settings")
     if not isinstance(recorded, dict):
         return settings
     try:
         update = {
-            "query": Query.model_validate(recorded["query"]),
-            "closures": Closures.model_validate(recorded["closures"]),
+            "query": ResolvedQuery.model_validate(recorded["query"]),
+            "closures": ResolvedClosures.model_validate(recorded["closures"]),
         }
     except (KeyError, ValueError):
         raise WorkspaceError(
@@ -199,7 +199,7 @@ def _count_queries(
     sessions: Mapping[str, SessionMap],
     tracks: Mapping[str, TrueTrack],
     rows: list[Judged],
-    settings: Settings,
+    settings: Resolved,
     self_closures: bool,
 ) -> tuple[int, int, int]:
     """Queries of known true pose, those of them that are possible, and those of the latter that are
@@ -232,9 +232,7 @@ def _count_queries(
             ):
                 continue
             counts[1] += 1
-            counts[2] += _is_answered(
-                positions[name], k, right.get(name, []), settings.query.every or 2.0
-            )
+            counts[2] += _is_answered(positions[name], k, right.get(name, []), settings.query.every)
     return counts[0], counts[1], counts[2]
 
 
@@ -269,7 +267,11 @@ def _is_answered(
 
 
 def _revisits_itself(
-    session: SessionMap, positions: F64, known: NDArray[np.bool_], keyframe: int, closures: Closures
+    session: SessionMap,
+    positions: F64,
+    known: NDArray[np.bool_],
+    keyframe: int,
+    closures: ResolvedClosures,
 ) -> bool:
     if not session.posed:
         return False
@@ -277,9 +279,7 @@ def _revisits_itself(
     later = (
         np.abs(session.stamps_ns - session.stamps_ns[keyframe]) >= closures.exclude_seconds * 1e9
     )
-    farther = np.abs(session.distance - session.distance[keyframe]) >= (
-        closures.exclude_distance or 0.0
-    )
+    farther = np.abs(session.distance - session.distance[keyframe]) >= (closures.exclude_distance)
     return bool((near & later & farther).any())
 
 

@@ -20,7 +20,7 @@ from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.selection import KeyframeSelector, thin
 from semloc_logs.mapping.up_direction import surface_normals
 from semloc_logs.numerics.prefetch import ahead
-from semloc_logs.settings import Fusion
+from semloc_logs.settings import ResolvedFusion
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -94,14 +94,14 @@ class Collected:
 def collect(
     session: Session,
     labeller: Labeller,
-    fusion: Fusion,
+    fusion: ResolvedFusion,
     scratch: Path,
     on_progress: Callable[[str], None],
 ) -> Collected:
     """Read the log once: thinned points of its keyframes go to files of ``scratch``, what is small
     stays in memory.
     """
-    collected = Collected(scratch, fusion.keyframe_resolution or 0.1)
+    collected = Collected(scratch, fusion.keyframe_resolution)
     selector = KeyframeSelector(fusion)
     clouds = session.clouds(labeller.on_image, labeller.images)
     # pictures come through the labeller in the same pass: they must not overtake the clouds that

@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.numerics.transforms import inverse, rotation_angle
-from semloc_logs.settings import Fusion
+from semloc_logs.settings import ResolvedFusion
 
 UNPOSED_SPACING_NS = 400_000_000  # frames of a log without poses are taken this far apart
 
@@ -51,8 +51,8 @@ class KeyframeSelector:
     stream's last keyframe.
     """
 
-    def __init__(self, fusion: Fusion) -> None:
-        self._distance = fusion.keyframe_distance or 0.0
+    def __init__(self, fusion: ResolvedFusion) -> None:
+        self._distance = fusion.keyframe_distance
         self._angle = fusion.keyframe_angle
         self._last: dict[str, tuple[int, NDArray[np.float64] | None]] = {}
 

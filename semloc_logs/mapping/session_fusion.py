@@ -30,7 +30,7 @@ from semloc_logs.mapping.selection import road_distance, submap_ranges
 from semloc_logs.mapping.up_direction import ground_height
 from semloc_logs.numerics.prefetch import ahead
 from semloc_logs.numerics.transforms import apply
-from semloc_logs.settings import STREET_VOXEL, Fusion, Settings
+from semloc_logs.settings import STREET_VOXEL, Resolved, ResolvedFusion
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import replacing_folder, write_json, write_table
 from semloc_logs.voxels.carve import Carver
@@ -56,7 +56,7 @@ class FuseTask:
 
     logs: tuple[Path, ...]
     folder: SessionFolder
-    settings: Settings  # resolved
+    settings: Resolved
     topics: dict[str, str] = field(default_factory=dict)
     fingerprint: str = ""
     poses: TrajectoryFile | None = None
@@ -77,8 +77,8 @@ def fuse_session(
     session = open_session(
         [*task.logs],
         task.topics,
-        min_range=fusion.min_range or 0.0,
-        max_range=2.0 * (fusion.max_range or 50.0),
+        min_range=fusion.min_range,
+        max_range=2.0 * fusion.max_range,
         noise=RangeNoise(fusion.depth_noise, fusion.disparity_noise),
         poses=task.poses,
         odometry=fusion.odometry,
@@ -165,9 +165,7 @@ class _Fused:
         distance = road_distance(self.poses) if posed else np.zeros(n)
         # without poses there is no map: the keyframes only ask
         ranges = (
-            submap_ranges(distance, fusion.submap_length or 100.0, fusion.submap_overlap)
-            if posed
-            else []
+            submap_ranges(distance, fusion.submap_length, fusion.submap_overlap) if posed else []
         )
         stamps = [h.stamp_ns for h in self.collected.headers]
         ground = GroundMapper(fusion.voxel_size / STREET_VOXEL)
@@ -265,7 +263,7 @@ def fuse_ranges(
     ranges: list[tuple[int, int]],
     poses: F64,
     origins: Sequence[NDArray[np.floating]],
-    fusion: Fusion,
+    fusion: ResolvedFusion,
 ) -> Iterator[BlockMap]:
     """The map of each of ``ranges`` [first, last) of ``keyframes``, which come one by one; both
     bounds never decrease.

@@ -19,7 +19,7 @@ from semloc_logs.closures.matching import allowed_places, match_words
 from semloc_logs.closures.query import SessionMap, build_query, query_members
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import inverse, turned_about_z
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved, Settings
 from semloc_logs.subvolumes.completed import completed, load_completion, states_of
 from semloc_logs.subvolumes.cut import SIZE, turn
 from semloc_logs.tables.table import read_metadata, read_table
@@ -186,7 +186,7 @@ def _varied(choices: Sequence[Choice], count: int) -> list[Choice]:
     return [*leading, *(c for c in choices if c not in leading)][:count]
 
 
-def closing_settings(work: Workspace) -> Settings:
+def closing_settings(work: Workspace) -> Resolved:
     """The settings that the workspace's closures were found with, which its tables hold."""
     try:
         return Settings.model_validate(read_metadata(work.closures)["settings"]).resolved()
@@ -197,7 +197,7 @@ def closing_settings(work: Workspace) -> Settings:
 
 
 def closure_view(
-    work: Workspace, choice: Choice, settings: Settings, most_matches: int = 3
+    work: Workspace, choice: Choice, settings: Resolved, most_matches: int = 3
 ) -> ClosureView:
     """All that a picture of ``choice`` needs; ``settings`` are those that the closures were found
     with.

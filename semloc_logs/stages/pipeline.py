@@ -46,7 +46,7 @@ from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.pictures.closures_picture import draw_closures
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.submap_descriptors import DescribeTask, variants_for
 from semloc_logs.tables.table import read_json, read_metadata, replacing_folder, write_json
 from semloc_logs.voxels.store import blocks_path
@@ -91,7 +91,7 @@ def _hash(*parts: str) -> str:
 def fuse(
     sessions: Mapping[str, Sequence[Path]],
     work: Workspace,
-    settings: Settings,
+    settings: Resolved,
     topics: Mapping[str, str],
     engine: Engine,
     note: Note,
@@ -176,7 +176,7 @@ def _fingerprint(path: Path) -> str | None:
 def describe(
     work: Workspace,
     names: Sequence[str],
-    settings: Settings,
+    settings: Resolved,
     engine: Engine,
     note: Note,
     overwrite: bool = False,
@@ -246,7 +246,7 @@ def describe(
     return report
 
 
-def _weights(settings: Settings) -> str:
+def _weights(settings: Resolved) -> str:
     """Fingerprint of weights and vocabulary given as files; the shipped ones belong to the version."""
     paths = [
         p for p in (settings.descriptor.weights, settings.descriptor.vocabulary) if p is not None
@@ -273,7 +273,7 @@ def close(
     work: Workspace,
     queries: Sequence[str],
     targets: Sequence[str],
-    settings: Settings,
+    settings: Resolved,
     engine: Engine,
     note: Note,
     self_closures: bool = True,
@@ -325,7 +325,7 @@ def close(
             for i in range(0, len(keyframes), QUERIES_A_TASK)
         ]
         tasks += [
-            CloseTask(work.path.absolute(), folder.name, chunk, others, settings.model_dump_json())
+            CloseTask(work.path.absolute(), folder.name, chunk, others, settings)
             for chunk in chunks
         ]
     found: list[Alignment] = []
@@ -340,7 +340,7 @@ def close(
         )
     found = decide(found, maps, settings)
     road = {name: m.distance for name, m in maps.items()}
-    closures = unique_closures([a for a in found if a.accepted], road, settings.query.every or 2.0)
+    closures = unique_closures([a for a in found if a.accepted], road, settings.query.every)
     metadata = {
         "schema_version": 1,
         "voxel_size": settings.fusion.voxel_size,
@@ -366,7 +366,7 @@ def close(
 def annotate(
     log: Path,
     work: Workspace,
-    settings: Settings,
+    settings: Resolved,
     *,
     output: Path | None,
     mode: str,
@@ -431,7 +431,7 @@ def _record(work: Workspace, mine: SessionMap, name: str, row: dict[str, Any]) -
 def run(
     sessions: Mapping[str, Sequence[Path]],
     work: Workspace,
-    settings: Settings,
+    settings: Resolved,
     topics: Mapping[str, str],
     engine: Engine,
     note: Note,
@@ -442,7 +442,6 @@ def run(
     """All of it: each log is a session. Resumable; ``annotation`` is none, copy, sidecar or
     in-place; ``poses`` as in :func:`fuse`.
     """
-    settings = settings.resolved()
     total = Report()
     clock = time.perf_counter()
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map
 from semloc_logs.subvolumes.network import Encoder
@@ -31,7 +31,7 @@ class DescribeTask:
     variants: tuple[str, ...]
     output: Path
     metadata: dict[str, Any]
-    settings: Settings  # resolved
+    settings: Resolved
 
 
 def describe_submap(
@@ -40,7 +40,7 @@ def describe_submap(
     ground_z: float,
     road: NDArray[np.floating],
     encoder: Encoder,
-    settings: Settings,
+    settings: Resolved,
     yaws: Sequence[float] = (0.0,),
 ) -> list[Described]:
     """Centres (voxels) and descriptors of every described subvolume of a submap, near the
@@ -53,7 +53,7 @@ def describe_submap(
     state = blocks.dense(low, tuple((high - low).tolist()))
     d = settings.descriptor
     v = settings.fusion.voxel_size
-    reach = d.reach or np.inf
+    reach = d.reach
     out = []
     for turned in (turned_map(state, low, yaw) for yaw in yaws):
         near = turned.from_map(road / v) * v
@@ -64,7 +64,7 @@ def describe_submap(
     return out
 
 
-def known_headings(settings: Settings) -> list[float]:
+def known_headings(settings: Resolved) -> list[float]:
     """The yaws that maps are described at, within a quarter turn (rad)."""
     return [
         2 * np.pi * k / settings.descriptor.headings
@@ -72,7 +72,7 @@ def known_headings(settings: Settings) -> list[float]:
     ]
 
 
-def variants_for(label_source: str, others: Iterable[str], settings: Settings) -> tuple[str, ...]:
+def variants_for(label_source: str, others: Iterable[str], settings: Resolved) -> tuple[str, ...]:
     """Networks that describe a session among ``others`` (their label sources).
 
     Semantic where classes come from a log or a model, geometric elsewhere, and both where it must

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from semloc_logs.mapping.selection import submap_ranges
-from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.tables.table import read_table
 from semloc_logs.training.pairs import SceneFrame, cut_pairs, write_shard
 from semloc_logs.voxels.store import poses_of, read_keyframe
@@ -30,7 +30,7 @@ class StretchTask:
     first: int
     last: int
     shard: Path
-    settings: Settings  # resolved
+    settings: Resolved
 
 
 def session_frames(
@@ -54,7 +54,7 @@ def session_frames(
 
 
 def stretch_tasks(
-    shards: Path, sessions: Sequence[SessionFolder], settings: Settings
+    shards: Path, sessions: Sequence[SessionFolder], settings: Resolved
 ) -> list[StretchTask]:
     """Tasks for every stretch of every session with poses, with shards in the folder ``shards``."""
     length = STRETCH * settings.fusion.voxel_size / STREET_VOXEL

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.numerics import transforms
-from semloc_logs.settings import Fusion, Training
+from semloc_logs.settings import ResolvedFusion, Training
 from semloc_logs.subvolumes.cut import SIZE, WIDE, turn
 from semloc_logs.tables.table import replacing_file
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
@@ -46,7 +46,7 @@ class SceneFrame:
     sigma: NDArray[np.float32] | None = None  # of the points along their rays (m)
 
 
-def fuse(frames: Iterable[SceneFrame], fusion: Fusion) -> BlockMap:
+def fuse(frames: Iterable[SceneFrame], fusion: ResolvedFusion) -> BlockMap:
     """The semantic map of some frames."""
     fuser = Fuser(fusion)
     for f in frames:
@@ -66,7 +66,7 @@ def occupied(state: U8) -> NDArray[np.bool_]:
 
 def cut_pairs(
     frames: Sequence[SceneFrame],
-    fusion: Fusion,
+    fusion: ResolvedFusion,
     training: Training,
     rng: np.random.Generator,
     min_occupied: int = 40,

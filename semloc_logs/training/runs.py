@@ -19,7 +19,7 @@ import semloc_logs
 from semloc_logs.engines import Engine
 from semloc_logs.engines.streamed import Growing
 from semloc_logs.errors import SettingsError
-from semloc_logs.settings import Settings, Training
+from semloc_logs.settings import Resolved, Training
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.completion_scores import completion_scores
@@ -66,7 +66,7 @@ class Packed:
 
 
 def simulated_shards(
-    folder: Path, settings: Settings, engine: Engine, note: Note, samples: int = 0
+    folder: Path, settings: Resolved, engine: Engine, note: Note, samples: int = 0
 ) -> Packed:
     """Pairs from ``training.scenes`` simulated scenes, as a training that has seen ``samples``
     samples goes on to need them.
@@ -97,7 +97,7 @@ def simulated_shards(
 
 
 def session_shards(
-    folder: Path, sessions: Sequence[SessionFolder], settings: Settings, engine: Engine, note: Note
+    folder: Path, sessions: Sequence[SessionFolder], settings: Resolved, engine: Engine, note: Note
 ) -> Packed:
     """Pairs from fused sessions with poses, a shard for each stretch of road. Raises SettingsError
     when there is none.
@@ -125,7 +125,7 @@ def given_shards(folder: Path) -> list[Path]:
     return shards
 
 
-def _shard_folder(folder: Path, kind: str, settings: Settings) -> Path:
+def _shard_folder(folder: Path, kind: str, settings: Resolved) -> Path:
     """Shards of other settings lie in another folder."""
     t = settings.training
     relevant = settings.model_copy(
@@ -137,7 +137,7 @@ def _shard_folder(folder: Path, kind: str, settings: Settings) -> Path:
 def learn_descriptor(
     variant: str,
     shards: Packed,
-    settings: Settings,
+    settings: Resolved,
     checkpoint: Path,
     output: Path,
     note: Note,
@@ -197,7 +197,7 @@ def learn_descriptor(
 def learn_vocabulary(
     variant: str,
     shards: Sequence[Path],
-    settings: Settings,
+    settings: Resolved,
     output: Path,
     pairs_per_shard: int | None = None,
     note: Note = lambda _: None,
@@ -226,7 +226,7 @@ def use_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
-def _card(settings: Settings, shards: int, **facts: Any) -> dict[str, str]:
+def _card(settings: Resolved, shards: int, **facts: Any) -> dict[str, str]:
     """What a model was made of, as strings for the file's metadata."""
     training = settings.training
     said = {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.training.pairs import SceneFrame, cut_pairs, write_shard
 from semloc_logs.training.training_scenes import TrainingFrame, training_scene
 
@@ -18,7 +18,7 @@ class SceneTask:
 
     seed: int
     shard: Path
-    settings: Settings  # resolved
+    settings: Resolved
 
 
 def make_shard(task: SceneTask) -> Path:
@@ -40,7 +40,7 @@ def scene_frame(frame: TrainingFrame) -> SceneFrame:
     return SceneFrame(frame.points, frame.origin, frame.labels, frame.world_T_base, frame.sigma)
 
 
-def scene_tasks(folder: Path, scenes: int, settings: Settings) -> list[SceneTask]:
+def scene_tasks(folder: Path, scenes: int, settings: Resolved) -> list[SceneTask]:
     """Tasks for ``scenes`` scenes with shards in ``folder``."""
     return [
         SceneTask(seed, folder / f"scene-{seed:05d}.parquet", settings) for seed in range(scenes)

@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import GROUND
-from semloc_logs.settings import Fusion
+from semloc_logs.settings import ResolvedFusion
 from semloc_logs.voxels.keys import BLOCK
 
 BITS = 12  # of an address within a block
@@ -53,9 +53,7 @@ class Marks:
 class Carver:
     """Carves one frame after the other; its grid is as large as the largest frame so far."""
 
-    def __init__(self, fusion: Fusion) -> None:
-        if fusion.max_range is None:
-            raise ValueError("fusion settings must be resolved")
+    def __init__(self, fusion: ResolvedFusion) -> None:
         self._per_metre = 1.0 / fusion.voxel_size
         self._limit = fusion.max_range / fusion.voxel_size
         self._grid, self._used = np.zeros(0, np.uint8), np.zeros(0, np.int64)

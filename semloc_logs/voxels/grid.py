@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import UNLABELLED
-from semloc_logs.settings import Fusion
+from semloc_logs.settings import ResolvedFusion
 from semloc_logs.voxels.carve import BITS, CLASSES, Carver, Marks, add_votes, flush, rehash
 from semloc_logs.voxels.keys import BLOCK, pack, unpack
 
@@ -125,7 +125,7 @@ class Fuser:
     the frames.
     """
 
-    fusion: Fusion  # resolved
+    fusion: ResolvedFusion
     _slots: dict[int, int] = field(default_factory=dict)
     _log_odds: NDArray[np.int8] = field(default_factory=lambda: np.zeros((0, BLOCK**3), np.int8))
     _vote_keys: I64 = field(default_factory=lambda: np.full(1 << 15, -1, np.int64))

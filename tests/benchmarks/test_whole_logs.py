@@ -40,7 +40,7 @@ def test_laps_join_and_go_on_or_come_back(lap: Lap, onwards: bool, tmp_path: Pat
 def test_fusing_is_split_into_parts(lap: Lap, tmp_path: Path) -> None:
     log = tmp_path / "drive.mcap"
     lap.write(log, 1, onwards=True)
-    figures, rows = profile_fuse([log], Settings(), rounds=1)
+    figures, rows = profile_fuse([log], Settings().resolved(), rounds=1)
     value = {k: float(v["ours"]) for k, v in figures.items()}
     assert value["clouds"] == value["keyframes"] == 20
     assert value["ratio"] == pytest.approx(

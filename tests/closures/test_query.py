@@ -12,7 +12,7 @@ from semloc_logs.closures.query import SessionMap, build_query, query_keyframes,
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.mapping.selection import road_distance
 from semloc_logs.numerics.transforms import apply, yaw_transform
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved, Settings
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_json, write_table
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
@@ -62,7 +62,7 @@ def straight(n: int, step: float = 0.6) -> NDArray[np.float64]:
     return np.array([yaw_transform(0.0, (step * i, 0.0, 0.0)) for i in range(n)])
 
 
-def settings(**query: Any) -> Settings:
+def settings(**query: Any) -> Resolved:
     return Settings.model_validate({"query": query}).resolved()
 
 

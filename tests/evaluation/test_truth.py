@@ -88,7 +88,10 @@ def work(tmp_path: Path) -> Workspace:
 
 def _evaluate(work: Workspace, **options: Any) -> Any:
     return evaluate_closures(
-        work, work.path.parent / "truth.json", load(assignments={"query.every": "2.0"}), **options
+        work,
+        work.path.parent / "truth.json",
+        load(assignments={"query.every": "2.0"}).resolved(),
+        **options,
     )
 
 

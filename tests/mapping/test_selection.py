@@ -13,7 +13,7 @@ from semloc_logs.mapping.selection import (
     thin,
 )
 from semloc_logs.numerics.transforms import yaw_transform
-from semloc_logs.settings import Fusion
+from semloc_logs.settings import Fusion, Settings
 
 steps = st.lists(st.floats(0, 60, allow_subnormal=False), min_size=1, max_size=200)
 
@@ -119,7 +119,9 @@ def test_thinning_is_what_a_dictionary_says(seed: int) -> None:
 
 
 def test_keyframes_by_travel_by_turn_and_by_time() -> None:
-    selector = KeyframeSelector(Fusion(keyframe_distance=1.0, keyframe_angle=0.2))
+    selector = KeyframeSelector(
+        Settings(fusion=Fusion(keyframe_distance=1.0, keyframe_angle=0.2)).resolved().fusion
+    )
     track = [
         (0.0, 0.0),
         (0.5, 0.0),
@@ -137,6 +139,6 @@ def test_keyframes_by_travel_by_turn_and_by_time() -> None:
     assert chosen == [True, False, False, True, False, True, False, True]
     # each stream has its own last keyframe
     assert selector.wants("/b", 100, yaw_transform(0.3, (2.6, 0.0, 0.0)))
-    unposed = KeyframeSelector(Fusion(keyframe_distance=1.0))
+    unposed = KeyframeSelector(Settings(fusion=Fusion(keyframe_distance=1.0)).resolved().fusion)
     times = [0, UNPOSED_SPACING_NS - 1, UNPOSED_SPACING_NS, UNPOSED_SPACING_NS + 5]
     assert [unposed.wants("/a", t, None) for t in times] == [True, False, True, False]

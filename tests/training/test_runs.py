@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from semloc_logs.engines import make_engine
 from semloc_logs.errors import SettingsError
 from semloc_logs.numerics.transforms import apply, yaw_transform
-from semloc_logs.settings import Settings, load
+from semloc_logs.settings import Resolved, load
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.training.own_sessions import session_frames, stretch_tasks
@@ -26,7 +26,7 @@ from semloc_logs.workspace import SessionFolder
 METADATA = {"schema_version": 1}
 
 
-def _settings(**training: Any) -> Settings:
+def _settings(**training: Any) -> Resolved:
     return load(assignments={f"training.{k}": str(v) for k, v in training.items()}).resolved()
 
 

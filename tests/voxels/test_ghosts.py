@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.settings import Fusion, Settings
+from semloc_logs.settings import ResolvedFusion, Settings
 from semloc_logs.voxels.grid import BlockMap, Fuser
 from semloc_logs.voxels.store import write_voxels
 
@@ -62,7 +62,7 @@ def sweep(car_y: float | None) -> tuple[F64, NDArray[np.uint8]]:
     return SENSOR + rays * reach[:, None], label
 
 
-def settings() -> Fusion:
+def settings() -> ResolvedFusion:
     return Settings.model_validate({"fusion": {"voxel_size": 0.3}}).resolved().fusion
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import UNLABELLED
-from semloc_logs.settings import Fusion, Settings
+from semloc_logs.settings import Fusion, ResolvedFusion, Settings
 from semloc_logs.voxels.carve import Carver
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
 from semloc_logs.voxels.keys import BLOCK
@@ -21,11 +21,11 @@ Walk = Callable[..., NDArray[np.uint8]]
 Frame = tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]
 
 
-def fusion(voxel: float = 0.5, reach: float = 6.0, **more: Any) -> Fusion:
+def fusion(voxel: float = 0.5, reach: float = 6.0, **more: Any) -> ResolvedFusion:
     return Settings(fusion=Fusion(voxel_size=voxel, max_range=reach, **more)).resolved().fusion
 
 
-def fused(frames: list[Frame], f: Fusion) -> BlockMap:
+def fused(frames: list[Frame], f: ResolvedFusion) -> BlockMap:
     fuser = Fuser(f)
     for points, label, origin in frames:
         fuser.add(points, label, origin)
@@ -60,7 +60,9 @@ def as_dictionary(blocks: BlockMap) -> dict[Cell, tuple[int, int, int]]:
     return out
 
 
-def slow_reference(walk: Walk, frames: list[Frame], f: Fusion) -> dict[Cell, tuple[int, int, int]]:
+def slow_reference(
+    walk: Walk, frames: list[Frame], f: ResolvedFusion
+) -> dict[Cell, tuple[int, int, int]]:
     """A dictionary of voxels; each frame changes a voxel once, hits win over passes, votes are
     counted by point.
     """
@@ -272,11 +274,6 @@ def test_dense_boxes_overlap_the_map_in_part() -> None:
     ijk, label = blocks.occupied()
     np.testing.assert_array_equal(whole[tuple((ijk - low).T)], label)
     assert len(ijk) == (whole < FREE_STATE - 1).sum() + (whole == UNLABELLED).sum()
-
-
-def test_unresolved_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match="resolved"):
-        Fuser(Fusion()).add(np.zeros((1, 3)), np.zeros(1, np.uint8), np.zeros(3))
 
 
 def test_uncertain_ranges_count_less_and_leave_room_before_them() -> None:

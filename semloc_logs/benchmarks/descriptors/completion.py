@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.benchmarks.descriptors.held_out import simulation_version
 from semloc_logs.pictures.completion_picture import draw_completions
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.completed import Completed, completed, load_completion, states_of
 from semloc_logs.training.pairs import read_shard
 from semloc_logs.training.scene_shards import SceneTask, make_shard
@@ -88,7 +88,7 @@ def _scores(confusion: I64, classes: int) -> dict[str, float]:
 
 def completion_benchmark(
     variant: str,
-    settings: Settings,
+    settings: Resolved,
     weights: Path | None = None,
     work: Path | None = None,
     picture: Path | None = None,
@@ -97,7 +97,6 @@ def completion_benchmark(
     """Figures on held-out streets, whose pairs are kept in the folder ``work``; ``picture`` is a
     PNG of some of them to look at.
     """
-    settings = settings.resolved()
     model = load_completion(variant, weights)
     with ExitStack() as stack:
         folder = work or Path(

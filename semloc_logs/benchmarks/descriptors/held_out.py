@@ -33,7 +33,7 @@ from semloc_logs.benchmarks.descriptors.places import (
 )
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drives.traffic import Traffic, random_traffic
 from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
@@ -73,7 +73,7 @@ class HeldOut:
     """
 
     paths: tuple[Path, ...]
-    settings: Settings  # resolved
+    settings: Resolved
     database: int
     queries: int
     others: tuple[Street, ...] = ()
@@ -97,7 +97,7 @@ class Extent:
 
 def held_out(
     folder: Path,
-    settings: Settings,
+    settings: Resolved,
     count: Callable[[Place], int],
     database: int = 100_000,
     queries: int = 2000,
@@ -220,7 +220,7 @@ class _Drive:
         return self.traffic.scene(float(self.rng.uniform(0, 60)), pose)
 
 
-def simulate_street(town: int, road: int, settings: Settings, extent: Extent = Extent()) -> Street:
+def simulate_street(town: int, road: int, settings: Resolved, extent: Extent = Extent()) -> Street:
     """The maps and queries of one road of a town."""
     network = _network(town, extent)
     rng = np.random.default_rng([TOWNS + town, 92, road])
@@ -270,7 +270,7 @@ def simulate_street(town: int, road: int, settings: Settings, extent: Extent = E
 
 
 def _fuse(
-    settings: Settings, clouds: list[Cloud], poses: F64, radius: float = np.inf
+    settings: Resolved, clouds: list[Cloud], poses: F64, radius: float = np.inf
 ) -> tuple[BlockMap, F64]:
     """The map of some clouds and the sensor's places (n, 3)."""
     fuser = Fuser(settings.fusion)
@@ -282,17 +282,15 @@ def _fuse(
     return fuser.finish(), np.array(track, np.float64)
 
 
-def _mapped(settings: Settings, clouds: list[Cloud], poses: F64, common_T_map: F64) -> Place:
+def _mapped(settings: Resolved, clouds: list[Cloud], poses: F64, common_T_map: F64) -> Place:
     blocks, track = _fuse(settings, clouds, poses)
     return map_place(blocks, track, float(np.median(poses[:, 2, 3])), common_T_map)
 
 
 def _asked(
-    settings: Settings, clouds: list[Cloud], poses: F64, common_T_map: F64, heading: float
+    settings: Resolved, clouds: list[Cloud], poses: F64, common_T_map: F64, heading: float
 ) -> Place:
     """A query in a frame of some ``heading`` in the map, its origin in the middle of the drive."""
     map_T_query = yaw_transform(heading, tuple(poses[len(poses) // 2][:3, 3]))
-    blocks, track = _fuse(
-        settings, clouds, inverse(map_T_query) @ poses, settings.query.radius or 24.0
-    )
+    blocks, track = _fuse(settings, clouds, inverse(map_T_query) @ poses, settings.query.radius)
     return asked_place(blocks, track, 0.0, common_T_map @ map_T_query, settings)

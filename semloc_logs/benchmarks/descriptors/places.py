@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import turn
 from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.grid import BlockMap
@@ -61,7 +61,7 @@ def map_place(blocks: BlockMap, track: F64, ground_z: float, common_T_map: F64) 
 
 
 def asked_place(
-    blocks: BlockMap, track: F64, ground_z: float, common_T_query: F64, settings: Settings
+    blocks: BlockMap, track: F64, ground_z: float, common_T_query: F64, settings: Resolved
 ) -> Place:
     """A query map about the origin of its level frame, turned by that heading of the paper that is
     nearest to the true one.
@@ -71,7 +71,7 @@ def asked_place(
     step = 2 * np.pi / HEADINGS
     yaw = step * round(float(np.arctan2(common_T_query[1, 0], common_T_query[0, 0])) / step)
     low, high = blocks.bounds()
-    half = -(-int((settings.query.radius or 24.0) / settings.fusion.voxel_size + 16) // 8) * 8
+    half = -(-int(settings.query.radius / settings.fusion.voxel_size + 16) // 8) * 8
     box = np.empty((2 * half, 2 * half, int(high[2] - low[2])), np.uint8)
     state = blocks.dense(low, tuple((high - low).tolist()))
     turn(state, low.astype(np.int64), -yaw, np.array([0.0, 0.0, (low[2] + high[2]) / 2]), box)

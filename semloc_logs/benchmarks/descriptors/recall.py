@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from semloc_logs.benchmarks.descriptors.held_out import HeldOut
 from semloc_logs.benchmarks.descriptors.places import Place
 from semloc_logs.numerics.transforms import apply
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import MARGIN, SIZE
 from semloc_logs.subvolumes.describe import Described, describe_map
 from semloc_logs.subvolumes.network import LATENT
@@ -70,7 +70,7 @@ class NoEncoder(nn.Module):
         )
 
 
-def network_describes(encoder: nn.Module, settings: Settings) -> Describe:
+def network_describes(encoder: nn.Module, settings: Resolved) -> Describe:
     """Describes places by the network, as ``semloc describe`` and ``semloc close`` do. ``settings``
     are resolved.
     """
@@ -89,13 +89,13 @@ def network_describes(encoder: nn.Module, settings: Settings) -> Describe:
             stride,
             d.min_occupied,
             road,
-            np.inf if is_query else d.reach or np.inf,
+            np.inf if is_query else d.reach,
         )
 
     return describe
 
 
-def count_subvolumes(settings: Settings) -> Callable[[Place], int]:
+def count_subvolumes(settings: Resolved) -> Callable[[Place], int]:
     """How many descriptors a place of a database has, whatever the network."""
     describe = network_describes(NoEncoder().eval(), settings)
     return lambda place: len(describe(place, False).centre)
@@ -147,7 +147,7 @@ def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:
     return out
 
 
-def true_radius(settings: Settings) -> float:
+def true_radius(settings: Resolved) -> float:
     """Metres within which a database word is the true one: the larger of 1.5 m (at 0.30 m voxels)
     and half a cell's diagonal.
     """

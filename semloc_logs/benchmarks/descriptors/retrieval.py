@@ -23,7 +23,7 @@ from semloc_logs.benchmarks.descriptors.recall import (
     retrieval_recall,
 )
 from semloc_logs.errors import SettingsError
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
 
 Figures = dict[str, dict[str, float | str]]
@@ -50,7 +50,7 @@ class RetrievalChoice:
 def retrieval_benchmark(
     choice: RetrievalChoice,
     peers: Mapping[str, str],
-    settings: Settings,
+    settings: Resolved,
     real: Mapping[str, Street] | None = None,
     note: Note = lambda _: None,
 ) -> Figures:
@@ -114,7 +114,7 @@ def retrieval_benchmark(
         return figures
 
 
-def densely(settings: Settings) -> Settings:
+def densely(settings: Resolved) -> Resolved:
     """Databases have descriptors at a stride of four voxels here: finer than `semloc describe` by
     default, so that 1.5 m tell right from wrong.
     """

@@ -14,7 +14,7 @@ from semloc_logs.benchmarks.descriptors.places import Place, Street, asked_place
 from semloc_logs.closures.query import SessionMap, build_query, query_keyframes, query_members
 from semloc_logs.evaluation.truth import TrueTrack
 from semloc_logs.numerics.transforms import apply, inverse
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.describe import describe_map
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.subvolumes.submap_descriptors import describe_submap
@@ -46,7 +46,7 @@ def word_recall(
     keyframe: int,
     target: SessionMap,
     targetmap_T_querymap: F64,
-    settings: Settings,
+    settings: Resolved,
     encoder: Encoder,
     vocabulary: Vocabulary | None,
     radius: float = 1.5,
@@ -95,7 +95,7 @@ def word_recall(
 
 
 def query_place(
-    query: SessionMap, keyframe: int, targetmap_T_querymap: F64, settings: Settings
+    query: SessionMap, keyframe: int, targetmap_T_querymap: F64, settings: Resolved
 ) -> Place:
     """The query at ``keyframe``, turned to the nearest heading of the search, and its place in the
     target's map frame.
@@ -115,7 +115,7 @@ def query_place(
 
 
 def true_queries(
-    query: SessionMap, target: SessionMap, tracks: Mapping[str, TrueTrack], settings: Settings
+    query: SessionMap, target: SessionMap, tracks: Mapping[str, TrueTrack], settings: Resolved
 ) -> list[tuple[int, F64]]:
     """Keyframes of ``query`` that ask within 10 m of the target's road, each with the true
     ``targetmap_T_querymap`` (4, 4) there.
@@ -139,7 +139,7 @@ def real_street(
     target: SessionMap,
     tracks: Mapping[str, TrueTrack],
     name: str,
-    settings: Settings,
+    settings: Resolved,
 ) -> Street:
     """The submaps of ``target`` as a database and the queries of ``query``, both called ``name``;
     far away from every simulated street.

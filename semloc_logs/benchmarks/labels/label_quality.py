@@ -23,7 +23,7 @@ from semloc_logs.labels.from_geometry import classify
 from semloc_logs.labels.space import UNLABELLED, cityscapes
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.numerics.transforms import apply
-from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.voxels.grid import BlockMap, Fuser
 from semloc_logs.voxels.keys import pack
 from semloc_logs.voxels.store import read_keyframe
@@ -77,13 +77,12 @@ def _compare_maps(truth: BlockMap, found: BlockMap) -> I64:
     return confusion(their_class[true_at], our_class[at])
 
 
-def measure_labels(logs: Sequence[Path], settings: Settings) -> Figures:
+def measure_labels(logs: Sequence[Path], settings: Resolved) -> Figures:
     """Classes from geometry against the labels of ``logs``, on keyframe points within the fused
     range and on fused voxels.
 
     LogError when a log has no labels.
     """
-    settings = settings.resolved()
     fused = settings.model_copy(
         update={"labels": settings.labels.model_copy(update={"source": "log"})}
     )
@@ -112,13 +111,13 @@ def measure_labels(logs: Sequence[Path], settings: Settings) -> Figures:
 
 
 def _measure_session(
-    session: SessionMap, settings: Settings, points: I64, taken: list[float], sizes: list[int]
+    session: SessionMap, settings: Resolved, points: I64, taken: list[float], sizes: list[int]
 ) -> I64:
     """Adds to the confusion of ``points``, to times (ms) and numbers of points; returns the
     confusion of the voxels.
     """
     scale = settings.fusion.voxel_size / STREET_VOXEL
-    far = settings.fusion.max_range or 50.0
+    far = settings.fusion.max_range
     maps = Fuser(settings.fusion), Fuser(settings.fusion)
     for k, pose in enumerate(session.map_T_base):
         frame = read_keyframe(session.folder.keyframes, k)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from semloc_logs.benchmarks.scans import Scan, log_sweeps, town_sweeps
 from semloc_logs.errors import LogError
 from semloc_logs.labels.space import cityscapes
-from semloc_logs.settings import Fusion, Settings
+from semloc_logs.settings import Resolved, ResolvedFusion
 from semloc_logs.subvolumes.cut import SIZE
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, Fuser
 
@@ -61,7 +61,7 @@ def total_variation(a: F64, b: F64) -> float:
     return float(0.5 * np.abs(a - b).sum())
 
 
-def portrait(scan: Scan, fusion: Fusion) -> Portrait:
+def portrait(scan: Scan, fusion: ResolvedFusion) -> Portrait:
     """Measure a labelled sweep. LogError when none of its points near the sensor is on a road or
     pavement.
     """
@@ -161,7 +161,11 @@ def _spread(z: F64) -> float:
 
 
 def _voxels(
-    scan: Scan, height: F64, fusion: Fusion, histograms: dict[str, F64], numbers: dict[str, float]
+    scan: Scan,
+    height: F64,
+    fusion: ResolvedFusion,
+    histograms: dict[str, F64],
+    numbers: dict[str, float],
 ) -> None:
     """The map of the sweep alone: classes of its voxels, and what subvolumes near the sensor hold."""
     fuser = Fuser(fusion)
@@ -201,7 +205,7 @@ def _voxels(
 
 def measure_realism(
     logs: Sequence[Path],
-    settings: Settings,
+    settings: Resolved,
     seeds: Sequence[int] = tuple(range(8)),
     sweeps: int = 3,
 ) -> Figures:

@@ -27,7 +27,7 @@ from semloc_logs.benchmarks.localisation.city import (
 from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.evaluation.truth import read_tum
 from semloc_logs.numerics.transforms import inverse, rotation_angle
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
@@ -105,7 +105,7 @@ class World:
         database = WorldDrive(self.drive.folder, DATABASE, "lidar", DATABASE)
         return read_tum(database.truth).at(self.database.stamps_ns)[0]
 
-    def keyframes(self, settings: Settings, most: int) -> list[int]:
+    def keyframes(self, settings: Resolved, most: int) -> list[int]:
         """At most ``most`` keyframes that ask, evenly among those that are where the condition
         says.
         """

@@ -38,7 +38,7 @@ from semloc_logs.benchmarks.localisation.our_method import (
 from semloc_logs.benchmarks.localisation.peer_methods import PEERS, PeerSystem, PeerTask
 from semloc_logs.benchmarks.peers.peer_process import runner
 from semloc_logs.errors import SettingsError
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
 
@@ -60,9 +60,9 @@ class Run(Protocol):
 class Prepare(Protocol):
     """Fuses ``logs`` (session -> log) into a workspace, or describes its sessions ``names``."""
 
-    def fuse(self, logs: Mapping[str, Path], work: Workspace, settings: Settings) -> None: ...
+    def fuse(self, logs: Mapping[str, Path], work: Workspace, settings: Resolved) -> None: ...
 
-    def describe(self, work: Workspace, names: Sequence[str], settings: Settings) -> None: ...
+    def describe(self, work: Workspace, names: Sequence[str], settings: Resolved) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ class Localisation:
     work: Path
     queries: int
     peers: Mapping[str, str]
-    settings: Settings  # resolved
+    settings: Resolved
     engine: Run
     prepare: Prepare
     note: Note

@@ -22,12 +22,12 @@ from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.verify import Query
 from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
 from semloc_logs.benchmarks.localisation.city import DATABASE, WorldDrive
-from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures import matching
 from semloc_logs.closures.acceptance.consistency import decide
+from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.query import SessionMap, query_keyframes
-from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
 from semloc_logs.subvolumes.network import Completion
@@ -82,7 +82,7 @@ class OurTask:
     drive: WorldDrive
     system: OurSystem
     keyframes: tuple[int, ...]
-    settings: Settings  # resolved, and the system's
+    settings: Resolved  # of the system
 
     def answers(self) -> list[Answer]:
         """One for each keyframe; the first query is asked twice, to warm up."""
@@ -256,7 +256,7 @@ def grid_hypotheses(
     return [out[i] for i in np.sort(rng.choice(len(out), most, replace=False))]
 
 
-def settings_of(system: OurSystem, settings: Settings, folder: Path) -> Settings:
+def settings_of(system: OurSystem, settings: Resolved, folder: Path) -> Resolved:
     """The settings that ``system`` asks with; random weights are kept in ``folder``."""
     update: dict[str, Any] = {
         "query": settings.query.model_copy(update=dict(system.query)),
@@ -271,7 +271,7 @@ def settings_of(system: OurSystem, settings: Settings, folder: Path) -> Settings
     return settings.model_copy(update=update)
 
 
-def write_random(work: Workspace, settings: Settings) -> None:
+def write_random(work: Workspace, settings: Resolved) -> None:
     """Random weights and a vocabulary of the database's descriptors by them, where ``settings``
     (see :func:`settings_of`) name them.
     """

@@ -27,7 +27,7 @@ from semloc_logs.closures.query import SessionMap, query_members
 from semloc_logs.errors import SemlocError
 from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.transforms import apply, inverse
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.tables.table import replacing_file
 from semloc_logs.voxels.store import read_keyframe
 
@@ -71,7 +71,7 @@ class PeerTask:
     system: PeerSystem
     python: str
     keyframes: tuple[int, ...]
-    settings: Settings  # resolved
+    settings: Resolved
 
     def answers(self) -> list[Answer]:
         """One for each keyframe. SemlocError when the peer fails or says something else."""
@@ -179,7 +179,7 @@ def cloud_frame(session: SessionMap, keyframe: int) -> F64:
 
 
 def write_clouds(
-    folder: Path, session: SessionMap, keyframes: Sequence[int], length: float, settings: Settings
+    folder: Path, session: SessionMap, keyframes: Sequence[int], length: float, settings: Resolved
 ) -> None:
     """The clouds about ``keyframes`` as NAME.npy, (n, 3) float32, where they are missing."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from semloc_logs.errors import SemlocError
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import WIDE, code_table
 from semloc_logs.subvolumes.describe import random_encoder
 from semloc_logs.subvolumes.network import Encoder, descriptors
@@ -40,7 +40,7 @@ MATRIX = 2048
 ROUNDING = 0.01  # of a coordinate of a unit descriptor: bf16 has 8 binary digits
 
 
-def encoder_speed(settings: Settings) -> Figures:
+def encoder_speed(settings: Resolved) -> Figures:
     """ms a descriptor, multiply-accumulates a descriptor, their rate, the difference between ways,
     and the share of each layer.
     """
@@ -102,7 +102,7 @@ def encoder_speed(settings: Settings) -> Figures:
         torch.set_num_threads(threads)
 
 
-def _piece(settings: Settings) -> NDArray[np.uint8]:
+def _piece(settings: Resolved) -> NDArray[np.uint8]:
     """Codes (EDGE, EDGE, 32) of the middle of a simulated street."""
     blocks = fuse([scene_frame(frame) for frame in training_scene(4, 24).mapped], settings.fusion)
     low, high = blocks.bounds()

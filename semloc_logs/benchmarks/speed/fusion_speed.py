@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from semloc_logs.benchmarks.peers.peer_process import Round, open_peers, write_scans
 from semloc_logs.benchmarks.scans import Scan, depth_images, log_sweeps, street_sweeps
 from semloc_logs.numerics.transforms import apply
-from semloc_logs.settings import Fusion, Settings
+from semloc_logs.settings import Resolved, ResolvedFusion
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
 
 Figures = dict[str, dict[str, float | str]]
@@ -54,7 +54,7 @@ class Case:
 
 
 def fusion_speed(
-    settings: Settings, logs: Sequence[Path] = (), peers: Mapping[str, str] | None = None
+    settings: Resolved, logs: Sequence[Path] = (), peers: Mapping[str, str] | None = None
 ) -> Figures:
     """Figures of a 120,000-point sweep, of a depth image and, if named, of the sweeps of a log;
     ``peers`` is name -> Python executable.
@@ -94,7 +94,7 @@ def fusion_speed(
     return figures
 
 
-def measure(case: Case, settings: Settings, peers: Mapping[str, str]) -> Figures:
+def measure(case: Case, settings: Resolved, peers: Mapping[str, str]) -> Figures:
     """Rounds of all, in turn: times of a scan, of what is due at the end, and the content of the
     map.
     """
@@ -139,7 +139,7 @@ def measure(case: Case, settings: Settings, peers: Mapping[str, str]) -> Figures
     }
 
 
-def our_round(scans: Sequence[Scan], fusion: Fusion) -> Round:
+def our_round(scans: Sequence[Scan], fusion: ResolvedFusion) -> Round:
     """Our fusion of ``scans`` with their labels."""
     fuser = Fuser(fusion)
     here = np.zeros(3)
@@ -156,7 +156,7 @@ def our_round(scans: Sequence[Scan], fusion: Fusion) -> Round:
     return Round(ms, cpu, 1e3 * (time.perf_counter() - start), *_content(blocks))
 
 
-def _fusion(settings: Settings, case: Case) -> Fusion:
+def _fusion(settings: Resolved, case: Case) -> ResolvedFusion:
     return settings.fusion.model_copy(
         update={"voxel_size": case.voxel_size, "max_range": case.max_range}
     )
@@ -169,7 +169,7 @@ def _content(blocks: BlockMap) -> tuple[int, int]:
     return free, blocks.state.size - free - unobserved
 
 
-def _limits(case: Case, settings: Settings, bandwidth: float, clock: float) -> Figures:
+def _limits(case: Case, settings: Resolved, bandwidth: float, clock: float) -> Figures:
     """What the middle scan needs at least, and its content beside that of all its rays walked."""
     scan = case.scans[len(case.scans) // 2]
     points = apply(scan.map_T_sensor, scan.points)

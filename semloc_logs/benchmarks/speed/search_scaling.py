@@ -36,7 +36,7 @@ from semloc_logs.benchmarks.descriptors.recall import (
 from semloc_logs.benchmarks.speed.search_speed import timed
 from semloc_logs.errors import SettingsError
 from semloc_logs.numerics.transforms import apply
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.tables.table import write_json
 from semloc_logs.voxels.store import blocks_path
@@ -164,7 +164,7 @@ class _World:
 
 
 def scaling_benchmark(
-    settings: Settings, work: Path | None, note: Callable[[str], None]
+    settings: Resolved, work: Path | None, note: Callable[[str], None]
 ) -> Figures:
     """Figures of :func:`search_scaling` on simulated streets, kept in the folder ``work`` where one
     is given.
@@ -207,7 +207,7 @@ def described(world: HeldOut, describe: Describe) -> Streets:
 
 
 def search_scaling(
-    settings: Settings,
+    settings: Resolved,
     streets: Streets,
     vocabulary: Vocabulary,
     lengths: Sequence[int] = LENGTHS,

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.words.index import Allowed, Index
 from semloc_logs.words.vocabulary import Vocabulary, codes_of, train_vocabulary
 
@@ -44,7 +44,7 @@ def draw(seed: int, n: int, dimensions: int = 256) -> F32:
 
 
 def search_speed(
-    settings: Settings,
+    settings: Resolved,
     sizes: Sequence[int] = (100_000, 1_000_000),
     peers: Mapping[str, str] | None = None,
 ) -> Figures:
@@ -67,7 +67,7 @@ def search_speed(
 
 
 def _one_size(
-    settings: Settings, vocabulary: Vocabulary, threshold: F32, size: int, peers: Mapping[str, str]
+    settings: Resolved, vocabulary: Vocabulary, threshold: F32, size: int, peers: Mapping[str, str]
 ) -> Figures:
     blocks = range(0, size, BLOCK)
     words = []

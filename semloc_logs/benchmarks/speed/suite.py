@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 
 if TYPE_CHECKING:
     from semloc_logs.logs.annotation.annotate import ClosureRecord
@@ -42,7 +42,7 @@ def _drive(folder: Path, length_m: float = 120.0, seed: int = 3) -> Path:
     return folder / "session_0.mcap"
 
 
-def reading(settings: Settings) -> Figures:
+def reading(settings: Resolved) -> Figures:
     """All messages of a simulated MCAP log, undecoded: MB of payload a second; and clouds decoded
     and posed.
     """
@@ -86,7 +86,7 @@ def reading(settings: Settings) -> Figures:
         }
 
 
-def fusion(settings: Settings) -> Figures:
+def fusion(settings: Resolved) -> Figures:
     """Sweeps and depth images into the semantic map, free space carved; see
     :mod:`semloc_logs.benchmarks.speed.fusion_speed`.
     """
@@ -95,7 +95,7 @@ def fusion(settings: Settings) -> Figures:
     return fusion_speed(settings)
 
 
-def encoder(settings: Settings) -> Figures:
+def encoder(settings: Resolved) -> Figures:
     """Descriptors of a map, densely and one by one; see
     :mod:`semloc_logs.benchmarks.speed.encoder_speed`.
     """
@@ -104,14 +104,14 @@ def encoder(settings: Settings) -> Figures:
     return encoder_speed(settings)
 
 
-def search(settings: Settings) -> Figures:
+def search(settings: Resolved) -> Figures:
     """Words looked up; see :mod:`semloc_logs.benchmarks.speed.search_speed`."""
     from semloc_logs.benchmarks.speed.search_speed import search_speed
 
     return search_speed(settings)
 
 
-def verification(settings: Settings) -> Figures:
+def verification(settings: Resolved) -> Figures:
     """Hypotheses searched, fitted and judged; see
     :mod:`semloc_logs.benchmarks.speed.verification_speed`.
     """
@@ -120,7 +120,7 @@ def verification(settings: Settings) -> Figures:
     return verification_speed(settings)
 
 
-def annotate(settings: Settings) -> Figures:
+def annotate(settings: Resolved) -> Figures:
     """A hundred closures into a simulated MCAP log in place, beside rewriting the log with
     mcap-python.
     """
@@ -199,7 +199,7 @@ def _annotated(log: Path, records: Sequence[ClosureRecord]) -> float:
     return time.perf_counter() - start
 
 
-BENCHMARKS: dict[str, Callable[[Settings], Figures]] = {
+BENCHMARKS: dict[str, Callable[[Resolved], Figures]] = {
     "reading": reading,
     "fusion": fusion,
     "encoder": encoder,
@@ -209,7 +209,7 @@ BENCHMARKS: dict[str, Callable[[Settings], Figures]] = {
 }
 
 
-def run_benchmark(name: str, settings: Settings) -> Figures:
+def run_benchmark(name: str, settings: Resolved) -> Figures:
     """The figures of one benchmark; SettingsError when there is none of that name."""
     if name not in BENCHMARKS:
         raise SettingsError(f"There is no benchmark '{name}': there are {', '.join(BENCHMARKS)}.")

@@ -15,7 +15,7 @@ from semloc_logs.alignment.surface import surface_of
 from semloc_logs.alignment.verify import Query, Target, coarse_fit, fine_fit, search_hypotheses
 from semloc_logs.benchmarks.speed.search_speed import timed
 from semloc_logs.numerics.transforms import apply, inverse
-from semloc_logs.settings import Settings
+from semloc_logs.settings import Resolved
 from semloc_logs.voxels.grid import BlockMap, Fuser
 
 Figures = dict[str, dict[str, float | str]]
@@ -84,7 +84,7 @@ def place(rng: np.random.Generator, density: float) -> tuple[F64, NDArray[np.uin
     )
 
 
-def scene(settings: Settings, density: float = 25.0, hypotheses: int = 96) -> Scene:
+def scene(settings: Resolved, density: float = 25.0, hypotheses: int = 96) -> Scene:
     """The place fused twice, each time from points of its own."""
     rng = np.random.default_rng(0)
     truth = pose_matrix(TRUTH)
@@ -114,7 +114,7 @@ def scene(settings: Settings, density: float = 25.0, hypotheses: int = 96) -> Sc
     )
 
 
-def verification_speed(settings: Settings) -> Figures:
+def verification_speed(settings: Resolved) -> Figures:
     """Processor milliseconds of the search, of a fit, of what they need of a place, and of the
     paper's ratio for all hypotheses.
     """

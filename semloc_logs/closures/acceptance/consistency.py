@@ -38,7 +38,7 @@ from semloc_logs.closures.acceptance.placements import (
 from semloc_logs.closures.closure import Agreement, Alignment
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import inverse
-from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.settings import STREET_VOXEL, Resolved
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -224,7 +224,7 @@ def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float
 
 
 def decide(
-    alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Settings
+    alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Resolved
 ) -> list[Alignment]:
     """The alignments of all queries, best first for each query: at most one accepted for each
     target session, the others with a reason.

@@ -88,7 +88,9 @@ def test_the_benchmark_draws_what_it_measured(
     monkeypatch.setattr(module, "make_shard", shard)
     monkeypatch.setattr(module, "SEEDS", (9001,))
     picture = tmp_path / "completion.png"
-    figures = completion_benchmark("semantic", Settings(), work=tmp_path / "work", picture=picture)
+    figures = completion_benchmark(
+        "semantic", Settings().resolved(), work=tmp_path / "work", picture=picture
+    )
     assert set(figures) == {
         "accuracy",
         "mean_iou",

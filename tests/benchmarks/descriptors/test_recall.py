@@ -37,7 +37,7 @@ from semloc_logs.simulation.meshes.world import MeshBuilder, Scene, box
 from semloc_logs.simulation.town.road_network import RoadNetwork, path_network
 from semloc_logs.subvolumes.describe import Described
 
-SETTINGS = densely(Settings()).resolved()
+SETTINGS = densely(Settings().resolved()).resolved()
 V = SETTINGS.fusion.voxel_size
 
 

@@ -44,9 +44,7 @@ def wall(x: float = 10.0) -> MeshBuilder:
 
 def ahead(scene: Scene, model: str = "hdl64", **changes: Any) -> np.ndarray:
     sensor = replace(PERFECT, **changes)
-    return full_sweep(
-        scene, np.eye(4), np.random.default_rng(3), sensor, sector=(-0.5, 0.5)
-    ).points
+    return full_sweep(scene, np.eye(4), np.random.default_rng(3), sensor, sector=(-0.5, 0.5)).points
 
 
 def test_noise_is_along_the_beam() -> None:
