@@ -59,7 +59,7 @@ INNER_ORDER = {
         "sessions",
         "demo",
     ],
-    "closures": ["query", "acceptance", "database", "matching", "closure_tables"],
+    "closures": ["closure", "query", "acceptance", "closure_tables", "database", "matching"],
     "benchmarks": ["scans", "peers", "descriptors", "labels", "localisation", "speed"],
 }
 SOURCES = sorted((ROOT / "semloc_logs").rglob("*.py"))
