@@ -18,7 +18,7 @@ from pathlib import Path
 from towns import Place, Town, collect, short_towns
 
 import semloc_logs.closures
-from semloc_logs.engines.engine import single_threaded
+from semloc_logs.engines.processes import single_threaded
 from semloc_logs.evaluation.calibration import (
     calibration_json,
     fit,

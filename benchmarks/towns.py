@@ -17,7 +17,10 @@ from semloc_logs.engines import make_engine
 from semloc_logs.evaluation.calibration import judge_town, read_judged
 from semloc_logs.settings import load
 from semloc_logs.simulation.sessions import simulate_sessions
-from semloc_logs.stages.pipeline import close, describe, fuse
+from semloc_logs.stages.close import close
+from semloc_logs.stages.describe import describe
+from semloc_logs.stages.fuse import fuse
+from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.tables.table import read_metadata
 from semloc_logs.workspace import Workspace
 
@@ -141,14 +144,10 @@ class Place:
         settings = load(
             assignments={"labels.source": town.labels, "closures.min_probability": "1"}
         ).resolved()
-        fuse({name: [log] for name, log in logs.items()}, work, settings, {}, engine, _silent)
-        describe(work, [], settings, engine, _silent)
-        close(work, [], [], settings, engine, _silent)
+        fuse([SessionInput(name, (log,)) for name, log in logs.items()], work, settings, engine)
+        describe(work, [], settings, engine)
+        close(work, settings, engine)
         return work
-
-
-def _silent(_: str) -> None:
-    pass
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,14 +51,13 @@ def command(
     Example:  semloc close -w work --query tuesday --target monday --query-every 5
     """
     from semloc_logs.closures.closure_tables import read_closures
-    from semloc_logs.stages.pipeline import close
+    from semloc_logs.stages.close import Selection, close
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(workspace.sessions())) as opened:
-        report = close(
-            workspace, queries, targets, settings, opened, console.note, not no_self, overwrite
-        )
+        selection = Selection(queries, targets, self_closures=not no_self)
+        report = close(workspace, settings, opened, selection, overwrite=overwrite)
     if as_json:
         console.result_json(
             report_json(report, work) | {"closures": read_closures(workspace.closures)}

@@ -66,7 +66,7 @@ class Program(click.Group):
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **__: Any
     ) -> NoReturn:
         """Run and exit with the code that DESIGN promises."""
-        from semloc_logs.engines.engine import single_threaded
+        from semloc_logs.engines.processes import single_threaded
 
         console.reset()
         single_threaded()

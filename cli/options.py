@@ -341,7 +341,7 @@ class EngineChoice:
         block fails.
         """
         from semloc_logs.engines import make_engine
-        from semloc_logs.engines.engine import cores
+        from semloc_logs.engines.processes import cores
 
         is_parallel = (self.jobs or cores()) > 1 and (tasks > 1 or self.jobs is not None)
         engine = make_engine(self.name or ("processes" if is_parallel else "serial"), self.jobs)

@@ -94,7 +94,7 @@ def command(
     \b
     Example:  semloc train --variant semantic -o weights --scenes 60 --samples 250000
     """
-    from semloc_logs.engines.engine import cores
+    from semloc_logs.engines.processes import cores
     from semloc_logs.training.checkpoints import steps_done
     from semloc_logs.training.runs import device_of, learn_descriptor, use_threads
     from semloc_logs.training.schedule import samples_after

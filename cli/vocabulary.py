@@ -76,7 +76,7 @@ def command(
     Example:  semloc vocabulary --variant semantic -o words.safetensors -w work
               semloc vocabulary --variant both -o semloc_logs/words/vocabularies --shards weights/checkpoint/simulated-0123456789
     """
-    from semloc_logs.engines.engine import cores
+    from semloc_logs.engines.processes import cores
     from semloc_logs.training.runs import given_shards, learn_vocabulary, use_threads
 
     if variant == "both" and settings.descriptor.weights is not None:

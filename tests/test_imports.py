@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # rooms in the order of the story; a room imports only what stands above it
 ORDER = [
     "errors",
+    "progress",
     "schemas",
     "settings",
     "workspace",

@@ -27,7 +27,10 @@ from semloc_logs.errors import SemlocError
 from semloc_logs.evaluation.truth import read_truth
 from semloc_logs.logs.session.session import open_session
 from semloc_logs.settings import Resolved
-from semloc_logs.stages.pipeline import describe, fuse, run, session_name
+from semloc_logs.stages.describe import describe
+from semloc_logs.stages.fuse import fuse
+from semloc_logs.stages.inputs import SessionInput, session_name
+from semloc_logs.stages.run import run
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.tables.table import read_metadata
@@ -80,12 +83,10 @@ def profile_pipeline(
         profiler = cProfile.Profile()
         report = profiler.runcall(
             run,
-            {session_name(log): [log] for log in logs},
+            [SessionInput(session_name(log), (log,)) for log in logs],
             work,
             settings,
-            {},
             make_engine("serial"),
-            lambda _: None,
         )
         queries = int(read_metadata(work.closures)["queries"])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
@@ -117,7 +118,7 @@ def profile_fuse(
     def whole(folder: Path, profiler: cProfile.Profile | None = None) -> Workspace:
         work = Workspace(folder)
         with profiler or nullcontext():
-            fuse({"session": logs}, work, settings, {}, make_engine("serial"), lambda _: None)
+            fuse([SessionInput("session", tuple(logs))], work, settings, make_engine("serial"))
         return work
 
     def reading() -> int:
@@ -309,9 +310,9 @@ def word_recalls(logs: Sequence[Path], truth: Path, settings: Resolved) -> Figur
     """
     with tempfile.TemporaryDirectory(prefix="semloc-words-") as folder:
         work = Workspace(Path(folder))
-        sessions = {session_name(log): [log] for log in logs}
-        fuse(sessions, work, settings, {}, make_engine("serial"), lambda _: None)
-        maps = {name: SessionMap(work.session(name)) for name in sessions}
+        sessions = [SessionInput(session_name(log), (log,)) for log in logs]
+        fuse(sessions, work, settings, make_engine("serial"))
+        maps = {s.name: SessionMap(work.session(s.name)) for s in sessions}
         target, query = maps.values()
         tracks = read_truth(truth, maps)
         pairs = true_queries(query, target, tracks, settings)
@@ -363,9 +364,9 @@ def real_streets(logs: Sequence[Path], truth: Path, settings: Resolved) -> dict[
         )
         with tempfile.TemporaryDirectory(prefix="semloc-real-") as folder:
             work = Workspace(Path(folder))
-            sessions = {session_name(log): [log] for log in logs}
-            fuse(sessions, work, labelled, {}, make_engine("serial"), lambda _: None)
-            maps = {name: SessionMap(work.session(name)) for name in sessions}
+            sessions = [SessionInput(session_name(log), (log,)) for log in logs]
+            fuse(sessions, work, labelled, make_engine("serial"))
+            maps = {s.name: SessionMap(work.session(s.name)) for s in sessions}
             query, target = maps.values()
             tracks = read_truth(truth, maps)
             out |= {name: real_street(query, target, tracks, name, labelled) for name in names}
@@ -379,17 +380,11 @@ class _Prepare:
         self._engine = engine
 
     def fuse(self, logs: Mapping[str, Path], work: Workspace, settings: Resolved) -> None:
-        fuse(
-            {name: [log] for name, log in logs.items()},
-            work,
-            settings,
-            {},
-            self._engine,
-            lambda _: None,
-        )
+        sessions = [SessionInput(name, (log,)) for name, log in logs.items()]
+        fuse(sessions, work, settings, self._engine)
 
     def describe(self, work: Workspace, names: Sequence[str], settings: Resolved) -> None:
-        describe(work, names, settings, self._engine, lambda _: None)
+        describe(work, names, settings, self._engine)
 
 
 def localisation(

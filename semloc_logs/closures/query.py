@@ -69,12 +69,9 @@ class SessionMap:
     def views(self) -> F64:
         """The mean of what each keyframe sees nearby (n, 3), metres in the map frame.
 
-        WorkspaceError when the session was fused before this was written down.
+        Raises WorkspaceError when an earlier version fused the session.
         """
-        if "view_x" not in self.frames.column_names:
-            raise WorkspaceError(
-                f"{self.folder.frames} is of an earlier version: fuse session {self.folder.name} again with --overwrite."
-            )
+        self.check_version()
         at = np.stack([self.frames[f"view_{c}"].to_numpy() for c in "xyz"], 1).astype(float)
         return np.asarray(
             np.einsum("nij,nj->ni", self.map_T_base[:, :3, :3], at) + self.map_T_base[:, :3, 3]
@@ -90,6 +87,18 @@ class SessionMap:
     @property
     def posed(self) -> bool:
         return bool(self.json["posed"])
+
+    @property
+    def label_source(self) -> str:
+        return str(self.json["label_source"])
+
+    def check_version(self) -> None:
+        """Raises WorkspaceError when an earlier version fused the session."""
+        if "view_x" not in self.frames.column_names:
+            raise WorkspaceError(
+                f"{self.folder.frames} is of an earlier version:"
+                f" fuse session {self.folder.name} again with --overwrite."
+            )
 
     @property
     def submaps(self) -> list[dict[str, Any]]:

@@ -298,11 +298,11 @@ def test_which_session_a_trajectory_belongs_to(
 ) -> None:
     seen: dict[str, Any] = {}
 
-    def run(*args: Any) -> Any:
-        seen.update(args[-1])
+    def run(sessions: Any, *_: Any, **__: Any) -> Any:
+        seen.update({session.name: session.poses for session in sessions})
         raise SystemExit(9)
 
-    monkeypatch.setattr("semloc_logs.stages.pipeline.run", run)
+    monkeypatch.setattr("semloc_logs.stages.run.run", run)
     logs = ("run", tmp_path / "a.mcap", tmp_path / "b.bag", "-w", tmp_path / "w")
     assert semloc(*logs, "--poses", "x.tum").exit_code == 2
     assert semloc(*logs, "--poses", "c=x.tum").exit_code == 2

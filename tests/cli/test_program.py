@@ -1,6 +1,7 @@
 """Exit codes, streams and start-up of the program, whatever the command."""
 
 import json
+import logging
 import os
 import resource
 import signal
@@ -19,6 +20,7 @@ from semloc_logs.cli.console import console
 from semloc_logs.cli.main import COMMANDS, program
 from semloc_logs.cli.options import Command, EngineChoice, console_options
 from semloc_logs.errors import LogError, RoleError, SettingsError, WorkspaceError
+from semloc_logs.progress import Progress
 
 HEAVY = (
     "torch",
@@ -188,12 +190,44 @@ def test_wrong_usage_is_2(args: list[str]) -> None:
 def test_progress_lines_are_few_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     console.reset()
     for k in range(1, 101):
-        console.note(f"query {k} of 100")
+        console.show_progress(Progress("close", "tuesday", k, 100, "queries"))
     console.note("done")
-    said = capsys.readouterr().err.splitlines()
-    assert said[0] == "query 1 of 100"
-    assert said[-2:] == ["query 100 of 100", "done"]
-    assert len(said) < 10
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-2:] == ["close tuesday: 100 of 100 queries", "done"]
+    assert len(lines) < 10
+
+
+def test_progress_has_the_same_fields_in_json(capsys: pytest.CaptureFixture[str]) -> None:
+    console.reset()
+    console.log_format = "json"
+    console.show_progress(Progress("fuse", "monday", 7, None, "frames"))
+    console.verbosity = 1  # every event
+    console.show_progress(Progress("fuse", "monday", 8, None, "frames"))
+    (line,) = capsys.readouterr().err.splitlines()
+    content = json.loads(line)
+    del content["time"]
+    assert content == {
+        "level": "info",
+        "message": "fuse monday: 8 frames",
+        "stage": "fuse",
+        "session": "monday",
+        "done": 8,
+        "total": None,
+        "unit": "frames",
+    }
+    console.reset()
+
+
+def test_what_the_package_logs_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    console.reset()
+    with console.progress():
+        logging.getLogger("semloc_logs.stages.fuse").info("%s: %d keyframes", "monday", 60)
+        logging.getLogger("semloc_logs.stages.fuse").warning("a.mcap is cut off")
+    logging.getLogger("semloc_logs.stages.fuse").info("later")
+    assert capsys.readouterr().err.splitlines() == [
+        "monday: 60 keyframes",
+        "Warning: a.mcap is cut off",
+    ]
 
 
 def test_numbers_that_are_none_are_null_in_json(capsys: pytest.CaptureFixture[str]) -> None:
@@ -221,7 +255,7 @@ def test_default_engine(
     cores: int,
     kind: str,
 ) -> None:
-    monkeypatch.setattr("semloc_logs.engines.engine.cores", lambda: cores)
+    monkeypatch.setattr("semloc_logs.engines.processes.cores", lambda: cores)
     with EngineChoice(name, jobs).open(tasks) as engine:
         assert type(engine).__name__ == kind
         assert engine.jobs == (1 if kind == "Serial" else jobs or cores)

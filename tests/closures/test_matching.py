@@ -18,7 +18,8 @@ from semloc_logs.engines import make_engine
 from semloc_logs.evaluation.truth import Evaluation, Judged, evaluate_closures
 from semloc_logs.settings import load
 from semloc_logs.simulation.sessions import simulate_sessions
-from semloc_logs.stages.pipeline import run
+from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.run import run
 from semloc_logs.workspace import Workspace
 
 POSES = ("/odometry", "/gnss", "/imu")
@@ -61,7 +62,8 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Evaluation]
     without(POSES, logs["map"][0], logs["frames"][0])
     settings = load(assignments={"query.every": "4"}).resolved()
     work = Workspace(folder / "work")
-    report = run(logs, work, settings, {}, make_engine("serial"), lambda _: None)
+    sessions = [SessionInput(name, tuple(paths)) for name, paths in logs.items()]
+    report = run(sessions, work, settings, make_engine("serial"))
     assert not report.failed
     truth = folder / "truth.json"
     truth.write_text(json.dumps({name: {"trajectory": "hdl32/session_0.tum"} for name in logs}))
