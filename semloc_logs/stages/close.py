@@ -78,9 +78,11 @@ def close(
     accepted = [alignment for alignment in decided if alignment.accepted]
     closures = unique_closures(accepted, road, settings.query.every)
     metadata = _metadata(settings, maps, sum(len(task.keyframes) for task in tasks))
+    metadata["fingerprint"] = fingerprint
+    # closures.parquet comes last: with its fingerprint it vouches for the other two
     write_rejected(work.rejected, [a for a in decided if not a.accepted], metadata)
-    write_closures(work.closures, closures, metadata | {"fingerprint": fingerprint})
     draw_closures(work, closures, maps)
+    write_closures(work.closures, closures, metadata)
     return Report(done=["closures"], closures=len(closures))
 
 
@@ -104,9 +106,10 @@ def _checked_variants(
 
 
 def _is_up_to_date(work: Workspace, fingerprint: str) -> bool:
-    if not work.rejected.exists() or not work.closures.exists():
-        return False
-    return read_metadata(work.closures).get("fingerprint") == fingerprint
+    return all(
+        table.exists() and read_metadata(table).get("fingerprint") == fingerprint
+        for table in (work.closures, work.rejected)
+    )
 
 
 def _update_indexes(work: Workspace, variants: Sequence[str], targets: Sequence[str]) -> None:

@@ -7,7 +7,8 @@ import resource
 import signal
 import subprocess
 import sys
-import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -264,13 +265,12 @@ def test_default_engine(
 # -- interruption, with real processes and signals
 
 SLOW = """
-import os, sys, tempfile, time
-from pathlib import Path
+import os, tempfile, time
 
 def nap(folder):
-    with tempfile.TemporaryDirectory(dir=folder) as mine:
-        (Path(folder).parent / f"pid-{os.getpid()}").touch()
-        time.sleep(100)
+    with tempfile.TemporaryDirectory(dir=folder):
+        os.write(1, b"asleep\\n")
+        time.sleep(1000)
 """
 NAPPING = """
 import click, slow, sys
@@ -288,56 +288,49 @@ if __name__ == "__main__":
 """
 
 
-def _start(folder: Path, engine: str, workers: int) -> tuple[subprocess.Popen[str], list[int]]:
-    """A program whose tasks sleep in a temporary folder inside ``folder``/busy, once they do; and
-    the processes they run in.
+@contextmanager
+def _sleeping(folder: Path, engine: str, tasks: int) -> Iterator[subprocess.Popen[str]]:
+    """A program of which so many tasks sleep, each in a temporary folder inside ``folder``/busy.
+
+    Its workers have its stdout, too: that ends when the last of them has. Nothing here waits for a
+    time.
     """
     (folder / "slow.py").write_text(SLOW)
     (folder / "napping.py").write_text(NAPPING)
     (folder / "busy").mkdir()
     command = [sys.executable, str(folder / "napping.py"), str(folder / "busy"), engine]
-    started = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    deadline = time.monotonic() + 40
-    while len(pids := [int(p.name[4:]) for p in folder.glob("pid-*")]) < workers:
-        assert time.monotonic() < deadline, "the workers did not start"
-        assert started.poll() is None, started.stderr and started.stderr.read()
-        time.sleep(0.05)
-    return started, pids
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        command, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    ) as started:
+        try:
+            assert started.stdout is not None
+            for _ in range(tasks):
+                assert started.stdout.readline() == "asleep\n", started.communicate()
+            assert len(list((folder / "busy").iterdir())) == tasks
+            yield started
+        finally:
+            with suppress(ProcessLookupError):  # as it should be
+                os.killpg(started.pid, signal.SIGKILL)
 
 
-def _are_gone(pids: list[int]) -> bool:
-    deadline = time.monotonic() + 15
-    while time.monotonic() < deadline:
-        if not [
-            p
-            for p in pids
-            if Path(f"/proc/{p}").exists()
-            and "Z" not in Path(f"/proc/{p}/stat").read_text().split()[2]
-        ]:
-            return True
-        time.sleep(0.05)
-    return False
-
-
-@pytest.mark.parametrize(("engine", "workers"), [("serial", 1), ("processes", 2)])
+@pytest.mark.timeout(240)  # new processes import much
+@pytest.mark.parametrize(("engine", "tasks"), [("serial", 1), ("processes", 2)])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_an_interrupted_program_cleans_up(
-    tmp_path: Path, engine: str, workers: int, number: signal.Signals, code: int
+    tmp_path: Path, engine: str, tasks: int, number: signal.Signals, code: int
 ) -> None:
-    started, pids = _start(tmp_path, engine, workers)
-    os.killpg(started.pid, number)  # as a terminal does it: workers get it too
-    _, said = started.communicate(timeout=30)
-    assert started.returncode == code
-    assert "Traceback" not in said
-    assert _are_gone(pids)
-    assert list((tmp_path / "busy").iterdir()) == []
+    with _sleeping(tmp_path, engine, tasks) as started:
+        os.killpg(started.pid, number)  # as a terminal does it: workers get it too
+        _, said = started.communicate()  # until the program and its workers are gone
+        assert started.returncode == code, said
+        assert "Traceback" not in said
+        assert list((tmp_path / "busy").iterdir()) == []
 
 
+@pytest.mark.timeout(240)
 def test_workers_leave_with_a_killed_parent(tmp_path: Path) -> None:
-    started, pids = _start(tmp_path, "processes", 2)
-    started.kill()
-    started.wait(timeout=20)
-    assert _are_gone(pids)
-    assert list((tmp_path / "busy").iterdir()) == []
-    if started.stderr:
-        started.stderr.close()
+    with _sleeping(tmp_path, "processes", 2) as started:
+        started.kill()
+        started.communicate()
+        assert list((tmp_path / "busy").iterdir()) == []

@@ -5,7 +5,7 @@ camera.
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -331,12 +331,12 @@ def test_what_the_model_lacks_is_said(tmp_path: Path) -> None:
         classes([sweep(0)], space="marskitti")
 
 
-def test_a_real_drive_without_poses(shared: Path, tmp_path: Path) -> None:
+def test_a_real_drive_without_poses(shared: Callable[[str], Path], tmp_path: Path) -> None:
     from semloc_logs.logs.session.session import open_session
 
     settings = by_brightness(tmp_path, 94, 311)
     session = open_session(
-        [shared / "logs" / "kitti_drive_camera_lidar.mcap"], min_range=0.9, max_range=80.0
+        [shared("logs/kitti_drive_camera_lidar.mcap")], min_range=0.9, max_range=80.0
     )
     try:
         labeller = Labeller(Labels(**settings), session)

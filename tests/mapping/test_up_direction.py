@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,6 @@ from semloc_logs.settings import load
 
 F64 = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
-SHARED = Path(__file__).resolve().parents[3] / "shared"
 
 
 def noisy(rng: np.random.Generator, direction: F64, n: int, degrees: float) -> F64:
@@ -110,12 +110,11 @@ def test_ground_height(scale: float) -> None:
     assert ground_height(few, np.zeros(3), scale) == pytest.approx(np.percentile(few[:, 2], 2))
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="no folder shared beside the checkout")
-def test_two_drives_through_a_basement_agree_on_up() -> None:
+def test_two_drives_through_a_basement_agree_on_up(shared: Callable[[str], Path]) -> None:
     """Both session frames are tilted, one of them by six degrees; the truth says how they lie to
     each other.
     """
-    truth = json.loads((SHARED / "logs" / "basement_truth.json").read_text())
+    truth = json.loads(shared("logs/basement_truth.json").read_text())
     ups = {}
     settings = load(
         assignments={
@@ -130,7 +129,7 @@ def test_two_drives_through_a_basement_agree_on_up() -> None:
             from semloc_logs.labels.labeller import Labeller
             from semloc_logs.logs.session.session import open_session
 
-            session = open_session([SHARED / "logs" / name], {}, min_range=0.9, max_range=30.0)
+            session = open_session([shared(f"logs/{name}")], {}, min_range=0.9, max_range=30.0)
             try:
                 collected = collect(
                     session,

@@ -52,7 +52,17 @@ from semloc_logs.simulation.output.drive_messages import (
 # endings; a ROS 2 bag is a directory
 FORMATS = {"mcap": ".mcap", "protobuf": ".mcap", "bag": ".bag", "ros2": ""}
 _LATENCY_NS = 4_000_000  # from the end of a measurement to the log
-_LATCHED_TEXT = "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
+_LATCHED_TEXT = """\
+- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline: {sec: 0, nsec: 0}
+  lifespan: {sec: 0, nsec: 0}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 0, nsec: 0}
+  avoid_ros_namespace_conventions: false
+"""  # every field: readers of bags want them all
 _LATCHED_QOS = Qos(
     QosHistory.KEEP_LAST,
     1,

@@ -7,6 +7,7 @@ import io
 import os
 import shutil
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,6 @@ from semloc_logs.logs.annotation.annotate import (
 )
 from semloc_logs.logs.annotation.mcap_append import read_ending
 
-SHARED = Path(__file__).resolve().parents[4] / "shared"
-CONFORMANCE = SHARED / "odd_logs" / "mcap_conformance"
 NO_TIMES: dict[int, int] = {}
 
 
@@ -213,10 +212,8 @@ def test_every_shape_copy_in_place_and_again(tmp_path: Path, shape: str, count: 
     assert (tmp_path / "second.mcap").read_bytes() == copy.read_bytes()
 
 
-def test_conformance_files(tmp_path: Path) -> None:
-    if not CONFORMANCE.is_dir():
-        pytest.skip("no shared/odd_logs/mcap_conformance beside the checkout")
-    for log in sorted(CONFORMANCE.glob("*.mcap"))[::5]:
+def test_conformance_files(shared: Callable[[str], Path], tmp_path: Path) -> None:
+    for log in sorted(shared("odd_logs/mcap_conformance").glob("*.mcap"))[::5]:
         copy = tmp_path / "copy.mcap"
         place = tmp_path / "place.mcap"
         annotate_copy(log, copy, Results(closures(), "a", {}, log_times=NO_TIMES), overwrite=True)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -18,7 +18,6 @@ from semloc_logs.numerics.transforms import inverse, yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
-ODD = Path(__file__).resolve().parents[4] / "shared" / "odd_logs"
 A, B = 6378137.0, 6356752.314245  # m, WGS 84
 LATITUDE, LONGITUDE, HEIGHT = 48.0, 11.0, 500.0
 RADIUS, SPEED = 40.0, 5.0
@@ -243,14 +242,11 @@ def test_driving_backwards_is_not_turning() -> None:
     assert all(abs(np.arctan2(p[1, 0], p[0, 0])) < 0.1 for p in found.values())
 
 
-@pytest.mark.skipif(
-    not ODD.is_dir(), reason="the folder ../shared/odd_logs with recorded logs is missing"
-)
-def test_the_fixes_of_a_husky_agree_with_its_odometry() -> None:
+def test_the_fixes_of_a_husky_agree_with_its_odometry(shared: Callable[[str], Path]) -> None:
     """Its length by fixes of a metre's noise is longer than by its wheels, but of the same size;
     fixes are used when named.
     """
-    log = ODD / "husky_imu_gnss_odometry.bag"
+    log = shared("odd_logs/husky_imu_gnss_odometry.bag")
     wheels = inspect_log(log)
     named = inspect_log(log, {"pose": "/fix"})
     poses = wheels["poses"]

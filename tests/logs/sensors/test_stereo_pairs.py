@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.numerics.transforms import apply, exp_se3
 
 MS = 1_000_000
-REAL = Path(__file__).resolve().parents[4] / "shared" / "logs" / "euroc_v101_stereo.bag"
+REAL = "logs/euroc_v101_stereo.bag"
 LEFT, RIGHT = "/left/image_rect", "/right/image_rect"
 ROLES = Roles(
     image=(LEFT,), stereo_left=LEFT, stereo_right=RIGHT, camera_info=("/l", "/r"), info_of={LEFT: "/l", RIGHT: "/r"},
@@ -220,10 +220,9 @@ def is_the_room(points: F64) -> bool:
 
 
 @pytest.fixture(scope="module")
-def room() -> list[PosedCloud]:
-    if not REAL.is_file():
-        pytest.skip(f"{REAL} is missing")
-    session = open_session([REAL], max_range=10.0)
+def room(shared: Callable[[str], Path]) -> list[PosedCloud]:
+    log = shared(REAL)
+    session = open_session([log], max_range=10.0)
     found = list(session.clouds())
     assert session.skipped == []
     session.close()
@@ -279,10 +278,9 @@ def test_the_direction_of_gravity_is_found_at_every_voxel_size(
 
 @pytest.mark.parametrize("turn", [(0.0, 0.01, 0.0), (0.01, 0.0, 0.0), (0.0, 0.0, 0.03)])
 def test_the_room_would_not_be_there_with_a_wrong_rectification(
-    monkeypatch: pytest.MonkeyPatch, turn: tuple[float, float, float]
+    shared: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch, turn: tuple[float, float, float]
 ) -> None:
-    if not REAL.is_file():
-        pytest.skip(f"{REAL} is missing")
+    log = shared(REAL)
 
     def wrong(
         left: Camera,
@@ -302,16 +300,15 @@ def test_the_room_would_not_be_there_with_a_wrong_rectification(
         )
 
     monkeypatch.setattr("semloc_logs.logs.sensors.stereo_pairs.rectification", wrong)
-    session = open_session([REAL], max_range=10.0)
+    session = open_session([log], max_range=10.0)
     cloud = next(session.clouds(), None)
     session.close()
     assert cloud is None or len(cloud.points) < 20_000 or not is_the_room(in_world(cloud))
 
 
-def test_inspect_names_the_roles() -> None:
-    if not REAL.is_file():
-        pytest.skip(f"{REAL} is missing")
-    told = inspect_log(REAL)
+def test_inspect_names_the_roles(shared: Callable[[str], Path]) -> None:
+    log = shared(REAL)
+    told = inspect_log(log)
     assert told["problems"] == []
     streams = told["streams"]
     assert isinstance(streams, list)
@@ -319,12 +316,12 @@ def test_inspect_names_the_roles() -> None:
     assert (roles["/cam0/image_raw"], roles["/cam1/image_raw"]) == ("stereo_left", "stereo_right")
     [sentence] = [
         p
-        for p in _listed(inspect_log(REAL, {"tf_static": "none"})["problems"])
+        for p in _listed(inspect_log(log, {"tf_static": "none"})["problems"])
         if "Nothing says where the cameras" in p
     ]
     assert sentence.endswith(".")
     swapped = _listed(
-        inspect_log(REAL, {"stereo_left": "/cam1/image_raw", "stereo_right": "/cam0/image_raw"})[
+        inspect_log(log, {"stereo_left": "/cam1/image_raw", "stereo_right": "/cam0/image_raw"})[
             "problems"
         ]
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,6 @@ from rosbags.typesys import Stores, get_typestore
 from semloc_logs.errors import LogError, RoleError
 from semloc_logs.logs.session.inspect import inspect_log
 
-SHARED = Path(__file__).resolve().parents[4] / "shared"
-needs_logs = pytest.mark.skipif(
-    not SHARED.is_dir(), reason="the folder ../shared with recorded logs is missing"
-)
 STORE = get_typestore(Stores.ROS1_NOETIC)
 S = 1_000_000_000
 
@@ -94,7 +91,6 @@ def test_no_log_at_all(tmp_path: Path) -> None:
         inspect_log(tmp_path / "nowhere.mcap")
 
 
-@needs_logs
 @pytest.mark.parametrize(
     ("name", "base", "poses", "roles"),
     [
@@ -127,8 +123,10 @@ def test_no_log_at_all(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_recorded_logs(name: str, base: str, poses: int, roles: dict[str, int]) -> None:
-    told = inspect(SHARED / "logs" / name)
+def test_recorded_logs(
+    shared: Callable[[str], Path], name: str, base: str, poses: int, roles: dict[str, int]
+) -> None:
+    told = inspect(shared(f"logs/{name}"))
     assert told["base_frame"] == base
     assert told["poses"]["count"] == poses
     found: dict[str, int] = {}
@@ -138,10 +136,12 @@ def test_recorded_logs(name: str, base: str, poses: int, roles: dict[str, int]) 
     assert told["skipped"] == []
 
 
-@needs_logs
-def test_odd_logs_give_an_answer_or_a_log_error() -> None:
-    paths = [p for p in sorted((SHARED / "odd_logs").iterdir()) if p.name != "mcap_conformance"]
-    paths += sorted((SHARED / "odd_logs" / "mcap_conformance").iterdir())
+def test_odd_logs_give_an_answer_or_a_log_error(shared: Callable[[str], Path]) -> None:
+    unreadable = {"empty-file.bag", "lfs_pointer.bag", "lfs_pointer.mcap", "not_a_bag.bag"}
+    for name in unreadable:
+        shared(f"odd_logs/{name}")
+    paths = [p for p in sorted(shared("odd_logs").iterdir()) if p.name != "mcap_conformance"]
+    paths += sorted(shared("odd_logs/mcap_conformance").iterdir())
     refused = {}
     for path in paths:
         try:
@@ -149,20 +149,16 @@ def test_odd_logs_give_an_answer_or_a_log_error() -> None:
         except LogError as error:
             refused[path.name] = str(error)
     assert all(sentence.endswith(".") for sentence in refused.values())
-    assert set(refused) == {
-        "empty-file.bag",
-        "lfs_pointer.bag",
-        "lfs_pointer.mcap",
-        "not_a_bag.bag",
-    }
+    assert set(refused) == unreadable
 
 
-@needs_logs
 @pytest.mark.parametrize("name", ["basement_a.mcap", "basement_b.bag"])
-def test_cut_off_and_scribbled_logs(name: str, tmp_path: Path) -> None:
-    data = (SHARED / "logs" / name).read_bytes()
+def test_cut_off_and_scribbled_logs(
+    shared: Callable[[str], Path], name: str, tmp_path: Path
+) -> None:
+    data = shared(f"logs/{name}").read_bytes()
     rng = np.random.default_rng(5)
-    whole = inspect(SHARED / "logs" / name)
+    whole = inspect(shared(f"logs/{name}"))
     for share in (0.9, 0.5, 0.1):
         path = tmp_path / name
         path.write_bytes(data[: int(len(data) * share)])
@@ -177,9 +173,8 @@ def test_cut_off_and_scribbled_logs(name: str, tmp_path: Path) -> None:
         assert inspect(tmp_path / name)["skipped"]
 
 
-@needs_logs
-def test_tf_alone_gives_poses() -> None:
-    told = inspect(SHARED / "odd_logs" / "tf_example.bag")
+def test_tf_alone_gives_poses(shared: Callable[[str], Path]) -> None:
+    told = inspect(shared("odd_logs/tf_example.bag"))
     assert (told["poses"]["count"], told["base_frame"], told["session_frame"]) == (
         517,
         "base_link",
@@ -188,8 +183,9 @@ def test_tf_alone_gives_poses() -> None:
     assert "base_footprint" in told["frames"]
 
 
-@needs_logs
-def test_undecodable_topics_that_nobody_needs_are_no_lost_data() -> None:
-    told = inspect(SHARED / "odd_logs" / "ros2_utm_drive_a")
+def test_undecodable_topics_that_nobody_needs_are_no_lost_data(
+    shared: Callable[[str], Path],
+) -> None:
+    told = inspect(shared("odd_logs/ros2_utm_drive_a"))
     assert any("ackermann_msgs" in problem for problem in told["problems"])
     assert told["skipped"] == []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,6 @@ from semloc_logs.numerics.transforms import Array, rotation_angle, yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
-REAL = Path(__file__).resolve().parents[4] / "shared" / "logs"
 TYPES = {
     LidarFrame: "sensor_msgs/msg/PointCloud2", DepthFrame: "sensor_msgs/msg/Image", ImageFrame: "sensor_msgs/msg/Image",
     Camera: "sensor_msgs/msg/CameraInfo", TransformSample: "tf2_msgs/msg/TFMessage", ImuSample: "sensor_msgs/msg/Imu",
@@ -457,13 +456,10 @@ def test_the_buffer_is_bounded_when_nothing_ever_comes() -> None:
     assert most <= MAX_WAITING
 
 
-@pytest.mark.skipif(
-    not REAL.is_dir(), reason="the folder ../shared/logs with recorded logs is missing"
-)
 class TestRecordedLogs:
-    def test_basement_has_a_pose_for_every_sweep(self) -> None:
+    def test_basement_has_a_pose_for_every_sweep(self, shared: Callable[[str], Path]) -> None:
         for name, count in (("basement_a.mcap", 88), ("basement_b.bag", 87)):
-            session = open_session([REAL / name])
+            session = open_session([shared(f"logs/{name}")])
             clouds = list(session.clouds())
             assert len(clouds) == count
             assert all(c.session_T_base is not None for c in clouds)
@@ -474,16 +470,18 @@ class TestRecordedLogs:
             )
             session.close()
 
-    def test_the_two_basements_meet_in_their_common_frame(self) -> None:
+    def test_the_two_basements_meet_in_their_common_frame(
+        self, shared: Callable[[str], Path]
+    ) -> None:
         """The last sweep of a and the first of b were taken within a second: in the common frame
         they are the same hall.
         """
         from scipy.spatial import cKDTree
 
-        truth = json.loads((REAL / "basement_truth.json").read_text())
+        truth = json.loads(shared("logs/basement_truth.json").read_text())
         halls = []
         for name, which in (("basement_a.mcap", -1), ("basement_b.bag", 0)):
-            session = open_session([REAL / name])
+            session = open_session([shared(f"logs/{name}")])
             cloud = list(session.clouds())[which]
             assert cloud.session_T_base is not None
             pose = np.array(truth[name]["T_common_session"]) @ cloud.session_T_base
@@ -493,11 +491,11 @@ class TestRecordedLogs:
         assert np.median(distance) < 0.1
 
     @pytest.mark.parametrize("name", ["room_a.mcap", "room_b"])
-    def test_room_depth_frames_overlap(self, name: str) -> None:
+    def test_room_depth_frames_overlap(self, shared: Callable[[str], Path], name: str) -> None:
         """Neighbouring depth images, put together by their poses, show the same surfaces."""
         from scipy.spatial import cKDTree
 
-        session = open_session([REAL / name], stride=8)
+        session = open_session([shared(f"logs/{name}")], stride=8)
         worlds = []
         for cloud, _ in zip(session.clouds(), range(6), strict=False):
             assert cloud.session_T_base is not None
@@ -509,16 +507,16 @@ class TestRecordedLogs:
         assert np.median(distance) < 0.04
         session.close()
 
-    def test_kitti_sweeps_have_labels_and_one_pose(self) -> None:
-        session = open_session([REAL / "kitti00_000052.mcap"])
+    def test_kitti_sweeps_have_labels_and_one_pose(self, shared: Callable[[str], Path]) -> None:
+        session = open_session([shared("logs/kitti00_000052.mcap")])
         (cloud,) = session.clouds()
         assert cloud.label is not None
         assert len(cloud.label) == len(cloud.points) > 100_000
         assert cloud.session_T_base is not None
         assert rotation_angle(cloud.session_T_base[:3, :3]) == 0.0
 
-    def test_a_drive_without_poses(self) -> None:
-        session = open_session([REAL / "kitti_drive_camera_lidar.mcap"])
+    def test_a_drive_without_poses(self, shared: Callable[[str], Path]) -> None:
+        session = open_session([shared("logs/kitti_drive_camera_lidar.mcap")])
         pictures: list[int] = []
         clouds = list(session.clouds(on_image=lambda image: pictures.append(image.header.stamp_ns)))
         assert len(clouds) == len(pictures) == 24

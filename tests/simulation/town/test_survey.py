@@ -4,6 +4,7 @@ under every pose.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -184,10 +185,8 @@ def test_sessions_drive_the_same_part_there_and_back(tmp_path: Path) -> None:
         simulate_sessions(tmp_path / "t", trajectory=path, part_m=(10, float("nan")))
 
 
-def test_a_drive_of_kitti_becomes_a_network(shared: Path) -> None:
-    path = shared / "trajectories" / "kitti_07.txt"
-    if not path.exists():
-        pytest.skip("there are no trajectories of KITTI in shared/")
+def test_a_drive_of_kitti_becomes_a_network(shared: Callable[[str], Path]) -> None:
+    path = shared("trajectories/kitti_07.txt")
     drive = read_drive(path)
     assert len(drive) == pytest.approx(694, abs=10)
     network = drive_network(np.random.default_rng(0), drive)
