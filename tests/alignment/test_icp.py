@@ -205,6 +205,91 @@ def test_covariance_says_what_is_not_known() -> None:
     assert covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] > 0.3**2
 
 
+def held(
+    information: F64,
+    pull: F64 | None = None,
+    rmse: float = 0.1,
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Fit:
+    return Fit(
+        np.eye(4),
+        1.0,
+        1000,
+        rmse,
+        information,
+        np.array(centre),
+        np.zeros((2, 6)) if pull is None else pull,
+    )
+
+
+def test_covariance_by_hand() -> None:
+    """1200 in each direction of position, 4800 about each axis (arms of 2 m), planes of 0.1 m
+    noise.
+
+    Normals 2 degrees off may pretend to know 3600 sin^2(2 degrees) = 4.38 of each; points share
+    their errors, so twelve count as one. Beside that the search bounds the error: 0.99 m and 5
+    degrees; a centimetre and a milliradian come on top.
+    """
+    C = covariance_of(held(np.diag([1200.0] * 3 + [4800.0] * 3)), np.eye(4), np.eye(4), 0.3)
+    position = 1 / ((1200 - 4.3845) / (12 * 0.01) + 1 / 0.99**2) + 1e-4
+    angle = 1 / ((4800 - 4 * 4.3845) / (12 * 0.01) + 131.31) + 1e-6
+    np.testing.assert_allclose([position, angle], [2.0036e-4, 2.600e-5], rtol=1e-3)
+    np.testing.assert_allclose(C, np.diag([position] * 3 + [angle] * 3), rtol=1e-4, atol=1e-12)
+
+
+def test_covariance_of_a_fit_that_knows_nothing_is_what_the_search_allows() -> None:
+    for nothing in (held(np.zeros((6, 6)), rmse=np.inf), held(np.zeros((6, 6)), rmse=0.0)):
+        expected = np.diag([(3.3 * 0.3) ** 2 + 1e-4] * 3 + [np.radians(5.0) ** 2 + 1e-6] * 3)
+        np.testing.assert_allclose(covariance_of(nothing, np.eye(4), np.eye(4), 0.3), expected)
+
+
+def test_too_little_rmse_is_not_believed() -> None:
+    """Planes of no noise at all are taken as of 2 cm."""
+    information = np.diag([1200.0] * 3 + [4800.0] * 3)
+    more, least, none = (
+        covariance_of(held(information, rmse=rmse), np.eye(4), np.eye(4), 0.3)
+        for rmse in (0.021, 0.02, 0.0)
+    )
+    np.testing.assert_array_equal(least, none)
+    assert more[0, 0] > least[0, 0]
+
+
+@pytest.mark.parametrize("yaw", [0.5, np.pi / 2, -2.0])
+def test_covariance_of_position_and_angles_turns_with_the_target(yaw: float) -> None:
+    """A target that looks along ``yaw`` has R^T C R, not R C R^T, and of angles too."""
+    half = np.random.default_rng(3).normal(size=(6, 6)) * 30
+    found = held(half @ half.T, half[:2] / 10, centre=(1.0, -2.0, 0.5))
+    query = yaw_transform(0.3, (2.0, 1.0, 0.0))
+    at = (5.0, 3.0, 1.0)
+    C = covariance_of(found, query, yaw_transform(0.0, at), 0.3)
+    turned = covariance_of(found, query, yaw_transform(yaw, at), 0.3)
+    R = np.kron(np.eye(2), yaw_transform(yaw)[:3, :3])
+    np.testing.assert_allclose(turned, R.T @ C @ R, rtol=1e-9, atol=1e-15)
+    assert np.abs(turned - R @ C @ R.T).max() > 1e-3 * np.abs(C).max()
+
+
+@pytest.mark.parametrize(
+    "arm", [(10.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, 10.0), (3.0, -4.0, 5.0)]
+)
+def test_an_error_of_angle_moves_the_base_across_its_arm(arm: tuple[float, float, float]) -> None:
+    """The base lies ``arm`` from what was aligned: position and angle of the base by the Jacobian
+    of turned points, by differences.
+    """
+    half = np.random.default_rng(4).normal(size=(6, 6)) * 30
+    found = held(half @ half.T)
+    here = yaw_transform(0.0, arm)
+    J = np.eye(6)
+    for k in range(3):
+        J[:3, 3 + k] = (
+            apply(exp_se3(np.zeros(3), 1e-6 * np.eye(3)[k]), np.array([arm]))[0] - arm
+        ) / 1e-6
+    floor = np.diag([1e-4] * 3 + [1e-6] * 3)
+    C = covariance_of(found, np.eye(4), np.eye(4), 0.3) - floor
+    np.testing.assert_allclose(
+        covariance_of(found, here, here, 0.3), J @ C @ J.T + floor, rtol=1e-4, atol=1e-9
+    )
+
+
 def test_covariance_lies_in_the_axes_of_the_target() -> None:
     """A corridor along the map's x is one along -y for a target that looks along the map's y."""
     rng = np.random.default_rng(5)

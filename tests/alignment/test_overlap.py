@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis
+from semloc_logs.alignment.icp import Step, align
 from semloc_logs.alignment.overlap import (
     ANY_BIT,
     FREE_BIT,
+    Evidence,
     build_level,
     class_bits,
     look_up,
@@ -20,11 +22,15 @@ from semloc_logs.alignment.overlap import (
 )
 from semloc_logs.alignment.verify import (
     Query,
+    Scores,
     Target,
+    measured,
+    rank,
     same_place,
     search_hypotheses,
     structure_mask,
     structure_scores,
+    thin_points,
 )
 from semloc_logs.labels.space import UNLABELLED, cityscapes
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
@@ -262,6 +268,97 @@ def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
     assert len(twice) == 1  # hypotheses that have met are one
 
 
+def evidence_of(cells: dict[Cell, int], structure: int) -> Evidence:
+    """The first ``structure`` of these voxels are structure, the rest ground."""
+    states = np.array(list(cells.values()), np.uint8)
+    return Evidence(
+        (np.array(list(cells)) + 0.5) * V,
+        class_bits(states, COARSE) & np.uint8(ANY_BIT - 1),
+        structure,
+    )
+
+
+def test_what_lies_in_free_space_is_subtracted_from_a_search_score() -> None:
+    """Of four voxels of a wall two lie on one, one in free space and one where nothing was
+    observed: a quarter of the structure's share, which is three quarters; of two voxels of ground
+    one lies on ground and one in free space.
+    """
+    target: dict[Cell, int] = {
+        (0, 0, 0): 2,
+        (12, 0, 0): 2,
+        (20, 0, 0): 254,
+        (40, 0, 0): 0,
+        (60, 0, 0): 254,
+    }
+    level = build_level(block_map(target), V, COARSE)
+    cells: dict[Cell, int] = {
+        (0, 0, 0): 2,
+        (12, 0, 0): 2,
+        (20, 0, 0): 2,
+        (30, 0, 0): 2,
+        (40, 0, 0): 0,
+        (60, 0, 0): 0,
+    }
+    value, pose = search(level, evidence_of(cells, 4), np.zeros(4), (0.0,), 1)
+    # one cell aside: free cells are left, walls are not
+    assert value == pytest.approx(0.75 * (2 - 0) / 4 + 0.25 * 1 / 2, abs=1e-5)
+    assert abs(pose[1:]).max() == V
+    free = {(20 + x, y, z): 254 for x in range(-3, 4) for y in range(-3, 4) for z in range(-3, 4)}
+    free |= {(60 + x, y, z): 254 for x in range(-3, 4) for y in range(-3, 4) for z in range(-3, 4)}
+    value, pose = search(
+        build_level(block_map(target | free), V, COARSE),
+        evidence_of(cells, 4),
+        np.zeros(4),
+        (0.0,),
+        1,
+    )
+    assert value == pytest.approx(0.75 * (2 - 1) / 4 + 0.25 * (1 - 1) / 2, abs=1e-5)
+    assert not pose.any()
+
+
+@given(st.integers(0, 10_000), st.sampled_from([1, 2]))
+@settings(max_examples=8, deadline=None)
+def test_a_search_finds_the_best_of_all_its_poses(seed: int, step: int) -> None:
+    """Every turn and shift that is tried, one by one, by look-ups of the turned and moved voxels."""
+    rng = np.random.default_rng(seed)
+    level = build_level(block_map(random_cells(seed, 500)), V, COARSE)
+    e = evidence_of({c: s for c, s in random_cells(seed + 1, 30, -6, 7).items() if occupied(s)}, 8)
+    start = np.r_[rng.uniform(-3, 3), rng.uniform(-0.5, 0.5, 3)]
+    yaws = (-0.2, 0.0, 0.3)
+
+    def value(pose: NDArray[np.float64]) -> float:
+        mask = look_up(level, apply(pose_matrix(pose), e.centres))
+        hit = ((mask & e.bits) != 0).astype(int) - (mask == FREE_BIT)
+        return float(0.75 * hit[:8].mean() + 0.25 * hit[8:].mean())
+
+    sides = [step * V * np.arange(-n, n + 1) for n in (2, 2, 1)]
+    poses = [
+        start + np.array([yaw, x, y, z])
+        for yaw in yaws
+        for x in sides[0]
+        for y in sides[1]
+        for z in sides[2]
+    ]
+    found, pose = search(level, e, start, yaws, step)
+    # of equals the nearest: 1e-6 a cell
+    assert found == pytest.approx(max(map(value, poses)), abs=2e-5)
+    assert value(pose) == pytest.approx(found, abs=2e-5)
+    assert np.abs(np.array(poses) - pose).max(1).min() < 1e-9
+
+
+def test_of_equally_good_poses_the_one_nearest_the_start_is_taken() -> None:
+    """A wall along x holds nothing along it: the search stays where it began, and takes the least
+    turn.
+    """
+    level = build_level(
+        block_map({(x, 0, z): 2 for x in range(-40, 40) for z in range(10)}), V, COARSE
+    )
+    cells: dict[Cell, int] = {(x, 0, z): 2 for x in range(-3, 4) for z in range(3, 6)}
+    start = np.array([0.0, 0.3, 0.1, 0.2])
+    _, pose = search(level, evidence_of(cells, len(cells)), start, (0.02, -0.01, 0.0, 0.01), 2)
+    np.testing.assert_array_equal(pose, start)
+
+
 def test_structure_scores_by_hand() -> None:
     target = Target(block_map({(0, 0, 0): 2, (0, 0, 1): 254, (4, 0, 0): 254, (8, 0, 0): 8}), V)
     query_cells: dict[Cell, int] = {
@@ -287,6 +384,68 @@ def test_structure_scores_by_hand() -> None:
         False,
         True,
     ]
+
+
+def test_ranks_by_hand() -> None:
+    """Below a coverage of a half the structure counts less in proportion; what contradicts free
+    space is taken off in full.
+    """
+    assert float(rank(0.8, 0.25, 0.1)) == pytest.approx(0.8 * 0.5 - 0.1)
+    assert float(rank(0.8, 0.5, 0.1)) == pytest.approx(0.7)
+    assert float(rank(0.8, 0.9, 0.1)) == pytest.approx(0.7)
+    assert Scores(0.8, 0.25, 0.1, 99).rank == pytest.approx(0.3)
+    np.testing.assert_allclose(
+        rank(np.array([1.0, 0.5]), np.array([0.1, 1.0]), np.array([0.0, 0.25])), [0.2, 0.25]
+    )
+
+
+def test_some_of_the_evidence_is_three_quarters_structure() -> None:
+    cells: dict[Cell, int] = {(x, 0, 0): 2 for x in range(40)}
+    cells.update({(x, 5, 0): 0 for x in range(20)})
+    e = evidence_of(cells, 40)
+    some = e.first(16)
+    assert (some.structure, len(some.bits)) == (12, 16)
+    np.testing.assert_array_equal(some.centres[:, 1] == 0.5 * V, [True] * 12 + [False] * 4)
+    every = e.first(1000)
+    assert (every.structure, len(every.bits)) == (40, 60)
+
+
+def test_of_a_cell_the_most_certain_point_stays() -> None:
+    points = np.array(
+        [[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1], [1.1, 0.1, 0.1], [1.2, 0.1, 0.1]]
+    )
+    assert sorted(thin_points(points, 0.5, np.zeros((5, 3))).tolist()) == [0, 3]
+    spread = np.array(
+        [[0.3, 0.0, 0.0], [0.0, 0.1, 0.1], [0.0, 0.0, 0.2], [0.2, 0.0, 0.0], [0.0, 0.2, 0.0]]
+    )
+    assert sorted(thin_points(points, 0.5, spread).tolist()) == [1, 3]
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_an_alignment_is_measured_as_it_is(degrees: int) -> None:
+    """Planes of the town under the true transform: nearly all points lie on them, and every third
+    point stands for three.
+    """
+    truth = yaw_transform(np.radians(degrees), (3.0, -2.0, 0.5))
+    target = Target(block_map(town()), V)
+    points = points_of(town())
+    query = Query(block_map(moved(town(), truth)), apply(inverse(truth), points), V)
+    found = measured(truth, target.surface, query)
+    np.testing.assert_array_equal(found.target_T_query, truth)
+    assert found.inliers > 0.99
+    assert found.rmse < 0.1 * V
+    assert found.count == pytest.approx(len(points[::3]), rel=0.01)
+    whole = align(query.points, target.surface, truth, (Step(0.4 * V, 0, 1),))
+    np.testing.assert_allclose(
+        found.information[:3, :3],
+        whole.information[:3, :3],
+        rtol=0.05,
+        atol=0.02 * whole.information.max(),
+    )
+    beside = measured(
+        yaw_transform(np.radians(degrees), (3.0, -2.0, 0.5 + 0.3)), target.surface, query
+    )
+    assert beside.inliers < 0.9
 
 
 def test_evidence_of_unlabelled_voxels_asks_for_anything_occupied() -> None:

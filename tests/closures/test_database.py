@@ -107,6 +107,36 @@ def test_a_query_sees_its_own_drive_but_for_what_is_near_in_time_and_road(
     assert len(database.keyframes(0)) == 60  # the database itself is as it was
 
 
+@pytest.mark.parametrize(
+    ("seconds", "distance", "first_hidden"),
+    [
+        (10.0, 0.0, 50),  # a keyframe a second: 50 to 59 are nearer in time than 10 s
+        (0.0, 60.0, 45),  # a keyframe every 4 m: 45 to 59 are nearer along the road than 60 m
+        (10.0, 60.0, 45),
+        (20.0, 60.0, 40),
+        (0.0, 0.0, 59),  # itself
+    ],
+)
+def test_time_and_road_each_hide_what_is_nearer_than_their_setting(
+    out_and_back: tuple[Database, SessionMap],
+    tmp_path: Path,
+    seconds: float,
+    distance: float,
+    first_hidden: int,
+) -> None:
+    _, session = out_and_back
+    settings = Settings.model_validate(
+        {"closures": {"exclude_seconds": seconds, "exclude_distance": distance}}
+    ).resolved()
+    seen = Database(Workspace(tmp_path), ("a",), settings).asked_by(session, 59).keyframes(0)
+    # a stretch of 4.8 m is hidden as a whole, and with it one keyframe more at most
+    assert seen.tolist() in (list(range(first_hidden)), list(range(first_hidden - 1)))
+    middle = Database(Workspace(tmp_path), ("a",), settings).asked_by(session, 30).keyframes(0)
+    reach = 59 - first_hidden
+    assert {30 - reach, 30, 30 + reach}.isdisjoint(middle.tolist())
+    assert {30 - reach - 2, 30 + reach + 2} <= set(middle.tolist())
+
+
 def test_submaps_of_which_nothing_may_be_seen_are_left_out(tmp_path: Path) -> None:
     road = np.stack([np.arange(60) * 4.0, np.zeros(60)], 1)
     none = np.zeros((0, 3))
@@ -231,3 +261,32 @@ def test_a_drive_without_poses_does_not_answer_itself(tmp_path: Path) -> None:
     )
     view = Database(work, ("a",), Settings().resolved()).asked_by(SessionMap(session.folder), 99)
     assert allowed_places(view, session) == {}
+
+
+@pytest.mark.parametrize(
+    ("query", "targets", "semantic", "geometric"),
+    [
+        ("log", ("log", "geometry"), [True, False], [False, True]),
+        ("onnx", ("log", "onnx"), [True, True], None),
+        ("geometry", ("log", "geometry"), None, [True, True]),
+    ],
+)
+def test_classes_are_compared_where_both_sides_know_them(
+    tmp_path: Path,
+    query: str,
+    targets: tuple[str, str],
+    semantic: list[bool] | None,
+    geometric: list[bool] | None,
+) -> None:
+    work = Workspace(tmp_path)
+    road = np.stack([np.arange(20) * 4.0, np.zeros(20)], 1)
+    for name, source in zip("qab", (query, *targets), strict=True):
+        folder = drive_session(work, name, road, [(0, 20)], [np.zeros((0, 3))]).folder
+        write_json(folder.session_json, read_json(folder.session_json) | {"label_source": source})
+    found = allowed_places(
+        Database(work, ("a", "b"), Settings().resolved()), SessionMap(work.session("q"))
+    )
+    expected = {"semantic": semantic, "geometric": geometric}
+    assert {variant: allowed.groups.tolist() for variant, allowed in found.items()} == {
+        k: x for k, x in expected.items() if x
+    }

@@ -101,6 +101,99 @@ def test_neighbours_add_and_take() -> None:
     assert decided(alone=0.97, neighbours=12, opposing=10.0) < 0.9
 
 
+def test_less_support_than_the_least_is_never_right() -> None:
+    """However well the rest fits: a handful of voxels fits anywhere."""
+    model = dataclasses.replace(shipped(), least_support=3.0)
+    values = np.array([own_values(dataclasses.replace(GOOD, support=s)) for s in (2.999, 3.0, 4.0)])
+    np.testing.assert_array_equal(model.own(values) > 0.9, [False, True, True])
+    assert model.own(values)[0] == 0.0
+    assert shipped().least_support > 3.0
+    assert (
+        shipped().own(own_values(dataclasses.replace(GOOD, support=shipped().least_support - 1e-4)))
+        == 0.0
+    )
+
+
+def steep(weights: dict[str, float], bias: float) -> Calibration:
+    """A model of some of the values of agreement."""
+    n = len(TOGETHER)
+    return Calibration(
+        tuple(weights.get(name, 0.0) for name in TOGETHER), (-9.0,) * n, (9.0,) * n, bias
+    )
+
+
+def test_which_model_decides() -> None:
+    """Near neighbours only: the model of near ones; far ones too, whether they agree or not: the
+    other. No neighbours: the alignment.
+    """
+    model = dataclasses.replace(
+        shipped(), near=steep({}, -1.0), together=steep({}, 1.0), most_alike=0.5
+    )
+
+    def by(**values: float) -> float:
+        a = Agreement(**values)  # type: ignore[arg-type]
+        return float(model.decided([np.array([getattr(a, n)]) for n in AGREEMENT])[0])
+
+    near = 1 / (1 + np.exp(1.0))
+    together = 1 / (1 + np.exp(-1.0))
+    assert by(alone=0.7, neighbours=3) == pytest.approx(near)
+    assert by(alone=0.7, neighbours=3, far_agreeing=0.1) == pytest.approx(together)
+    assert by(alone=0.7, neighbours=3, far_opposing=0.1) == pytest.approx(together)
+    assert by(alone=0.7, far_agreeing=5.0) == 0.7
+    # what is impossible by itself stays so
+    assert by(alone=0.0, neighbours=3, far_agreeing=5.0) == 0.0
+    assert by(alone=0.7, neighbours=3, lookalike=0.5) == pytest.approx(near)
+    assert by(alone=0.7, neighbours=3, lookalike=0.51) == pytest.approx(near / 2)
+
+
+def test_without_agreement_all_counts_are_zero() -> None:
+    assert dataclasses.astuple(Agreement(0.5)) == (0.5, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_the_reason_is_the_first_that_holds() -> None:
+    neighbours = Agreement(0.999, 12, agreeing=3.0, opposing=2.0)
+    assert "neighbouring" not in reason(
+        GOOD, 0.5, 0.99, dataclasses.replace(neighbours, neighbours=0)
+    )
+    assert "neighbouring" not in reason(
+        GOOD, 0.5, 0.99, dataclasses.replace(neighbours, alone=0.98)
+    )
+    assert "neighbouring" in reason(GOOD, 0.5, 0.99, dataclasses.replace(neighbours, alone=0.99))
+    assert "right with 60%" in reason(
+        GOOD, 0.594, 0.99, neighbours, sigma=0.1, precision=0.9999, share=0.6
+    )
+    # the lesser of the two
+    assert "known to 0.50 m" in reason(
+        GOOD, 0.52, 0.99, neighbours, sigma=0.5, precision=0.6, share=0.87
+    )
+    assert "look like others" in reason(
+        GOOD, 0.495, 0.99, dataclasses.replace(neighbours, lookalike=0.9)
+    )
+    assert "look like others" not in reason(
+        GOOD, 0.494, 0.99, dataclasses.replace(neighbours, lookalike=0.9)
+    )
+
+
+def test_logistic_regression_counts_rows_and_takes_offsets() -> None:
+    """A row that counts three times is three rows; log-odds that are known already are not fitted
+    again.
+    """
+    rng = np.random.default_rng(1)
+    x = rng.normal(0, 1, (400, 2))
+    right = rng.random(400) < 1 / (1 + np.exp(-(x @ [1.0, -2.0] + 0.5)))
+    twice = np.r_[np.arange(400), np.arange(100)]
+    counts = np.r_[np.full(100, 2.0), np.ones(300)]
+    z = (x - x[twice].mean(0)) / x[twice].std(0)  # scaled alike, so that the ridge is one
+    (w, b), (expected, bias) = (
+        fit_logistic(z, right, 1e-9, counts),
+        fit_logistic(z[twice], right[twice], 1e-9),
+    )
+    np.testing.assert_allclose([*w, b], [*expected, bias], rtol=1e-5)
+    w, b = fit_logistic(x[:, :1], right, 1e-9, offset=-2.0 * x[:, 1])
+    np.testing.assert_allclose([w[0], b], [1.0, 0.5], atol=0.3)
+    assert abs(fit_logistic(x[:, :1], right, 1e-9)[0][0] - w[0]) > 0.1
+
+
 def test_a_model_as_json_and_back() -> None:
     model = shipped().together
     assert Calibration.from_json(model.to_json(TOGETHER), TOGETHER) == model

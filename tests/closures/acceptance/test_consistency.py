@@ -25,7 +25,16 @@ from semloc_logs.closures.acceptance.consistency import (
     decide,
     shares,
 )
-from semloc_logs.closures.acceptance.placements import ARM, DRIFT, FAR, Placed, place, strays
+from semloc_logs.closures.acceptance.placements import (
+    ARM,
+    DRIFT,
+    FAR,
+    Placed,
+    asked_roads,
+    pairs_of,
+    place,
+    strays,
+)
 from semloc_logs.closures.closure import Agreement, Alignment
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
@@ -217,6 +226,69 @@ def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself() -> None:
     assert refuted.probability == 0.0
     assert "odometry" in refuted.reason
     assert right.probability > 0.9
+
+
+@pytest.mark.parametrize(
+    ("off", "way", "is_stray"),  # 10 voxels = 3 m, and 5 % of the way
+    [
+        (2.9, 0.0, False),
+        (3.1, 0.0, True),
+        (7.9, 100.0, False),
+        (8.1, 100.0, True),
+        (7.9, -100.0, False),
+    ],
+)
+def test_how_far_off_its_own_odometry_a_session_may_be(
+    off: float, way: float, is_stray: bool
+) -> None:
+    def placed(query: str, target: str, posed: bool = True) -> Placed:
+        at = yaw_transform(0.0, (0.0, off, 0.0))[None]
+        half = np.full(1, 0.5)
+        return Placed(
+            np.array([query], object),
+            np.array([target], object),
+            np.zeros(1, np.int64),
+            np.array([150.0]),
+            np.array([150.0 + way]),
+            np.eye(4)[None],
+            at,
+            half,
+            half,
+            half,
+            np.array([posed]),
+        )
+
+    assert strays(placed("a", "a"), 0.3).tolist() == [is_stray]
+    assert strays(placed("a", "b"), 0.3).tolist() == [False]
+    assert strays(placed("a", "a", posed=False), 0.3).tolist() == [False]
+
+
+def test_roads_of_queries_are_counted_once_whatever_answers() -> None:
+    rows = [
+        alignment(30, 0.5),
+        alignment(20, 0.5),
+        alignment(20, 0.5, at=50),
+        alignment(40, 0.5, query="b", target="a"),
+    ]
+    roads = asked_roads(place(rows, MAPS))
+    assert {name: road.tolist() for name, road in roads.items()} == {"a": [40.0, 60.0], "b": [80.0]}
+
+
+def test_alignments_of_one_pair_of_sessions_belong_together() -> None:
+    rows = [
+        alignment(30, 0.5),
+        alignment(20, 0.5),
+        alignment(40, 0.5, query="b", target="a"),
+        alignment(25, 0.5),
+    ]
+    assert {pair: r.tolist() for pair, r in pairs_of(place(rows, MAPS)).items()} == {
+        ("a", "b"): [1, 3, 0],
+        ("b", "a"): [2],
+    }
+    unposed = {"a": session(ROAD, posed=False), "b": MAPS["b"]}
+    assert {pair: r.tolist() for pair, r in pairs_of(place(rows, unposed)).items()} == {
+        ("b", "a"): [2]
+    }
 
 
 def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_else() -> None:
