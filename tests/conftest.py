@@ -2,10 +2,12 @@
 beside the checkout.
 """
 
+import importlib.util
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -36,3 +38,17 @@ def shared() -> Callable[[str], Path]:
         return path
 
     return find
+
+
+def _load_helper(name: str) -> None:
+    """Make ``tests/NAME.py`` importable as ``tests.NAME``; the tests have no package."""
+    spec = importlib.util.spec_from_file_location(f"tests.{name}", ROOT / "tests" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules.setdefault("tests", ModuleType("tests"))
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+
+
+_load_helper("lossy_disk")

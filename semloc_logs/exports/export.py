@@ -14,7 +14,8 @@ from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
 from semloc_logs.numerics.transforms import translation_quaternion
-from semloc_logs.tables.table import read_table, replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
+from semloc_logs.tables.table import read_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 

@@ -32,7 +32,8 @@ from semloc_logs.numerics.prefetch import ahead
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, Resolved, ResolvedFusion
 from semloc_logs.tables import contracts
-from semloc_logs.tables.table import replacing_folder, write_json, write_table
+from semloc_logs.tables.atomic_files import replacing_folder
+from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.carve import Carver
 from semloc_logs.voxels.grid import BlockMap, Fuser, empty_map
 from semloc_logs.voxels.store import (

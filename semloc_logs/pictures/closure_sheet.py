@@ -20,7 +20,7 @@ from semloc_logs.pictures.lettering import FONT, INK, SOFT, Sheet
 from semloc_logs.pictures.map_picture import GEOMETRY_NAMES
 from semloc_logs.pictures.solids import Solid, View, draw_solids, top_view
 from semloc_logs.subvolumes.cut import SIZE
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
-from semloc_logs.tables.table import read_table, replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
+from semloc_logs.tables.table import read_table
 from semloc_logs.workspace import Workspace
 
 WIDTH = 1400

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import UNLABELLED, cityscapes
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 U8 = NDArray[np.uint8]

@@ -19,7 +19,8 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.labels.space import GROUND, UNLABELLED, cityscapes
 from semloc_logs.pictures.lettering import Sheet
-from semloc_logs.tables.table import read_table, replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
+from semloc_logs.tables.table import read_table
 from semloc_logs.voxels.keys import BLOCK
 
 # pixels along the longer edge: small maps are enlarged to the first, large ones reduced to the

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 
 SIZE, MARGIN = 720, 80  # px
 COLOURS = ((120, 120, 120), (214, 120, 20), (20, 90, 200))  # RGB

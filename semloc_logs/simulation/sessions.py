@@ -33,6 +33,7 @@ from semloc_logs.simulation.town.road_network import (
 )
 from semloc_logs.simulation.town.street import build_street, street_ground
 from semloc_logs.simulation.town.survey import drive_network, opposite_lane, read_drive
+from semloc_logs.tables.atomic_files import replacing_file
 
 _BLOCK = 85.0  # m between crossings
 _START_NS = 1_760_000_000_000_000_000
@@ -247,9 +248,8 @@ def write_sessions(
     for session in sessions:
         _write(folder, network, session, seed, sensor, format)
     entries = {s.file: {"trajectory": Path(s.file).with_suffix(".tum").name} for s in sessions}
-    part = truth.with_suffix(".part")
-    part.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
-    part.replace(truth)
+    with replacing_file(truth) as temporary:
+        temporary.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
     return truth
 
 

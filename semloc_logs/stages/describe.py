@@ -15,7 +15,8 @@ from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of, recorded_fingerprint
 from semloc_logs.stages.report import Report
 from semloc_logs.subvolumes.submap_descriptors import DescribeTask, variants_for
-from semloc_logs.tables.table import read_json, replacing_folder, write_json
+from semloc_logs.tables.atomic_files import replacing_folder
+from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words.submap_words import index_submap, write_words
 from semloc_logs.workspace import SessionFolder, Workspace

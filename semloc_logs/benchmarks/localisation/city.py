@@ -22,7 +22,7 @@ from semloc_logs.simulation.meshes.objects import resample
 from semloc_logs.simulation.sessions import Sensor, Session, write_sessions
 from semloc_logs.simulation.town.road_network import left_of
 from semloc_logs.simulation.town.survey import drive_network, opposite_lane
-from semloc_logs.tables.table import replacing_folder
+from semloc_logs.tables.atomic_files import replacing_folder
 
 F64 = NDArray[np.float64]
 SEED = 300
