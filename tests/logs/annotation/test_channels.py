@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -349,22 +348,3 @@ def test_run_id_follows_content() -> None:
     assert all(run_id(*other) != same for other in others)
     assert re.fullmatch("[0-9a-f]{16}", same)
     assert channel_metadata(same, "1")["semloc.run_id"] == same
-
-
-@pytest.mark.parametrize(
-    ("module", "above"),
-    [
-        ("channels", []),
-        ("channels_ros", ["channels"]),
-        ("channels_foxglove", ["channels"]),
-        ("mcap_append", ["channels"]),
-        ("tail_swap", ["channels", "mcap_append"]),
-    ],
-)
-def test_what_writes_channels_imports_in_one_direction(
-    repository: Path, module: str, above: list[str]
-) -> None:
-    text = (repository / "semloc_logs" / "logs" / f"{module}.py").read_text()
-    rooms = "channels|channels_ros|channels_foxglove|annotate|mcap_append|tail_swap|rosbag_copy"
-    found = re.findall(rf"from semloc_logs\.logs\.({rooms}) import", text)
-    assert set(found) <= set(above)

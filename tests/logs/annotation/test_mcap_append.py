@@ -30,7 +30,7 @@ from semloc_logs.logs.annotation.annotate import (
 from semloc_logs.logs.annotation.mcap_append import read_end
 from semloc_logs.logs.containers.open import open_log
 
-SHARED = Path(__file__).resolve().parents[2].parent / "shared"
+SHARED = Path(__file__).resolve().parents[4] / "shared"
 CONFORMANCE = SHARED / "odd_logs" / "mcap_conformance"
 NO_TIMES: dict[int, int] = {}
 
