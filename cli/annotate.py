@@ -75,6 +75,7 @@ def command(
     else:
         replaced = ", earlier results replaced" if made.replaced else ""
         console.result(
-            f"{made.path}: {made.closures} closures in {made.messages} messages, {made.bytes_written} bytes{replaced}"
+            f"{made.path}: {made.closures} closures in {made.messages} messages,"
+            f" {made.bytes_written} bytes{replaced}"
         )
     return 0

@@ -38,7 +38,8 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
     metavar="NAME=PYTHON",
     multiple=True,
     callback=pairs,
-    help="What to compare with and the Python that has it (benchmarks/README.md): octomap or kiss_slam for fusion, fpfh for retrieval, "
+    help="What to compare with and the Python that has it (benchmarks/README.md): octomap or"
+    " kiss_slam for fusion, fpfh for retrieval, "
     "faiss for search, scan_context, fpfh_ransac, kiss_matcher or map_closures for localisation.",
 )
 @click.option(
@@ -67,12 +68,14 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
     "--queries",
     type=click.IntRange(1),
     metavar="N",
-    help="Words that ask, for retrieval (default 2000), or queries of each condition, for localisation (default 40).",
+    help="Words that ask, for retrieval (default 2000), or queries of each condition, for"
+    " localisation (default 40).",
 )
 @path_option("--picture", help="PNG of some subvolumes to write, for completion.")
 @path_option(
     "--work",
-    help="Folder that keeps the simulated streets, for retrieval, completion, scaling and localisation.",
+    help="Folder that keeps the simulated streets, for retrieval, completion, scaling and"
+    " localisation.",
 )
 @json_option
 @settings_options
@@ -189,7 +192,7 @@ def _measure(
     lengths: tuple[int, ...],
     settings: Resolved,
 ) -> tuple[dict[str, dict[str, Any]], Rows]:
-    """The figures of benchmark ``name`` and, where it profiles, the functions that took most time."""
+    """The figures of benchmark ``name`` and, of a profile, the functions that took most time."""
     if name == "pipeline":
         from semloc_logs.benchmarks.whole_logs import profile_pipeline
 

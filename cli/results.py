@@ -1,4 +1,4 @@
-"""What several commands print about a run: closures as a table, and what was skipped."""
+"""Output that several commands share: closures as a table, and skipped input."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def checked_name(name: str) -> str:
 
 
 def finish(*reports: Report) -> int:
-    """Print what was skipped or failed; the exit code."""
+    """Print the sentences about skipped and failed input; the exit code."""
     sentences = list(dict.fromkeys(s for r in reports for s in (*r.skipped, *r.failed)))
     for sentence in sentences:
         console.warn(sentence)
@@ -114,7 +114,8 @@ def show_closures(work: Workspace) -> None:
     if len(rows) > SHOWN:
         console.result(f"... and {len(rows) - SHOWN} more.")
     console.result(
-        f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in {work.rejected}"
+        f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in"
+        f" {work.rejected}"
     )
     if work.picture.exists():
         console.result(f"Picture: {work.picture}")

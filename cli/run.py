@@ -49,7 +49,7 @@ def command(
     engine: EngineChoice,
     settings: Resolved,
 ) -> int:
-    """Logs -> loop closures, all of it: fuse, describe, close and, if asked for, annotate. Each LOG
+    """Logs -> loop closures, all of it: fuse, describe, close and, with --annotate, annotate. Each LOG
     is a session.
 
     Can be interrupted and run again: finished work is kept. A log that cannot be read is named, the

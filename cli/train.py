@@ -126,7 +126,8 @@ def command(
             if found is None:
                 opened.stop()  # scenes that are being made are made again
                 console.warn(
-                    f"{minutes:g} minutes are over and {where} is written: the same command goes on from there."
+                    f"{minutes:g} minutes are over and {where} is written: the same command goes"
+                    " on from there."
                 )
                 return 3
             scores[name] = found

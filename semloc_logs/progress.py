@@ -1,7 +1,7 @@
-"""Progress of long work as events; whoever wants to show them listens, and nobody has to.
+"""Progress of long work, as events that a listener may show.
 
-A stage reports from whatever process it runs in: the engines carry the events of their workers,
-and what is logged there, to the process that started them.
+A stage reports from the process it runs in. Engines carry the events and log records of their
+workers to the process that started them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Listener = Callable[[Progress], None]
 
 
 def _ignore(_: Progress) -> None:
-    """Nobody listens."""
+    """The listener until another one is set."""
 
 
 _listener: Listener = _ignore

@@ -1,4 +1,4 @@
-"""Where tasks run: in this process or in several; a stage receives an engine and never makes one."""
+"""Where tasks run: in this process or in several. A stage is given its engine."""
 
 from semloc_logs.engines.base import Engine, Serial
 from semloc_logs.engines.choice import ENGINES, make_engine

@@ -1,4 +1,4 @@
-"""Engines run picklable tasks with a plain function and give the results in the order of the tasks."""
+"""Engines call a plain function on picklable tasks; results come in the order of the tasks."""
 
 from __future__ import annotations
 

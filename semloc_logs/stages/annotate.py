@@ -92,7 +92,7 @@ def _results(work: Workspace, own: SessionMap, name: str, settings: Resolved) ->
 
 
 def _record(work: Workspace, own: SessionMap, name: str, row: dict[str, Any]) -> ClosureRecord:
-    """A closure with what the channels need beside the row: poses in the frames of the pose streams."""
+    """A closure as the channels need it: with poses in the frames of the pose streams."""
     target = SessionMap(work.session(row["target_session"]))
     target_end = keyframe_at(target, row["target_stamp_ns"])
     translation = np.array([row["t_x"], row["t_y"], row["t_z"]])

@@ -114,7 +114,7 @@ def _describe_session(
 
 
 def _weights(settings: Resolved) -> str:
-    """Fingerprint of weights and vocabulary given as files; the shipped ones belong to the version."""
+    """Fingerprint of weights and vocabulary given as files; shipped ones belong to the version."""
     paths = [settings.descriptor.weights, settings.descriptor.vocabulary]
     files = [path for path in paths if path is not None and path.is_file()]
     return fingerprint_of(hashlib.sha256(path.read_bytes()).hexdigest() for path in files)

@@ -1,4 +1,4 @@
-"""What a stage did."""
+"""Reports of stages."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 
 @dataclass(slots=True)
 class Report:
-    """Names of what was done and of what was up to date before, sentences about input that was
-    skipped and about logs that failed, seconds of each stage, and the number of closures.
+    """The outcome of a stage, or of several.
+
+    ``done`` and ``kept`` name the work that was done and the work that was up to date; ``skipped``
+    and ``failed`` are sentences about input that was left out; ``seconds`` are by stage.
     """
 
     done: list[str] = field(default_factory=list)

@@ -80,9 +80,16 @@ def cloud(seconds: float, x: float) -> Any:
     size = points.nbytes
     return make(
         "sensor_msgs/msg/PointCloud2",
-        header=header(seconds, "lidar"), height=1, width=len(points), fields=fields, is_bigendian=False, point_step=12, row_step=size,
-        data=points.reshape(-1).view(np.uint8), is_dense=True,
-    )  # fmt: skip
+        header=header(seconds, "lidar"),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=size,
+        data=points.reshape(-1).view(np.uint8),
+        is_dense=True,
+    )
 
 
 def drive(
@@ -199,8 +206,8 @@ def test_poses_beyond_what_a_map_reaches_are_1_and_a_sentence(tmp_path: Path) ->
     )
     assert done.exit_code == 1
     assert (
-        "the poses have come 5300 km from the first at 2023-11-14T22:13:20.500Z, but a map of 0.3 m voxels reaches 900 km"
-        in done.stderr
+        "the poses have come 5300 km from the first at 2023-11-14T22:13:20.500Z, but a map of 0.3"
+        " m voxels reaches 900 km" in done.stderr
     )
     assert not session
     done, _ = fuse(drive(tmp_path / "b.mcap", [(t, x + 5.3e6) for t, x in GOOD]))

@@ -64,7 +64,10 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
     "args", [["--help"], ["run", "--help"], ["--version"], ["benchmark", "--help"], ["nothing"]]
 )
 def test_start_up_imports_nothing_heavy(args: list[str]) -> None:
-    code = f"import sys; sys.argv = ['semloc', *{args!r}]\nfrom semloc_logs.cli.main import main\ntry: main()\nexcept SystemExit: pass\n"
+    code = (
+        f"import sys; sys.argv = ['semloc', *{args!r}]\nfrom semloc_logs.cli.main import"
+        " main\ntry: main()\nexcept SystemExit: pass\n"
+    )
     code += f"print('HEAVY', *[m for m in {HEAVY!r} if m in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=30

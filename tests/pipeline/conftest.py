@@ -90,7 +90,7 @@ class Drive:
 
 
 def crossing() -> World:
-    """Two streets that cross at the origin, and other houses, trees, poles and cars on every side."""
+    """Two streets that cross at the origin; each side has other houses, trees, poles and cars."""
     rng = np.random.default_rng(4)
     builder = MeshBuilder(lambda x, y: 0 * x)
     builder.add(box(120.0, 120.0, 1.0, z=-1.0), ROAD, ground="none")
@@ -292,6 +292,6 @@ def _coarse(tmp_path_factory: pytest.TempPathFactory, drives: dict[str, Drive]) 
 
 @pytest.fixture
 def coarse(_coarse: Workspace, tmp_path: Path) -> Iterator[Workspace]:
-    """Monday and Tuesday, fused, described and closed under coarse settings; the test's own copy."""
+    """Monday and Tuesday, closed under coarse settings; a copy that belongs to the test."""
     yield Workspace(Path(shutil.copytree(_coarse.path, tmp_path / "work")))
     shutil.rmtree(tmp_path / "work")

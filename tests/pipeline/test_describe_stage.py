@@ -145,7 +145,7 @@ def test_files_of_weights_and_vocabulary_are_inputs(
 
 
 def variants(work: Workspace, name: str) -> list[str]:
-    """The kinds of words in the tables of a session, which have to be those that words.json lists."""
+    """The variants of words in the tables of a session; words.json has to list the same."""
     found = sorted(
         set(read_table(work.session(name).words / "submap-00000.parquet")["variant"].to_pylist())
     )
