@@ -231,8 +231,8 @@ def query_options(function: Function) -> Function:
             "--query-frames",
             type=int,
             metavar="N",
-            help="A query is fused from so many keyframes around it; 1 makes single-frame queries, as"
-            " logs without poses always do.  "
+            help="A query is fused from so many keyframes around it; 1 makes single-frame"
+            " queries, as for logs without poses.  "
             "[default: 5]",
         ),
     ):

@@ -49,8 +49,9 @@ def command(
     engine: EngineChoice,
     settings: Resolved,
 ) -> int:
-    """Logs -> loop closures, all of it: fuse, describe, close and, with --annotate, annotate. Each LOG
-    is a session.
+    """Logs -> loop closures: fuse, describe, close and, with --annotate, annotate.
+
+    Each LOG is a session.
 
     Can be interrupted and run again: finished work is kept. A log that cannot be read is named, the
     others are done, and the exit code is 3.

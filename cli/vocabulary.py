@@ -74,7 +74,7 @@ def command(
 
     \b
     Example:  semloc vocabulary --variant semantic -o words.safetensors -w work
-              semloc vocabulary --variant both -o vocabularies --shards weights/checkpoint/simulated-01
+              semloc vocabulary --variant both -o vocabularies --shards weights/checkpoint/simulated
     """
     from semloc_logs.engines.processes import cores
     from semloc_logs.training.runs import given_shards, learn_vocabulary, use_threads

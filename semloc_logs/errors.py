@@ -1,6 +1,7 @@
 """The errors of the package: each is one sentence with the fault, its place and the remedy.
 
-The place is a file, a topic, an offset or a time. Only :mod:`semloc_logs.cli` turns them into exit codes.
+The place is a file, a topic, an offset or a time.
+Only :mod:`semloc_logs.cli` turns them into exit codes.
 """
 
 
