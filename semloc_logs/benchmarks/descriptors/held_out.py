@@ -11,7 +11,6 @@ a step. Streets are kept in a folder.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs import simulation
 from semloc_logs.benchmarks.descriptors.places import (
     HEADINGS,
     Place,
@@ -31,6 +29,7 @@ from semloc_logs.benchmarks.descriptors.places import (
     read_street,
     write_street,
 )
+from semloc_logs.benchmarks.versions import simulation_version
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 from semloc_logs.settings import Resolved
@@ -141,14 +140,6 @@ def held_out(
             f"{database} held-out descriptors cannot be had: {min(counts.values())} at most."
         )
     return HeldOut(tuple(paths), settings, database, queries)
-
-
-def simulation_version() -> str:
-    """Of the simulation: a hash of its modules."""
-    package = Path(simulation.__file__).parent
-    return hashlib.sha256(
-        b"".join(path.read_bytes() for path in sorted(package.glob("*.py")))
-    ).hexdigest()[:12]
 
 
 def _is_made(path: Path, note: dict[str, Any]) -> bool:
