@@ -56,6 +56,7 @@ INNER_ORDER = {
         "sensors",
         "drives",
         "output",
+        "plan",
         "sessions",
         "demo",
     ],
