@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.numerics.transforms import apply, interpolate
 from semloc_logs.simulation.drives.traffic import Traffic
@@ -34,11 +33,6 @@ class DriveFrame:
     odom_T_base: F64
     base_T_lidar: F64
     sweep: Sweep
-
-    @property
-    def points_base(self) -> NDArray[np.float32]:
-        """Points (n, 3) in the base frame, the motion during the sweep left in."""
-        return apply(self.base_T_lidar, self.sweep.points).astype(np.float32)
 
 
 def mounting(model: LidarModel) -> F64:

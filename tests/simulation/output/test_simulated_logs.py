@@ -59,7 +59,8 @@ def test_drive_frames_are_on_time_and_in_place(
     assert [f.stamp_ns for f in frames[:3]] == [START, START + 500_000_000, START + 1_000_000_000]
     assert frames[-1].stamp_ns + 100_000_000 <= trajectory.stamps_ns[-1]
     for frame in frames:
-        walls = apply(frame.world_T_base, frame.points_base)[frame.sweep.labels == WALL]
+        points = apply(frame.world_T_base @ frame.base_T_lidar, frame.sweep.points)
+        walls = points[frame.sweep.labels == WALL]
         assert np.median(np.abs(walls[:, 1])) == pytest.approx(5.5, abs=0.05)
 
 
