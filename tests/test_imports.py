@@ -58,11 +58,22 @@ INNER_ORDER = {
         "sensors",
         "drives",
         "output",
+        "plan",
         "sessions",
         "demo",
     ],
     "closures": ["closure", "query", "acceptance", "closure_tables", "database", "matching"],
-    "benchmarks": ["scans", "peers", "descriptors", "labels", "localisation", "speed"],
+    "benchmarks": [
+        "spans",
+        "versions",
+        "scans",
+        "fused_sessions",
+        "peers",
+        "descriptors",
+        "labels",
+        "localisation",
+        "speed",
+    ],
 }
 SOURCES = sorted((ROOT / "semloc_logs").rglob("*.py"))
 CLI = sorted((ROOT / "cli").rglob("*.py"))

@@ -5,6 +5,7 @@ rejections (paper 3.4, 3.5).
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -39,6 +40,10 @@ from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
+# how hypotheses for the query at a keyframe are found, and how the words of a query whose ground is
+# at a height are matched; other ways than the package's own are compared with it by benchmarks
+FindHypotheses = Callable[[Database, SessionMap, int, Query], list[Hypothesis]]
+MatchWords = Callable[[Database, str, Allowed, Query, float], tuple[Described, Matches]]
 # candidates of a target session that are fitted on the points: also hopeless ones tell which
 # streets look like others
 ALIGNED = 4
@@ -85,13 +90,18 @@ def close_queries(task: CloseTask) -> list[list[Alignment]]:
     return [close_query(database, session, k) for k in task.keyframes]
 
 
-def close_query(database: Database, session: SessionMap, keyframe: int) -> list[Alignment]:
-    """Alignments of the query at ``keyframe`` with every target session, best first."""
+def close_query(
+    database: Database, session: SessionMap, keyframe: int, find: FindHypotheses | None = None
+) -> list[Alignment]:
+    """Alignments of the query at ``keyframe`` with every target session, best first.
+
+    Hypotheses come from ``find``, by default :func:`find_hypotheses`.
+    """
     database = database.asked_by(session, keyframe)
     query, query_T_base = build_query(session, keyframe, database.settings)
     if not len(query.structure[0]):
         return []
-    hypotheses = find_hypotheses(database, session, keyframe, query)
+    hypotheses = (find or find_hypotheses)(database, session, keyframe, query)
     candidates = verify_hypotheses(database, query, hypotheses)
     out: list[Alignment] = []
     by_session: dict[str, list[Candidate]] = defaultdict(list)
@@ -159,16 +169,20 @@ def match_words(
 
 
 def find_hypotheses(
-    database: Database, session: SessionMap, keyframe: int, query: Query
+    database: Database,
+    session: SessionMap,
+    keyframe: int,
+    query: Query,
+    match: MatchWords = match_words,
 ) -> list[Hypothesis]:
-    """Word matches of the query in all headings, pooled."""
+    """Word matches of the query in all headings, pooled; ``match`` finds them."""
     settings = database.settings
     closures = settings.closures
     v = settings.fusion.voxel_size
     parts: list[tuple[NDArray[np.int64], F64, F64, F64]] = []
     ground = float(session.ground_z[keyframe] - session.map_T_base[keyframe][2, 3])
     for variant, allowed in allowed_places(database, session).items():
-        d, m = match_words(database, variant, allowed, query, ground)
+        d, m = match(database, variant, allowed, query, ground)
         shift = m.centre - turned_about_z(d.centre[m.query].astype(float) * v, m.yaw)
         parts.append((m.group, m.yaw, shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3))
     if not parts:

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import looked_at
+from semloc_logs.alignment.hypotheses import Hypothesis
+from semloc_logs.alignment.verify import Query, looked_at
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.matching import allowed_places
+from semloc_logs.closures.matching import allowed_places, close_query
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.mapping.selection import road_distance
 from semloc_logs.numerics.transforms import yaw_transform
@@ -290,3 +291,15 @@ def test_classes_are_compared_where_both_sides_know_them(
     assert {variant: allowed.groups.tolist() for variant, allowed in found.items()} == {
         k: x for k, x in expected.items() if x
     }
+
+
+def test_a_query_searches_where_it_is_told(out_and_back: tuple[Database, SessionMap]) -> None:
+    database, session = out_and_back
+    searched = []
+
+    def find(view: Database, of: SessionMap, keyframe: int, query: Query) -> list[Hypothesis]:
+        searched.append((of, keyframe, len(view.keyframes(0)) < 60, len(query.structure[0]) > 0))
+        return []
+
+    assert close_query(database, session, 5, find) == []
+    assert searched == [(session, 5, True, True)]

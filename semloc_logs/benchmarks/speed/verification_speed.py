@@ -21,12 +21,6 @@ from semloc_logs.voxels.grid import BlockMap, Fuser
 Figures = dict[str, dict[str, float | str]]
 F64 = NDArray[np.float64]
 ROAD, BUILDING, POLE, TREE = 0, 2, 5, 8
-FRONTS = (
-    (-20.0, 9.0, -3.0, 9.0, 6.0),
-    (6.0, 8.0, 20.0, 10.0, 8.0),
-    (-18.0, -8.0, -2.0, -8.0, 5.0),
-    (6.0, -9.0, 6.0, -20.0, 7.0),
-)
 TRUTH = np.array([0.6, 5.0, -3.0, 0.2])  # target_T_query of the place: yaw, x, y, z
 
 
