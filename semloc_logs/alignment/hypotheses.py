@@ -10,6 +10,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
+# two alignments of a query with one target are the same place: to within so many voxels and degrees
+SAME_PLACE_VOXELS = 3.3
+SAME_PLACE_DEGREES = 5.0
+# m per m of road, and degrees per m: what odometry drifts; the acceptance was calibrated with it
+ODOMETRY_DRIFT = 0.01
+ODOMETRY_TURN_DRIFT = 0.02
 
 
 @dataclass(frozen=True, slots=True)

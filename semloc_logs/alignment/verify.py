@@ -200,32 +200,6 @@ def _apart(found: Sequence[Found], distance: float, most: int) -> list[Found]:
     return [found[i] for i in first_apart(groups, poses, distance, most).tolist()]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Features:
-    """What acceptance looks at; see ``schemas/parquet/rejected.json``."""
-
-    structure: float
-    coverage: float
-    contradiction: float
-    fit: float
-    rmse: float
-    distinct: float
-    support: float
-    stiffness: float
-
-
-FEATURES = (
-    "structure",
-    "coverage",
-    "contradiction",
-    "fit",
-    "rmse",
-    "distinct",
-    "support",
-    "stiffness",
-)
-
-
 def rank(structure: F64 | float, coverage: F64 | float, contradiction: F64 | float) -> F64:
     """Aligned structure, less what contradicts free space: what alignments are ranked by."""
     return np.asarray(structure * np.minimum(1.0, np.divide(coverage, 0.5)) - contradiction)

@@ -16,7 +16,6 @@ from semloc_logs.alignment.icp import Fit
 from semloc_logs.alignment.overlap import tau, yaw_between
 from semloc_logs.alignment.verify import (
     Candidate,
-    Features,
     Query,
     Scores,
     coarse_fit,
@@ -27,8 +26,12 @@ from semloc_logs.alignment.verify import (
     search_hypotheses,
     structure_scores,
 )
-from semloc_logs.closures.acceptance.calibration import CLOSE, HOPELESS, own_values, shipped
-from semloc_logs.closures.closure import Agreement, Alignment
+from semloc_logs.closures.acceptance.calibration import (
+    MIN_RELATIVE_SCORE,
+    MIN_SCORE,
+    shipped,
+)
+from semloc_logs.closures.closure import Alignment, Features
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.query import SessionMap, build_query
 from semloc_logs.labels.space import cityscapes
@@ -236,7 +239,9 @@ def _align(
     fine: list[Fitted] = []
     for f in best:
         target = database.target(f.candidate.group)
-        if f.scores.rank >= max(CLOSE * max((o.scores.rank for o in fine), default=0.0), HOPELESS):
+        if f.scores.rank >= max(
+            MIN_RELATIVE_SCORE * max((o.scores.rank for o in fine), default=0.0), MIN_SCORE
+        ):
             fit = fine_fit(f.fit.target_T_query, database.surface(f.candidate.group, f.sees), query)
             fine.append(
                 replace(f, fit=fit, scores=structure_scores(query, target, fit.target_T_query))
@@ -309,7 +314,7 @@ def _judge(
         support=float(np.log10(scores.aligned + 1)),
         stiffness=float(np.log10(_stiffness(fine) + 1)),
     )
-    probability = float(shipped().own(own_values(features)))
+    probability = float(shipped().own(features))
     same_source = session.json["label_source"] == target_session.json["label_source"]
     overlap, inliers = tau(
         query.occupied,
@@ -338,7 +343,6 @@ def _judge(
         inliers=inliers,
         words=candidate.votes,
         features=features,
-        agreement=Agreement(probability),
     )
 
 

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 import semloc_logs
-from semloc_logs.closures.acceptance.consistency import decide
-from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.acceptance.decide import decide
+from semloc_logs.closures.closure import Alignment, Closure, Rejected
 from semloc_logs.closures.closure_tables import (
     keyframe_at,
     read_closures,
@@ -338,9 +338,11 @@ def close(
         note(
             f"query {asked_queries} of {total}: {sum(a.probability >= least for a in found)} probable places"
         )
-    found = decide(found, maps, settings)
+    outcomes = decide(found, maps, settings)
     road = {name: m.distance for name, m in maps.items()}
-    closures = unique_closures([a for a in found if a.accepted], road, settings.query.every)
+    closures = unique_closures(
+        [o for o in outcomes if isinstance(o, Closure)], road, settings.query.every
+    )
     metadata = {
         "schema_version": 1,
         "voxel_size": settings.fusion.voxel_size,
@@ -351,7 +353,7 @@ def close(
         "queries": total,
         "settings": settings.model_dump(mode="json", include=set(sections)),
     }
-    write_rejected(work.rejected, [a for a in found if not a.accepted], metadata)
+    write_rejected(work.rejected, [o for o in outcomes if isinstance(o, Rejected)], metadata)
     write_closures(work.closures, closures, metadata | {"fingerprint": fingerprint})
     draw_closures(work, closures, maps)
     report.done.append("closures")

@@ -23,8 +23,8 @@ from semloc_logs.alignment.verify import Query
 from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
 from semloc_logs.benchmarks.localisation.city import DATABASE, WorldDrive
 from semloc_logs.closures import matching
-from semloc_logs.closures.acceptance.consistency import decide
-from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.acceptance.decide import decide
+from semloc_logs.closures.closure import Alignment, Closure
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.settings import STREET_VOXEL, Resolved
@@ -93,7 +93,9 @@ class OurTask:
             asked = [self._ask(database, world, k) for k in self.keyframes]
         maps = {self.drive.name: world.query, DATABASE: world.database}
         decided = decide([a for _, found in asked for a in found], maps, self.settings)
-        accepted = {a.query_keyframe: a for a in decided if a.accepted}
+        accepted = {
+            c.alignment.query_keyframe: c.alignment for c in decided if isinstance(c, Closure)
+        }
         return [
             self._answer(world, k, *said, accepted.get(k))
             for k, said in zip(self.keyframes, asked, strict=True)
