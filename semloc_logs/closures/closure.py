@@ -133,7 +133,7 @@ class Reason(Enum):
         "only {structure:.0f} % of the query's structure lies on structure of its class"
     )
     RIVAL_PLACE = "another place fits nearly as well ({rival:.0f} % of this score)"
-    BETTER_RIVAL = "another place fits better (this one has {of_rival:.0f} % of its score)"
+    BETTER_RIVAL = "another place fits better (this one has at most {of_rival:.0f} % of its score)"
     LOOSE_FIT = "only {fit:.0f} % of the points lie on a surface"
     WEAK_EVIDENCE = "the evidence together is too weak"
     SECOND_CHOICE = "another place of the same session fits better"

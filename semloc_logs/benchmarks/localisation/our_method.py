@@ -19,13 +19,14 @@ import numpy as np
 import torch
 
 from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.verify import Query
+from semloc_logs.alignment.query_map import Query
 from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
 from semloc_logs.benchmarks.localisation.city import DATABASE, WorldDrive
 from semloc_logs.closures import matching
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.closure import Alignment, Closure
 from semloc_logs.closures.database import Database
+from semloc_logs.closures.matching import QueryContext
 from semloc_logs.closures.query import SessionMap, query_keyframes
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.cut import turned_map
@@ -41,11 +42,11 @@ STEP = 4.0  # m between hypotheses of the grid along the road, and across it
 PROFILED = 30  # queries, one after the other along the road
 WHOLE = "whole query"
 PARTS = {  # of a query, by the functions that do them
-    "fuse": ("queries.py build_query",),
+    "fuse": ("query.py build_query",),
     "describe": ("describe.py describe_map", "cut.py turn"),
     "search words": ("index.py search",),
-    "verify": ("closing.py verify_hypotheses",),
-    "align and judge": ("closing.py _align",),
+    "verify": ("matching.py verify_hypotheses",),
+    "align and judge": ("matching.py align_candidates",),
 }
 
 
@@ -178,7 +179,7 @@ def _parts(profiler: cProfile.Profile) -> dict[str, float]:
         key = f"{Path(path).name} {name}"
         total[key] = total.get(key, 0.0) + cumulative
     out = {part: sum(total.get(f, 0.0) for f in functions) for part, functions in PARTS.items()}
-    return out | {"rest": max(0.0, total.get("closing.py close_query", 0.0) - sum(out.values()))}
+    return out | {"rest": max(0.0, total.get("matching.py close_query", 0.0) - sum(out.values()))}
 
 
 def sweep_words(
@@ -225,12 +226,11 @@ def sweep_words(
     )
 
 
-def grid_hypotheses(
-    database: Database, session: SessionMap, keyframe: int, query: Query, most: int | None = None
-) -> list[Hypothesis]:
+def grid_hypotheses(context: QueryContext, most: int | None = None) -> list[Hypothesis]:
     """Instead of word matches: every heading every few metres along and across the database's road,
     or ``most`` of these at random.
     """
+    database = context.visible.database
     settings = database.settings
     step = STEP * settings.fusion.voxel_size / STREET_VOXEL
     yaws = np.split(
@@ -254,7 +254,7 @@ def grid_hypotheses(
                     out += [Hypothesis(group, (float(yaw), x, y, z), 0, 0.0) for yaw in yaws[half]]
     if most is None or len(out) <= most:
         return out
-    rng = np.random.default_rng([7, keyframe])
+    rng = np.random.default_rng([7, context.keyframe])
     return [out[i] for i in np.sort(rng.choice(len(out), most, replace=False))]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from semloc_logs.alignment.verify import rank
+from semloc_logs.alignment.scores import alignment_score
 from semloc_logs.closures.closure import FEATURES, Agreement, Columns, Features
 from semloc_logs.settings import STREET_VOXEL
 
@@ -80,7 +80,7 @@ def position_confidence(sigma: F64 | float, voxel_size: float) -> F64:
 
 def is_plausible(features: Features[F64]) -> Bools:
     """Which alignments (n,) score near the best of their query, and are held by their points."""
-    score = rank(features.structure, features.coverage, features.contradiction)
+    score = alignment_score(features.structure, features.coverage, features.contradiction)
     loose = (features.fit < LOOSE_FIT) & (features.stiffness < LOOSE_STIFFNESS)
     return np.asarray((score >= MIN_SCORE) & ~loose & ~(features.distinct > 1 / MIN_RELATIVE_SCORE))
 

@@ -78,7 +78,7 @@ def sentence(
         (
             {"distinct": 1.6},
             Reason.BETTER_RIVAL,
-            "another place fits better (this one has 62 % of its score)",
+            "another place fits better (this one has at most 62 % of its score)",
         ),
         ({"fit": 0.4}, Reason.LOOSE_FIT, "only 40 % of the points lie on a surface"),
         ({}, Reason.WEAK_EVIDENCE, "the evidence together is too weak"),
