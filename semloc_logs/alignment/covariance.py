@@ -45,8 +45,8 @@ def covariance_of(
     What noisy normals alone would claim to know is taken off first. Where the points then hold
     nothing (along a corridor) the error is as large as the search lets it be: the bounds of the
     same place. Uncertain ranges may all be too long or too short, which no number of points
-    averages out. The target's keyframe may lie metres from what was aligned, and ``road`` metres
-    from where that was seen: between them its odometry drifts.
+    averages out. The target's keyframe may lie metres from the aligned points, and ``road`` metres
+    from where they were seen: between them its odometry drifts.
     """
     about_centre = _about_centre(fit, voxel_size)
 

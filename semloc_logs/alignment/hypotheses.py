@@ -27,8 +27,10 @@ CELL_SHARE = 0.25  # of a voting cell: poses nearer than this are one
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """``target_T_query`` as (yaw, x, y, z), radians and metres, in submap ``group``, with the word
-    matches that voted for it.
+    """A pose of the query in submap ``group`` that word matches voted for.
+
+    ``pose`` is ``target_T_query`` as (yaw, x, y, z), radians and metres; ``weight`` the sum of its
+    ``votes``' weights.
     """
 
     group: int

@@ -46,8 +46,9 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Correspondences within ``radius`` metres, at most ``iterations`` times, with every
-    ``stride``-th query point.
+    """One radius of a fit: correspondences are within ``radius`` metres.
+
+    At most ``iterations`` times, with every ``stride``-th query point.
     """
 
     radius: float
@@ -57,9 +58,11 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """``noise`` of planes whose points are certain (m): an uncertain point weighs as much as it
-    leaves across the plane. ``hold``: as many points on planes hold the middle of the query where
-    it starts; it may turn about it.
+    """What points weigh, and the start.
+
+    ``noise`` of planes whose points are certain (m): an uncertain point weighs as much as it leaves
+    across the plane. ``hold``: as many points on planes hold the middle of the query where it
+    starts; it may turn about it.
     """
 
     noise: float = 0.05
@@ -106,8 +109,9 @@ def _align(
     steps: tuple[F64, I64, I64],
     weighting: tuple[float, float],
 ) -> tuple[F64, F64, int, int, float, F64, F64]:
-    """The transform, the centre of the points, how many were used and how many met a surface, their
-    squares, information and range bias.
+    """The transform, the points' centre, their numbers, squares, information and range bias.
+
+    The numbers are of the points that were used and of those that met a surface.
     """
     T = start
     centre = start[:3, 3].copy()
@@ -205,8 +209,9 @@ def _increment(T: F64, centre: F64, H: F64, g: F64) -> tuple[F64, float, float]:
 
 @njit(cache=True, nogil=True)
 def _moved(T: F64, centre: F64, move: F64) -> F64:
-    """``T`` (4, 4) turned about ``centre`` (3,) by the rotation vector ``move[3:]`` and moved by
-    ``move[:3]``.
+    """``T`` (4, 4) moved by ``move[:3]`` and turned about ``centre`` (3,) by ``move[3:]``.
+
+    The turn is a rotation vector.
     """
     w = move[3:]
     angle = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
@@ -232,7 +237,7 @@ def _normal_equations(
 ) -> tuple[float, F64, F64, F64, F64]:
     """Squared distances, information (6, 6), range bias (2, 6); normal equations (6, 6), (6,).
 
-    The squares are sums of plane distances, those of uncertain points for as much as they count.
+    The squares are summed over plane distances; uncertain points count by their weight.
     ``variances``: of the robust kernel, and of certain planes. ``ray`` is (n, 3), or (0, 3) where
     points are certain. The first three are of planes alone,
     the normal equations of planes and points.
@@ -258,13 +263,10 @@ def _normal_equations(
         J[3] = a[1] * J[2] - a[2] * J[1]
         J[4] = a[2] * J[0] - a[0] * J[2]
         J[5] = a[0] * J[1] - a[1] * J[0]
-        r = o[0] * J[0] + o[1] * J[1] + o[2] * J[2]
-        off = off_target = along = 0.0
-        if len(ray):
-            off = ray[n, 0] * J[0] + ray[n, 1] * J[1] + ray[n, 2] * J[2]
-            along = ray[n, 0] ** 2 + ray[n, 1] ** 2 + ray[n, 2] ** 2
-        if len(spread):
-            off_target = spread[i, 0] * J[0] + spread[i, 1] * J[1] + spread[i, 2] * J[2]
+        r = _dot(o, J)
+        off = _dot(ray[n], J) if len(ray) else 0.0
+        off_target = _dot(spread[i], J) if len(spread) else 0.0
+        along = ray[n, 0] ** 2 + ray[n, 1] ** 2 + ray[n, 2] ** 2 if len(ray) else 0.0
         across = off * off + off_target * off_target
         certain = noise / (noise + across)
         squared += certain * r * r
@@ -274,11 +276,16 @@ def _normal_equations(
             # points that are not on planes (poles, leaves) hold what planes leave free, weakly
             certain = noise / (noise + along)
             loose = (1 - planar[i]) * LOOSE * certain
-            distance = o[0] * o[0] + o[1] * o[1] + o[2] * o[2]
-            _add_point(H, g, a, o, loose / (1 + distance / (kernel + along)))
+            _add_point(H, g, a, o, loose / (1 + _dot(o, o) / (kernel + along)))
     _mirror(information)
     _mirror(H)
     return squared, information, bias, H + information, g
+
+
+@njit(cache=True, nogil=True)
+def _dot(a: F64, b: F64) -> float:
+    """The scalar product of the first three values of each."""
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 @njit(cache=True, nogil=True)
@@ -301,7 +308,7 @@ def _add_plane(
 
 @njit(cache=True, nogil=True)
 def _mirror(H: F64) -> None:
-    """Copy what is above the diagonal below it."""
+    """Copy the half above the diagonal below it."""
     for k in range(6):
         for m in range(k):
             H[k, m] = H[m, k]
@@ -309,8 +316,9 @@ def _mirror(H: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def _add_point(H: F64, g: F64, a: F64, o: F64, weight: float) -> None:
-    """Add weight * J^T J, above the diagonal, and weight * J^T o of the point distance ``o`` at arm
-    ``a``, J = [I, -[a]x].
+    """Add weight * J^T J, above the diagonal, and weight * J^T o; J = [I, -[a]x].
+
+    ``o`` (3,) is the distance to a point, at the arm ``a`` (3,).
     """
     for k in range(3):
         H[k, k] += weight

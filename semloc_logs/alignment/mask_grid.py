@@ -2,8 +2,8 @@
 
 Bit c of a cell is set where a voxel of coarse class c lies in the cell or beside it, so one look-up
 tells whether a query voxel is aligned to within a cell; another bit tells that it contradicts free
-space. There are no coarser grids: they know nothing of contradictions, and in halls they lost
-places that a few hundred look-ups in the finest grid find.
+space. The finest grid is the only one: coarser ones know nothing of contradictions, and in halls
+they lost places that a few hundred look-ups in the finest find.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ Arrays = tuple[U8, F64, float]  # of a grid, in the order of its fields
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskGrid:
-    """``mask`` (x, y, z) uint8; cell (0, 0, 0) has its corner at ``corner`` (3,) metres and edge
-    ``cell`` metres.
+    """``mask`` (x, y, z) uint8 of a map, in cells of ``cell`` metres.
+
+    Cell (0, 0, 0) has its corner at ``corner`` (3,), metres in the map frame.
     """
 
     mask: U8
@@ -78,7 +79,7 @@ def build_mask_grid(blocks: BlockMap, voxel_size: float, coarse: U8) -> MaskGrid
 
 @njit(cache=True, nogil=True)
 def _fill(mask: U8, corners: NDArray[np.int64], state: U8, bits: U8) -> None:
-    """Set the bits of occupied voxels in their cells and the 26 beside; then those of free cells.
+    """Set the bits of occupied voxels in their cells and the 26 beside; then the free cells'.
 
     Blocks (n,) have their corner cells at ``corners`` (n, 3).
     """

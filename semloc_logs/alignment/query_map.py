@@ -21,8 +21,9 @@ VIEW_AHEAD = 20.0  # voxels between a sensor and the mean of its points if it lo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Query voxels: ``centres`` (n, 3) metres and class ``bits`` (n,); the first ``structure`` of
-    them are structure, the rest ground.
+    """Query voxels to look up: ``centres`` (n, 3) metres and class ``bits`` (n,).
+
+    The first ``structure`` of them are structure, the rest ground.
     """
 
     centres: F64
@@ -61,8 +62,7 @@ def view_centres(position: F64, mean: F64, voxel_size: float) -> F64:
 
 @dataclass(eq=False)
 class Query:
-    """A query map in its own level frame: fused ``blocks`` and the ``points`` (n, 3) of its
-    keyframes.
+    """A query map in its own level frame: fused ``blocks``, and ``points`` (n, 3) of keyframes.
 
     ``spread`` (n, 3) is one standard deviation of each point along its ray, metres; zeros, or None,
     where they are certain.

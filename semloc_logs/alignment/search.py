@@ -23,7 +23,7 @@ U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Voxels = tuple[F64, U8, int]  # of Evidence, in the order of its fields
-CHUNK = 128  # voxels counted before a sum is given up
+CHUNK = 128  # voxels counted between two checks whether the shift can be the best
 # a cell or radian: among equals the pose nearest the start wins, so that ties do not drift
 TIE = 1e-6
 NONE = -2.0  # less than any score

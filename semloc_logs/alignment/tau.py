@@ -47,7 +47,7 @@ def tau(
     high = np.minimum(np.floor(high + reach + 1).astype(int), last)
     if (low >= high).any():
         return 0.0, 0
-    margin = 2 * int(reach) + 4  # twice: for points beside the map, and for what is around them
+    margin = 2 * int(reach) + 4  # twice: for points beside the map and cells around them
     low = low - margin
     x, y, z = (-(-(high - low + margin) // CUBE) * CUBE).tolist()
     dense = target.dense(low, (x, y, z))
@@ -131,8 +131,8 @@ def _closest_observed(
     """State of the observed cell whose centre is closest to each of ``points`` (n, 3), in cells.
 
     It is unobserved where none is within reach. The grid begins at cell ``low`` (3,) and has a
-    margin of twice ``reach`` and four cells on all sides; ``cubes`` are those of
-    :func:`_observed_cubes` and ``offsets`` those of :func:`_cubes`.
+    margin of twice ``reach`` and four cells on all sides; :func:`_observed_cubes` makes ``cubes``
+    and :func:`_cubes` ``offsets``.
     """
     out = np.full(len(points), UNOBSERVED_STATE, np.uint8)
     margin = int(reach) + 1
@@ -149,7 +149,7 @@ def _closest_observed(
         ):
             continue  # farther from the map than it may be
         if state[i, j, k] != UNOBSERVED_STATE and reach > HALF_DIAGONAL:
-            # no other centre is as close as the one of the cell that the point lies in
+            # the centre of the cell that a point lies in is the closest
             out[n] = state[i, j, k]
         else:
             out[n] = _closest_around(state, cubes, point, (i, j, k), offsets, reach)

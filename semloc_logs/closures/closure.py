@@ -32,8 +32,9 @@ class Columns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features(Columns, Generic[Value]):
-    """Evidence for an alignment by itself; the columns of the same names are described in
-    ``schemas/parquet/rejected.json``.
+    """Evidence for an alignment by itself.
+
+    The columns of the same names are described in ``schemas/parquet/rejected.json``.
     """
 
     structure: Value

@@ -60,8 +60,7 @@ class Recent(Generic[Cached]):
 
 
 class Database:
-    """Submaps of ``targets`` in the order of their names; a submap's ``group`` is its number in
-    :attr:`places`.
+    """Submaps of target sessions; the ``group`` of a submap is its number in :attr:`places`.
 
     ``targets`` and ``surfaces`` are caches of what :mod:`.visibility` and :mod:`.target_surface`
     make.

@@ -130,7 +130,7 @@ def close_query(database: Database, session: SessionMap, keyframe: int) -> list[
 def allowed_words(visible: Visibility, session: SessionMap) -> dict[str, Allowed]:
     """Which words may match, by their variant: semantic where both label sources know classes.
 
-    Of the query's own session they are those of another time (:mod:`.visibility`).
+    Of the query's own session only words of another time may (:mod:`.visibility`).
     """
     database = visible.database
     forced = database.settings.descriptor.variant
@@ -153,7 +153,7 @@ def match_words(
 ) -> tuple[Described, Matches]:
     """The subvolumes of a query, described once, and their nearest words in all headings.
 
-    The query's ground is at ``ground_z`` (m). The matches' ``yaw`` is that of ``target_T_query``.
+    The query's ground is at ``ground_z`` (m). The ``yaw`` of a match is of ``target_T_query``.
     """
     described = _described(query, variant, ground_z, database.settings)
     closures = database.settings.closures

@@ -179,7 +179,7 @@ def visible_to(database: Database, session: SessionMap, keyframe: int) -> Visibi
     near = (time_ns < closures.exclude_seconds * 1e9) | (road < closures.exclude_distance)
     near[keyframe] = True
 
-    # whole stretches, so that several queries share what is made without them
+    # whole stretches, so that several queries share maps without them
     stretch = session.distance // (SQUARE_VOXELS * database.settings.fusion.voxel_size)
     hidden = np.isin(stretch, stretch[near]) | (not session.posed)
     return Visibility(database, {name: hidden}, origin)

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.query_map import view_centres
-from semloc_logs.closures.database import Database
+from semloc_logs.closures.database import Database, Recent
 from semloc_logs.closures.matching import allowed_words
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.closures.target_surface import target_surface
@@ -172,6 +172,22 @@ def test_beyond_the_end_of_a_drive_a_surface_has_what_was_seen_from_afar(tmp_pat
     assert beyond == 36.0 + 45.0
 
 
+def test_a_surface_is_made_from_so_many_keyframes(tmp_path: Path) -> None:
+    """Keyframe i saw a point at a height of i decimetres; the nearest ones are about number 5."""
+    road = np.stack([np.arange(10) * 4.0, np.zeros(10)], 1)
+    drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [np.zeros((0, 3))])
+
+    def heights(count: int) -> list[int]:
+        settings = Settings.model_validate({"closures": {"surface_keyframes": count}}).resolved()
+        database = Database(Workspace(tmp_path), ("a",), settings)
+        surface = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW)
+        return sorted(np.rint(surface.points[:, 2] * 10).astype(int).tolist())
+
+    assert heights(1) == [5]
+    assert heights(3) == [4, 5, 6]
+    assert heights(100) == list(range(10))
+
+
 def test_what_looks_all_around_looks_where_it_is() -> None:
     """At 0.30 m voxels a mean of the points 6 m ahead is a view, one of 5 m is not."""
     found = view_centres(np.zeros((2, 3)), np.array([[5.9, 0.0, 0.0], [6.1, 0.0, 0.0]]), 0.3)
@@ -213,6 +229,22 @@ def test_a_drive_without_revisits_does_not_answer_itself(tmp_path: Path) -> None
     )
     view = visible_to(Database(Workspace(tmp_path), ("a",), Settings().resolved()), session, 10)
     assert allowed_words(view, session) == {}
+
+
+def test_recent_values_are_made_once_and_the_oldest_is_forgotten() -> None:
+    recent: Recent[int] = Recent(2)
+    made: list[str] = []
+
+    def value(key: str) -> int:
+        def make() -> int:
+            made.append(key)
+            return len(made)
+
+        return recent.get(key, make)
+
+    assert [value(k) for k in "aabab"] == [1, 1, 2, 1, 2]
+    assert (value("c"), value("b"), value("a")) == (3, 2, 4)
+    assert made == ["a", "b", "c", "a"]
 
 
 def test_other_sessions_answer_whatever_their_time(tmp_path: Path) -> None:

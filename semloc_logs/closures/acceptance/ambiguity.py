@@ -2,7 +2,7 @@
 
 Two drives through copies of a street, one block apart, agree in every query, and nothing in them
 tells. A third place reveals copies: a session that came through several copies has two places with
-support for one query, or the alignments of three sessions with each other do not close.
+support for one query, or the alignments of three sessions contradict each other.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def ambiguity(
     """How ambiguous the road around either end of each alignment is (n,), in [0, 1].
 
     ``support`` (n,) is the probability of an alignment ignoring rivals, times the share of near
-    neighbours that agree; ``roads`` are those of :func:`.placements.query_roads`.
+    neighbours that agree; :func:`.placements.query_roads` makes ``roads``.
 
     It is the mean over the queries about an end of the support of a second place in one session, or
     the share of them that three sessions contradict each other about; the session that shows it
@@ -74,8 +74,9 @@ def ambiguity(
 
 
 def _about(at: F64, road: F64, reach: float, much: F64 | None = None) -> F64:
-    """How many of ``at`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,); or the
-    sums of how ``much`` (m,) they show.
+    """How many of ``at`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,).
+
+    With ``much`` (m,) the sums of how much they show.
     """
     order = np.argsort(at, kind="stable")
     sums = np.r_[0.0, np.cumsum(np.ones(len(at)) if much is None else much[order])]
@@ -89,11 +90,10 @@ def _about(at: F64, road: F64, reach: float, much: F64 | None = None) -> F64:
 def _second_places(
     placed: Placed, rows: I64, support: F64, voxel_size: float
 ) -> tuple[I64, I64, F64]:
-    """Of each query in one target the rows of two places, a view apart, of which the second has as
-    much support as possible, and how much.
+    """Of each query in one target the rows of two places, a view apart, and the second's support.
 
-    Where a session queries itself, the first place is where it is by odometry, so any other one is
-    a second place.
+    The second has as much support as possible. Where a session queries itself, the first place is
+    where it is by odometry, so any other one is a second place.
     """
     apart = APART * voxel_size / STREET_VOXEL
     contradicting = contradicts_odometry(placed.part(rows), voxel_size)
@@ -164,7 +164,8 @@ def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float)
 
 
 def _nearest(values: F64, wanted: F64) -> I64:
-    """Numbers (n,) of the ascending ``values`` nearest to the ``wanted`` ones (n,), of equally near
-    ones the first.
+    """Numbers (n,) of the ascending ``values`` nearest to the ``wanted`` ones (n,).
+
+    Of equally near ones it is the first.
     """
     return np.searchsorted((values[1:] + values[:-1]) / 2, wanted)

@@ -130,13 +130,14 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """``own_features`` of an alignment alone; ``near`` of its log-odds and near neighbours;
-    ``together`` of far ones too.
+    """Three logistic models: of an alignment's own features, and with near and far neighbours.
 
-    A short log has no far neighbours, which is not evidence against an alignment. With less support
-    than ``min_support`` hardly any right alignment was ever seen: a handful of voxels fits
-    anywhere, and the probability is 0. Where the ambiguity exceeds ``max_ambiguity`` the drive may
-    as well have been in a copy of the place: whatever agrees, the probability is at most a half.
+    ``own_features`` is of the alignment alone; ``near`` of its log-odds and near neighbours;
+    ``together`` of far ones too. A short log has no far neighbours, which is not evidence against
+    an alignment. With less support than ``min_support`` hardly any right alignment was ever seen: a
+    handful of voxels fits anywhere, and the probability is 0. Where the ambiguity exceeds
+    ``max_ambiguity`` the drive may as well have been in a copy of the place: whatever agrees, the
+    probability is at most a half.
     """
 
     own_features: Calibration
@@ -194,10 +195,9 @@ def fit_logistic(
     counts: F64 | None = None,
     offset: F64 | float = 0.0,
 ) -> tuple[F64, float]:
-    """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d), by
-    Newton's method.
+    """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d).
 
-    Row i counts ``counts`` (n,) times; ``offset`` (n,) is added to its log-odds.
+    By Newton's method. Row i counts ``counts`` (n,) times; ``offset`` (n,) adds to the log-odds.
     """
     counts = np.ones(len(x)) if counts is None else counts
     mean = x.mean(0)

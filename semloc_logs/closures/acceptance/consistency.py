@@ -155,8 +155,9 @@ def _add_votes(
 def _agrees(
     target_T_map: F64, map_T_query: F64, target_T_query: F64, most: float, turn: float
 ) -> bool:
-    """Whether the query lies where ``target_T_map`` and its odometry put it, to within ``most``
-    metres and ``turn`` radians.
+    """Whether the query lies where ``target_T_map`` and its odometry put it.
+
+    To within ``most`` metres and ``turn`` radians.
     """
     off, trace = 0.0, 0.0
     for i in range(3):
@@ -191,8 +192,9 @@ def mode_shares(placed: Placed, voxel_size: float) -> F64:
 
 @njit(cache=True, nogil=True)
 def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float) -> F64:
-    """Of alignments ordered by ``query`` (n,); beside each other are those within ``most`` metres
-    and ``turn`` radians about z.
+    """Mode shares of alignments ordered by ``query`` (n,).
+
+    In one place are poses within ``most`` metres and ``turn`` radians about z.
     """
     out = np.ones(len(query))
     first = 0

@@ -1,4 +1,4 @@
-"""The decision about every alignment, once those of all queries are known."""
+"""The decision about every alignment, once the alignments of all queries are known."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from semloc_logs.closures.acceptance.calibration import (
     shipped,
 )
 from semloc_logs.closures.acceptance.consistency import count_votes, mode_shares
-from semloc_logs.closures.acceptance.placements import contradicts_odometry, features_of, place
+from semloc_logs.closures.acceptance.placements import (
+    Bools,
+    Placed,
+    contradicts_odometry,
+    features_of,
+    place,
+)
 from semloc_logs.closures.closure import (
     Alignment,
     Closure,
@@ -38,29 +44,10 @@ def decide(
 
     For each target session at most one alignment of a query is accepted.
     """
-    voxel_size = settings.fusion.voxel_size
     placed = place(alignments, maps)
-    votes = count_votes(placed, voxel_size)
-    refuted = contradicts_odometry(placed, voxel_size)
-
     plausible = is_plausible(features_of(alignments))
-
-    of_place = np.where(plausible, shipped().decided(votes), 0.0)
-    of_position = position_confidence(placed.sigma, voxel_size)
-    of_mode = mode_shares(placed, voxel_size)
-    probability = np.where(refuted | ~plausible, 0.0, of_place * of_position * of_mode)
-
-    decisions = [
-        Decision(
-            probability=float(probability[k]),
-            agreement=votes.row(k),
-            place_probability=float(of_place[k]),
-            position_confidence=float(of_position[k]),
-            mode_share=float(of_mode[k]),
-            min_probability=settings.closures.min_probability,
-        )
-        for k in range(len(alignments))
-    ]
+    refuted = contradicts_odometry(placed, settings.fusion.voxel_size)
+    decisions = _decisions(placed, plausible, refuted, settings)
     order = sorted(
         range(len(alignments)), key=lambda k: _order(alignments[k], decisions[k].probability)
     )
@@ -69,27 +56,46 @@ def decide(
     outcomes: list[Closure | Rejected] = []
     for k in order:
         a = alignments[k]
+        decision = decisions[k]
         query = (a.query_session, a.query_keyframe, a.target_session)
         reason = None
         if refuted[k]:
             reason = Reason.CONTRADICTS_ODOMETRY
-        elif not decisions[k].probability >= settings.closures.min_probability:  # nor a NaN
-            reason = (
-                low_probability(a.features, decisions[k])
-                if plausible[k]
-                else weakest_evidence(a.features)
-            )
+        elif not decision.probability >= decision.min_probability:  # nor a NaN
+            weakest = weakest_evidence(a.features)
+            reason = weakest if not plausible[k] else low_probability(weakest, decision)
         elif query in answered:
             reason = Reason.SECOND_CHOICE
         answered.add(query)
-        outcomes.append(
-            Closure(a, decisions[k]) if reason is None else Rejected(a, decisions[k], reason)
-        )
+        outcomes.append(Closure(a, decision) if reason is None else Rejected(a, decision, reason))
     return outcomes
 
 
-def low_probability(features: Features[float], decision: Decision) -> Reason:
-    """The factor for which the probability of a plausible alignment is below the required one."""
+def _decisions(
+    placed: Placed, plausible: Bools, refuted: Bools, settings: Resolved
+) -> list[Decision]:
+    """The probability of each alignment (n,): 0 if it is not ``plausible`` or is ``refuted``."""
+    voxel_size = settings.fusion.voxel_size
+    votes = count_votes(placed, voxel_size)
+    of_place = np.where(plausible, shipped().decided(votes), 0.0)
+    of_position = position_confidence(placed.sigma, voxel_size)
+    of_mode = mode_shares(placed, voxel_size)
+    probability = np.where(refuted | ~plausible, 0.0, of_place * of_position * of_mode)
+    return [
+        Decision(
+            probability=float(probability[k]),
+            agreement=votes.row(k),
+            place_probability=float(of_place[k]),
+            position_confidence=float(of_position[k]),
+            mode_share=float(of_mode[k]),
+            min_probability=settings.closures.min_probability,
+        )
+        for k in range(len(placed))
+    ]
+
+
+def low_probability(weakest: Reason, decision: Decision) -> Reason:
+    """Which factor makes the probability of a plausible alignment too low, else the ``weakest``."""
     required = decision.min_probability
     if decision.place_probability >= required:
         if decision.mode_share < decision.position_confidence:
@@ -102,11 +108,11 @@ def low_probability(features: Features[float], decision: Decision) -> Reason:
         return Reason.AMBIGUOUS_PLACE
     if agreement.own_probability >= required and agreement.neighbours:
         return Reason.NEIGHBOURS_CONFLICT
-    return weakest_evidence(features)
+    return weakest
 
 
 def weakest_evidence(features: Features[float]) -> Reason:
-    """The first feature that is worse than those of right alignments are."""
+    """The first feature that is worse than in right alignments."""
     if features.coverage < LOW_COVERAGE:
         return Reason.UNOBSERVED
     if features.structure < LOW_STRUCTURE:

@@ -88,8 +88,9 @@ Pairs = dict[tuple[str, str], I64]
 
 
 def pairs_of(placed: Placed) -> Pairs:
-    """Rows of each query session and target session with odometry, by query and then by place, in
-    the order of names.
+    """Rows of each query session and target session with odometry, in the order of names.
+
+    They are ordered by query, and then by place.
     """
     names, number = np.unique(
         np.concatenate([placed.query_session, placed.target_session]).astype(str),

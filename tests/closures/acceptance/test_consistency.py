@@ -265,7 +265,7 @@ def test_two_queries_of_a_street_do_not_make_all_of_it_look_like_others() -> Non
 def test_a_second_place_as_far_off_as_the_target_may_have_drifted_is_the_same(
     road: float, alike: bool
 ) -> None:
-    """The target drove the street twice; the second time it lies 24 m on, after so much ``road``."""
+    """The target drove the street twice; the second time it lies 24 m on, after ``road`` metres."""
     twice = SimpleNamespace(
         map_T_base=np.tile(STRAIGHT, (2, 1, 1)),
         distance=np.r_[STREETS["b"].distance, road + STREETS["b"].distance],
@@ -286,7 +286,7 @@ def test_three_sessions_that_contradict_each_other_look_like_others() -> None:
             assert not accepted(a)
 
 
-def test_streets_that_a_session_itself_has_twice_look_alike() -> None:
+def test_streets_that_a_session_itself_has_twice_are_ambiguous() -> None:
     rows = [in_street(k, k) for k in COPIED] + [in_street(k, k + 40, target="a") for k in COPIED]
     for a in decide(rows, STREETS, SETTINGS):
         assert a.decision.agreement.ambiguity > 0.9

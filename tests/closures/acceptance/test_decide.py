@@ -93,7 +93,7 @@ def test_the_weakest_evidence_is_named(change: dict[str, float], reason: Reason,
 def test_neighbours_that_conflict() -> None:
     votes = Agreement(0.995, 12.0, 1.04, 7.96, 0.0, 0.0, 0.0)
     made = dataclasses.replace(decision(0.5), agreement=votes)
-    reason = low_probability(GOOD, made)
+    reason = low_probability(Reason.WEAK_EVIDENCE, made)
     assert reason is Reason.NEIGHBOURS_CONFLICT
     assert sentence(reason, made) == (
         "probability 0.500 below 0.99: neighbouring queries conflict: of 12, 1.0 support this place"
@@ -104,40 +104,47 @@ def test_neighbours_that_conflict() -> None:
 def test_an_ambiguous_place_is_named_where_nothing_else_rejects_it() -> None:
     votes = dataclasses.replace(SURE, ambiguity=0.9)
     made = dataclasses.replace(decision(0.4996), agreement=votes)
-    reason = low_probability(GOOD, made)
+    reason = low_probability(Reason.WEAK_EVIDENCE, made)
     assert reason is Reason.AMBIGUOUS_PLACE
     assert sentence(reason, made) == (
         "probability 0.500 below 0.99: ambiguous place: 90 % of nearby queries match elsewhere"
     )
     # without the ambiguity the probability is still too low
     low = dataclasses.replace(made, place_probability=0.4)
-    assert low_probability(GOOD, low) is Reason.NEIGHBOURS_CONFLICT
+    assert low_probability(Reason.WEAK_EVIDENCE, low) is Reason.NEIGHBOURS_CONFLICT
     clear = dataclasses.replace(
         made, agreement=dataclasses.replace(votes, ambiguity=shipped().max_ambiguity)
     )
-    assert low_probability(GOOD, clear) is Reason.NEIGHBOURS_CONFLICT
+    assert low_probability(Reason.WEAK_EVIDENCE, clear) is Reason.NEIGHBOURS_CONFLICT
 
 
 def test_a_right_place_in_which_the_position_is_uncertain() -> None:
     made = decision(0.999, confidence=0.6827)
-    reason = low_probability(GOOD, made)
+    reason = low_probability(Reason.WEAK_EVIDENCE, made)
     assert reason is Reason.UNCERTAIN_POSITION
     assert sentence(reason, made, sigma=0.8) == (
         "probability 0.682 below 0.99: position uncertainty 0.80 m (1 sigma) is too large"
     )
-    assert low_probability(GOOD, decision(0.992, confidence=0.994)) is reason  # the place would do
-    assert low_probability(GOOD, decision(0.98, confidence=0.6827)) is not reason  # it would not
+    assert (
+        low_probability(Reason.WEAK_EVIDENCE, decision(0.992, confidence=0.994)) is reason
+    )  # the place would do
+    assert (
+        low_probability(Reason.WEAK_EVIDENCE, decision(0.98, confidence=0.6827)) is not reason
+    )  # it would not
 
 
 def test_a_right_place_with_several_pose_modes() -> None:
     made = decision(0.999, confidence=0.9, share=0.86)
-    reason = low_probability(GOOD, made)
+    reason = low_probability(Reason.WEAK_EVIDENCE, made)
     assert reason is Reason.POSE_MODES
     assert sentence(reason, made) == (
         "probability 0.773 below 0.99: other poses fit this place too: this one has 86 % of the"
         " odds"
     )
-    assert low_probability(GOOD, decision(0.999, 0.86, 0.9)) is Reason.UNCERTAIN_POSITION
+    assert (
+        low_probability(Reason.WEAK_EVIDENCE, decision(0.999, 0.86, 0.9))
+        is Reason.UNCERTAIN_POSITION
+    )
 
 
 @pytest.mark.parametrize("distinct", [0.86, 1.0, 1.01, 2.0])
