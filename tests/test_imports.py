@@ -62,7 +62,6 @@ INNER_ORDER = {
         "sessions",
         "demo",
     ],
-    "closures": ["closure", "query", "acceptance", "closure_tables", "database", "matching"],
     "benchmarks": [
         "spans",
         "versions",
@@ -73,6 +72,29 @@ INNER_ORDER = {
         "labels",
         "localisation",
         "speed",
+    ],
+    "alignment": [
+        "hypotheses",
+        "mask_grid",
+        "tau",
+        "surface",
+        "icp",
+        "query_map",
+        "target_map",
+        "scores",
+        "search",
+        "refine",
+        "covariance",
+    ],
+    "closures": [
+        "closure",
+        "query",
+        "acceptance",
+        "closure_tables",
+        "database",
+        "visibility",
+        "target_surface",
+        "matching",
     ],
 }
 SOURCES = sorted((ROOT / "semloc_logs").rglob("*.py"))

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.overlap import FREE_BIT, look_up
+from semloc_logs.alignment.mask_grid import FREE_BIT, look_up
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.pictures.closure_view import ClosureView
@@ -184,7 +184,8 @@ class _Scene:
         """The aligned query by what the map says of its voxels: occupied, free, or nothing."""
         view = top_view(self._at, PANEL, PANEL, self.metres)
         found = look_up(
-            self._view.target.level, apply(self._view.map_T_query, (self._query + 0.5) * self._v)
+            self._view.target.mask_grid,
+            apply(self._view.map_T_query, (self._query + 0.5) * self._v),
         )
         rgb = np.where(
             (found & ~np.uint8(FREE_BIT))[:, None] != 0,

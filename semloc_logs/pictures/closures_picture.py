@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.closure import Closure
 from semloc_logs.closures.query import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.tables.atomic_files import replacing_file
@@ -22,7 +22,7 @@ QUERY_COLOUR = (214, 120, 20)
 
 
 def draw_closures(
-    work: Workspace, closures: Sequence[Alignment], maps: Mapping[str, SessionMap]
+    work: Workspace, closures: Sequence[Closure], maps: Mapping[str, SessionMap]
 ) -> None:
     """WORK/closures.png: the pair of sessions with most closures, the query's map laid on the
     target's by the best closure.
@@ -30,16 +30,19 @@ def draw_closures(
     Grey: the target's map; orange: the query's; lines: their drives; red: where the closures are.
     Without closures nothing is drawn and an older picture is removed.
     """
-    pairs: dict[tuple[str, str], list[Alignment]] = {}
+    pairs: dict[tuple[str, str], list[Closure]] = {}
     for closure in closures:
-        pairs.setdefault((closure.query_session, closure.target_session), []).append(closure)
+        ends = (closure.alignment.query_session, closure.alignment.target_session)
+        pairs.setdefault(ends, []).append(closure)
     if not pairs:
         work.picture.unlink(missing_ok=True)
         return
     (query_name, target_name), found = max(pairs.items(), key=lambda p: (len(p[1]), p[0]))
     query = maps[query_name]
     target = maps[target_name]
-    best = max(found, key=lambda a: (a.probability, a.features.structure))
+    best = max(
+        found, key=lambda c: (c.decision.probability, c.alignment.features.structure)
+    ).alignment
     target_T_query = (
         target.map_T_base[best.target_keyframe]
         @ best.target_T_query
@@ -73,8 +76,8 @@ def draw_closures(
             image, [pixels(track).astype(np.int32).reshape(-1, 1, 2)], False, colour, 2, cv2.LINE_AA
         )
     for c in found:
-        p = pixels(tracks[0][[c.target_keyframe]])[0]
-        q = pixels(tracks[1][[c.query_keyframe]])[0]
+        p = pixels(tracks[0][[c.alignment.target_keyframe]])[0]
+        q = pixels(tracks[1][[c.alignment.query_keyframe]])[0]
         cv2.line(image, tuple(p.tolist()), tuple(q.tolist()), (220, 0, 0), 2, cv2.LINE_AA)
         cv2.circle(image, tuple(q.tolist()), 6, (220, 0, 0), -1, cv2.LINE_AA)
     text = f"{query_name} (orange) on {target_name} (grey): {len(found)} closures"

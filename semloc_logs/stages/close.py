@@ -11,8 +11,8 @@ import numpy as np
 
 import semloc_logs
 from semloc_logs import progress
-from semloc_logs.closures.acceptance.consistency import decide
-from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.acceptance.decide import decide
+from semloc_logs.closures.closure import Alignment, Closure, Rejected
 from semloc_logs.closures.closure_tables import (
     read_closures,
     unique_closures,
@@ -75,12 +75,13 @@ def close(
     decided = decide(_search(tasks, engine), maps, settings)
 
     road = {name: session_map.distance for name, session_map in maps.items()}
-    accepted = [alignment for alignment in decided if alignment.accepted]
+    accepted = [outcome for outcome in decided if isinstance(outcome, Closure)]
+    rejected = [outcome for outcome in decided if isinstance(outcome, Rejected)]
     closures = unique_closures(accepted, road, settings.query.every)
     metadata = _metadata(settings, maps, sum(len(task.keyframes) for task in tasks))
     metadata["fingerprint"] = fingerprint
     # closures.parquet comes last: with its fingerprint it vouches for the other two
-    write_rejected(work.rejected, [a for a in decided if not a.accepted], metadata)
+    write_rejected(work.rejected, rejected, metadata)
     draw_closures(work, closures, maps)
     write_closures(work.closures, closures, metadata)
     return Report(done=["closures"], closures=len(closures))

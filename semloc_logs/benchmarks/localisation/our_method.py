@@ -16,20 +16,22 @@ import numpy as np
 import torch
 
 from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.verify import Query
+from semloc_logs.alignment.query_map import Query
 from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
 from semloc_logs.benchmarks.localisation.city import DATABASE, WorldDrive
 from semloc_logs.benchmarks.spans import FunctionTimes, Span, span_seconds
-from semloc_logs.closures.acceptance.consistency import decide
-from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.acceptance.decide import decide
+from semloc_logs.closures.closure import Alignment, Closure
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import (
     FindHypotheses,
+    QueryContext,
+    align_candidates,
     close_query,
     find_hypotheses,
     verify_hypotheses,
 )
-from semloc_logs.closures.query import SessionMap, build_query, query_keyframes
+from semloc_logs.closures.query import build_query, query_keyframes
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
@@ -50,7 +52,7 @@ SPANS = (  # of a query
     Span("describe", (describe_map, turned_map)),
     Span("search words", (Index.search,)),
     Span("verify", (verify_hypotheses,)),
-    Span("align and judge", (close_query,), (build_query, find_hypotheses, verify_hypotheses)),
+    Span("align and judge", (align_candidates,)),
 )
 
 
@@ -116,7 +118,9 @@ class OurTask:
 
         maps = {self.drive.name: world.query, DATABASE: world.database}
         decided = decide([a for of_query in alignments for a in of_query], maps, self.settings)
-        accepted = {a.query_keyframe: a for a in decided if a.accepted}
+        accepted = {
+            c.alignment.query_keyframe: c.alignment for c in decided if isinstance(c, Closure)
+        }
         return [
             self._answer(
                 world, keyframe, duration, of_query[0] if of_query else None, accepted.get(keyframe)
@@ -235,13 +239,12 @@ def _joined(parts: Sequence[Arrays]) -> Arrays:
     return kind(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(kind)))
 
 
-def grid_hypotheses(
-    database: Database, session: SessionMap, keyframe: int, query: Query, count: int | None = None
-) -> list[Hypothesis]:
+def grid_hypotheses(context: QueryContext, count: int | None = None) -> list[Hypothesis]:
     """Every heading every few metres along and across the database's road, without words.
 
     With ``count``, so many of them at random.
     """
+    database = context.visible.database
     settings = database.settings
     step = STEP * settings.fusion.voxel_size / STREET_VOXEL
     yaws = np.split(
@@ -264,7 +267,7 @@ def grid_hypotheses(
                     out += [Hypothesis(group, (float(yaw), x, y, z), 0, 0.0) for yaw in yaws[half]]
     if count is None or len(out) <= count:
         return out
-    rng = np.random.default_rng([GRID_SEED, keyframe])
+    rng = np.random.default_rng([GRID_SEED, context.keyframe])
     return [out[i] for i in np.sort(rng.choice(len(out), count, replace=False))]
 
 
