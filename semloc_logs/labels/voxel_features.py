@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.numerics.cells import cell_starts
 from semloc_logs.numerics.eigen import eigen
 
 F64 = NDArray[np.float64]
@@ -75,10 +76,8 @@ def voxelise(points: F64, size: float) -> Voxels:
     nx, ny, nz = (ijk.max(0) + 1).tolist()
     key, of_point = np.unique((ijk[:, 0] * ny + ijk[:, 1]) * nz + ijk[:, 2], return_inverse=True)
     column = key // nz
-    start = np.r_[0, np.cumsum(np.bincount(column, minlength=nx * ny))]
-    return Voxels(
-        np.stack([column // ny, column % ny, key % nz], 1), of_point.reshape(-1), (nx, ny), start
-    )
+    ijk = np.stack([column // ny, column % ny, key % nz], 1)
+    return Voxels(ijk, of_point.reshape(-1), (nx, ny), cell_starts(column, nx * ny))
 
 
 def voxel_shapes(points: F64, voxels: Voxels, size: float) -> VoxelShapes:
