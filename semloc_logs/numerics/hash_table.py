@@ -38,7 +38,7 @@ def empty_table(keys: int) -> I64:
 def place_of(table: I64, key: int | np.int64) -> int:
     """Where ``key`` is in ``table``, or the empty place for it."""
     mask = len(table) - 1
-    place = ((key * MULTIPLIER) >> SHIFT) & mask
+    place = int(((key * MULTIPLIER) >> SHIFT) & mask)
     while table[place] != EMPTY and table[place] != key:
         place = (place + 1) & mask
     return place
