@@ -23,11 +23,10 @@ from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.logs.sensors.depth import RangeNoise
 from semloc_logs.logs.session.session import open_session
-from semloc_logs.mapping.ground import GroundMapper, write_ground
+from semloc_logs.mapping.ground import GroundMapper, ground_height, write_ground
 from semloc_logs.mapping.keyframes import Collected, collect
 from semloc_logs.mapping.levelling import check_reach, level
 from semloc_logs.mapping.selection import road_distance, submap_ranges
-from semloc_logs.mapping.up_direction import ground_height
 from semloc_logs.numerics.prefetch import ahead
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, Resolved, ResolvedFusion

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import imsave
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 from matplotlib.transforms import IdentityTransform
@@ -273,7 +273,8 @@ def rendered(figure: Figure) -> U8:
 def write_png(path: Path, image: U8) -> None:
     """RGB ``image`` (height, width, 3) as a PNG that appears complete or not at all."""
     with replacing_file(path) as temporary:
-        imsave(temporary, image, format="png")
+        _, data = cv2.imencode(".png", np.ascontiguousarray(image[:, :, ::-1]))
+        temporary.write_bytes(data.tobytes())
 
 
 def below_each_other(images: Sequence[U8]) -> U8:
