@@ -21,11 +21,11 @@ import numpy as np
 from semloc_logs.benchmarks.descriptors.places import Street
 from semloc_logs.benchmarks.descriptors.word_matches import real_street, true_queries, word_recall
 from semloc_logs.benchmarks.localisation.localisation import Localisation
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SemlocError
 from semloc_logs.evaluation.truth import read_truth
 from semloc_logs.logs.session.session import open_session
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.pipeline import describe, fuse, run, session_name
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.verify import FEATURES
 from semloc_logs.closures.acceptance.calibration import AGREEMENT
 from semloc_logs.closures.closure import Alignment
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.store import pose_columns

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.alignment.surface import Surface
 from semloc_logs.alignment.verify import Target, is_uncertain, looked_at, points_surface
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Resolved
 from semloc_logs.voxels.grid import Fuser

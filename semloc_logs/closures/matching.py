@@ -30,8 +30,9 @@ from semloc_logs.alignment.verify import (
 from semloc_logs.closures.acceptance.calibration import CLOSE, HOPELESS, own_values, shipped
 from semloc_logs.closures.closure import Agreement, Alignment
 from semloc_logs.closures.database import Database, open_database
-from semloc_logs.closures.query import SessionMap, build_query
+from semloc_logs.closures.query import build_query
 from semloc_logs.labels.space import cityscapes
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse, turned_about_z
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns

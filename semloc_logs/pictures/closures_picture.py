@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.closures.closure import Alignment
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.pictures.colours import CLOSURE, QUERY, TARGET, Colour, web_colour
 from semloc_logs.pictures.map_marks import draw_line

@@ -28,7 +28,7 @@ from semloc_logs.closures.closure_tables import (
     write_rejected,
 )
 from semloc_logs.closures.matching import CloseTask, close_queries
-from semloc_logs.closures.query import SessionMap, query_keyframes
+from semloc_logs.closures.query import query_keyframes
 from semloc_logs.engines import Engine, Serial
 from semloc_logs.errors import LogError, SemlocError, WorkspaceError
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
@@ -44,6 +44,7 @@ from semloc_logs.logs.annotation.annotate import (
 )
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.pictures.closures_picture import draw_closures
 from semloc_logs.settings import Resolved

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.verify import looked_at
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import allowed_places
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.mapping.selection import road_distance
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.tables import contracts

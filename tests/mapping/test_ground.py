@@ -42,7 +42,7 @@ def test_a_hill_driven_over(scale: float) -> None:
     centres = (ground.ij + 0.5) * ground.cell / scale
     # around the road, and not below the bridge, whose edge it is for some keyframes
     road = (np.abs(centres - [15.0, 0.0]) < [30.0, 15.0]).all(1)
-    off = ground.z[road] / scale - hill(centres[road])
+    off = ground.z[road] / scale - hill(np.asarray(centres[road], float))
     assert len(off) > 1500
     assert np.abs(off).max() < 0.25  # a cell of 1 m at slopes up to 14 %
     assert np.median(np.abs(off)) < 0.05

@@ -26,7 +26,8 @@ from semloc_logs.closures import matching
 from semloc_logs.closures.acceptance.consistency import decide
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.query import SessionMap, query_keyframes
+from semloc_logs.closures.query import query_keyframes
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder

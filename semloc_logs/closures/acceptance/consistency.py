@@ -36,7 +36,7 @@ from semloc_logs.closures.acceptance.placements import (
     strays,
 )
 from semloc_logs.closures.closure import Agreement, Alignment
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL, Resolved
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.verify import FEATURES
 from semloc_logs.closures.acceptance.calibration import own_values, shipped, unrivalled
 from semloc_logs.closures.closure import Alignment
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

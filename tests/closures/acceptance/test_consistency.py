@@ -27,7 +27,7 @@ from semloc_logs.closures.acceptance.consistency import (
 )
 from semloc_logs.closures.acceptance.placements import ARM, DRIFT, FAR, Placed, place, strays
 from semloc_logs.closures.closure import Agreement, Alignment
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import STREET_VOXEL, Settings
 
