@@ -47,6 +47,7 @@ from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.pictures.closures_picture import draw_closures
+from semloc_logs.pictures.map_picture import Caption, draw_map
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.submap_descriptors import DescribeTask, variants_for
 from semloc_logs.tables.table import read_json, read_metadata, replacing_folder, write_json
@@ -158,9 +159,20 @@ def _fuse_one(task: FuseTask, note: Note = lambda _: None) -> dict[str, Any] | S
     """An expected error is a result: one bad log does not end the night's work."""
     try:
         task.folder.session_json.unlink(missing_ok=True)  # what is half replaced must not look done
-        return fuse_session(task, lambda said: note(f"{task.folder.name}: {said}"))
+        return fuse_session(
+            task,
+            lambda text: note(f"{task.folder.name}: {text}"),
+            partial(_draw_session_map, task.folder),
+        )
     except SemlocError as problem:
         return problem
+
+
+def _draw_session_map(folder: SessionFolder, content: dict[str, Any]) -> None:
+    """map.png of a session whose tables are written; ``content`` goes into its session.json."""
+    drive = SessionMap(folder).map_T_base[:, :3, 3] if content["posed"] else np.zeros((0, 3))
+    caption = Caption(folder.name, content["label_source"], content["voxel_size"])
+    draw_map(folder.voxels, drive, caption, folder.picture)
 
 
 def _fingerprint(path: Path) -> str | None:
