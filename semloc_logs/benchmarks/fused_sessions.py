@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import Engine, make_engine
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.fuse import fuse
 from semloc_logs.stages.inputs import SessionInput, session_name

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.closures.closure import FEATURES, Closure, Rejected
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.store import pose_columns

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.surface import Surface
 from semloc_logs.alignment.target_map import Target
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.voxels.store import Keyframe, read_keyframe
 from semloc_logs.words.catalogue import read_words, segments

@@ -20,10 +20,11 @@ from semloc_logs.alignment.tau import tau
 from semloc_logs.closures.acceptance.calibration import MIN_RELATIVE_SCORE, MIN_SCORE, shipped
 from semloc_logs.closures.closure import Alignment, Features
 from semloc_logs.closures.database import Database, open_database
-from semloc_logs.closures.query import SessionMap, build_query
+from semloc_logs.closures.query import build_query
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import Visibility, visible_to
 from semloc_logs.labels.space import cityscapes
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse, turned_about_z
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from semloc_logs.alignment.query_map import view_centres
 from semloc_logs.alignment.target_map import Target
 from semloc_logs.closures.database import SQUARE_VOXELS, Database
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import blocks_path, read_blocks, read_keyframe
 from semloc_logs.words.index import Allowed

@@ -33,8 +33,8 @@ from semloc_logs.closures.acceptance.consistency import count_votes, mode_shares
 from semloc_logs.closures.acceptance.placements import Placed, contradicts_odometry
 from semloc_logs.closures.closure import FEATURES, Agreement, Features
 from semloc_logs.closures.closure_tables import keyframe_at
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, judge_closure, read_truth
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.tables.table import read_metadata, read_table, write_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace

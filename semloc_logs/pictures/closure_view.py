@@ -17,9 +17,10 @@ from semloc_logs.alignment.target_map import Target
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import allowed_words, match_words
-from semloc_logs.closures.query import SessionMap, build_query, query_members
+from semloc_logs.closures.query import build_query, query_members
 from semloc_logs.closures.visibility import Visibility, visible_to
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, turned_about_z
 from semloc_logs.settings import Resolved, Settings
 from semloc_logs.subvolumes.completed import completed, load_completion, states_of

@@ -20,9 +20,10 @@ from semloc_logs.closures.closure_tables import (
     write_rejected,
 )
 from semloc_logs.closures.matching import CloseTask, close_queries
-from semloc_logs.closures.query import SessionMap, query_keyframes
+from semloc_logs.closures.query import query_keyframes
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.pictures.closures_picture import draw_closures
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of, recorded_fingerprint

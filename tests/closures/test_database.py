@@ -12,10 +12,10 @@ from semloc_logs.alignment.query_map import view_centres
 from semloc_logs.alignment.verify import Query
 from semloc_logs.closures.database import Database, Recent
 from semloc_logs.closures.matching import allowed_places, allowed_words, close_query
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import everything, visible_to
 from semloc_logs.mapping.selection import road_distance
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.tables import contracts

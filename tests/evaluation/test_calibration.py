@@ -12,7 +12,6 @@ import pytest
 from semloc_logs.closures.acceptance.calibration import NEIGHBOUR_EVIDENCE, Calibration
 from semloc_logs.closures.acceptance.placements import Placed
 from semloc_logs.closures.closure import FEATURES, Features
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.evaluation import calibration
 from semloc_logs.evaluation.calibration import (
     Judged,
@@ -24,6 +23,7 @@ from semloc_logs.evaluation.calibration import (
     recall_at,
     reliability,
 )
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.pictures.reliability_diagram import draw_reliability
 from semloc_logs.tables import contracts

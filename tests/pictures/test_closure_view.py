@@ -123,7 +123,7 @@ def test_nothing_to_show(work: Workspace, tmp_path: Path) -> None:
 
 
 def view(shift: float, *, accepted: bool) -> ClosureView:
-    """A square of walls seen from its middle, that lies ``shift`` metres off before it is aligned."""
+    """A square of walls seen from its middle, ``shift`` metres off before the alignment."""
     side = np.linspace(-4.0, 4.0, 60)
     walls = [
         np.stack(np.broadcast_arrays(*xy, z), -1)

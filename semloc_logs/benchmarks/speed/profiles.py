@@ -15,18 +15,17 @@ import numpy as np
 from semloc_logs.benchmarks.fused_sessions import fuse_sessions
 from semloc_logs.benchmarks.spans import FunctionTimes, Rows, Span, span_seconds
 from semloc_logs.benchmarks.speed.memory import PEAKS_PER_MB
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import make_engine
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.logs.annotation.annotate import content_fingerprint
 from semloc_logs.logs.session.session import Session, open_session
 from semloc_logs.mapping import session_fusion
-from semloc_logs.mapping.ground import GroundMapper
+from semloc_logs.mapping.ground import GroundMapper, ground_height
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.levelling import level
 from semloc_logs.mapping.selection import thin
-from semloc_logs.mapping.up_direction import ground_height
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics import prefetch
 from semloc_logs.pictures.map_picture import draw_map
 from semloc_logs.settings import Resolved

@@ -27,7 +27,7 @@ from semloc_logs.closures.closure import (
     Reason,
     Rejected,
 )
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 
 # the weakest evidence of an improbable alignment is named, in this order, if it is beyond its bound

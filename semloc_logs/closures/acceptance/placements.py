@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.closures.acceptance.calibration import probability_ignoring_rivals, shipped
 from semloc_logs.closures.closure import FEATURES, Alignment, Columns, Features
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -32,7 +32,7 @@ from semloc_logs.closures.acceptance.placements import (
     place,
 )
 from semloc_logs.closures.closure import Agreement, Alignment, Closure, Features, Rejected
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import STREET_VOXEL, Settings
 
