@@ -25,7 +25,7 @@ from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SemlocError
 from semloc_logs.evaluation.truth import read_truth
-from semloc_logs.logs.session.session import open_session
+from semloc_logs.logs.session.session import SessionOptions, open_session
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.pipeline import describe, fuse, run, session_name
 from semloc_logs.subvolumes.describe import load_encoder, random_encoder
@@ -121,12 +121,8 @@ def profile_fuse(
         return work
 
     def reading() -> int:
-        session = open_session(
-            [*logs],
-            {},
-            min_range=fusion.min_range,
-            max_range=2.0 * fusion.max_range,
-        )
+        options = SessionOptions(min_range=fusion.min_range, max_range=2.0 * fusion.max_range)
+        session = open_session([*logs], options)
         try:
             return sum(1 for _ in session.clouds())
         finally:

@@ -1,5 +1,4 @@
-"""Label images -> labels of points that another sensor measured from elsewhere, where the camera
-can see them.
+"""Label images -> labels of points of another sensor, where the camera can see them.
 
 A LIDAR beside a camera looks past the edges of near things at what is hidden from the camera, and
 its points are sparse: through the gaps between the points of a near thing, a plain depth test lets
@@ -10,12 +9,13 @@ point is hidden where a strip is much nearer.
 
 A LIDAR also looks through the windows of cars, and gets nothing back from black paint: there is no
 surface where the picture has one. A point that lies behind a near surface of the very label that it
-would get, and beside it by less than a thing's size, is marked DOUBTFUL.
+would get, and beside it by less than a thing's size, is marked doubtful.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -35,7 +35,6 @@ _LOOK_AHEAD = 16  # points of a column that are tried as the continuation of a s
 _CELL = np.radians(0.16)  # of the depth image
 _NEARER = 0.25  # what hides a point is nearer by so much (m),
 _NEARER_SHARE = 0.04  # and by this share of the distance
-DOUBTFUL = 1 << 31  # set in a label that may be that of something nearer
 _THING = 0.8  # m, half the size of what has windows
 # around a point, for near surfaces of which _THING is as large as that
 _REACH = (np.radians(6.0), np.radians(3.0), np.radians(1.5))
@@ -198,6 +197,16 @@ def _line(
             depth[row, column] = z
 
 
+class PaintedPoints(NamedTuple):
+    """Labels (m,), or UNPAINTED; which of them may belong to something nearer (m,); and which
+    points are in the picture at all (m,).
+    """
+
+    label: U32
+    is_doubtful: NDArray[np.bool_]
+    is_inside: NDArray[np.bool_]
+
+
 def paint(
     points: F32,
     wanted: NDArray[np.integer],
@@ -205,13 +214,11 @@ def paint(
     labels: U32,
     camera_T_base: F64,
     projector: Projector,
-) -> tuple[U32, NDArray[np.bool_]]:
-    """Labels (m,) of ``points[wanted]`` in the base frame from the picture ``labels`` (h, w), and
-    which points are in the picture at all.
+) -> PaintedPoints:
+    """Labels of ``points[wanted]`` (m,) in the base frame from the picture ``labels`` (h, w).
 
-    ``points`` (n, 3) are all that the sensor at ``viewpoint`` measured: they hide each other.
-    UNPAINTED where the picture does not show the point: outside of it, or hidden. DOUBTFUL is added
-    to labels that may be those of something nearer.
+    ``points`` (n, 3) are all points that the sensor at ``viewpoint`` measured: they hide each
+    other. UNPAINTED where the picture does not show the point: outside of it, or hidden.
     """
     out = np.full(len(wanted), UNPAINTED, np.uint32)
     camera = in_base(camera_T_base, points)
@@ -232,8 +239,9 @@ def paint(
     doubtful = _behind_its_own(
         depth, cell, labels, out[known], row, column, camera[known, 2], projector.focal
     )
-    out[known[doubtful]] |= np.uint32(DOUBTFUL)
-    return out, inside
+    is_doubtful = np.zeros(len(wanted), bool)
+    is_doubtful[known[doubtful]] = True
+    return PaintedPoints(out, is_doubtful, inside)
 
 
 def _behind_its_own(

@@ -21,8 +21,9 @@ from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.space import SKY
 from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.logs.problems import Problem, lost, sentences
 from semloc_logs.logs.sensors.depth import RangeNoise
-from semloc_logs.logs.session.session import open_session
+from semloc_logs.logs.session.session import SessionOptions, open_session
 from semloc_logs.mapping.ground import GroundMapper, write_ground
 from semloc_logs.mapping.keyframes import Collected, collect
 from semloc_logs.mapping.levelling import check_reach, level
@@ -62,35 +63,44 @@ class FuseTask:
     poses: TrajectoryFile | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class FusedSession:
+    """The ``content`` of session.json, and the ``problems`` that it lists as sentences."""
+
+    content: dict[str, Any]
+    problems: tuple[Problem, ...]
+
+
 def fuse_session(
     task: FuseTask,
     on_progress: Callable[[str], None] = lambda _: None,
     on_tables: Callable[[dict[str, Any]], None] = lambda _: None,
-) -> dict[str, Any]:
-    """Write every table and, last, session.json; returns the latter. ``on_tables`` is called with
-    its content just before that, when all tables are there.
+) -> FusedSession:
+    """Writes every table and, last, session.json.
+
+    ``on_tables`` is called with the content of session.json just before that, when all tables are
+    there.
 
     Raises LogError when the log has nothing to fuse, RoleError when its streams leave open what to
     use.
     """
     fusion = task.settings.fusion
-    session = open_session(
-        [*task.logs],
-        task.topics,
+    options = SessionOptions(
+        topics=task.topics,
         min_range=fusion.min_range,
         max_range=2.0 * fusion.max_range,
         noise=RangeNoise(fusion.depth_noise, fusion.disparity_noise),
         poses=task.poses,
         odometry=fusion.odometry,
     )
+    session = open_session([*task.logs], options)
     try:
         with _scratch(task.folder) as scratch:
             labeller = Labeller(task.settings.labels, session)
             collected = collect(session, labeller, fusion, scratch, on_progress)
             if not len(collected):
-                raise LogError(
-                    f"{session.name} gave no usable points: {'; '.join(session.problems) or 'its sensor streams are empty'}"
-                )
+                reasons = "; ".join(sentences(session.problems)) or "its sensor streams are empty"
+                raise LogError(f"{session.name} gave no usable points: {reasons}")
             check_reach(session, collected, fusion.voxel_size)
             labeller.conclude()
             session_T_map, poses = level(session, collected)
@@ -107,22 +117,23 @@ def fuse_session(
         stamps_ns, track = session.trajectory()
         trajectory = contracts.table("trajectory", {"stamp_ns": stamps_ns, **pose_columns(track)})
         write_table(task.folder.trajectory, trajectory, metadata, ("stamp_ns",))
-        for note in labeller.notes:
-            on_progress(note)
+        problems = [*session.problems, *labeller.problems]
+        for text in sentences(labeller.problems):
+            on_progress(text)
         content = {
             **session.to_json(),
-            "problems": [*session.problems, *labeller.notes],
+            "problems": sentences(problems),
             "labels": labeller.to_json(),
             "name": task.folder.name,
             "fingerprint": task.fingerprint,
             "settings": task.settings.model_dump(mode="json", include={"fusion", "labels"}),
             **metadata,
             **content,
-            "skipped": session.skipped,
+            "skipped": sentences(lost(problems)),
         }
         on_tables(content)
         write_json(task.folder.session_json, content)
-        return content
+        return FusedSession(content, tuple(problems))
     finally:
         session.close()
 

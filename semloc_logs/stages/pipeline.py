@@ -43,7 +43,8 @@ from semloc_logs.logs.annotation.annotate import (
     recover,
 )
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
-from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
+from semloc_logs.logs.problems import lost, sentences
+from semloc_logs.mapping.session_fusion import FusedSession, FuseTask, fuse_session
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.pictures.closures_picture import draw_closures
 from semloc_logs.settings import Resolved
@@ -143,17 +144,19 @@ def fuse(
                 note(f"{name}: {outcome}")
         else:
             report.done.append(name)
-            report.skipped += outcome["skipped"]
-            made = f"{outcome['keyframes']} keyframes, {len(outcome['submaps'])} submaps, {outcome['voxels']} voxels"
-            note(f"{name}: {made}, labels from {outcome['label_source']}")
-            for problem in (p for p in outcome["problems"] if p not in outcome["skipped"]):
-                note(problem if problem.startswith(name) else f"{name}: {problem}")
+            content = outcome.content
+            report.skipped += sentences(lost(outcome.problems))
+            made = f"{content['keyframes']} keyframes, {len(content['submaps'])} submaps, {content['voxels']} voxels"
+            note(f"{name}: {made}, labels from {content['label_source']}")
+            for problem in outcome.problems:
+                if not problem.lost:
+                    note(f"{name}: {problem.text}")
     if report.failed and not report.done and not report.kept:
         raise LogError(" ".join(report.failed))
     return report
 
 
-def _fuse_one(task: FuseTask, note: Note = lambda _: None) -> dict[str, Any] | SemlocError:
+def _fuse_one(task: FuseTask, note: Note = lambda _: None) -> FusedSession | SemlocError:
     """An expected error is a result: one bad log does not end the night's work."""
     try:
         task.folder.session_json.unlink(missing_ok=True)  # what is half replaced must not look done

@@ -28,6 +28,7 @@ from semloc_logs.frames import (
 )
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.problems import Problem, sentences
 from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Labels
@@ -55,7 +56,7 @@ class FakeLog:
         self.path = Path("drive.mcap")
         self.format = "mcap"
         self.encoding = "ros2"
-        self.start_ns, self.end_ns, self.problems = 0, 10**10, list[str]()
+        self.start_ns, self.end_ns, self.problems = 0, 10**10, list[Problem]()
         topics = [f.header.topic for f in frames]
         kinds = {f.header.topic: TYPES[type(f)] for f in frames}
         if "/lidar/label_space" in kinds:
@@ -142,7 +143,7 @@ def test_the_log_says_what_its_ids_mean() -> None:
         "said_by": "log",
         "colours": False,
     }
-    assert labeller.notes == [
+    assert sentences(labeller.problems) == [
         "Classes of /lidar/points that mean nothing here are unlabelled: quux."
     ]
 
@@ -174,7 +175,7 @@ def test_a_guess_looks_at_all_keyframes_and_is_recorded() -> None:
         "said_by": "guess",
         "colours": False,
     }
-    assert "semantickitti by their looks" in labeller.notes[0]
+    assert "semantickitti by their looks" in sentences(labeller.problems)[0]
 
 
 def test_labels_that_are_all_zero_are_none() -> None:
@@ -217,7 +218,7 @@ def test_colours_and_those_that_the_palette_does_not_have() -> None:
         "colours": True,
     }
     assert (
-        labeller.notes[1]
+        sentences(labeller.problems)[1]
         == "1 points have colours of /cam/labels that cityscapes does not have and are unlabelled: (1, 2, 3)."
     )
 
@@ -281,7 +282,7 @@ def test_two_cameras() -> None:
 def test_cameras_that_cannot_be_placed_are_said() -> None:
     found, labeller = classes([camera(), halves(0, 5, 2), sweep(0)])
     assert labeller.source == "geometry"
-    assert "No transform connects the camera frame 'optical'" in labeller.notes[0]
+    assert "No transform connects the camera frame 'optical'" in sentences(labeller.problems)[0]
     assert len(found) == 1
 
 
@@ -332,11 +333,12 @@ def test_what_the_model_lacks_is_said(tmp_path: Path) -> None:
 
 
 def test_a_real_drive_without_poses(shared: Path, tmp_path: Path) -> None:
-    from semloc_logs.logs.session.session import open_session
+    from semloc_logs.logs.session.session import SessionOptions, open_session
 
     settings = by_brightness(tmp_path, 94, 311)
     session = open_session(
-        [shared / "logs" / "kitti_drive_camera_lidar.mcap"], min_range=0.9, max_range=80.0
+        [shared / "logs" / "kitti_drive_camera_lidar.mcap"],
+        SessionOptions(min_range=0.9, max_range=80.0),
     )
     try:
         labeller = Labeller(Labels(**settings), session)

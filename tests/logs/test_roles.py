@@ -6,6 +6,7 @@ import pytest
 
 from semloc_logs.errors import RoleError
 from semloc_logs.logs.log import Stream
+from semloc_logs.logs.problems import sentences
 from semloc_logs.logs.roles import Roles, find_roles, guess_roles
 
 CLOUD, IMAGE, JPEG, INFO = (
@@ -44,7 +45,7 @@ def test_a_car_with_everything() -> None:
     assert found.info_of["/cam_back/image_raw/compressed"] == "/cam_back/camera_info"
     assert found.role_of("/rosout") is None
     assert found.role_of("/map") is None
-    assert any("--topic lidar=/map" in note for note in found.notes)
+    assert any("--topic lidar=/map" in note for note in sentences(found.notes))
 
 
 def test_depth_camera_with_both_infos_and_a_posestamped() -> None:
@@ -221,7 +222,7 @@ def test_fixes_named_as_the_pose() -> None:
 
 def test_overrides_that_cannot_be() -> None:
     topics = {"/points": CLOUD, "/odom": ODOM}
-    with pytest.raises(RoleError, match=r"no role 'laser'.*lidar, depth"):
+    with pytest.raises(RoleError, match=r"role 'laser' is unknown.*lidar, depth"):
         roles(topics, laser="/points")
     with pytest.raises(
         RoleError, match=r"no topic '/pionts'.*/odom \(nav_msgs/msg/Odometry\), /points"

@@ -1,6 +1,4 @@
-"""When each point of a sweep was measured: units and origins of recorded point times, and whether
-they can be believed.
-"""
+"""Times of the points of a sweep: unit and origin as recorded, and whether they are plausible."""
 
 from __future__ import annotations
 
@@ -10,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F32, LidarFrame
+from semloc_logs.frames import F32, LidarFrame, PointTimeRemark
 
-SWEEP_NS = 1_000_000_000  # no time of a point is further from its header than a second
+# the points of a sweep are within a second, and within a second of their header
+LONGEST_SWEEP_NS = 1_000_000_000
 # a sweep takes longer than this, which tells milliseconds from microseconds
 _LEAST_SPAN_NS = 5_000_000
 _PERIODS_PER_SWEEP = 1.5  # a sweep is over when the next one begins, give or take
@@ -22,9 +21,6 @@ _ORDERED = 0.5
 _NEARLY = 0.05  # of the sweep's span
 _LOOKED_AT = 20_000  # points that are compared
 _CELLS = 180  # cells of azimuth of 2 degrees
-
-NO_SENSE = "times"  # remarks of a LidarFrame, see semloc_logs.logs.session.tally
-OTHER_CLOCK = "clock"
 
 
 def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int64] | None, bool]:
@@ -50,10 +46,12 @@ def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int
         (u, o)
         for u, first, last in ranges
         for o in (0, stamp_ns)
-        if max(abs(first - o), abs(last - o)) < SWEEP_NS
+        if max(abs(first - o), abs(last - o)) < LONGEST_SWEEP_NS
     ]
     sweeps = {
-        u: first for u, first, last in ranges if _LEAST_SPAN_NS <= last - first < 2 * SWEEP_NS
+        u: first
+        for u, first, last in ranges
+        if _LEAST_SPAN_NS <= last - first < 2 * LONGEST_SWEEP_NS
     }
     for unit, origin in near:
         if unit in sweeps:
@@ -115,10 +113,10 @@ class PointTimes:
         if offset is None or not len(offset):
             return frame
         # the longest of some: several sensors on one topic come in bursts
-        longest = _PERIODS_PER_SWEEP * max(periods) if len(periods) > 1 else SWEEP_NS
+        longest = _PERIODS_PER_SWEEP * max(periods) if len(periods) > 1 else LONGEST_SWEEP_NS
         if int(offset.max()) - int(offset.min()) <= longest and in_order(offset, frame.points):
             return frame
-        return replace(frame, offset_ns=None, remark=NO_SENSE)
+        return replace(frame, offset_ns=None, remark=PointTimeRemark.UNUSABLE)
 
 
 def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:

@@ -9,9 +9,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F32, F64, LidarFrame
+from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.numerics import transforms
 
-LONGEST_SWEEP_NS = 1_000_000_000  # point times that span more are no sweep but garbage
 _BIN_NS = 1_000_000  # within a millisecond a vehicle at 30 m/s moves 3 cm
 
 PosesAt = Callable[[NDArray[np.int64]], tuple[F64, NDArray[np.bool_]]]

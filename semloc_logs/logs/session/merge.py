@@ -20,11 +20,12 @@ def merged_streams(logs: Sequence[Log]) -> list[Stream]:
 
 
 def merged_frames(logs: Sequence[Log], topics: Collection[str]) -> Iterator[Frame]:
-    """The frames of ``topics`` in log-time order over all logs, which may overlap. A log is read
-    only once its time has come.
+    """The frames of ``topics`` in log-time order over all logs, which may overlap.
+
+    A log is read only once its time has come.
     """
     waiting = sorted(range(len(logs)), key=lambda i: (logs[i].start_ns or 0, i), reverse=True)
-    # (log time, log, nothing compares further): the log's index keeps equal times in a fixed order
+    # (log time, index of the log): the index keeps equal times in a fixed order
     heads: list[tuple[int, int]] = []
     frames: dict[int, Frame] = {}
     readers: dict[int, Iterator[Frame]] = {}

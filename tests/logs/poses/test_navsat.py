@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.frames import F64, Frame, Header, ImuSample, NavSatSample
 from semloc_logs.logs.poses.navsat import LocalFrame, NavSatPoses, earth_centred
+from semloc_logs.logs.problems import sentences
 from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
@@ -155,7 +156,6 @@ def test_with_the_orientation_of_a_mounted_imu() -> None:
     assert len(found) == 100
     check(found, position=0.01, angle=0.1)
     assert source.problems == []
-    assert source.notes == []
     told = source.to_json()
     assert (told["heading"], told["fixes"]) == ("imu", 100)
 
@@ -187,14 +187,14 @@ def test_an_imu_of_unknown_mounting_is_not_believed() -> None:
         position=2,
         angle=1,
     )
-    assert any("from 'imu', the IMU's frame" in note for note in source.notes)
-    assert any("from 'gps', the antenna of /fix" in note for note in source.notes)
+    assert any("from 'imu', the IMU's frame" in note for note in sentences(source.problems))
+    assert any("from 'gps', the antenna of /fix" in note for note in sentences(source.problems))
 
 
 def test_a_heading_that_is_not_relative_to_east_is_said() -> None:
     source = NavSatPoses("/fix", 100)
     drive(source, [*fixes(), *samples(with_orientation=True, offset=np.radians(90))])
-    (said,) = source.problems
+    (said,) = sentences(source.problems)
     assert re.search(r"off the course over ground by (89|9[0-2]) degrees.*--topic imu=none", said)
 
 
@@ -208,8 +208,8 @@ def test_uncertain_and_missing_fixes_are_left_out() -> None:
     assert len(found) == 99
     assert 2.0 not in found
     check(found, position=0.01, angle=0.1)
-    assert source.problems == [
-        "/fix: 3 of 103 messages say that there is no fix; they were left out.",
+    assert sentences(source.problems) == [
+        "/fix: 3 of 103 messages report that there is no fix; they were left out.",
         "/fix: 1 of 103 messages are less certain than 5 m or out of order; they were left out.",
     ]
 
@@ -224,7 +224,7 @@ def test_a_gap_stays_a_gap() -> None:
 def test_who_never_moves_has_no_heading() -> None:
     source = NavSatPoses("/fix", 50)
     assert drive(source, [fix(0.2 * k, np.zeros(3)) for k in range(50)]) == {}
-    (said,) = source.problems
+    (said,) = sentences(source.problems)
     assert "never moves faster than 1 m/s" in said
     assert "50 fixes give no pose" in said
 

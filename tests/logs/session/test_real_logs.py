@@ -12,6 +12,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import DepthFrame, LidarFrame
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log
+from semloc_logs.logs.problems import sentences
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
 ODD = SHARED / "odd_logs"
@@ -95,7 +96,7 @@ def test_a_type_without_definition_is_named_and_the_rest_read() -> None:
         ("/odometry", "PoseSample"): 2143,
         ("/vehicle_pose", "PoseSample"): 2034,
     }
-    [sentence] = log.problems
+    [sentence] = sentences(log.problems)
     assert sentence.startswith(
         "/vehicle_command_ackermann: messages of type ackermann_msgs/msg/AckermannDriveStamped cannot be decoded"
     )
@@ -126,7 +127,7 @@ def test_a_truncated_drive(tmp_path: Path) -> None:
     assert sum(found.values()) >= 60
     assert {s.topic: s.count for s in log.streams} == found
     assert len(log.problems) == 1
-    assert "cut.mcap" in log.problems[0]
+    assert "cut.mcap" in sentences(log.problems)[0]
 
 
 def test_labels_of_a_real_sweep() -> None:
