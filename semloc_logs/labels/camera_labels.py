@@ -1,4 +1,4 @@
-"""Pictures of a session's cameras, kept until the clouds of their time come and painted onto them."""
+"""Pictures of a session's cameras, kept until the clouds of their time come and painted on them."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Pictures:
             self._bytes -= fullest.waiting.popleft().image.nbytes
 
     def labels(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> Painted | None:
-        """Labels of ``cloud.points[keep]``, the first camera's that sees a point; None: no picture."""
+        """Labels of ``cloud.points[keep]``, of the first camera that sees each, or None."""
         out: Painted = np.zeros(len(keep), PAINTED)
         out["label"] = UNPAINTED
         inside = np.zeros(len(keep), bool)

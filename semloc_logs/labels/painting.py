@@ -1,11 +1,11 @@
 """Label images -> labels of points of another sensor, where the camera can see them.
 
-A LIDAR beside a camera looks past the edges of near things at what is hidden from the camera, and
-its points are sparse: through the gaps between the points of a near thing, a plain depth test lets
-the hidden points take the near thing's class. So the surfaces that the LIDAR saw are drawn into a
-depth image without gaps: in columns of equal azimuth, as seen from the LIDAR, each point is joined
-with the next one above it that continues the same surface, and this strip is as wide as a column. A
-point is hidden where a strip is much nearer.
+A LIDAR beside a camera looks past the edges of near things at points that are hidden from the
+camera, and its points are sparse: through the gaps between the points of a near thing, a plain
+depth test lets the hidden points take the near thing's class. So the surfaces that the LIDAR saw
+are drawn into a depth image without gaps: in columns of equal azimuth, as seen from the LIDAR, each
+point is joined with the next one above it that continues the same surface, and this strip is as
+wide as a column. A point is hidden where a strip is much nearer.
 
 A LIDAR also looks through the windows of cars, and gets nothing back from black paint: there is no
 surface where the picture has one. A point that lies behind a near surface of the very label that it
@@ -46,17 +46,17 @@ U32 = NDArray[np.uint32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Viewpoint:
-    """Where points were measured from: ``origin`` (3,) of the sensor in their frame, and ``axis``
-    (3,), a unit vector, about which its azimuth is counted.
+    """Where points were measured from.
+
+    ``origin`` (3,) of the sensor in their frame, and ``axis`` (3,), a unit vector, about which its
+    azimuth is counted.
     """
 
     origin: NDArray[np.floating]
     axis: NDArray[np.floating]
 
     def columns(self, points: F32) -> tuple[NDArray[np.int32], F32, F32]:
-        """Column of equal azimuth, elevation (rad) and distance (m) of ``points`` (n, 3), each
-        (n,).
-        """
+        """Column of equal azimuth, elevation (rad) and distance (m) of points (n, 3), each (n,)."""
         rays = points - np.asarray(self.origin, np.float32)
         side = np.cross(self.axis, (1.0, 0.0, 0.0) if abs(self.axis[0]) < 0.9 else (0.0, 1.0, 0.0))
         side /= np.linalg.norm(side)
@@ -76,11 +76,10 @@ class Viewpoint:
 def nearest_depth(
     points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, projector: Projector
 ) -> tuple[F32, float]:
-    """Depth (m along the optical axis) of the nearest surface in each cell of the picture, infinite
-    where there is none, and the edge of a cell in pixels.
+    """Depth of the nearest surface in each cell of the picture, and the edge of a cell in pixels.
 
-    ``camera`` and ``pixels`` are where all the ``points`` (n, 3) of a cloud lie in the camera's
-    frame and in its picture.
+    Depth in m along the optical axis, infinite where there is no surface. ``camera`` and ``pixels``
+    are the places of all ``points`` (n, 3) of a cloud in the camera's frame and in its picture.
     """
     cell = max(1.0, float(round(projector.focal * _CELL)))
     shape = int(np.ceil(projector.height / cell)), int(np.ceil(projector.width / cell))
@@ -132,9 +131,10 @@ def _continues(
     i: int,
     step: int,
 ) -> int:
-    """The next point of another ring, upwards or downwards, that is on the same surface as point
-    ``i``; _ENDS where the next ring sees something much farther or nothing, and _STEPS where it
-    sees something else.
+    """The next point of another ring that is on the same surface as point ``i``.
+
+    Upwards or downwards by ``step``; _ENDS where the next ring sees something much farther or
+    nothing, and _STEPS where it sees something else.
     """
     ends = _ENDS
     for k in range(1, _LOOK_AHEAD + 1):
@@ -164,8 +164,9 @@ def _strip(
     half_a: float,
     half_b: float,
 ) -> None:
-    """Joins two points: in each row of cells the farthest depth that the line has there, which is
-    linear in 1 / z; in each column where the line lies rather than stands.
+    """Joins two points: in each row of cells the farthest depth that the line has there.
+
+    It is linear in 1 / z; in each column where the line lies rather than stands.
     """
     main = 1 if abs(b[1] - a[1]) >= abs(b[0] - a[0]) else 0
     first = int(np.floor(min(a[main], b[main])))
@@ -198,8 +199,10 @@ def _line(
 
 
 class PaintedPoints(NamedTuple):
-    """Labels (m,), or UNPAINTED; which of them may belong to something nearer (m,); and which
-    points are in the picture at all (m,).
+    """Labels (m,) or UNPAINTED, and what else is known about each point.
+
+    ``is_doubtful`` (m,): the label may belong to something nearer; ``is_inside`` (m,): the point is
+    in the picture at all, visible or hidden.
     """
 
     label: U32
@@ -254,8 +257,9 @@ def _behind_its_own(
     z: F32,
     focal: float,
 ) -> NDArray[np.bool_]:
-    """Which points (n,) with the labels ``own`` at cells (``row``, ``column``) have a much nearer
-    surface of the same label beside them.
+    """Which points (n,) have a much nearer surface of the same label beside them.
+
+    ``own``: their labels, at cells (``row``, ``column``).
     """
     out = np.zeros(len(own), bool)
     half = int(cell) // 2
@@ -283,7 +287,7 @@ def _behind_its_own(
 
 
 def without_borders(labels: U32, width: int) -> U32:
-    """The picture (h, w) of labels with UNPAINTED within ``width`` pixels of where two labels meet."""
+    """The picture (h, w) of labels, UNPAINTED within ``width`` pixels of where two labels meet."""
     if width <= 0:
         return labels
     border: NDArray[np.uint8] = np.zeros(labels.shape, np.uint8)

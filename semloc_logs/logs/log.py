@@ -63,7 +63,7 @@ class Log(Protocol):
 
     @property
     def encoding(self) -> str:
-        """Encoding of most streams: ``ros2``, ``ros1``, ``protobuf`` or ``json``; "" without any."""
+        """Encoding of most streams: ``ros2``, ``ros1``, ``protobuf``, ``json``; "" without."""
 
     @property
     def start_ns(self) -> int | None:

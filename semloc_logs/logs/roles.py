@@ -323,7 +323,7 @@ def _camera_of_depth(name: str) -> str:
 
 
 def _lidar(guess: _Guess) -> list[str]:
-    """All clouds that a sensor measures: not maps or derived clouds, not a depth image once more."""
+    """All clouds that a sensor measures: not maps, derived clouds or a depth image once more."""
     clouds = guess.of_kind(_CLOUDS)
     cameras = {_DEPTH.split(t.lower(), maxsplit=1)[0] for t in guess.topics("depth")}
     measured = []

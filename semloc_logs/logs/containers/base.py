@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bz2
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heappop, heappush, heapreplace
 from pathlib import Path
@@ -15,7 +16,7 @@ import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Frame
-from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.log import Log, Message, Stream
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problem, Problems
 
@@ -93,6 +94,15 @@ def encoding_of(streams: Iterable[Stream]) -> str:
     return max(sorted(set(encodings)), key=encodings.count, default="")
 
 
+def merged_streams(logs: Sequence[Log]) -> list[Stream]:
+    """The streams of all logs sorted by topic; counts of the same topic and type add up."""
+    counts: Counter[tuple[str, str, str]] = Counter()
+    for log in logs:
+        for s in log.streams:
+            counts[s.topic, s.type, s.encoding] += s.count
+    return [Stream(*key, count) for key, count in sorted(counts.items())]
+
+
 def in_log_time_order(
     parts: Iterable[tuple[int, Callable[[], Iterator[Message]]]],
 ) -> Iterator[Message]:
@@ -107,12 +117,16 @@ def in_log_time_order(
         reverse=True,
     )
     heap: list[tuple[int, int, Message, Iterator[Message]]] = []
-    while waiting or heap:
+
+    def open_due() -> None:
         while waiting and (not heap or waiting[-1][0] <= heap[0][0]):
             _, order, part = waiting.pop()
             opened = iter(part())
             if (first := next(opened, None)) is not None:
                 heappush(heap, (first.log_time_ns, order, first, opened))
+
+    while waiting or heap:
+        open_due()
         if not heap:
             continue
         _, order, message, opened = heap[0]

@@ -50,7 +50,7 @@ class SqliteLog(BaseLog):
         self._name_undefined()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
-        """The messages of ``topics`` (None: of all) in log-time order; damage ends the iteration."""
+        """The messages of ``topics`` (None: of all) in log-time order, up to any damage."""
         wanted = [i for i, (topic, *_) in self._topics.items() if topics is None or topic in topics]
         if not wanted:
             return

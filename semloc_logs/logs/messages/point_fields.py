@@ -111,7 +111,7 @@ def decode_points(
 def _offsets(
     time: NDArray[np.generic] | None, stamp_ns: int
 ) -> tuple[NDArray[np.int64] | None, PointTimeRemark | None]:
-    """Times relative to ``stamp_ns`` where they make sense, and a remark where they are not usual."""
+    """Times relative to ``stamp_ns`` where they make sense, and a remark where they are unusual."""
     if time is None:
         return None, None
     offset, is_other_clock = offsets_ns(time, stamp_ns)

@@ -1,4 +1,4 @@
-"""Times of the points of a sweep: unit and origin as recorded, and whether they are plausible."""
+"""Times of the points of a sweep: unit, origin, and whether they are plausible."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ _CELLS = 180  # cells of azimuth of 2 degrees
 
 
 def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int64] | None, bool]:
-    """Times of points relative to ``stamp_ns``, whatever their unit and origin, and whether the
-    origin is that of another clock.
+    """Times (n,) of points relative to ``stamp_ns``; and whether they are of another clock.
 
     None when nothing makes sense of them. The unit (s, ms, us, ns) and origin (the stamp, or the
     epoch) are those with which the points span more than 5 ms and stay within a second of the
@@ -89,18 +88,18 @@ def _shift(time: NDArray[np.generic], unit: int, origin: int) -> NDArray[np.int6
 
 
 class PointTimes:
-    """Compares the point times of the sweeps of a log with what sweeps are like, topic by topic."""
+    """Checks the point times of the sweeps of a log, topic by topic."""
 
     def __init__(self) -> None:
         self._newest: dict[tuple[str, str], int] = {}
         self._periods: dict[tuple[str, str], deque[int]] = {}
 
     def checked(self, frame: LidarFrame) -> LidarFrame:
-        """The sweep as it is, or without times and remarked when they cannot be believed.
+        """The sweep as it is, or without times and with a remark when they are not plausible.
 
         A sweep does not take much longer than the time to the next one; clouds gathered from
         several sweeps do. And points recorded one after the other, or seen in the same direction,
-        were measured nearly together; where they were not, it is no time.
+        were measured nearly together; where they were not, the values are not times.
         """
         key = (frame.header.topic, frame.header.frame_id)
         stamp_ns = frame.header.stamp_ns
@@ -120,8 +119,9 @@ class PointTimes:
 
 
 def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:
-    """Whether neighbours among ``points`` (n, 3), as recorded or by their direction, have nearly
-    the same time.
+    """Whether neighbours among ``points`` (n, 3) have nearly the same time.
+
+    Neighbours in the recorded order, or by their direction.
     """
     span = int(offset_ns.max()) - int(offset_ns.min())
     if span == 0 or len(offset_ns) < 100:

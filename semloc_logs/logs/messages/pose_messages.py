@@ -1,4 +1,4 @@
-"""Messages that say where the vehicle is: poses, transforms, inertial and satellite measurements."""
+"""Messages with poses and transforms, inertial and satellite measurements."""
 
 from __future__ import annotations
 
@@ -64,8 +64,9 @@ def _is_static(header: Header) -> bool:
 
 
 def _each(convert: Convert) -> Convert:
-    """The transforms that make sense, and then the error of the first that does not: one bad edge
-    does not cost the others.
+    """Converts all transforms that make sense, then raises the error of the first bad one.
+
+    One bad edge does not cost the others.
     """
 
     def convert_all(m: Any, message: Message) -> Iterator[Frame]:
@@ -96,8 +97,9 @@ def _imu(header: Header, m: Any) -> Iterator[Frame]:
 
 
 def _imu_orientation(m: Any) -> F64 | None:
-    """The quaternion of an IMU that reports one: without, the first element of its covariance is
-    -1, or it is no unit quaternion.
+    """The quaternion xyzw of an IMU that reports one, else None.
+
+    Without one the first element of its covariance is -1, or its length is not 1.
     """
     q = getattr(m, "orientation", None)
     covariance = getattr(m, "orientation_covariance", None)

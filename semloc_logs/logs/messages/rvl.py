@@ -1,5 +1,6 @@
-"""RVL, the run-length code of ROS's compressedDepth: runs of zeros, then runs of differences as
-variable-length numbers.
+"""RVL, the run-length code of ROS's compressedDepth.
+
+Runs of zeros, then runs of differences as variable-length numbers.
 """
 
 from __future__ import annotations
@@ -39,9 +40,7 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
 
 
 def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[list[int], list[int], list[int]]:
-    """For each run of values its first pixel, the place of its first number, and how many there
-    are.
-    """
+    """For each run of values its first pixel, the index of its first number, and its length."""
     starts: list[int] = []
     firsts: list[int] = []
     counts: list[int] = []
@@ -63,9 +62,7 @@ def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[list[int], list[int]
 
 
 def _numbers(code: bytes | memoryview) -> NDArray[np.int64]:
-    """All numbers of the code: 3 bits a nibble, low ones first, the fourth says that another nibble
-    follows.
-    """
+    """All numbers of the code: 3 bits a nibble, low ones first, the fourth marks a continuation."""
     words = np.frombuffer(code, "<u4", count=len(code) // 4)
     shifts = np.arange(28, -1, -4, dtype=np.uint32)  # the first nibble of a word is its highest
     nibbles = ((words[:, None] >> shifts) & 15).astype(np.int64).reshape(-1)

@@ -44,9 +44,7 @@ def choose_base_frame(
     sensors, the most important first.
     """
     sensors = [frame_name(s) for s in sensors]
-    reachable = any(tree.connected(BASE_LINK, s) for s in sensors) or (
-        not sensors and BASE_LINK in tree.frames
-    )
+    reachable = _has_base_link(tree, sensors)
     first = sensors[0] if sensors else (BASE_LINK if reachable else "")
     if pose_child is None:
         return BaseFrame(BASE_LINK if reachable else first, None)
@@ -64,6 +62,13 @@ def choose_base_frame(
     return BaseFrame(
         child, child, assumed=first, problems=(_unconnected_sensor(first, child, pose_topic),)
     )
+
+
+def _has_base_link(tree: TransformTree, sensors: Sequence[str]) -> bool:
+    """Whether ``base_link`` is connected with a sensor, or known where there are none."""
+    if not sensors:
+        return BASE_LINK in tree.frames
+    return any(tree.connected(BASE_LINK, sensor) for sensor in sensors)
 
 
 def _unnamed_child(pose_topic: str | None, sensor: str) -> Problem:

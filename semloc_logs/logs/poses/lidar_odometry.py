@@ -1,7 +1,7 @@
 """LIDAR odometry for logs without usable poses: KISS-ICP (Vizzo et al., RA-L 2023).
 
-It is installed with the extra ``odometry``. Every sweep of one LIDAR is registered, in the pass that reads the log. The trajectory begins at the
-identity of the base frame.
+It is installed with the extra ``odometry``. Every sweep of one LIDAR is registered, in the pass
+that reads the log. The trajectory begins at the identity of the base frame.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 TUM: ``stamp t_x t_y t_z q_x q_y q_z q_w``, seconds and metres, lines that start with ``#`` are
 comments (TUM RGB-D benchmark, file formats). KITTI: the upper 3 x 4 of the pose, row-major (KITTI
 odometry development kit); line i belongs to the i-th frame of the main range sensor, unless a file
-of times, one number of seconds a line, says when each pose was.
+of times, one number of seconds a line, gives the time of each pose.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ class CameraClouds:
     def points(
         self, frame: DepthFrame | ImageFrame, min_range: float, max_range: float
     ) -> RangePoints | NoCloud:
-        """Points in the optical frame between the ranges (m, along the ray), or why there are none."""
+        """Points in the optical frame between the ranges (m, along the ray), or the reason."""
         if frame.header.topic != self._roles.stereo_left:
             return self._depth.points(frame, min_range, max_range)
         if not isinstance(frame, ImageFrame):

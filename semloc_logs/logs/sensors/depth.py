@@ -50,7 +50,7 @@ USUAL_NOISE = RangeNoise()
 
 
 class RangePoints(NamedTuple):
-    """Points (n, 3) in the optical frame (m), ``label`` (n,) or None, ``sigma`` (n,) of the range."""
+    """Points (n, 3) in the optical frame (m), ``label`` (n,) or None, ``sigma`` (n,) of range."""
 
     points: F32
     label: NDArray[np.uint32] | None
@@ -221,8 +221,8 @@ class LabelImages:
         # else it is painted by its own calibration
         if nearest.header.topic not in self._roles.info_of:
             self.problems.add(
-                f"{nearest.header.topic} is not used for labels: its pictures do not have the size of "
-                f"{frame.header.topic}; --topic label_image=TOPIC names another.",
+                f"{nearest.header.topic} is not used for labels: its pictures do not have the size "
+                f"of {frame.header.topic}; --topic label_image=TOPIC names another.",
                 topic=nearest.header.topic,
                 kind=ProblemKind.LABEL,
                 lost=False,

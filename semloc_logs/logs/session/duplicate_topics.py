@@ -1,4 +1,4 @@
-"""One LIDAR published twice, as measured and filtered: found by equal points, not by topic names."""
+"""One LIDAR published twice, as measured and filtered: found by equal points, not by names."""
 
 from __future__ import annotations
 

@@ -6,17 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 from heapq import heappop, heappush
 
 from semloc_logs.frames import Frame
-from semloc_logs.logs.log import Log, Stream
-
-
-def merged_streams(logs: Sequence[Log]) -> list[Stream]:
-    """The streams of all logs sorted by topic; the counts of the same topic and type add up."""
-    counts: dict[tuple[str, str, str], int] = {}
-    for log in logs:
-        for s in log.streams:
-            key = (s.topic, s.type, s.encoding)
-            counts[key] = counts.get(key, 0) + s.count
-    return [Stream(*key, count) for key, count in sorted(counts.items())]
+from semloc_logs.logs.log import Log
 
 
 def merged_frames(logs: Sequence[Log], topics: Collection[str]) -> Iterator[Frame]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError, RoleError
 from semloc_logs.frames import F64, Camera, ImageFrame, LabelNames, PosedCloud
+from semloc_logs.logs.containers.base import merged_streams
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log, Stream
 from semloc_logs.logs.poses.base_frame import BasePoses, PoseSource
@@ -29,7 +30,7 @@ from semloc_logs.logs.sensors.depth import USUAL_NOISE, RangeNoise
 from semloc_logs.logs.session.cloud_builder import CloudBuilder, RangeLimits
 from semloc_logs.logs.session.duplicate_topics import DuplicateTopics
 from semloc_logs.logs.session.image_relay import ImageRelay
-from semloc_logs.logs.session.merge import merged_frames, merged_streams
+from semloc_logs.logs.session.merge import merged_frames
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.summary import conclude
 

@@ -281,7 +281,7 @@ def test_livox_claims_and_strange_definitions(encoding: str) -> None:
         == []
     )
     assert (
-        "not that of the Livox drivers" in sentences(problems)[0]
+        "differs from the Livox drivers" in sentences(problems)[0]
         or "need" in sentences(problems)[0]
     )
 

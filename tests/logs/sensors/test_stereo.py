@@ -393,7 +393,7 @@ def test_what_is_no_stereo_pair_is_said_in_a_sentence() -> None:
     other = camera(
         "plumb_bob", 1, P=np.array([[400.0, 0, 160, -80], [0, 400, 120, 0], [0, 0, 1, 0]])
     )
-    refused(None, "are not those of one rectified pair", rectified=True, right=other)
+    refused(None, "do not belong to one rectified pair", rectified=True, right=other)
     far_off = np.array([[210.0, 0, 1e5], [0, 210, 120], [0, 0, 1]])
     refused(ahead, "Nothing of the pictures is left", right=camera("plumb_bob", 1, K=far_off))
     refused(
