@@ -33,11 +33,13 @@ _ENDS, _STEPS = -1, -2
 _LEAST_GAP = np.radians(0.08)
 _LOOK_AHEAD = 16  # points of a column that are tried as the continuation of a surface
 _CELL = np.radians(0.16)  # of the depth image
-_NEARER = 0.25  # what hides a point is nearer by so much (m),
+_NEARER = 0.25  # a surface that hides a point is nearer by so much (m),
 _NEARER_SHARE = 0.04  # and by this share of the distance
-_THING = 0.8  # m, half the size of what has windows
+_THING = 0.8  # m, half the size of things with windows
 # around a point, for near surfaces of which _THING is as large as that
 _REACH = (np.radians(6.0), np.radians(3.0), np.radians(1.5))
+_NOTHING = 1e9  # m, the depth of cells without a surface
+_BEHIND_SHARE = 1.1  # of the depth of the nearer surface, and
 _BEHIND = 3.0  # m, so that the side of a truck is not behind its own rear
 _MOST_LABELS = 40  # of a picture that are looked at: more are noise
 
@@ -84,18 +86,18 @@ def nearest_depth(
     cell = max(1.0, float(round(projector.focal * _CELL)))
     shape = int(np.ceil(projector.height / cell)), int(np.ceil(projector.width / cell))
     depth = np.full(shape, np.inf, np.float32)
-    near = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    column, elevation, distance = viewpoint.columns(points[near])
+    shown = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    column, elevation, distance = viewpoint.columns(points[shown])
     order = np.lexsort((elevation, column))
-    near = near[order]
+    shown = shown[order]
     column = column[order]
     elevation = elevation[order]
     distance = distance[order]
-    z = camera[near, 2].astype(float)
+    z = camera[shown, 2].astype(float)
     # off the axis a picture is stretched by the square of the ray's length over its depth
-    stretch = np.linalg.norm(camera[near], axis=1) / z
+    stretch = np.linalg.norm(camera[shown], axis=1) / z
     half = np.maximum(projector.focal / cell * (COLUMN / 2) * distance / z * stretch, 0.5)
-    _draw(depth, (pixels[near] + 0.5) / cell, z, distance, column, elevation, half)
+    _draw(depth, (pixels[shown] + 0.5) / cell, z, distance, column, elevation, half)
     return depth, cell
 
 
@@ -166,7 +168,7 @@ def _strip(
 ) -> None:
     """Joins two points: in each row of cells the farthest depth that the line has there.
 
-    It is linear in 1 / z; in each column where the line lies rather than stands.
+    It is linear in 1 / z; where the line is flat, in each column instead.
     """
     main = 1 if abs(b[1] - a[1]) >= abs(b[0] - a[0]) else 0
     first = int(np.floor(min(a[main], b[main])))
@@ -234,10 +236,10 @@ def paint(
     column, row = np.floor((pixels[inside] + 0.5) / cell).astype(int).T
     z = camera[inside, 2]
     visible = depth[row, column] * (1 + _NEARER_SHARE) + _NEARER >= z
-    at = np.flatnonzero(inside)[visible]
-    u, v = np.rint(pixels[at]).astype(int).T
-    out[at] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
-    known = at[out[at] != UNPAINTED]
+    seen = np.flatnonzero(inside)[visible]
+    u, v = np.rint(pixels[seen]).astype(int).T
+    out[seen] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
+    known = seen[out[seen] != UNPAINTED]
     column, row = np.floor((pixels[known] + 0.5) / cell).astype(int).T
     doubtful = _behind_its_own(
         depth, cell, labels, out[known], row, column, camera[known, 2], projector.focal
@@ -269,20 +271,21 @@ def _behind_its_own(
     )
     values, counts = np.unique(own, return_counts=True)
     for label in values[np.argsort(-counts, kind="stable")][:_MOST_LABELS]:
-        mine = np.flatnonzero(own == label)
+        of_label = np.flatnonzero(own == label)
         surface = np.where(
             coarse[: depth.shape[0], : depth.shape[1]] == label, depth, np.float32(np.inf)
         )
         for reach in _REACH:
-            near = np.where(surface < _THING / np.tan(reach), surface, np.float32(1e9))
+            close = np.where(surface < _THING / np.tan(reach), surface, np.float32(_NOTHING))
             size = 2 * int(focal * reach / cell) + 1
             around = cv2.erode(
-                near,
+                close,
                 np.ones((size, size), np.uint8),
                 borderType=cv2.BORDER_CONSTANT,
-                borderValue=1e9,
+                borderValue=_NOTHING,
             )
-            out[mine] |= np.asarray(around)[row[mine], column[mine]] * 1.1 + _BEHIND < z[mine]
+            nearest = np.asarray(around)[row[of_label], column[of_label]]
+            out[of_label] |= nearest * _BEHIND_SHARE + _BEHIND < z[of_label]
     return out
 
 

@@ -1,4 +1,4 @@
-"""Problems of a log: input that was lost, and what was assumed instead."""
+"""Problems of a log: lost input and assumptions."""
 
 from __future__ import annotations
 

@@ -282,7 +282,7 @@ class _Guess:
         return [Problem("", ProblemKind.ROLE, text, lost=False)]
 
 
-# -- rules: what plays a role, given the roles before it
+# -- rules: the topics of a role, given the roles before it
 
 
 def _label_images(guess: _Guess) -> list[str]:

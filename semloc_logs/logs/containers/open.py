@@ -18,7 +18,7 @@ _SQLITE = b"SQLite format 3\0"
 def open_log(path: str | Path) -> Log:
     """The log at ``path``: an MCAP file, a ROS 1 bag, a ROS 2 bag directory or one of its files.
 
-    LogError names what the file is instead, or what is wrong with it.
+    LogError describes the file where it is not a log, or its damage.
     """
     path = Path(path)
     if path.is_dir():

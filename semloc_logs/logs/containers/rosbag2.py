@@ -210,7 +210,9 @@ class Rosbag2Log(BaseLog):
         except (zstandard.ZstdError, OSError) as error:
             if not target.exists() or target.stat().st_size == 0:
                 raise LogError(f"{path} cannot be decompressed: {error}.") from error
-            self._problems.add(f"{path} is damaged ({error}); what could be decompressed is used.")
+            self._problems.add(
+                f"{path} is damaged ({error}); the part that could be decompressed is used."
+            )
         return target
 
     def _load(self, file: Log, topics: Collection[str] | None) -> Iterator[Message]:

@@ -88,7 +88,7 @@ class SqliteLog(BaseLog):
                 f"{columns} {where} ORDER BY timestamp, id", topic_ids
             )
             return
-        # an index may be what is damaged: without it, and only as far as the table can be read
+        # an index may be damaged: without it, and only as far as the table can be read
         times: list[tuple[int, int]] = []
         with contextlib.suppress(*_DAMAGE):
             for time, row in self._database.execute(
@@ -139,7 +139,7 @@ class SqliteLog(BaseLog):
         self.encoding = "ros2"
 
     def _name_undefined(self) -> None:
-        """Names the types that nobody can decode: not standard, in a bag without definitions."""
+        """Names the types that cannot be decoded: not standard, in a bag without definitions."""
         for topic, type_, encoding, definition in self._topics.values():
             counted = any(s.count for s in self.streams if (s.topic, s.type) == (topic, type_))
             if counted and encoding == "cdr" and not definition.text and not is_standard(type_):
@@ -154,7 +154,7 @@ class SqliteLog(BaseLog):
         """Counts the messages of a damaged file that can still be read."""
         self._damaged = True
         self._problems.add(
-            f"{self._name}: the file is damaged ({error}); what can be read of it is used."
+            f"{self._name}: the file is damaged ({error}); the readable part is used."
         )
         counts.clear()
         self.start_ns = self.end_ns = None
@@ -221,5 +221,5 @@ def _decompress(data: bytes) -> bytes:
     except zstandard.ZstdError as error:
         raise LogError(f"its zstd data are damaged ({error})") from error
     if not 0 <= size <= MAX_CHUNK:
-        raise LogError("its zstd data do not say their size")
+        raise LogError("its zstd data do not contain their size")
     return decompress(data, "zstd", size)

@@ -43,7 +43,7 @@ def parser(encoding: str, type_: str, definition: Definition) -> Parser:
     raise UndecodableError(
         f"the encoding {encoding[:40]!r} is not supported"
         if encoding
-        else "the log does not say its encoding"
+        else "the log does not name its encoding"
     )
 
 
@@ -123,13 +123,13 @@ def _refuse_lists_of_nothing(types: dict[str, Any]) -> None:
     empty: set[str] = set()
     grown = True
     while grown:
-        found = {
+        without_bytes = {
             name
             for name, (_, fields) in types.items()
             if all(_has_no_bytes(kind, empty) for _, kind in fields)
         }
-        grown = found != empty
-        empty = found
+        grown = without_bytes != empty
+        empty = without_bytes
     for name, (_, fields) in types.items():
         for field, (kind, content) in fields:
             if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and _has_no_bytes(content[0], empty):

@@ -19,7 +19,7 @@ Convert = Callable[[Any, Message], Iterator[Frame]]
 # the same where the header is all that is needed of the latter
 Body = Callable[[Header, Any], Iterator[Frame]]
 
-# what hostile values in a well-formed message may raise in converters
+# errors that hostile values in a well-formed message may raise in converters
 BAD_VALUES = (
     ArithmeticError,
     AttributeError,

@@ -119,7 +119,7 @@ def decode_compressed_depth(data: bytes | memoryview, format_: str) -> F32:
     body = data[_COMPRESSED_DEPTH_HEAD.size :]
     raw = decode_rvl(body) if "rvl" in format_.lower() else decode_compressed(body)
     if raw.ndim != 2 or raw.dtype != np.uint16:
-        raise UndecodableError("its depth image is no picture of 16 bits")
+        raise UndecodableError("its depth image is not a picture of 16 bits")
     if format_.strip().lower().startswith("32fc1"):  # stored as inverse depth
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             metres = np.float32(quant_a) / (raw.astype(np.float32) - np.float32(quant_b))

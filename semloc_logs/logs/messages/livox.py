@@ -70,7 +70,7 @@ def _check_definition(types: dict[str, Any], type_: str) -> None:
 
 
 def _parse(data: bytes | memoryview, *, is_cdr: bool) -> CustomMsg:
-    # CDR counts its alignment from behind 4 bytes that say the byte order
+    # CDR counts its alignment from behind 4 bytes, which hold the byte order
     order = ">" if is_cdr and len(data) > 1 and data[1] == 0 else "<"
     body = memoryview(data)[4 if is_cdr else 0 :]
     position = 0 if is_cdr else 4  # ROS 1 headers begin with a sequence number

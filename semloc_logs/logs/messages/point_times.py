@@ -12,13 +12,14 @@ from semloc_logs.frames import F32, LidarFrame, PointTimeRemark
 
 # the points of a sweep are within a second, and within a second of their header
 LONGEST_SWEEP_NS = 1_000_000_000
-# a sweep takes longer than this, which tells milliseconds from microseconds
+# a sweep takes longer than this, so milliseconds and microseconds are not confused
 _LEAST_SPAN_NS = 5_000_000
 _PERIODS_PER_SWEEP = 1.5  # a sweep is over when the next one begins, give or take
 _PERIODS_KEPT = 16
 # the share of neighbours measured nearly together: above 0.9 in sweeps, 0.1 where times are noise
 _ORDERED = 0.5
 _NEARLY = 0.05  # of the sweep's span
+_FEWEST = 100  # points of a sweep whose order can be judged
 _LOOKED_AT = 20_000  # points that are compared
 _CELLS = 180  # cells of azimuth of 2 degrees
 
@@ -41,23 +42,25 @@ def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int
     # in integers, because nanoseconds since 1970 do not fit a float64; the parts of a second are
     # exact enough as float
     ranges = [(unit, _to_ns(low, unit), _to_ns(high, unit)) for unit in _units(time)]
-    near = [
-        (u, o)
-        for u, first, last in ranges
-        for o in (0, stamp_ns)
-        if max(abs(first - o), abs(last - o)) < LONGEST_SWEEP_NS
+    # units and origins that put all points within a second of the stamp
+    plausible = [
+        (unit, origin)
+        for unit, first, last in ranges
+        for origin in (0, stamp_ns)
+        if max(abs(first - origin), abs(last - origin)) < LONGEST_SWEEP_NS
     ]
+    # first point, by the units with which the points span as long as a sweep
     sweeps = {
-        u: first
-        for u, first, last in ranges
+        unit: first
+        for unit, first, last in ranges
         if _LEAST_SPAN_NS <= last - first < 2 * LONGEST_SWEEP_NS
     }
-    for unit, origin in near:
+    for unit, origin in plausible:
         if unit in sweeps:
             return _shift(time, unit, origin), False
     for unit, first in sweeps.items():
         return _shift(time, unit, first), True
-    return (_shift(time, *near[0]), False) if near else (None, False)
+    return (_shift(time, *plausible[0]), False) if plausible else (None, False)
 
 
 def _units(time: NDArray[np.generic]) -> tuple[int, ...]:
@@ -124,11 +127,11 @@ def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:
     Neighbours in the recorded order, or by their direction.
     """
     span = int(offset_ns.max()) - int(offset_ns.min())
-    if span == 0 or len(offset_ns) < 100:
+    if span == 0 or len(offset_ns) < _FEWEST:
         return True
-    near = max(1.0, _NEARLY * span)
+    together = max(1.0, _NEARLY * span)  # ns
     some = slice(0, _LOOKED_AT)
-    if float(np.mean(np.abs(np.diff(offset_ns[some])) < near)) > _ORDERED:
+    if float(np.mean(np.abs(np.diff(offset_ns[some])) < together)) > _ORDERED:
         return True
     every = max(1, len(offset_ns) // _LOOKED_AT)
     cell = (
@@ -140,4 +143,4 @@ def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:
     middle = starts + np.diff(starts, append=len(order)) // 2
     median = np.zeros(int(cell.max()) + 1, np.int64)
     median[cell[order[starts]]] = time[order[middle]]
-    return float(np.mean(np.abs(time - median[cell]) < near)) > _ORDERED
+    return float(np.mean(np.abs(time - median[cell]) < together)) > _ORDERED

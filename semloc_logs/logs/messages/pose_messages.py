@@ -114,7 +114,7 @@ def _nav_sat(header: Header, m: Any) -> Iterator[Frame]:
     longitude = float(m.longitude or 0.0)
     altitude = float(m.altitude or 0.0)
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and math.isfinite(altitude)):
-        raise UndecodableError("its latitude, longitude or altitude is no number on Earth")
+        raise UndecodableError("its latitude, longitude or altitude is not on Earth")
     yield NavSatSample(header, latitude, longitude, altitude, _fix_covariance(m))
 
 
@@ -130,7 +130,7 @@ def _fix_covariance(m: Any) -> F64 | None:
 
 
 def _nav_sat_fix(header: Header, m: Any) -> Iterator[Frame]:
-    if m.status.status >= 0:  # below: the receiver itself says that it has no fix
+    if m.status.status >= 0:  # below: the receiver itself reports that it has no fix
         yield from _nav_sat(header, m)
 
 

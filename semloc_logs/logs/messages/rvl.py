@@ -44,20 +44,21 @@ def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[list[int], list[int]
     starts: list[int] = []
     firsts: list[int] = []
     counts: list[int] = []
-    at = position = 0
+    index = 0  # of the numbers
+    position = 0  # of the pixels
     while position < pixels:
-        if at + 2 > len(numbers):
+        if index + 2 > len(numbers):
             raise UndecodableError("its RVL picture is cut off")
-        zeros = int(numbers[at])
-        values = int(numbers[at + 1])
+        zeros = int(numbers[index])
+        values = int(numbers[index + 1])
         position += zeros
-        if zeros + values == 0 or position + values > pixels or at + 2 + values > len(numbers):
+        if zeros + values == 0 or position + values > pixels or index + 2 + values > len(numbers):
             raise UndecodableError("its RVL picture is damaged")
         starts.append(position)
-        firsts.append(at + 2)
+        firsts.append(index + 2)
         counts.append(values)
         position += values
-        at += 2 + values
+        index += 2 + values
     return starts, firsts, counts
 
 

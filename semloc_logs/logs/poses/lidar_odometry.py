@@ -22,8 +22,7 @@ from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 
 MAX_SPEED = 100.0  # m/s; nothing on wheels is faster
-# m/s from one sweep to the next beyond what 30 m/s^2 explain: no brake and no crash survivor does
-# that
+# m/s from one sweep to the next beyond an acceleration of 30 m/s^2: no brake reaches that
 MAX_SPEED_CHANGE = 12.0
 _MAX_ACCELERATION = 30.0  # m/s^2
 MAX_TURN = 10.0  # rad/s
@@ -40,8 +39,8 @@ class LidarOdometry:
     """Poses of the LIDAR on ``topic`` from its sweeps; LogError when KISS-ICP is not installed.
 
     ``max_range`` and ``min_range`` (m): points that are used. After a jump that no vehicle can
-    make, or once a sweep does not lie on the sweep before any more, there are no more poses, which
-    is one of the ``problems``. Slow drift goes unnoticed.
+    make, or once a sweep does not lie on the sweep before any more, there are no more poses, which is
+    named in ``problems``. Slow drift goes unnoticed.
     """
 
     name = "LIDAR odometry"

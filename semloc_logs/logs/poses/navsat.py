@@ -107,7 +107,10 @@ class NavSatPoses:
         self._assumptions = Problems()
         self.is_over = False
         self.local: LocalFrame | None = None
-        self._count, self._seen, self._refused, self._used = count, 0, 0, 0
+        self._count = count
+        self._seen = 0
+        self._refused = 0
+        self._used = 0
         # stamp, antenna, its frame
         self._fixes: deque[tuple[int, F64, str]] = deque(maxlen=_MOST_WAITING)
         # fixes within the window behind the next one to give
@@ -254,17 +257,17 @@ class NavSatPoses:
         self._past.append((stamp_ns, antenna))
         while self._past[0][0] < stamp_ns - WINDOW_NS:
             self._past.popleft()
-        near = [*self._past]
+        window = [*self._past]
         for later in self._fixes:
             if later[0] > stamp_ns + WINDOW_NS:
                 break
-            near.append(later[:2])
-        t = np.array([(s - stamp_ns) * 1e-9 for s, _ in near])
-        if len(near) < 2:
+            window.append(later[:2])
+        t = np.array([(s - stamp_ns) * 1e-9 for s, _ in window])
+        if len(window) < 2:
             return _Motion(None, np.zeros(3))
-        degree = 2 if len(near) > 3 else 1
+        degree = 2 if len(window) > 3 else 1
         fitted, *_ = np.linalg.lstsq(
-            np.vander(t, degree + 1, increasing=True), np.array([p for _, p in near]), rcond=None
+            np.vander(t, degree + 1, increasing=True), np.array([p for _, p in window]), rcond=None
         )
         velocity = fitted[1]
         acceleration = 2.0 * fitted[2] if degree == 2 else np.zeros(3)
@@ -286,12 +289,12 @@ class NavSatPoses:
         """Mean specific force (3,) in the base frame around a time."""
         while self._forces and self._forces[0][0] < stamp_ns - WINDOW_NS:
             self._forces.popleft()
-        near = []
+        window = []
         for s, force in self._forces:
             if s > stamp_ns + WINDOW_NS:
                 break
-            near.append(force)
-        return base_T_imu[:3, :3] @ np.mean(near, axis=0) if near else None
+            window.append(force)
+        return base_T_imu[:3, :3] @ np.mean(window, axis=0) if window else None
 
     def _along_course(
         self,

@@ -165,8 +165,10 @@ class FilePoses:
         self.name = str(source.path)
         self.session_frame = "trajectory"
         self.child: str | None = source.frame
-        self.problems: list[Problem] = []  # none: what is wrong with a file is an error
-        self._source, self._topic, self._count = source, topic, count
+        self.problems: list[Problem] = []  # none: a file with a mistake is an error
+        self._source = source
+        self._topic = topic
+        self._count = count
         self._trajectory = read_trajectory(source)
         self._frames = 0
         self._given = 0

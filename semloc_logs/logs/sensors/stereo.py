@@ -21,13 +21,14 @@ from semloc_logs.logs.sensors.rectification import SMALLEST, Rectification
 
 # px of the matched pictures, where texture is plenty: interpolation, pixel locking, calibration
 DISPARITY_NOISE = 0.2
-# of the range; beyond that sigma, 1 / disparity is no longer linear enough to speak of one
+# of the range; beyond that sigma, 1 / disparity is not linear enough for a standard deviation
 LARGEST_SHARE = 0.15
 MOST_PIXELS = 500_000  # larger pictures are shrunk before they are matched
 DENSE_PIXELS = 200_000  # of larger ones every second pixel of every second row becomes a point
-_GREY_NOISE = 3.0  # grey levels: noise, and what two cameras see differently
+_GREY_NOISE = 3.0  # grey levels: noise, and differences between the cameras
 _LARGEST_NOISE = 0.8  # px; a disparity that is worse for want of texture is dropped
 _TEXTURE = 9  # px; window that texture is measured in
+_NEAREST = 1e-3  # m; a smaller min_range would search without end
 _BLOCK = 5  # px; matched windows
 _FIXED_POINT = 16  # OpenCV's disparities are in sixteenths of a pixel
 # disparities up to a tenth of the width are searched: from 0.5 m at 11 cm and a lens of 90 degrees
@@ -35,7 +36,7 @@ _SHARE_SEARCHED = 10
 _LEFT_RIGHT = 1.0  # px; largest difference of the disparities from both sides
 _UNIQUENESS = 10  # percent by which the second best match is worse
 _SPECKLE = 0.0004  # share of the picture that a patch of like disparities covers at least
-_RIM = 4  # px along the edge of the recorded picture whose windows see what was not recorded
+_RIM = 4  # px along the edge of the recorded picture whose windows reach beyond it
 
 Grey = NDArray[np.uint8]
 
@@ -90,8 +91,8 @@ class StereoMatcher:
         if abs(self.least) + self.count >= self.width:
             raise LogError(
                 f"The calibrations of the stereo pair put all within {max_range:g} m at "
-                f"disparities of {self.least} pixels and more, too many for pictures {self.width} pixels wide; "
-                f"name others with --topic camera_info=TOPIC,TOPIC."
+                f"disparities of {self.least} pixels and more, too many for pictures "
+                f"{self.width} pixels wide; name others with --topic camera_info=TOPIC,TOPIC."
             )
         self._matcher = _matcher(self.least, self.count)
         self._back_least = math.floor(self.least / 2)
@@ -113,10 +114,10 @@ class StereoMatcher:
 
         No more than are worth their time.
         """
-        far = self._fb / self._max_range + self._offset
-        near = self._fb / max(self._min_range, 1e-3) + self._offset
-        least = math.floor(max(far - 1, self._offset))
-        most = min(math.ceil(near) + 1, least + self.width // _SHARE_SEARCHED)
+        at_max_range = self._fb / self._max_range + self._offset
+        at_min_range = self._fb / max(self._min_range, _NEAREST) + self._offset
+        least = math.floor(max(at_max_range - 1, self._offset))
+        most = min(math.ceil(at_min_range) + 1, least + self.width // _SHARE_SEARCHED)
         return least, max(16, 16 * math.ceil((most - least) / 16))
 
     def _set_rays(self) -> None:

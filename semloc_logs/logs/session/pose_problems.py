@@ -5,7 +5,7 @@ from __future__ import annotations
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import Problem, ProblemKind
 
-# a vehicle may well stand so long, but a log of nothing else is worth a sentence
+# a vehicle may well stand still so long, but a log of nothing else is suspicious
 _STANDSTILL_NS = 10_000_000_000
 
 

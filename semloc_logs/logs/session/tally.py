@@ -1,4 +1,4 @@
-"""Counts what became of the frames of each topic."""
+"""Counts the used and the left out frames of each topic."""
 
 from __future__ import annotations
 
