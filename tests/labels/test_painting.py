@@ -1,6 +1,4 @@
-"""Painting: a near board before a far wall, seen by a camera beside the LIDAR; ground, walls along
-the road, windows.
-"""
+"""Painting: a near board before a far wall, seen by a camera beside the LIDAR; ground, windows."""
 
 from __future__ import annotations
 
@@ -46,9 +44,7 @@ def camera_at(x: float, y: float, z: float) -> F64:
 def rays(
     rings: float, step: float = 0.2, reach: float = 45.0, low: float = -14.0, high: float = 10.0
 ) -> F64:
-    """Unit vectors (n, 3) of a spinning LIDAR: one ring every ``rings`` degrees, one point every
-    ``step`` degrees.
-    """
+    """Unit vectors (n, 3) of a spinning LIDAR: rings and points every so many degrees."""
     elevation, azimuth = np.meshgrid(
         np.radians(np.arange(low, high, rings)),
         np.radians(np.arange(-reach, reach, step)),
@@ -65,9 +61,7 @@ def rays(
 
 
 def hit(origin: F64, directions: F64, x: float, half_y: float, half_z: float) -> F64:
-    """Distance (n,) along the rays to the upright rectangle at ``x``, infinite for those that miss
-    it.
-    """
+    """Distance (n,) along the rays to the upright rectangle at ``x``, infinite where they miss."""
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (x - origin[0]) / directions[:, 0]
     p = origin + directions * np.where(np.isfinite(t), t, 0)[:, None]
@@ -164,7 +158,7 @@ def _board_half(base_T_camera: F64) -> F64:
 
 
 def test_a_lidar_on_its_side() -> None:
-    """The rings of a sensor that turns about y stand upright; its azimuth counts about that axis."""
+    """The rings of a sensor that turns about y are upright; its azimuth counts about that axis."""
     base_T_camera = camera_at(0.3, 0.5, -0.2)
     turned = rays(1.0, reach=30.0, low=-30.0, high=30.0)[:, [0, 2, 1]]
     distance, truth = seen(np.zeros(3), turned)
@@ -190,10 +184,8 @@ def test_the_ground_and_a_wall_along_the_road_do_not_hide_themselves(
     assert (found[inside] == 0).mean() > 0.97
 
 
-def test_what_is_seen_through_a_window_is_doubtful() -> None:
-    """A board with a window that a LIDAR looks through, all of one label in the picture, before a
-    wall.
-    """
+def test_points_behind_a_window_are_doubtful() -> None:
+    """A board with a window before a wall, all of one label in the picture."""
     base_T_camera = camera_at(0.2, 0.1, -0.1)
     directions = rays(0.4)
     distance, _ = seen(np.zeros(3), directions)

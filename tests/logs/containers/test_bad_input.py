@@ -1,5 +1,6 @@
-"""Logs with one fault each: what is skipped is counted and named, the rest is used, and nothing
-claimed is allocated.
+"""Logs with one fault each: skipped data are counted and named, the rest is used.
+
+Nothing is allocated for a claim.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ def test_layouts_that_do_not_fit(
 
 
 @pytest.mark.parametrize("type_", ["i2", "u4", "i1"])
-def test_whole_numbers_are_no_positions(recorder: Any, type_: str) -> None:
+def test_whole_numbers_are_not_positions(recorder: Any, type_: str) -> None:
     log = recorder()
     whole = rows([(axis, f"<{type_}") for axis in "xyz"])
     clouds, skipped = good_and_bad(log, lambda stamp: log.cloud("/points", stamp, "lidar", whole))
@@ -141,7 +142,8 @@ def test_points_that_are_no_numbers_are_counted(recorder: Any) -> None:
     clouds, skipped = good_and_bad(log, lambda stamp: holes(stamp, is_dense=True))
     assert [len(c.points) for c in clouds] == [60, 60, 60, 56, 56]
     assert skipped == [
-        "/points: 8 of 300 points are left out: they are not finite, although their clouds call themselves dense."
+        "/points: 8 of 300 points are left out: they are not finite, although "
+        "their clouds call themselves dense."
     ]
     log = recorder(name="honest")
     assert good_and_bad(log, lambda stamp: holes(stamp, is_dense=False))[1] == []
@@ -159,11 +161,12 @@ def test_clouds_of_nothing_are_counted(recorder: Any) -> None:
     )
     assert len(clouds) == 3
     assert skipped == [
-        "/points: 2 of 5 frames are left out: they hold no points, or none whose position is a number."
+        "/points: 2 of 5 frames are left out: they hold no points, or none whose "
+        "position is a number."
     ]
 
 
-def test_inspect_and_fuse_say_it_and_exit_with_3(recorder: Any, tmp_path: Path) -> None:
+def test_inspect_and_fuse_name_it_and_exit_with_3(recorder: Any, tmp_path: Path) -> None:
     log = recorder()
     stage(log)
     for k in range(5):
@@ -305,7 +308,8 @@ def test_poses_that_stop(recorder: Any) -> None:
     clouds, session = all_of(log)
     assert 10 <= len(clouds) <= 12
     assert sentences(lost(session.problems))[0].startswith(
-        f"/points: {40 - len(clouds)} of 40 frames are left out: no pose is known at their time (frames 2023"
+        f"/points: {40 - len(clouds)} of 40 frames are left out: no pose is known "
+        f"at their time (frames 2023"
     )
 
 
@@ -379,7 +383,7 @@ BOMBS = {
 
 
 def test_bombs_in_a_log_cost_nothing(recorder: Any) -> None:
-    """Read in a process whose memory is limited to little more than what it has after the imports."""
+    """Read in a process whose memory is limited to little more than its imports need."""
     log = recorder()
     stage(log)
     log.camera_info("/cam/depth/camera_info", EPOCH, "lidar", 8, 6, 5.0)
@@ -424,17 +428,15 @@ print(json.dumps([len(clouds), sentences(lost(session.problems)), grown]))
     assert count == 1
     assert not any("MemoryError" in s for s in skipped), skipped
     assert grown_kib < 100 << 10
-    told = " ".join(skipped)
-    assert "/colour/image/compressed: 5 messages skipped" in told
-    assert "/cam/depth/image/compressedDepth: 3 messages skipped" in told
-    assert "/points: 3 messages skipped" in told
+    text = " ".join(skipped)
+    assert "/colour/image/compressed: 5 messages skipped" in text
+    assert "/cam/depth/image/compressedDepth: 3 messages skipped" in text
+    assert "/points: 3 messages skipped" in text
 
 
 @pytest.mark.parametrize("name", BOMBS)
 def test_bombs_are_refused_for_their_claim(name: str) -> None:
-    """Before the decoder of pictures sees them: it would ask for the memory, and say only that it
-    failed.
-    """
+    """Before the decoder of pictures sees them: it would allocate the memory."""
     format_, data = BOMBS[name]
     with pytest.raises(UndecodableError, match=r"claim|cut off"):
         decode_compressed_depth(data, format_) if "Depth" in format_ else decode_compressed(data)
@@ -454,10 +456,11 @@ def test_inspect_names_clouds_without_points(recorder: Any) -> None:
     stage(log)
     for k in range(3):
         log.cloud("/points", EPOCH + k * S // 5, "lidar", rows()[: 0 if k < 2 else 60])
-    told: Any = inspect_log(log.write())
-    assert told["sensors"]["/points"]["points"] == 60
+    inspected: Any = inspect_log(log.write())
+    assert inspected["sensors"]["/points"]["points"] == 60
     assert any(
-        "/points: no point with a position in the first 2 clouds." in p for p in told["problems"]
+        "/points: no point with a position in the first 2 clouds." in p
+        for p in inspected["problems"]
     )
 
 

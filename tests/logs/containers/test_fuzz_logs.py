@@ -36,7 +36,7 @@ HURRY = settings(max_examples=15, deadline=None, suppress_health_check=list(Heal
 
 
 def ros_messages(store: Any) -> dict[str, Any]:
-    """A message of each kind whose bytes say how much there is."""
+    """A message of each kind whose bytes hold their size."""
     t = store.types
     head = {"seq": 0} if store is ROS1 else {}
     header = t["std_msgs/msg/Header"](

@@ -68,7 +68,7 @@ def bag2(
 
 
 def check(log: Log, times: list[int], encoding: str) -> None:
-    """Everything that a log of ``times`` says."""
+    """The whole content of a log of ``times``."""
     assert [m.log_time_ns for m in log.messages()] == sorted(times)
     assert [m.log_time_ns for m in log.messages(["/b"])] == sorted(times[1::2])
     found = list(log.frames())
@@ -195,7 +195,7 @@ def test_missing_and_unlisted_files_are_named(tmp_path: Path) -> None:
         "a: &a {b: 1}\nc: {<<: [*a, *a]}",
     ],
 )
-def test_unusable_metadata_is_no_obstacle(tmp_path: Path, text: str) -> None:
+def test_unusable_metadata_does_not_matter(tmp_path: Path, text: str) -> None:
     folder = bag2(tmp_path / "x", TIMES)
     (folder / "metadata.yaml").write_text(text)
     log = open_log(folder)
@@ -244,7 +244,8 @@ def test_undefined_types_are_named(tmp_path: Path) -> None:
     log = open_log(folder / "x.db3")
     assert len(list(log.frames())) == 15
     assert sentences(log.problems) == [
-        "/b: messages of type foo_msgs/msg/Bar cannot be decoded because the log does not define the type."
+        "/b: messages of type foo_msgs/msg/Bar cannot be decoded because the log "
+        "does not define the type."
     ]
 
 

@@ -120,7 +120,8 @@ def test_impossible_rotations_are_skipped_and_counted(
     assert ros.frames(odometry(ros, q)) == []
     [sentence] = sentences(ros.problems)
     assert sentence.startswith(
-        "/t: 2 messages skipped; the first because nav_msgs/msg/Odometry at log time 9000000000 ns: "
+        "/t: 2 messages skipped; the first because nav_msgs/msg/Odometry at log "
+        "time 9000000000 ns: "
     )
 
 
@@ -342,12 +343,16 @@ def test_imu_and_nav_sat(ros: Ros) -> None:
             np.diag([4.0] * 3).tolist() if known else None
         )
     assert fix(-1, 47.25) == []
-    assert sentences(ros.problems) == []  # a receiver without a fix is no problem of the log
+    assert sentences(ros.problems) == []  # a receiver without a fix is not a problem of the log
     assert fix(0, math.nan) == []
     assert len(sentences(ros.problems)) == 1
 
 
-IMU_LIKE = b"geometry_msgs/Vector3 linear_acceleration\ngeometry_msgs/Vector3 angular_velocity\nstd_msgs/Header header\n"
+IMU_LIKE = (
+    b"geometry_msgs/Vector3 linear_acceleration\n"
+    b"geometry_msgs/Vector3 angular_velocity\n"
+    b"std_msgs/Header header\n"
+)
 
 
 def test_the_definition_in_the_log_beats_the_standard_one() -> None:
@@ -570,7 +575,7 @@ def test_impossible_times_are_named() -> None:
     assert "is impossible" in sentences(problems)[0]
 
 
-def test_what_labels_mean() -> None:
+def test_the_meaning_of_labels() -> None:
     """A LabelInfo without a definition in the log, and the name of a label space."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(

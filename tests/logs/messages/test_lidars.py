@@ -42,9 +42,7 @@ def rows(points: Array) -> NDArray[np.void]:
 
 
 def half_room(world_T_sensor: Array, ahead: float, seed: int) -> Array:
-    """Points (n, 3) of the room's walls, in the sensor frame, with x in the room on the side
-    ``ahead`` (1 or -1).
-    """
+    """Points (n, 3) of the walls on one side, ``ahead`` 1 or -1, in the sensor frame."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (6000, 3)) * HALF
     axis = rng.integers(0, 3, len(points))
@@ -118,7 +116,8 @@ def test_a_missing_extrinsic_costs_one_lidar_and_one_sentence(recorder: Any) -> 
     assert {c.header.topic for c in session.clouds()} == {"/front/points"}
     [sentence] = sentences(lost(session.problems))
     assert sentence.startswith(
-        "/rear/points: 8 of 8 frames are left out: no transform leads from their frame to the base frame"
+        "/rear/points: 8 of 8 frames are left out: no transform leads from their "
+        "frame to the base frame"
     )
 
 
@@ -173,7 +172,7 @@ def test_one_lidar_twice_is_used_once(
     assert len(list(both.clouds())) == 12
 
 
-def test_the_name_tells_a_filtered_topic(recorder: Any) -> None:
+def test_a_filtered_topic_by_its_name(recorder: Any) -> None:
     path = publish_twice(recorder(), without_ground, "/lidar_filtered")
     session = open_session([path])
     assert [c.header.topic for c in session.clouds()] == ["/lidar"] * 6
@@ -192,8 +191,14 @@ def test_two_sensors_in_one_frame_are_both_used(recorder: Any) -> None:
 # -- other messages
 
 CUSTOM = {
-    "ros2": "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n",
-    "point": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n",
+    "ros2": (
+        "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 "
+        "lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+    ),
+    "point": (
+        "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 "
+        "reflectivity\nuint8 tag\nuint8 line\n"
+    ),
 }
 PACKAGES = ["livox_ros_driver", "livox_ros_driver2", "livox_interfaces"]
 
@@ -318,7 +323,7 @@ def test_packets_are_named(type_: str, recorder: Any) -> None:
     assert any(n.startswith("/packets holds") for n in sentences(guess_roles(streams).notes))
 
 
-def test_a_log_of_packets_is_refused_with_what_to_do(recorder: Any) -> None:
+def test_a_log_of_packets_is_refused_with_advice(recorder: Any) -> None:
     log = recorder()
     text = "std_msgs/Header header\nVelodynePacket[] packets\n"
     log.store = get_typestore(Stores.ROS2_HUMBLE)
@@ -334,7 +339,10 @@ def test_a_log_of_packets_is_refused_with_what_to_do(recorder: Any) -> None:
     log.add("/velodyne_packets", scan, EPOCH)
     with pytest.raises(
         RoleError,
-        match=r"drive.mcap: /velodyne_packets holds velodyne_msgs/msg/VelodyneScan, packets .* PointCloud2",
+        match=(
+            r"drive.mcap: /velodyne_packets holds velodyne_msgs/msg/VelodyneScan, "
+            r"packets .* PointCloud2"
+        ),
     ):
         open_session([log.write()])
 

@@ -28,7 +28,7 @@ S = 1_000_000_000
         ([0, 1, 3600, 7200, 2, 3], []),
     ],
 )
-def test_what_goes_back_is_refused(seconds: list[float], refused: list[float]) -> None:
+def test_stamps_that_go_back_are_refused(seconds: list[float], refused: list[float]) -> None:
     order = StampOrder()
     assert [s for s in seconds if not order.accepts(round(s * S))] == refused
 

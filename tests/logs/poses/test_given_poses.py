@@ -35,9 +35,11 @@ EPOCH = 1_700_000_000 * S
 MOUNT = yaw_transform(np.pi / 2, (1.0, 0.0, 2.0))  # base_T_lidar
 POINTS = np.array([[5.0, 0.0, 0.0], [0.0, 7.0, 0.0]], np.float32)
 TYPES: dict[type, str] = {
-    LidarFrame: "sensor_msgs/msg/PointCloud2", TransformSample: "tf2_msgs/msg/TFMessage", PoseSample: "nav_msgs/msg/Odometry",
+    LidarFrame: "sensor_msgs/msg/PointCloud2",
+    TransformSample: "tf2_msgs/msg/TFMessage",
+    PoseSample: "nav_msgs/msg/Odometry",
     NavSatSample: "sensor_msgs/msg/NavSatFix",
-}  # fmt: skip
+}
 
 
 class FakeLog:
@@ -105,9 +107,9 @@ def test_a_tum_file_gives_the_poses_of_the_base_frame(tmp_path: Path) -> None:
     assert len(session.trajectory()[0]) == 21
     assert lost(session.problems) == []
     assert session.problems == []
-    told = session.to_json()["pose_source"]
-    assert isinstance(told, dict)
-    assert (told["kind"], told["path"], told["fingerprint"]) == (
+    content = session.to_json()["pose_source"]
+    assert isinstance(content, dict)
+    assert (content["kind"], content["path"], content["fingerprint"]) == (
         "file",
         str(poses.path),
         poses.fingerprint(),
@@ -142,8 +144,8 @@ def test_a_file_that_covers_part_of_the_log(tmp_path: Path) -> None:
     # the nearest pose serves a tenth of a second
     assert (min(stamps), max(stamps)) == (19 * S // 10, 41 * S // 10)
     assert any(
-        "77 of 100 frames are left out: no pose is known" in said
-        for said in sentences(lost(session.problems))
+        "77 of 100 frames are left out: no pose is known" in problem
+        for problem in sentences(lost(session.problems))
     )
 
 
@@ -242,19 +244,19 @@ def test_every_sweep_is_registered_and_its_pose_is_that_of_its_last_point(engine
     np.testing.assert_allclose(clouds[1].points[-1], [0.1, 7.0, 0.0], atol=2e-3)
 
 
-def test_a_jump_ends_the_poses_and_is_said(engine: Any) -> None:
+def test_a_jump_ends_the_poses_and_is_named(engine: Any) -> None:
     engine.steps = along(*(0.1 * np.arange(6)), 5.0, *([5.0] * 20))
     session = Session([FakeLog([STATIC, *sweeps(20, many=60)])], SessionOptions(odometry="lidar"))
     clouds = list(session.clouds())
     assert len(engine.calls) == 7
     assert len(clouds) == 7  # the nearest pose serves a tenth of a second
     assert any(
-        "LIDAR odometry lost track at 2023-11-14T22:13:20.600Z" in said
-        for said in sentences(lost(session.problems))
+        "LIDAR odometry lost track at 2023-11-14T22:13:20.600Z" in problem
+        for problem in sentences(lost(session.problems))
     )
     assert any(
-        "13 of 20 frames are left out: no pose" in said
-        for said in sentences(lost(session.problems))
+        "13 of 20 frames are left out: no pose" in problem
+        for problem in sentences(lost(session.problems))
     )
 
 
@@ -271,7 +273,7 @@ def test_a_sweep_that_does_not_lie_on_the_one_before_ends_the_poses(engine: Any)
 @pytest.mark.parametrize(
     "pose", [yaw_transform(1.5), np.full((4, 4), np.nan), yaw_transform(0.0, (30.0, 0, 0))]
 )
-def test_what_no_vehicle_does_is_a_jump(engine: Any, pose: F64) -> None:
+def test_steps_that_no_vehicle_makes_are_jumps(engine: Any, pose: F64) -> None:
     engine.steps = [np.eye(4), pose]
     made = LidarOdometry("/points", min_range=0.5, max_range=80.0)
     for frame in sweeps(2, many=60):
@@ -301,11 +303,14 @@ def test_one_sweep_has_the_identity(engine: Any) -> None:
     np.testing.assert_allclose(cloud.session_T_base, np.eye(4), atol=1e-12)
 
 
-def test_without_kiss_icp_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_kiss_icp_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
     with pytest.raises(
         LogError,
-        match=r"install it with pip install 'semloc_logs\[odometry\]', or give poses with --poses FILE",
+        match=(
+            r"install it with pip install 'semloc_logs\[odometry\]', or give "
+            r"poses with --poses FILE"
+        ),
     ):
         Session([FakeLog(sweeps(1))], SessionOptions(odometry="lidar"))
 

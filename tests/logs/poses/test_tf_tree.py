@@ -54,7 +54,7 @@ def test_same_frame_is_identity_and_strangers_are_unknown() -> None:
     assert tree.lookup("a", "d", 0) is None
     assert tree.lookup("a", "nowhere", 0) is None
     assert not tree.connected("b", "c")
-    # what was looked up before is not remembered as unconnected
+    # an earlier look-up is not remembered as unconnected
     tree.add(edge("b", "c", np.eye(4)))
     assert tree.connected("a", "d")
     assert tree.frames == ["a", "b", "c", "d"]

@@ -1,6 +1,4 @@
-"""Trajectories from files: exact stamps, both formats, what is refused and where, and sessions that
-use them.
-"""
+"""Trajectories from files: exact stamps, both formats, errors with their line, and sessions."""
 
 from __future__ import annotations
 
@@ -48,7 +46,8 @@ def kitti(pose: F64) -> str:
 def test_tum_with_comments_and_blank_lines(tmp_path: Path) -> None:
     found = read(
         tmp_path,
-        f"# stamp tx ty tz qx qy qz qw\n\n{TUM_LINE.format(stamp='1.5')}\n{TUM_LINE.format(stamp='2')} # end\n",
+        f"# stamp tx ty tz qx qy qz qw\n\n{TUM_LINE.format(stamp='1.5')}\n"
+        f"{TUM_LINE.format(stamp='2')} # end\n",
     )
     assert found.stamps_ns is not None
     assert found.stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
@@ -73,7 +72,7 @@ def test_nanoseconds_survive_as_decimals(stamp_ns: int) -> None:
 @pytest.mark.parametrize(
     "text", ["nan", "inf", "1e99999999", "x", "1700000000123456789", "1,5", "-9e99"]
 )
-def test_what_is_no_time(text: str) -> None:
+def test_text_that_is_not_a_time(text: str) -> None:
     with pytest.raises(LogError, match=r"x.tum, line 7: '.*' is not a time in seconds\."):
         seconds_to_ns(text, Path("x.tum"), 7)
 
@@ -94,7 +93,7 @@ def test_kitti_round_trip_with_and_without_times(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("", "poses.txt has no poses"),
         ("# nothing\n", "poses.txt has no poses"),
@@ -121,8 +120,8 @@ def test_kitti_round_trip_with_and_without_times(tmp_path: Path) -> None:
         ("1 " * 5000, "line 1 is longer than 4096 characters"),
     ],
 )
-def test_bad_files_are_one_sentence_with_the_line(tmp_path: Path, text: str, says: str) -> None:
-    with pytest.raises(LogError, match=says) as caught:
+def test_bad_files_are_one_sentence_with_the_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(LogError, match=message) as caught:
         read(tmp_path, text)
     assert str(tmp_path / "poses.txt") in str(caught.value)
 

@@ -117,7 +117,7 @@ def test_rectified_pictures_use_the_projection_matrix() -> None:
     assert points[0].tolist() == pytest.approx([(6 - 8) / 8 * 2.0, (3 - 6) / 8 * 2.0, 2.0])
 
 
-def test_unusable_calibrations_are_said_so() -> None:
+def test_unusable_calibrations_are_refused() -> None:
     with pytest.raises(LogError, match="is for 8 x 6 pixels but the depth image has 4 x 3"):
         Unprojector(camera(), 3, 4)
     with pytest.raises(LogError, match="no focal length"):

@@ -28,9 +28,14 @@ MS = 1_000_000
 REAL = Path(__file__).resolve().parents[4] / "shared" / "logs" / "euroc_v101_stereo.bag"
 LEFT, RIGHT = "/left/image_rect", "/right/image_rect"
 ROLES = Roles(
-    image=(LEFT,), stereo_left=LEFT, stereo_right=RIGHT, camera_info=("/l", "/r"), info_of={LEFT: "/l", RIGHT: "/r"},
-    label_image=("/ids",), label_of={LEFT: "/ids"},
-)  # fmt: skip
+    image=(LEFT,),
+    stereo_left=LEFT,
+    stereo_right=RIGHT,
+    camera_info=("/l", "/r"),
+    info_of={LEFT: "/l", RIGHT: "/r"},
+    label_image=("/ids",),
+    label_of={LEFT: "/ids"},
+)
 
 
 def info(topic: str, t: float = 0.0, width: int = 160) -> Camera:
@@ -91,7 +96,7 @@ def test_a_pair_waits_for_all_that_belongs_to_it() -> None:
     assert stereo.has_all(left)
 
 
-def test_labels_are_those_of_the_left_pixels() -> None:
+def test_labels_belong_to_the_left_pixels() -> None:
     stereo = clouds()
     ids = np.arange(120 * 160, dtype=np.uint16).reshape(120, 160)
     stereo._labels.take(ImageFrame(Header("/ids", 0, 0, ""), ids, "mono16"))
@@ -137,7 +142,7 @@ def test_why_a_pair_gives_nothing(
     assert sentence.startswith(f"{LEFT}: 1 of 1 frames are left out: ")
 
 
-def test_transforms_serve_where_the_infos_say_nothing() -> None:
+def test_transforms_serve_where_the_infos_have_no_baseline() -> None:
     right_T_left = np.eye(4)
     right_T_left[0, 3] = -0.2
     for left, right in ((LEFT, RIGHT), ("/left/image_raw", "/right/image_raw")):
@@ -161,14 +166,14 @@ def test_colour_and_sixteen_bits_become_the_same_grey() -> None:
 
 
 # -- a real pair
-# ------------------------------------------------------------------------------------------------------------------------
 
 
 def planes(
     points: NDArray[np.floating], count: int, width: float = 0.05
 ) -> list[tuple[F64, float, float]]:
-    """The largest planes one after the other, by RANSAC: unit normal, root mean square (m) and
-    share of the points within ``width``.
+    """The largest planes one after the other, by RANSAC.
+
+    Unit normal, root mean square (m) and share of the points within ``width``.
     """
     rng = np.random.default_rng(0)
     found = []
@@ -209,11 +214,12 @@ def tilt(normal: F64) -> float:
 
 
 def is_the_room(points: F64) -> bool:
-    """A level, flat floor at the height of the world's origin, and walls that stand: mattresses,
-    some of which lean by 20 degrees.
+    """A level, flat floor at the height of the world's origin, and upright walls.
+
+    The walls are mattresses, some of which lean by 20 degrees.
     """
     floor, *walls = planes(points, 3)
-    height = np.percentile(points[:, 2], 25)  # the floor is nearly half of what is seen
+    height = np.percentile(points[:, 2], 25)  # the floor is nearly half of the points
     is_floor = tilt(floor[0]) < 2.0 and floor[1] < 0.018 and floor[2] > 0.4 and abs(height) < 0.03
     return (
         bool(is_floor)
@@ -314,9 +320,9 @@ def test_the_room_would_not_be_there_with_a_wrong_rectification(
 def test_inspect_names_the_roles() -> None:
     if not REAL.is_file():
         pytest.skip(f"{REAL} is missing")
-    told = inspect_log(REAL)
-    assert told["problems"] == []
-    streams = told["streams"]
+    content = inspect_log(REAL)
+    assert content["problems"] == []
+    streams = content["streams"]
     assert isinstance(streams, list)
     roles = {s["topic"]: s["role"] for s in streams}
     assert (roles["/cam0/image_raw"], roles["/cam1/image_raw"]) == ("stereo_left", "stereo_right")

@@ -27,7 +27,7 @@ def frames(log: Log) -> Counter[tuple[str, str]]:
     "name",
     ["empty-file.bag", "not_a_bag.bag", "lfs_pointer.bag", "lfs_pointer.mcap", "no such file"],
 )
-def test_what_is_no_log_is_refused(name: str) -> None:
+def test_files_that_are_not_logs_are_refused(name: str) -> None:
     with pytest.raises(LogError, match=name):
         open_log(ODD / name)
 
@@ -98,7 +98,8 @@ def test_a_type_without_definition_is_named_and_the_rest_read() -> None:
     }
     [sentence] = sentences(log.problems)
     assert sentence.startswith(
-        "/vehicle_command_ackermann: messages of type ackermann_msgs/msg/AckermannDriveStamped cannot be decoded"
+        "/vehicle_command_ackermann: messages of type "
+        "ackermann_msgs/msg/AckermannDriveStamped cannot be decoded"
     )
 
 

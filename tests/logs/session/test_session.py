@@ -31,9 +31,13 @@ S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
 REAL = Path(__file__).resolve().parents[4] / "shared" / "logs"
 TYPES = {
-    LidarFrame: "sensor_msgs/msg/PointCloud2", DepthFrame: "sensor_msgs/msg/Image", ImageFrame: "sensor_msgs/msg/Image",
-    Camera: "sensor_msgs/msg/CameraInfo", TransformSample: "tf2_msgs/msg/TFMessage", ImuSample: "sensor_msgs/msg/Imu",
-}  # fmt: skip
+    LidarFrame: "sensor_msgs/msg/PointCloud2",
+    DepthFrame: "sensor_msgs/msg/Image",
+    ImageFrame: "sensor_msgs/msg/Image",
+    Camera: "sensor_msgs/msg/CameraInfo",
+    TransformSample: "tf2_msgs/msg/TFMessage",
+    ImuSample: "sensor_msgs/msg/Imu",
+}
 
 
 class FakeLog:
@@ -231,7 +235,7 @@ def test_the_frame_of_the_pose_is_the_base_without_base_link() -> None:
     np.testing.assert_allclose(session.base_T_sensors()["lidar"], MOUNT)
 
 
-def test_an_unconnected_sensor_is_taken_as_the_base_and_that_is_said() -> None:
+def test_an_unconnected_sensor_is_taken_as_the_base_with_a_problem() -> None:
     session = Session(
         [FakeLog([*[sweep(0.1 * k) for k in range(3)], *[odometry(0.1 * k) for k in range(4)]])]
     )
@@ -351,8 +355,16 @@ def test_a_later_log_is_not_touched_before_its_time() -> None:
 
 
 def test_depth_camera_with_labels_and_its_own_pose() -> None:
-    info = Camera(header("/camera/depth/camera_info", 0.02, "optical"), 4, 4, np.array([[2.0, 0, 2], [0, 2, 2], [0, 0, 1]]),
-                  np.zeros(5), np.eye(3), np.zeros((3, 4)), "plumb_bob")  # fmt: skip
+    info = Camera(
+        header("/camera/depth/camera_info", 0.02, "optical"),
+        4,
+        4,
+        np.array([[2.0, 0, 2], [0, 2, 2], [0, 0, 1]]),
+        np.zeros(5),
+        np.eye(3),
+        np.zeros((3, 4)),
+        "plumb_bob",
+    )
     frames: list[Frame] = [info]
     for k in range(4):
         frames.append(
@@ -376,7 +388,7 @@ def test_depth_camera_with_labels_and_its_own_pose() -> None:
     assert list(session.cameras) == ["/camera/depth/image", "/camera/label"]
 
 
-def test_depth_without_calibration_is_said() -> None:
+def test_depth_without_calibration_is_named() -> None:
     frames: list[Frame] = [
         DepthFrame(header("/depth", 0.0, "optical"), np.ones((4, 4), np.float32)),
         odometry(0.0, "optical"),
@@ -429,7 +441,7 @@ def test_up_from_a_tilted_imu_on_a_turning_base() -> None:
         np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=0.02)
 
 
-def test_what_cannot_be_a_session() -> None:
+def test_logs_that_cannot_be_a_session() -> None:
     with pytest.raises(LogError, match="none was named"):
         open_session([])
     with pytest.raises(RoleError, match="no LIDAR and no depth"):
@@ -484,9 +496,7 @@ class TestRecordedLogs:
             session.close()
 
     def test_the_two_basements_meet_in_their_common_frame(self) -> None:
-        """The last sweep of a and the first of b were taken within a second: in the common frame
-        they are the same hall.
-        """
+        """The last sweep of a and the first of b, within a second, show the same hall."""
         from scipy.spatial import cKDTree
 
         truth = json.loads((REAL / "basement_truth.json").read_text())
