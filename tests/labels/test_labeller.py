@@ -279,6 +279,27 @@ def test_two_cameras() -> None:
     assert [c["points"] for c in labeller.to_json()["cameras"].values()] == [2, 1]
 
 
+def test_painted_points_have_the_number_of_their_camera() -> None:
+    frames: list[Frame] = [
+        static(),
+        static("rear", yaw_transform(np.pi) @ OPTICAL),
+        camera(),
+        camera("/rear/camera_info", "rear"),
+        sweep(0),
+        halves(0, 5, 2),
+        halves(0, 13, 13, "/rear/labels", "rear"),
+    ]
+    session = Session([FakeLog(frames)])
+    labeller = Labeller(Labels(), session)
+    assert labeller.images == ("/cam/labels", "/rear/labels")
+    [cloud] = session.clouds(labeller.on_image, labeller.images)
+    painted = labeller.take(cloud, np.array([0, 2]))
+    assert painted is not None
+    assert painted["label"].tolist() == [5, 13]
+    assert painted["camera"].tolist() == [0, 1]
+    assert painted["is_doubtful"].tolist() == [False, False]
+
+
 def test_cameras_that_cannot_be_placed_are_named() -> None:
     found, labeller = classes([camera(), halves(0, 5, 2), sweep(0)])
     assert labeller.source == "geometry"

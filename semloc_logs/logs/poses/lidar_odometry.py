@@ -39,8 +39,8 @@ class LidarOdometry:
     """Poses of the LIDAR on ``topic`` from its sweeps; LogError when KISS-ICP is not installed.
 
     ``max_range`` and ``min_range`` (m): points that are used. After a jump that no vehicle can
-    make, or once a sweep does not lie on the sweep before any more, there are no more poses, which is
-    named in ``problems``. Slow drift goes unnoticed.
+    make, or once a sweep does not lie on the sweep before any more, there are no more poses:
+    ``problems`` names the time. Slow drift goes unnoticed.
     """
 
     name = "LIDAR odometry"

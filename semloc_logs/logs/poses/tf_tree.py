@@ -76,11 +76,6 @@ class TransformTree:
         """Whether edges lead from one frame to the other; a frame is connected with itself."""
         return self._path(frame_name(target), frame_name(source)) is not None
 
-    def is_static(self, target: str, source: str) -> bool:
-        """Whether the frames are connected by static edges alone."""
-        path = self._path(frame_name(target), frame_name(source))
-        return path is not None and not any(self._moving_edge(a, b) for a, b in pairwise(path))
-
     def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
         """``target_T_source`` (4, 4), dynamic edges interpolated at ``stamp_ns``.
 
@@ -131,9 +126,6 @@ class TransformTree:
         return next(
             (edge for edge in chain if edge[0].endswith("odom")), chain[-1] if chain else None
         )
-
-    def _moving_edge(self, a: str, b: str) -> bool:
-        return (a, b) in self._moving or (b, a) in self._moving
 
     def _step(self, target: str, source: str, stamp_ns: int) -> F64 | None:
         """``target_T_source`` (4, 4) of two neighbours."""

@@ -69,8 +69,6 @@ def test_moving_edges_are_interpolated_in_their_time_only() -> None:
     assert found is not None
     np.testing.assert_allclose(found[:3, 3], [12.0, 0.0, 2.0])
     assert tree.lookup("odom", "lidar", 2 * S) is None
-    assert tree.is_static("base_link", "lidar")
-    assert not tree.is_static("odom", "lidar")
 
 
 def test_loops_end() -> None:
