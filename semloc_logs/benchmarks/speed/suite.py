@@ -69,7 +69,7 @@ def reading(settings: Resolved) -> Figures:
                 return sum(len(m.data) for _, _, m in make_reader(file).iter_messages())
 
         def clouds() -> int:
-            session = open_session([log], {})
+            session = open_session([log])
             try:
                 return sum(1 for _ in session.clouds())
             finally:
