@@ -73,6 +73,7 @@ INNER_ORDER = {
         "labels",
         "localisation",
         "speed",
+        "named",
     ],
     "alignment": [
         "hypotheses",
