@@ -31,7 +31,7 @@ from semloc_logs.closures.matching import (
     find_hypotheses,
     verify_hypotheses,
 )
-from semloc_logs.closures.query import build_query, query_keyframes
+from semloc_logs.closures.query import SessionMap, build_query, query_keyframes
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
