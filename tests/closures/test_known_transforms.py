@@ -185,7 +185,7 @@ TARGET_T_SCENE = yaw_transform(0.4, (120.0, -60.0, 7.0))
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """Maps of the court: as it is, with a vehicle that looks to its left, and twice in one drive."""
+    """Maps of the court: as it is, from a vehicle that looks left, and twice in one drive."""
     work = Workspace(tmp_path_factory.mktemp("courts"))
     court = courtyard()
     write_session(work, "court", court, drive(), TARGET_T_SCENE)
