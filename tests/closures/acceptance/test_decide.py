@@ -167,6 +167,8 @@ def test_the_reason_is_the_first_that_holds() -> None:
     ambiguous = dataclasses.replace(votes, ambiguity=0.9)
     assert "ambiguous place" in why(decision(0.495), ambiguous)
     assert "ambiguous place" not in why(decision(0.494), ambiguous)
+    # the position is uncertain too, but the place comes first
+    assert "ambiguous place" in why(decision(0.34 / 0.68, confidence=0.68), ambiguous, sigma=0.8)
 
 
 @pytest.mark.parametrize("distinct", [0.86, 1.0, 1.01, 2.0])
