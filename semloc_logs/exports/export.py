@@ -1,6 +1,4 @@
-"""Sessions and closures in other programs' formats: poses (TUM, KITTI), a pose graph (g2o), points
-(PLY, PCD, LAS, LAZ, XYZ).
-"""
+"""Sessions and closures in other programs' formats: poses, a pose graph, points."""
 
 from __future__ import annotations
 
@@ -32,9 +30,7 @@ FORMATS = ("tum", "kitti", "g2o", *POINT_FORMATS)
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which points: the map's ``voxels`` or those of the ``keyframes``, in which frame, and within
-    which bounds of it (m) if any.
-    """
+    """Which points to export, in which frame, and within which bounds of it (m), if any."""
 
     what: Literal["voxels", "keyframes"] = "voxels"
     frame: Literal["session", "map"] = "session"
@@ -48,18 +44,19 @@ def export(
     output: Path,
     selection: Selection | None = None,
 ) -> list[Path]:
-    """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
+    """Write the sessions ``names`` (all if empty) to the folder ``output``; returns the files.
 
     ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``:
     one pose graph of all; the point formats: ``selection``, by default the centres of all occupied
-    voxels in the session frame. Raises WorkspaceError when a session is not there or does not fit
-    the format, SemlocError when a library is missing.
+    voxels in the session frame. Raises WorkspaceError when a session is missing or does not fit the
+    format, SemlocError when a library is missing.
     """
     known = {f.name: SessionMap(f) for f in work.sessions()}
     missing = [n for n in names if n not in known]
     if missing or not known:
         raise WorkspaceError(
-            f"{work.path} has no fused session {', '.join(missing) or 'at all'} (there are: {', '.join(known) or 'none'})."
+            f"{work.path} has no fused session {', '.join(missing) or 'at all'} "
+            f"(there are: {', '.join(known) or 'none'})."
         )
     sessions = {n: known[n] for n in names or known}
     if form == "g2o":
@@ -86,9 +83,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def tum(session: SessionMap) -> bytes:
-    """Seconds, position (m), quaternion xyzw of the base frame in the session frame: the whole
-    trajectory.
-    """
+    """Lines of the whole trajectory: seconds, position (m), quaternion xyzw, session frame."""
     table = read_table(session.folder.trajectory)
     t, q = translation_quaternion(poses_of(table))
     lines = [
@@ -100,9 +95,7 @@ def tum(session: SessionMap) -> bytes:
 
 
 def kitti(session: SessionMap) -> bytes:
-    """Twelve numbers a line: the upper 3 x 4 of ``session_T_base`` of each pose of the trajectory,
-    row-major.
-    """
+    """Lines of the whole trajectory: the upper 3 x 4 of ``session_T_base``, row-major."""
     poses = poses_of(read_table(session.folder.trajectory))
     return "".join(
         " ".join(f"{x:.12g}" for x in pose[:3].ravel()) + "\n" for pose in poses

@@ -155,7 +155,8 @@ class Pictures:
         if calibration is None:
             if near:
                 self.notes.setdefault(
-                    f"{topic} has no CameraInfo: its pictures give no labels; name one with --topic camera_info=TOPIC."
+                    f"{topic} has no CameraInfo: its pictures give no labels; name one with "
+                    "--topic camera_info=TOPIC."
                 )
             return None
         for picture in sorted(near, key=lambda p: abs(p.header.stamp_ns - stamp_ns)):
@@ -169,7 +170,8 @@ class Pictures:
             base_T_camera = self._session.base_T(frame_id, picture.header.stamp_ns)
             if base_T_camera is None:
                 self.notes.setdefault(
-                    f"No transform connects the camera frame '{frame_id}' of {topic} with '{self._session.base_frame}': "
+                    f"No transform connects the camera frame '{frame_id}' of {topic} with "
+                    f"'{self._session.base_frame}': "
                     f"its pictures give no labels; record /tf_static."
                 )
                 return None

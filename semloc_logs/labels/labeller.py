@@ -92,7 +92,8 @@ class Labeller:
             topics = tuple(t for t in roles.image if t in roles.info_of)
             if not topics:
                 raise LogError(
-                    f"{session.name} has no camera pictures with a CameraInfo for the model: name them with --topic image=TOPIC "
+                    f"{session.name} has no camera pictures with a CameraInfo for the model: name "
+                    "them with --topic image=TOPIC "
                     f"and --topic camera_info=TOPIC, or use --set labels.source=geometry."
                 )
             self._pictures = Pictures(session, topics, self._predict, settings.erode)
@@ -120,11 +121,13 @@ class Labeller:
                 continue
             if t.said_by == "guess":
                 said.append(
-                    f"The labels of {topic} are taken as {t.space.name} by their looks; --set labels.space=NAME says otherwise."
+                    f"The labels of {topic} are taken as {t.space.name} by their looks; --set "
+                    "labels.space=NAME says otherwise."
                 )
             if t.space.unknown and t.said_by == "log":
                 said.append(
-                    f"Classes of {topic} that mean nothing here are unlabelled: {_some(t.space.unknown)}."
+                    f"Classes of {topic} that mean nothing here are unlabelled: "
+                    f"{_some(t.space.unknown)}."
                 )
             if t.strange:
                 names = [
@@ -133,7 +136,8 @@ class Labeller:
                 ]
                 total = sum(t.strange.values())
                 said.append(
-                    f"{total} points have colours of {topic} that {t.space.name} does not have and are unlabelled: {_some(names)}."
+                    f"{total} points have colours of {topic} that {t.space.name} does not have and "
+                    f"are unlabelled: {_some(names)}."
                 )
         return said
 
@@ -176,7 +180,8 @@ class Labeller:
         )
         if not has_labels and self.source == "log":
             raise LogError(
-                f"{self._session.name} has no labels (a 'label' field of the points or a label image): use --set labels.source=geometry."
+                f"{self._session.name} has no labels (a 'label' field of the points or a label "
+                "image): use --set labels.source=geometry."
             )
         self.source = "log" if has_labels else "geometry"
         for name, topic in self._topics.items():

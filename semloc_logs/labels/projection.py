@@ -37,7 +37,8 @@ class Projector:
         scale = np.array([width / (camera.width or width), height / (camera.height or height)])
         if abs(scale[0] / scale[1] - 1) > 0.02:
             raise LogError(
-                f"{where} is for {camera.width} x {camera.height} pixels but its picture has {width} x {height}: "
+                f"{where} is for {camera.width} x {camera.height} pixels but its picture has "
+                f"{width} x {height}: "
                 f"record the CameraInfo of the picture, or name it with --topic camera_info=TOPIC."
             )
         # pixel centres are whole numbers: the corner of the picture is at -0.5
@@ -45,7 +46,8 @@ class Projector:
         matrix[:2, :2] *= scale[:, None]
         if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
             raise LogError(
-                f"{where} has no focal length: the camera is not calibrated; name another with --topic camera_info=TOPIC."
+                f"{where} has no focal length: the camera is not calibrated; name another with "
+                "--topic camera_info=TOPIC."
             )
         self.height, self.width, self.focal, self._matrix = (
             height,
@@ -64,8 +66,10 @@ class Projector:
         ) and count in (4, 5, 8, 12, 14)
         if np.any(self._distortion) and not (self._fisheye or is_polynomial):
             raise LogError(
-                f"{where} has the distortion model '{camera.model[:40]}' with {count} coefficients, which is not supported: "
-                f"record rectified pictures, or name another calibration with --topic camera_info=TOPIC."
+                f"{where} has the distortion model '{camera.model[:40]}' with {count} "
+                "coefficients, which is not supported: "
+                "record rectified pictures, or name another calibration with --topic "
+                "camera_info=TOPIC."
             )
         corners = (
             np.array([[u, v] for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])

@@ -54,7 +54,8 @@ def _digest(path: Path) -> str:
 def _named(settings: Labels) -> tuple[Path, Path]:
     if settings.model is None or settings.spec is None:
         raise SettingsError(
-            "labels.source=onnx needs a model and its spec: give --seg-model MODEL.onnx --seg-spec SPEC.yaml."
+            "labels.source=onnx needs a model and its spec: give --seg-model MODEL.onnx --seg-spec "
+            "SPEC.yaml."
         )
     return settings.model, settings.spec
 
@@ -169,31 +170,37 @@ class Segmenter:
         )
         if not output.size or output.dtype.kind not in "biuf":
             raise SettingsError(
-                f"Model {self._path} gives {given} values of type {output.dtype}: output.name may be that of another."
+                f"Model {self._path} gives {given} values of type {output.dtype}: output.name may "
+                "be that of another."
             )
         classes = len(self._table) - 1
         if spec.kind == "ids":
             if image.ndim != 2:
                 raise SettingsError(
-                    f"Model {self._path} gives {given} values, which is no picture of ids: output.kind may be 'logits'."
+                    f"Model {self._path} gives {given} values, which is no picture of ids: "
+                    "output.kind may be 'logits'."
                 )
             ids: NDArray[np.intp] = np.rint(image).astype(np.intp)
             left_out = (ids == -1) | ((ids == UNLABELLED) & (classes <= UNLABELLED))
             strange = ids[((ids < 0) | (ids >= classes)) & ~left_out]
             if len(strange):
                 raise SettingsError(
-                    f"Model {self._path} gives the class {strange[0]}, but {self._space.name} ends at {classes - 1}."
+                    f"Model {self._path} gives the class {strange[0]}, but {self._space.name} ends "
+                    f"at {classes - 1}."
                 )
             return np.where(left_out, classes, ids)
         if image.ndim != 3 or (image.shape[0] == 1 and classes > 1):
             raise SettingsError(
-                f"Model {self._path} gives {given} values, not classes x rows x columns: output.kind may be 'ids'."
+                f"Model {self._path} gives {given} values, not classes x rows x columns: "
+                "output.kind may be 'ids'."
             )
         axis = 0 if spec.layout == "CHW" else 2
         if image.shape[axis] != classes:
             raise SettingsError(
-                f"Model {self._path} gives {given} values, {image.shape[axis]} classes in layout {spec.layout}, "
-                f"but {self._space.name} has {classes}: give the model's own list of classes, or another layout."
+                f"Model {self._path} gives {given} values, {image.shape[axis]} classes in layout "
+                f"{spec.layout}, "
+                f"but {self._space.name} has {classes}: give the model's own list of classes, or "
+                "another layout."
             )
         best: NDArray[np.intp] = np.argmax(image, axis=axis)
         return best
@@ -245,12 +252,14 @@ def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, threads: int) -> Net
     name = spec.input.name or (next(iter(inputs)) if len(inputs) == 1 else "")
     if name not in inputs:
         raise SettingsError(
-            f"Model {path} has no input '{name}': name one of {', '.join(inputs)} as input.name in its spec."
+            f"Model {path} has no input '{name}': name one of {', '.join(inputs)} as input.name in "
+            "its spec."
         )
     output = spec.output.name or outputs[0]
     if output not in outputs:
         raise SettingsError(
-            f"Model {path} has no output '{output}': name one of {', '.join(outputs)} as output.name in its spec."
+            f"Model {path} has no output '{output}': name one of {', '.join(outputs)} as "
+            "output.name in its spec."
         )
     _check_shape(path, spec, inputs[name].shape, inputs[name].type)
 
@@ -259,7 +268,8 @@ def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, threads: int) -> Net
             return np.asarray(session.run([output], {name: batch})[0])
         except Exception as error:
             raise SettingsError(
-                f"Model {path} fails on an input of {' x '.join(map(str, batch.shape))}: {_short(error)}."
+                f"Model {path} fails on an input of {' x '.join(map(str, batch.shape))}: "
+                f"{_short(error)}."
             ) from None
 
     return run
@@ -273,7 +283,8 @@ def _check_shape(path: Path, spec: Spec, shape: list[Any], type_: str) -> None:
     )
     if not fits:
         raise SettingsError(
-            f"Model {path} takes an input of {' x '.join(map(str, shape))}, but its spec says {' x '.join(map(str, wanted))} "
+            f"Model {path} takes an input of {' x '.join(map(str, shape))}, but its spec says "
+            f"{' x '.join(map(str, wanted))} "
             f"({spec.input.layout}): correct input.size or input.layout."
         )
     types = {"tensor(float)": "float32", "tensor(uint8)": "uint8"}
@@ -289,7 +300,8 @@ def _load_cv2(path: Path, spec: Spec, threads: int) -> Net:
         net = cv2.dnn.readNetFromONNX(str(path))
     except (cv2.error, RuntimeError) as error:
         raise SettingsError(
-            f"Model {path} cannot be read by OpenCV: {_short(error)}; install onnxruntime (pip install 'semloc_logs[onnx]')."
+            f"Model {path} cannot be read by OpenCV: {_short(error)}; install onnxruntime (pip "
+            "install 'semloc_logs[onnx]')."
         ) from None
 
     def run(batch: NDArray[Any]) -> NDArray[Any]:
@@ -298,7 +310,8 @@ def _load_cv2(path: Path, spec: Spec, threads: int) -> Net:
             return np.asarray(net.forward(spec.output.name) if spec.output.name else net.forward())
         except (cv2.error, RuntimeError) as error:
             raise SettingsError(
-                f"Model {path} fails in OpenCV: {_short(error)}; install onnxruntime (pip install 'semloc_logs[onnx]')."
+                f"Model {path} fails in OpenCV: {_short(error)}; install onnxruntime (pip install "
+                "'semloc_logs[onnx]')."
             ) from None
 
     return run

@@ -145,7 +145,8 @@ def _parse(content: Any, where: str, by_name: Mapping[str, int]) -> LabelSpace:
         }
     except (TypeError, KeyError, ValueError, AttributeError, OverflowError):
         raise SettingsError(
-            f"Label space {where} has no 'classes' of the form 'ID: {{name: NAME, to: CITYSCAPES_CLASS}}'."
+            f"Label space {where} has no 'classes' of the form 'ID: {{name: NAME, to: "
+            f"CITYSCAPES_CLASS}}'."
         ) from None
     if not 0 <= mask <= 0xFFFFFFFF:
         raise SettingsError(
@@ -184,7 +185,8 @@ def _target(value: Any, where: str, i: int) -> int:
     if type(value) is int and 0 <= value < len(own):
         return value
     raise SettingsError(
-        f"Label space {where} maps {i} to {str(value)[:40]!r}, which is no class of Cityscapes: {', '.join(own)}, or null."
+        f"Label space {where} maps {i} to {str(value)[:40]!r}, which is no class of Cityscapes: "
+        f"{', '.join(own)}, or null."
     )
 
 
@@ -196,7 +198,8 @@ def _colour(value: Any, where: str, i: int) -> tuple[int, int, int]:
     ):
         return value[0], value[1], value[2]
     raise SettingsError(
-        f"Label space {where} gives {i} the colour {str(value)[:40]!r}: it has to be [red, green, blue], each 0 to 255."
+        f"Label space {where} gives {i} the colour {str(value)[:40]!r}: it has to be [red, green, "
+        "blue], each 0 to 255."
     )
 
 

@@ -66,8 +66,10 @@ def check_reach(session: Session, collected: Collected, voxel_size: float) -> No
         if away > reach:
             when = span(header.stamp_ns, header.stamp_ns).split(" to ")[0]
             raise LogError(
-                f"{session.name}: the poses have come {away / 1e3:.0f} km from the first at {when}, "
-                f"but a map of {voxel_size:g} m voxels reaches {reach / 1e3:.0f} km: cut the log there, or give poses with --poses FILE."
+                f"{session.name}: the poses have come {away / 1e3:.0f} km from the first at "
+                f"{when}, "
+                f"but a map of {voxel_size:g} m voxels reaches {reach / 1e3:.0f} km: cut the log "
+                "there, or give poses with --poses FILE."
             )
 
 

@@ -120,7 +120,8 @@ def choose(work: Workspace, wanted: Wanted) -> list[Choice]:
     if wanted.number is not None:
         if not 1 <= wanted.number <= len(accepted):
             raise WorkspaceError(
-                f"{work.closures} has {len(accepted)} closures, and no closure {wanted.number}: give a number from 1 on."
+                f"{work.closures} has {len(accepted)} closures, and no closure {wanted.number}: "
+                "give a number from 1 on."
             )
         return [accepted[wanted.number - 1]]
     if wanted.session is not None:
@@ -139,7 +140,8 @@ def choose(work: Workspace, wanted: Wanted) -> list[Choice]:
     if not found:
         whose = f" of session '{wanted.session}'" if wanted.session else ""
         raise WorkspaceError(
-            f"{work.path} has neither a closure nor a rejected hypothesis{whose}: name another session, or close again."
+            f"{work.path} has neither a closure nor a rejected hypothesis{whose}: name another "
+            "session, or close again."
         )
     return found
 
@@ -193,7 +195,8 @@ def closing_settings(work: Workspace) -> Resolved:
         return Settings.model_validate(read_metadata(work.closures)["settings"]).resolved()
     except (KeyError, ValueError):
         raise WorkspaceError(
-            f"{work.closures} does not say how it was made: run 'semloc close -w {work.path} --overwrite'."
+            f"{work.closures} does not say how it was made: run 'semloc close -w {work.path} "
+            "--overwrite'."
         ) from None
 
 

@@ -54,6 +54,7 @@ def load_weights(
     except (OSError, SafetensorError, KeyError, RuntimeError) as problem:
         said = str(problem).splitlines()[0]
         raise SettingsError(
-            f"{weights or 'The shipped weights'}: no weights of the {variant} {part.strip('.') or 'network'} ({said})."
+            f"{weights or 'The shipped weights'}: no weights of the {variant} "
+            f"{part.strip('.') or 'network'} ({said})."
         ) from None
     return network.eval()

@@ -135,7 +135,8 @@ def read_keyframe(folder: Path, keyframe: int) -> Keyframe:
         )
     except (OSError, pa.ArrowException) as problem:
         raise WorkspaceError(
-            f"{path} cannot be read ({str(problem).splitlines()[0]}): fuse the session again with --overwrite."
+            f"{path} cannot be read ({str(problem).splitlines()[0]}): fuse the session again with "
+            "--overwrite."
         ) from None
     points = np.stack([table[c].to_numpy() for c in "xyz"], 1)
     sigma = table["sigma"].to_numpy()

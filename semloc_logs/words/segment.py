@@ -222,7 +222,8 @@ def open_segment(path: Path, variant: str, check: bool = False) -> Segment:
                 raise ValueError("the entries of the words do not follow each other")
         except (ValueError, KeyError, TypeError, struct.error, OverflowError) as problem:
             raise WorkspaceError(
-                f"{path} is no segment of an index ({problem}): delete it; it is built again from the words."
+                f"{path} is no segment of an index ({problem}): delete it; it is built again from "
+                "the words."
             ) from None
     return Segment(held, path=path, **arrays)
 

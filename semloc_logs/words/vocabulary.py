@@ -147,7 +147,8 @@ def train_vocabulary(
     n = len(descriptors)
     if n < 256 or descriptors.shape[1] < BITS:
         raise SettingsError(
-            f"A vocabulary needs at least 256 descriptors of {BITS} dimensions, not {n} of {descriptors.shape[1]}: describe more sessions."
+            f"A vocabulary needs at least 256 descriptors of {BITS} dimensions, not {n} of "
+            f"{descriptors.shape[1]}: describe more sessions."
         )
     rng = np.random.default_rng(seed)
     cells = int(min(cells, max(8, n // 64)))
@@ -233,5 +234,6 @@ def load_vocabulary(variant: str, path: Path | None = None) -> Vocabulary:
         )
     except (OSError, SafetensorError, KeyError, IndexError, ValueError) as problem:
         raise SettingsError(
-            f"{path or 'The shipped vocabulary'}: no vocabulary of the {variant} variant ({problem})."
+            f"{path or 'The shipped vocabulary'}: no vocabulary of the {variant} variant "
+            f"({problem})."
         ) from None
