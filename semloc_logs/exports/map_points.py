@@ -82,7 +82,7 @@ class SessionPoints:
         return self.float32_step <= self.voxel_size / FLOAT32_FINENESS
 
     def count(self) -> int:
-        """How many points :meth:`batches` gives; reads only footers when there are no bounds."""
+        """How many points :meth:`batches` gives; reads only footers without bounds."""
         if self.bounds is not None:
             return sum(len(label) for _, label in self.batches())
         if self.what == "keyframes":

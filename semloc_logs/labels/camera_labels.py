@@ -1,6 +1,4 @@
-"""Pictures of a session's cameras, kept until the clouds of their time come, and painted onto
-those.
-"""
+"""Pictures of a session's cameras, kept until the clouds of their time come and are painted."""
 
 from __future__ import annotations
 
@@ -28,8 +26,9 @@ CAMERA_SHIFT = 24  # painted labels have the number of their camera in the upper
 
 @dataclass(slots=True, eq=False)
 class _Camera:
-    """One topic's pictures that wait, its projector, the newest label image, and how much it has
-    painted.
+    """One topic: its waiting pictures, its projector, its newest label image, and counts.
+
+    ``pictures`` were used, ``points`` were painted.
     """
 
     number: int
@@ -41,12 +40,11 @@ class _Camera:
 
 
 class Pictures:
-    """Paints the pictures of ``topics`` onto clouds; ``label_of`` makes the labels (h, w) of a
-    picture, at most 24 bits or UNPAINTED.
+    """Paints the pictures of ``topics`` onto clouds.
 
-    The number of the camera stands above them, and DOUBTFUL above that (labels/painting.py).
-
-    ``erode``: pixels next to where two labels meet that do not count. ``notes`` are sentences about
+    ``label_of`` makes the labels (h, w) of a picture, at most 24 bits or UNPAINTED. In a painted
+    label the number of the camera is above these bits, and DOUBTFUL above it (labels/painting.py).
+    ``erode``: pixels beside a border of two labels that do not count. ``notes`` are sentences about
     pictures that cannot be used.
     """
 
@@ -73,18 +71,19 @@ class Pictures:
             self._bytes -= fullest.waiting.popleft().image.nbytes
 
     def labels(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> U32 | None:
-        """Labels of ``cloud.points[keep]`` with the camera's number above them, UNPAINTED where no
-        camera sees; None without a picture.
+        """Labels of ``cloud.points[keep]``, the camera's number above them; None without a picture.
+
+        UNPAINTED where no camera sees the point.
         """
         out = np.full(len(keep), UNPAINTED, np.uint32)
         inside = np.zeros(len(keep), bool)
         viewpoint = None
         for topic, camera in self._cameras.items():
             self._forget(camera, cloud.header.stamp_ns)
-            found = self._picture(topic, camera, cloud)
-            if found is None:
+            match = self._picture(topic, camera, cloud)
+            if match is None:
                 continue
-            picture, camera_T_base, projector = found
+            picture, camera_T_base, projector = match
             viewpoint = viewpoint or Viewpoint(cloud.origin, self._axis(cloud))
             if camera.newest is None or camera.newest[0] != picture.header.stamp_ns:
                 camera.newest = (
@@ -92,17 +91,17 @@ class Pictures:
                     without_borders(self._label_of(picture), self._erode),
                 )
                 camera.pictures += 1
-            open_ = np.flatnonzero(out == UNPAINTED)
-            got, got_inside = paint(
-                cloud.points, keep[open_], viewpoint, camera.newest[1], camera_T_base, projector
+            unpainted = np.flatnonzero(out == UNPAINTED)
+            painted, painted_inside = paint(
+                cloud.points, keep[unpainted], viewpoint, camera.newest[1], camera_T_base, projector
             )
-            out[open_] = np.where(
-                got == UNPAINTED,
+            out[unpainted] = np.where(
+                painted == UNPAINTED,
                 np.uint32(UNPAINTED),
-                got | np.uint32(camera.number << CAMERA_SHIFT),
+                painted | np.uint32(camera.number << CAMERA_SHIFT),
             )
-            inside[open_] |= got_inside
-            camera.points += int((got != UNPAINTED).sum())
+            inside[unpainted] |= painted_inside
+            camera.points += int((painted != UNPAINTED).sum())
         if viewpoint is None:
             return None
         self.seen += len(out)
@@ -111,9 +110,7 @@ class Pictures:
         return out
 
     def to_json(self) -> dict[str, object]:
-        """Points of keyframes with a picture, of which in a picture, of which painted; and by
-        camera.
-        """
+        """Counts of points: of keyframes with a picture, in a picture, painted; and by camera."""
         cameras = {
             topic: {"pictures": c.pictures, "points": c.points}
             for topic, c in self._cameras.items()
@@ -144,22 +141,24 @@ class Pictures:
     def _picture(
         self, topic: str, camera: _Camera, cloud: PosedCloud
     ) -> tuple[ImageFrame, F64, Projector] | None:
-        """The picture nearest in time to a cloud, ``camera_T_base`` (4, 4) from the cloud's base
-        frame, and the projector.
+        """The picture nearest in time to a cloud, and how the cloud is projected into it.
+
+        Returns the picture, ``camera_T_base`` (4, 4) from the cloud's base frame, and the
+        projector.
         """
         stamp_ns = cloud.header.stamp_ns
         posed = cloud.session_T_base is not None
         tolerance = POSED_TOLERANCE_NS if posed else UNPOSED_TOLERANCE_NS
-        near = [p for p in camera.waiting if abs(p.header.stamp_ns - stamp_ns) <= tolerance]
+        candidates = [p for p in camera.waiting if abs(p.header.stamp_ns - stamp_ns) <= tolerance]
         calibration = self._session.cameras.get(topic)
         if calibration is None:
-            if near:
+            if candidates:
                 self.notes.setdefault(
                     f"{topic} has no CameraInfo: its pictures give no labels; name one with "
                     "--topic camera_info=TOPIC."
                 )
             return None
-        for picture in sorted(near, key=lambda p: abs(p.header.stamp_ns - stamp_ns)):
+        for picture in sorted(candidates, key=lambda p: abs(p.header.stamp_ns - stamp_ns)):
             moved = np.eye(4)
             if cloud.session_T_base is not None:
                 pose = self._session.pose_at(picture.header.stamp_ns)

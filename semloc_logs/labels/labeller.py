@@ -1,6 +1,4 @@
-"""The classes of one session, from whatever source: what the log's points or pictures say, the
-user's model, or geometry.
-"""
+"""The classes of one session: from labels of the log, from the user's model, or from geometry."""
 
 from __future__ import annotations
 
@@ -38,18 +36,19 @@ from semloc_logs.settings import Labels
 
 _MOST_COLOURS = 4096  # that are remembered of one topic, to guess the palette
 _LOW = (1 << CAMERA_SHIFT) - 1
+NO_PICTURE = "no camera picture shows points of the same time; use --set labels.source=geometry."
 
 
 @dataclass(slots=True, eq=False)
 class _Topic:
-    """What has been seen of the labels of one topic, and what they mean in the end."""
+    """The labels of one topic as seen so far, and their meaning in the end."""
 
     low: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(1 << 16, bool))
     has_instances: bool = False
     colours: dict[int, int] = field(default_factory=dict)
     is_coloured: bool = False
     space: LabelSpace | None = None
-    said_by: str = ""
+    origin: str = ""  # of the space: setting, log or guess
     strange: dict[int, int] = field(default_factory=dict)
 
     def see(self, ids: U32, is_coloured: bool) -> None:
@@ -69,11 +68,11 @@ class _Topic:
 
 
 class Labeller:
-    """Gives the points of every keyframe their classes. During the pass over the log :meth:`take`
-    each keyframe, with :attr:`on_image` and :attr:`images` for the session's pass; :meth:`conclude`
-    after it; then ask for :meth:`labels`.
+    """Gives the points of every keyframe their classes.
 
-    LogError and SettingsError when the source that the settings demand cannot be had.
+    During the pass over the log :meth:`take` each keyframe, with :attr:`on_image` and
+    :attr:`images` for the session's pass; after it :meth:`conclude`; then call :meth:`labels`.
+    LogError and SettingsError when the log cannot give the source that the settings demand.
     """
 
     def __init__(self, settings: Labels, session: Session) -> None:
@@ -85,7 +84,7 @@ class Labeller:
         self._model: Segmenter | None = None
         self._pictures: Pictures | None = None
         if settings.space is not None:
-            read_space(settings.space)  # a mistake costs nobody a pass over the log
+            read_space(settings.space)  # a mistake is found before the pass over the log
         roles = session.roles
         if settings.source == "onnx":
             self._model = Segmenter.open(settings)
@@ -109,23 +108,23 @@ class Labeller:
 
     @property
     def on_image(self) -> Callable[[ImageFrame], None] | None:
-        """What takes the pictures during the pass; None when none are needed."""
+        """Takes the pictures during the pass; None when none are needed."""
         return self._pictures.take if self._pictures else None
 
     @property
     def notes(self) -> list[str]:
-        """Sentences about what was assumed and what could not be used."""
-        said = [*self._pictures.notes] if self._pictures else []
+        """Sentences about assumptions, and about labels that cannot be used."""
+        sentences = [*self._pictures.notes] if self._pictures else []
         for topic, t in sorted(self._topics.items()):
             if t.space is None or self.source != "log":
                 continue
-            if t.said_by == "guess":
-                said.append(
+            if t.origin == "guess":
+                sentences.append(
                     f"The labels of {topic} are taken as {t.space.name} by their looks; --set "
                     "labels.space=NAME says otherwise."
                 )
-            if t.space.unknown and t.said_by == "log":
-                said.append(
+            if t.space.unknown and t.origin == "log":
+                sentences.append(
                     f"Classes of {topic} that mean nothing here are unlabelled: "
                     f"{_some(t.space.unknown)}."
                 )
@@ -135,15 +134,16 @@ class Labeller:
                     for c in sorted(t.strange, key=lambda c: (-t.strange[c], c))
                 ]
                 total = sum(t.strange.values())
-                said.append(
+                sentences.append(
                     f"{total} points have colours of {topic} that {t.space.name} does not have and "
                     f"are unlabelled: {_some(names)}."
                 )
-        return said
+        return sentences
 
     def take(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> U32 | None:
-        """Labels of ``cloud.points[keep]`` as recorded or painted, to be kept for :meth:`labels`;
-        of every keyframe in turn.
+        """Labels of ``cloud.points[keep]`` as recorded or painted, to be kept for :meth:`labels`.
+
+        To be called with every keyframe in turn.
         """
         ids, topic, form = None, "", ""
         if cloud.label is not None and self.source in ("auto", "log"):
@@ -164,13 +164,13 @@ class Labeller:
         return ids
 
     def conclude(self) -> None:
-        """Settles the source and what the labels mean, now that all have been seen."""
+        """Settle the source and the meaning of the labels, now that all have been seen."""
         if self.source == "onnx":
             if self._pictures is None or not self._pictures.painted:
-                why = " ".join(self._pictures.notes) if self._pictures else ""
+                reasons = " ".join(self._pictures.notes) if self._pictures else ""
                 raise LogError(
                     f"{self._session.name}: no point was labelled by the model: "
-                    f"{why or 'no camera picture shows points of the same time; use --set labels.source=geometry.'}"
+                    f"{reasons or NO_PICTURE}"
                 )
             return
         if self.source not in ("auto", "log"):
@@ -185,7 +185,7 @@ class Labeller:
             )
         self.source = "log" if has_labels else "geometry"
         for name, topic in self._topics.items():
-            topic.space, topic.said_by = self._space(name, topic)
+            topic.space, topic.origin = self._space(name, topic)
 
     def labels(
         self,
@@ -196,11 +196,10 @@ class Labeller:
         scale: float,
         ground: GroundSurface | None = None,
     ) -> U8:
-        """Classes (n,) of the level ``points`` (n, 3) of a keyframe seen from ``origin`` (3,), from
-        what :meth:`take` gave.
+        """Classes (n,) of the level ``points`` (n, 3) of a keyframe seen from ``origin`` (3,).
 
-        ``scale`` is the voxel size over 0.30 m; ``ground`` saves finding the ground below the
-        points again.
+        ``ids`` are the result of :meth:`take`; ``scale`` is the voxel size over 0.30 m; ``ground``
+        saves estimating the ground below the points again.
         """
         if self.source == "geometry":
             return classify(points, origin, scale, ground)
@@ -217,9 +216,9 @@ class Labeller:
                 if self.source == "onnx"
                 else self._train_ids(name, ids[own] & np.uint32(_LOW))
             )
-        out[out == SKY] = UNLABELLED  # what gave a return is no sky
-        # a car's class on what is seen through its windows; a road has no windows, and is always
-        # behind a nearer piece of itself
+        out[out == SKY] = UNLABELLED  # the sky returns no echo
+        # a car's class on points behind its windows; a road has no windows, and is always behind a
+        # nearer piece of itself
         out[(ids & DOUBTFUL > 0) & np.isin(out, THINGS)] = UNLABELLED
         if self._settings.unseen == "geometry":
             unseen = ids == UNPAINTED
@@ -227,11 +226,9 @@ class Labeller:
         return out
 
     def to_json(self) -> dict[str, Any]:
-        """What the labels are from, for session.json: the source, the label space of each topic and
-        who said so, what was painted.
-        """
+        """For session.json: the source, the label space of each topic, counts of painted points."""
         spaces = {
-            name: {"space": t.space.name, "said_by": t.said_by, "colours": t.is_coloured}
+            name: {"space": t.space.name, "said_by": t.origin, "colours": t.is_coloured}
             for name, t in sorted(self._topics.items())
             if t.space is not None and self.source == "log"
         }
@@ -252,14 +249,16 @@ class Labeller:
         return label_ids(frame)
 
     def _space(self, name: str, topic: _Topic) -> tuple[LabelSpace, str]:
-        """What the labels of a topic mean, and who said so: setting, log or guess."""
+        """The meaning of the labels of a topic, and where it comes from: setting, log or guess."""
         if self._settings.space is not None:
             return read_space(self._settings.space), "setting"
-        said = self._session.label_names.get(name)
-        if said is not None and said.names and not topic.is_coloured:
-            return space_of_names(said.names, said.header.topic), "log"
-        if said is not None and said.space in spaces():  # a log may name what is shipped, no file
-            return read_space(said.space), "log"
+        recorded = self._session.label_names.get(name)
+        if recorded is not None and recorded.names and not topic.is_coloured:
+            return space_of_names(recorded.names, recorded.header.topic), "log"
+        if (
+            recorded is not None and recorded.space in spaces()
+        ):  # a log may name a shipped space, not a file
+            return read_space(recorded.space), "log"
         if topic.is_coloured:
             return read_space(guess_palette(topic.colours) or "cityscapes"), "guess"
         seen = np.flatnonzero(topic.low) + (1 << 16 if topic.has_instances else 0)

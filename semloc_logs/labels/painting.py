@@ -1,15 +1,14 @@
-"""Label images -> labels of points that another sensor measured from elsewhere, where the camera
-can see them.
+"""Label images -> labels of points of another sensor, where the camera sees them.
 
-A LIDAR beside a camera looks past the edges of near things at what is hidden from the camera, and
-its points are sparse: through the gaps between the points of a near thing, a plain depth test lets
-the hidden points take the near thing's class. So the surfaces that the LIDAR saw are drawn into a
-depth image without gaps: in columns of equal azimuth, as seen from the LIDAR, each point is joined
-with the next one above it that continues the same surface, and this strip is as wide as a column. A
-point is hidden where a strip is much nearer.
+A LIDAR beside a camera measures points behind near things that are hidden from the camera, and its
+points are sparse: through the gaps between the points of a near thing, a plain depth test lets the
+hidden points take the near thing's class. So the surfaces of the LIDAR are drawn into a depth image
+without gaps: in columns of equal azimuth, as seen from the LIDAR, each point is joined with the
+next one above it that continues the same surface, and this strip is as wide as a column. A point is
+hidden where a strip is much nearer.
 
-A LIDAR also looks through the windows of cars, and gets nothing back from black paint: there is no
-surface where the picture has one. A point that lies behind a near surface of the very label that it
+A LIDAR also looks through the windows of cars, and black paint returns nothing: the cloud lacks a
+surface that the picture shows. A point that lies behind a near surface of the very label that it
 would get, and beside it by less than a thing's size, is marked DOUBTFUL.
 """
 
@@ -35,8 +34,8 @@ _LOOK_AHEAD = 16  # points of a column that are tried as the continuation of a s
 _CELL = np.radians(0.16)  # of the depth image
 _NEARER = 0.25  # what hides a point is nearer by so much (m),
 _NEARER_SHARE = 0.04  # and by this share of the distance
-DOUBTFUL = 1 << 31  # set in a label that may be that of something nearer
-_THING = 0.8  # m, half the size of what has windows
+DOUBTFUL = 1 << 31  # set in a label that may belong to something nearer
+_THING = 0.8  # m, half the size of things with windows
 # around a point, for near surfaces of which _THING is as large as that
 _REACH = (np.radians(6.0), np.radians(3.0), np.radians(1.5))
 _BEHIND = 3.0  # m, so that the side of a truck is not behind its own rear
@@ -47,17 +46,17 @@ U32 = NDArray[np.uint32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Viewpoint:
-    """Where points were measured from: ``origin`` (3,) of the sensor in their frame, and ``axis``
-    (3,), a unit vector, about which its azimuth is counted.
+    """Where points were measured from.
+
+    ``origin`` (3,) of the sensor in their frame, and ``axis`` (3,), a unit vector, about which its
+    azimuth is counted.
     """
 
     origin: NDArray[np.floating]
     axis: NDArray[np.floating]
 
     def columns(self, points: F32) -> tuple[NDArray[np.int32], F32, F32]:
-        """Column of equal azimuth, elevation (rad) and distance (m) of ``points`` (n, 3), each
-        (n,).
-        """
+        """Column of azimuth, elevation (rad) and distance (m) of ``points`` (n, 3), each (n,)."""
         rays = points - np.asarray(self.origin, np.float32)
         side = np.cross(self.axis, (1.0, 0.0, 0.0) if abs(self.axis[0]) < 0.9 else (0.0, 1.0, 0.0))
         side /= np.linalg.norm(side)
@@ -77,27 +76,27 @@ class Viewpoint:
 def nearest_depth(
     points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, projector: Projector
 ) -> tuple[F32, float]:
-    """Depth (m along the optical axis) of the nearest surface in each cell of the picture, infinite
-    where there is none, and the edge of a cell in pixels.
+    """Depth (m along the optical axis) of the nearest surface in each cell of the picture.
 
-    ``camera`` and ``pixels`` are where all the ``points`` (n, 3) of a cloud lie in the camera's
-    frame and in its picture.
+    Infinite without a surface; the second value is the edge of a cell in pixels. ``camera`` and
+    ``pixels`` are where all the ``points`` (n, 3) of a cloud lie in the camera's frame and in its
+    picture.
     """
     cell = max(1.0, float(round(projector.focal * _CELL)))
     shape = int(np.ceil(projector.height / cell)), int(np.ceil(projector.width / cell))
     depth = np.full(shape, np.inf, np.float32)
-    near = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    column, elevation, distance = viewpoint.columns(points[near])
+    seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    column, elevation, distance = viewpoint.columns(points[seen])
     order = np.lexsort((elevation, column))
-    near = near[order]
+    seen = seen[order]
     column = column[order]
     elevation = elevation[order]
     distance = distance[order]
-    z = camera[near, 2].astype(float)
+    z = camera[seen, 2].astype(float)
     # off the axis a picture is stretched by the square of the ray's length over its depth
-    stretch = np.linalg.norm(camera[near], axis=1) / z
+    stretch = np.linalg.norm(camera[seen], axis=1) / z
     half = np.maximum(projector.focal / cell * (COLUMN / 2) * distance / z * stretch, 0.5)
-    _draw(depth, (pixels[near] + 0.5) / cell, z, distance, column, elevation, half)
+    _draw(depth, (pixels[seen] + 0.5) / cell, z, distance, column, elevation, half)
     return depth, cell
 
 
@@ -133,9 +132,10 @@ def _continues(
     i: int,
     step: int,
 ) -> int:
-    """The next point of another ring, upwards or downwards, that is on the same surface as point
-    ``i``; _ENDS where the next ring sees something much farther or nothing, and _STEPS where it
-    sees something else.
+    """The next point of another ring, upwards or downwards, on the same surface as point ``i``.
+
+    _ENDS where the next ring measured something much farther or nothing, _STEPS where it measured
+    something else.
     """
     ends = _ENDS
     for k in range(1, _LOOK_AHEAD + 1):
@@ -165,8 +165,10 @@ def _strip(
     half_a: float,
     half_b: float,
 ) -> None:
-    """Joins two points: in each row of cells the farthest depth that the line has there, which is
-    linear in 1 / z; in each column where the line lies rather than stands.
+    """Join two points by a strip.
+
+    In each row of cells (in each column where the line is flat) it has the farthest depth of the
+    line there, which is linear in 1 / z.
     """
     main = 1 if abs(b[1] - a[1]) >= abs(b[0] - a[0]) else 0
     first = int(np.floor(min(a[main], b[main])))
@@ -206,12 +208,11 @@ def paint(
     camera_T_base: F64,
     projector: Projector,
 ) -> tuple[U32, NDArray[np.bool_]]:
-    """Labels (m,) of ``points[wanted]`` in the base frame from the picture ``labels`` (h, w), and
-    which points are in the picture at all.
+    """Labels (m,) of ``points[wanted]`` from the picture ``labels`` (h, w), and which lie in it.
 
-    ``points`` (n, 3) are all that the sensor at ``viewpoint`` measured: they hide each other.
-    UNPAINTED where the picture does not show the point: outside of it, or hidden. DOUBTFUL is added
-    to labels that may be those of something nearer.
+    ``points`` (n, 3), base frame, are all that the sensor at ``viewpoint`` measured: they hide each
+    other. UNPAINTED where the picture does not show the point: outside of it, or hidden. DOUBTFUL
+    is added to labels that may belong to something nearer.
     """
     out = np.full(len(wanted), UNPAINTED, np.uint32)
     camera = in_base(camera_T_base, points)
@@ -224,10 +225,10 @@ def paint(
     column, row = np.floor((pixels[inside] + 0.5) / cell).astype(int).T
     z = camera[inside, 2]
     visible = depth[row, column] * (1 + _NEARER_SHARE) + _NEARER >= z
-    at = np.flatnonzero(inside)[visible]
-    u, v = np.rint(pixels[at]).astype(int).T
-    out[at] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
-    known = at[out[at] != UNPAINTED]
+    shown = np.flatnonzero(inside)[visible]
+    u, v = np.rint(pixels[shown]).astype(int).T
+    out[shown] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
+    known = shown[out[shown] != UNPAINTED]
     column, row = np.floor((pixels[known] + 0.5) / cell).astype(int).T
     doubtful = _behind_its_own(
         depth, cell, labels, out[known], row, column, camera[known, 2], projector.focal
@@ -246,8 +247,9 @@ def _behind_its_own(
     z: F32,
     focal: float,
 ) -> NDArray[np.bool_]:
-    """Which points (n,) with the labels ``own`` at cells (``row``, ``column``) have a much nearer
-    surface of the same label beside them.
+    """Which points (n,) have a much nearer surface of the same label beside them.
+
+    Their labels are ``own``, their cells (``row``, ``column``).
     """
     out = np.zeros(len(own), bool)
     half = int(cell) // 2
@@ -257,25 +259,27 @@ def _behind_its_own(
     )
     values, counts = np.unique(own, return_counts=True)
     for label in values[np.argsort(-counts, kind="stable")][:_MOST_LABELS]:
-        mine = np.flatnonzero(own == label)
+        members = np.flatnonzero(own == label)
         surface = np.where(
             coarse[: depth.shape[0], : depth.shape[1]] == label, depth, np.float32(np.inf)
         )
         for reach in _REACH:
-            near = np.where(surface < _THING / np.tan(reach), surface, np.float32(1e9))
+            close = np.where(surface < _THING / np.tan(reach), surface, np.float32(1e9))
             size = 2 * int(focal * reach / cell) + 1
             around = cv2.erode(
-                near,
+                close,
                 np.ones((size, size), np.uint8),
                 borderType=cv2.BORDER_CONSTANT,
                 borderValue=1e9,
             )
-            out[mine] |= np.asarray(around)[row[mine], column[mine]] * 1.1 + _BEHIND < z[mine]
+            out[members] |= (
+                np.asarray(around)[row[members], column[members]] * 1.1 + _BEHIND < z[members]
+            )
     return out
 
 
 def without_borders(labels: U32, width: int) -> U32:
-    """The picture (h, w) of labels with UNPAINTED within ``width`` pixels of where two labels meet."""
+    """The labels (h, w), UNPAINTED within ``width`` pixels of a border between two labels."""
     if width <= 0:
         return labels
     border: NDArray[np.uint8] = np.zeros(labels.shape, np.uint8)

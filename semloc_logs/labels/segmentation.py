@@ -1,7 +1,7 @@
 """The user's ONNX model: camera picture -> Cityscapes train ids of its pixels.
 
 It runs in onnxruntime (the extra ``onnx``) or, where that is not installed, in OpenCV, in as many
-threads as ``labels.threads`` says.
+threads as ``labels.threads`` allows.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ Net = Callable[[NDArray[Any]], NDArray[Any]]  # a batch of one picture -> the ou
 
 def fingerprint(settings: Labels) -> str:
     """Hashes of the files that ``settings`` name: model, spec, label spaces; "" without any.
+
     SettingsError if one is missing.
     """
     paths = []
@@ -61,8 +62,9 @@ def _named(settings: Labels) -> tuple[Path, Path]:
 
 
 class Segmenter:
-    """A model with its spec. :meth:`train_ids` is a function of the picture alone: the same picture
-    gives the same labels.
+    """A model with its spec.
+
+    :meth:`train_ids` depends on the picture alone: the same picture gives the same labels.
     """
 
     def __init__(
@@ -72,14 +74,15 @@ class Segmenter:
         self._space = spec.label_space(spec_path)
         ignored = spec.ignored(self._space)
         ids = np.arange(max(self._space.targets, default=0) + 1)
-        # the last for what a model itself leaves out
+        # the last is for pixels that a model itself leaves out
         self._table = np.append(self._space.train_ids(ids), np.uint8(UNLABELLED))
         self._table[sorted(ignored)] = UNLABELLED
 
     @classmethod
     def open(cls, settings: Labels) -> Segmenter:
-        """The model that ``labels.model`` and ``labels.spec`` name. SettingsError when one of them
-        is missing or cannot be used.
+        """The model that ``labels.model`` and ``labels.spec`` name.
+
+        SettingsError when one of them is missing or cannot be used.
         """
         model_path, spec_path = _named(settings)
         spec = read_spec(spec_path)
@@ -98,9 +101,7 @@ class Segmenter:
         }
 
     def train_ids(self, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> U32:
-        """Train ids (h, w) of a picture (h, w) or (h, w, 3) RGB; UNPAINTED where the spec crops it
-        off.
-        """
+        """Train ids (h, w) of a picture (h, w) or (h, w, 3) RGB; UNPAINTED where it is cropped."""
         spec = self._spec.input
         height, width = picture.shape[:2]
         top, bottom, left, right = (
@@ -127,8 +128,9 @@ class Segmenter:
         return out
 
     def _batch(self, picture: U8) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
-        """The input of the model, and the share of it that is the picture: first and last of rows
-        and of columns.
+        """The input of the model, and the share of it that the picture fills.
+
+        The share is the first and last of rows and of columns.
         """
         spec = self._spec.input
         rows, columns = spec.size
@@ -158,8 +160,9 @@ class Segmenter:
         return np.ascontiguousarray(values[None]), box
 
     def _ids(self, output: NDArray[Any]) -> NDArray[np.intp]:
-        """Class ids (rows, columns) of what the model gave. SettingsError when it is not of the
-        form that the spec says.
+        """Class ids (rows, columns) of the model's output.
+
+        SettingsError when the output has not the form that the spec describes.
         """
         spec = self._spec.output
         given = " x ".join(map(str, output.shape))
@@ -171,13 +174,13 @@ class Segmenter:
         if not output.size or output.dtype.kind not in "biuf":
             raise SettingsError(
                 f"Model {self._path} gives {given} values of type {output.dtype}: output.name may "
-                "be that of another."
+                "name another output."
             )
         classes = len(self._table) - 1
         if spec.kind == "ids":
             if image.ndim != 2:
                 raise SettingsError(
-                    f"Model {self._path} gives {given} values, which is no picture of ids: "
+                    f"Model {self._path} gives {given} values, not a picture of ids: "
                     "output.kind may be 'logits'."
                 )
             ids: NDArray[np.intp] = np.rint(image).astype(np.intp)
@@ -283,14 +286,14 @@ def _check_shape(path: Path, spec: Spec, shape: list[Any], type_: str) -> None:
     )
     if not fits:
         raise SettingsError(
-            f"Model {path} takes an input of {' x '.join(map(str, shape))}, but its spec says "
+            f"Model {path} takes an input of {' x '.join(map(str, shape))}, but its spec has "
             f"{' x '.join(map(str, wanted))} "
             f"({spec.input.layout}): correct input.size or input.layout."
         )
     types = {"tensor(float)": "float32", "tensor(uint8)": "uint8"}
     if types.get(type_) != spec.input.type:
         raise SettingsError(
-            f"Model {path} takes {type_}, but its spec says input.type {spec.input.type}."
+            f"Model {path} takes {type_}, but its spec has input.type {spec.input.type}."
         )
 
 

@@ -1,6 +1,4 @@
-"""The pass over a log: which clouds become keyframes, thinned and kept on disk until gravity and
-the meaning of labels are known.
-"""
+"""The pass over a log: keyframes, thinned and kept on disk until gravity and labels are known."""
 
 from __future__ import annotations
 
@@ -25,14 +23,15 @@ from semloc_logs.settings import ResolvedFusion
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U32 = NDArray[np.uint32]
-MOST_NORMALS = 20  # keyframes whose normals say where up is
+MOST_NORMALS = 20  # keyframes whose normals show where up is
 
 
 @dataclass(slots=True, eq=False)
 class Collected:
-    """Keyframe by keyframe: ``headers``, ``poses`` session_T_base (4, 4) or None, and ``origins``
-    (3,) of the sensor in the base frame; their points, thinned to one a ``cell`` (m), are in files
-    of the folder ``scratch``.
+    """Keyframe by keyframe: ``headers``, ``poses`` session_T_base (4, 4) or None, ``origins``.
+
+    ``origins`` (3,) are the sensor in the base frame. The points, thinned to one a ``cell`` (m),
+    are in files of the folder ``scratch``.
     """
 
     scratch: Path
@@ -45,9 +44,7 @@ class Collected:
         return len(self.headers)
 
     def add(self, cloud: PosedCloud, kept: NDArray[np.int64], label: U32 | None = None) -> None:
-        """A keyframe: the points ``kept`` (m,) of ``cloud``, and their labels (m,) as recorded, if
-        any.
-        """
+        """Add a keyframe: the points ``kept`` (m,) of ``cloud``, recorded labels (m,) or None."""
         number = len(self)
         self._save(number, "points", cloud.points[kept])
         self._save(number, "label", label)
@@ -57,10 +54,10 @@ class Collected:
         self.origins.append(cloud.origin)
 
     def load(self, keyframe: int) -> tuple[F32, U32 | None, F32 | None]:
-        """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of
-        their range, where there are any.
+        """Points (n, 3) in the base frame, labels as recorded, standard deviation of the ranges.
 
-        WorkspaceError when somebody removed them, as a second ``fuse`` of the same session would.
+        The latter two are None where there are none. WorkspaceError when somebody removed the
+        files, as a second ``fuse`` of the same session does.
         """
         points = self._load(keyframe, "points")
         if points is None:
@@ -70,8 +67,9 @@ class Collected:
         return points, self._load(keyframe, "label"), self._load(keyframe, "sigma")
 
     def normals(self, most: int = MOST_NORMALS) -> list[tuple[int, F64, F64]]:
-        """Of ``most`` keyframes, evenly spread: number, unit normals (m, 3) of surfaces in the
-        session frame, or in the base frame without poses, and their weights (m,).
+        """Of ``most`` keyframes, evenly spread: number, unit normals (m, 3) and weights (m,).
+
+        Normals of surfaces are in the session frame, or in the base frame without poses.
         """
         out = []
         for i in np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64)).tolist():
@@ -98,9 +96,7 @@ def collect(
     scratch: Path,
     on_progress: Callable[[str], None],
 ) -> Collected:
-    """Read the log once: thinned points of its keyframes go to files of ``scratch``, what is small
-    stays in memory.
-    """
+    """Read the log once: the thinned points of its keyframes go to files of ``scratch``."""
     collected = Collected(scratch, fusion.keyframe_resolution)
     selector = KeyframeSelector(fusion)
     clouds = session.clouds(labeller.on_image, labeller.images)
