@@ -10,6 +10,7 @@ are objects.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -77,18 +78,29 @@ def ground_surface(
     nx, ny = (np.floor((p[:, :2].max(0) - low) / cell) + 2).astype(int).tolist()
     column = ((p[:, :2] - low) / cell).astype(np.int64)
     order, start = by_cell(column[:, 0] * ny + column[:, 1], nx * ny)
-    lowest = _lowest(p[:, 2].copy(), start, order)
+    cells = _Cells(p[:, 2].copy(), order, start, nx, ny)
+    lowest = _lowest(cells)
     i, j = np.divmod(np.arange(nx * ny), ny)
     away = np.hypot(low[0] + (i + 0.5) * cell - o[0], low[1] + (j + 0.5) * cell - o[1])
     seed = _seed(lowest, away, float(o[2]), scale)
     if seed is None:
         seed = float(np.percentile(p[:, 2], 2))
-    z, gap = _grow(
-        p[:, 2].copy(), start, order, nx, ny, np.argsort(away, kind="stable"), seed, scale
-    )
-    return GroundSurface(
-        low, cell, _relax(z, gap, nx, ny, scale).reshape(nx, ny), gap.reshape(nx, ny)
-    )
+    z, gap = _grow(cells, np.argsort(away, kind="stable"), seed, scale)
+    smooth = _relax(z, gap, nx, ny, scale)
+    return GroundSurface(low, cell, smooth.reshape(nx, ny), gap.reshape(nx, ny))
+
+
+class _Cells(NamedTuple):
+    """Points of height ``z`` (n,) by cells of a grid (nx, ny), for compiled functions.
+
+    Cell a = i * ny + j holds the points ``order[start[a]:start[a + 1]]``.
+    """
+
+    z: F64
+    order: I64
+    start: I64
+    nx: int
+    ny: int
 
 
 def _seed(lowest: F64, away: F64, origin_z: float, scale: float) -> float | None:
@@ -109,8 +121,9 @@ def _seed(lowest: F64, away: F64, origin_z: float, scale: float) -> float | None
 
 
 @njit(cache=True, nogil=True)
-def _lowest(z: F64, start: I64, order: I64) -> F64:
+def _lowest(cells: _Cells) -> F64:
     """Lowest height of each cell, infinite without points."""
+    z, order, start, _, _ = cells
     out = np.full(len(start) - 1, np.inf)
     for a in range(len(out)):
         for k in range(start[a], start[a + 1]):
@@ -119,7 +132,7 @@ def _lowest(z: F64, start: I64, order: I64) -> F64:
 
 
 @njit(cache=True, nogil=True)
-def _promise(z: F64, gap: F64, a: int, nx: int, ny: int) -> tuple[float, float]:
+def _predicted(z: F64, gap: F64, a: int, nx: int, ny: int) -> tuple[float, float]:
     """The height of cell ``a`` by the visited cells within two cells, and the way to a seen one.
 
     The way is in cells, -1 where none of them was visited.
@@ -141,31 +154,23 @@ def _promise(z: F64, gap: F64, a: int, nx: int, ny: int) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def _grow(
-    height: F64,
-    start: I64,
-    order: I64,
-    nx: int,
-    ny: int,
-    sequence: NDArray[np.int64],
-    seed: float,
-    scale: float,
-) -> tuple[F64, F64]:
+def _grow(cells: _Cells, sequence: I64, seed: float, scale: float) -> tuple[F64, F64]:
     """Height and gap of all cells, visited in ``sequence``; the first ones lie at ``seed``."""
+    height, order, start, nx, ny = cells
     z = np.empty(nx * ny)
     gap = np.full(nx * ny, -1.0)
     for a in sequence:
-        promised, away = _promise(z, gap, a, nx, ny)
+        predicted, away = _predicted(z, gap, a, nx, ny)
         if away < 0:
-            promised, away = seed, 1.0
+            predicted, away = seed, 1.0
         tolerance = scale * (STEP + WIDENING * min(away, MOST_GAP))
         lowest = np.inf
         for k in range(start[a], start[a + 1]):
             h = height[order[k]]
-            if h > promised - tolerance and h < lowest:
+            if h > predicted - tolerance and h < lowest:
                 lowest = h
-        z[a], gap[a] = promised, away
-        if lowest < promised + tolerance:
+        z[a], gap[a] = predicted, away
+        if lowest < predicted + tolerance:
             total, count = 0.0, 0
             for k in range(start[a], start[a + 1]):
                 h = height[order[k]]
