@@ -17,7 +17,7 @@ from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.selection import KeyframeSelector, thin
 from semloc_logs.mapping.up_direction import surface_normals
-from semloc_logs.numerics.prefetch import ahead
+from semloc_logs.numerics.prefetch import prefetched
 from semloc_logs.settings import ResolvedFusion
 
 F32 = NDArray[np.float32]
@@ -103,7 +103,7 @@ def collect(
     # pictures come through the labeller in the same pass: they must not overtake the clouds that
     # they are painted on
     with closing(
-        ahead(clouds) if labeller.on_image is None else (cloud for cloud in clouds)
+        prefetched(clouds) if labeller.on_image is None else (cloud for cloud in clouds)
     ) as coming:
         for cloud in coming:
             if selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):

@@ -188,7 +188,7 @@ def test_a_failure_half_way_leaves_no_thread_and_no_file(
     with pytest.raises(OSError, match="no space") as problem:
         fuse_session(FuseTask((drive(tmp_path / "a.mcap", GOOD),), folder, settings))
     assert problem.value
-    assert not [t for t in threading.enumerate() if t.name == "semloc-ahead"]
+    assert not [t for t in threading.enumerate() if t.name == "semloc-prefetch"]
     assert list(folder.path.iterdir()) == []
 
 

@@ -218,7 +218,8 @@ def test_colours_and_those_that_the_palette_does_not_have() -> None:
     }
     assert (
         labeller.notes[1]
-        == "1 points have colours of /cam/labels that cityscapes does not have and are unlabelled: (1, 2, 3)."
+        == "1 points have colours of /cam/labels that cityscapes does not have and are "
+        "unlabelled: (1, 2, 3)."
     )
 
 

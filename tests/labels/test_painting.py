@@ -165,7 +165,7 @@ def _board_half(base_T_camera: F64) -> F64:
 
 
 def test_a_lidar_on_its_side() -> None:
-    """The rings of a sensor that turns about y stand upright; its azimuth counts about that axis."""
+    """The rings of a sensor that turns about y are upright; its azimuth counts about y."""
     base_T_camera = camera_at(0.3, 0.5, -0.2)
     turned = rays(1.0, reach=30.0, low=-30.0, high=30.0)[:, [0, 2, 1]]
     distance, truth = seen(np.zeros(3), turned)

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from semloc_logs.numerics.prefetch import ahead
+from semloc_logs.numerics.prefetch import THREAD_NAME, prefetched
 
 
 def test_items_come_in_their_order() -> None:
-    assert list(ahead(range(100), depth=3)) == list(range(100))
-    assert list(ahead([])) == []
+    assert list(prefetched(range(100), depth=3)) == list(range(100))
+    assert list(prefetched([])) == []
 
 
 def test_at_most_the_depth_and_one_are_made_ahead() -> None:
@@ -22,19 +22,19 @@ def test_at_most_the_depth_and_one_are_made_ahead() -> None:
             made.append(i)
             yield i
 
-    coming = ahead(items(), depth=2)
+    coming = prefetched(items(), depth=2)
     assert next(coming) == 0
     time.sleep(0.3)
     assert made == [0, 1, 2, 3]  # one taken, two waiting, one in hand
     assert list(coming) == list(range(1, 10))
 
 
-def test_what_is_raised_there_is_raised_here_after_the_items_before_it() -> None:
+def test_an_exception_of_the_source_is_raised_after_the_items_before_it() -> None:
     def items() -> Iterator[int]:
         yield 1
         raise KeyError("lost")
 
-    coming = ahead(items())
+    coming = prefetched(items())
     assert next(coming) == 1
     with pytest.raises(KeyError, match="lost"):
         next(coming)
@@ -49,8 +49,8 @@ def test_leaving_early_closes_the_source_and_ends_the_thread() -> None:
         finally:
             closed.set()
 
-    coming = ahead(items())
+    coming = prefetched(items())
     next(coming)
     coming.close()
     assert closed.is_set()
-    assert not [t for t in threading.enumerate() if t.name == "semloc-ahead"]
+    assert not [t for t in threading.enumerate() if t.name == THREAD_NAME]
