@@ -27,12 +27,15 @@ from towns import Place, Town, collect, short_towns
 from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.engines import Engine, make_engine
-from semloc_logs.engines.engine import single_threaded
+from semloc_logs.engines.processes import single_threaded
 from semloc_logs.evaluation.calibration import SURE, answers, decided_by, read_judged, recall_at
 from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import load
-from semloc_logs.stages.pipeline import close, describe, fuse, session_name
+from semloc_logs.stages.close import close
+from semloc_logs.stages.describe import describe
+from semloc_logs.stages.fuse import fuse
+from semloc_logs.stages.inputs import SessionInput, session_name
 from semloc_logs.tables.table import read_metadata
 from semloc_logs.workspace import Workspace
 
@@ -155,14 +158,12 @@ def ask_pairs(
     """Fuse, describe and close; a log that cannot be fused is named and left out."""
     settings = load(assignments=assignments).resolved()
 
-    def note(said: str) -> None:
-        print(f"  {said}", flush=True)
-
-    report = fuse({session_name(log): [log] for log in logs}, work, settings, {}, engine, note)
+    sessions = [SessionInput(session_name(log), (log,)) for log in logs]
+    report = fuse(sessions, work, settings, engine)
     for failed in report.failed:
         print(f"  left out: {failed}")
-    describe(work, [], settings, engine, note)
-    close(work, [], [], settings, engine, note)
+    describe(work, [], settings, engine)
+    close(work, settings, engine)
 
 
 def count_pairs(work: Workspace, logs: Path, title: str) -> int:

@@ -59,36 +59,23 @@ def command(
     \b
     Example:  semloc annotate monday.mcap -w work -o monday.semloc.mcap
     """
-    chosen = [
-        m
-        for m, given in (
-            ("copy", output is not None),
-            ("in-place", in_place),
-            ("sidecar", sidecar is not None),
-        )
-        if given
-    ]
+    modes = {"copy": output is not None, "in-place": in_place, "sidecar": sidecar is not None}
+    chosen = [mode for mode, is_given in modes.items() if is_given]
     if len(chosen) != 1:
         raise click.UsageError(
             "Give exactly one of -o OUT.mcap, --in-place and --sidecar OUT.mcap."
         )
-    from semloc_logs.stages.pipeline import annotate
+    from semloc_logs.stages.annotate import Annotation, AnnotationMode, annotate
     from semloc_logs.workspace import Workspace
 
-    made = annotate(
-        log,
-        Workspace(work),
-        settings,
-        output=output or sidecar,
-        mode=chosen[0],
-        overwrite=overwrite,
-        session=session,
-    )
+    annotation = Annotation(AnnotationMode(chosen[0]), output or sidecar, overwrite)
+    made = annotate(log, Workspace(work), settings, annotation, session=session)
     if as_json:
         console.result_json({k: getattr(made, k) for k in made.__dataclass_fields__})
     else:
         replaced = ", earlier results replaced" if made.replaced else ""
         console.result(
-            f"{made.path}: {made.closures} closures in {made.messages} messages, {made.bytes_written} bytes{replaced}"
+            f"{made.path}: {made.closures} closures in {made.messages} messages,"
+            f" {made.bytes_written} bytes{replaced}"
         )
     return 0

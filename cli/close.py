@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     "queries",
     metavar="SESSION",
     multiple=True,
-    help="Session that asks; repeatable; default: all.",
+    help="Session to localise; repeatable; default: all.",
 )
 @click.option(
     "--target",
     "targets",
     metavar="SESSION",
     multiple=True,
-    help="Session that is asked; repeatable; default: all.",
+    help="Session to localise it in; repeatable; default: all.",
 )
 @click.option("--no-self", is_flag=True, help="Do not look for revisits within a session.")
 @query_options
@@ -44,21 +44,22 @@ def command(
     engine: EngineChoice,
     settings: Resolved,
 ) -> int:
-    """Words -> loop closures: every session asks all others, and itself apart from what is near in
-    time; writes closures.parquet.
+    """Words -> loop closures.
+
+    Every session is localised in all others, and in itself apart from keyframes that are near in
+    time. Writes closures.parquet.
 
     \b
     Example:  semloc close -w work --query tuesday --target monday --query-every 5
     """
     from semloc_logs.closures.closure_tables import read_closures
-    from semloc_logs.stages.pipeline import close
+    from semloc_logs.stages.close import Selection, close
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(workspace.sessions())) as opened:
-        report = close(
-            workspace, queries, targets, settings, opened, console.note, not no_self, overwrite
-        )
+        selection = Selection(queries, targets, self_closures=not no_self)
+        report = close(workspace, settings, opened, selection, overwrite=overwrite)
     if as_json:
         console.result_json(
             report_json(report, work) | {"closures": read_closures(workspace.closures)}

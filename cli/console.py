@@ -5,35 +5,37 @@ JSON each.
 from __future__ import annotations
 
 import json
-import re
+import logging
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import TaskID
 
-_COUNTED = re.compile(r"(\d+) of (\d+)|\bread \d+")
-_PLAIN_SECONDS = 5.0  # between progress lines where nobody watches a bar
+    from semloc_logs.progress import Progress
+
+PLAIN_SECONDS = 5.0  # between lines about one piece of work where nobody watches a bar
 
 
 class Console:
     """One for the program; ``verbosity`` is -1 with -q, above 0 with -v."""
 
     def __init__(self) -> None:
-        self.verbosity = 0
-        self.log_format = "text"
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
-        self._spoke = 0.0
+        self.reset()
 
     def reset(self) -> None:
         """As at the start of the program."""
-        self.__init__()  # type: ignore[misc]
+        self.verbosity = 0
+        self.log_format = "text"
+        self._bars: Bars | None = None
+        self._shown: dict[tuple[str, str], float] = {}
+        self._begun = time.monotonic()
 
     # -- stdout
 
@@ -69,28 +71,9 @@ class Console:
     # -- stderr
 
     def note(self, message: str) -> None:
-        """What is going on; a message with 'N of M' or 'read N' in it is progress and may be left
-        out.
-        """
-        if self.verbosity < 0:
-            return
-        counted = _COUNTED.search(message)
-        if counted and self._bar is not None and self._task is not None:
-            total = int(counted[2]) if counted[2] else None
-            self._bar.update(
-                self._task, description=message, completed=int(counted[1] or 0), total=total
-            )
-            return
-        if (
-            counted
-            and self.verbosity == 0
-            and (counted[1] is None or counted[1] != counted[2])
-            and time.monotonic() - self._spoke < _PLAIN_SECONDS
-        ):
-            return
-        if counted:
-            self._spoke = time.monotonic()
-        self._say("info", message)
+        """A notice."""
+        if self.verbosity >= 0:
+            self._say("info", message)
 
     def warn(self, message: str) -> None:
         """About input that was skipped."""
@@ -100,47 +83,137 @@ class Console:
         """Why the command failed."""
         self._say("error", message)
 
-    def _say(self, level: str, message: str) -> None:
+    def show_progress(self, event: Progress) -> None:
+        """A bar on a terminal; elsewhere a line every few seconds, and one at the end."""
+        if self.verbosity < 0:
+            return
+        if self._bars is not None:
+            self._bars.show(event)
+            return
+        now = time.monotonic()
+        key = event.stage, event.session
+        is_due = now - self._shown.get(key, self._begun) >= PLAIN_SECONDS
+        if is_due or event.finished or self.verbosity > 0:
+            self._shown[key] = now
+            self._say("info", sentence(event), **asdict(event))
+
+    def _say(self, level: str, message: str, **fields: object) -> None:
         if self.log_format == "json":
-            click.echo(
-                json.dumps(
-                    {
-                        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-                        "level": level,
-                        "message": message,
-                    }
-                ),
-                err=True,
-            )
+            now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+            content = {"time": now, "level": level, "message": message, **fields}
+            click.echo(json.dumps(content), err=True)
             return
         text = message if level == "info" else f"{level.capitalize()}: {message}"
-        if self._bar is not None:
-            self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        if self._bars is not None:
+            self._bars.print(text)
         else:
             click.echo(text, err=True)
 
     @contextmanager
     def progress(self) -> Iterator[None]:
-        """A bar on a terminal, plain lines elsewhere, for the length of the block."""
-        if self.verbosity < 0 or self.log_format == "json" or not sys.stderr.isatty():
-            yield
-            return
-        from rich.console import Console as Screen
-        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+        """Show the progress events and notices of the block."""
+        from semloc_logs.progress import listening
 
-        with Progress(
+        self._begun = time.monotonic()
+        self._shown.clear()
+        is_plain = self.verbosity < 0 or self.log_format == "json" or not sys.stderr.isatty()
+        with self._notices(), listening(self.show_progress):
+            if is_plain:
+                yield
+                return
+            with Bars() as bars:
+                self._bars = bars
+                try:
+                    yield
+                finally:
+                    self._bars = None
+
+    @contextmanager
+    def _notices(self) -> Iterator[None]:
+        """Show what the package logs."""
+        logger = logging.getLogger("semloc_logs")
+        handler = _Notices(self)
+        before = logger.level
+        logger.setLevel(logging.INFO)
+        logger.addHandler(handler)
+        try:
+            yield
+        finally:
+            logger.removeHandler(handler)
+            logger.setLevel(before)
+
+
+class _Notices(logging.Handler):
+    """Log records as notices and warnings of the console."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        message = record.getMessage()
+        if record.levelno >= logging.WARNING:
+            self._console.warn(message)
+        else:
+            self._console.note(message)
+
+
+class Bars:
+    """A bar for each stage of each session that is being worked on."""
+
+    def __init__(self) -> None:
+        from rich.console import Console as Screen
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            SpinnerColumn,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+        from rich.progress import Progress as RichProgress
+
+        self._tasks: dict[tuple[str, str], TaskID] = {}
+        self._bar = RichProgress(
             SpinnerColumn(),
             TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            TimeElapsedColumn(),
+            BarColumn(bar_width=20),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[unit]}", markup=False),
+            TimeRemainingColumn(),
             console=Screen(stderr=True),
             transient=True,
-        ) as bar:
-            self._bar, self._task = bar, bar.add_task("", total=None)
-            try:
-                yield
-            finally:
-                self._bar = self._task = None
+        )
+
+    def __enter__(self) -> Bars:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, event: Progress) -> None:
+        """Move the bar of the event's work; a finished one disappears."""
+        key = event.stage, event.session
+        if event.finished:
+            if key in self._tasks:
+                self._bar.remove_task(self._tasks.pop(key))
+            return
+        if key not in self._tasks:
+            description = f"{event.stage} {event.session}".strip()
+            self._tasks[key] = self._bar.add_task(description, total=None, unit=event.unit)
+        task = self._tasks[key]
+        self._bar.update(task, completed=event.done, total=event.total, unit=event.unit)
+
+    def print(self, text: str) -> None:
+        """A line above the bars."""
+        self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def sentence(event: Progress) -> str:
+    """Such as ``fuse monday: 120 of 300 keyframes``."""
+    of = "" if event.total is None else f" of {event.total}"
+    name = f"{event.stage} {event.session}".strip()
+    return f"{name}: {event.done}{of} {event.unit}"
 
 
 def _finite(content: Any) -> Any:

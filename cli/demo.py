@@ -10,7 +10,7 @@ import click
 from .console import console
 from .evaluate import show_evaluation
 from .options import Command, EngineChoice, stage_options
-from .results import finish, report_json, session_logs
+from .results import finish, report_json, session_inputs
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Resolved
@@ -39,7 +39,9 @@ def command(
     """
     from semloc_logs.evaluation.truth import evaluate_closures
     from semloc_logs.simulation.demo import simulate_demo
-    from semloc_logs.stages.pipeline import run
+    from semloc_logs.simulation.meshes.world import require_ray_caster
+    from semloc_logs.stages.annotate import AnnotationMode
+    from semloc_logs.stages.run import run
     from semloc_logs.workspace import Workspace
 
     settings = settings.model_copy(
@@ -50,11 +52,17 @@ def command(
     workspace = Workspace(output / "work")
     with console.progress():
         if overwrite or not truth.exists():
+            require_ray_caster("semloc demo")
             console.note(f"Simulating two drives in {output}")
             simulate_demo(output)
         with engine.open(len(logs)) as opened:
             report = run(
-                session_logs(logs), workspace, settings, {}, opened, console.note, "copy", overwrite
+                session_inputs(logs),
+                workspace,
+                settings,
+                opened,
+                annotation=AnnotationMode.COPY,
+                overwrite=overwrite,
             )
     result = evaluate_closures(workspace, truth, settings)
     if as_json:

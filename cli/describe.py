@@ -33,12 +33,12 @@ def command(
     \b
     Example:  semloc describe -w work monday tuesday
     """
-    from semloc_logs.stages.pipeline import describe
+    from semloc_logs.stages.describe import describe
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(sessions) or len(workspace.sessions())) as opened:
-        report = describe(workspace, sessions, settings, opened, console.note, overwrite)
+        report = describe(workspace, sessions, settings, opened, overwrite=overwrite)
     if as_json:
         console.result_json(report_json(report, work))
     else:

@@ -54,7 +54,8 @@ def command(work: Path, truth: Path, no_self: bool, as_json: bool, settings: Res
         show_evaluation(result)
     if result.unjudged:
         console.warn(
-            f"{result.unjudged} closures have an end whose true pose {truth} does not say: they are neither correct nor false."
+            f"{result.unjudged} closures have an end whose true pose {truth} does not say: they"
+            " are neither correct nor false."
         )
     return 0
 
@@ -86,5 +87,6 @@ def show_evaluation(result: Evaluation) -> None:
         )
     if result.recall is not None:
         console.result(
-            f"Recall {result.recall:.3f}: {result.answered} of {result.possible} queries with a revisit within 5 m"
+            f"Recall {result.recall:.3f}: {result.answered} of {result.possible} queries with a"
+            " revisit within 5 m"
         )

@@ -31,7 +31,8 @@ POINTS = ("ply", "pcd", "las", "laz", "xyz")
 @click.option(
     "--frame",
     type=click.Choice(["session", "map"]),
-    help="Points are in the session frame of the log's poses (default), or in the level map frame that starts at the first keyframe.",
+    help="Points are in the session frame of the log's poses (default), or in the level map frame"
+    " that starts at the first keyframe.",
 )
 @click.option(
     "--bounds",
@@ -64,7 +65,8 @@ def command(
     """
     if form not in POINTS and (what or frame or bounds):
         raise click.UsageError(
-            f"--what, --frame and --bounds choose points; {form} has none. Formats with points: {', '.join(POINTS)}."
+            f"--what, --frame and --bounds choose points; {form} has none. Formats with points:"
+            f" {', '.join(POINTS)}."
         )
     if bounds and not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
         raise click.BadParameter(

@@ -53,15 +53,14 @@ def command(
     \b
     Example:  semloc fuse monday_0.mcap monday_1.mcap -w work --session monday
     """
-    from semloc_logs.stages.pipeline import fuse, session_name
+    from semloc_logs.stages.fuse import fuse
+    from semloc_logs.stages.inputs import SessionInput, session_name
     from semloc_logs.workspace import Workspace
 
     name = checked_name(session or session_name(logs[0]))
-    given = poses.by_session([name])
+    given = SessionInput(name, logs, topics, poses.by_session([name]).get(name))
     with console.progress(), engine.open(1) as opened:
-        report = fuse(
-            {name: logs}, Workspace(work), settings, topics, opened, console.note, overwrite, given
-        )
+        report = fuse([given], Workspace(work), settings, opened, overwrite=overwrite)
     if as_json:
         console.result_json(report_json(report, work))
     else:

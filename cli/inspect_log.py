@@ -56,7 +56,8 @@ def command(logs: tuple[Path, ...], topics: dict[str, str], as_json: bool) -> in
 
 def _show(content: dict[str, Any]) -> None:
     console.result(
-        f"{content['path']}: {content['format']}, {content['encoding'] or 'no messages'}, {content['duration_s']} s"
+        f"{content['path']}: {content['format']}, {content['encoding'] or 'no messages'},"
+        f" {content['duration_s']} s"
     )
     console.table(
         "",
@@ -73,7 +74,8 @@ def _show(content: dict[str, Any]) -> None:
     for topic, sensor in content["sensors"].items():
         facts = ", ".join(f"{k} {v}" for k, v in sensor.items() if k != "base_T_sensor")
         console.result(
-            f"  {topic}: {facts}{'' if sensor['base_T_sensor'] else ', no transform to the base frame'}"
+            f"  {topic}:"
+            f" {facts}{'' if sensor['base_T_sensor'] else ', no transform to the base frame'}"
         )
     for sentence in content["problems"]:
         console.result(f"- {sentence}")

@@ -23,7 +23,7 @@ from semloc_logs.errors import SemlocError, SettingsError
 from .console import console
 
 COMMANDS = {  # name -> (module, what --help says), in the order of the story
-    "inspect": ("inspect_log", "What is in a log, and what stands in the way."),
+    "inspect": ("inspect_log", "Contents of a log, and what prevents its use."),
     "run": ("run", "Logs -> loop closures: fuse, describe, close, annotate."),
     "fuse": ("fuse", "Logs -> the semantic map of one session."),
     "describe": ("describe", "Maps -> semantic words."),
@@ -46,7 +46,7 @@ class Terminated(BaseException):
 
 
 class Program(click.Group):
-    """Commands by name; each module is imported when its command is asked for."""
+    """Commands by name; the module of a command is imported when it is needed."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -66,11 +66,11 @@ class Program(click.Group):
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **__: Any
     ) -> NoReturn:
         """Run and exit with the code that DESIGN promises."""
-        from semloc_logs.engines.engine import single_threaded
+        from semloc_logs.engines.processes import single_threaded
 
         console.reset()
         single_threaded()
-        warnings.simplefilter("ignore")  # numerical libraries' remarks are no sentences for a user
+        warnings.simplefilter("ignore")  # remarks of numerical libraries are not for users
         before = None
         with suppress(ValueError):  # not in the main thread of an embedding program
             before = signal.signal(signal.SIGTERM, _terminate)
@@ -109,7 +109,8 @@ class Program(click.Group):
             _explain(problem)
             where = problem.filename or "A file"
             console.error(
-                f"{where} cannot be read or written ({problem.strerror or problem}): check the path, permissions and disk space."
+                f"{where} cannot be read or written ({problem.strerror or problem}): check the"
+                " path, permissions and disk space."
             )
             return 1
         except MemoryError as problem:
@@ -122,7 +123,8 @@ class Program(click.Group):
             where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
             detail = " ".join(str(problem).split())[:200]
             console.error(
-                f"Unexpected {type(problem).__name__}{where} ({detail}): run again with -v for the traceback and report it."
+                f"Unexpected {type(problem).__name__}{where} ({detail}): run again with -v for the"
+                " traceback and report it."
             )
             return 1
 
@@ -149,7 +151,7 @@ def program() -> None:
 
     \b
     semloc demo                              everything once, on two simulated sessions
-    semloc inspect A.mcap                    what is in a log, and what stands in the way
+    semloc inspect A.mcap                    contents of a log, and what prevents its use
     semloc run A.mcap B.bag -w work          logs -> maps -> words -> closures, resumable
     """
 

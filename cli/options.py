@@ -36,9 +36,7 @@ FLAGS = {  # options that are short for a setting
 
 
 class Command(click.Command):
-    """A command that answers --dump-config before it asks for the arguments that it needs
-    otherwise.
-    """
+    """A command that needs no arguments when --dump-config is given."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if "--dump-config" in args and any(p.name == "dump_config" for p in self.params):
@@ -211,27 +209,30 @@ def label_options(function: Function) -> Function:
 
 
 def query_options(function: Function) -> Function:
-    """What is asked of the database."""
+    """Which queries are made."""
     for decorate in (
         click.option(
             "--query-every",
             type=float,
             metavar="M",
-            help="A query after so much road (m), and after every turn of 20 degrees: fewer are quicker, more find more.  "
+            help="A query after so much road (m), and after every turn of 20 degrees: fewer are"
+            " quicker, more find more.  "
             "[default: 2 at 0.30 m voxels, in proportion at others]",
         ),
         click.option(
             "--query-length",
             type=float,
             metavar="M",
-            help="A query is fused from all keyframes of so much road (m) around it, instead of --query-frames: for cameras, "
+            help="A query is fused from all keyframes of so much road (m) around it, instead of"
+            " --query-frames: for cameras, "
             "which see little at once, and for places that look alike.",
         ),
         click.option(
             "--query-frames",
             type=int,
             metavar="N",
-            help="A query is fused from so many keyframes around it; 1 asks with single frames, as logs without poses always do.  "
+            help="A query is fused from so many keyframes around it; 1 makes single-frame"
+            " queries, as for logs without poses.  "
             "[default: 5]",
         ),
     ):
@@ -241,7 +242,7 @@ def query_options(function: Function) -> Function:
 
 @dataclass(frozen=True, slots=True)
 class PoseChoice:
-    """What --poses, --pose-times and --pose-frame said."""
+    """Values of --poses, --pose-times and --pose-frame."""
 
     files: tuple[str, ...]
     times: tuple[str, ...]
@@ -257,7 +258,7 @@ class PoseChoice:
         without = [name for name in times if name not in files]
         if without or (self.frame and not files):
             raise click.UsageError(
-                f"{'--pose-times' if without else '--pose-frame'} says something about --poses FILE: give that, too."
+                f"{'--pose-times' if without else '--pose-frame'} needs --poses FILE, too."
             )
         return {
             name: TrajectoryFile(file, times.get(name), self.frame) for name, file in files.items()
@@ -273,7 +274,8 @@ def _by_session(option: str, names: list[str], values: Iterable[str]) -> dict[st
             rest = value
             if len(names) > 1:
                 raise click.UsageError(
-                    f"{option} {value}: say which session it belongs to with SESSION=FILE ({', '.join(names)})."
+                    f"{option} {value}: say which session it belongs to with SESSION=FILE"
+                    f" ({', '.join(names)})."
                 )
         if name in out:
             raise click.UsageError(f"{option} is given twice for session '{name}'.")
@@ -289,14 +291,16 @@ def pose_options(function: Function) -> Function:
     @click.option(
         "--odometry",
         type=click.Choice(["none", "lidar"]),
-        help="lidar: poses from LIDAR odometry instead of the log's own (needs the extra 'odometry').",
+        help="lidar: poses from LIDAR odometry instead of the log's own (needs the extra"
+        " 'odometry').",
     )
     @click.option(
         "--poses",
         "pose_files",
         metavar="[SESSION=]FILE",
         multiple=True,
-        help="Trajectory (TUM or KITTI) instead of the log's own poses; SESSION= for each of several logs.",
+        help="Trajectory (TUM or KITTI) instead of the log's own poses; SESSION= for each of"
+        " several logs.",
     )
     @click.option(
         "--pose-times",
@@ -330,7 +334,7 @@ def reading_options(function: Function) -> Function:
 
 @dataclass(frozen=True, slots=True)
 class EngineChoice:
-    """What --engine and --jobs said."""
+    """Values of --engine and --jobs."""
 
     name: str | None
     jobs: int | None
@@ -341,7 +345,7 @@ class EngineChoice:
         block fails.
         """
         from semloc_logs.engines import make_engine
-        from semloc_logs.engines.engine import cores
+        from semloc_logs.engines.processes import cores
 
         is_parallel = (self.jobs or cores()) > 1 and (tasks > 1 or self.jobs is not None)
         engine = make_engine(self.name or ("processes" if is_parallel else "serial"), self.jobs)
@@ -376,9 +380,7 @@ def engine_options(function: Function) -> Function:
 
 
 def stage_options(function: Function) -> Function:
-    """What every stage over a workspace is asked: --overwrite, --json, the engine, settings and the
-    console.
-    """
+    """Options of every stage: --overwrite, --json, the engine, settings and the console."""
     for decorate in (
         console_options,
         settings_options,

@@ -1,8 +1,8 @@
-"""What several commands print about a run: closures as a table, and what was skipped."""
+"""Output that several commands share: closures as a table, and skipped input."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,25 +11,36 @@ import click
 from .console import console
 
 if TYPE_CHECKING:
-    from semloc_logs.stages.pipeline import Report
+    from semloc_logs.stages.inputs import SessionInput
+    from semloc_logs.stages.report import Report
     from semloc_logs.workspace import Workspace
+
+    from .options import PoseChoice
 
 SHOWN = 20  # rows of a table; files have them all
 
 
-def session_logs(logs: Iterable[Path]) -> dict[str, Sequence[Path]]:
+def session_inputs(
+    logs: Iterable[Path],
+    topics: Mapping[str, str] | None = None,
+    poses: PoseChoice | None = None,
+) -> list[SessionInput]:
     """Each log is a session; UsageError when two have the same name."""
-    from semloc_logs.stages.pipeline import session_name
+    from semloc_logs.stages.inputs import SessionInput, session_name
 
-    out: dict[str, Sequence[Path]] = {}
+    by_name: dict[str, Path] = {}
     for log in logs:
         name = session_name(log)
-        if name in out:
+        if name in by_name:
             raise click.UsageError(
-                f"{out[name][0]} and {log} would both be session '{name}': rename one, or fuse them one by one with --session."
+                f"{by_name[name]} and {log} would both be session '{name}':"
+                " rename one, or fuse them one by one with --session."
             )
-        out[name] = (log,)
-    return out
+        by_name[name] = log
+    files = {} if poses is None else poses.by_session(by_name)
+    return [
+        SessionInput(name, (log,), topics or {}, files.get(name)) for name, log in by_name.items()
+    ]
 
 
 def checked_name(name: str) -> str:
@@ -40,7 +51,7 @@ def checked_name(name: str) -> str:
 
 
 def finish(*reports: Report) -> int:
-    """Print what was skipped or failed; the exit code."""
+    """Print the sentences about skipped and failed input; the exit code."""
     sentences = list(dict.fromkeys(s for r in reports for s in (*r.skipped, *r.failed)))
     for sentence in sentences:
         console.warn(sentence)
@@ -103,7 +114,8 @@ def show_closures(work: Workspace) -> None:
     if len(rows) > SHOWN:
         console.result(f"... and {len(rows) - SHOWN} more.")
     console.result(
-        f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in {work.rejected}"
+        f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in"
+        f" {work.rejected}"
     )
     if work.picture.exists():
         console.result(f"Picture: {work.picture}")

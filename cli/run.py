@@ -18,7 +18,7 @@ from .options import (
     stage_options,
     work_option,
 )
-from .results import finish, report_json, session_logs, show_closures
+from .results import finish, report_json, session_inputs, show_closures
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Resolved
@@ -49,8 +49,9 @@ def command(
     engine: EngineChoice,
     settings: Resolved,
 ) -> int:
-    """Logs -> loop closures, all of it: fuse, describe, close and, if asked for, annotate. Each LOG
-    is a session.
+    """Logs -> loop closures: fuse, describe, close and, with --annotate, annotate.
+
+    Each LOG is a session.
 
     Can be interrupted and run again: finished work is kept. A log that cannot be read is named, the
     others are done, and the exit code is 3.
@@ -58,24 +59,15 @@ def command(
     \b
     Example:  semloc run monday.mcap tuesday.bag -w work --annotate copy
     """
-    sessions = session_logs(logs)
-    given = poses.by_session(sessions)
-    from semloc_logs.stages.pipeline import run
+    sessions = session_inputs(logs, topics, poses)
+    from semloc_logs.stages.annotate import AnnotationMode
+    from semloc_logs.stages.run import run
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
+    mode = AnnotationMode(annotation)
     with console.progress(), engine.open(len(sessions)) as opened:
-        report = run(
-            sessions,
-            workspace,
-            settings,
-            topics,
-            opened,
-            console.note,
-            annotation,
-            overwrite,
-            given,
-        )
+        report = run(sessions, workspace, settings, opened, annotation=mode, overwrite=overwrite)
     if as_json:
         console.result_json(report_json(report, work))
     else:

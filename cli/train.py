@@ -94,7 +94,7 @@ def command(
     \b
     Example:  semloc train --variant semantic -o weights --scenes 60 --samples 250000
     """
-    from semloc_logs.engines.engine import cores
+    from semloc_logs.engines.processes import cores
     from semloc_logs.training.checkpoints import steps_done
     from semloc_logs.training.runs import device_of, learn_descriptor, use_threads
     from semloc_logs.training.schedule import samples_after
@@ -126,7 +126,8 @@ def command(
             if found is None:
                 opened.stop()  # scenes that are being made are made again
                 console.warn(
-                    f"{minutes:g} minutes are over and {where} is written: the same command goes on from there."
+                    f"{minutes:g} minutes are over and {where} is written: the same command goes"
+                    " on from there."
                 )
                 return 3
             scores[name] = found
@@ -155,9 +156,11 @@ def packed_shards(
     """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes;
     ``samples`` have been seen of them.
     """
+    from semloc_logs.simulation.meshes.world import require_ray_caster
     from semloc_logs.training.runs import session_shards, simulated_shards
     from semloc_logs.workspace import Workspace
 
     if work is None:
+        require_ray_caster("semloc train")
         return simulated_shards(folder, settings, engine, console.note, samples)
     return session_shards(folder, Workspace(work).sessions(), settings, engine, console.note)

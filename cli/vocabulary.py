@@ -74,9 +74,9 @@ def command(
 
     \b
     Example:  semloc vocabulary --variant semantic -o words.safetensors -w work
-              semloc vocabulary --variant both -o semloc_logs/words/vocabularies --shards weights/checkpoint/simulated-0123456789
+              semloc vocabulary --variant both -o vocabularies --shards weights/checkpoint/simulated
     """
-    from semloc_logs.engines.engine import cores
+    from semloc_logs.engines.processes import cores
     from semloc_logs.training.runs import given_shards, learn_vocabulary, use_threads
 
     if variant == "both" and settings.descriptor.weights is not None:
@@ -111,6 +111,7 @@ def command(
     else:
         for said in made.values():
             console.result(
-                f"{said['vocabulary']}: from {said['descriptors']} descriptors of {said['shards']} scenes"
+                f"{said['vocabulary']}: from {said['descriptors']} descriptors of {said['shards']}"
+                " scenes"
             )
     return 0

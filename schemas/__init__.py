@@ -1,4 +1,4 @@
-"""Contracts as files: Parquet columns, message definitions, label spaces. Imports nothing of ours."""
+"""Contracts as files: Parquet columns, message definitions, label spaces."""
 
 from importlib.resources import files
 

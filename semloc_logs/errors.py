@@ -1,6 +1,6 @@
-"""Every error of the package: one sentence that says what, where (file, topic, offset or time) and
-what to do.
+"""The errors of the package: each is one sentence with the fault, its place and the remedy.
 
+The place is a file, a topic, an offset or a time.
 Only :mod:`semloc_logs.cli` turns them into exit codes.
 """
 
@@ -14,8 +14,9 @@ class LogError(SemlocError):
 
 
 class RoleError(SemlocError):
-    """The streams of a log do not say which topic plays which role; the sentence lists the flags
-    that solve it.
+    """The streams of a log leave open which topic has which role.
+
+    The sentence lists the options that settle it.
     """
 
 
@@ -24,7 +25,7 @@ class SettingsError(SemlocError):
 
 
 class WorkspaceError(SemlocError):
-    """A workspace lacks what a stage needs, or holds what another version or other settings wrote."""
+    """A workspace lacks input of a stage, or another version or other settings wrote it."""
 
 
 class ContractError(SemlocError):

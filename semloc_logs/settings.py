@@ -41,7 +41,8 @@ class Fusion(_Section):
     max_range: float | None = Field(
         None,
         gt=0,
-        description="points farther than this are not fused, only carved (m); default 50 m at 0.30 m voxels",
+        description="points farther than this are not fused, only carved (m); default 50 m at 0.30"
+        " m voxels",
     )
     keyframe_distance: float | None = Field(
         None, ge=0, description="a frame becomes a keyframe after this travel (m); default 2 voxels"
@@ -62,7 +63,8 @@ class Fusion(_Section):
         0.0019,
         ge=0,
         le=1,
-        description="standard deviation of a depth image: 0.0012 m + this (1/m) times (z - 0.4 m)^2; structured light",
+        description="standard deviation of a depth image: 0.0012 m + this (1/m) times (z - 0.4"
+        " m)^2; structured light",
     )
     disparity_noise: float = Field(
         0.2, gt=0, le=10, description="standard deviation of a stereo pair's disparity (px)"
@@ -75,7 +77,8 @@ class Fusion(_Section):
     )
     odometry: Literal["none", "lidar"] = Field(
         "none",
-        description="lidar: poses from LIDAR odometry (KISS-ICP, the extra 'odometry') instead of those of the log",
+        description="lidar: poses from LIDAR odometry (KISS-ICP, the extra 'odometry') instead of"
+        " those of the log",
     )
     clamp: tuple[float, float] = Field(
         (-2.0, 3.5), description="bounds of the log-odds (OctoMap), within +-6"
@@ -92,7 +95,7 @@ class Fusion(_Section):
 
 
 class Labels(_Section):
-    """Where the classes come from (paper 3.1); always recorded in session.json and in every table."""
+    """Source of the classes (paper 3.1); recorded in session.json and in every table."""
 
     source: LabelSource = Field(
         "auto",
@@ -100,7 +103,8 @@ class Labels(_Section):
     )
     space: str | None = Field(
         None,
-        description="label space of the log's ids, shipped (schemas/label_spaces) or a YAML file; default: as the log says, else guessed",
+        description="label space of the log's ids, shipped (schemas/label_spaces) or a YAML file;"
+        " default: as the log says, else guessed",
     )
     model: Path | None = Field(
         None, description="ONNX model that labels the camera pictures, for source onnx"
@@ -131,7 +135,8 @@ class Descriptor(_Section):
         20,
         ge=4,
         multiple_of=4,
-        description="yaw hypotheses about gravity: maps are described in a quarter of them, the rest is free",
+        description="yaw hypotheses about gravity: maps are described in a quarter of them, the"
+        " rest is free",
     )
     stride: Literal[4, 8] = Field(
         8, description="database subvolumes every so many voxels in x and y (4 or 8)"
@@ -141,7 +146,8 @@ class Descriptor(_Section):
     )
     reach: float | None = Field(
         None,
-        description="database subvolumes lie this near to the road (m); default 30 m at 0.30 m voxels",
+        description="database subvolumes lie this near to the road (m); default 30 m at 0.30 m"
+        " voxels",
     )
     min_occupied: int = Field(
         40, ge=1, description="subvolumes with fewer occupied voxels are not described"
@@ -155,17 +161,19 @@ class Descriptor(_Section):
 
 
 class Query(_Section):
-    """What is asked of the database."""
+    """Which queries are made (paper 3, 4.4)."""
 
     frames: int = Field(
         5,
         ge=1,
-        description="keyframes fused into a query, as many before its own as after it; acc. of the paper is 5",
+        description="keyframes fused into a query, as many before its own as after it; acc. of the"
+        " paper is 5",
     )
     length: float | None = Field(
         None,
         gt=0,
-        description="or all keyframes of this stretch of road (m), at most twice fusion.submap_length",
+        description="or all keyframes of this stretch of road (m), at most twice"
+        " fusion.submap_length",
     )
     every: float | None = Field(
         None, gt=0, description="distance between queries (m); default 2 m at 0.30 m voxels"
@@ -174,7 +182,8 @@ class Query(_Section):
     radius: float | None = Field(
         None,
         gt=0,
-        description="a query map has what is this near to its keyframes (m); default 24 m at 0.30 m voxels",
+        description="a query map has what is this near to its keyframes (m); default 24 m at 0.30"
+        " m voxels",
     )
 
 
@@ -189,7 +198,23 @@ class Closures(_Section):
     places: int = Field(
         16,
         ge=1,
-        description="submaps, of all sessions, that a query is verified in: those whose words agree best",
+        description="submaps, of all sessions, that a query is verified in: those whose words"
+        " agree best",
+    )
+    session_hypotheses: int = Field(
+        16, ge=1, description="pooled hypotheses of each target session, at least"
+    )
+    candidates: int = Field(
+        4,
+        ge=1,
+        description="best hypotheses of a query in each target session that are aligned on points;"
+        " wrong ones count too, for they tell which places are ambiguous",
+    )
+    surface_keyframes: int = Field(
+        9,
+        ge=1,
+        description="keyframes of a target that a query is aligned with, for each query.radius of"
+        " a query's length",
     )
     kappa: float = Field(10.0, gt=0, description="kappa of the paper in voxels (3 m at 0.30 m)")
     min_probability: float = Field(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from semloc_logs.errors import WorkspaceError
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +71,21 @@ class Workspace:
 
     def sessions(self) -> list[SessionFolder]:
         """Sessions that were fused, by name."""
-        return [
-            SessionFolder(p.parent) for p in sorted((self.path / "sessions").glob("*/session.json"))
-        ]
+        files = sorted((self.path / "sessions").glob("*/session.json"))
+        return [SessionFolder(path.parent) for path in files]
+
+    def chosen(self, names: Sequence[str]) -> list[SessionFolder]:
+        """The fused sessions ``names``, all without names. WorkspaceError where one is missing."""
+        known = {folder.name: folder for folder in self.sessions()}
+        if not known:
+            raise WorkspaceError(f"{self.path} holds no sessions: run 'semloc fuse' first.")
+        missing = [name for name in names if name not in known]
+        if missing:
+            raise WorkspaceError(
+                f"{self.path} has no session {', '.join(missing)} (it has {', '.join(known)}):"
+                " run 'semloc fuse' first."
+            )
+        return [known[name] for name in names] if names else list(known.values())
 
     @property
     def closures(self) -> Path:

@@ -1,10 +1,13 @@
-"""For all tests: the installed package instead of the checkout, and the folder of real logs beside
-the checkout.
+"""For all tests: the installed package instead of the checkout, and the real logs in a folder
+beside the checkout.
 """
 
+import importlib.util
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -23,9 +26,29 @@ def repository() -> Path:
 
 
 @pytest.fixture(scope="session")
-def shared() -> Path:
-    """The folder of real logs, trajectories and odd files; the test is skipped where there is none."""
-    folder = ROOT.parent / "shared"
-    if not folder.is_dir():
-        pytest.skip("there is no folder shared/ with real logs beside the repository")
-    return folder
+def shared() -> Callable[[str], Path]:
+    """``shared(name)`` is a real log, trajectory or folder of them beside the repository; the test
+    is skipped where it is missing.
+    """
+
+    def find(name: str) -> Path:
+        path = ROOT.parent / "shared" / name
+        if not path.exists():
+            pytest.skip(f"shared/{name} beside the repository is missing")
+        return path
+
+    return find
+
+
+def _load_helper(name: str) -> None:
+    """Make ``tests/NAME.py`` importable as ``tests.NAME``; the tests have no package."""
+    spec = importlib.util.spec_from_file_location(f"tests.{name}", ROOT / "tests" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules.setdefault("tests", ModuleType("tests"))
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+
+
+_load_helper("lossy_disk")

@@ -104,7 +104,10 @@ def test_wheel_has_the_console_script_and_the_licence(wheel: zipfile.ZipFile) ->
 
 def test_schemas_are_readable_from_the_wheel(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
     wheel.extractall(tmp_path)
-    program = "import semloc_logs.schemas as s; print(s.__file__, len(s.read_text('parquet/closures.json')), *s.names('parquet', '.json'))"
+    program = (
+        "import semloc_logs.schemas as s; print(s.__file__,"
+        " len(s.read_text('parquet/closures.json')), *s.names('parquet', '.json'))"
+    )
     command = [sys.executable, "-P", "-c", program]
     done = subprocess.run(
         command, cwd=tmp_path, env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True

@@ -1,22 +1,26 @@
-"""Queries: which keyframes ask, and the small map that each asks with (paper 3, acc. of 4.4)."""
+"""Queries: which keyframes are queries, and the small map of each (paper 3, acc. of 4.4)."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import Query, thin_points
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.alignment.surface import thin_points
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 from semloc_logs.settings import Resolved
 from semloc_logs.voxels.grid import Fuser
 
 F64 = NDArray[np.float64]
+CACHED_KEYFRAMES = 64  # in memory: a query of 20 m and the next one
+POINTS_A_VOXEL = 2  # of a query along each edge
 
 
 def query_keyframes(session: SessionMap, settings: Resolved) -> list[int]:
-    """Keyframes that ask: every ``query.every`` metres or ``query.every_angle`` of turning; all of
-    them in a log without poses.
+    """The keyframes that are queries: every ``query.every`` metres or ``query.every_angle``.
+
+    In a log without poses all of them are.
     """
     if not session.posed:
         return list(range(len(session.stamps_ns)))
@@ -33,28 +37,27 @@ def query_keyframes(session: SessionMap, settings: Resolved) -> list[int]:
 
 
 def query_members(session: SessionMap, keyframe: int, settings: Resolved) -> list[int]:
-    """The keyframes fused into the query of ``keyframe``: ``query.frames`` around it, or all within
-    ``query.length`` of road.
+    """The keyframes fused into a query: ``query.frames`` around it, or ``query.length`` of road.
 
-    Poses may jump, between logs or where positions come back: what lies beyond the query's radius
-    is no part of the place.
+    Poses may jump, between logs or where positions come back: keyframes beyond the query's radius
+    are not part of the place.
     """
     n = len(session.stamps_ns)
     if not session.posed:
         return [keyframe]
-    away = np.abs(session.distance - session.distance[keyframe])
+    distance = np.abs(session.distance - session.distance[keyframe])
     if settings.query.length is not None:
-        return np.flatnonzero(away <= settings.query.length / 2).tolist()
+        return np.flatnonzero(distance <= settings.query.length / 2).tolist()
     count = min(settings.query.frames, n)
     first = min(max(0, keyframe - count // 2), n - count)
-    return [i for i in range(first, first + count) if away[i] <= settings.query.radius]
+    return [i for i in range(first, first + count) if distance[i] <= settings.query.radius]
 
 
 def build_query(session: SessionMap, keyframe: int, settings: Resolved) -> tuple[Query, F64]:
-    """The query map in a level frame whose origin is the base at ``keyframe``, and the level
-    ``query_T_base`` (4, 4) of it.
+    """The query map in a level frame whose origin is the base at ``keyframe``.
 
-    The frame keeps the map's axes: only the origin moves, so voxels stay small numbers.
+    Returned with the level ``query_T_base`` (4, 4). The frame keeps the map's axes: only the origin
+    moves, so voxels stay small numbers.
     """
     members = query_members(session, keyframe, settings)
     query_T_map = np.eye(4)
@@ -72,5 +75,5 @@ def build_query(session: SessionMap, keyframe: int, settings: Resolved) -> tuple
     v = settings.fusion.voxel_size
     points = np.concatenate(clouds)
     spread = np.concatenate(spreads)
-    kept = thin_points(points, v / 2, spread)
+    kept = thin_points(points, v / POINTS_A_VOXEL, spread)
     return Query(fuser.finish(), points[kept], v, spread[kept]), poses[keyframe]

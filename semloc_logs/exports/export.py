@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import translation_quaternion
-from semloc_logs.tables.table import read_table, replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
+from semloc_logs.tables.table import read_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 
@@ -51,14 +51,7 @@ def export(
     voxels in the session frame. Raises WorkspaceError when a session is missing or does not fit the
     format, SemlocError when a library is missing.
     """
-    known = {f.name: SessionMap(f) for f in work.sessions()}
-    missing = [n for n in names if n not in known]
-    if missing or not known:
-        raise WorkspaceError(
-            f"{work.path} has no fused session {', '.join(missing) or 'at all'} "
-            f"(there are: {', '.join(known) or 'none'})."
-        )
-    sessions = {n: known[n] for n in names or known}
+    sessions = {folder.name: SessionMap(folder) for folder in work.chosen(names)}
     if form == "g2o":
         path = output / "closures.g2o"
         _write(path, pose_graph(sessions, work).encode())

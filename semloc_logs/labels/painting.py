@@ -1,15 +1,15 @@
-"""Label images -> labels of points of another sensor, where the camera sees them.
+"""Label images -> labels of points of another sensor, where the camera can see them.
 
-A LIDAR beside a camera measures points behind near things that are hidden from the camera, and its
-points are sparse: through the gaps between the points of a near thing, a plain depth test lets the
-hidden points take the near thing's class. So the surfaces of the LIDAR are drawn into a depth image
-without gaps: in columns of equal azimuth, as seen from the LIDAR, each point is joined with the
-next one above it that continues the same surface, and this strip is as wide as a column. A point is
-hidden where a strip is much nearer.
+A LIDAR beside a camera looks past the edges of near things at points that are hidden from the
+camera, and its points are sparse: through the gaps between the points of a near thing, a plain
+depth test lets the hidden points take the near thing's class. So the surfaces that the LIDAR saw
+are drawn into a depth image without gaps: in columns of equal azimuth, as seen from the LIDAR, each
+point is joined with the next one above it that continues the same surface, and this strip is as
+wide as a column. A point is hidden where a strip is much nearer.
 
-A LIDAR also looks through the windows of cars, and black paint returns nothing: the cloud lacks a
-surface that the picture shows. A point that lies behind a near surface of the very label that it
-would get, and beside it by less than a thing's size, is marked DOUBTFUL.
+A LIDAR also looks through the windows of cars, and gets nothing back from black paint: there is no
+surface where the picture has one. A point that lies behind a near surface of the very label that it
+would get, and beside it by less than a thing's size, is marked doubtful.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _ENDS, _STEPS = -1, -2
 _LEAST_GAP = np.radians(0.08)
 _LOOK_AHEAD = 16  # points of a column that are tried as the continuation of a surface
 _CELL = np.radians(0.16)  # of the depth image
-_NEARER = 0.25  # what hides a point is nearer by so much (m),
+_NEARER = 0.25  # a surface that hides a point is nearer by so much (m),
 _NEARER_SHARE = 0.04  # and by this share of the distance
-DOUBTFUL = 1 << 31  # set in a label that may belong to something nearer
 _THING = 0.8  # m, half the size of things with windows
 # around a point, for near surfaces of which _THING is as large as that
 _REACH = (np.radians(6.0), np.radians(3.0), np.radians(1.5))
+_NOTHING = 1e9  # m, the depth of cells without a surface
+_BEHIND_SHARE = 1.1  # of the depth of the nearer surface, and
 _BEHIND = 3.0  # m, so that the side of a truck is not behind its own rear
-_NOTHING = 1e9  # a depth where no surface is
 _MOST_LABELS = 40  # of a picture that are looked at: more are noise
 
 U32 = NDArray[np.uint32]
@@ -58,7 +58,7 @@ class Viewpoint:
     axis: NDArray[np.floating]
 
     def columns(self, points: F32) -> tuple[NDArray[np.int32], F32, F32]:
-        """Column of azimuth, elevation (rad) and distance (m) of ``points`` (n, 3), each (n,)."""
+        """Column of equal azimuth, elevation (rad) and distance (m) of points (n, 3), each (n,)."""
         rays = points - np.asarray(self.origin, np.float32)
         side = np.cross(self.axis, (1.0, 0.0, 0.0) if abs(self.axis[0]) < 0.9 else (0.0, 1.0, 0.0))
         side /= np.linalg.norm(side)
@@ -78,25 +78,24 @@ class Viewpoint:
 def nearest_depth(
     points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, projector: Projector
 ) -> tuple[F32, float]:
-    """Depth (m along the optical axis) of the nearest surface in each cell of the picture.
+    """Depth of the nearest surface in each cell of the picture, and the edge of a cell in pixels.
 
-    Infinite without a surface; the second value is the edge of a cell in pixels. ``camera`` and
-    ``pixels`` are where all the ``points`` (n, 3) of a cloud lie in the camera's frame and in its
-    picture.
+    Depth in m along the optical axis, infinite where there is no surface. ``camera`` and ``pixels``
+    are the places of all ``points`` (n, 3) of a cloud in the camera's frame and in its picture.
     """
     cell = max(1.0, float(round(projector.focal * _CELL)))
     shape = int(np.ceil(projector.height / cell)), int(np.ceil(projector.width / cell))
     depth = np.full(shape, np.inf, np.float32)
-    seen = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    column, elevation, distance = viewpoint.columns(points[seen])
+    shown = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    column, elevation, distance = viewpoint.columns(points[shown])
     order = np.lexsort((elevation, column))
-    seen = seen[order]
+    shown = shown[order]
     distance = distance[order]
-    z = camera[seen, 2].astype(float)
+    z = camera[shown, 2].astype(float)
     # off the axis a picture is stretched by the square of the ray's length over its depth
-    stretch = np.linalg.norm(camera[seen], axis=1) / z
+    stretch = np.linalg.norm(camera[shown], axis=1) / z
     half = np.maximum(projector.focal / cell * (COLUMN / 2) * distance / z * stretch, 0.5)
-    cells = (pixels[seen] + 0.5) / cell
+    cells = (pixels[shown] + 0.5) / cell
     _draw(depth, _Rings(cells, z, distance, column[order], elevation[order], half))
     return depth, cell
 
@@ -202,6 +201,18 @@ def _line(
             depth[row, column] = z
 
 
+class PaintedPoints(NamedTuple):
+    """Labels (m,) or UNPAINTED, and what else is known about each point.
+
+    ``is_doubtful`` (m,): the label may belong to something nearer; ``is_inside`` (m,): the point is
+    in the picture at all, visible or hidden.
+    """
+
+    label: U32
+    is_doubtful: NDArray[np.bool_]
+    is_inside: NDArray[np.bool_]
+
+
 def paint(
     points: F32,
     wanted: NDArray[np.integer],
@@ -209,12 +220,11 @@ def paint(
     labels: U32,
     camera_T_base: F64,
     projector: Projector,
-) -> tuple[U32, NDArray[np.bool_]]:
-    """Labels (m,) of ``points[wanted]`` from the picture ``labels`` (h, w), and which lie in it.
+) -> PaintedPoints:
+    """Labels of ``points[wanted]`` (m,) in the base frame from the picture ``labels`` (h, w).
 
-    ``points`` (n, 3), base frame, are all that the sensor at ``viewpoint`` measured: they hide each
-    other. UNPAINTED where the picture does not show the point: outside of it, or hidden. DOUBTFUL
-    is added to labels that may belong to something nearer.
+    ``points`` (n, 3) are all points that the sensor at ``viewpoint`` measured: they hide each
+    other. UNPAINTED where the picture does not show the point: outside of it, or hidden.
     """
     out = np.full(len(wanted), UNPAINTED, np.uint32)
     camera = in_base(camera_T_base, points)
@@ -227,15 +237,16 @@ def paint(
     column, row = np.floor((pixels[inside] + 0.5) / cell).astype(int).T
     z = camera[inside, 2]
     visible = depth[row, column] * (1 + _NEARER_SHARE) + _NEARER >= z
-    shown = np.flatnonzero(inside)[visible]
-    u, v = np.rint(pixels[shown]).astype(int).T
-    out[shown] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
-    known = shown[out[shown] != UNPAINTED]
+    seen = np.flatnonzero(inside)[visible]
+    u, v = np.rint(pixels[seen]).astype(int).T
+    out[seen] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
+    known = seen[out[seen] != UNPAINTED]
     column, row = np.floor((pixels[known] + 0.5) / cell).astype(int).T
     labelled = _Labelled(out[known], row, column, camera[known, 2])
     doubtful = _behind_its_own(labelled, depth, cell, labels, projector.focal)
-    out[known[doubtful]] |= np.uint32(DOUBTFUL)
-    return out, inside
+    is_doubtful = np.zeros(len(wanted), bool)
+    is_doubtful[known[doubtful]] = True
+    return PaintedPoints(out, is_doubtful, inside)
 
 
 class _Labelled(NamedTuple):
@@ -276,12 +287,12 @@ def _behind_its_own(
                 borderValue=_NOTHING,
             )
             nearest = np.asarray(around)[row[members], column[members]]
-            out[members] |= nearest * 1.1 + _BEHIND < z[members]
+            out[members] |= nearest * _BEHIND_SHARE + _BEHIND < z[members]
     return out
 
 
 def without_borders(labels: U32, width: int) -> U32:
-    """The labels (h, w), UNPAINTED within ``width`` pixels of a border between two labels."""
+    """The picture (h, w) of labels, UNPAINTED within ``width`` pixels of where two labels meet."""
     if width <= 0:
         return labels
     border: NDArray[np.uint8] = np.zeros(labels.shape, np.uint8)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.frames import Header, PosedCloud
+from semloc_logs.labels.camera_labels import PointLabels
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.selection import KeyframeSelector, thin
@@ -43,8 +44,10 @@ class Collected:
     def __len__(self) -> int:
         return len(self.headers)
 
-    def add(self, cloud: PosedCloud, kept: NDArray[np.int64], label: U32 | None = None) -> None:
-        """Add a keyframe: the points ``kept`` (m,) of ``cloud``, recorded labels (m,) or None."""
+    def add(
+        self, cloud: PosedCloud, kept: NDArray[np.int64], label: PointLabels | None = None
+    ) -> None:
+        """Add a keyframe: points ``kept`` (m,) of ``cloud``, labels (m,) from the labeller or None."""
         number = len(self)
         self._save(number, "points", cloud.points[kept])
         self._save(number, "label", label)
@@ -53,7 +56,7 @@ class Collected:
         self.poses.append(cloud.session_T_base)
         self.origins.append(cloud.origin)
 
-    def load(self, keyframe: int) -> tuple[F32, U32 | None, F32 | None]:
+    def load(self, keyframe: int) -> tuple[F32, PointLabels | None, F32 | None]:
         """Points (n, 3) in the base frame, labels as recorded, standard deviation of the ranges.
 
         The latter two are None where there are none. WorkspaceError when somebody removed the

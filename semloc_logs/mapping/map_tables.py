@@ -25,7 +25,8 @@ from semloc_logs.numerics.prefetch import prefetched
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, ResolvedFusion
 from semloc_logs.tables import contracts
-from semloc_logs.tables.table import replacing_folder, write_table
+from semloc_logs.tables.atomic_files import replacing_folder
+from semloc_logs.tables.table import write_table
 from semloc_logs.voxels.grid import BlockMap, empty_map
 from semloc_logs.voxels.store import (
     Keyframe,

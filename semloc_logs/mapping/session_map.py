@@ -75,16 +75,25 @@ class SessionMap:
     def views(self) -> F64:
         """Means (n, 3) of the points around the sensor of each keyframe, metres in the map frame.
 
-        WorkspaceError when the session was fused by a version that did not store them.
+        Raises WorkspaceError when an earlier version fused the session.
         """
-        if "view_x" not in self.frames.column_names:
-            raise WorkspaceError(
-                f"{self.folder.frames} is of an earlier version: fuse session {self.folder.name} "
-                "again with --overwrite."
-            )
+        self.check_version()
         view = self._vectors("view")
         rotated = np.einsum("nij,nj->ni", self.map_T_base[:, :3, :3], view)
         return np.asarray(rotated + self.map_T_base[:, :3, 3])
+
+    def check_version(self) -> None:
+        """Raises WorkspaceError when an earlier version fused the session."""
+        if "view_x" not in self.frames.column_names:
+            raise WorkspaceError(
+                f"{self.folder.frames} is of an earlier version:"
+                f" fuse session {self.folder.name} again with --overwrite."
+            )
+
+    @property
+    def label_source(self) -> str:
+        """Source of the classes, such as ``log`` or ``geometry``."""
+        return str(self.json["label_source"])
 
     @cached_property
     def keyframe(self) -> Callable[[int], Keyframe]:

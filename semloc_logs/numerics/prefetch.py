@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import TypeVar
@@ -10,8 +12,22 @@ from typing import TypeVar
 T = TypeVar("T")
 _END = object()
 THREAD_NAME = "semloc-prefetch"
+_IN_CALLERS_THREAD = ContextVar("in_callers_thread", default=False)
 PUT_SECONDS = 0.1  # after which a waiting producer looks whether the consumer has left
 GET_SECONDS = 1.0  # after which a waiting consumer lets Ctrl-C through
+
+
+@contextmanager
+def in_callers_thread() -> Iterator[None]:
+    """Within it :func:`prefetched` makes each item when the caller takes it.
+
+    For profilers, which see one thread.
+    """
+    token = _IN_CALLERS_THREAD.set(True)
+    try:
+        yield
+    finally:
+        _IN_CALLERS_THREAD.reset(token)
 
 
 def prefetched(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
@@ -21,6 +37,9 @@ def prefetched(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
     used. Exceptions of ``items`` are raised here; an iterator that is left early stops the other
     thread before it returns.
     """
+    if _IN_CALLERS_THREAD.get():
+        yield from items
+        return
     queue: Queue[object] = Queue(depth)
     left = Event()
     failure: list[BaseException] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.overlap import FREE_BIT, look_up
+from semloc_logs.alignment.mask_grid import FREE_BIT, look_up
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.pictures.closure_view import ClosureView
 from semloc_logs.pictures.colours import (
@@ -92,7 +92,7 @@ class ClosureScene:
         """The aligned query over the pale map; the map gives each of its voxels a colour."""
         map_T_query = self._view.map_T_query
         mask = look_up(
-            self._view.target.level, apply(map_T_query, (self._query + 0.5) * self._size)
+            self._view.target.mask_grid, apply(map_T_query, (self._query + 0.5) * self._size)
         )
         is_occupied = (mask & ~np.uint8(FREE_BIT)) != 0
         observed = np.where((mask != 0)[:, None], IN_FREE_SPACE, UNOBSERVED)

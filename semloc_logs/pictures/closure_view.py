@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import Query, Target
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.alignment.target_map import Target
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.matching import allowed_places, match_words
+from semloc_logs.closures.matching import allowed_words, match_words
 from semloc_logs.closures.query import build_query, query_members
+from semloc_logs.closures.visibility import Visibility, visible_to
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, turned_about_z
@@ -221,11 +223,12 @@ def closure_view(
     )
     query_keyframe = keyframe_at(session, row["query_stamp_ns"])
     target_keyframe = keyframe_at(target, row["target_stamp_ns"])
-    database = Database(work, (row["target_session"],), settings).asked_by(session, query_keyframe)
+    database = Database(work, (row["target_session"],), settings)
+    visible = visible_to(database, session, query_keyframe)
     query, query_T_base = build_query(session, query_keyframe, settings)
     map_T_target = target.map_T_base[target_keyframe]
     map_T_query = map_T_target @ choice.target_T_query @ inverse(query_T_base)
-    group = _group(database, target_keyframe)
+    group = _group(visible, target_keyframe)
     before = np.eye(4)
     if session.folder.name == target.folder.name:
         before[:3, 3] = session.map_T_base[query_keyframe, :3, 3]  # by odometry
@@ -235,11 +238,11 @@ def closure_view(
     members = query_members(session, query_keyframe, settings)
     road = session.map_T_base[members, :3, 3] - session.map_T_base[query_keyframe, :3, 3]
     ground = float(session.ground_z[query_keyframe] - session.map_T_base[query_keyframe, 2, 3])
-    aligned = _Aligned(database, session, query, ground, map_T_query, group)
+    aligned = _Aligned(visible, session, query, ground, map_T_query, group)
     return ClosureView(
         choice,
         query,
-        database.target(group),
+        visible.target(group),
         map_T_query,
         before,
         query_T_base,
@@ -256,24 +259,24 @@ def drawn(view: ClosureView) -> dict[str, Any]:
     return {**view.choice.row, "accepted": view.choice.accepted, "matches": matches}
 
 
-def _group(database: Database, keyframe: int) -> int:
+def _group(visible: Visibility, keyframe: int) -> int:
     """The submap in whose middle a keyframe of the only target session is."""
 
     def off(g: int) -> int:
-        seen = database.keyframes(g)
+        seen = visible.keyframes(g)
         return min(keyframe - seen[0], seen[-1] - keyframe) if len(seen) else -len(seen) - 1
 
-    return max(range(len(database.places)), key=off)
+    return max(range(len(visible.database.places)), key=off)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Aligned:
-    """A query aligned with submap ``group`` of the only target session of ``database``.
+    """A query aligned with submap ``group`` of the only target session, which is ``visible``.
 
     ``ground`` is the height of the ground in the query's frame, metres.
     """
 
-    database: Database
+    visible: Visibility
     session: SessionMap
     query: Query
     ground: float
@@ -288,16 +291,18 @@ class _Aligned:
 
 def _matches(aligned: _Aligned, most: int) -> list[Match]:
     """Word matches that agree with the alignment, nearest first, none beside another."""
-    places = allowed_places(aligned.database, aligned.session)
+    places = allowed_words(aligned.visible, aligned.session)
     if not places or not most:
         return []
     # a single target session has one kind of words
     variant, allowed = next(iter(places.items()))
-    words, matches = match_words(aligned.database, variant, allowed, aligned.query, aligned.ground)
+    words, matches = match_words(
+        aligned.visible.database, variant, allowed, aligned.query, aligned.ground
+    )
 
     # the query's subvolumes, voxels in the map's axes, and those that agree
     laid = turned_about_z(words.centre.astype(float), np.full(len(words.centre), aligned.yaw))
-    size = aligned.database.settings.fusion.voxel_size
+    size = aligned.visible.database.settings.fusion.voxel_size
     position = aligned.map_T_query[:3, 3]
     offset = np.abs(matches.centre - laid[matches.query] * size - position).max(1)
     turned = np.abs(np.mod(matches.yaw - aligned.yaw + np.pi, 2 * np.pi) - np.pi)
@@ -330,12 +335,12 @@ def _states(aligned: _Aligned, variant: str, laid: F64, centres: F64) -> tuple[U
     ``laid`` (n, 3) are the query's centres, voxels in the map's axes; ``centres`` (n, 3) the
     target's, metres in its map.
     """
-    settings = aligned.database.settings
+    settings = aligned.visible.database.settings
     half = SIZE // 2
     box, corner = _turned(aligned.query, aligned.yaw)
     corners = np.round(laid).astype(int) - corner - half
     query = np.stack([_cut(box, c, half) for c in corners])
-    blocks = aligned.database.target(aligned.group).blocks
+    blocks = aligned.visible.target(aligned.group).blocks
     low = np.round(centres / settings.fusion.voxel_size).astype(int) - half
     target = np.stack([blocks.dense(c, (SIZE, SIZE, SIZE)) for c in low])
     completion = completed(

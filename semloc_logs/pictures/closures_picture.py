@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.closure import Closure
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.pictures.colours import CLOSURE, QUERY, TARGET, Colour, web_colour
@@ -30,15 +30,16 @@ GROUND_PERCENTILE, ABOVE_GROUND = 20, 3
 
 
 def draw_closures(
-    work: Workspace, closures: Sequence[Alignment], maps: Mapping[str, SessionMap]
+    work: Workspace, closures: Sequence[Closure], maps: Mapping[str, SessionMap]
 ) -> None:
     """WORK/closures.png: the pair of sessions with most closures, laid together by the best one.
 
     Without closures nothing is drawn and an older picture is removed.
     """
-    pairs: dict[tuple[str, str], list[Alignment]] = {}
+    pairs: dict[tuple[str, str], list[Closure]] = {}
     for closure in closures:
-        pairs.setdefault((closure.query_session, closure.target_session), []).append(closure)
+        ends = closure.alignment.query_session, closure.alignment.target_session
+        pairs.setdefault(ends, []).append(closure)
     if not pairs:
         work.picture.unlink(missing_ok=True)
         return
@@ -46,9 +47,11 @@ def draw_closures(
     _pair_sheet(maps[query_name], maps[target_name], chosen).save(work.picture)
 
 
-def _pair_sheet(query: SessionMap, target: SessionMap, closures: Sequence[Alignment]) -> Sheet:
+def _pair_sheet(query: SessionMap, target: SessionMap, closures: Sequence[Closure]) -> Sheet:
     """Both maps, the drives of both, and a line from each query to where it was found."""
-    best = max(closures, key=lambda a: (a.probability, a.features.structure))
+    best = max(
+        closures, key=lambda c: (c.decision.probability, c.alignment.features.structure)
+    ).alignment
     target_T_query = (
         target.map_T_base[best.target_keyframe]
         @ best.target_T_query
@@ -80,8 +83,8 @@ def _pair_sheet(query: SessionMap, target: SessionMap, closures: Sequence[Alignm
     axes = sheet.axes[0][0]
     draw_line(axes, pixels(target_drive), TARGET)
     draw_line(axes, pixels(query_drive), QUERY)
-    starts = pixels(query_drive[[c.query_keyframe for c in closures]])
-    ends = pixels(target_drive[[c.target_keyframe for c in closures]])
+    starts = pixels(query_drive[[c.alignment.query_keyframe for c in closures]])
+    ends = pixels(target_drive[[c.alignment.target_keyframe for c in closures]])
     axes.plot(*np.stack([starts, ends]).transpose(2, 0, 1), color=web_colour(CLOSURE))
     axes.plot(*starts.T, "o", color=web_colour(CLOSURE), markersize=7)
     return sheet

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from semloc_logs.pictures.colours import INK, SOFT, WHITE, Colour, Legend, web_colour
 from semloc_logs.pictures.fonts import written
 from semloc_logs.pictures.map_marks import DPI, SMALL, TEXT, scale_bar
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 
 U8 = NDArray[np.uint8]
 

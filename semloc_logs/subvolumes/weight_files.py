@@ -14,7 +14,7 @@ from torch import nn
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.subvolumes.network import Completion
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 
 Network = TypeVar("Network", bound=nn.Module)
 

@@ -49,7 +49,7 @@ def schema(name: str) -> pa.Schema:
 
 @cache
 def contract(name: str) -> dict[str, Any]:
-    """The contract as written: version, meaning, and name, type, unit and meaning of every column."""
+    """The contract as written: version, meaning, and its columns."""
     content: dict[str, Any] = json.loads(read_text(f"parquet/{name}.json"))
     return content
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.network import Completion
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.training.schedule import plateau_end, steps_of
 
 

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from semloc_logs.numerics import transforms
 from semloc_logs.settings import ResolvedFusion, Training
 from semloc_logs.subvolumes.cut import SIZE, WIDE, turn
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
 
 U8 = NDArray[np.uint8]

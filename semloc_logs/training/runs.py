@@ -89,7 +89,7 @@ def simulated_shards(
 
     def drop(before: int) -> None:
         nonlocal kept
-        for task in tasks[kept:before]:
+        for task in tasks[kept : max(kept, before)]:
             task.shard.unlink(missing_ok=True)
         kept = max(kept, before)
 

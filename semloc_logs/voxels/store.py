@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import transform, translation_quaternion
 from semloc_logs.tables import contracts
-from semloc_logs.tables.table import read_table, replacing_folder, write_table
+from semloc_logs.tables.atomic_files import replacing_folder
+from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.evidence import Tiles, Voxels, resolve
 from semloc_logs.voxels.grid import SCALE, BlockMap, empty_map
 from semloc_logs.voxels.keys import pack, unpack

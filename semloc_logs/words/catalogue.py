@@ -10,10 +10,9 @@ copied as often. One process at a time builds; the others wait for it and find i
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
@@ -232,16 +232,17 @@ def _locked(folder: Path) -> Iterator[None]:
 
     Elsewhere two may build the same files, and the later rename wins.
     """
+    lock = FileLock(folder / ".lock")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("w")
-    except OSError:
+        lock.acquire()
+    except (OSError, NotImplementedError):
         yield
         return
-    with lock:
-        with suppress(OSError):
-            fcntl.flock(lock, fcntl.LOCK_EX)
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def _build(

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.cells import cell_starts
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 
 MAGIC, VERSION = b"SEMLOCIX", 1
 WORDS = 2**16

@@ -29,7 +29,7 @@ from safetensors.numpy import load_file, save_file
 
 from semloc_logs.errors import SettingsError
 from semloc_logs.numerics.cells import by_cell
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.words.kmeans import BLOCK, grid, kmeans, nearest_centroids
 
 BITS = 64

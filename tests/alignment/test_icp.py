@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.icp import Fit, Step, _add_point, align
+from semloc_logs.alignment.covariance import COMMON_BIAS, RANGE_BIAS, covariance_of
+from semloc_logs.alignment.hypotheses import SAME_PLACE_VOXELS
+from semloc_logs.alignment.icp import Fit, Step, Weighting, _add_point, align
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.alignment.refine import fine_fit
 from semloc_logs.alignment.surface import flattened_surface, surface_of
-from semloc_logs.alignment.verify import Query, fine_fit, points_surface
-from semloc_logs.closures.matching import COMMON, SYSTEMATIC, covariance_of
+from semloc_logs.alignment.target_map import point_surface
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import Fuser
@@ -205,6 +208,91 @@ def test_covariance_says_what_is_not_known() -> None:
     assert covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] > 0.3**2
 
 
+def held(
+    information: F64,
+    pull: F64 | None = None,
+    rmse: float = 0.1,
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Fit:
+    return Fit(
+        np.eye(4),
+        1.0,
+        1000,
+        rmse,
+        information,
+        np.array(centre),
+        np.zeros((2, 6)) if pull is None else pull,
+    )
+
+
+def test_covariance_by_hand() -> None:
+    """1200 in each direction of position, 4800 about each axis (arms of 2 m), planes of 0.1 m
+    noise.
+
+    Normals 2 degrees off may pretend to know 3600 sin^2(2 degrees) = 4.38 of each; points share
+    their errors, so twelve count as one. Beside that the search bounds the error: 0.99 m and 5
+    degrees; a centimetre and a milliradian come on top.
+    """
+    C = covariance_of(held(np.diag([1200.0] * 3 + [4800.0] * 3)), np.eye(4), np.eye(4), 0.3)
+    position = 1 / ((1200 - 4.3845) / (12 * 0.01) + 1 / 0.99**2) + 1e-4
+    angle = 1 / ((4800 - 4 * 4.3845) / (12 * 0.01) + 131.31) + 1e-6
+    np.testing.assert_allclose([position, angle], [2.0036e-4, 2.600e-5], rtol=1e-3)
+    np.testing.assert_allclose(C, np.diag([position] * 3 + [angle] * 3), rtol=1e-4, atol=1e-12)
+
+
+def test_covariance_of_a_fit_that_knows_nothing_is_what_the_search_allows() -> None:
+    for nothing in (held(np.zeros((6, 6)), rmse=np.inf), held(np.zeros((6, 6)), rmse=0.0)):
+        expected = np.diag([(3.3 * 0.3) ** 2 + 1e-4] * 3 + [np.radians(5.0) ** 2 + 1e-6] * 3)
+        np.testing.assert_allclose(covariance_of(nothing, np.eye(4), np.eye(4), 0.3), expected)
+
+
+def test_too_little_rmse_is_not_believed() -> None:
+    """Planes of no noise at all are taken as of 2 cm."""
+    information = np.diag([1200.0] * 3 + [4800.0] * 3)
+    more, least, none = (
+        covariance_of(held(information, rmse=rmse), np.eye(4), np.eye(4), 0.3)
+        for rmse in (0.021, 0.02, 0.0)
+    )
+    np.testing.assert_array_equal(least, none)
+    assert more[0, 0] > least[0, 0]
+
+
+@pytest.mark.parametrize("yaw", [0.5, np.pi / 2, -2.0])
+def test_covariance_of_position_and_angles_turns_with_the_target(yaw: float) -> None:
+    """A target that looks along ``yaw`` has R^T C R, not R C R^T, and of angles too."""
+    half = np.random.default_rng(3).normal(size=(6, 6)) * 30
+    found = held(half @ half.T, half[:2] / 10, centre=(1.0, -2.0, 0.5))
+    query = yaw_transform(0.3, (2.0, 1.0, 0.0))
+    at = (5.0, 3.0, 1.0)
+    C = covariance_of(found, query, yaw_transform(0.0, at), 0.3)
+    turned = covariance_of(found, query, yaw_transform(yaw, at), 0.3)
+    R = np.kron(np.eye(2), yaw_transform(yaw)[:3, :3])
+    np.testing.assert_allclose(turned, R.T @ C @ R, rtol=1e-9, atol=1e-15)
+    assert np.abs(turned - R @ C @ R.T).max() > 1e-3 * np.abs(C).max()
+
+
+@pytest.mark.parametrize(
+    "arm", [(10.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, 10.0), (3.0, -4.0, 5.0)]
+)
+def test_an_error_of_angle_moves_the_base_across_its_arm(arm: tuple[float, float, float]) -> None:
+    """The base lies ``arm`` from what was aligned: position and angle of the base by the Jacobian
+    of turned points, by differences.
+    """
+    half = np.random.default_rng(4).normal(size=(6, 6)) * 30
+    found = held(half @ half.T)
+    here = yaw_transform(0.0, arm)
+    J = np.eye(6)
+    for k in range(3):
+        J[:3, 3 + k] = (
+            apply(exp_se3(np.zeros(3), 1e-6 * np.eye(3)[k]), np.array([arm]))[0] - arm
+        ) / 1e-6
+    floor = np.diag([1e-4] * 3 + [1e-6] * 3)
+    C = covariance_of(found, np.eye(4), np.eye(4), 0.3) - floor
+    np.testing.assert_allclose(
+        covariance_of(found, here, here, 0.3), J @ C @ J.T + floor, rtol=1e-4, atol=1e-9
+    )
+
+
 def test_covariance_lies_in_the_axes_of_the_target() -> None:
     """A corridor along the map's x is one along -y for a target that looks along the map's y."""
     rng = np.random.default_rng(5)
@@ -273,7 +361,7 @@ def test_uncertain_points_are_aligned_through_the_slab_they_lie_in() -> None:
     here, here_spread = seen_by_a_camera(
         rng, room(rng, 3000) * [2, 2, 1], np.array([6.0, 0.5, 1.5]), 0.04
     )
-    surface = points_surface(there, there_spread, v)
+    surface = point_surface(there, there_spread, v)
     assert surface.sigma > 0.25 * v
     query = Query(Fuser(Settings().resolved().fusion).finish(), here, v, here_spread)
     found = fine_fit(start, surface, query).target_T_query
@@ -296,7 +384,7 @@ def test_a_certain_point_weighs_as_many_uncertain_ones_as_it_is_more_certain() -
     spread = np.r_[np.zeros((40, 3)), np.tile([0.2, 0.0, 0.0], (40, 1))]
     # so wide a kernel takes all as they are; the last step measures what was found
     wide = (Step(100.0, 15), Step(100.0, 0))
-    found = align(query, surface_of(grid, CELL), np.eye(4), wide, spread, 0.1)
+    found = align(query, surface_of(grid, CELL), np.eye(4), wide, spread, Weighting(0.1))
     assert found.target_T_query[0, 3] == pytest.approx(-0.1 * 0.2 / 1.2, rel=0.02)
     assert found.rmse == pytest.approx(
         np.sqrt((0.1 * 0.2 / 1.2) ** 2 / 2 + 0.2 * (0.1 / 1.2) ** 2 / 2), rel=0.02
@@ -312,7 +400,8 @@ def test_a_start_holds_where_little_says_otherwise() -> None:
     )
     rng = np.random.default_rng(0)
     query = np.c_[np.full(40, 0.1), rng.uniform(-1.5, 1.5, 40), rng.uniform(0.2, 1.8, 40)]
-    found = align(query, surface_of(grid, CELL), np.eye(4), (Step(100.0, 15),), hold=40.0)
+    hold = Weighting(hold=40.0)
+    found = align(query, surface_of(grid, CELL), np.eye(4), (Step(100.0, 15),), weighting=hold)
     assert found.target_T_query[0, 3] == pytest.approx(-0.05, rel=0.01)
 
 
@@ -326,7 +415,7 @@ def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
     query = grid[::3]
     along = np.array([0.1, 0.0, 0.0])
     certain = align(query, surface_of(grid, CELL), np.eye(4), STEPS)
-    assert not certain.pull.any()
+    assert not certain.range_bias.any()
     least = covariance_of(certain, np.eye(4), np.eye(4), 0.3)[0, 0]
     mapped = flattened_surface(
         grid, np.tile(along, (len(grid), 1)), np.arange(len(grid)), CELL, 0.05
@@ -336,7 +425,7 @@ def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
         align(query, mapped, np.eye(4), STEPS),
     ):
         more = covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] - least
-        assert np.sqrt(more) == pytest.approx(SYSTEMATIC * 0.1, rel=0.1)
+        assert np.sqrt(more) == pytest.approx(RANGE_BIAS * 0.1, rel=0.1)
 
 
 def test_what_ranges_of_both_sides_have_in_common_counts_where_they_look_from_opposite_sides() -> (
@@ -364,9 +453,9 @@ def test_what_ranges_of_both_sides_have_in_common_counts_where_they_look_from_op
         )
         for ray in (along, -along)
     )
-    assert same == pytest.approx(SYSTEMATIC * 0.1 * np.sqrt(2 * (1 - COMMON)), rel=0.1)
+    assert same == pytest.approx(RANGE_BIAS * 0.1 * np.sqrt(2 * (1 - COMMON_BIAS)), rel=0.1)
     assert opposite == pytest.approx(
-        SYSTEMATIC * 0.1 * np.sqrt(2 * (1 - COMMON) + 4 * COMMON), rel=0.1
+        RANGE_BIAS * 0.1 * np.sqrt(2 * (1 - COMMON_BIAS) + 4 * COMMON_BIAS), rel=0.1
     )
 
 
@@ -381,7 +470,7 @@ def test_an_uncertain_wall_of_the_target_weighs_less_than_a_certain_one() -> Non
     spread = np.r_[np.zeros_like(side), np.tile([0.2, 0.0, 0.0], (len(side), 1))]
     mapped = walls + np.r_[np.zeros_like(side), np.tile([0.1, 0.0, 0.0], (len(side), 1))]
     surface = flattened_surface(mapped, spread, np.arange(len(mapped)), CELL, 0.1)
-    found = align(walls[::3], surface, np.eye(4), (Step(100.0, 15),), noise=0.1)
+    found = align(walls[::3], surface, np.eye(4), (Step(100.0, 15),), weighting=Weighting(0.1))
     assert found.target_T_query[0, 3] == pytest.approx(0.1 * 0.2 / 1.2, rel=0.05)
 
 
@@ -393,7 +482,9 @@ def test_ranges_pull_no_farther_than_points_hold() -> None:
     points = room(rng, 700, corridor=True)
     far = 0.1 * points / np.linalg.norm(points, axis=1)[:, None]
     found = align(points, surface_of(room(rng, 1500, corridor=True), CELL), np.eye(4), STEPS, far)
-    assert covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] < 2 * (3.3 * 0.3) ** 2
+    assert (
+        covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] < 2 * (SAME_PLACE_VOXELS * 0.3) ** 2
+    )
 
 
 def test_a_fit_that_meets_too_little_knows_nothing() -> None:
@@ -408,7 +499,7 @@ def test_a_fit_that_meets_too_little_knows_nothing() -> None:
     )
     assert (found.inliers, found.rmse) == (0.0, float("inf"))
     assert not found.information.any()
-    assert not found.pull.any()
+    assert not found.range_bias.any()
 
 
 def test_what_was_seen_farther_along_the_road_is_less_certain_by_the_drift_between() -> None:

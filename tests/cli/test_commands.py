@@ -2,6 +2,8 @@
 stand-ins or hand-made files.
 """
 
+import importlib
+import inspect
 import json
 import time
 from collections.abc import Callable
@@ -14,10 +16,12 @@ import yaml
 from click.testing import CliRunner, Result
 from mcap.writer import Writer
 
+from semloc_logs.benchmarks.named import Outcome
 from semloc_logs.cli.main import program
 from semloc_logs.logs.annotation.annotate import AnnotateReport
-from semloc_logs.stages import pipeline
-from semloc_logs.stages.pipeline import Report
+from semloc_logs.stages.annotate import Annotation, AnnotationMode
+from semloc_logs.stages.close import Selection
+from semloc_logs.stages.report import Report
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
 from semloc_logs.training.runs import Packed
@@ -55,12 +59,12 @@ def called(
         seen: dict[str, Any] = {}
 
         def stand_in(*args: Any, **options: Any) -> Any:
-            names = getattr(pipeline, f"_original_{stage}").__code__.co_varnames
-            seen.update(zip(names, args, strict=False), **options)
+            seen.update(signature.bind(*args, **options).arguments)
             return answer
 
-        monkeypatch.setattr(pipeline, f"_original_{stage}", getattr(pipeline, stage), raising=False)
-        monkeypatch.setattr(pipeline, stage, stand_in)
+        module = importlib.import_module(f"semloc_logs.stages.{stage}")
+        signature = inspect.signature(getattr(module, stage))
+        monkeypatch.setattr(module, stage, stand_in)
         return seen
 
     _write_closures(Workspace(tmp_path / "work"))
@@ -160,11 +164,10 @@ def test_run_makes_each_log_a_session(called: Any, tmp_path: Path) -> None:
         "--overwrite",
     )
     assert done.exit_code == 0, done.stderr
-    assert {name: list(paths) for name, paths in seen["sessions"].items()} == {
-        "monday": [logs[0]],
-        "tuesday": [logs[1]],
-    }
-    assert seen["topics"] == {"lidar": "/points"}
+    assert [(s.name, s.logs, dict(s.topics)) for s in seen["sessions"]] == [
+        ("monday", (logs[0],), {"lidar": "/points"}),
+        ("tuesday", (logs[1],), {"lidar": "/points"}),
+    ]
     assert seen["settings"].query.frames == 3
     assert seen["settings"].fusion.max_range == 50.0  # resolved
     assert (seen["annotation"], seen["overwrite"]) == ("copy", True)
@@ -221,11 +224,11 @@ def test_fuse_makes_all_logs_one_session(called: Any, tmp_path: Path) -> None:
         ).exit_code
         == 0
     )
-    assert {n: [str(p) for p in logs] for n, logs in seen["sessions"].items()} == {
-        "drive": ["a_0.mcap", "a_1.mcap"]
-    }
+    (session,) = seen["sessions"]
+    assert session.name == "drive"
+    assert [str(log) for log in session.logs] == ["a_0.mcap", "a_1.mcap"]
     semloc("fuse", "a_0.mcap", "a_1.mcap", "-w", tmp_path / "work")
-    assert list(seen["sessions"]) == ["a_0"]
+    assert [s.name for s in seen["sessions"]] == ["a_0"]
 
 
 @pytest.mark.parametrize("name", ["../x", "a/b", "", ".hidden"])
@@ -268,11 +271,7 @@ def test_describe_and_close_take_sessions(called: Any, tmp_path: Path) -> None:
         "--json",
     )
     assert done.exit_code == 0
-    assert (closed["queries"], closed["targets"], closed["self_closures"]) == (
-        ("a", "b"),
-        ("c",),
-        False,
-    )
+    assert closed["selection"] == Selection(("a", "b"), ("c",), self_closures=False)
     assert closed["settings"].query.length == 12.5
     assert len(json.loads(done.stdout)["closures"]) == 2
 
@@ -281,7 +280,7 @@ def test_a_workspace_without_sessions_is_1(tmp_path: Path) -> None:
     for command in (["describe"], ["close"], ["export", "--format", "tum"]):
         done = semloc(*command, "-w", tmp_path / "w")
         assert done.exit_code == 1
-        assert "no fused session" in done.stderr
+        assert "holds no sessions" in done.stderr
 
 
 # -- annotate
@@ -316,12 +315,8 @@ def test_annotate_hands_on_what_was_asked(
     seen = called("annotate", AnnotateReport(Path("x.mcap"), "run", "ros2", 3, 9, 1234, True))
     done = semloc("annotate", "a.mcap", "-w", "w", *outputs, "--session", "other", "--json")
     assert done.exit_code == 0, done.stderr
-    assert (seen["mode"], seen["output"], seen["session"], seen["overwrite"]) == (
-        mode,
-        output,
-        "other",
-        False,
-    )
+    assert seen["annotation"] == Annotation(AnnotationMode(mode), output, overwrite=False)
+    assert seen["session"] == "other"
     assert json.loads(done.stdout)["closures"] == 3
 
 
@@ -405,7 +400,11 @@ def test_commands_that_open_a_log_repair_it_first(
         repaired.append(path)
         return False
 
-    for module in ("semloc_logs.logs.annotation.annotate", "semloc_logs.stages.pipeline"):
+    for module in (
+        "semloc_logs.logs.annotation.annotate",
+        "semloc_logs.stages.fuse",
+        "semloc_logs.stages.annotate",
+    ):
         monkeypatch.setattr(f"{module}.recover", recover)
     log = _log(tmp_path / "a.mcap")
     done = semloc(*(a.format(log=log, work=tmp_path / "w") for a in args))
@@ -480,12 +479,12 @@ def test_vocabulary_needs_a_variant(tmp_path: Path) -> None:
 
 
 def test_benchmark_prints_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = {
+    figures: dict[str, dict[str, float | str]] = {
         "messages": {"ours": 400.0, "unit": "MB/s", "peer": 200.0},
         "clouds": {"ours": 2.5, "unit": "ms"},
     }
     monkeypatch.setattr(
-        "semloc_logs.benchmarks.speed.suite.BENCHMARKS", {"reading": lambda _: figures}
+        "semloc_logs.benchmarks.named.BENCHMARKS", {"reading": lambda _: Outcome(figures)}
     )
     assert json.loads(semloc("benchmark", "reading", "--json").stdout) == figures
     assert "200" in semloc("benchmark", "reading").stdout

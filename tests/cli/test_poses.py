@@ -80,9 +80,16 @@ def cloud(seconds: float, x: float) -> Any:
     size = points.nbytes
     return make(
         "sensor_msgs/msg/PointCloud2",
-        header=header(seconds, "lidar"), height=1, width=len(points), fields=fields, is_bigendian=False, point_step=12, row_step=size,
-        data=points.reshape(-1).view(np.uint8), is_dense=True,
-    )  # fmt: skip
+        header=header(seconds, "lidar"),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=size,
+        data=points.reshape(-1).view(np.uint8),
+        is_dense=True,
+    )
 
 
 def drive(
@@ -200,8 +207,8 @@ def test_poses_beyond_what_a_map_reaches_are_1_and_a_sentence(tmp_path: Path) ->
     )
     assert done.exit_code == 1
     assert (
-        "the poses have come 5300 km from the first at 2023-11-14T22:13:20.500Z, but a map of 0.3 m voxels reaches 900 km"
-        in done.stderr
+        "the poses have come 5300 km from the first at 2023-11-14T22:13:20.500Z, but a map of 0.3"
+        " m voxels reaches 900 km" in done.stderr
     )
     assert not session
     done, _ = fuse(drive(tmp_path / "b.mcap", [(t, x + 5.3e6) for t, x in GOOD]))
@@ -225,7 +232,7 @@ def test_sweeps_whose_clock_jumps_are_3_and_a_sentence(
 def test_no_poses_is_0_with_a_note(tmp_path: Path) -> None:
     done, session = fuse(drive(tmp_path / "a.mcap"))
     assert done.exit_code == 0, done.stderr
-    assert "a.mcap has no pose stream" in done.stderr
+    assert "a: The log has no pose stream" in done.stderr
     assert "--odometry lidar" in done.stderr
     assert "--poses FILE" in done.stderr
     assert not session["posed"]
@@ -300,11 +307,11 @@ def test_which_session_a_trajectory_belongs_to(
 ) -> None:
     seen: dict[str, Any] = {}
 
-    def run(*args: Any) -> Any:
-        seen.update(args[-1])
+    def run(sessions: Any, *_: Any, **__: Any) -> Any:
+        seen.update({session.name: session.poses for session in sessions})
         raise SystemExit(9)
 
-    monkeypatch.setattr("semloc_logs.stages.pipeline.run", run)
+    monkeypatch.setattr("semloc_logs.stages.run.run", run)
     logs = ("run", tmp_path / "a.mcap", tmp_path / "b.bag", "-w", tmp_path / "w")
     assert semloc(*logs, "--poses", "x.tum").exit_code == 2
     assert semloc(*logs, "--poses", "c=x.tum").exit_code == 2

@@ -1,12 +1,14 @@
 """Exit codes, streams and start-up of the program, whatever the command."""
 
 import json
+import logging
 import os
 import resource
 import signal
 import subprocess
 import sys
-import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from semloc_logs.cli.console import console
 from semloc_logs.cli.main import COMMANDS, program
 from semloc_logs.cli.options import Command, EngineChoice, console_options
 from semloc_logs.errors import LogError, RoleError, SettingsError, WorkspaceError
+from semloc_logs.progress import Progress
 
 HEAVY = (
     "torch",
@@ -61,7 +64,10 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
     "args", [["--help"], ["run", "--help"], ["--version"], ["benchmark", "--help"], ["nothing"]]
 )
 def test_start_up_imports_nothing_heavy(args: list[str]) -> None:
-    code = f"import sys; sys.argv = ['semloc', *{args!r}]\nfrom semloc_logs.cli.main import main\ntry: main()\nexcept SystemExit: pass\n"
+    code = (
+        f"import sys; sys.argv = ['semloc', *{args!r}]\nfrom semloc_logs.cli.main import"
+        " main\ntry: main()\nexcept SystemExit: pass\n"
+    )
     code += f"print('HEAVY', *[m for m in {HEAVY!r} if m in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=30
@@ -188,12 +194,44 @@ def test_wrong_usage_is_2(args: list[str]) -> None:
 def test_progress_lines_are_few_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     console.reset()
     for k in range(1, 101):
-        console.note(f"query {k} of 100")
+        console.show_progress(Progress("close", "tuesday", k, 100, "queries"))
     console.note("done")
-    said = capsys.readouterr().err.splitlines()
-    assert said[0] == "query 1 of 100"
-    assert said[-2:] == ["query 100 of 100", "done"]
-    assert len(said) < 10
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-2:] == ["close tuesday: 100 of 100 queries", "done"]
+    assert len(lines) < 10
+
+
+def test_progress_has_the_same_fields_in_json(capsys: pytest.CaptureFixture[str]) -> None:
+    console.reset()
+    console.log_format = "json"
+    console.show_progress(Progress("fuse", "monday", 7, None, "frames"))
+    console.verbosity = 1  # every event
+    console.show_progress(Progress("fuse", "monday", 8, None, "frames"))
+    (line,) = capsys.readouterr().err.splitlines()
+    content = json.loads(line)
+    del content["time"]
+    assert content == {
+        "level": "info",
+        "message": "fuse monday: 8 frames",
+        "stage": "fuse",
+        "session": "monday",
+        "done": 8,
+        "total": None,
+        "unit": "frames",
+    }
+    console.reset()
+
+
+def test_what_the_package_logs_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    console.reset()
+    with console.progress():
+        logging.getLogger("semloc_logs.stages.fuse").info("%s: %d keyframes", "monday", 60)
+        logging.getLogger("semloc_logs.stages.fuse").warning("a.mcap is cut off")
+    logging.getLogger("semloc_logs.stages.fuse").info("later")
+    assert capsys.readouterr().err.splitlines() == [
+        "monday: 60 keyframes",
+        "Warning: a.mcap is cut off",
+    ]
 
 
 def test_numbers_that_are_none_are_null_in_json(capsys: pytest.CaptureFixture[str]) -> None:
@@ -221,7 +259,7 @@ def test_default_engine(
     cores: int,
     kind: str,
 ) -> None:
-    monkeypatch.setattr("semloc_logs.engines.engine.cores", lambda: cores)
+    monkeypatch.setattr("semloc_logs.engines.processes.cores", lambda: cores)
     with EngineChoice(name, jobs).open(tasks) as engine:
         assert type(engine).__name__ == kind
         assert engine.jobs == (1 if kind == "Serial" else jobs or cores)
@@ -230,13 +268,12 @@ def test_default_engine(
 # -- interruption, with real processes and signals
 
 SLOW = """
-import os, sys, tempfile, time
-from pathlib import Path
+import os, tempfile, time
 
 def nap(folder):
-    with tempfile.TemporaryDirectory(dir=folder) as mine:
-        (Path(folder).parent / f"pid-{os.getpid()}").touch()
-        time.sleep(100)
+    with tempfile.TemporaryDirectory(dir=folder):
+        os.write(1, b"asleep\\n")
+        time.sleep(1000)
 """
 NAPPING = """
 import click, slow, sys
@@ -254,56 +291,82 @@ if __name__ == "__main__":
 """
 
 
-def _start(folder: Path, engine: str, workers: int) -> tuple[subprocess.Popen[str], list[int]]:
-    """A program whose tasks sleep in a temporary folder inside ``folder``/busy, once they do; and
-    the processes they run in.
+@contextmanager
+def _sleeping(folder: Path, engine: str, tasks: int) -> Iterator[subprocess.Popen[str]]:
+    """A program of which so many tasks sleep, each in a temporary folder inside ``folder``/busy.
+
+    Its workers have its stdout, too: that ends when the last of them has. Nothing here waits for a
+    time.
     """
     (folder / "slow.py").write_text(SLOW)
     (folder / "napping.py").write_text(NAPPING)
     (folder / "busy").mkdir()
     command = [sys.executable, str(folder / "napping.py"), str(folder / "busy"), engine]
-    started = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    deadline = time.monotonic() + 40
-    while len(pids := [int(p.name[4:]) for p in folder.glob("pid-*")]) < workers:
-        assert time.monotonic() < deadline, "the workers did not start"
-        assert started.poll() is None, started.stderr and started.stderr.read()
-        time.sleep(0.05)
-    return started, pids
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        command, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    ) as started:
+        try:
+            assert started.stdout is not None
+            for _ in range(tasks):
+                assert started.stdout.readline() == "asleep\n", started.communicate()
+            assert len(list((folder / "busy").iterdir())) == tasks
+            yield started
+        finally:
+            with suppress(ProcessLookupError):  # as it should be
+                os.killpg(started.pid, signal.SIGKILL)
 
 
-def _are_gone(pids: list[int]) -> bool:
-    deadline = time.monotonic() + 15
-    while time.monotonic() < deadline:
-        if not [
-            p
-            for p in pids
-            if Path(f"/proc/{p}").exists()
-            and "Z" not in Path(f"/proc/{p}/stat").read_text().split()[2]
-        ]:
-            return True
-        time.sleep(0.05)
-    return False
-
-
-@pytest.mark.parametrize(("engine", "workers"), [("serial", 1), ("processes", 2)])
+@pytest.mark.timeout(240)  # new processes import much
+@pytest.mark.parametrize(("engine", "tasks"), [("serial", 1), ("processes", 2)])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_an_interrupted_program_cleans_up(
-    tmp_path: Path, engine: str, workers: int, number: signal.Signals, code: int
+    tmp_path: Path, engine: str, tasks: int, number: signal.Signals, code: int
 ) -> None:
-    started, pids = _start(tmp_path, engine, workers)
-    os.killpg(started.pid, number)  # as a terminal does it: workers get it too
-    _, said = started.communicate(timeout=30)
-    assert started.returncode == code
-    assert "Traceback" not in said
-    assert _are_gone(pids)
-    assert list((tmp_path / "busy").iterdir()) == []
+    with _sleeping(tmp_path, engine, tasks) as started:
+        os.killpg(started.pid, number)  # as a terminal does it: workers get it too
+        _, said = started.communicate()  # until the program and its workers are gone
+        assert started.returncode == code, said
+        assert "Traceback" not in said
+        assert list((tmp_path / "busy").iterdir()) == []
 
 
+@pytest.mark.timeout(240)
 def test_workers_leave_with_a_killed_parent(tmp_path: Path) -> None:
-    started, pids = _start(tmp_path, "processes", 2)
-    started.kill()
-    started.wait(timeout=20)
-    assert _are_gone(pids)
-    assert list((tmp_path / "busy").iterdir()) == []
-    if started.stderr:
-        started.stderr.close()
+    with _sleeping(tmp_path, "processes", 2) as started:
+        started.kill()
+        started.communicate()
+        assert list((tmp_path / "busy").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("simulate", "-o"),
+        ("demo", "-o"),
+        ("train", "--variant", "semantic", "-o"),
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_without_the_ray_caster_a_command_names_the_extra_and_writes_nothing(
+    arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    done = semloc(*arguments, str(tmp_path / "out"))
+    assert done.exit_code == 1
+    assert (
+        f"semloc {arguments[0]} needs the extra 'sim': pip install 'semloc_logs[sim]'"
+        in " ".join(done.stderr.split())
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_simulation_is_imported_without_the_ray_caster() -> None:
+    code = (
+        "import sys; sys.modules['embreex'] = None\n"
+        "import semloc_logs.simulation.demo, semloc_logs.training.training_scenes\n"
+        "from semloc_logs.simulation.town.hall import build_hall\n"
+        "print(len(build_hall(1).triangles) > 100)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"

@@ -1,20 +1,24 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
 from semloc_logs.engines import ENGINES, Engine, make_engine
-from semloc_logs.engines.engine import cores
+from semloc_logs.engines.processes import cores
 from semloc_logs.errors import LogError, SemlocError, SettingsError
+from semloc_logs.progress import Progress, listening
 
 TASKS = """
-import os, time
+import logging, os, time
+from semloc_logs import progress
 from semloc_logs.errors import LogError
 
 def slow_square(n):
@@ -29,6 +33,12 @@ def picky(n):
 def dies(n):
     if n == 2:
         os._exit(9)
+    return n
+
+def talks(n):
+    progress.report("fuse", "monday", n, 10, "keyframes")
+    logging.getLogger("semloc_logs.tasks").info("task %d", n)
+    logging.getLogger("semloc_logs.tasks").debug("not wanted")
     return n
 
 def threads(_):
@@ -112,8 +122,48 @@ def test_unknown_engines_are_refused_by_name() -> None:
 
 
 def test_cores_that_the_scheduler_grants(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("loky.cpu_count", lambda: 64)
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "7")
     assert cores() == 7
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "70")
+    assert cores() == 64
     for odd in ("", "0", "many"):
         monkeypatch.setenv("SLURM_CPUS_PER_TASK", odd)
-        assert cores() == len(os.sched_getaffinity(0))
+        assert cores() == 64
+
+
+def test_cores_of_a_pod_are_those_of_its_cgroup(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The limit of a container, in microseconds of processor time a period."""
+    limits = {"/sys/fs/cgroup/cpu.max": "200000 100000"}
+    real_open = open
+
+    def fake_open(path: Any, *args: Any, **options: Any) -> Any:
+        if str(path) in limits:
+            (tmp_path / "limit").write_text(limits[str(path)])
+            return real_open(tmp_path / "limit", *args, **options)
+        return real_open(path, *args, **options)
+
+    monkeypatch.delenv("SLURM_CPUS_PER_TASK", raising=False)
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(64)), raising=False)
+    exists = os.path.exists
+    monkeypatch.setattr("os.path.exists", lambda p: str(p) in limits or exists(p))
+    monkeypatch.setattr("builtins.open", fake_open)
+    assert cores() == 2
+
+
+def test_what_workers_report_and_log_arrives(
+    engine: Engine, tasks: ModuleType, caplog: pytest.LogCaptureFixture
+) -> None:
+    events: list[Progress] = []
+    with caplog.at_level(logging.INFO, "semloc_logs"), listening(events.append):
+        assert list(engine.map(tasks.talks, [3, 4])) == [3, 4]
+        engine.close()  # events are handed on before
+    assert sorted(events, key=lambda e: e.done) == [
+        Progress("fuse", "monday", 3, 10, "keyframes"),
+        Progress("fuse", "monday", 4, 10, "keyframes"),
+    ]
+    assert sorted(r.getMessage() for r in caplog.records) == ["task 3", "task 4"]
+    assert {r.name for r in caplog.records} == {"semloc_logs.tasks"}

@@ -157,7 +157,7 @@ def test_g2o_of_some_sessions_leaves_out_the_others(work: Workspace, tmp_path: P
 
 
 def test_unknown_sessions_are_named(work: Workspace, tmp_path: Path) -> None:
-    with pytest.raises(WorkspaceError, match=r"no fused session c \(there are: a, b\)"):
+    with pytest.raises(WorkspaceError, match=r"no session c \(it has a, b\)"):
         export(work, ["c"], "tum", tmp_path)
 
 

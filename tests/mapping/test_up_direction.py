@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,6 @@ from semloc_logs.settings import load
 
 F64 = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
-SHARED = Path(__file__).resolve().parents[3] / "shared"
 
 
 def noisy(rng: np.random.Generator, direction: F64, n: int, degrees: float) -> F64:
@@ -88,12 +88,11 @@ def test_with_nothing_to_see_the_prior_stays() -> None:
     np.testing.assert_allclose(find_up(np.tile(UP, (500, 1)), np.zeros(500), prior), unit)
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="no folder shared beside the checkout")
-def test_two_drives_through_a_basement_agree_on_up() -> None:
+def test_two_drives_through_a_basement_agree_on_up(shared: Callable[[str], Path]) -> None:
     """Both session frames are tilted, one of them by six degrees; the truth says how they lie to
     each other.
     """
-    truth = json.loads((SHARED / "logs" / "basement_truth.json").read_text())
+    truth = json.loads(shared("logs/basement_truth.json").read_text())
     ups = {}
     settings = load(
         assignments={
@@ -106,9 +105,11 @@ def test_two_drives_through_a_basement_agree_on_up() -> None:
         scratch = Path(tempfile.mkdtemp())
         try:
             from semloc_logs.labels.labeller import Labeller
-            from semloc_logs.logs.session.session import open_session
+            from semloc_logs.logs.session.session import SessionOptions, open_session
 
-            session = open_session([SHARED / "logs" / name], {}, min_range=0.9, max_range=30.0)
+            session = open_session(
+                [shared(f"logs/{name}")], SessionOptions(min_range=0.9, max_range=30.0)
+            )
             try:
                 collected = collect(
                     session,

@@ -9,7 +9,8 @@ import pyarrow as pa
 import pytest
 from click.testing import CliRunner
 
-from semloc_logs.alignment.verify import Query, Target
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.alignment.target_map import Target
 from semloc_logs.cli.main import program
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import yaw_transform

@@ -1,10 +1,6 @@
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -15,125 +11,7 @@ import pytest
 from semloc_logs.errors import ContractError, WorkspaceError
 from semloc_logs.schemas import read_text
 from semloc_logs.tables import contracts
-from semloc_logs.tables.table import (
-    read_json,
-    read_metadata,
-    read_table,
-    replacing_file,
-    replacing_folder,
-    write_json,
-    write_table,
-)
-
-
-def leftovers(folder: Path) -> list[str]:
-    return sorted(p.name for p in folder.iterdir() if p.name.startswith("."))
-
-
-def test_a_file_is_replaced_at_the_end_of_the_block(tmp_path: Path) -> None:
-    path = tmp_path / "deep" / "er" / "file"
-    for content in ("old", "new"):
-        with replacing_file(path) as temporary:
-            temporary.write_text(content)
-            assert not path.exists() or path.read_text() == "old"
-        assert path.read_text() == content
-    assert not leftovers(path.parent)
-
-
-def test_an_exception_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.write_text("old")
-
-    def half() -> None:
-        with replacing_file(path) as temporary:
-            temporary.write_text("half")
-            raise RuntimeError("stop")
-
-    with pytest.raises(RuntimeError, match="stop"):
-        half()
-    assert path.read_text() == "old"
-    assert not leftovers(tmp_path)
-
-
-def test_a_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:
-    path = tmp_path / "folder"
-    for n in (3, 2):
-        with replacing_folder(path) as temporary:
-            (temporary / "sub").mkdir()
-            for i in range(n):
-                (temporary / "sub" / f"{i}").write_text(f"{n}")
-        assert sorted(p.name for p in (path / "sub").iterdir()) == [str(i) for i in range(n)]
-    assert not leftovers(tmp_path)
-
-
-def test_an_exception_leaves_the_old_folder(tmp_path: Path) -> None:
-    path = tmp_path / "folder"
-    path.mkdir()
-    (path / "a").write_text("old")
-
-    def half() -> None:
-        with replacing_folder(path) as temporary:
-            (temporary / "a").write_text("half")
-            raise RuntimeError("stop")
-
-    with pytest.raises(RuntimeError, match="stop"):
-        half()
-    assert (path / "a").read_text() == "old"
-    assert not leftovers(tmp_path)
-
-
-def test_what_a_killed_run_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
-    path = tmp_path / "a[1]"  # no pattern
-    for name in (".a[1].0badcafe.tmp", ".a[1].0badcafe.old.tmp", ".other.0badcafe.tmp", "a[1].tmp"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "x").write_text("x")
-    with replacing_folder(path) as temporary:
-        (temporary / "x").write_text("new")
-    assert leftovers(tmp_path) == [".other.0badcafe.tmp"]
-    assert sorted(p.name for p in tmp_path.iterdir() if p.name[0] != ".") == ["a[1]", "a[1].tmp"]
-
-
-WRITER = """
-import sys
-from pathlib import Path
-from semloc_logs.tables.table import replacing_file, replacing_folder
-root = Path(sys.argv[1])
-print("ready", flush=True)
-n = 0
-while True:
-    n += 1
-    with replacing_file(root / "file") as temporary:
-        temporary.write_text(f"{n}\\n" * 2000)
-    with replacing_folder(root / "folder") as temporary:
-        for i in range(5):
-            (temporary / f"{i}").write_text(f"{n}\\n" * 500)
-"""
-
-
-@pytest.mark.parametrize("wait", [0.02, 0.11])
-def test_a_kill_leaves_old_or_new_but_never_half(wait: float, tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"ready\n"
-    while not (tmp_path / "folder").exists():
-        time.sleep(0.005)
-    time.sleep(wait)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    lines = (tmp_path / "file").read_text().splitlines()
-    assert len(lines) == 2000
-    assert len(set(lines)) == 1
-    if (tmp_path / "folder").exists():  # between the two renames there is none
-        contents = [p.read_text() for p in sorted((tmp_path / "folder").iterdir())]
-        assert len(contents) == 5
-        assert len(set(contents)) == 1
-        assert contents[0].count("\n") == 500
-    with replacing_folder(tmp_path / "folder") as temporary:
-        (temporary / "0").write_text("after")
-    assert [p.name for p in (tmp_path / "folder").iterdir()] == ["0"]
-    assert not [name for name in leftovers(tmp_path) if name.startswith(".folder")]
+from semloc_logs.tables.table import read_json, read_metadata, read_table, write_json, write_table
 
 
 def columns(n: int = 3) -> dict[str, object]:

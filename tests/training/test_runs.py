@@ -19,7 +19,13 @@ from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.training.own_sessions import session_frames, stretch_tasks
 from semloc_logs.training.pairs import read_shard, write_shard
-from semloc_logs.training.runs import Packed, learn_descriptor, learn_vocabulary, session_shards
+from semloc_logs.training.runs import (
+    Packed,
+    learn_descriptor,
+    learn_vocabulary,
+    session_shards,
+    simulated_shards,
+)
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import SessionFolder
 
@@ -215,3 +221,23 @@ def test_sessions_without_poses_teach_nothing(tmp_path: Path) -> None:
         session_shards(
             tmp_path / "shards", [folder], load().resolved(), make_engine("serial"), lambda _: None
         )
+
+
+def test_used_scenes_are_dropped_and_others_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def make(task: Any) -> Path:
+        task.shard.parent.mkdir(parents=True, exist_ok=True)
+        task.shard.touch()
+        return Path(task.shard)
+
+    monkeypatch.setattr("semloc_logs.training.runs.make_shard", make)
+    settings = load(assignments={"training.scenes": "12"}).resolved()
+    packed = simulated_shards(tmp_path, settings, make_engine("serial"), lambda _: None)
+    paths = packed.every
+    assert len(paths) == 12
+    for before, left in ((-256, 12), (0, 12), (3, 9), (1, 9), (5, 7)):
+        packed.drop(before)
+        assert sum(path.exists() for path in paths) == left
+    assert [path.exists() for path in paths[:6]] == [False] * 5 + [True]
+    packed.close()

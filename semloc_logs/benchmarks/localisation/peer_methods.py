@@ -29,7 +29,7 @@ from semloc_logs.mapping.selection import thin
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Resolved
-from semloc_logs.tables.table import replacing_file
+from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.voxels.store import read_keyframe
 
 F64 = NDArray[np.float64]

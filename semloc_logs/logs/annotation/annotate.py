@@ -1,6 +1,4 @@
-"""Loop closures into a log: as a copy, in place, or beside it; and what a log's content is without
-them.
-"""
+"""Loop closures into a log: as a copy, in place, or beside it; and a log's own content."""
 
 from __future__ import annotations
 
@@ -13,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.records import Header
-
 from semloc_logs import __version__
 from semloc_logs.errors import LogError
 from semloc_logs.logs.annotation.channels import (
     ClosureRecord,
+    Encoder,
     Encoding,
+    LogContext,
     LogFacts,
     channel_metadata,
     encode,
@@ -27,15 +25,14 @@ from semloc_logs.logs.annotation.channels import (
     run_id,
 )
 from semloc_logs.logs.annotation.mcap_append import (
-    MAGIC,
     METADATA_PREFIX,
-    Ending,
-    compose,
+    AppendPlan,
+    LogEnd,
     content_end,
-    definitions,
-    empty_ending,
+    empty_end,
     hash_range,
-    read_ending,
+    plan_append,
+    read_end,
     read_header,
 )
 from semloc_logs.logs.annotation.rosbag_copy import QOS_KEY, bag_facts, opened, write_copy
@@ -45,9 +42,10 @@ from semloc_logs.logs.annotation.tail_swap import (
     locked,
     recover,
     recover_locked,
-    replace_end,
-    sync_folder,
+    swap_tail,
 )
+from semloc_logs.logs.containers.mcap_records import MAGIC
+from semloc_logs.tables.atomic_files import replacing_file
 
 __all__ = [
     "AnnotateReport",
@@ -71,10 +69,10 @@ _ENCODINGS: dict[str, Encoding] = {
 
 @dataclass(frozen=True, slots=True)
 class AnnotateReport:
-    """What was written: ``closures`` in which the session takes part, ``messages`` of all topics,
-    bytes from our first record to the end.
+    """What was written.
 
-    ``replaced`` tells that earlier results of ours were taken away.
+    ``closures`` in which the session takes part, ``messages`` of all topics, bytes from our first
+    record to the end of the file. ``replaced``: earlier results of ours were taken away.
     """
 
     path: Path
@@ -88,9 +86,9 @@ class AnnotateReport:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """What is to be written, whatever the log: the ``closures`` in which ``session`` takes part,
-    and the ``settings`` behind them.
+    """What is to be written, whatever the log.
 
+    The ``closures`` in which ``session`` takes part, and the ``settings`` behind them.
     ``log_times`` maps the stamp (ns) of an end in this log to the receive time (ns) of the frame
     there; ``frame_id`` is the frame of the log's pose stream, for the markers; None:
     semloc/SESSION.
@@ -102,25 +100,28 @@ class Results:
     log_times: Mapping[int, int]
     frame_id: str | None = None
 
-    def end(self, path: Path, ending: Ending, facts: LogFacts) -> tuple[bytes, AnnotateReport]:
-        """The bytes of the file from ``ending.offset`` on."""
+    def plan(self, output: Path, end: LogEnd, facts: LogFacts) -> tuple[AppendPlan, AnnotateReport]:
+        """How a file that ends with ``end`` takes the results."""
         run = run_id(self.closures, self.session, self.settings, __version__)
-        channels, messages = encode(
-            self.closures,
-            self.session,
-            facts,
-            log_times=self.log_times,
-            frame_id=f"semloc/{self.session}" if self.frame_id is None else self.frame_id,
-            size=_marker_size(self.settings),
-            metadata=channel_metadata(run, __version__),
-        )
+        frame_id = f"semloc/{self.session}" if self.frame_id is None else self.frame_id
+        size = _marker_size(self.settings)
+        context = LogContext(self.session, facts, self.log_times, frame_id, size)
+        metadata = channel_metadata(run, __version__)
+        channels, messages = encode(self.closures, context, encoder_for(facts), metadata)
+
         own = {f"setting.{key}": value for key, value in sorted(self.settings.items())}
         own |= {"version": __version__, "schema_version": "1", "session": self.session}
-        data = compose(ending, channels, messages, f"{METADATA_PREFIX}{run}", own)
-        count = sum(m.channel == 0 for m in messages)
-        return data, AnnotateReport(
-            path, run, facts.encoding, count, len(messages), len(data), ending.replaces
+        plan = plan_append(end, channels, messages, f"{METADATA_PREFIX}{run}", own)
+        report = AnnotateReport(
+            path=output,
+            run_id=run,
+            encoding=facts.encoding,
+            closures=sum(m.channel == 0 for m in messages),
+            messages=len(messages),
+            bytes_written=len(plan.new_tail),
+            replaced=end.replaces,
         )
+        return plan, report
 
 
 def annotate_copy(
@@ -138,44 +139,42 @@ def annotate_copy(
         with opened(log) as readers, _published(output) as file:
             write_copy(log, readers, file, LIBRARY)
             file.flush()
-            ending = read_ending(file, log)
-            data, report = results.end(output, ending, bag_facts(log, readers))
-            _finish(file, ending.offset, data)
+            end = read_end(file, log)
+            plan, report = results.plan(output, end, bag_facts(log, readers))
+            _finish(file, plan)
             return report
     with (
         locked(log, shared=True) as source,
         os.fdopen(os.dup(source), "rb") as original,
         _published(output) as file,
     ):
-        ending = read_ending(original, log)
-        data, report = results.end(
-            output, ending, _mcap_facts(log, read_header(original, log), ending)
-        )
-        copy_start(source, file.fileno(), ending.offset)
-        _finish(file, ending.offset, data)
+        end = read_end(original, log)
+        plan, report = results.plan(output, end, _mcap_facts(end))
+        copy_start(source, file.fileno(), plan.start)
+        _finish(file, plan)
         return report
 
 
 def annotate_in_place(log: Path, results: Results) -> AnnotateReport:
-    """Write the results into ``log`` itself, an MCAP file; only its end is written. Errors as for
-    :func:`annotate_copy`.
+    """Write the results into ``log`` itself, an MCAP file; only its tail is written.
 
-    An interruption at any point leaves a log that is whole, or that :func:`recover` makes whole.
+    Its end is read once, a plan is made of it, and the plan is applied. An interruption at any
+    point leaves a log that is whole, or that :func:`recover` makes whole. Errors as for
+    :func:`annotate_copy`.
     """
     if not log.exists():
         raise LogError(f"{log} does not exist; give the path of a log.")
     if not _is_mcap(log):
         raise LogError(
-            f"{log} is no MCAP file, so it cannot take our channels; use `-o OUT.mcap` or `--sidecar OUT.mcap`."
+            f"{log} is no MCAP file, so it cannot take our channels; "
+            "use `-o OUT.mcap` or `--sidecar OUT.mcap`."
         )
     with locked(log) as fd:
         recover_locked(log, fd)
         with os.fdopen(os.dup(fd), "rb") as file:
-            ending = read_ending(file, log)
-            data, report = results.end(
-                log, ending, _mcap_facts(log, read_header(file, log), ending)
-            )
-        replace_end(log, fd, ending.offset, data)
+            end = read_end(file, log)
+        plan, report = results.plan(log, end, _mcap_facts(end))
+        swap_tail(log, fd, plan)
         return report
 
 
@@ -183,33 +182,29 @@ def annotate_sidecar(
     log: Path, output: Path, results: Results, *, overwrite: bool = False
 ) -> AnnotateReport:
     """Write ``output``, an MCAP file of the log's profile and encoding with the results only.
+
     Errors as for :func:`annotate_copy`.
     """
     _refuse(log, output, overwrite)
     recover(log)
     if _is_mcap(log):
-        with log.open("rb") as original:
-            header = read_header(original, log)
-            try:
-                facts = _mcap_facts(log, header, read_ending(original, log))
-            except LogError:  # a log that is cut off has its profile at least
-                facts = _mcap_facts(log, header, empty_ending("", "")[1])
+        facts = _facts_for_sidecar(log)
     else:
         with opened(log) as readers:
             facts = bag_facts(log, readers)
-    start, ending = empty_ending(facts.profile, LIBRARY)
+    start, end = empty_end(facts.profile, LIBRARY)
     with _published(output) as file:
-        data, report = results.end(output, ending, facts)
+        plan, report = results.plan(output, end, facts)
         file.write(start)
-        _finish(file, len(start), data)
+        _finish(file, plan)
         return report
 
 
 def content_fingerprint(log: Path) -> str:
-    """sha256 of the recorded content without our own records: annotating a log in place does not
-    change it.
+    """sha256 of the recorded content without our own records.
 
-    ``log`` is a file, a bag folder, or the metadata.yaml in it. Reads every byte once.
+    Annotating a log in place does not change it. ``log`` is a file, a bag folder, or the
+    metadata.yaml in it. Reads every byte once.
     """
     folder = log.parent if log.name == "metadata.yaml" else log
     try:
@@ -235,26 +230,50 @@ def _file_fingerprint(path: Path) -> str:
         return str(hash_range(file, 0, stop).hexdigest())
 
 
-def _mcap_facts(log: Path, header: Header, ending: Ending) -> LogFacts:
-    """What our channels need to know of an MCAP log: the encoding of most of its channels, unless
-    its profile says so.
+def _mcap_facts(end: LogEnd) -> LogFacts:
+    """What our channels need to know of an MCAP log.
+
+    The encoding is that of most of its channels, unless its profile states it.
     """
-    schemas, channels = definitions(ending, log)
-    counted = Counter(c.message_encoding for c in channels if c.message_encoding in _ENCODINGS)
-    most = max(sorted(counted), key=lambda e: counted[e], default="json")
+    encodings = Counter(c.message_encoding for c in end.channels)
+    known = [e for e in sorted(encodings) if e in _ENCODINGS]
+    most = max(known, key=lambda e: encodings[e], default="json")
     by_profile: dict[str, Encoding] = {"ros1": "ros1", "ros2": "ros2"}
-    encoding = by_profile.get(header.profile, _ENCODINGS[most])
-    qos = sorted(
-        (c.metadata[QOS_KEY] for c in channels if c.metadata.get(QOS_KEY)),
-        key=lambda q: q.count("history"),
+    encoding = by_profile.get(end.header.profile, _ENCODINGS[most])
+    qos = [c.metadata[QOS_KEY] for c in end.channels if c.metadata.get(QOS_KEY)]
+    qos.sort(key=lambda profiles: profiles.count("history"))
+    is_ros2 = encoding == "ros2"
+    statistics = end.summary.statistics
+    return LogFacts(
+        encoding=encoding,
+        profile=encoding if encoding in by_profile else end.header.profile,
+        channel_metadata={QOS_KEY: qos[0] if qos else ""} if is_ros2 else {},
+        start_ns=statistics.message_start_time,
+        end_ns=statistics.message_end_time,
+        messages=statistics.message_count,
+        old_markers=is_ros2 and any(is_old_marker(s.name, s.data) for s in end.schemas),
     )
-    statistics = ending.summary.statistics
-    profile = {"ros1": "ros1", "ros2": "ros2"}.get(encoding, header.profile)
-    metadata = {QOS_KEY: qos[0] if qos else ""} if encoding == "ros2" else {}
-    old_markers = encoding == "ros2" and any(is_old_marker(s.name, s.data) for s in schemas)
-    start = statistics.message_start_time
-    end = statistics.message_end_time
-    return LogFacts(encoding, profile, metadata, start, end, statistics.message_count, old_markers)
+
+
+def _facts_for_sidecar(log: Path) -> LogFacts:
+    with log.open("rb") as original:
+        header = read_header(original, log)
+        try:
+            return _mcap_facts(read_end(original, log))
+        except LogError:  # a log that is cut off has its profile at least
+            return _mcap_facts(empty_end(header.profile, LIBRARY)[1])
+
+
+def encoder_for(facts: LogFacts) -> Encoder:
+    """The writer of the log's encoding; the libraries behind it are loaded when they are needed."""
+    encoding = facts.encoding
+    if encoding == "ros1" or encoding == "ros2":
+        from semloc_logs.logs.annotation.channels_ros import RosEncoder
+
+        return RosEncoder(1 if encoding == "ros1" else 2, old_markers=facts.old_markers)
+    from semloc_logs.logs.annotation.channels_foxglove import FoxgloveEncoder
+
+    return FoxgloveEncoder(encoding)
 
 
 def _marker_size(settings: Mapping[str, str]) -> float:
@@ -291,32 +310,16 @@ def _refuse(log: Path, output: Path, overwrite: bool) -> None:
 def _published(output: Path) -> Iterator[BinaryIO]:
     """A file that becomes ``output`` when the block ends well, and vanishes when it does not."""
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        name = output.with_name(f".{output.name}.{os.getpid()}.tmp")
-        fd = os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+        with replacing_file(output) as temporary, temporary.open("w+b") as file:
+            yield file
     except OSError as error:
         raise LogError(
-            f"{output} cannot be written ({error.strerror}); give another output."
+            f"{output} could not be written ({error.strerror}); make room or give another output."
         ) from error
-    try:
-        with os.fdopen(fd, "w+b") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(name, output)
-        sync_folder(output.parent)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            os.unlink(name)
-        if isinstance(error, OSError):
-            raise LogError(
-                f"{output} could not be written ({error.strerror}); make room or give another output."
-            ) from error
-        raise
 
 
-def _finish(file: BinaryIO, offset: int, data: bytes) -> None:
-    """Write the end of a new file."""
-    file.seek(offset)
-    file.write(data)
+def _finish(file: BinaryIO, plan: AppendPlan) -> None:
+    """Write the tail of a new file."""
+    file.seek(plan.start)
+    file.write(plan.new_tail)
     file.truncate()

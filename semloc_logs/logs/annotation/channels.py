@@ -1,5 +1,7 @@
-"""Loop closures as messages of a log, in the log's own encoding: one foreign channel would make it
-unreadable for some readers.
+"""Loop closures as messages of a log: the types, and which closure gives which messages.
+
+The messages are in the log's own encoding: one foreign channel would make the log unreadable for
+some readers. :mod:`channels_ros` and :mod:`channels_foxglove` write the encodings.
 """
 
 from __future__ import annotations
@@ -14,12 +16,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import ContractError
-from semloc_logs.logs.annotation.mcap_append import RUN_KEY, NewChannel, NewMessage
 from semloc_logs.numerics.transforms import inverse, transform
 
 F64 = NDArray[np.float64]
 Encoding = Literal["ros2", "ros1", "protobuf", "json"]
 TOPICS = ("/semloc/loop_closures", "/semloc/pose", "/semloc/markers")
+RUN_KEY = "semloc.run_id"  # in the metadata of each of our channels
+
+
+@dataclass(frozen=True, slots=True)
+class NewChannel:
+    """A channel to add, with its schema."""
+
+    topic: str
+    message_encoding: str
+    schema_name: str
+    schema_encoding: str
+    schema_data: bytes
+    metadata: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class NewMessage:
+    """A message to add; its publish time is its log time.
+
+    ``channel`` counts the channels that are added with it.
+    """
+
+    channel: int
+    log_time_ns: int
+    data: bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,24 +84,30 @@ class ClosureRecord:
         session_T_query: F64 | None = None,
         session_position: F64 | None = None,
     ) -> ClosureRecord:
-        """From a row of the table as plain Python values; ``ContractError`` when a column is
-        missing or has another type.
+        """From a row of the table as plain Python values.
+
+        ``ContractError`` when a column is missing or has another type.
         """
         try:
             values: dict[str, object] = {}
             for name in COLUMNS:
                 value = row[name]
                 kind = _TYPES[name]
-                values[name] = tuple(float(x) for x in value) if kind is tuple else kind(value)  # type: ignore[attr-defined]
+                if kind is tuple:
+                    value = tuple(float(x) for x in value)  # type: ignore[attr-defined]
+                values[name] = kind(value)
         except (KeyError, TypeError, ValueError) as error:
             raise ContractError(
-                f"A row of closures.parquet lacks a good value for {error}; write the table again with `semloc close`."
+                f"A row of closures.parquet lacks a good value for {error}; "
+                "write the table again with `semloc close`."
             ) from error
         if len(values["covariance"]) != 36:  # type: ignore[arg-type]
             raise ContractError(
-                "The covariance of a row of closures.parquet has not 36 numbers; write the table again with `semloc close`."
+                "The covariance of a row of closures.parquet has not 36 numbers; "
+                "write the table again with `semloc close`."
             )
-        return cls(**values, session_T_query=session_T_query, session_position=session_position)  # type: ignore[arg-type]
+        values |= {"session_T_query": session_T_query, "session_position": session_position}
+        return cls(**values)  # type: ignore[arg-type]
 
     def columns(self) -> dict[str, object]:
         """The columns of closures.parquet, in their order."""
@@ -89,8 +121,9 @@ class ClosureRecord:
         )
 
     def covariance_in_session(self) -> F64:
-        """(6, 6) covariance of ``session_T_query`` due to the closure: the same errors along the
-        axes of the target's session frame.
+        """(6, 6) covariance of ``session_T_query`` due to the closure.
+
+        The same errors, along the axes of the target's session frame.
         """
         session_T_query = np.eye(4) if self.session_T_query is None else self.session_T_query
         session_R_target = session_T_query[:3, :3] @ self.target_T_query()[:3, :3].T
@@ -111,8 +144,9 @@ _TYPES: dict[str, type] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mark:
-    """What is drawn at this log's end of a closure, in the frame ``frame_id``: a sphere, a text
-    and, within one session, a line.
+    """Drawing at this log's end of a closure, in the frame ``frame_id``.
+
+    A sphere, a text and, within one session, a line.
     """
 
     stamp_ns: int
@@ -130,9 +164,7 @@ class Mark:
 
 
 class Encoder(Protocol):
-    """The three messages in one encoding: their channels in the order of ``TOPICS``, and their
-    bytes.
-    """
+    """The messages in one encoding: channels in the order of ``TOPICS``, and their bytes."""
 
     def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]: ...
     def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes: ...
@@ -142,11 +174,11 @@ class Encoder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LogFacts:
-    """What has to be known of a log to write into it: encoding, profile, metadata for new channels,
-    first and last receive time.
+    """Facts that a writer needs of a log: encoding, profile, metadata for new channels, times.
 
-    ``old_markers``: the log defines visualization_msgs/Marker as ROS 2 did before Humble; readers
-    know one definition of a type.
+    ``start_ns`` and ``end_ns`` are the first and last receive time. ``old_markers``: the log
+    defines visualization_msgs/Marker as ROS 2 did before Humble; readers know one definition of a
+    type.
     """
 
     encoding: Encoding
@@ -156,6 +188,29 @@ class LogFacts:
     end_ns: int
     messages: int
     old_markers: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class LogContext:
+    """What the messages of one log share.
+
+    ``log_times`` maps the stamp (ns) of an end to the receive time (ns) of the log at that frame.
+    ``frame_id`` is the frame of the markers, ``marker_size`` their diameter in metres.
+    """
+
+    session: str
+    facts: LogFacts
+    log_times: Mapping[int, int]
+    frame_id: str
+    marker_size: float
+
+    def log_time(self, stamp_ns: int) -> int:
+        """The receive time at a stamp; without one, the stamp within the log's time range."""
+        facts = self.facts
+        time = self.log_times.get(stamp_ns)
+        if time is None and facts.messages:
+            time = min(max(stamp_ns, facts.start_ns), facts.end_ns)
+        return min(max(stamp_ns if time is None else time, 0), (1 << 64) - 1)
 
 
 def is_old_marker(name: str, definition: bytes) -> bool:
@@ -169,8 +224,9 @@ def is_old_marker(name: str, definition: bytes) -> bool:
 def run_id(
     closures: Sequence[ClosureRecord], session: str, settings: Mapping[str, str], version: str
 ) -> str:
-    """Sixteen hexadecimal digits that name this result: the same closures, settings and version
-    give the same.
+    """Sixteen hexadecimal digits that name this result.
+
+    The same closures, settings and version give the same.
     """
     rows = [list(c.columns().values()) for c in closures]
     content = json.dumps([version, session, sorted(settings.items()), rows], allow_nan=True)
@@ -179,58 +235,32 @@ def run_id(
 
 def encode(
     closures: Sequence[ClosureRecord],
-    session: str,
-    facts: LogFacts,
-    *,
-    log_times: Mapping[int, int],
-    frame_id: str,
-    size: float,
+    context: LogContext,
+    encoder: Encoder,
     metadata: Mapping[str, str],
 ) -> tuple[list[NewChannel], list[NewMessage]]:
-    """Channels and messages for the closures in which ``session`` takes part, in log-time order.
+    """Channels and messages for the closures of the session, in log-time order.
 
-    ``log_times`` maps the stamp of an end to the receive time of the log at that frame; an end
-    without one takes its stamp, moved into the log's time range. ``size`` is the diameter of the
-    markers in metres; ``metadata`` goes to the channels. Channels without messages are left out.
+    ``metadata`` goes to the channels. Channels without messages are left out.
     """
-    encoder = _encoder(facts)
-    messages: list[NewMessage] = []
+    session = context.session
     mine = [c for c in closures if session in (c.query_session, c.target_session)]
-    for c in mine:
-        if not np.isfinite(
-            [
-                *c.covariance,
-                c.t_x,
-                c.t_y,
-                c.t_z,
-                c.q_x,
-                c.q_y,
-                c.q_z,
-                c.q_w,
-                c.overlap,
-                c.probability,
-            ]
-        ).all():
-            raise ContractError(
-                f"The closure of {c.query_session} at {c.query_stamp_ns} ns has a number that is not finite; run `semloc close`."
-            )
+    messages: list[NewMessage] = []
     for key, closure in enumerate(sorted(mine, key=_order)):
+        _refuse_infinite(closure)
         is_query = closure.query_session == session
         stamp = closure.query_stamp_ns if is_query else closure.target_stamp_ns
-        log_time = min(max(log_times.get(stamp, _clip(stamp, facts)), 0), (1 << 64) - 1)
+        log_time = context.log_time(stamp)
         messages.append(NewMessage(0, log_time, encoder.loop_closure(closure, stamp)))
         if is_query and closure.session_T_query is not None:
-            messages.append(
-                NewMessage(1, log_time, encoder.pose(closure, f"semloc/{closure.target_session}"))
-            )
+            pose = encoder.pose(closure, f"semloc/{closure.target_session}")
+            messages.append(NewMessage(1, log_time, pose))
         if closure.session_position is not None:
-            messages.append(
-                NewMessage(
-                    2, log_time, encoder.mark(_mark(closure, is_query, stamp, key, frame_id, size))
-                )
-            )
+            mark = _mark(closure, stamp, key, context)
+            messages.append(NewMessage(2, log_time, encoder.mark(mark)))
     messages.sort(key=lambda m: m.log_time_ns)  # stable: closures of one frame stay in their order
-    return _used(encoder.channels({**facts.channel_metadata, **metadata}), messages)
+    channels = encoder.channels({**context.facts.channel_metadata, **metadata})
+    return _used(channels, messages)
 
 
 def channel_metadata(run: str, version: str) -> dict[str, str]:
@@ -238,52 +268,39 @@ def channel_metadata(run: str, version: str) -> dict[str, str]:
     return {RUN_KEY: run, "semloc.version": version}
 
 
-def _encoder(facts: LogFacts) -> Encoder:
-    encoding = facts.encoding
-    if encoding == "ros1" or encoding == "ros2":
-        from semloc_logs.logs.annotation.channels_ros import RosEncoder
-
-        return RosEncoder(1 if encoding == "ros1" else 2, old_markers=facts.old_markers)
-    from semloc_logs.logs.annotation.channels_foxglove import FoxgloveEncoder
-
-    return FoxgloveEncoder(encoding)
+def _refuse_infinite(c: ClosureRecord) -> None:
+    pose = (c.t_x, c.t_y, c.t_z, c.q_x, c.q_y, c.q_z, c.q_w)
+    if not np.isfinite([*c.covariance, *pose, c.overlap, c.probability]).all():
+        raise ContractError(
+            f"The closure of {c.query_session} at {c.query_stamp_ns} ns has a number that is not "
+            "finite; run `semloc close`."
+        )
 
 
 def _order(closure: ClosureRecord) -> tuple[str, int, str, int]:
-    return (
-        closure.query_session,
-        closure.query_stamp_ns,
-        closure.target_session,
-        closure.target_stamp_ns,
-    )
+    query = closure.query_session, closure.query_stamp_ns
+    return *query, closure.target_session, closure.target_stamp_ns
 
 
-def _clip(stamp: int, facts: LogFacts) -> int:
-    return min(max(stamp, facts.start_ns), facts.end_ns) if facts.messages else stamp
-
-
-def _mark(
-    closure: ClosureRecord, is_query: bool, stamp: int, key: int, frame_id: str, size: float
-) -> Mark:
+def _mark(closure: ClosureRecord, stamp_ns: int, key: int, context: LogContext) -> Mark:
     position = np.asarray(closure.session_position, float)
     other = None
-    name = closure.target_session if is_query else closure.query_session
+    name = closure.target_session
     if closure.query_session == closure.target_session:
-        name = (
-            "an earlier place"
-            if closure.target_stamp_ns <= closure.query_stamp_ns
-            else "a later place"
-        )
+        earlier = closure.target_stamp_ns <= closure.query_stamp_ns
+        name = "an earlier place" if earlier else "a later place"
         if closure.session_T_query is not None:
             other = (closure.session_T_query @ inverse(closure.target_T_query()))[:3, 3]
+    elif closure.query_session != context.session:
+        name = closure.query_session
     good = min(1.0, max(0.0, 2 * closure.probability - 1))  # red at 0.5 and below, green at 1
     return Mark(
-        stamp,
-        frame_id,
+        stamp_ns,
+        context.frame_id,
         key,
         position,
         other,
-        size,
+        context.marker_size,
         f"{name} {closure.probability:.2f}",
         (1 - good, good, 0.1, 0.9),
     )
@@ -295,6 +312,5 @@ def _used(
     """Without channels that have no message."""
     used = sorted({m.channel for m in messages})
     number = {old: new for new, old in enumerate(used)}
-    return [channels[k] for k in used], [
-        NewMessage(number[m.channel], m.log_time_ns, m.data) for m in messages
-    ]
+    kept = [NewMessage(number[m.channel], m.log_time_ns, m.data) for m in messages]
+    return [channels[k] for k in used], kept

@@ -19,8 +19,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from semloc_logs.logs.annotation.channels import F64, TOPICS, ClosureRecord, Mark
-from semloc_logs.logs.annotation.mcap_append import NewChannel
+from semloc_logs.logs.annotation.channels import F64, TOPICS, ClosureRecord, Mark, NewChannel
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 
@@ -28,8 +27,7 @@ _STRING = FieldDescriptor.TYPE_STRING
 _INT64 = FieldDescriptor.TYPE_INT64
 _INT32 = FieldDescriptor.TYPE_INT32
 _DOUBLE = FieldDescriptor.TYPE_DOUBLE
-# the fields of schemas/messages/LoopClosure.proto after the timestamp, in the order of their
-# numbers
+# the fields of schemas/messages/LoopClosure.proto after the timestamp, by their numbers
 _FIELDS = (
     ("query_session", _STRING),
     ("target_session", _STRING),
@@ -143,8 +141,9 @@ def loop_closure_class() -> Any:
 
 
 def json_schema(descriptor: Descriptor) -> dict[str, Any]:
-    """JSON Schema of a protobuf message in Foxglove's JSON: times as sec and nsec, enumerations as
-    numbers, bytes as base64.
+    """JSON Schema of a protobuf message in Foxglove's JSON.
+
+    Times are sec and nsec, enumerations numbers, bytes base64.
     """
     if descriptor.full_name in ("google.protobuf.Timestamp", "google.protobuf.Duration"):
         title = "time" if descriptor.name == "Timestamp" else "duration"

@@ -10,16 +10,18 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from semloc_logs.logs.annotation.channels import F64, TOPICS, ClosureRecord, Mark
-from semloc_logs.logs.annotation.mcap_append import NewChannel
+from semloc_logs.logs.annotation.channels import F64, TOPICS, ClosureRecord, Mark, NewChannel
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 
 CLOSURE = "semloc_msgs/msg/LoopClosure"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 MARKERS = "visualization_msgs/msg/MarkerArray"
-# values of visualization_msgs/Marker.type, equal in ROS 1 and 2
-_SPHERE, _LINE_LIST, _TEXT = 2, 5, 9
+_SPHERE, _LINE_LIST, _TEXT = (
+    2,
+    5,
+    9,
+)  # values of visualization_msgs/Marker.type, equal in ROS 1 and 2
 
 
 class RosEncoder:
@@ -27,13 +29,8 @@ class RosEncoder:
 
     def __init__(self, version: int, *, old_markers: bool = False) -> None:
         self.version = version
-        self.store = _store(
-            Stores.ROS1_NOETIC
-            if version == 1
-            else Stores.ROS2_FOXY
-            if old_markers
-            else Stores.ROS2_HUMBLE
-        )
+        ros2 = Stores.ROS2_FOXY if old_markers else Stores.ROS2_HUMBLE
+        self.store = _store(Stores.ROS1_NOETIC if version == 1 else ros2)
 
     def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]:
         encoding, schema_encoding = ("ros1", "ros1msg") if self.version == 1 else ("cdr", "ros2msg")
@@ -100,8 +97,7 @@ class RosEncoder:
         ns: str,
         position: F64,
         scale: tuple[float, ...],
-        points: list[Any] | None = None,
-        text: str = "",
+        **more: Any,
     ) -> Any:
         given = {
             "header": self._header(mark.stamp_ns, mark.frame_id),
@@ -113,10 +109,10 @@ class RosEncoder:
             "color": self._new(
                 "std_msgs/msg/ColorRGBA", **dict(zip("rgba", mark.color, strict=True))
             ),
-            "points": points or [],
-            "text": text,
+            "points": [],
+            "text": "",
         }
-        return self._new("visualization_msgs/msg/Marker", **given)
+        return self._new("visualization_msgs/msg/Marker", **(given | more))
 
     def _pose(self, position: F64, quaternion: F64) -> Any:
         x, y, z, w = (float(v) for v in quaternion)

@@ -1,9 +1,12 @@
 """Adding channels to an MCAP file without decoding what is there.
 
 An MCAP file is magic, data section, DataEnd, summary, footer, magic. To add records, everything up
-to DataEnd is kept as it is and the end of the file, from DataEnd on, is written anew: our records,
-a continued DataEnd and a summary that lists old and new. Our last record is a metadata record that
-says where ours start, so that a later run finds them, takes them away and puts new ones in.
+to DataEnd is kept as it is, and the tail of the file, from DataEnd on, is written anew: our
+records, a continued DataEnd and a summary that lists old and new. Our last record is a metadata
+record that states where ours start. A later run finds them by it and puts new ones in their place.
+
+:func:`read_end` reads the end of a file once; :func:`plan_append` turns it and new messages into an
+:class:`AppendPlan`, a value; who applies the plan knows nothing of MCAP.
 """
 
 from __future__ import annotations
@@ -11,15 +14,13 @@ from __future__ import annotations
 import hashlib
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
@@ -38,269 +39,237 @@ from mcap.records import (
 )
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.containers.mcap_scan import SUMMARY_ORDER, Summary, raw, scan
+from semloc_logs.logs.annotation.channels import RUN_KEY, NewChannel, NewMessage
+from semloc_logs.logs.containers.mcap_records import HEAD, MAGIC, Record, parse, raw, spans
+from semloc_logs.logs.containers.mcap_scan import SUMMARY_ORDER, Summary, scan
 
-MAGIC = b"\x89MCAP0\r\n"
 METADATA_PREFIX = "semloc/"
-RUN_KEY = "semloc.run_id"  # in the metadata of each of our channels
 CHUNK_SIZE = 1 << 20  # bytes of a chunk before compression
-_DATA_END_SIZE = 9 + 4
-_FOOTER_SIZE = 9 + 20
-_PADDING = 256  # bytes by which a DataEnd record may be longer than the specification says
+MAX_HEADER = 1 << 20  # bytes of the header record that are read
+MAX_METADATA = 1 << 24  # bytes; our metadata record is smaller
+_DATA_END_SIZE = HEAD.size + 4
+_FOOTER_SIZE = HEAD.size + 20
+_PADDING = 256  # bytes by which a DataEnd record may be longer than the specification states
+_NO_STATISTICS = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class NewChannel:
-    """A channel to add, with its schema."""
+class LogEnd:
+    """What the end of a file holds, our own earlier records taken away.
 
-    topic: str
-    message_encoding: str
-    schema_name: str
-    schema_encoding: str
-    schema_data: bytes
-    metadata: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class NewMessage:
-    """A message to add; ``channel`` counts the channels that are added with it. Its publish time is
-    its log time.
+    ``start`` is where our records start; ``crc`` is the CRC of the bytes before, 0 where the file
+    has none. ``old_tail`` are the bytes from ``start`` on, our earlier records included.
     """
 
-    channel: int
-    log_time_ns: int
+    header: Header
+    start: int
+    crc: int
+    summary: Summary
+    schemas: Sequence[Schema]
+    channels: Sequence[Channel]
+    old_tail: bytes
+    replaces: bool  # whether the file holds records of ours
+
+
+@dataclass(frozen=True, slots=True)
+class AppendPlan:
+    """How a file changes: from ``start`` on, ``new_tail`` takes the place of ``old_tail``."""
+
+    start: int
+    old_tail: bytes
+    new_tail: bytes
+
+
+class _Tail(NamedTuple):
+    """A file from its DataEnd record on."""
+
+    data_end: int  # offset
+    crc: int
+    groups: dict[int, list[bytes]]  # raw records of the summary by opcode
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Ending:
-    """What is known of a file from its end, without our own records: ``offset`` is where the file
-    is to be continued.
+class _NewRecords(NamedTuple):
+    """The records to add, with the ids that they get in the file."""
 
-    ``crc`` is that of the bytes before ``offset``, 0 where the file has none. ``replaces`` tells
-    that the file holds our records.
-    """
-
-    offset: int
-    crc: int
-    summary: Summary
-    replaces: bool
+    schemas: list[Schema]
+    channels: list[Channel]
+    messages: list[Message]
 
 
 def read_header(file: BinaryIO, path: Path) -> Header:
     """The header record; ``LogError`` when the file is no MCAP file."""
     file.seek(0)
-    start = file.read(8 + 9)
+    start = file.read(len(MAGIC) + HEAD.size)
     if start[:8] != MAGIC or len(start) < 17 or start[8] != Opcode.HEADER:
         raise LogError(
-            f"{path} is not an MCAP file: it does not start with the MCAP magic and a header; give another file."
+            f"{path} is not an MCAP file: it does not start with the MCAP magic and a header; "
+            "give another file."
         )
     length = int.from_bytes(start[9:], "little")
-    body = file.read(min(length, 1 << 20))
+    body = file.read(min(length, MAX_HEADER))
     if len(body) < length:
-        raise LogError(
-            f"{path} is cut off in its header; recover it with `mcap recover {path} -o OUT.mcap`."
-        )
-    return _parse(Header.read, body, path, 8)  # type: ignore[no-any-return]
+        raise LogError(f"{path} is cut off in its header; {_advice(path)}")
+    header: Header = _parsed(Header.read, body, path, len(MAGIC))
+    return header
 
 
-def read_ending(file: BinaryIO, path: Path) -> Ending:
+def read_end(file: BinaryIO, path: Path) -> LogEnd:
     """The end of an MCAP file, our own earlier records taken away.
 
     A file whose summary is missing or incomplete is scanned for what it should list. Raises
-    ``LogError`` when the file is cut off or damaged, or when it holds records of ours that were
-    moved by another tool.
+    ``LogError`` when the file is cut off or damaged, or when it holds records of ours that another
+    tool moved.
     """
-    read_header(file, path)
-    data_end, crc, groups = _locate(file, path)
-    own = _own_metadata(file, groups, data_end)
-    summary = _complete_summary(groups, path) or scan(file, data_end, path)
-    ending = (
-        Ending(data_end, crc, summary, False) if own is None else _without_own(own, summary, path)
-    )
-    for channel in definitions(ending, path)[1]:
+    header = read_header(file, path)
+    tail = _read_tail(file, path)
+    own = _own_metadata(file, tail)
+    summary = _complete_summary(tail.groups, path) or scan(file, tail.data_end, path)
+    start = tail.data_end
+    crc = tail.crc
+    if own is not None:
+        start, crc, summary = _without_own(own, summary, path)
+    file.seek(start)
+    old_tail = file.read(tail.data_end - start) + tail.data
+    schemas = _definitions(Schema.read, summary.groups.get(Opcode.SCHEMA, ()), path, start)
+    channels = _definitions(Channel.read, summary.groups.get(Opcode.CHANNEL, ()), path, start)
+    for channel in channels:
         if RUN_KEY in channel.metadata:
             raise LogError(
-                f"{path} holds results on {channel.topic} that another tool moved or followed by other records, so they cannot be"
-                " replaced; annotate the original log, or remove the /semloc/ topics with `mcap filter` first."
+                f"{path} holds results on {channel.topic} that another tool moved or followed by "
+                "other records, so they cannot be replaced; annotate the original log, or remove "
+                "the /semloc/ topics with `mcap filter` first."
             )
-    return ending
+    return LogEnd(header, start, crc, summary, schemas, channels, old_tail, own is not None)
 
 
-def definitions(ending: Ending, path: Path) -> tuple[list[Schema], list[Channel]]:
-    """Schemas and channels of a file; ``LogError`` where they make no sense."""
-    groups = ending.summary.groups
-    schemas = [
-        _parse(Schema.read, record[9:], path, ending.offset)
-        for record in groups.get(Opcode.SCHEMA, ())
-    ]
-    return schemas, [
-        _parse(Channel.read, record[9:], path, ending.offset)
-        for record in groups.get(Opcode.CHANNEL, ())
-    ]
+def empty_end(profile: str, library: str) -> tuple[bytes, LogEnd]:
+    """The first bytes of a new file, and the end that continues it."""
+    header = Header(profile, library)
+    start = MAGIC + raw(header)
+    summary = Summary({}, _NO_STATISTICS, 0)
+    return start, LogEnd(header, len(start), zlib.crc32(start), summary, (), (), b"", False)
 
 
-def empty_ending(profile: str, library: str) -> tuple[bytes, Ending]:
-    """The first bytes of a new file, and the ending that continues it."""
-    start = MAGIC + raw(Header(profile, library))
-    return start, Ending(
-        len(start), zlib.crc32(start), Summary({}, Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0), 0), False
-    )
-
-
-def compose(
-    ending: Ending,
+def plan_append(
+    end: LogEnd,
     channels: Sequence[NewChannel],
     messages: Sequence[NewMessage],
     name: str,
     metadata: Mapping[str, str],
-) -> bytes:
-    """All bytes of the file from ``ending.offset`` on: our records, DataEnd, summary and footer.
-    Messages must be in log-time order.
+) -> AppendPlan:
+    """The tail with our records: messages (in log-time order), then the metadata record ``name``.
+
+    After them come DataEnd, summary and footer.
     """
-    offset = ending.offset
-    summary = ending.summary
-    old = summary.statistics
-    schemas, ours = _number(summary, channels if messages else ())
-    groups: dict[int, list[bytes]] = {
-        opcode: list(entries) for opcode, entries in summary.groups.items()
-    }
-    groups.setdefault(Opcode.SCHEMA, []).extend(raw(s) for s in schemas)
-    groups.setdefault(Opcode.CHANNEL, []).extend(raw(c) for c in ours)
-    numbered = _sequenced(messages, [c.id for c in ours])
-    # a log whose messages lie outside of chunks has to stay so: readers that find one chunk index
-    # look nowhere else
+    new = _numbered(end.summary, channels if messages else (), messages)
+    # a log whose messages lie outside of chunks stays so: readers that find one chunk index look
+    # nowhere else
     indexes: list[ChunkIndex] = []
-    if summary.loose_messages:
-        body = b"".join(raw(r) for r in (*schemas, *ours, *numbered))
+    if end.summary.loose_messages:
+        body = b"".join(raw(r) for r in (*new.schemas, *new.channels, *new.messages))
     else:
-        body, indexes = _chunks(offset, schemas, ours, numbered)
-    groups.setdefault(Opcode.CHUNK_INDEX, []).extend(raw(i) for i in indexes)
-    record = Metadata(
-        name,
-        {
-            **metadata,
-            "start": str(offset),
-            "records_sha256": hashlib.sha256(body).hexdigest(),
-            "data_section_crc": str(ending.crc),
-            "log_start_ns": str(old.message_start_time),
-            "log_end_ns": str(old.message_end_time),
-            "schema_ids": " ".join(str(s.id) for s in schemas),
-            "channel_ids": " ".join(str(c.id) for c in ours),
-        },
-    )
-    metadata_raw = raw(record)
-    groups.setdefault(Opcode.METADATA_INDEX, []).append(
-        raw(MetadataIndex(offset + len(body), len(metadata_raw), name))
-    )
-    body += metadata_raw
-    counts = dict(old.channel_message_counts) | {
-        c.id: sum(m.channel == k for m in messages) for k, c in enumerate(ours)
+        body, indexes = _chunks(end.start, new)
+    own = raw(Metadata(name, {**metadata, **_marker(end, body, new)}))
+    own_index = MetadataIndex(end.start + len(body), len(own), name)
+    body += own
+
+    groups = {opcode: list(entries) for opcode, entries in end.summary.groups.items()}
+    added: dict[int, Sequence[Any]] = {
+        Opcode.SCHEMA: new.schemas,
+        Opcode.CHANNEL: new.channels,
+        Opcode.CHUNK_INDEX: indexes,
+        Opcode.METADATA_INDEX: [own_index],
     }
-    times = [m.log_time_ns for m in messages] + (
-        [old.message_start_time, old.message_end_time] if old.message_count else []
-    )
-    statistics = Statistics(
-        attachment_count=old.attachment_count,
-        channel_count=old.channel_count + len(ours),
-        channel_message_counts=counts,
-        chunk_count=old.chunk_count + len(indexes),
-        message_count=old.message_count + len(messages),
-        message_end_time=max(times, default=old.message_end_time),
-        message_start_time=min(times, default=old.message_start_time),
-        metadata_count=old.metadata_count + 1,
-        schema_count=old.schema_count + len(schemas),
-    )
-    groups[Opcode.STATISTICS] = [raw(statistics)]
-    body += raw(DataEnd(zlib.crc32(body, ending.crc) if ending.crc else 0))
-    return body + _summary(offset + len(body), groups)
+    for opcode, records in added.items():
+        groups.setdefault(opcode, []).extend(raw(record) for record in records)
+    groups[Opcode.STATISTICS] = [raw(_with_new(end.summary.statistics, new, len(indexes)))]
+
+    body += raw(DataEnd(zlib.crc32(body, end.crc) if end.crc else 0))
+    return AppendPlan(end.start, end.old_tail, body + _summary(end.start + len(body), groups))
 
 
 def content_end(log: Path) -> int | None:
-    """How many bytes of an MCAP file are recorded content, our own records not counted; None when
-    its end is missing or damaged.
+    """How many bytes of an MCAP file are recorded content, our own records not counted.
+
+    None when its end is missing or damaged.
     """
     try:
         with log.open("rb") as file:
-            data_end, _, groups = _locate(file, log)
-            own = _own_metadata(file, groups, data_end)
-            return data_end if own is None else int(own.metadata["start"])
+            tail = _read_tail(file, log)
+            own = _own_metadata(file, tail)
+            return tail.data_end if own is None else int(own.metadata["start"])
     except LogError:
         return None
 
 
-def _locate(file: BinaryIO, path: Path) -> tuple[int, int, dict[int, list[bytes]]]:
-    """Offset of DataEnd, its CRC, and the raw summary records by opcode."""
+# -- reading
+
+
+def _read_tail(file: BinaryIO, path: Path) -> _Tail:
+    """The end of a file from DataEnd on; ``LogError`` when it is cut off or damaged."""
     size = file.seek(0, 2)
-    cut = LogError(
-        f"{path} is cut off or damaged at its end (offset {size}); recover it with `mcap recover {path} -o OUT.mcap`."
-    )
+    cut = LogError(f"{path} is cut off or damaged at its end (offset {size}); {_advice(path)}")
     file.seek(max(0, size - _FOOTER_SIZE - len(MAGIC)))
     end = file.read()
-    if (
-        len(end) != _FOOTER_SIZE + len(MAGIC)
-        or end[-8:] != MAGIC
-        or end[:9] != struct.pack("<BQ", Opcode.FOOTER, 20)
-    ):
+    if len(end) != _FOOTER_SIZE + len(MAGIC) or end[-8:] != MAGIC:
+        raise cut
+    if end[: HEAD.size] != HEAD.pack(Opcode.FOOTER, 20):
         raise cut
     summary_start, _, summary_crc = struct.unpack("<QQI", end[9:29])
     footer_at = size - len(end)
     summary_start = summary_start or footer_at
     if not len(MAGIC) + _DATA_END_SIZE <= summary_start <= footer_at:
         raise cut
-    file.seek(max(0, summary_start - _DATA_END_SIZE - _PADDING))
-    before = file.read(min(summary_start, _DATA_END_SIZE + _PADDING))
-    record = _data_end(before)
+
+    before_at = max(0, summary_start - _DATA_END_SIZE - _PADDING)
+    file.seek(before_at)
+    data = file.read(footer_at - before_at)
+    record = _data_end(data[: summary_start - before_at])
     if record is None:
         raise cut
-    data_end = summary_start - len(record)
-    groups: dict[int, list[bytes]] = {}
-    data = file.read(footer_at - summary_start)
-    if summary_crc and zlib.crc32(end[:25], zlib.crc32(data)) != summary_crc:
+    summary = data[summary_start - before_at :]
+    if summary_crc and zlib.crc32(end[:25], zlib.crc32(summary)) != summary_crc:
         raise LogError(
-            f"{path} has a damaged summary (checksum at offset {size - 12}); recover it with `mcap recover {path} -o OUT.mcap`."
+            f"{path} has a damaged summary (checksum at offset {size - 12}); {_advice(path)}"
         )
-    for opcode, entry in _split(data, cut):
-        if opcode != Opcode.SUMMARY_OFFSET:
-            groups.setdefault(opcode, []).append(entry)
-    return data_end, struct.unpack("<I", record[9:13])[0], groups
+    groups = _groups(summary, cut)
+    crc = int.from_bytes(record[9:13], "little")
+    return _Tail(summary_start - len(record), crc, groups, record + summary + end)
+
+
+def _groups(summary: bytes, error: LogError) -> dict[int, list[bytes]]:
+    """The raw records of a summary by opcode, without the summary offsets."""
+    groups: dict[int, list[bytes]] = {}
+    try:
+        for opcode, start, stop in spans(summary):
+            if opcode != Opcode.SUMMARY_OFFSET:
+                groups.setdefault(opcode, []).append(summary[start - HEAD.size : stop])
+    except LogError:
+        raise error from None
+    return groups
 
 
 def _data_end(before: bytes) -> bytes | None:
     """The DataEnd record at the end of ``before``; a writer may have extended it by some bytes."""
     for padding in range(len(before) - _DATA_END_SIZE + 1):
         record = before[len(before) - _DATA_END_SIZE - padding :]
-        if record[:9] == struct.pack("<BQ", Opcode.DATA_END, 4 + padding):
+        if record[: HEAD.size] == HEAD.pack(Opcode.DATA_END, 4 + padding):
             return record
     return None
-
-
-def _split(data: bytes, error: LogError) -> Iterator[tuple[int, bytes]]:
-    """Records, header included, that lie one after another in ``data``."""
-    at = 0
-    while at < len(data):
-        if at + 9 > len(data):
-            raise error
-        stop = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
-        if stop > len(data):
-            raise error
-        yield data[at], data[at:stop]
-        at = stop
 
 
 def _complete_summary(groups: Mapping[int, list[bytes]], path: Path) -> Summary | None:
     """The summary as it is, if it lists everything that its statistics count."""
     if len(groups.get(Opcode.STATISTICS, ())) != 1:
         return None
-    counted: Statistics = _parse(Statistics.read, groups[Opcode.STATISTICS][0][9:], path, 0)
+    counted = _parsed(Statistics.read, groups[Opcode.STATISTICS][0][HEAD.size :], path, 0)
     listed = {
         opcode: len({entry[9:11] for entry in groups.get(opcode, ())})
         for opcode in (Opcode.SCHEMA, Opcode.CHANNEL)
     }
-    listed |= {
-        o: len(groups.get(o, ()))
-        for o in (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
-    }
+    for opcode in (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+        listed[opcode] = len(groups.get(opcode, ()))
     expected = {
         Opcode.SCHEMA: counted.schema_count,
         Opcode.CHANNEL: counted.channel_count,
@@ -314,31 +283,24 @@ def _complete_summary(groups: Mapping[int, list[bytes]], path: Path) -> Summary 
     return Summary(dict(groups), counted, loose)
 
 
-def _own_metadata(
-    file: BinaryIO, groups: Mapping[int, list[bytes]], data_end: int
-) -> Metadata | None:
-    """Our metadata record, if ours are the last records of the data section and exactly as we wrote
-    them.
-    """
-    for entry in groups.get(Opcode.METADATA_INDEX, ()):
+def _own_metadata(file: BinaryIO, tail: _Tail) -> Metadata | None:
+    """Our metadata record, if ours are the last of the data section, exactly as we wrote them."""
+    for entry in tail.groups.get(Opcode.METADATA_INDEX, ()):
         if entry[29 : 29 + len(METADATA_PREFIX)] != METADATA_PREFIX.encode():
             continue
         offset = int.from_bytes(entry[9:17], "little")
-        if not 0 < offset < data_end:
+        length = tail.data_end - offset
+        if not 0 < offset < tail.data_end or length >= MAX_METADATA:
             continue
         file.seek(offset)
-        record = file.read(data_end - offset) if data_end - offset < 1 << 24 else b""
-        if (
-            len(record) < 9
-            or record[0] != Opcode.METADATA
-            or 9 + int.from_bytes(record[1:9], "little") != len(record)
-        ):
+        record = file.read(length)
+        if record[: HEAD.size] != HEAD.pack(Opcode.METADATA, length - HEAD.size):
             continue
         try:
-            found: Metadata = Metadata.read(ReadDataStream(BytesIO(record[9:])))
+            found: Metadata = parse(Metadata.read, record[HEAD.size :])
             start = int(found.metadata["start"])
             digest = found.metadata["records_sha256"]
-        except (KeyError, ValueError, struct.error, McapError):
+        except (KeyError, ValueError, LogError):
             continue
         if len(MAGIC) < start <= offset and hash_range(file, start, offset).hexdigest() == digest:
             return found
@@ -355,131 +317,171 @@ def hash_range(file: BinaryIO, start: int, stop: int) -> Any:
     return digest
 
 
-def _without_own(own: Metadata, summary: Summary, path: Path) -> Ending:
-    """The ending as it was before our records came."""
+def _without_own(own: Metadata, summary: Summary, path: Path) -> tuple[int, int, Summary]:
+    """Start of our records; CRC and summary as they were before our records came."""
     try:
         start = int(own.metadata["start"])
         crc = int(own.metadata["data_section_crc"])
-        first = int(own.metadata["log_start_ns"])
-        last = int(own.metadata["log_end_ns"])
-        ids = {
-            Opcode.SCHEMA: own.metadata["schema_ids"].split(),
-            Opcode.CHANNEL: own.metadata["channel_ids"].split(),
-        }
-        drop = {opcode: {struct.pack("<H", int(i)) for i in texts} for opcode, texts in ids.items()}
+        times = int(own.metadata["log_start_ns"]), int(own.metadata["log_end_ns"])
+        schema_ids = {struct.pack("<H", int(i)) for i in own.metadata["schema_ids"].split()}
+        channel_ids = {struct.pack("<H", int(i)) for i in own.metadata["channel_ids"].split()}
     except (KeyError, ValueError, struct.error) as error:
         raise LogError(
-            f"{path}: the metadata record {own.name!r} is not one of ours; annotate the original log."
+            f"{path}: the metadata record {own.name!r} is not one of ours; annotate the original "
+            "log."
         ) from error
     groups = {opcode: list(entries) for opcode, entries in summary.groups.items()}
-    for opcode, gone in drop.items():
-        groups[opcode] = [entry for entry in groups.get(opcode, ()) if entry[9:11] not in gone]
-    chunks = groups.get(Opcode.CHUNK_INDEX, [])
-    groups[Opcode.CHUNK_INDEX] = [r for r in chunks if int.from_bytes(r[25:33], "little") < start]
-    groups[Opcode.METADATA_INDEX] = [
-        r
-        for r in groups.get(Opcode.METADATA_INDEX, ())
-        if int.from_bytes(r[9:17], "little") < start
-    ]
+    for opcode, ids in ((Opcode.SCHEMA, schema_ids), (Opcode.CHANNEL, channel_ids)):
+        groups[opcode] = [entry for entry in groups.get(opcode, ()) if entry[9:11] not in ids]
+    # the offset of what they index lies at byte 25 of chunk indexes, at byte 9 of metadata indexes
+    for opcode, place in ((Opcode.CHUNK_INDEX, 25), (Opcode.METADATA_INDEX, 9)):
+        groups[opcode] = [
+            entry
+            for entry in groups.get(opcode, ())
+            if int.from_bytes(entry[place : place + 8], "little") < start
+        ]
     old = summary.statistics
-    channels = {struct.unpack("<H", i)[0] for i in drop[Opcode.CHANNEL]}
-    counts = {c: n for c, n in old.channel_message_counts.items() if c not in channels}
+    ours = {int.from_bytes(i, "little") for i in channel_ids}
+    counts = {c: n for c, n in old.channel_message_counts.items() if c not in ours}
+    dropped = len(summary.groups.get(Opcode.CHUNK_INDEX, ())) - len(groups[Opcode.CHUNK_INDEX])
     statistics = Statistics(
         attachment_count=old.attachment_count,
-        channel_count=old.channel_count - len(channels),
+        channel_count=old.channel_count - len(channel_ids),
         channel_message_counts=counts,
-        chunk_count=old.chunk_count - len(chunks) + len(groups[Opcode.CHUNK_INDEX]),
+        chunk_count=old.chunk_count - dropped,
         message_count=sum(counts.values()),
-        message_end_time=last,
-        message_start_time=first,
+        message_end_time=times[1],
+        message_start_time=times[0],
         metadata_count=old.metadata_count - 1,
-        schema_count=old.schema_count - len(drop[Opcode.SCHEMA]),
+        schema_count=old.schema_count - len(schema_ids),
     )
     loose = summary.loose_messages and statistics.message_count
-    return Ending(start, crc, Summary(groups, statistics, loose), True)
+    return start, crc, Summary(groups, statistics, loose)
 
 
-def _number(summary: Summary, channels: Sequence[NewChannel]) -> tuple[list[Schema], list[Channel]]:
-    """Schema and channel records with ids above those in use."""
-    used = {
-        o: [int.from_bytes(r[9:11], "little") for r in summary.groups.get(o, ())]
-        for o in (Opcode.SCHEMA, Opcode.CHANNEL)
-    }
-    schema_id = max(used[Opcode.SCHEMA], default=0) + 1
-    channel_id = max(used[Opcode.CHANNEL], default=0) + 1
+# -- writing
+
+
+def _numbered(
+    summary: Summary, channels: Sequence[NewChannel], messages: Sequence[NewMessage]
+) -> _NewRecords:
+    """Records with ids above those in use; messages are counted from 0 on each channel."""
+    schema_id = _highest_id(summary, Opcode.SCHEMA) + 1
+    channel_id = _highest_id(summary, Opcode.CHANNEL) + 1
     if max(schema_id, channel_id) + len(channels) > 1 << 16:
         raise LogError(
-            "The log has no free schema or channel ids left; write a sidecar with `--sidecar OUT.mcap` instead."
+            "The log has no free schema or channel ids left; write a sidecar with "
+            "`--sidecar OUT.mcap` instead."
         )
-    schemas = [
-        Schema(schema_id + k, c.schema_data, c.schema_encoding, c.schema_name)
-        for k, c in enumerate(channels)
-    ]
-    return schemas, [
-        Channel(channel_id + k, c.topic, c.message_encoding, dict(c.metadata), schema_id + k)
-        for k, c in enumerate(channels)
-    ]
-
-
-def _sequenced(messages: Sequence[NewMessage], ids: Sequence[int]) -> list[Message]:
-    """Message records, counted from 0 on each channel."""
-    seen = [0] * len(ids)
-    out = []
+    new = _NewRecords([], [], [])
+    for k, c in enumerate(channels):
+        schema = Schema(schema_id + k, c.schema_data, c.schema_encoding, c.schema_name)
+        new.schemas.append(schema)
+        new.channels.append(
+            Channel(channel_id + k, c.topic, c.message_encoding, dict(c.metadata), schema.id)
+        )
+    sequence = [0] * len(channels)
     for m in messages:
-        out.append(Message(ids[m.channel], m.log_time_ns, m.data, m.log_time_ns, seen[m.channel]))
-        seen[m.channel] += 1
-    return out
+        time = m.log_time_ns
+        number = sequence[m.channel]
+        new.messages.append(Message(channel_id + m.channel, time, m.data, time, number))
+        sequence[m.channel] += 1
+    return new
 
 
-def _chunks(
-    offset: int, schemas: list[Schema], channels: list[Channel], messages: list[Message]
-) -> tuple[bytes, list[ChunkIndex]]:
-    """Compressed chunks with their message indexes, as they stand at ``offset``; schemas and
-    channels open the first.
+def _highest_id(summary: Summary, opcode: Opcode) -> int:
+    ids = (int.from_bytes(record[9:11], "little") for record in summary.groups.get(opcode, ()))
+    return max(ids, default=0)
+
+
+def _marker(end: LogEnd, body: bytes, new: _NewRecords) -> dict[str, str]:
+    """What a later run needs to take our records away."""
+    old = end.summary.statistics
+    return {
+        "start": str(end.start),
+        "records_sha256": hashlib.sha256(body).hexdigest(),
+        "data_section_crc": str(end.crc),
+        "log_start_ns": str(old.message_start_time),
+        "log_end_ns": str(old.message_end_time),
+        "schema_ids": " ".join(str(s.id) for s in new.schemas),
+        "channel_ids": " ".join(str(c.id) for c in new.channels),
+    }
+
+
+def _with_new(old: Statistics, new: _NewRecords, chunks: int) -> Statistics:
+    """The statistics of a file with our records."""
+    counts = dict(old.channel_message_counts)
+    for channel in new.channels:
+        counts[channel.id] = sum(m.channel_id == channel.id for m in new.messages)
+    times = [m.log_time for m in new.messages]
+    if old.message_count:
+        times += [old.message_start_time, old.message_end_time]
+    return Statistics(
+        attachment_count=old.attachment_count,
+        channel_count=old.channel_count + len(new.channels),
+        channel_message_counts=counts,
+        chunk_count=old.chunk_count + chunks,
+        message_count=old.message_count + len(new.messages),
+        message_end_time=max(times, default=old.message_end_time),
+        message_start_time=min(times, default=old.message_start_time),
+        metadata_count=old.metadata_count + 1,
+        schema_count=old.schema_count + len(new.schemas),
+    )
+
+
+def _chunks(offset: int, new: _NewRecords) -> tuple[bytes, list[ChunkIndex]]:
+    """Compressed chunks with their message indexes, as they are at ``offset`` of the file.
+
+    Schemas and channels open the first.
     """
     body = b""
-    indexes = []
-    compressor = zstandard.ZstdCompressor(level=3)
-    at = 0
-    while at < len(messages):
-        data = bytearray(b"".join(raw(r) for r in (*schemas, *channels)) if at == 0 else b"")
-        first = at
-        index = dict[int, MessageIndex]()
-        while at < len(messages) and (at == first or len(data) < CHUNK_SIZE):
-            m = messages[at]
-            index.setdefault(m.channel_id, MessageIndex(m.channel_id, [])).records.append(
-                (m.log_time, len(data))
-            )
+    indexes: list[ChunkIndex] = []
+    definitions = b"".join(raw(r) for r in (*new.schemas, *new.channels))
+    position = 0
+    while position < len(new.messages):
+        data = bytearray(b"" if position else definitions)
+        first = position
+        index: dict[int, MessageIndex] = {}
+        while position < len(new.messages) and (position == first or len(data) < CHUNK_SIZE):
+            m = new.messages[position]
+            entry = index.setdefault(m.channel_id, MessageIndex(m.channel_id, []))
+            entry.records.append((m.log_time, len(data)))
             data += raw(m)
-            at += 1
-        packed = compressor.compress(bytes(data))
-        times = [m.log_time for m in messages[first:at]]
-        chunk = raw(Chunk("zstd", packed, max(times), min(times), zlib.crc32(data), len(data)))
-        start = offset + len(body)
-        offsets = dict[int, int]()
-        tail = b""
-        for channel_id, entry in index.items():
-            offsets[channel_id] = start + len(chunk) + len(tail)
-            tail += raw(entry)
-        indexes.append(
-            ChunkIndex(
-                len(chunk),
-                start,
-                "zstd",
-                len(packed),
-                max(times),
-                len(tail),
-                offsets,
-                min(times),
-                len(data),
-            )
-        )
-        body += chunk + tail
+            position += 1
+        times = [m.log_time for m in new.messages[first:position]]
+        written, chunk_index = _chunk(offset + len(body), bytes(data), times, index)
+        body += written
+        indexes.append(chunk_index)
     return body, indexes
 
 
+def _chunk(
+    start: int, data: bytes, times: list[int], index: Mapping[int, MessageIndex]
+) -> tuple[bytes, ChunkIndex]:
+    """A chunk at offset ``start`` of the file with its message indexes, and its index."""
+    packed = zstandard.ZstdCompressor(level=3).compress(data)
+    chunk = raw(Chunk("zstd", packed, max(times), min(times), zlib.crc32(data), len(data)))
+    offsets: dict[int, int] = {}
+    tail = b""
+    for channel_id, entry in index.items():
+        offsets[channel_id] = start + len(chunk) + len(tail)
+        tail += raw(entry)
+    chunk_index = ChunkIndex(
+        chunk_length=len(chunk),
+        chunk_start_offset=start,
+        compression="zstd",
+        compressed_size=len(packed),
+        message_end_time=max(times),
+        message_index_length=len(tail),
+        message_index_offsets=offsets,
+        message_start_time=min(times),
+        uncompressed_size=len(data),
+    )
+    return chunk + tail, chunk_index
+
+
 def _summary(start: int, groups: Mapping[int, list[bytes]]) -> bytes:
-    """Summary, summary offsets, footer and magic as they stand at offset ``start``."""
+    """Summary, summary offsets, footer and magic as they are at offset ``start`` of the file."""
     out = b""
     offsets = []
     for opcode in (*SUMMARY_ORDER, *sorted(set(groups) - set(SUMMARY_ORDER))):
@@ -489,14 +491,26 @@ def _summary(start: int, groups: Mapping[int, list[bytes]]) -> bytes:
     offset_start = start + len(out)
     out += b"".join(raw(o) for o in offsets)
     footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
-    return out + raw(Footer(start, offset_start, zlib.crc32(footer, zlib.crc32(out)))) + MAGIC
+    crc = zlib.crc32(footer, zlib.crc32(out))
+    return out + raw(Footer(start, offset_start, crc)) + MAGIC
 
 
-def _parse(read: Any, body: bytes, path: Path, offset: int) -> Any:
-    """One record's fields; ``LogError`` when its bytes make no sense."""
+def _definitions(
+    read: Callable[[ReadDataStream], Record], records: Sequence[bytes], path: Path, offset: int
+) -> list[Record]:
+    """Schemas or channels of a summary; ``LogError`` where they make no sense."""
+    return [_parsed(read, record[HEAD.size :], path, offset) for record in records]
+
+
+def _parsed(
+    read: Callable[[ReadDataStream], Record], body: bytes, path: Path, offset: int
+) -> Record:
+    """A record from its body; ``LogError`` when its bytes make no sense."""
     try:
-        return read(ReadDataStream(BytesIO(body)))
-    except (struct.error, ValueError, McapError) as error:
-        raise LogError(
-            f"{path} is damaged near offset {offset}; recover it with `mcap recover {path} -o OUT.mcap`."
-        ) from error
+        return parse(read, body)
+    except LogError as error:
+        raise LogError(f"{path} is damaged near offset {offset}; {_advice(path)}") from error
+
+
+def _advice(path: Path) -> str:
+    return f"recover it with `mcap recover {path} -o OUT.mcap`."

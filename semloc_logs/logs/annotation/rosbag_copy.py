@@ -1,6 +1,4 @@
-"""ROS bags that are no MCAP files, as raw messages: what has to be known to write beside them, and
-a copy of them as MCAP.
-"""
+"""ROS bags that are not MCAP files: facts for a writer of new channels, and a copy as MCAP."""
 
 from __future__ import annotations
 
@@ -24,8 +22,9 @@ QOS_KEY = "offered_qos_profiles"
 
 @contextlib.contextmanager
 def opened(log: Path) -> Iterator[Sequence[Any]]:
-    """Open rosbags readers of a .bag, a .db3, or a ROS 2 bag folder (the .db3 or .mcap files in it
-    where metadata.yaml is missing).
+    """Open rosbags readers of a .bag, a .db3, or a ROS 2 bag folder.
+
+    Of a folder without metadata.yaml: readers of the .db3 or .mcap files in it.
     """
     with contextlib.ExitStack() as stack:
         with _told(log):
@@ -90,7 +89,8 @@ def write_copy(log: Path, readers: Sequence[Any], file: BinaryIO, library: str) 
     expected = sum(r.message_count for r in readers)
     if written != expected:
         raise LogError(
-            f"{log} holds {expected} messages but only {written} could be read; repair it with `rosbag reindex` or `ros2 bag reindex`."
+            f"{log} holds {expected} messages but only {written} could be read; "
+            "repair it with `rosbag reindex` or `ros2 bag reindex`."
         )
     writer.finish()  # type: ignore[no-untyped-call]
     return written
@@ -107,13 +107,14 @@ def _readers(log: Path) -> list[Any]:
     files = sorted(f for f in folder.iterdir() if f.suffix in (".db3", ".mcap"))
     if not files:
         raise LogError(
-            f"{folder} holds no ROS 2 bag: neither metadata.yaml nor .db3 or .mcap files; give the folder of a bag."
+            f"{folder} holds no ROS 2 bag: neither metadata.yaml nor .db3 or .mcap files; "
+            "give the folder of a bag."
         )
     return [Reader2(f) for f in files]
 
 
 def _guarded(log: Path, reader: Any) -> Iterator[tuple[Any, int, bytes]]:
-    """The messages of a reader, with one kind of error; errors of the one who writes them pass by."""
+    """The messages of a reader, with one kind of error; errors of their writer pass by."""
     with _told(log):
         messages = reader.messages(reader.connections) if reader.connections else iter(())
     while True:
@@ -126,8 +127,9 @@ def _guarded(log: Path, reader: Any) -> Iterator[tuple[Any, int, bytes]]:
 
 @contextlib.contextmanager
 def _told(log: Path) -> Iterator[None]:
-    """Whatever the library raises on a damaged bag (it is of many types, AssertionError among them)
-    becomes a LogError.
+    """Whatever the library raises on a damaged bag becomes a LogError.
+
+    The errors are of many types, AssertionError among them.
     """
     try:
         yield
@@ -135,13 +137,15 @@ def _told(log: Path) -> Iterator[None]:
         raise
     except Exception as error:
         raise LogError(
-            f"{log} cannot be read as a bag ({type(error).__name__}: {error}); repair it with `rosbag reindex` or `ros2 bag reindex`."
+            f"{log} cannot be read as a bag ({type(error).__name__}: {error}); "
+            "repair it with `rosbag reindex` or `ros2 bag reindex`."
         ) from error
 
 
 def _schema(connection: Any, ros1: bool) -> tuple[str, str, str]:
-    """Name, encoding and text of a connection's definition; a ROS 2 type that is not defined is
-    looked up among the standard ones.
+    """Name, encoding and text of a connection's definition.
+
+    A ROS 2 type that is not defined is looked up among the standard ones.
     """
     name = connection.msgtype
     definition = connection.msgdef

@@ -2,7 +2,7 @@
 
 The bytes that will be overwritten are first saved in ``LOG.semloc-tail`` beside the log and synced;
 only then the log is touched; the saved tail goes away when the log is synced. :func:`recover` sees
-the saved tail of an interrupted run and puts it back, or finds that the new end is complete.
+the saved tail of an interrupted run and puts it back, or finds that the new tail is complete.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semloc_logs.errors import LogError
+from semloc_logs.logs.annotation.mcap_append import AppendPlan
+from semloc_logs.tables.atomic_files import remove_file, replacing_file, stale_temporaries
 
 try:
     import fcntl
@@ -24,9 +26,10 @@ except ImportError:  # a system without advisory locks
 
 SIDE_SUFFIX = ".semloc-tail"
 _MAGIC = b"semloc-tail 1\n"
-# offset, old size, new size, sha256 of: file before the offset, new end, old end
+# offset, old size, new size, sha256 of: file before the offset, new tail, old tail
 _FIELDS = struct.Struct("<QQQ32s32s32s")
 _GUARD = 1 << 16  # bytes at the start and before the offset that identify the file
+_BLOCK = 1 << 24  # bytes read or written at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +40,19 @@ class _Saved:
     new_size: int
     guard: bytes
     new_digest: bytes
-    old_end: bytes
+    old_tail: bytes
+
+    @property
+    def old_size(self) -> int:
+        return self.offset + len(self.old_tail)
 
 
 @contextlib.contextmanager
 def locked(path: Path, *, shared: bool = False) -> Iterator[int]:
-    """A descriptor of ``path`` under an advisory lock: for reading and writing, or, ``shared`` with
-    others, for reading.
+    """A descriptor of ``path`` under an advisory lock.
 
-    Raises ``LogError`` when the file cannot be opened so, or when another process holds the lock.
+    For reading and writing, or, ``shared`` with others, for reading. Raises ``LogError`` when the
+    file cannot be opened so, or when another process holds the lock.
     """
     try:
         fd = os.open(path, os.O_RDONLY if shared else os.O_RDWR)
@@ -65,58 +72,49 @@ def locked(path: Path, *, shared: bool = False) -> Iterator[int]:
         os.close(fd)
 
 
-def replace_end(path: Path, fd: int, offset: int, new_end: bytes) -> None:
-    """Let the locked file ``fd`` at ``path`` end with ``new_end`` from ``offset`` on, or leave it
-    as it was.
+def swap_tail(path: Path, fd: int, plan: AppendPlan) -> None:
+    """Apply ``plan`` to the locked file ``fd`` at ``path``, or leave the file as it was.
 
     Raises ``LogError`` when it cannot be written; the file then is what it was before, now or after
     :func:`recover`.
     """
-    old_end = _read(fd, offset, os.fstat(fd).st_size - offset)
-    if old_end == new_end:
+    if plan.old_tail == plan.new_tail:
         return
-    saved = _Saved(
-        offset, offset + len(new_end), _guard(fd, offset), hashlib.sha256(new_end).digest(), old_end
-    )
+    digest = hashlib.sha256(plan.new_tail).digest()
+    new_size = plan.start + len(plan.new_tail)
+    saved = _Saved(plan.start, new_size, _guard(fd, plan.start), digest, plan.old_tail)
     side = _side(path)
     try:
         _save(side, saved)
     except OSError as error:
-        for leftover in (_temporary(side), side):
-            with contextlib.suppress(OSError):
-                os.unlink(leftover)
+        with contextlib.suppress(OSError):
+            os.unlink(side)
         raise LogError(
-            f"{path} is unchanged: its end could not be saved to {side} ({error.strerror}); make room or use `-o`."
+            f"{path} is unchanged: its end could not be saved to {side} ({error.strerror}); "
+            "make room or use `-o`."
         ) from error
     try:
-        _write(fd, new_end, offset)
-        os.ftruncate(fd, saved.new_size)
-        os.fsync(fd)
+        _write_tail(fd, plan.start, plan.new_tail)
     except BaseException as error:
-        try:
-            _restore(fd, saved)
-            _remove(side)
-        except OSError as second:
-            raise LogError(
-                f"{path} could not be restored ({second.strerror}); make room, and the next command repairs it."
-            ) from second
+        _undo(path, fd, saved)
         if isinstance(error, OSError):
             raise LogError(
-                f"{path} is unchanged: results could not be written ({error.strerror}); make room and try again."
+                f"{path} is unchanged: results could not be written ({error.strerror}); "
+                "make room and try again."
             ) from error
         raise
-    _remove(side)
+    remove_file(side)
 
 
 def recover(path: Path) -> bool:
-    """Repair a log whose end was being written when the process died; True when there was something
-    to repair.
+    """Repair a log whose tail was being written when the process died.
 
-    Costs one look into the folder when there is nothing to do. Raises ``LogError`` when another
-    process is writing right now, or when the saved tail does not belong to the log.
+    True when there was something to repair. Costs one look into the folder when there is nothing to
+    do. Raises ``LogError`` when another process is writing right now, or when the saved tail does
+    not belong to the log.
     """
     side = _side(path)
-    if not path.is_file() or not (side.exists() or _temporary(side).exists()):
+    if not path.is_file() or not (side.exists() or stale_temporaries(side)):
         return False
     with locked(path) as fd:
         return recover_locked(path, fd)
@@ -128,57 +126,38 @@ def recover_locked(path: Path, fd: int) -> bool:
     repaired = False
     try:
         if side.exists():
-            saved = _load(side)
-            size = os.fstat(fd).st_size
-            sizes = (saved.offset + len(saved.old_end), saved.new_size)
-            if not saved.offset <= size <= max(sizes) or _guard(fd, saved.offset) != saved.guard:
-                raise LogError(
-                    f"{side} is not the saved end of this state of {path}; if the log is good, delete that file and go on."
-                )
-            # a finished end is kept: only the removal of the side file was missing
-            if (
-                size != saved.new_size
-                or hashlib.sha256(_read(fd, saved.offset, size - saved.offset)).digest()
-                != saved.new_digest
-            ):
-                _restore(fd, saved)
-            _remove(side)
+            _repair(path, fd, side)
             repaired = True
-        if _temporary(side).exists():  # died while saving: the log was not touched yet
-            os.unlink(_temporary(side))
+        for temporary in stale_temporaries(side):  # died while saving: the log was not touched yet
+            remove_file(temporary)
     except OSError as error:
         raise LogError(
-            f"{path} cannot be repaired from {side} ({error.strerror}); make room or make it writable."
+            f"{path} cannot be repaired from {side} ({error.strerror}); "
+            "make room or make it writable."
         ) from error
     return repaired
 
 
 def copy_start(source: int, target: int, length: int) -> None:
     """Copy the first ``length`` bytes of a descriptor to another without looking at them."""
-    at = 0
+    position = 0
     if hasattr(os, "copy_file_range"):
         with contextlib.suppress(OSError):  # other file systems, old kernels: go on by hand
-            while at < length and (
-                n := os.copy_file_range(source, target, min(length - at, 1 << 30), at, at)
-            ):
-                at += n
-    while at < length:
-        block = os.pread(source, min(length - at, 1 << 20), at)
+            while position < length:
+                count = min(length - position, 1 << 30)
+                copied = os.copy_file_range(source, target, count, position, position)
+                if not copied:
+                    break
+                position += copied
+    while position < length:
+        block = os.pread(source, min(length - position, 1 << 20), position)
         if not block:
             raise LogError(
-                f"The log became shorter while it was copied (at offset {at}); let its recording end first."
+                f"The log became shorter while it was copied (at offset {position}); "
+                "let its recording end first."
             )
-        _write(target, block, at)
-        at += len(block)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make renames and removals in a folder durable."""
-    fd = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+        _write(target, block, position)
+        position += len(block)
 
 
 def _side(path: Path) -> Path:
@@ -186,35 +165,19 @@ def _side(path: Path) -> Path:
     return real.with_name(real.name + SIDE_SUFFIX)
 
 
-def _temporary(side: Path) -> Path:
-    return side.with_name(side.name + ".tmp")
-
-
 def _guard(fd: int, offset: int) -> bytes:
     start = max(0, offset - _GUARD)
-    return hashlib.sha256(
-        _read(fd, 0, min(_GUARD, offset)) + _read(fd, start, offset - start)
-    ).digest()
+    head = _read(fd, 0, min(_GUARD, offset))
+    return hashlib.sha256(head + _read(fd, start, offset - start)).digest()
 
 
 def _save(side: Path, saved: _Saved) -> None:
-    digest = hashlib.sha256(saved.old_end).digest()
-    old_size = saved.offset + len(saved.old_end)
-    data = (
-        _MAGIC
-        + _FIELDS.pack(
-            saved.offset, old_size, saved.new_size, saved.guard, saved.new_digest, digest
-        )
-        + saved.old_end
-    )
-    fd = os.open(_temporary(side), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    try:
-        _write(fd, data, 0)
-        os.fsync(fd)
-    finally:
-        os.close(fd)
-    os.replace(_temporary(side), side)
-    sync_folder(side.parent)
+    digest = hashlib.sha256(saved.old_tail).digest()
+    sizes = (saved.offset, saved.old_size, saved.new_size)
+    fields = _FIELDS.pack(*sizes, saved.guard, saved.new_digest, digest)
+    with replacing_file(side, mode=0o600) as temporary:
+        temporary.touch(0o600)  # private from the start: it holds what the log holds
+        temporary.write_bytes(_MAGIC + fields + saved.old_tail)
 
 
 def _load(side: Path) -> _Saved:
@@ -224,28 +187,55 @@ def _load(side: Path) -> _Saved:
         offset, old_size, new_size, guard, new_digest, digest = _FIELDS.unpack(
             data[len(_MAGIC) : head]
         )
-        old_end = data[head:]
-        if offset + len(old_end) == old_size and hashlib.sha256(old_end).digest() == digest:
-            return _Saved(offset, new_size, guard, new_digest, old_end)
+        saved = _Saved(offset, new_size, guard, new_digest, data[head:])
+        if saved.old_size == old_size and hashlib.sha256(saved.old_tail).digest() == digest:
+            return saved
     raise LogError(
-        f"{side} is damaged, so the log beside it cannot be repaired from it; recover the log with `mcap recover`."
+        f"{side} is damaged, so the log beside it cannot be repaired from it; "
+        "recover the log with `mcap recover`."
     )
 
 
-def _restore(fd: int, saved: _Saved) -> None:
-    _write(fd, saved.old_end, saved.offset)
-    os.ftruncate(fd, saved.offset + len(saved.old_end))
+def _repair(path: Path, fd: int, side: Path) -> None:
+    """Keep a finished new tail, else put the saved one back; then drop the saved one."""
+    saved = _load(side)
+    size = os.fstat(fd).st_size
+    fits = saved.offset <= size <= max(saved.old_size, saved.new_size)
+    if not fits or _guard(fd, saved.offset) != saved.guard:
+        raise LogError(
+            f"{side} is not the saved end of this state of {path}; "
+            "if the log is good, delete that file and go on."
+        )
+    tail = _read(fd, saved.offset, size - saved.offset)
+    if size == saved.new_size and hashlib.sha256(tail).digest() == saved.new_digest:
+        os.fsync(fd)  # what a killed process wrote may still be in memory only
+    else:
+        _write_tail(fd, saved.offset, saved.old_tail)
+    remove_file(side)
+
+
+def _undo(path: Path, fd: int, saved: _Saved) -> None:
+    """Put the saved tail back after a failed write."""
+    try:
+        _write_tail(fd, saved.offset, saved.old_tail)
+        remove_file(_side(path))
+    except OSError as error:
+        raise LogError(
+            f"{path} could not be restored ({error.strerror}); "
+            "make room, and the next command repairs it."
+        ) from error
+
+
+def _write_tail(fd: int, offset: int, tail: bytes) -> None:
+    """Let a file end with ``tail`` from ``offset`` on, durably."""
+    _write(fd, tail, offset)
+    os.ftruncate(fd, offset + len(tail))
     os.fsync(fd)
-
-
-def _remove(side: Path) -> None:
-    os.unlink(side)
-    sync_folder(side.parent)
 
 
 def _read(fd: int, offset: int, length: int) -> bytes:
     parts = []
-    while length > 0 and (block := os.pread(fd, min(length, 1 << 24), offset)):
+    while length > 0 and (block := os.pread(fd, min(length, _BLOCK), offset)):
         parts.append(block)
         offset += len(block)
         length -= len(block)
@@ -255,6 +245,6 @@ def _read(fd: int, offset: int, length: int) -> bytes:
 def _write(fd: int, data: bytes, offset: int) -> None:
     view = memoryview(data)
     while view:
-        n = os.pwrite(fd, view[: 1 << 24], offset)
-        view = view[n:]
-        offset = offset + n
+        written = os.pwrite(fd, view[:_BLOCK], offset)
+        view = view[written:]
+        offset += written

@@ -1,5 +1,6 @@
-"""MCAP files: by their index where it can be trusted, else by walking over what is readable; memory
-holds overlapping chunks only.
+"""MCAP files: by their index where it can be trusted, else by walking over all records.
+
+Memory holds overlapping chunks only.
 """
 
 from __future__ import annotations
@@ -7,14 +8,11 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from functools import partial
-from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
 
@@ -22,28 +20,32 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import (
     BaseLog,
     closed_on_error,
-    decompress,
     encoding_of,
     in_log_time_order,
     open_file,
     read_exactly,
 )
+from semloc_logs.logs.containers.mcap_records import (
+    HEAD,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_BODY,
+    chunk_head,
+    chunk_records,
+    parse,
+    spans,
+    walk,
+)
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
 from semloc_logs.logs.problems import Problems
 
-MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")
-# a message record up to its data: opcode, length, channel, sequence, log time, publish time
-_MESSAGE = struct.Struct("<BQHIQQ")
 _FOOTER = struct.Struct("<BQQQI")
 _LOOSE = 1 << 22  # messages outside chunks are read in runs of about this many bytes
 
-Record = TypeVar("Record")
-
 
 class Part(NamedTuple):
-    """A chunk record, or a run of messages outside chunks: where it is and which times it covers."""
+    """A chunk record, or a run of messages outside chunks: its place and its times."""
 
     offset: int
     size: int
@@ -69,8 +71,9 @@ class McapLog(BaseLog):
             self._open()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
-        """The messages of ``topics`` (None: of all) in log-time order; a damaged chunk is skipped
-        and named in ``problems``.
+        """The messages of ``topics`` (None: of all) in log-time order.
+
+        A damaged chunk is skipped and named in ``problems``.
         """
         wanted = None if topics is None else frozenset(topics)
         parts = (
@@ -104,19 +107,15 @@ class McapLog(BaseLog):
 
     def _profile(self) -> str:
         try:
-            opcode, length = _RECORD.unpack(read_exactly(self._file, 8, _RECORD.size, self._size))
+            opcode, length = HEAD.unpack(read_exactly(self._file, 8, HEAD.size, self._size))
             if opcode != Opcode.HEADER:
                 return ""
-            return str(
-                self._parse(Header.read, read_exactly(self._file, 17, length, self._size)).profile
-            )
+            return str(parse(Header.read, read_exactly(self._file, 17, length, self._size)).profile)
         except LogError:
             return ""  # the walk over the file will name the damage
 
     def _read_summary(self) -> dict[int, int] | None:
-        """Message counts by channel if index and statistics can be trusted to describe the whole
-        file, else None.
-        """
+        """Message counts by channel; None where the index does not describe the whole file."""
         tail_size = _FOOTER.size + len(MAGIC)
         if self._size < len(MAGIC) + tail_size:
             return None
@@ -133,28 +132,21 @@ class McapLog(BaseLog):
         summary = read_exactly(self._file, summary_start, footer_at - summary_start, self._size)
         if crc and zlib.crc32(tail[: _FOOTER.size - 4], zlib.crc32(summary)) != crc:
             self._problems.add(
-                f"{self._name}: the index at byte {summary_start} does not match its checksum, so the whole file was walked."
+                f"{self._name}: the index at byte {summary_start} does not match its "
+                "checksum, so the whole file was walked."
             )
             return None
         try:
             return self._trusted_summary(summary)
         except LogError as error:
             self._problems.add(
-                f"{self._name}: the index at byte {summary_start} is damaged ({error}), so the whole file was walked."
+                f"{self._name}: the index at byte {summary_start} is damaged ({error}), "
+                "so the whole file was walked."
             )
             return None
 
     def _trusted_summary(self, summary: bytes) -> dict[int, int] | None:
-        statistics: Statistics | None = None
-        indexes: list[ChunkIndex] = []
-        for opcode, start, end in _records(summary):
-            body = summary[start:end]
-            if opcode == Opcode.STATISTICS:
-                statistics = self._parse(Statistics.read, body)
-            elif opcode == Opcode.CHUNK_INDEX:
-                indexes.append(self._parse(ChunkIndex.read, body))
-            else:
-                self._define(opcode, body)
+        statistics, indexes = self._summary_records(summary)
         if (
             statistics is None
             or len(indexes) != statistics.chunk_count
@@ -171,7 +163,8 @@ class McapLog(BaseLog):
         for i in indexes:
             if i.chunk_start_offset + i.chunk_length > self._size:
                 raise LogError(
-                    f"a chunk is claimed at byte {i.chunk_start_offset}, but the file ends at byte {self._size}"
+                    f"a chunk is claimed at byte {i.chunk_start_offset}, "
+                    f"but the file ends at byte {self._size}"
                 )
             channels = frozenset(i.message_index_offsets)
             self._parts.append(
@@ -189,38 +182,48 @@ class McapLog(BaseLog):
             self.end_ns = statistics.message_end_time
         return counts
 
+    def _summary_records(self, summary: bytes) -> tuple[Statistics | None, list[ChunkIndex]]:
+        """Statistics and chunk indexes; learns of schemas and channels on the way."""
+        statistics: Statistics | None = None
+        indexes: list[ChunkIndex] = []
+        for opcode, start, end in spans(summary):
+            body = summary[start:end]
+            if opcode == Opcode.STATISTICS:
+                statistics = parse(Statistics.read, body)
+            elif opcode == Opcode.CHUNK_INDEX:
+                indexes.append(parse(ChunkIndex.read, body))
+            else:
+                self._define(opcode, body)
+        return statistics, indexes
+
     def _scan(self) -> dict[int, int]:
-        """Walks over all records, decompresses every chunk once, and so finds parts and counts of
-        what can be read.
+        """Walks over all records and decompresses every chunk once.
+
+        Finds parts and counts of everything that can be read.
         """
         self._parts.clear()
         counts: Counter[int] = Counter()
         position = len(MAGIC)
         closed = False
         loose: list[Part] = []
-        while position + _RECORD.size <= self._size and not closed:
-            opcode, length = _RECORD.unpack(
-                read_exactly(self._file, position, _RECORD.size, self._size)
-            )
-            end = position + _RECORD.size + length
-            if opcode == 0 or end > self._size:
-                break
+        for opcode, offset, size in walk(self._file, position, self._size):
             try:
                 if opcode == Opcode.CHUNK:
-                    self._scan_chunk(position, end - position, counts)
-                elif opcode == Opcode.MESSAGE and length >= 22:
-                    self._scan_loose(position, end - position, loose, counts)
+                    self._scan_chunk(offset, size, counts)
+                elif opcode == Opcode.MESSAGE and size >= MESSAGE.size:
+                    self._scan_loose(offset, size, loose, counts)
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self._define(
-                        opcode,
-                        read_exactly(self._file, position + _RECORD.size, length, self._size),
-                    )
+                    body_size = size - HEAD.size
+                    body = read_exactly(self._file, offset + HEAD.size, body_size, self._size)
+                    self._define(opcode, body)
             except LogError as error:
                 self._problems.add(
-                    f"{self._name}: the record at byte {position} was skipped: {error}."
+                    f"{self._name}: the record at byte {offset} was skipped: {error}."
                 )
+            position = offset + size
             closed = opcode in (Opcode.DATA_END, Opcode.FOOTER)
-            position = end
+            if closed:
+                break
         self._parts += loose
         if (
             not closed
@@ -246,8 +249,8 @@ class McapLog(BaseLog):
             self._parts.append(Part(offset, size, min(times), max(times), channels, True))
 
     def _scan_loose(self, offset: int, size: int, loose: list[Part], counts: Counter[int]) -> None:
-        _, _, channel, _, log_time, _ = _MESSAGE.unpack(
-            read_exactly(self._file, offset, _MESSAGE.size, self._size)
+        _, _, channel, _, log_time, _ = MESSAGE.unpack(
+            read_exactly(self._file, offset, MESSAGE.size, self._size)
         )
         if channel in self._channels:
             counts[channel] += 1
@@ -280,7 +283,8 @@ class McapLog(BaseLog):
         for log_time, channel, start, end in found:
             if channel not in self._channels:
                 self._problems.add(
-                    f"{self._name}: messages of channel {channel} were skipped: the file does not say what it is."
+                    f"{self._name}: messages of channel {channel} were skipped: "
+                    "the file does not say what it is."
                 )
                 continue
             topic, type_, encoding, definition = self._kind(channel)
@@ -289,60 +293,40 @@ class McapLog(BaseLog):
 
     def _unpack_chunk(self, offset: int, size: int) -> bytes:
         record = read_exactly(self._file, offset, size, self._size)
-        try:
-            opcode, length, _, _, unpacked_size, crc, name_length = struct.unpack_from(
-                "<BQQQQII", record
-            )
-            compression = record[41 : 41 + name_length].decode()
-            (data_length,) = struct.unpack_from("<Q", record, 41 + name_length)
-        except (struct.error, UnicodeDecodeError) as error:
-            raise LogError(f"its head is damaged ({error})") from error
-        start = 49 + name_length
-        if opcode != Opcode.CHUNK or length + _RECORD.size != size or start + data_length > size:
-            raise LogError("it is not the chunk that the index claims")
-        data = decompress(record[start : start + data_length], compression, unpacked_size)
-        if crc and zlib.crc32(data) != crc:
-            raise LogError("its checksum does not match its data")
-        return data
+        return chunk_records(record, chunk_head(record))
 
     def _walk(self, data: bytes, offset: int) -> list[tuple[int, int, int, int]]:
-        """(log time, channel, start, end) of the messages in ``data``; learns of schemas and
-        channels on the way.
+        """(log time, channel, start, end) of the messages in ``data``.
+
+        Learns of schemas and channels on the way.
         """
         found = []
-        unpack = _MESSAGE.unpack_from
-        record_size = _RECORD.size
+        unpack = MESSAGE.unpack_from
+        record_size = HEAD.size
         message = int(Opcode.MESSAGE)
         try:
-            for opcode, start, end in _records(data):
+            for opcode, start, end in spans(data):
                 if opcode == message:
-                    if end - start < 22:
+                    if end - start < MESSAGE_BODY:
                         raise LogError(f"a message has {end - start} bytes")
                     _, _, channel, _, log_time, _ = unpack(data, start - record_size)
-                    found.append((log_time, channel, start + 22, end))
+                    found.append((log_time, channel, start + MESSAGE_BODY, end))
                 else:
                     self._define(opcode, data[start:end])
         except LogError as error:
             self._problems.add(
-                f"{self._name}: the chunk at byte {offset} is damaged inside: {error}; {len(found)} messages of it are used."
+                f"{self._name}: the chunk at byte {offset} is damaged inside: {error}; "
+                f"{len(found)} messages of it are used."
             )
         return found
 
     def _define(self, opcode: int, body: bytes) -> None:
         if opcode == Opcode.SCHEMA:
-            schema = self._parse(Schema.read, body)
+            schema = parse(Schema.read, body)
             self._schemas.setdefault(schema.id, schema)
         elif opcode == Opcode.CHANNEL:
-            channel = self._parse(Channel.read, body)
+            channel = parse(Channel.read, body)
             self._channels.setdefault(channel.id, channel)
-
-    def _parse(self, read: Callable[[ReadDataStream], Record], body: bytes) -> Record:
-        try:
-            return read(ReadDataStream(BytesIO(body)))
-        except (McapError, struct.error, ValueError, MemoryError, OverflowError) as error:
-            raise LogError(
-                f"a record cannot be parsed ({error or type(error).__name__})"
-            ) from error
 
     def _topic(self, channel: int) -> str:
         return self._kind(channel)[0] if channel in self._channels else ""
@@ -366,24 +350,3 @@ class McapLog(BaseLog):
                 return c.topic, type_, c.message_encoding, definition  # its schema may still come
             self._kinds[channel] = (c.topic, type_, c.message_encoding, definition)
         return self._kinds[channel]
-
-
-def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """(opcode, start of its body, end of its body) of the records in ``data``; LogError where they
-    stop making sense.
-    """
-    position = 0
-    size = len(data)
-    head = _RECORD.size
-    unpack = _RECORD.unpack_from
-    while position + head <= size:
-        opcode, length = unpack(data, position)
-        start = position + head
-        position = start + length
-        if position > size:
-            raise LogError(
-                f"a record at byte {start - head} in it claims {length} bytes of {size - start}"
-            )
-        yield opcode, start, position
-    if position != size:
-        raise LogError(f"{size - position} bytes at its end are no record")

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import struct
-import zlib
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame
-import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.exceptions import McapError
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Chunk, ChunkIndex, McapRecord, MetadataIndex, Statistics
+from mcap.records import AttachmentIndex, ChunkIndex, MetadataIndex, Statistics
 
 from semloc_logs.errors import LogError
+from semloc_logs.logs.containers.mcap_records import (
+    HEAD,
+    MAGIC,
+    MESSAGE_BODY,
+    chunk_head,
+    chunk_records,
+    parse,
+    raw,
+    spans,
+    walk,
+)
 
+MAX_NAMES = 1 << 16  # bytes at the start of attachments and metadata in which their names lie
 SUMMARY_ORDER = (
     Opcode.SCHEMA,
     Opcode.CHANNEL,
@@ -31,9 +38,7 @@ SUMMARY_ORDER = (
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Raw summary records by opcode, the statistics, and the number of messages that lie outside of
-    chunks.
-    """
+    """Raw summary records by opcode, the statistics, the number of messages outside of chunks."""
 
     groups: dict[int, list[bytes]]
     statistics: Statistics
@@ -71,122 +76,83 @@ def scan(file: BinaryIO, data_end: int, path: Path) -> Summary:
     record does not fit or is damaged.
     """
     found = _Found()
-    at = len(b"\x89MCAP0\r\n")
+    offset = end = len(MAGIC)
     try:
-        while at < data_end:
-            file.seek(at)
-            head = file.read(9)
-            opcode, length = struct.unpack("<BQ", head)
-            if at + 9 + length > data_end:
-                raise ValueError("record reaches beyond the data section")
-            _visit(found, file, opcode, at, length, head)
-            at += 9 + length
-    except (
-        struct.error,
-        ValueError,
-        KeyError,
-        EOFError,
-        RuntimeError,
-        zstandard.ZstdError,
-        McapError,
-    ) as error:
+        for opcode, start, size in walk(file, offset, data_end):
+            offset = start
+            _visit(found, file, opcode, offset, size)
+            end = offset + size
+        if end != data_end:
+            offset = end
+            raise LogError("record reaches beyond the data section")
+    except (struct.error, LogError) as error:
         raise LogError(
-            f"{path} is damaged at offset {at} ({error}) and has no complete summary; recover it with `mcap recover {path} -o OUT.mcap`."
+            f"{path} is damaged at offset {offset} ({error}) and has no complete summary; "
+            f"recover it with `mcap recover {path} -o OUT.mcap`."
         ) from error
     return _summarise(found)
 
 
-def _visit(found: _Found, file: BinaryIO, opcode: int, at: int, length: int, head: bytes) -> None:
+def _visit(found: _Found, file: BinaryIO, opcode: int, offset: int, size: int) -> None:
+    """Note one record of ``size`` bytes; the file is at the start of its body."""
+    length = size - HEAD.size
     if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-        found.definition(opcode, head + file.read(length))
+        found.definition(opcode, HEAD.pack(opcode, length) + file.read(length))
     elif opcode == Opcode.MESSAGE:
-        found.message(file.read(min(length, 22)))
+        found.message(file.read(min(length, MESSAGE_BODY)))
         found.loose += 1
     elif opcode == Opcode.CHUNK:
-        _visit_chunk(found, file.read(length), at)
+        _visit_chunk(found, HEAD.pack(opcode, length) + file.read(length), offset)
     elif opcode == Opcode.MESSAGE_INDEX and found.chunks:
-        channel, size = struct.unpack("<HI", file.read(6))
+        channel, entries = struct.unpack("<HI", file.read(6))
         chunk = found.chunks[-1]
         # writers differ on whether a channel without messages in the chunk gets an index; one
-        # without entries says nothing
-        if size:
-            chunk.message_index_offsets[channel] = at
-        chunk.message_index_length = at + 9 + length - chunk.chunk_start_offset - chunk.chunk_length
+        # without entries tells nothing
+        if entries:
+            chunk.message_index_offsets[channel] = offset
+        chunk_end = chunk.chunk_start_offset + chunk.chunk_length
+        chunk.message_index_length = offset + size - chunk_end
     elif opcode == Opcode.ATTACHMENT:
-        stream = ReadDataStream(BytesIO(file.read(min(length, 1 << 16))))
+        body = file.read(min(length, MAX_NAMES))
+        found.attachments.append(parse(_attachment_index(offset, size), body))
+    elif opcode == Opcode.METADATA:
+        name = parse(ReadDataStream.read_prefixed_string, file.read(min(length, MAX_NAMES)))
+        found.metadata.append(MetadataIndex(offset, size, name))
+
+
+def _attachment_index(offset: int, size: int) -> Callable[[ReadDataStream], AttachmentIndex]:
+    def read(stream: ReadDataStream) -> AttachmentIndex:
         log_time = stream.read8()
         create_time = stream.read8()
         name = stream.read_prefixed_string()
         media_type = stream.read_prefixed_string()
-        found.attachments.append(
-            AttachmentIndex(at, 9 + length, log_time, create_time, stream.read8(), name, media_type)
-        )
-    elif opcode == Opcode.METADATA:
-        name = ReadDataStream(BytesIO(file.read(min(length, 1 << 16)))).read_prefixed_string()
-        found.metadata.append(MetadataIndex(at, 9 + length, name))
+        data_size = stream.read8()
+        return AttachmentIndex(offset, size, log_time, create_time, data_size, name, media_type)
+
+    return read
 
 
-def _visit_chunk(found: _Found, content: bytes, at: int) -> None:
-    chunk = Chunk.read(ReadDataStream(BytesIO(content)))
-    data = _decompress(chunk)
-    for opcode, start, stop in _records(data):
+def _visit_chunk(found: _Found, record: bytes, offset: int) -> None:
+    head = chunk_head(record)
+    data = chunk_records(record, head)
+    for opcode, start, stop in spans(data):
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            found.definition(opcode, data[start:stop])
+            found.definition(opcode, data[start - HEAD.size : stop])
         elif opcode == Opcode.MESSAGE:
-            found.message(data[start + 9 : min(stop, start + 31)])
+            found.message(data[start : min(stop, start + MESSAGE_BODY)])
     found.chunks.append(
         ChunkIndex(
-            chunk_length=9 + len(content),
-            chunk_start_offset=at,
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
-            message_end_time=chunk.message_end_time,
+            chunk_length=len(record),
+            chunk_start_offset=offset,
+            compression=head.compression,
+            compressed_size=head.data.stop - head.data.start,
+            message_end_time=head.end_ns,
             message_index_length=0,
             message_index_offsets={},
-            message_start_time=chunk.message_start_time,
-            uncompressed_size=chunk.uncompressed_size,
+            message_start_time=head.start_ns,
+            uncompressed_size=head.unpacked_size,
         )
     )
-
-
-def _decompress(chunk: Chunk) -> bytes:
-    """The records of a chunk; memory grows with what is there, not with what the chunk claims."""
-    limit = chunk.uncompressed_size
-    if chunk.compression == "zstd":
-        out = bytearray()
-        with zstandard.ZstdDecompressor().stream_reader(BytesIO(chunk.data)) as reader:
-            while len(out) <= limit and (block := reader.read(1 << 20)):
-                out += block
-        data = bytes(out)
-    elif chunk.compression == "lz4":
-        decoder = lz4.frame.LZ4FrameDecompressor()
-        out = bytearray(decoder.decompress(chunk.data, max_length=1 << 20))
-        while not decoder.eof and len(out) <= limit:
-            block = decoder.decompress(b"", max_length=1 << 20)
-            if not block and decoder.needs_input:
-                break
-            out += block
-        data = bytes(out)
-    elif chunk.compression == "":
-        data = chunk.data
-    else:
-        raise ValueError(f"unknown compression {chunk.compression!r}")
-    if len(data) != limit:
-        raise ValueError(f"chunk of {len(data)} bytes where {limit} were announced")
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ValueError("chunk with a wrong checksum")
-    return data
-
-
-def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and stop of the records in a chunk."""
-    at = 0
-    while at < len(data):
-        opcode, length = struct.unpack_from("<BQ", data, at)
-        if at + 9 + length > len(data):
-            raise ValueError("record reaches beyond its chunk")
-        yield opcode, at, at + 9 + length
-        at += 9 + length
 
 
 def _summarise(found: _Found) -> Summary:
@@ -212,10 +178,3 @@ def _summarise(found: _Found) -> Summary:
         Opcode.METADATA_INDEX: [raw(i) for i in found.metadata],
     }
     return Summary(groups, statistics, found.loose)
-
-
-def raw(record: McapRecord) -> bytes:
-    """The bytes of a record, its opcode and length included."""
-    builder = RecordBuilder()
-    record.write(builder)
-    return bytes(builder.end())  # type: ignore[no-untyped-call]

@@ -1,12 +1,13 @@
-"""Opens whatever log a path names, by its content rather than its suffix."""
+"""Opens the log at a path, by its content rather than its suffix."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.containers import mcap, rosbag1
+from semloc_logs.logs.containers import rosbag1
 from semloc_logs.logs.containers.mcap import McapLog
+from semloc_logs.logs.containers.mcap_records import MAGIC
 from semloc_logs.logs.containers.rosbag1 import Rosbag1Log
 from semloc_logs.logs.containers.rosbag2 import Rosbag2Log
 from semloc_logs.logs.containers.sqlite import SqliteLog
@@ -16,10 +17,9 @@ _SQLITE = b"SQLite format 3\0"
 
 
 def open_log(path: str | Path) -> Log:
-    """The log at ``path``: an MCAP file, a ROS 1 bag, a ROS 2 bag directory, its metadata.yaml, or
-    one of its files.
+    """The log at ``path``: an MCAP file, a ROS 1 bag, a ROS 2 bag directory or one of its files.
 
-    LogError says what it is instead, or what is wrong with it.
+    LogError describes the file where it is not a log, or its damage.
     """
     path = Path(path)
     if path.is_dir():
@@ -35,16 +35,16 @@ def open_log(path: str | Path) -> Log:
         ) from error
     if path.name == "metadata.yaml":
         return Rosbag2Log(path.parent)
-    if head.startswith(mcap.MAGIC):
+    if head.startswith(MAGIC):
         return McapLog(path)
     if head.startswith(b"#ROSBAG V"):
         return Rosbag1Log(path)
     if head.startswith(_SQLITE):
         return SqliteLog(path)
-    raise LogError(f"{path} {_what_it_is(head)}")
+    raise LogError(f"{path} {_description(head)}")
 
 
-def _what_it_is(head: bytes) -> str:
+def _description(head: bytes) -> str:
     if not head:
         return "is empty; record or copy it again."
     if head.startswith(b"version https://git-lfs"):
@@ -55,6 +55,9 @@ def _what_it_is(head: bytes) -> str:
         )
     if head.startswith((b"\x1f\x8b", b"PK\x03\x04", b"BZh", b"\xfd7zXZ")):
         return "is an archive; unpack it first."
-    if mcap.MAGIC.startswith(head) or rosbag1.MAGIC.startswith(head):
+    if MAGIC.startswith(head) or rosbag1.MAGIC.startswith(head):
         return "is cut off within its first bytes; record or copy it again."
-    return "is no log: it starts neither like an MCAP file nor like a ROS 1 bag nor like a ROS 2 sqlite3 bag."
+    return (
+        "is not a log: it starts neither like an MCAP file nor like a ROS 1 bag nor like a ROS 2 "
+        "sqlite3 bag."
+    )

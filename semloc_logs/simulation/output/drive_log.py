@@ -10,8 +10,8 @@ there is neither an IMU nor a label space.
 
 from __future__ import annotations
 
+import errno
 import heapq
-import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,11 +48,26 @@ from semloc_logs.simulation.output.drive_messages import (
     RosMessages,
     antenna,
 )
+from semloc_logs.tables.atomic_files import replacing_file, replacing_folder
 
-# endings; a ROS 2 bag is a directory
-FORMATS = {"mcap": ".mcap", "protobuf": ".mcap", "bag": ".bag", "ros2": ""}
+FORMATS = {
+    "mcap": ".mcap",
+    "protobuf": ".mcap",
+    "bag": ".bag",
+    "ros2": "",
+}  # endings; a ROS 2 bag is a directory
 _LATENCY_NS = 4_000_000  # from the end of a measurement to the log
-_LATCHED_TEXT = "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
+_LATCHED_TEXT = """\
+- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline: {sec: 0, nsec: 0}
+  lifespan: {sec: 0, nsec: 0}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 0, nsec: 0}
+  avoid_ros_namespace_conventions: false
+"""  # every field: readers of bags want them all
 _LATCHED_QOS = Qos(
     QosHistory.KEEP_LAST,
     1,
@@ -164,41 +179,48 @@ class _Bag2:
 @contextmanager
 def _sink(path: Path, format_: str) -> Iterator[_Sink]:
     """A log that appears under its name when everything is in it."""
-    part = path.with_name(path.name + ".part")
-    _remove(part)
     try:
-        whole = part
-        if format_ == "bag":
-            file = BagFile(part)
-            file.set_compression(BagFile.CompressionFormat.LZ4)
-            with file:
-                yield _Bag(file)
-        elif format_ == "ros2":
-            part.mkdir()
-            whole = part / path.name  # the files in a bag are called after it
-            with BagFolder(whole, version=8) as folder:
-                yield _Bag2(folder)
+        path.parent.stat()  # a folder that is not there is an error, and not created
+        if format_ == "ros2":
+            with _bag_folder(path) as folder:
+                yield folder
         else:
-            with part.open("wb") as stream:
-                mcap = _Mcap(stream, protobuf=format_ == "protobuf")
-                yield mcap
-                mcap.finish()
-        if (path / "metadata.yaml").exists():
-            _remove(path)  # an earlier bag: a directory is not replaced by renaming
-        whole.replace(path)
+            with replacing_file(path) as temporary, _file_sink(temporary, format_) as sink:
+                yield sink
     except OSError as error:
         raise LogError(
-            f"{path} cannot be written ({error.strerror or error}): choose another folder or make room"
+            f"{path} cannot be written ({error.strerror or error}): "
+            "choose another folder or make room"
         ) from error
-    finally:
-        _remove(part)
 
 
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
+@contextmanager
+def _file_sink(path: Path, format_: str) -> Iterator[_Sink]:
+    """A bag or an MCAP file."""
+    if format_ == "bag":
+        file = BagFile(path)
+        file.set_compression(BagFile.CompressionFormat.LZ4)
+        with file:
+            yield _Bag(file)
     else:
-        path.unlink(missing_ok=True)
+        with path.open("wb") as stream:
+            mcap = _Mcap(stream, protobuf=format_ == "protobuf")
+            yield mcap
+            mcap.finish()
+
+
+@contextmanager
+def _bag_folder(path: Path) -> Iterator[_Sink]:
+    """A ROS 2 bag; only an earlier bag or an empty folder is replaced."""
+    if path.exists() and not (path / "metadata.yaml").exists() and any(path.iterdir()):
+        raise OSError(errno.ENOTEMPTY, "Directory not empty")
+    with replacing_folder(path) as temporary:
+        whole = temporary / path.name  # the files in a bag are called after it
+        with BagFolder(whole, version=8) as folder:
+            yield _Bag2(folder)
+        for file in sorted(whole.iterdir()):
+            file.rename(temporary / file.name)
+        whole.rmdir()
 
 
 def write_session(
@@ -210,20 +232,22 @@ def write_session(
     sensors: VehicleSensors | None = None,
     shots: Iterable[CameraShot] = (),
 ) -> int:
-    """Write a drive as the log ``path``, sweep by sweep; the number of sweeps. LogError when that
-    is not possible.
+    """Write a drive as the log ``path``, sweep by sweep; returns the number of sweeps.
+
+    LogError when it cannot be written.
 
     ``shots`` are what cameras record (:mod:`semloc_logs.simulation.output.camera_log` has their
     topics).
 
-    ``format`` is a name in ``FORMATS``; without, the ending says it: .mcap (ROS 2 messages), .bag,
+    ``format`` is a name in ``FORMATS``; without, the ending decides: .mcap (ROS 2 messages), .bag,
     or none for a ROS 2 bag directory.
     """
     if format is None:
         format = next((name for name, suffix in FORMATS.items() if suffix == path.suffix), None)
     if format is None or FORMATS.get(format) != path.suffix:
         raise LogError(
-            f"{path} is neither .mcap nor .bag nor a directory: give the simulated log the ending of its format"
+            f"{path} is neither .mcap nor .bag nor a directory: "
+            "give the simulated log the ending of its format"
         )
     sweeps = 0
     with _sink(path, format) as sink:
@@ -241,15 +265,14 @@ def write_session(
 
 
 def write_truth(path: Path, trajectory: Trajectory) -> None:
-    """``world_T_base`` as a TUM file: seconds with 9 decimals, translation in metres, quaternion
-    xyzw.
-    """
+    """``world_T_base`` as a TUM file: seconds with 9 decimals, metres, quaternion xyzw."""
     translation, quaternion = translation_quaternion(trajectory.world_T_base)
     rows = [
         f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{v:.9f}" for v in (*t, *q))
         for stamp, t, q in zip(trajectory.stamps_ns.tolist(), translation, quaternion, strict=True)
     ]
-    path.write_text("\n".join(rows) + "\n", encoding="ascii")
+    with replacing_file(path) as temporary:
+        temporary.write_text("\n".join(rows) + "\n", encoding="ascii")
 
 
 def _lidar(messages: Messages, frames: Iterable[DriveFrame], first_ns: int) -> Iterator[Event]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -37,11 +38,9 @@ def test_a_class_that_the_truth_lacks_has_no_iou() -> None:
     assert np.isnan(iou[1:]).all()
 
 
-def test_real_sweeps(shared: Path) -> None:
+def test_real_sweeps(shared: Callable[[str], Path]) -> None:
     """Thresholds are what has been reached, less a margin."""
-    figures = measure_labels(
-        [shared / "logs" / f"{name}.mcap" for name in KITTI], Settings().resolved()
-    )
+    figures = measure_labels([shared(f"logs/{name}.mcap") for name in KITTI], Settings().resolved())
     least = {"mean": 0.59, "ground": 0.88, "construction": 0.75, "vegetation": 0.42, "pole": 0.25}
     for name, iou in least.items():
         for what in ("points", "voxels"):
@@ -51,6 +50,6 @@ def test_real_sweeps(shared: Path) -> None:
     assert float(figures["points: vehicle or other"]["unlabelled"]) > 0.7
 
 
-def test_a_log_without_labels_is_refused(shared: Path) -> None:
+def test_a_log_without_labels_is_refused(shared: Callable[[str], Path]) -> None:
     with pytest.raises(SemlocError, match="label"):
-        measure_labels([shared / "logs" / "kitti_drive_camera_lidar.mcap"], Settings().resolved())
+        measure_labels([shared("logs/kitti_drive_camera_lidar.mcap")], Settings().resolved())

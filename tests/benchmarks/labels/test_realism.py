@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from semloc_logs.errors import LogError
 from semloc_logs.settings import Settings
 
 FUSION = Settings().resolved().fusion
-KITTI = Path(__file__).parents[4] / "shared" / "logs" / "kitti00_000052.mcap"
 
 
 def street(half_width: float = 5.0, facade: float = 9.0) -> Scan:
@@ -109,13 +109,15 @@ def test_simulated_sweeps_have_as_many_points_as_real_ones() -> None:
     assert seen.numbers["range, 99 %: m"] < 80
 
 
-@pytest.mark.skipif(not KITTI.exists(), reason="the folder shared/ with real logs is not there")
-def test_the_command_compares_with_a_real_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_compares_with_a_real_log(
+    shared: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = shared("logs/kitti00_000052.mcap")
     monkeypatch.setattr(
         "semloc_logs.benchmarks.labels.realism.town_sweeps",
         lambda seed, sweeps: [street()] if seed == 0 else [],
     )
-    result = CliRunner().invoke(program, ["benchmark", "realism", str(KITTI), "--json"])
+    result = CliRunner().invoke(program, ["benchmark", "realism", str(log), "--json"])
     assert result.exit_code == 0
     figures = json.loads(result.stdout)
     assert figures["points a sweep"]["real"] == 120_796

@@ -1,6 +1,7 @@
 """What fusion is measured with, how its limits are counted, and the peers beside it."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -83,8 +84,8 @@ def test_depth_images_have_a_point_for_every_pixel_inside_the_room(scans: list[S
     assert placed[:, 2].min() < 0.15  # the floor is seen, so down is down
 
 
-def test_sweep_of_a_log_is_seen_from_further_on(shared: Path) -> None:
-    seen = log_sweeps(shared / "logs" / "kitti00_000052.mcap", 3)
+def test_sweep_of_a_log_is_seen_from_further_on(shared: Callable[[str], Path]) -> None:
+    seen = log_sweeps(shared("logs/kitti00_000052.mcap"), 3)
     at = np.array([s.map_T_sensor[:3, 3] for s in seen])
     assert np.linalg.norm(np.diff(at, axis=0), axis=1) == pytest.approx([1.2, 1.2])
     assert len(seen[0].points) > 100_000

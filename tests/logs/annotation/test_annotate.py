@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,6 @@ from semloc_logs.logs.annotation.annotate import (
     recover,
 )
 
-SHARED = Path(__file__).resolve().parents[4] / "shared"
 TEXT = "std_msgs/msg/String"
 
 
@@ -347,10 +347,8 @@ def test_fingerprint_sees_content(tmp_path: Path) -> None:
         "../odd_logs/ros2_utm_drive_a",
     ],
 )
-def test_real_ros2_logs(tmp_path: Path, name: str) -> None:
-    log = SHARED / "logs" / name
-    if not log.exists():
-        pytest.skip(f"no shared/logs/{name} beside the checkout")
+def test_real_ros2_logs(shared: Callable[[str], Path], tmp_path: Path, name: str) -> None:
+    log = shared(f"logs/{name}")
     from mcap_ros2.decoder import DecoderFactory
 
     out = tmp_path / "out.mcap"

@@ -16,18 +16,21 @@ from mcap_protobuf.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.errors import ContractError
+from semloc_logs.logs.annotation.annotate import encoder_for
 from semloc_logs.logs.annotation.channels import (
     COLUMNS,
     TOPICS,
     ClosureRecord,
     Encoding,
+    LogContext,
     LogFacts,
+    NewChannel,
+    NewMessage,
     channel_metadata,
     encode,
     run_id,
 )
 from semloc_logs.logs.annotation.channels_foxglove import loop_closure_class
-from semloc_logs.logs.annotation.mcap_append import NewChannel, NewMessage
 from semloc_logs.numerics.transforms import transform, yaw_transform
 from semloc_logs.schemas import read_text
 
@@ -82,12 +85,9 @@ def decoded(
     facts = LogFacts(encoding, "", {}, 10, 20, 1)
     channels, messages = encode(
         closures,
-        session,
-        facts,
-        log_times=log_times or {},
-        frame_id="odom",
-        size=1.0,
-        metadata={"run": "1"},
+        LogContext(session, facts, log_times or {}, frame_id="odom", marker_size=1.0),
+        encoder_for(facts),
+        {"run": "1"},
     )
     out: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in TOPICS}
     for m in messages:
@@ -101,8 +101,8 @@ def test_every_column_comes_back(encoding: Encoding) -> None:
     ((_, message),) = decoded([closure], "wet_monday", encoding)["/semloc/loop_closures"]
     for name in COLUMNS:
         value = getattr(message, name)
-        expected = list(ROW[name]) if name == "covariance" else ROW[name]  # type: ignore[call-overload]
-        assert (list(value) if name == "covariance" else value) == expected
+        expected: Any = ROW[name]
+        assert (list(value) if name == "covariance" else value) == expected, name
     stamp = message.header.stamp if encoding.startswith("ros") else message.timestamp
     seconds = getattr(stamp, "seconds", None) or stamp.sec
     rest = getattr(stamp, "nanos", None) or getattr(stamp, "nanosec", None) or stamp.nsec
@@ -121,8 +121,9 @@ def test_pose_of_the_query_in_the_frame_of_the_target(encoding: Encoding) -> Non
     assert (
         message.header.frame_id if encoding.startswith("ros") else message.frame_id
     ) == "semloc/dry_sunday"
-    # there the log is the target
-    assert not decoded([closure], "dry_sunday", encoding)["/semloc/pose"]
+    assert not decoded([closure], "dry_sunday", encoding)[
+        "/semloc/pose"
+    ]  # there the log is the target
 
 
 def test_covariance_of_the_pose_is_turned_into_the_axes_of_the_session() -> None:
@@ -143,9 +144,7 @@ def test_covariance_of_the_pose_is_turned_into_the_axes_of_the_session() -> None
 
 
 def test_covariance_in_session_against_sampled_errors() -> None:
-    """Perturb the closure as 3.3 defines its errors, and look at the errors of the pose in the
-    session.
-    """
+    """Perturb the closure by its errors, and look at the errors of the pose in the session."""
     from scipy.spatial.transform import Rotation
 
     rng = np.random.default_rng(1)
@@ -172,9 +171,7 @@ def test_covariance_in_session_against_sampled_errors() -> None:
 
 
 def test_markers_show_the_place_and_the_other_end() -> None:
-    """A self closure: the query stands at (5, 0, 0) by its own odometry, the target end lies at (0,
-    0, 0).
-    """
+    """A self closure: the query is at (5, 0, 0) by odometry, the target end at (0, 0, 0)."""
     row = ROW | {
         "target_session": "wet_monday",
         "t_x": 4.0,
@@ -223,9 +220,7 @@ def test_markers_between_sessions_have_no_line(encoding: Encoding) -> None:
 
 
 def test_times_and_order() -> None:
-    """An end takes the receive time of its frame; one without takes its stamp, moved into the log's
-    range of 10 to 20.
-    """
+    """An end takes the receive time of its frame, else its stamp within the range of the log."""
 
     def one(stamp: int) -> ClosureRecord:
         return ClosureRecord.from_row(ROW | {"query_stamp_ns": stamp, "words": stamp})
@@ -287,7 +282,10 @@ def test_ros_definitions_name_their_types_as_the_profile_wants() -> None:
     facts = LogFacts("ros1", "ros1", {}, 0, 0, 0)
     closure = ClosureRecord.from_row(ROW, session_T_query=np.eye(4), session_position=np.zeros(3))
     channels, _ = encode(
-        [closure], "wet_monday", facts, log_times={}, frame_id="", size=1.0, metadata={"run": "1"}
+        [closure],
+        LogContext("wet_monday", facts, {}, frame_id="", marker_size=1.0),
+        encoder_for(facts),
+        {"run": "1"},
     )
     assert [
         (c.topic, c.schema_name, c.schema_encoding, c.message_encoding, dict(c.metadata))

@@ -1,12 +1,12 @@
-"""Adding records to MCAP files of every shape, and surviving an interruption at every step of it."""
+"""Adding records to MCAP files of every shape; what was recorded survives."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-import os
 import shutil
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +20,15 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.annotation import tail_swap
 from semloc_logs.logs.annotation.annotate import (
     ClosureRecord,
     Results,
     annotate_copy,
     annotate_in_place,
     content_fingerprint,
-    recover,
 )
-from semloc_logs.logs.annotation.mcap_append import read_ending
+from semloc_logs.logs.annotation.mcap_append import read_end
+from semloc_logs.logs.containers.open import open_log
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
 CONFORMANCE = SHARED / "odd_logs" / "mcap_conformance"
@@ -140,10 +139,43 @@ def is_ours(record: tuple[Any, ...]) -> bool:
     return str(record[1]).startswith(("/semloc/", "semloc/"))
 
 
+def data_section(path: Path) -> tuple[bytes, int]:
+    """All bytes before DataEnd (a record of 13 bytes here), and the CRC in it."""
+    data = path.read_bytes()
+    summary_start = struct.unpack("<Q", data[-28:-20])[0] or len(data) - 37
+    assert data[summary_start - 13 : summary_start - 4] == b"\x0f" + struct.pack("<Q", 4)
+    return data[: summary_start - 13], int.from_bytes(
+        data[summary_start - 4 : summary_start], "little"
+    )
+
+
+def check_data_section(original: Path, annotated: Path) -> None:
+    """No recorded byte changes, and a CRC of the data section stays one."""
+    before, crc = data_section(original)
+    after, new_crc = data_section(annotated)
+    assert after[: len(before)] == before
+    assert crc in (0, zlib.crc32(before))
+    assert new_crc == (zlib.crc32(after) if crc else 0)
+
+
+def check_indexes(original: Path, annotated: Path) -> None:
+    """Each index, schema and channel that the original lists is there, unchanged."""
+    with original.open("rb") as file:
+        before = make_reader(file).get_summary()
+    with annotated.open("rb") as file:
+        after = make_reader(file).get_summary()
+    assert before is not None
+    assert after is not None
+    for name in ("chunk_indexes", "attachment_indexes", "metadata_indexes"):
+        old = getattr(before, name)
+        new = getattr(after, name)
+        assert new[: len(old)] == old
+    assert {k: after.schemas[k] for k in before.schemas} == before.schemas
+    assert {k: after.channels[k] for k in before.channels} == before.channels
+
+
 def check_annotated(original: Path, annotated: Path) -> None:
-    """Everything of the original is there in its order, our six records are the last, and the
-    summary lists all of it.
-    """
+    """All of the original is there in its order, our six records are last, all is listed."""
     before = linear(original)
     after = linear(annotated)
     assert [r for r in after if not is_ours(r)] == before
@@ -195,8 +227,11 @@ def test_every_shape_copy_in_place_and_again(tmp_path: Path, shape: str, count: 
     shutil.copyfile(log, place)
     report = annotate_copy(log, copy, Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES))
     check_annotated(log, copy)
+    check_data_section(log, copy)
+    if count and shape != "no summary":  # else it is scanned for what it should list
+        check_indexes(log, copy)
     assert (report.closures, report.messages, report.replaced) == (2, 5, False)
-    assert copy.stat().st_size - read_ending(log.open("rb"), log).offset == report.bytes_written
+    assert copy.stat().st_size - read_end(log.open("rb"), log).start == report.bytes_written
     fingerprint = content_fingerprint(place)
     annotate_in_place(place, Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES))
     assert place.read_bytes() == copy.read_bytes()
@@ -276,9 +311,7 @@ def test_no_closures_replace_earlier_ones(tmp_path: Path) -> None:
 
 
 def test_records_behind_ours_are_not_lost(tmp_path: Path) -> None:
-    """Another tool that adds an attachment behind our results: neither is it cut off nor are
-    results written twice.
-    """
+    """Another tool added an attachment behind our results: nothing is cut off or doubled."""
     log = tmp_path / "log.mcap"
     write_log(log)
     annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
@@ -340,174 +373,44 @@ def test_damaged_bytes_give_a_log_error_or_a_result(data: st.DataObject) -> None
     for _ in range(data.draw(st.integers(1, 3))):
         raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.sampled_from([0, 1, 127, 255]))
     with contextlib.suppress(LogError):  # and no other error
-        read_ending(io.BytesIO(bytes(raw)), Path("log.mcap"))
+        read_end(io.BytesIO(bytes(raw)), Path("log.mcap"))
 
 
-class Crash(BaseException):
-    """The process died."""
+# place of a length in a chunk record, what the error states
+CLAIMS = {
+    "unpacked size": (25, "a chunk claims"),
+    "packed size": (9 + 8 + 8 + 8 + 4 + 4 + len("zstd"), "its data claim"),
+    "record": (1, "record reaches beyond the data section"),
+}
 
 
-class Dying:
-    """The operating system for a process that dies after a number of steps; a write of n bytes is n
-    // grain + 1 steps.
-    """
-
-    def __init__(self, steps: int, grain: int) -> None:
-        self.left, self.grain = steps, grain
-
-    def step(self) -> None:
-        if self.left <= 0:
-            raise Crash
-        self.left -= 1
-
-    def pwrite(self, fd: int, data: memoryview, offset: int) -> int:
-        for at in range(0, len(data), self.grain):
-            self.step()
-            os.pwrite(fd, data[at : at + self.grain], offset + at)
-        self.step()
-        return len(data)
-
-    def __getattr__(self, name: str) -> Any:
-        real = getattr(os, name)
-        if name not in ("fsync", "ftruncate", "replace", "unlink"):
-            return real
-
-        def call(*args: Any) -> Any:
-            self.step()
-            return real(*args)
-
-        return call
-
-
-@pytest.mark.parametrize("fewer", [False, True])
-def test_interruption_at_every_step_of_writing_in_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fewer: bool
-) -> None:
-    """After the next look at the log it is exactly what it was before, or exactly what it was to
-    become.
-    """
-    log = tmp_path / "log.mcap"
-    done = tmp_path / "done.mcap"
-    write_log(log, chunk_size=100)
-    if fewer:  # the file becomes shorter
-        annotate_in_place(log, Results(closures(), "a", {"k": "old"}, log_times=NO_TIMES))
-    wanted = closures()[: 1 if fewer else 3]
-    before = log.read_bytes()
-    annotate_copy(log, done, Results(wanted, "a", {}, log_times=NO_TIMES))
-    after = done.read_bytes()
-    assert (len(after) < len(before)) == fewer
-    outcomes = []
-    for steps in range(10_000):
-        log.write_bytes(before)
-        with monkeypatch.context() as patch:
-            patch.setattr(tail_swap, "os", Dying(steps, grain=997))
-            try:
-                annotate_in_place(log, Results(wanted, "a", {}, log_times=NO_TIMES))
-                finished = True
-            except Crash:
-                finished = False
-        torn = log.read_bytes() not in (before, after)
-        left = [p.name for p in tmp_path.iterdir() if p.name not in ("log.mcap", "done.mcap")]
-        assert recover(log) == bool([n for n in left if n.endswith("semloc-tail")])
-        assert log.read_bytes() in ((after,) if finished else (before, after))
-        assert sorted(p.name for p in tmp_path.iterdir()) == ["done.mcap", "log.mcap"]
-        assert not recover(log)
-        outcomes.append((torn, log.read_bytes() == after))
-        if finished:
-            break
-    assert any(torn for torn, _ in outcomes)  # some interruptions did leave a torn file
-    assert not outcomes[0][1]
-    assert outcomes[-1][1]
-
-
-def test_interruption_of_the_repair_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = tmp_path / "log.mcap"
-    write_log(log, chunk_size=100)
-    before = log.read_bytes()
-
-    def interrupted(action: Any, steps: int) -> bool:
-        with monkeypatch.context() as patch:
-            patch.setattr(tail_swap, "os", Dying(steps, grain=997))
-            try:
-                action()
-            except Crash:
-                return True
-        return False
-
-    assert interrupted(
-        lambda: annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES)), 12
-    )
-    torn = log.read_bytes()
-    side = (tmp_path / "log.mcap.semloc-tail").read_bytes()
-    assert torn != before
-    for steps in range(100):
-        log.write_bytes(torn)
-        (tmp_path / "log.mcap.semloc-tail").write_bytes(side)
-        died = interrupted(lambda: recover(log), steps)
-        recover(log)
-        assert log.read_bytes() == before
-        if not died:
-            return
-    pytest.fail("the repair never ended")
-
-
-def test_full_disk_while_writing_leaves_the_log_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = tmp_path / "log.mcap"
-    write_log(log)
-    before = log.read_bytes()
-
-    class Full(Dying):
-        def pwrite(self, fd: int, data: memoryview, offset: int) -> int:
-            self.left -= 1
-            if self.left == 0:
-                os.pwrite(fd, data[:100], offset)
-                raise OSError(28, "No space left on device")
-            return os.pwrite(fd, data, offset)
-
-        def step(self) -> None:
-            pass
-
-    for write in (1, 2):  # the saved tail, then the log
-        with monkeypatch.context() as patch:
-            patch.setattr(tail_swap, "os", Full(write, 1))
-            with pytest.raises(LogError, match=r"unchanged.*No space left"):
-                annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
-        assert log.read_bytes() == before
-        assert [p.name for p in tmp_path.iterdir()] == ["log.mcap"]
-
-
-def test_a_saved_tail_of_another_file_is_not_put_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = tmp_path / "log.mcap"
-    write_log(log)
-    with monkeypatch.context() as patch:
-        patch.setattr(tail_swap, "os", Dying(12, grain=997))
-        with pytest.raises(Crash):
-            annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
-    write_log(log, count=21)
-    other = log.read_bytes()
-    with pytest.raises(LogError, match="delete that file"):
-        recover(log)
-    assert log.read_bytes() == other
-
-
-def test_two_writers(tmp_path: Path) -> None:
-    log = tmp_path / "log.mcap"
-    write_log(log)
-    with tail_swap.locked(log), pytest.raises(LogError, match="another process"):
-        annotate_in_place(log, Results(closures(), "a", {}, log_times=NO_TIMES))
-
-
-def test_chunk_that_claims_to_be_huge(tmp_path: Path) -> None:
+@pytest.mark.parametrize("claim", [1 << 40, 1 << 62, 1 << 63, (1 << 64) - 1])
+@pytest.mark.parametrize("name", CLAIMS)
+def test_chunk_that_claims_to_be_huge(tmp_path: Path, name: str, claim: int) -> None:
+    """The sentence names file and offset; nothing is allocated for the claim."""
     log = tmp_path / "log.mcap"
     write_log(log, attachment=False, use_statistics=False)
     data = bytearray(log.read_bytes())
     start = 8 + 9 + int.from_bytes(data[9:17], "little")
-    assert data[start] == 6  # the chunk; its uncompressed size follows two times
-    data[start + 25 : start + 33] = (1 << 62).to_bytes(8, "little")
+    assert data[start] == 6  # the chunk
+    place, reason = CLAIMS[name]
+    data[start + place : start + place + 8] = claim.to_bytes(8, "little")
     log.write_bytes(data)
-    with pytest.raises(LogError, match="announced"):
-        annotate_copy(log, tmp_path / "out.mcap", Results(closures(), "a", {}, log_times=NO_TIMES))
+    before = read_files(tmp_path)
+    for annotate in (annotate_in_place, annotate_there):
+        with pytest.raises(LogError) as caught:
+            annotate(log, Results(closures(), "a", {}, log_times=NO_TIMES))
+        assert f"{log} is damaged at offset {start} ({reason}" in str(caught.value)
+    assert read_files(tmp_path) == before
+    with contextlib.closing(open_log(log)) as opened:
+        assert list(opened.messages()) == []
+        assert len(opened.problems) == 1
+        assert f"byte {start}" in opened.problems[0].text
+
+
+def annotate_there(log: Path, results: Results) -> object:
+    return annotate_copy(log, log.with_name("out.mcap"), results)
+
+
+def read_files(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir()}

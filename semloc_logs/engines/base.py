@@ -1,0 +1,43 @@
+"""Engines call a plain function on picklable tasks; results come in the order of the tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Protocol, TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+class Engine(Protocol):
+    """Runs independent tasks; results come in the order of the tasks, errors as they are raised.
+
+    Progress events and log records of the tasks arrive in the process that called ``map``.
+    """
+
+    jobs: int
+
+    def map(
+        self, function: Callable[[Task], Result], tasks: Iterable[Task]
+    ) -> Iterator[Result]: ...
+
+    def close(self) -> None:
+        """Release the workers once their tasks are done."""
+
+    def stop(self) -> None:
+        """End the workers now; they clean up what they were writing."""
+
+
+class Serial:
+    """Everything in this process, one task after the other."""
+
+    jobs = 1
+
+    def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
+        return map(function, tasks)
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def stop(self) -> None:
+        """Nothing to end."""

@@ -1,0 +1,117 @@
+"""The records of an MCAP file: one walk over them and one bounded decompressor.
+
+Every error is a ``LogError`` that states what is wrong; the caller adds the file and the offset.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from typing import NamedTuple, TypeVar
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import McapRecord
+
+from semloc_logs.errors import LogError
+from semloc_logs.logs.containers.base import SizedFile, decompress, read_exactly
+
+MAGIC = b"\x89MCAP0\r\n"
+HEAD = struct.Struct("<BQ")  # of a record: opcode, length of its body
+MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish time
+MESSAGE_BODY = MESSAGE.size - HEAD.size  # bytes of a message's body before its data
+_CHUNK = struct.Struct("<BQQQQII")  # head, times, size and CRC unpacked, length of the compression
+_DATA_LENGTH = struct.Struct("<Q")
+
+Record = TypeVar("Record")
+
+
+class ChunkHead(NamedTuple):
+    """What a chunk record claims; ``data`` is the part of the record that is compressed."""
+
+    start_ns: int
+    end_ns: int
+    unpacked_size: int
+    crc: int
+    compression: str
+    data: slice
+
+
+def raw(record: McapRecord) -> bytes:
+    """The bytes of a record, its opcode and length included."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
+
+
+def parse(read: Callable[[ReadDataStream], Record], body: bytes) -> Record:
+    """A record from its body; ``LogError`` when the bytes make no sense."""
+    try:
+        return read(ReadDataStream(BytesIO(body)))
+    except (McapError, struct.error, ValueError, MemoryError, OverflowError) as error:
+        reason = error or type(error).__name__
+        raise LogError(f"a record cannot be parsed ({reason})") from error
+
+
+def spans(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """(opcode, start of the body, end of the body) of the records in ``data``, in their order.
+
+    ``LogError`` where they stop to fit.
+    """
+    position = 0
+    size = len(data)
+    head = HEAD.size
+    unpack = HEAD.unpack_from
+    while position + head <= size:
+        opcode, length = unpack(data, position)
+        start = position + head
+        position = start + length
+        if position > size:
+            raise LogError(
+                f"a record at byte {start - head} in it claims {length} bytes of {size - start}"
+            )
+        yield opcode, start, position
+    if position != size:
+        raise LogError(f"{size - position} bytes at its end are no record")
+
+
+def walk(file: SizedFile, position: int, end: int) -> Iterator[tuple[int, int, int]]:
+    """(opcode, offset, size with the head) of the records of a file between two offsets.
+
+    Stops before the first record that is not valid or reaches beyond ``end``.
+    """
+    while position + HEAD.size <= end:
+        opcode, length = HEAD.unpack(read_exactly(file, position, HEAD.size, end))
+        size = HEAD.size + length
+        if opcode == 0 or position + size > end:
+            return
+        yield opcode, position, size
+        position += size
+
+
+def chunk_head(record: bytes) -> ChunkHead:
+    """The claims of a whole chunk record; ``LogError`` when they do not fit the record."""
+    try:
+        opcode, length, start_ns, end_ns, size, crc, name_length = _CHUNK.unpack_from(record)
+        compression = record[_CHUNK.size : _CHUNK.size + name_length].decode()
+        (data_length,) = _DATA_LENGTH.unpack_from(record, _CHUNK.size + name_length)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise LogError(f"its head is damaged ({error})") from error
+    start = _CHUNK.size + name_length + _DATA_LENGTH.size
+    if opcode != Opcode.CHUNK or HEAD.size + length != len(record):
+        raise LogError("it is not the chunk that the index claims")
+    if start + data_length > len(record):
+        raise LogError(f"its data claim {data_length} bytes of {len(record) - start}")
+    data = slice(start, start + data_length)
+    return ChunkHead(start_ns, end_ns, size, crc, compression, data)
+
+
+def chunk_records(record: bytes, head: ChunkHead) -> bytes:
+    """The records in a chunk; memory grows with what is there, not with what the chunk claims."""
+    data = decompress(record[head.data], head.compression, head.unpacked_size)
+    if head.crc and zlib.crc32(data) != head.crc:
+        raise LogError("its checksum does not match its data")
+    return data

@@ -1,0 +1,93 @@
+"""The pipeline on one screen: fuse, describe, close, annotate."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import semloc_logs
+from semloc_logs.engines import Engine
+from semloc_logs.settings import Resolved
+from semloc_logs.stages.annotate import Annotation, AnnotationMode, annotate
+from semloc_logs.stages.close import Selection, close
+from semloc_logs.stages.describe import describe
+from semloc_logs.stages.fuse import fuse
+from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.report import Report
+from semloc_logs.tables.table import write_json
+from semloc_logs.workspace import Workspace
+
+LOGGER = logging.getLogger(__name__)
+
+
+def run(
+    sessions: Sequence[SessionInput],
+    work: Workspace,
+    settings: Resolved,
+    engine: Engine,
+    *,
+    annotation: AnnotationMode = AnnotationMode.NONE,
+    overwrite: bool = False,
+) -> Report:
+    """All of it, resumable: each session is fused and described, all are closed together."""
+    total = _Total()
+    total.add("fuse", fuse(sessions, work, settings, engine, overwrite=overwrite))
+    fused = [s for s in sessions if work.session(s.name).session_json.exists()]
+    names = [s.name for s in fused]
+    total.add("describe", describe(work, names, settings, engine, overwrite=overwrite))
+    selection = Selection(queries=tuple(names), targets=tuple(names))
+    total.add("close", close(work, settings, engine, selection, overwrite=overwrite))
+    if annotation is not AnnotationMode.NONE:
+        for session in fused:
+            _annotate_logs(session, work, settings, annotation)
+        total.add("annotate", Report(closures=total.report.closures))
+    _write_summary(work, total.report)
+    return total.report
+
+
+class _Total:
+    """One report of all stages."""
+
+    def __init__(self) -> None:
+        self.report = Report()
+        self._begun = time.perf_counter()
+
+    def add(self, stage: str, part: Report) -> None:
+        """Add what a stage did since the last one was added."""
+        self.report.done += [f"{stage} {name}" for name in part.done]
+        self.report.kept += [f"{stage} {name}" for name in part.kept]
+        self.report.skipped += part.skipped
+        self.report.failed += part.failed
+        self.report.closures = part.closures
+        now = time.perf_counter()
+        self.report.seconds[stage] = round(now - self._begun, 3)
+        self._begun = now
+
+
+def _annotate_logs(
+    session: SessionInput, work: Workspace, settings: Resolved, mode: AnnotationMode
+) -> None:
+    for log in session.logs:
+        output = None if mode is AnnotationMode.IN_PLACE else _output(session, log, work, mode)
+        annotation = Annotation(mode, output, overwrite=True)
+        made = annotate(log, work, settings, annotation, session=session.name)
+        LOGGER.info("%s: %d messages in %s", session.name, made.messages, made.path)
+
+
+def _output(session: SessionInput, log: Path, work: Workspace, mode: AnnotationMode) -> Path:
+    stem = session.name if log.is_dir() else log.stem
+    ending = ".semloc.mcap" if mode is AnnotationMode.SIDECAR else ".mcap"
+    return work.annotated / f"{stem}{ending}"
+
+
+def _write_summary(work: Workspace, report: Report) -> None:
+    content = {
+        "version": semloc_logs.__version__,
+        "seconds": report.seconds,
+        "skipped": report.skipped,
+        "failed": report.failed,
+        "closures": report.closures,
+    }
+    write_json(work.summary, content)

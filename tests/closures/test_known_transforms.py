@@ -1,0 +1,468 @@
+"""From maps to alignments: a query whose pose in a small map is known is localised in it, and what
+the alignment reports is checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from semloc_logs.alignment.covariance import stiffness
+from semloc_logs.alignment.icp import Fit
+from semloc_logs.alignment.scores import Scores
+from semloc_logs.alignment.search import Candidate
+from semloc_logs.closures.acceptance.calibration import shipped
+from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.database import Database
+from semloc_logs.closures.matching import (
+    CloseTask,
+    Fitted,
+    QueryContext,
+    _each_place_once,
+    _rival_score,
+    allowed_words,
+    close_queries,
+    find_hypotheses,
+    match_words,
+)
+from semloc_logs.closures.query import build_query
+from semloc_logs.closures.visibility import everything
+from semloc_logs.engines import make_engine
+from semloc_logs.labels.space import cityscapes
+from semloc_logs.mapping.selection import road_distance
+from semloc_logs.mapping.session_map import SessionMap
+from semloc_logs.numerics.transforms import apply, inverse, rotation_angle, yaw_transform
+from semloc_logs.settings import Resolved, Settings
+from semloc_logs.stages.describe import describe
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import write_json, write_table
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, Fuser
+from semloc_logs.voxels.store import (
+    Keyframe,
+    blocks_path,
+    keep_keyframes,
+    pose_columns,
+    read_blocks,
+    write_blocks,
+)
+from semloc_logs.words.index import Matches
+from semloc_logs.workspace import Workspace
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+Scene = tuple[F64, U8]
+V = 0.3
+ROAD, BUILDING, WALL, POLE, VEGETATION = 0, 2, 3, 5, 8
+SENSOR = np.array([0.0, 0.0, 1.8])  # in the base frame
+SETTINGS = Settings().resolved()
+pytestmark = pytest.mark.timeout(300)  # much is compiled when this runs first
+
+
+def side(a: tuple[float, float], b: tuple[float, float], height: float, label: int) -> Scene:
+    """An upright wall from ``a`` to ``b``, a point every 12 cm."""
+    start = np.array(a)
+    way = np.subtract(b, a)
+    along, up = np.meshgrid(np.arange(0, np.linalg.norm(way), 0.12), np.arange(0.05, height, 0.12))
+    xy = start + along.reshape(-1, 1) / np.linalg.norm(way) * way
+    return np.c_[xy, up.reshape(-1)], np.full(up.size, label, np.uint8)
+
+
+def joined(*parts: Scene) -> Scene:
+    return np.concatenate([p for p, _ in parts]), np.concatenate([label for _, label in parts])
+
+
+def courtyard(more: float = 0.0, front: int = BUILDING) -> Scene:
+    """A court of 34 m x 26 m without any symmetry, which is seen as a whole from its middle. Its
+    fronts are ``more`` metres higher.
+    """
+    x, y = (
+        g.reshape(-1) for g in np.meshgrid(np.arange(-16.9, 17, 0.2), np.arange(-12.9, 13, 0.2))
+    )
+    ground = np.c_[x, y, np.zeros(len(x))], np.full(len(x), ROAD, np.uint8)
+    poles = [
+        side((px - 0.1, py), (px + 0.1, py + 0.1), 4.0, POLE)
+        for px, py in ((-11.0, 7.0), (-4.0, 9.0), (9.0, -8.0), (13.0, 4.0))
+    ]
+    return joined(
+        ground,
+        side((-17, -13), (17, -13), 3.0 + more, front),
+        side((-17, 13), (2, 13), 4.5 + more, front),
+        side((2, 13), (17, 10), 2.0, VEGETATION),
+        side((17, -13), (17, 10), 3.5 + more, front),
+        side((-17, -13), (-17, 2), 2.5, VEGETATION),
+        side((-17, 2), (-17, 13), 3.0 + more, front),
+        *poles,
+    )
+
+
+def write_session(
+    work: Workspace,
+    name: str,
+    scene: Scene,
+    poses: F64,
+    map_T_scene: F64,
+    source: str = "log",
+    seed: int = 0,
+    submaps: int = 1,
+) -> SessionMap:
+    """A fused session whose keyframes at ``poses`` (n, 4, 4), in the scene's frame, saw a third of
+    the points within 24 m of each.
+    """
+    folder = work.session(name)
+    n = len(poses)
+    rng = np.random.default_rng(seed)
+    folder.keyframes.mkdir(parents=True)
+    folder.blocks.mkdir()
+    in_map, (points, label) = map_T_scene @ poses, scene
+    clouds = []
+    for pose in poses:
+        some = rng.random(len(points)) < 1 / 3
+        seen = apply(inverse(pose), points[some] + rng.normal(0, 0.01, (int(some.sum()), 3)))
+        near = np.linalg.norm(seen - SENSOR, axis=1) < 24
+        clouds.append(Keyframe(seen[near].astype(np.float32), label[some][near]))
+    columns: dict[str, Any] = {
+        "keyframe": np.arange(n),
+        "stamp_ns": np.arange(n) * 10**9,
+        "log_time_ns": np.arange(n) * 10**9,
+        "topic": ["/points"] * n,
+        "posed": [True] * n,
+        "distance": road_distance(in_map),
+        "ground_z": in_map[:, 2, 3],
+        "points": [len(c.points) for c in clouds],
+        **{f"origin_{c}": np.full(n, value) for c, value in zip("xyz", SENSOR, strict=True)},
+        **{f"view_{c}": np.zeros(n) for c in "xyz"},
+        **pose_columns(in_map),
+    }
+    write_table(folder.frames, contracts.table("frames", columns), {})
+    clouds = list(keep_keyframes(folder.keyframes, range(n), clouds, {}))
+    rows = []
+    for i, members in enumerate(np.array_split(np.arange(n), submaps)):
+        fuser = Fuser(SETTINGS.fusion)
+        for k in members:
+            fuser.add(clouds[k].points, clouds[k].label, SENSOR, None, in_map[k])
+        write_blocks(blocks_path(folder.blocks, i), fuser.finish(), {})
+        rows.append(
+            {
+                "id": i,
+                "first": int(members[0]),
+                "last": int(members[-1]),
+                "ground_z": float(in_map[members[0], 2, 3]),
+                "blocks": 1,
+            }
+        )
+    content = {
+        "posed": True,
+        "label_source": source,
+        "submaps": rows,
+        "settings": {"fusion": {"voxel_size": V}},
+        "fingerprint": name,
+    }
+    content |= {
+        "schema_version": 1,
+        "voxel_size": V,
+        "session_T_map": np.eye(4).tolist(),
+        "label_space": "cityscapes",
+        "version": "0",
+    }
+    write_json(folder.session_json, content)
+    return SessionMap(folder)
+
+
+def drive(n: int = 5, heading: float = 0.0, y: float = 0.0) -> F64:
+    """Poses (n, 4, 4), 1.5 m apart along the court's x through its middle; the vehicle looks along
+    ``heading``.
+    """
+    return np.array([yaw_transform(heading, (1.5 * (i - n // 2), y, 0.0)) for i in range(n)])
+
+
+TARGET_T_SCENE = yaw_transform(0.4, (120.0, -60.0, 7.0))
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """Maps of the court: as it is, from a vehicle that looks left, and twice in one drive."""
+    work = Workspace(tmp_path_factory.mktemp("courts"))
+    court = courtyard()
+    write_session(work, "court", court, drive(), TARGET_T_SCENE)
+    write_session(work, "turned", court, drive(heading=np.pi / 2), TARGET_T_SCENE)
+    away = np.array([300.0, 0.0, 0.0])
+    twice = np.concatenate([court[0], court[0] + away]), np.tile(court[1], 2)
+    poses = np.concatenate([drive(), yaw_transform(0.0, tuple(away)) @ drive()])
+    write_session(work, "twice", twice, poses, TARGET_T_SCENE, submaps=2)
+    describe(work, ["court", "turned", "twice"], SETTINGS, make_engine("serial"))
+    return work
+
+
+Ask = Callable[..., list[Alignment]]
+
+
+@pytest.fixture
+def ask(work: Workspace, request: pytest.FixtureRequest) -> Ask:
+    """Alignments of a query at the court's middle; its own map lies in the scene as ``map_T_scene``
+    has it.
+    """
+    names = (f"query-{request.node.name}-{i}" for i in range(100))
+
+    def asked(
+        map_T_scene: F64,
+        target: str = "court",
+        scene: Scene | None = None,
+        settings: Resolved = SETTINGS,
+        source: str = "log",
+    ) -> list[Alignment]:
+        name = next(names)
+        write_session(
+            work, name, scene or courtyard(), drive(3, 0.3, 1.0), map_T_scene, source, seed=7
+        )
+        return close_queries(CloseTask(work.path, name, (1,), (target,), settings))[0]
+
+    return asked
+
+
+def placed(work: Workspace, a: Alignment) -> F64:
+    """Where an alignment puts the query's base in the scene."""
+    target = SessionMap(work.session(a.target_session))
+    return np.asarray(
+        inverse(TARGET_T_SCENE) @ target.map_T_base[a.target_keyframe] @ a.target_T_query
+    )
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270, 37])
+def test_a_query_turned_and_moved_by_a_known_transform_is_found_where_it_is(
+    work: Workspace, ask: Ask, degrees: int
+) -> None:
+    """The query's map is turned by ``degrees`` against the court: every quarter turn has to be
+    undone with the right sign.
+    """
+    best = ask(yaw_transform(0.4 + np.radians(degrees), (-35.0, 12.0, 2.0)))[0]
+    off = inverse(drive(3, 0.3, 1.0)[1]) @ placed(work, best)
+    assert np.linalg.norm(off[:3, 3]) < 0.05
+    assert rotation_angle(off[:3, :3]) < np.radians(0.3)
+    assert best.probability > 0.9
+    assert best.features.structure > 0.9
+
+
+def states(session: SessionMap) -> tuple[F64, U8]:
+    """Centres (n, 3) in the map frame and states (n,) of the observed voxels of a session's only
+    submap.
+    """
+    blocks = read_blocks(blocks_path(session.folder.blocks, 0), states_only=True)
+    low, high = blocks.bounds()
+    dense = blocks.dense(low, tuple((high - low).tolist()))
+    ijk = np.argwhere(dense != UNOBSERVED_STATE)
+    return np.asarray((ijk + low + 0.5) * V, float), dense[tuple(ijk.T)]
+
+
+@pytest.mark.parametrize(
+    ("front", "kappa", "source", "overlap"),
+    [
+        (BUILDING, 10.0, "log", 0.940),
+        (BUILDING, 1.0, "log", 0.872),
+        (WALL, 10.0, "log", 0.683),
+        (WALL, 10.0, "onnx", 0.940),
+    ],
+)
+def test_the_overlap_is_that_of_the_nearest_observed_voxels(
+    work: Workspace, ask: Ask, front: int, kappa: float, source: str, overlap: float
+) -> None:
+    """The query has the fronts 1.5 m higher than the map, and perhaps as walls instead of
+    buildings: one coarse class, which counts where the labels of the two are not of one source.
+    """
+    settings = Settings.model_validate({"closures": {"kappa": kappa}}).resolved()
+    best = ask(
+        yaw_transform(1.0, (5.0, 2.0, 0.0)),
+        scene=courtyard(1.5, front),
+        settings=settings,
+        source=source,
+    )[0]
+    target = SessionMap(work.session("court"))
+    query, query_T_base = build_query(SessionMap(work.session(best.query_session)), 1, settings)
+    map_T_query = (
+        target.map_T_base[best.target_keyframe] @ best.target_T_query @ inverse(query_T_base)
+    )
+    centres, state = states(target)
+    ijk, label = query.occupied
+    away, nearest = cKDTree(centres).query(apply(map_T_query, (ijk + 0.5) * V))
+    group = np.arange(256) if source == "log" else cityscapes().coarse
+    aligned = (
+        (away < kappa * V)
+        & (state[nearest] != FREE_STATE)
+        & (group[state[nearest]] == group[label])
+    )
+    # of two voxels that are equally near either may be taken
+    assert best.inliers == pytest.approx(aligned.sum(), rel=0.002)
+    assert best.overlap == pytest.approx(aligned.mean(), rel=0.002)
+    assert best.overlap == pytest.approx(overlap, abs=0.005)  # the four cases differ
+
+
+def test_the_covariance_lies_in_the_axes_of_the_targets_vehicle(ask: Ask) -> None:
+    """Two drives through one map, of which one vehicle looks to the other's left: its x is the
+    other's y.
+    """
+    here = yaw_transform(1.0, (5.0, 2.0, 0.0))
+    there = np.zeros((6, 6))
+    one, other = (ask(here, target)[0].covariance for target in ("court", "turned"))
+    R = yaw_transform(np.pi / 2)[:3, :3]
+    there[:3, :3] = there[3:, 3:] = R
+    np.testing.assert_allclose(other, there.T @ one @ there, rtol=0.01, atol=2e-9)
+    assert np.abs(other - one).max() > 1e-6
+    assert np.abs(other - there @ one @ there.T).max() > 1e-7  # nor turned to the other side
+
+
+def test_a_second_place_that_fits_as_well_is_a_rival(work: Workspace, ask: Ask) -> None:
+    """In a drive through two equal courts each is the other's rival; in one court there are only
+    places that fit worse.
+    """
+    here = yaw_transform(1.0, (5.0, 2.0, 0.0))
+    alone, first, second = (ask(here)[0], *ask(here, "twice")[:2])
+    assert {first.target_keyframe // 5, second.target_keyframe // 5} == {0, 1}
+    assert first.features.distinct == pytest.approx(1.0, abs=0.02)
+    assert second.features.distinct == pytest.approx(1.0, abs=0.02)
+    assert 0.3 < alone.features.distinct < 0.8
+    assert max(first.probability, second.probability) < 0.99 < alone.probability
+    # the better place is the rival of the worse one: its score by that of the worse
+    worse = ask(here)[1]
+    assert worse.features.distinct == pytest.approx(1 / alone.features.distinct, rel=0.02)
+
+
+def test_a_query_of_little_structure_is_never_probable(ask: Ask) -> None:
+    """What lies within 10.5 m has a few hundred voxels of structure, too few to tell one place from
+    another.
+    """
+    few = ask(
+        yaw_transform(1.0), settings=Settings.model_validate({"query": {"radius": 10.5}}).resolved()
+    )
+    assert few
+    assert all(a.features.support < shipped().min_support and a.probability == 0 for a in few)
+
+
+def test_a_near_word_outweighs_several_far_ones(
+    work: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A word that differs in no bit weighs 1.001; three that differ in 28 of 64 bits weigh (4 /
+    32)^2 + 0.001 each.
+    """
+    settings = SETTINGS
+    session = SessionMap(work.session("court"))
+    query, query_T_base = build_query(session, 2, settings)
+    one = np.array([90.0, -40.0, 7.0])
+    several = np.array([150.0, -40.0, 7.0])
+
+    class Words:
+        def search(self, descriptor: NDArray[np.float32], *_: Any) -> Matches:
+            rows = np.zeros(4, np.int32)
+            centre = np.stack([one, several, several, several])
+            return Matches(
+                rows,
+                rows.astype(np.int64),
+                rows.astype(np.int64),
+                centre,
+                np.full(4, 0.25),
+                np.array([0, 28, 28, 28], np.int32),
+            )
+
+    monkeypatch.setattr(Database, "words", lambda *_: Words())
+    database = Database(work, ("turned",), settings)
+    visible = everything(database)
+    allowed = allowed_words(visible, session)["semantic"]
+    described, _ = match_words(database, "semantic", allowed, query, 0.0)
+    found = find_hypotheses(QueryContext(visible, session, 2, query, query_T_base))
+    assert [round(h.weight, 6) for h in found] == [1.001] * 4 + [round(3 * (1 / 64 + 0.001), 6)] * 4
+    assert [h.votes for h in found] == [1] * 4 + [3] * 4
+    assert sorted(h.pose[0] for h in found[:4]) == pytest.approx(
+        [0.25 + k * np.pi / 2 for k in range(4)]
+    )
+    for h in found:  # the word of the query lies on that of the map
+        at = apply(
+            yaw_transform(h.pose[0], np.array(h.pose[1:])), described.centre[:1].astype(float) * V
+        )[0]
+        np.testing.assert_allclose(at, one if h.votes == 1 else several, atol=1e-6)
+
+
+def fitted(score: float, x: float = 0.0, degrees: float = 0.0, nearest: int = 0) -> Fitted:
+    """A fit ``x`` metres along the map and turned by ``degrees``, beside keyframe ``nearest``, of
+    this score.
+    """
+    T = yaw_transform(np.radians(degrees), (x, 0.0, 0.0))
+    fit = Fit(T, 1.0, 1000, 0.1, np.eye(6), np.zeros(3), np.zeros((2, 6)))
+    scores = Scores(score, 1.0, 0.0, 1000)
+    return Fitted(Candidate(0, T, score, 1), nearest, np.zeros(3), fit, scores)
+
+
+def road_of_metres() -> QueryContext:
+    """A query in a target that has a keyframe every metre of its road."""
+    target = SimpleNamespace(distance=np.arange(200.0))
+    database = SimpleNamespace(settings=SETTINGS, session=lambda group: target)
+    visible = SimpleNamespace(database=database)
+    return QueryContext(cast(Any, visible), cast(Any, None), 0, cast(Any, None), np.eye(4))
+
+
+@pytest.mark.parametrize(
+    # the one lies at the start of a road of 1 m between keyframes; of 1 % of the way the map may
+    # have drifted
+    ("other", "is_rival"),
+    [
+        (fitted(0.7, 50.0, nearest=50), True),  # another place
+        # the same, 100 m of road later: within 0.99 m + 1 m
+        (fitted(0.7, 1.4, nearest=100), False),
+        (fitted(0.7, 1.9, nearest=100), False),
+        (fitted(0.7, 2.1, nearest=100), True),  # farther off than that
+        (fitted(0.7, 0.9, nearest=10), True),  # beside it in the same pass: another pose
+        (fitted(0.7, 0.9, nearest=14), True),
+        (fitted(0.7, 0.9, nearest=16), False),  # from 50 voxels of road on another pass
+        (fitted(0.7, 1.4, 6.9, nearest=100), False),  # 5 degrees, and 0.02 a metre
+        (fitted(0.7, 1.4, -6.9, nearest=100), False),
+        (fitted(0.7, 1.4, 7.1, nearest=100), True),
+    ],
+)
+def test_a_later_pass_within_the_drift_of_the_map_is_no_rival(
+    other: Fitted, is_rival: bool
+) -> None:
+    context = road_of_metres()
+    one = fitted(0.9)
+    assert _rival_score(context, one, [one, other]) == (0.7 if is_rival else 0.0)
+    assert _rival_score(context, other, [one, other]) == (0.9 if is_rival else 0.0)
+
+
+def test_the_best_rival_counts_and_never_itself() -> None:
+    context = road_of_metres()
+    every = [
+        fitted(0.5, 60.0, nearest=60),
+        fitted(0.9),
+        fitted(0.6, 120.0, nearest=120),
+        fitted(0.4, 180.0, nearest=180),
+    ]
+    assert [_rival_score(context, f, every) for f in every] == [0.9, 0.6, 0.9, 0.9]
+    assert _rival_score(context, every[1], [every[1]]) == 0.0
+    worst = fitted(-0.2, 60.0, nearest=60)
+    assert _rival_score(context, every[1], [every[1], worst]) == 0.0
+
+
+def test_each_place_is_kept_once_and_the_best_first() -> None:
+    """Within 3.3 voxels = 0.99 m and 5 degrees it is the same place."""
+    every = [
+        fitted(0.5),
+        fitted(0.9, 0.9),
+        fitted(0.6, 1.9),
+        fitted(0.7, 0.9, 6.0),
+        fitted(0.8, 0.5, 4.0),
+    ]
+    assert [f.scores.score for f in _each_place_once(every, V)] == [0.9, 0.7, 0.6]
+
+
+def test_stiffness_is_what_holds_the_weakest_direction_while_the_rotation_is_free() -> None:
+    def of(information: F64) -> float:
+        return stiffness(Fit(np.eye(4), 1.0, 1000, 0.1, information, np.zeros(3), np.zeros((2, 6))))
+
+    H = np.diag([900.0, 400.0, 1600.0, 50.0, 60.0, 70.0])
+    assert of(H) == pytest.approx(400.0)
+    H[0, 3] = H[3, 0] = 200.0  # a turn about x takes up 200^2 / 50 of what holds x
+    assert of(H) == pytest.approx(100.0)
+    assert of(np.diag([900.0, 0.0, 1600.0, 50.0, 60.0, 70.0])) == 0.0
+    assert of(np.diag([900.0, 400.0, 1600.0, 50.0, 60.0, np.nan])) == 0.0

@@ -1,0 +1,246 @@
+"""Annotated logs of three encodings, as other people's readers see them, against the closures'
+table and the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from semloc_logs.numerics.transforms import transform
+from semloc_logs.stages import annotate as annotate_stage
+from semloc_logs.stages.annotate import Annotation, AnnotationMode
+from semloc_logs.workspace import Workspace
+
+# after its stamp a sweep is in the log: it takes 0.1 s, and 4 ms to be written
+RECEIVED_NS = 104_000_000
+NAMES = ("monday", "tuesday", "wednesday")  # ROS 2, ROS 1, protobuf
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """A message as another reader decodes it."""
+
+    topic: str
+    log_time_ns: int
+    message: Any
+
+
+def read_ros2(path: Path) -> Iterator[Read]:
+    with AnyReader([path]) as reader:
+        for connection, time, data in reader.messages():
+            yield Read(connection.topic, time, reader.deserialize(data, connection.msgtype))
+
+
+def read_ros1(path: Path) -> Iterator[Read]:
+    """MCAP of ROS 1 messages, decoded by the definitions in the file."""
+    with path.open("rb") as file:
+        stores: dict[str, Any] = {}
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            assert schema is not None
+            kind = schema.name.replace("/", "/msg/")
+            if schema.name not in stores:
+                stores[schema.name] = get_typestore(Stores.ROS1_NOETIC)
+                stores[schema.name].register(get_types_from_msg(schema.data.decode(), kind))
+            yield Read(
+                channel.topic,
+                message.log_time,
+                stores[schema.name].deserialize_ros1(message.data, kind),
+            )
+
+
+def read_protobuf(path: Path) -> Iterator[Read]:
+    with path.open("rb") as file:
+        for _, channel, message, decoded in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            yield Read(channel.topic, message.log_time, decoded)
+
+
+READERS = {"monday": read_ros2, "tuesday": read_ros1, "wednesday": read_protobuf}
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(name, mode) for name in NAMES for mode in ("copy", "sidecar")],
+    ids="-".join,
+)
+def annotated(
+    request: pytest.FixtureRequest,
+    tmp_path_factory: pytest.TempPathFactory,
+    labelled: Workspace,
+    drives: Any,
+    tools: SimpleNamespace,
+) -> tuple[str, dict[str, list[Read]]]:
+    """A drive's name, and the messages of its annotated log by topic."""
+    name, mode = request.param
+    output = tmp_path_factory.mktemp("annotated") / "out.mcap"
+    annotation = Annotation(AnnotationMode(mode), output)
+    report = annotate_stage.annotate(drives[name].log, labelled, tools.quick_settings(), annotation)
+    assert report.path == output
+    by_topic: dict[str, list[Read]] = {}
+    for read in READERS[name](output):
+        by_topic.setdefault(read.topic, []).append(read)
+    own = {"/semloc/loop_closures", "/semloc/pose", "/semloc/markers"}
+    assert own <= set(by_topic)
+    assert ("/lidar/points" in by_topic) == (mode == "copy")
+    assert report.messages == sum(len(by_topic[topic]) for topic in own)
+    return name, by_topic
+
+
+@pytest.fixture(scope="module")
+def rows(labelled: Workspace) -> list[dict[str, Any]]:
+    """The closures, read without our reader; each drive is the query of some and the target of
+    others.
+    """
+    found: list[dict[str, Any]] = pq.read_table(labelled.closures).to_pylist()
+    for name in NAMES:
+        assert any(row["query_session"] == name for row in found)
+        assert any(row["target_session"] == name for row in found)
+    return found
+
+
+def ends(row: Any) -> tuple[str, int, str, int]:
+    """What names a closure, of a row or a message."""
+    get = row.__getitem__ if isinstance(row, dict) else lambda key: getattr(row, key)
+    return (
+        str(get("query_session")),
+        int(get("query_stamp_ns")),
+        str(get("target_session")),
+        int(get("target_stamp_ns")),
+    )
+
+
+def stamp_ns(stamp: Any) -> int:
+    """Of a ROS time or a protobuf timestamp."""
+    return int(
+        stamp.sec * 10**9 + stamp.nanosec
+        if hasattr(stamp, "sec")
+        else stamp.seconds * 10**9 + stamp.nanos
+    )
+
+
+def header(message: Any) -> tuple[int, str]:
+    """Stamp and frame of a ROS message or of a protobuf one."""
+    if hasattr(message, "header"):
+        return stamp_ns(message.header.stamp), str(message.header.frame_id)
+    return stamp_ns(message.timestamp), str(getattr(message, "frame_id", ""))
+
+
+def pose_of(pose: Any) -> Any:
+    """(4, 4) of a ROS pose or a Foxglove one."""
+    p = pose.position
+    q = pose.orientation
+    return transform(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+
+
+def test_every_closure_of_the_log_is_there_as_query_and_as_target(
+    annotated: Any, rows: list[dict[str, Any]]
+) -> None:
+    name, topics = annotated
+    expected = {
+        ends(row): row for row in rows if name in (row["query_session"], row["target_session"])
+    }
+    assert {end[0] == name for end in expected} == {True, False}
+    found = topics["/semloc/loop_closures"]
+    assert sorted(ends(read.message) for read in found) == sorted(expected)
+    for read in found:
+        row = expected[ends(read.message)]
+        for key in (
+            "t_x",
+            "t_y",
+            "t_z",
+            "q_x",
+            "q_y",
+            "q_z",
+            "q_w",
+            "probability",
+            "overlap",
+            "inliers",
+            "words",
+        ):
+            assert getattr(read.message, key) == pytest.approx(row[key])
+        np.testing.assert_allclose(read.message.covariance, row["covariance"])
+
+
+def test_closures_are_at_the_time_of_their_end_in_this_log(annotated: Any) -> None:
+    name, topics = annotated
+    for read in topics["/semloc/loop_closures"]:
+        is_query = read.message.query_session == name
+        own = read.message.query_stamp_ns if is_query else read.message.target_stamp_ns
+        assert header(read.message)[0] == own
+        assert read.log_time_ns == own + RECEIVED_NS
+
+
+def test_poses_are_the_true_ones_in_the_frame_of_the_target(
+    annotated: Any, rows: list[dict[str, Any]], drives: Any
+) -> None:
+    """``session_T_world`` of the target and ``world_T_base`` of the query are known from the
+    simulation.
+    """
+    name, topics = annotated
+    wanted = sorted(
+        (row["query_stamp_ns"], f"semloc/{row['target_session']}")
+        for row in rows
+        if row["query_session"] == name
+    )
+    found = topics["/semloc/pose"]
+    assert sorted(header(read.message) for read in found) == wanted
+    for read in found:
+        stamp, frame_id = header(read.message)
+        assert read.log_time_ns == stamp + RECEIVED_NS
+        target = drives[frame_id.removeprefix("semloc/")]
+        pose = read.message.pose.pose if hasattr(read.message.pose, "pose") else read.message.pose
+        truth = target.session_T_world @ drives[name].world_T_base(stamp)
+        np.testing.assert_allclose(pose_of(pose)[:3, 3], truth[:3, 3], atol=0.06)
+        np.testing.assert_allclose(pose_of(pose)[:3, :3], truth[:3, :3], atol=0.01)
+
+
+def test_markers_are_at_this_drives_end_of_every_closure(annotated: Any, drives: Any) -> None:
+    name, topics = annotated
+    drive = drives[name]
+    times = sorted(read.log_time_ns for read in topics["/semloc/markers"])
+    assert times == sorted(read.log_time_ns for read in topics["/semloc/loop_closures"])
+    for read in topics["/semloc/markers"]:
+        if name == "wednesday":
+            (entity,) = read.message.entities
+            stamp, frame_id = header(entity)
+            sphere = entity.spheres[0]
+            text = entity.texts[0].text
+        else:
+            sphere, words = read.message.markers
+            stamp, frame_id = header(sphere)
+            assert (sphere.type, words.type) == (2, 9)  # SPHERE, TEXT_VIEW_FACING
+            text = words.text
+        assert (read.log_time_ns, frame_id) == (stamp + RECEIVED_NS, "odom")
+        assert text.split()[0] in set(NAMES) - {name}
+        truth = drive.session_T_world @ drive.world_T_base(stamp)
+        np.testing.assert_allclose(pose_of(sphere.pose)[:3, 3], truth[:3, 3], atol=0.01)
+
+
+def test_annotating_under_another_name_takes_the_closures_of_that_session(
+    labelled: Workspace,
+    drives: Any,
+    tools: SimpleNamespace,
+    tmp_path: Path,
+    rows: list[dict[str, Any]],
+) -> None:
+    log = Path(tmp_path / "renamed.mcap")
+    log.write_bytes(drives["monday"].log.read_bytes())
+    annotation = Annotation(AnnotationMode.COPY, tmp_path / "o.mcap")
+    settings = tools.quick_settings()
+    report = annotate_stage.annotate(log, labelled, settings, annotation, session="monday")
+    assert report.closures == sum(
+        "monday" in (row["query_session"], row["target_session"]) for row in rows
+    )

@@ -1,0 +1,329 @@
+"""What makes `fuse` work again: every input, and nothing else; overwriting, and going on after an
+interruption.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import semloc_logs
+from semloc_logs.engines import Serial
+from semloc_logs.errors import LogError
+from semloc_logs.logs.annotation.annotate import Results, annotate_in_place
+from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.mapping.session_fusion import FuseTask
+from semloc_logs.numerics.transforms import transform
+from semloc_logs.settings import Resolved
+from semloc_logs.simulation.output.drive_log import write_truth
+from semloc_logs.stages import fuse as fuse_stage
+from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.report import Report
+from semloc_logs.tables.table import read_json, read_table
+from semloc_logs.workspace import SessionFolder, Workspace
+
+Fuse = Callable[..., Report]
+
+
+@pytest.fixture
+def fuse(tools: SimpleNamespace, drives: Any, coarse: Workspace) -> Fuse:
+    """Fuses Monday into the workspace ``coarse``, where it was fused before, with whatever differs
+    from then.
+    """
+
+    def again(
+        logs: list[Path] | None = None,
+        settings: Resolved | None = None,
+        topics: dict[str, str] | None = None,
+        poses: TrajectoryFile | None = None,
+        overwrite: bool = False,
+    ) -> Report:
+        monday = tuple(logs or [drives["monday"].log])
+        session = SessionInput("monday", monday, topics or {}, poses)
+        settings = settings or tools.coarse_settings()
+        return fuse_stage.fuse([session], coarse, settings, Serial(), overwrite=overwrite)
+
+    return again
+
+
+def was_done(report: Report) -> bool:
+    assert (report.done, report.kept) in ((["monday"], []), ([], ["monday"]))
+    return bool(report.done == ["monday"])
+
+
+def test_nothing_is_done_twice(fuse: Fuse, coarse: Workspace, tools: SimpleNamespace) -> None:
+    before = tools.write_times(coarse.path)
+    assert not was_done(fuse())
+    assert tools.write_times(coarse.path) == before
+
+
+def test_overwriting_does_it_again(fuse: Fuse, coarse: Workspace, tools: SimpleNamespace) -> None:
+    tables = tools.files(coarse.path)
+    times = tools.write_times(coarse.path)
+    assert was_done(fuse(overwrite=True))
+    assert tools.files(coarse.path) == tables
+    written = {name for name, time in tools.write_times(coarse.path).items() if time != times[name]}
+    assert {
+        "sessions/monday/session.json",
+        "sessions/monday/frames.parquet",
+        "sessions/monday/map.png",
+    } <= written
+    assert not [name for name in written if not name.startswith("sessions/monday/")]
+
+
+# -- the logs
+
+
+def test_another_content_of_the_log_is_fused(
+    fuse: Fuse, coarse: Workspace, drives: Any, tmp_path: Path
+) -> None:
+    log = Path(shutil.copyfile(drives["monday"].log, tmp_path / "monday.mcap"))
+    assert not was_done(fuse([log])), "the same content under another path"
+    shutil.copyfile(drives["wednesday"].log, log)
+    assert was_done(fuse([log]))
+    assert (
+        read_table(coarse.session("monday").frames)["stamp_ns"][0].as_py()
+        == drives["wednesday"].trajectory.stamps_ns[0]
+    )
+    assert not was_done(fuse([log]))
+
+
+def test_a_log_that_is_touched_or_annotated_keeps_its_content(
+    fuse: Fuse, drives: Any, tmp_path: Path
+) -> None:
+    log = Path(shutil.copyfile(drives["monday"].log, tmp_path / "monday.mcap"))
+    os.utime(log, (1, 1))
+    assert not was_done(fuse([log]))
+    annotate_in_place(log, Results([], "monday", {}, {}))
+    assert log.read_bytes() != drives["monday"].log.read_bytes()
+    assert not was_done(fuse([log]))
+
+
+def test_another_log_of_the_session_is_fused(fuse: Fuse, drives: Any) -> None:
+    both = [drives["monday"].log, drives["tuesday"].log]
+    assert was_done(fuse(both))
+    assert not was_done(fuse(both))
+    assert was_done(fuse(both[:1]))
+
+
+# -- settings, topics, version
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"fusion__hit": "0.9"},
+        {"fusion__submap_length": "70"},
+        {"labels__source": "uniform"},
+        {"labels__erode": "3"},
+    ],
+)
+def test_settings_of_fusion_and_labels_are_inputs(
+    fuse: Fuse, tools: SimpleNamespace, changed: dict[str, str]
+) -> None:
+    assert was_done(fuse(settings=tools.coarse_settings(**changed)))
+    assert not was_done(fuse(settings=tools.coarse_settings(**changed)))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"descriptor__stride": "4"},
+        {"query__frames": "3"},
+        {"closures__min_probability": "0.5"},
+        {"training__seed": "7"},
+    ],
+)
+def test_settings_of_later_stages_are_none(
+    fuse: Fuse, tools: SimpleNamespace, changed: dict[str, str]
+) -> None:
+    assert not was_done(fuse(settings=tools.coarse_settings(**changed)))
+
+
+def test_topics_are_inputs(fuse: Fuse) -> None:
+    assert was_done(fuse(topics={"lidar": "/lidar/points", "pose": "/odometry"}))
+    assert not was_done(fuse(topics={"pose": "/odometry", "lidar": "/lidar/points"})), (
+        "their order means nothing"
+    )
+    assert was_done(fuse(topics={"lidar": "/lidar/points"}))
+
+
+def test_the_version_is_an_input(fuse: Fuse, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(semloc_logs, "__version__", "999.0")
+    assert was_done(fuse())
+
+
+# -- files beside the log
+
+
+def test_the_file_of_poses_is_an_input(
+    fuse: Fuse, coarse: Workspace, drives: Any, tmp_path: Path
+) -> None:
+    file = tmp_path / "poses.tum"
+    twin = tmp_path / "twin.tum"
+    write_truth(file, drives["monday"].trajectory)
+    assert was_done(fuse(poses=TrajectoryFile(file)))
+    first = read_table(coarse.session("monday").trajectory)
+    # in the world; in the frame of the odometry it is near 100
+    assert first["t_x"][0].as_py() == pytest.approx(-9.0, abs=0.05)
+    shutil.copyfile(file, twin)
+    assert not was_done(fuse(poses=TrajectoryFile(twin))), "the same content under another path"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(lines[1:]) + "\n")
+    assert was_done(fuse(poses=TrajectoryFile(file)))
+    assert was_done(fuse(poses=TrajectoryFile(file, frame="lidar")))
+    assert was_done(fuse()), "back to the poses of the log"
+
+
+def test_the_file_of_a_label_space_is_an_input(
+    fuse: Fuse, coarse: Workspace, tools: SimpleNamespace, tmp_path: Path
+) -> None:
+    file = tmp_path / "space.yaml"
+    settings = tools.coarse_settings(labels__space=str(file))
+
+    def labels() -> set[int]:
+        return set(
+            read_table(coarse.session("monday").voxels / "tile=0_0/part-0.parquet")[
+                "label"
+            ].to_pylist()
+        ) - {255}
+
+    file.write_text("classes: {0: {name: street, to: road}, 2: {name: house, to: building}}\n")
+    assert was_done(fuse(settings=settings))
+    assert labels() == {0, 2}
+    os.utime(file, (1, 1))
+    assert not was_done(fuse(settings=settings))
+    file.write_text("classes: {0: {name: street, to: road}, 2: {name: house, to: wall}}\n")
+    assert was_done(fuse(settings=settings))
+    assert labels() == {0, 3}
+
+
+def test_the_files_of_a_label_model_are_inputs(
+    fuse: Fuse, tools: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model itself is not run: a stand-in writes what tells that a session is done."""
+
+    def stand_in(task: FuseTask, **_: Any) -> dict[str, Any]:
+        content = {
+            "fingerprint": task.fingerprint,
+            "skipped": [],
+            "problems": [],
+            "keyframes": 0,
+            "submaps": [],
+            "voxels": 0,
+        }
+        task.folder.session_json.write_text(json.dumps(content))
+        return {**content, "label_source": "onnx"}
+
+    monkeypatch.setattr(fuse_stage, "fuse_session", stand_in)
+    model = tmp_path / "model.onnx"
+    spec = tmp_path / "spec.yaml"
+    model.write_bytes(b"one model")
+    spec.write_text("input: {size: [8, 8]}\nclasses: [building, car]\n")
+    settings = tools.coarse_settings(
+        labels__source="onnx", labels__model=str(model), labels__spec=str(spec)
+    )
+    assert was_done(fuse(settings=settings))
+    os.utime(model, (1, 1))
+    assert not was_done(fuse(settings=settings))
+    model.write_bytes(b"another model")
+    assert was_done(fuse(settings=settings))
+    spec.write_text("input: {size: [8, 8]}\nclasses: [car, building]\n")
+    assert was_done(fuse(settings=settings))
+    assert not was_done(fuse(settings=settings))
+
+
+# -- failures and interruptions
+
+
+def test_a_log_that_fails_does_not_end_the_others(
+    tools: SimpleNamespace, drives: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "empty.bag").touch()
+    (tmp_path / "no.mcap").write_bytes(b"no log")
+    work = Workspace(tmp_path / "work")
+    no_log = SessionInput("no", (tmp_path / "no.mcap",))
+    inputs = [no_log, *tools.inputs(drives, "monday")]
+    report = fuse_stage.fuse(inputs, work, tools.coarse_settings(), Serial())
+    assert report.done == ["monday"]
+    assert len(report.failed) == 1
+    assert [s.name for s in work.sessions()] == ["monday"]
+    with pytest.raises(LogError):
+        fuse_stage.fuse([no_log], work, tools.coarse_settings(), Serial())
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_an_interrupted_session_is_done_again(
+    share: float,
+    fuse: Fuse,
+    coarse: Workspace,
+    tools: SimpleNamespace,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Interrupted after a share of its files, under other settings: neither these nor the old
+    settings take the mixture for done.
+    """
+    folder = coarse.session("monday")
+    other = tools.coarse_settings(fusion__hit="0.9", fusion__keyframe_resolution="0.3")
+    first = fused_files(tools, folder)
+    steps = tools.renames(monkeypatch, lambda: fuse(settings=other))
+    second = fused_files(tools, folder)
+    assert steps > 5
+    assert {name for name in first if first[name] != second.get(name)} >= {
+        "keyframes/part-00000.parquet",
+        "session.json",
+    }
+    tools.renames(monkeypatch, fuse, round(share * (steps - 1)))
+    assert was_done(fuse(settings=other)), "what was done before the interruption"
+    assert fused_files(tools, folder) == second
+    tools.renames(monkeypatch, fuse, round(share * (steps - 1)))
+    assert was_done(fuse()), "what was interrupted"
+    assert fused_files(tools, folder) == first
+
+
+def fused_files(tools: SimpleNamespace, folder: SessionFolder) -> dict[str, str]:
+    """Digests of what fusing writes."""
+    return {
+        name: digest
+        for name, digest in tools.files(folder.path).items()
+        if not name.startswith("words")
+    }
+
+
+# -- what fusing makes of the known drives
+
+
+@pytest.mark.parametrize("name", ["monday", "tuesday", "wednesday"])
+def test_the_poses_of_a_session_are_the_true_ones(
+    name: str, labelled: Workspace, drives: Any
+) -> None:
+    """The trajectory is in the session frame, keyframes are in the map frame; the true headings are
+    40, 80 and 290 degrees.
+    """
+    drive = drives[name]
+    folder = labelled.session(name)
+    expected = {"monday": 40.0, "tuesday": 80.0, "wednesday": 290.0}[name]
+    frames = read_table(folder.frames)
+    session_T_map = np.array(read_json(folder.session_json)["session_T_map"])
+    positions = np.column_stack([frames[f"t_{c}"].to_numpy() for c in "xyz"])
+    turns = np.column_stack([frames[f"q_{c}"].to_numpy() for c in "xyzw"])
+    for stamp, map_T_base in zip(
+        frames["stamp_ns"].to_pylist(), transform(positions, turns), strict=True
+    ):
+        session_T_base = session_T_map @ map_T_base
+        np.testing.assert_allclose(
+            session_T_base, drive.session_T_world @ drive.world_T_base(stamp), atol=2e-3
+        )
+        heading = np.degrees(np.arctan2(session_T_base[1, 0], session_T_base[0, 0])) % 360
+        assert heading == pytest.approx(expected, abs=1.0)
+    np.testing.assert_allclose(
+        session_T_map[:3, 3],
+        (drive.session_T_world @ drive.world_T_base(frames["stamp_ns"][0].as_py()))[:3, 3],
+        atol=2e-3,
+    )
