@@ -86,7 +86,7 @@ class Judged:
 
     @property
     def clear(self) -> Bools:
-        """Right, or wrong by three times the bounds (n,): what is in between teaches neither side."""
+        """Right, or wrong by three times the bounds (n,): cases in between teach neither side."""
         return np.asarray(
             self.right | (self.error_m > 3 * CORRECT_M) | (self.error_deg > 3 * CORRECT_DEG)
         )
@@ -440,7 +440,7 @@ def _tempered(p: F64, before: Calibration, after: Calibration) -> F64:
     )
 
 
-# -- what is reported
+# -- reports
 
 
 def reliability(p: F64, right: Bools, edges: Sequence[float] = EDGES) -> list[dict[str, float]]:
@@ -466,13 +466,13 @@ def answers(judged: Judged, p: F64) -> NDArray[np.int64]:
     ascending.
     """
     best: dict[tuple[Any, ...], int] = {}
-    for k, key in enumerate(_asked(judged)):
+    for k, key in enumerate(_query_keys(judged)):
         if key not in best or p[k] > p[best[key]]:
             best[key] = k
     return np.array(sorted(best.values()), np.int64)
 
 
-def _asked(judged: Judged) -> Iterator[tuple[Any, ...]]:
+def _query_keys(judged: Judged) -> Iterator[tuple[Any, ...]]:
     placed = judged.placed
     return zip(
         judged.town, placed.query_session, placed.query.tolist(), placed.target_session, strict=True
@@ -486,7 +486,7 @@ def recall_at(
     have a right alignment with a target.
     """
     chosen = answers(judged, p)
-    able = len({key for key, right in zip(_asked(judged), judged.right, strict=True) if right})
+    able = len({key for key, right in zip(_query_keys(judged), judged.right, strict=True) if right})
     out = []
     for least in thresholds:
         accepted = chosen[p[chosen] >= least]
@@ -506,8 +506,9 @@ def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
     high, and what they are made from.
     """
     return {
-        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature; 'near' where a query has neighbours, "
-        "'together' where it has far ones too; at most a half where lookalike exceeds most_alike",
+        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature; "
+        "'near' where a query has neighbours, 'together' where it has far ones too; "
+        "at most a half where lookalike exceeds most_alike",
         "alone": fitted.model.alone.to_json(FEATURES),
         "least_support": round(fitted.model.least_support, 4),
         "most_alike": round(fitted.model.most_alike, 4),

@@ -214,5 +214,5 @@ BENCHMARKS: dict[str, Callable[[Resolved], Figures]] = {
 def run_benchmark(name: str, settings: Resolved) -> Figures:
     """The figures of one benchmark; SettingsError when there is none of that name."""
     if name not in BENCHMARKS:
-        raise SettingsError(f"There is no benchmark '{name}': there are {', '.join(BENCHMARKS)}.")
+        raise SettingsError(f"Unknown benchmark '{name}': give one of {', '.join(BENCHMARKS)}.")
     return BENCHMARKS[name](settings)

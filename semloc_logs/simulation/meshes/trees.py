@@ -234,7 +234,7 @@ def _limbs(
 
 
 def _inside(rng: Rng, shape: str, count: int, crown: _Crown) -> F64:
-    """Points (n, 3) in the crown, more of them near its surface; the surface has lumps and dents."""
+    """Points (n, 3) in the crown, more of them near its surface, which has lumps and dents."""
     up = rng.uniform(0.03, 0.97, count)
     angle = rng.uniform(0, 2 * np.pi, count)
     phase = rng.uniform(0, 2 * np.pi, 4)

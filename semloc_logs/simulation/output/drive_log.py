@@ -188,7 +188,8 @@ def _sink(path: Path, format_: str) -> Iterator[_Sink]:
         whole.replace(path)
     except OSError as error:
         raise LogError(
-            f"{path} cannot be written ({error.strerror or error}): choose another folder or make room"
+            f"{path} cannot be written ({error.strerror or error}): "
+            "choose another folder or make room"
         ) from error
     finally:
         _remove(part)
@@ -216,14 +217,15 @@ def write_session(
     ``shots`` are what cameras record (:mod:`semloc_logs.simulation.output.camera_log` has their
     topics).
 
-    ``format`` is a name in ``FORMATS``; without, the ending says it: .mcap (ROS 2 messages), .bag,
+    ``format`` is a name in ``FORMATS``; without, the ending decides: .mcap (ROS 2 messages), .bag,
     or none for a ROS 2 bag directory.
     """
     if format is None:
         format = next((name for name, suffix in FORMATS.items() if suffix == path.suffix), None)
     if format is None or FORMATS.get(format) != path.suffix:
         raise LogError(
-            f"{path} is neither .mcap nor .bag nor a directory: give the simulated log the ending of its format"
+            f"{path} is neither .mcap nor .bag nor a directory: "
+            "give the simulated log the ending of its format"
         )
     sweeps = 0
     with _sink(path, format) as sink:

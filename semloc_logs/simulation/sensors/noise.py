@@ -142,6 +142,6 @@ def stones(
 def letters(
     u: NDArray[np.floating], v: NDArray[np.floating], size: float, footprint: F32, seed: I64 | int
 ) -> F32:
-    """Blocks like those of letters and numbers: 1 where there is ink."""
+    """Blocks like letters and numbers: 1 on the ink."""
     ink = number(cell(u, size), cell(v, size), seed) < 0.45
     return np.where(footprint > 0.7 * size, np.float32(0.4), ink.astype(np.float32))

@@ -154,7 +154,7 @@ def _painted(seed: I64, salt: I64 | int) -> F32:
 
 
 def _wall(at: Spots, u: F32, h: F32) -> F32:
-    """Brick, plaster or panels, with dirt and what was sprayed onto them."""
+    """Brick, plaster or panels, with dirt and graffiti."""
     seed = at.seed
     f = at.footprint
     rough = at.noise(1.7, 7, 0.85)
@@ -346,7 +346,7 @@ def _plant(at: Spots, season: str) -> tuple[F32, F32]:
 
 
 def _vehicle(at: Spots, season: str) -> tuple[F32, F32]:
-    """Paint, panes and tyres by height; nothing that would stay in place while the vehicle drives."""
+    """Paint, panes and tyres by height; nothing that stays in place while the vehicle drives."""
     size = at.high[:, 2] - at.low[:, 2]
     share = (at.points[:, 2] - at.low[:, 2]) / np.maximum(size, 0.1)
     up = np.abs(at.normals[:, 2])
@@ -427,7 +427,7 @@ def _thing(at: Spots, season: str) -> tuple[F32, F32]:
 
 
 def _snow(at: Spots, colour: F32, gloss: F32) -> None:
-    """White on what is not steep; roads are driven away and salted."""
+    """White on surfaces that are not steep; roads are driven away and salted."""
     up = np.abs(at.normals[:, 2])
     some = np.flatnonzero((up > 0.35) & ((at.labels < PERSON) | (at.labels > MOTORCYCLE)))
     lying = at.take(some)
@@ -445,7 +445,8 @@ def _snow(at: Spots, colour: F32, gloss: F32) -> None:
 
 
 _PAINTERS: dict[int, Callable[[Spots, str], tuple[F32, F32]]] = {
-    ROAD: _road, SIDEWALK: _sidewalk, BUILDING: _building, WALL: _masonry, FENCE: _fence, POLE: _pole, TRAFFIC_LIGHT: _lamp,
+    ROAD: _road, SIDEWALK: _sidewalk, BUILDING: _building, WALL: _masonry, FENCE: _fence,
+    POLE: _pole, TRAFFIC_LIGHT: _lamp,
     TRAFFIC_SIGN: _sign, VEGETATION: _plant, TERRAIN: _terrain, PERSON: _person, RIDER: _person,
     **dict.fromkeys(range(CAR, MOTORCYCLE), _vehicle),
 }  # fmt: skip
