@@ -1,0 +1,25 @@
+"""Settings of the documentation: ``make docs`` builds it."""
+
+from semloc_logs import __version__
+
+project = "semloc_logs"
+copyright = "The semloc_logs contributors, Apache-2.0"
+release = version = __version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_click",
+]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 4
+exclude_patterns = ["build", "**/.ipynb_checkpoints"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
+
+html_theme = "furo"
+html_title = f"semloc_logs {release}"
+html_copy_source = False
