@@ -26,11 +26,11 @@ from towns import Place, Town, collect, short_towns
 
 from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.closure_tables import read_closures
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.engines.processes import single_threaded
 from semloc_logs.evaluation.calibration import SURE, answers, decided_by, read_judged, recall_at
 from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import load
 from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe

@@ -16,6 +16,8 @@ import numpy as np
 from semloc_logs.engines import make_engine
 from semloc_logs.evaluation.calibration import judge_town, read_judged
 from semloc_logs.settings import load
+from semloc_logs.simulation import plan
+from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe
@@ -113,21 +115,21 @@ class Place:
         for sensor in town.sensors:
             place = home / sensor
             if not (place / "truth.json").exists():
-                simulate_sessions(
-                    place,
-                    seed=FIRST_SEED + town.seed,
-                    sessions=town.sessions,
-                    length_m=town.length,
-                    sensor=sensor,
-                    trajectory=self._part(town) if town.trajectory else None,
-                    there_and_back=bool(town.trajectory),
-                    repeating=town.repeating,
-                    label_noise=town.noise,
-                    drift=town.drift,
-                    seasons=town.seasons,
+                streets = plan.Town(
+                    FIRST_SEED + town.seed,
+                    town.repeating,
+                    town.seasons,
                     roadworks=town.roadworks,
-                    overwrite=True,
                 )
+                trajectory = self._part(town) if town.trajectory else None
+                route = plan.Route(
+                    town.sessions,
+                    town.length,
+                    trajectory,
+                    there_and_back=trajectory is not None,
+                )
+                carried = Sensor(sensor, label_noise=town.noise, drift=town.drift)
+                simulate_sessions(place, streets, route, carried, overwrite=True)
             for k in range(town.sessions):
                 logs[f"{sensor}_{k}"] = place / f"session_{k}.mcap"
                 truth[f"{sensor}_{k}"] = {"trajectory": f"{sensor}/session_{k}.tum"}

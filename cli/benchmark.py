@@ -130,11 +130,11 @@ def command(
         raise click.UsageError(f"{name} needs at least one log.")
     with console.progress():
         if name == "retrieval":
+            from semloc_logs.benchmarks.descriptors.real_logs import real_streets
             from semloc_logs.benchmarks.descriptors.retrieval import (
                 RetrievalChoice,
                 retrieval_benchmark,
             )
-            from semloc_logs.benchmarks.whole_logs import real_streets
 
             variants = ("semantic", "geometric") if variant == "both" else (variant,)
             real = real_streets(logs, truth, settings) if truth is not None else None
@@ -157,9 +157,9 @@ def command(
             figures = scaling_benchmark(settings, work, console.note)
             rows = []
         elif name == "localisation":
-            from semloc_logs.benchmarks.whole_logs import localisation
+            from semloc_logs.benchmarks.localisation.localisation import localisation_benchmark
 
-            figures = localisation(work, queries or 40, peers, settings, console.note)
+            figures = localisation_benchmark(work, queries or 40, peers, settings, console.note)
             rows = []
         else:
             figures, rows = _measure(name, logs, truth, peers, lengths, settings)
@@ -194,19 +194,19 @@ def _measure(
 ) -> tuple[dict[str, dict[str, Any]], Rows]:
     """The figures of benchmark ``name`` and, of a profile, the functions that took most time."""
     if name == "pipeline":
-        from semloc_logs.benchmarks.whole_logs import profile_pipeline
+        from semloc_logs.benchmarks.speed.profiles import profile_pipeline
 
         return profile_pipeline(logs, settings)
     if name == "fuse":
-        from semloc_logs.benchmarks.whole_logs import profile_fuse
+        from semloc_logs.benchmarks.speed.profiles import profile_fuse
 
         return profile_fuse(logs, settings)
     if name == "memory":
-        from semloc_logs.benchmarks.whole_logs import memory_curve
+        from semloc_logs.benchmarks.speed.memory import memory_curve
 
         return memory_curve(lengths, settings), []
     if name == "words" and truth is not None:
-        from semloc_logs.benchmarks.whole_logs import word_recalls
+        from semloc_logs.benchmarks.descriptors.real_logs import word_recalls
 
         return word_recalls(logs, truth, settings), []
     if name == "labels":

@@ -39,6 +39,7 @@ def command(
     """
     from semloc_logs.evaluation.truth import evaluate_closures
     from semloc_logs.simulation.demo import simulate_demo
+    from semloc_logs.simulation.meshes.world import require_ray_caster
     from semloc_logs.stages.annotate import AnnotationMode
     from semloc_logs.stages.run import run
     from semloc_logs.workspace import Workspace
@@ -51,6 +52,7 @@ def command(
     workspace = Workspace(output / "work")
     with console.progress():
         if overwrite or not truth.exists():
+            require_ray_caster("semloc demo")
             console.note(f"Simulating two drives in {output}")
             simulate_demo(output)
         with engine.open(len(logs)) as opened:

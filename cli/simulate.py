@@ -144,31 +144,26 @@ def command(
     \b
     Example:  semloc simulate -o town --sessions 3 --length 800 --seed 7
     """
+    from semloc_logs.simulation.meshes.world import require_ray_caster
+    from semloc_logs.simulation.plan import Route, Town
+    from semloc_logs.simulation.sensors.sensor import Sensor
     from semloc_logs.simulation.sessions import simulate_sessions
 
+    require_ray_caster("semloc simulate")
+    town = Town(
+        seed,
+        repeating,
+        [name.strip() for name in season.split(",")],
+        [name.strip() for name in daytime.split(",")],
+        roadworks,
+        rebuilt,
+    )
+    if sessions is None:
+        sessions = 1 if trajectory else 2
+    route = Route(sessions, length, trajectory, (from_, to), there_and_back)
+    carried = Sensor(sensor, rate, label_noise=label_noise, drift=drift, wet=wet, imu_hz=imu_rate)
     with console.progress():
-        truth = simulate_sessions(
-            output,
-            seed=seed,
-            sessions=sessions if sessions is not None else 1 if trajectory else 2,
-            length_m=length,
-            trajectory=trajectory,
-            part_m=(from_, to),
-            there_and_back=there_and_back,
-            repeating=repeating,
-            sensor=sensor,
-            rate_hz=rate,
-            format=format_,
-            label_noise=label_noise,
-            drift=drift,
-            imu_hz=imu_rate,
-            wet=wet,
-            seasons=[name.strip() for name in season.split(",")],
-            daytimes=[name.strip() for name in daytime.split(",")],
-            roadworks=roadworks,
-            rebuilt=rebuilt,
-            overwrite=overwrite,
-        )
+        truth = simulate_sessions(output, town, route, carried, format=format_, overwrite=overwrite)
     logs = sorted(str(output / name) for name in json.loads(truth.read_text()))
     if as_json:
         console.result_json({"truth": str(truth), "logs": logs})

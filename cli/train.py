@@ -156,9 +156,11 @@ def packed_shards(
     """Shards of pairs from the sessions of ``work`` or, without one, from simulated scenes;
     ``samples`` have been seen of them.
     """
+    from semloc_logs.simulation.meshes.world import require_ray_caster
     from semloc_logs.training.runs import session_shards, simulated_shards
     from semloc_logs.workspace import Workspace
 
     if work is None:
+        require_ray_caster("semloc train")
         return simulated_shards(folder, settings, engine, console.note, samples)
     return session_shards(folder, Workspace(work).sessions(), settings, engine, console.note)

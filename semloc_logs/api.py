@@ -22,7 +22,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.evaluation.truth import Evaluation, evaluate_closures
@@ -31,6 +30,7 @@ from semloc_logs.logs.annotation.annotate import AnnotateReport
 from semloc_logs.logs.containers import open as containers
 from semloc_logs.logs.log import Log
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.progress import Listener, listening
 from semloc_logs.settings import Resolved, Settings, load

@@ -201,6 +201,21 @@ class Closures(_Section):
         description="submaps, of all sessions, that a query is verified in: those whose words"
         " agree best",
     )
+    session_hypotheses: int = Field(
+        16, ge=1, description="pooled hypotheses of each target session, at least"
+    )
+    candidates: int = Field(
+        4,
+        ge=1,
+        description="best hypotheses of a query in each target session that are aligned on points;"
+        " wrong ones count too, for they tell which places are ambiguous",
+    )
+    surface_keyframes: int = Field(
+        9,
+        ge=1,
+        description="keyframes of a target that a query is aligned with, for each query.radius of"
+        " a query's length",
+    )
     kappa: float = Field(10.0, gt=0, description="kappa of the paper in voxels (3 m at 0.30 m)")
     min_probability: float = Field(
         0.99, ge=0.0, le=1.0, description="closures below this are rejected"

@@ -1,5 +1,6 @@
-"""The target of an alignment on points: a grid of cells to find the nearest point in, and tangent
-planes made when they are first met.
+"""The surface of a target: points in cells, to find the nearest one, and their tangent planes.
+
+The planes are made when they are first met.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.eigen import eigen
 from semloc_logs.numerics.local_shape import shapes_of
 
@@ -18,23 +20,28 @@ I64 = NDArray[np.int64]
 I32 = NDArray[np.int32]
 NEIGHBOURS = 14  # that make a tangent plane
 RINGS = 4  # of cells around a point that they are looked for in
-SCATTERED, LINEAR = 0.3, 0.9  # planes are less than this
-THICK, LEAST_FLAT = 0.5, 8  # of slabs of uncertain points, and how many make one
+# planes are less scattered and less linear than this
+SCATTERED = 0.3
+LINEAR = 0.9
+# slabs of uncertain points are thinner than this share of their width, and have so many points
+THICK = 0.5
+LEAST_FLAT = 8
 
 
 # A grid of cells: their edge (m), where it begins (3,), how many there are along each axis (3,),
 # and ``start``: points ``start[c]`` to ``start[c + 1]`` lie in cell c. A plain tuple, which
-# compiled functions hand on for nothing.
+# compiled functions pass on without a cost.
 Cells = tuple[float, F64, I64, I32]
 Arrays = tuple[F64, F64, F64, Cells, F64]  # of a surface, in the order of its fields
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Target ``points`` (n, 3) ordered by the ``cells`` they lie in. ``normals`` (n, 3) are unit
-    vectors and ``planar`` (n,) is 1 where the surroundings are a plane, 0 where not, -1 where
-    nobody has asked yet. ``spread`` (n, 3) is one standard deviation of the points along their
-    rays, metres, of a flattened surface; (0, 3) else.
+    """Target ``points`` (n, 3) ordered by the ``cells`` they lie in.
+
+    ``normals`` (n, 3) are unit vectors and ``planar`` (n,) is 1 where the surroundings are a plane,
+    0 where not, -1 where they are not computed yet. ``spread`` (n, 3) is one standard deviation of
+    the points along their rays, metres, of a flattened surface; (0, 3) else.
     """
 
     points: F64
@@ -50,31 +57,36 @@ class Surface:
 
     @property
     def sigma(self) -> float:
-        """Median standard deviation of the points along their rays, metres; 0 of a surface that is
-        not flattened.
-        """
+        """Median standard deviation of the points along their rays, metres; 0 if not flattened."""
         return float(np.median(np.linalg.norm(self.spread, axis=1))) if len(self.spread) else 0.0
 
 
+def thin_points(points: F64, cell: float, spread: F64) -> I64:
+    """Numbers of one point a cell: the one of least ``spread`` (n, 3), of equal ones the first."""
+    if not spread.any():
+        return thin(points.astype(np.float32), cell)
+    order = np.argsort(np.einsum("ij,ij->i", spread, spread), kind="stable")
+    return order[thin(points[order].astype(np.float32), cell)]
+
+
 def surface_of(points: NDArray[np.floating], cell: float) -> Surface:
-    """A surface of ``points`` (n, 3), best of some points in each of the occupied cells of ``cell``
-    metres.
-    """
+    """A surface of ``points`` (n, 3); best are some points in each occupied cell of ``cell`` m."""
     p = np.ascontiguousarray(points, float)
     order, cells = _in_cells(p, cell)
     return Surface(p[order], np.zeros_like(p), np.full(len(p), -1.0), cells)
 
 
 def flattened_surface(points: F64, spread: F64, kept: I64, radius: float, noise: float) -> Surface:
-    """A surface through the middle of what ``points`` (n, 3) with ``spread`` (n, 3), a standard
-    deviation along their rays, saw of a wall.
+    """A surface through the middle of the slab in which uncertain ``points`` (n, 3) lie.
 
-    Points of a camera lie in a slab as thick as their ranges are uncertain, in which the nearest
-    one is near whatever the alignment: so the points ``kept`` (m,) move onto the plane of those
-    within ``radius`` metres, each of weight 1 / (noise^2 + sigma^2) (moving least squares: Alexa et
-    al., Computing and Rendering Point Set Surfaces, TVCG 2003, with planes).
+    ``spread`` (n, 3) is a standard deviation along their rays, metres. Points of a camera lie in a
+    slab as thick as their ranges are uncertain, in which the nearest one is near for any alignment:
+    so the points ``kept`` (m,) move onto the plane of those within ``radius`` metres, each of
+    weight 1 / (noise^2 + sigma^2) (moving least squares: Alexa et al., Computing and Rendering
+    Point Set Surfaces, TVCG 2003, with planes).
     """
-    (order, cells), sigma = _in_cells(points, radius), np.linalg.norm(spread, axis=1)
+    sigma = np.linalg.norm(spread, axis=1)
+    order, cells = _in_cells(points, radius)
     moved, normals, planar = _flattened(points[order], sigma[order], cells, points[kept], noise)
     order, cells = _in_cells(moved, radius)
     return Surface(
@@ -87,9 +99,7 @@ def flattened_surface(points: F64, spread: F64, kept: I64, radius: float, noise:
 
 
 def _in_cells(points: F64, edge: float) -> tuple[I64, Cells]:
-    """The order of points (n, 3) by cells of ``edge`` metres, those of one cell as they came, and
-    the cells.
-    """
+    """The order of points (n, 3) by cells of ``edge`` m, in a cell as they came; and the cells."""
     order, low, shape, start = _sorted(points, edge)
     return order, (float(edge), low, shape, start)
 
@@ -102,7 +112,8 @@ def _sorted(points: F64, cell: float) -> tuple[I64, F64, I64, I32]:
     shape = np.ones(3, np.int64)
     for n in range(len(points)):
         for k in range(3):
-            low[k], high[k] = min(low[k], points[n, k]), max(high[k], points[n, k])
+            low[k] = min(low[k], points[n, k])
+            high[k] = max(high[k], points[n, k])
     if not len(points):
         low[:] = high[:] = 0.0
     for k in range(3):
@@ -127,8 +138,9 @@ def _sorted(points: F64, cell: float) -> tuple[I64, F64, I64, I32]:
 
 @njit(cache=True, nogil=True)
 def _column(cells: Cells, x: int, y: int, low: int, high: int) -> tuple[int, int]:
-    """The points of cells ``low`` to ``high``, both included, of column (x, y); none of a column
-    beside the grid.
+    """The range of points in cells ``low`` to ``high``, both included, of column (x, y).
+
+    It is empty beside the grid.
     """
     _, _, shape, start = cells
     low = max(low, 0)
@@ -143,10 +155,10 @@ def _column(cells: Cells, x: int, y: int, low: int, high: int) -> tuple[int, int
 def _flattened(
     around: F64, sigma: F64, cells: Cells, points: F64, noise: float
 ) -> tuple[F64, F64, F64]:
-    """Each of ``points`` (m, 3) on the plane of those ``around`` it, a cell's edge at most, the
-    plane's normal, and whether it is one.
+    """Each of ``points`` (m, 3) on the plane of those ``around`` it, its normal, whether planar.
+
+    Points within a cell's edge make the plane.
     """
-    radius, low, _, _ = cells
     moved = points.copy()
     normals = np.zeros((len(points), 3))
     planar = np.zeros(len(points))
@@ -155,36 +167,14 @@ def _flattened(
     values = np.empty(3)
     vectors = np.empty((3, 3))
     for n in range(len(points)):
-        p = points[n]
-        x = int(np.floor((p[0] - low[0]) / radius))
-        y = int(np.floor((p[1] - low[1]) / radius))
-        z = int(np.floor((p[2] - low[2]) / radius))
-        mean[:], a[:], total, count = 0.0, 0.0, 0.0, 0
-        for dx in range(-1, 2):
-            for dy in range(-1, 2):
-                first, end = _column(cells, x + dx, y + dy, z - 1, z + 1)
-                for i in range(first, end):
-                    o0 = around[i, 0] - p[0]
-                    o1 = around[i, 1] - p[1]
-                    o2 = around[i, 2] - p[2]
-                    if o0 * o0 + o1 * o1 + o2 * o2 > radius * radius:
-                        continue
-                    w = 1.0 / (noise * noise + sigma[i] * sigma[i])
-                    total = total + w
-                    count = count + 1
-                    mean[0] += w * o0
-                    mean[1] += w * o1
-                    mean[2] += w * o2
-                    a[0, 0] += w * o0 * o0
-                    a[1, 1] += w * o1 * o1
-                    a[2, 2] += w * o2 * o2
-                    a[0, 1] += w * o0 * o1
-                    a[0, 2] += w * o0 * o2
-                    a[1, 2] += w * o1 * o2
+        p = (points[n, 0], points[n, 1], points[n, 2])
+        total, count = _moments(around, sigma, cells, p, noise, (mean, a))
         if count < LEAST_FLAT:
             continue
         mean /= total
-        a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
+        a[1, 0] = a[0, 1]
+        a[2, 0] = a[0, 2]
+        a[2, 1] = a[1, 2]
         for k in range(3):
             for m in range(3):
                 a[k, m] = a[k, m] / total - mean[k] * mean[m]
@@ -201,9 +191,56 @@ def _flattened(
 
 
 @njit(cache=True, nogil=True)
+def _moments(
+    around: F64,
+    sigma: F64,
+    cells: Cells,
+    p: tuple[float, float, float],
+    noise: float,
+    moments: tuple[F64, F64],
+) -> tuple[float, int]:
+    """Weight and number of the points ``around`` within a cell's edge of ``p``.
+
+    ``moments``: the sums of weighted offsets (3,) and of their products, above the diagonal (3, 3).
+    """
+    radius, low, _, _ = cells
+    mean, a = moments
+    x = int(np.floor((p[0] - low[0]) / radius))
+    y = int(np.floor((p[1] - low[1]) / radius))
+    z = int(np.floor((p[2] - low[2]) / radius))
+    mean[:] = 0.0
+    a[:] = 0.0
+    total = 0.0
+    count = 0
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            first, end = _column(cells, x + dx, y + dy, z - 1, z + 1)
+            for i in range(first, end):
+                o0 = around[i, 0] - p[0]
+                o1 = around[i, 1] - p[1]
+                o2 = around[i, 2] - p[2]
+                if o0 * o0 + o1 * o1 + o2 * o2 > radius * radius:
+                    continue
+                w = 1.0 / (noise * noise + sigma[i] * sigma[i])
+                total = total + w
+                count = count + 1
+                mean[0] += w * o0
+                mean[1] += w * o1
+                mean[2] += w * o2
+                a[0, 0] += w * o0 * o0
+                a[1, 1] += w * o1 * o1
+                a[2, 2] += w * o2 * o2
+                a[0, 1] += w * o0 * o1
+                a[0, 2] += w * o0 * o2
+                a[1, 2] += w * o1 * o2
+    return total, count
+
+
+@njit(cache=True, nogil=True)
 def _gap(offset: int, inside: float, cell: float) -> float:
-    """Distance along an axis from a point at ``inside`` (0..1) of its cell to the cell ``offset``
-    away.
+    """Distance along an axis from a point, at ``inside`` (0..1) of its cell, to another cell.
+
+    The other cell is ``offset`` cells away.
     """
     if offset > 0:
         return (offset - inside) * cell
@@ -212,7 +249,7 @@ def _gap(offset: int, inside: float, cell: float) -> float:
 
 @njit(cache=True, nogil=True)
 def look_at(surface: Arrays, index: I64) -> None:
-    """Make the tangent planes of the points ``index`` (m,) that have none yet; -1 is no point."""
+    """Make the tangent planes of the points ``index`` (m,) that lack one; -1 stands for none."""
     points, normals, planar, cells, _ = surface
     wanted = np.empty(len(index), np.int64)
     count = 0
@@ -231,20 +268,19 @@ def look_at(surface: Arrays, index: I64) -> None:
 
 @njit(cache=True, nogil=True)
 def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
-    """Number (m,) of the surface's point nearest to each of ``query`` (m, 3), -1 where none is
-    nearer than ``radius``.
+    """Number (m,) of the surface's point nearest to each of ``query`` (m, 3).
+
+    It is -1 where none is nearer than ``radius``.
     """
     points, _, _, cells, _ = surface
     cell, low, _, _ = cells
-    found = np.full(len(query), -1, np.int64)
+    nearest = np.full(len(query), -1, np.int64)
     rings = int(np.ceil(radius / cell))
     for n in range(len(query)):
-        px = query[n, 0]
-        py = query[n, 1]
-        pz = query[n, 2]
-        gx = (px - low[0]) / cell
-        gy = (py - low[1]) / cell
-        gz = (pz - low[2]) / cell
+        p = (query[n, 0], query[n, 1], query[n, 2])
+        gx = (p[0] - low[0]) / cell
+        gy = (p[1] - low[1]) / cell
+        gz = (p[2] - low[2]) / cell
         x = int(np.floor(gx))
         y = int(np.floor(gy))
         z = int(np.floor(gz))
@@ -252,9 +288,9 @@ def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
         fy = gy - y
         margin = min(fx, 1 - fx, fy, 1 - fy)
         best = radius * radius
-        at = -1
-        # most lie there: the others are soon too far
-        best, at = _nearer(points, _column(cells, x, y, z, z), px, py, pz, best, at)
+        number = -1
+        # most lie in the point's own cell: the others are soon too far
+        best, number = _nearer(points, _column(cells, x, y, z, z), p, best, number)
         for ring in range(rings + 1):
             for dx in range(-ring, ring + 1):
                 ax = _gap(dx, fx, cell) ** 2
@@ -269,34 +305,41 @@ def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
                     column = _column(
                         cells, x + dx, y + dy, int(np.floor(gz - up)), int(np.floor(gz + up))
                     )
-                    best, at = _nearer(points, column, px, py, pz, best, at)
+                    best, number = _nearer(points, column, p, best, number)
             if ((ring + margin) * cell) ** 2 >= best:
                 break
-        found[n] = at
-    return found
+        nearest[n] = number
+    return nearest
 
 
 @njit(cache=True, nogil=True)
 def _nearer(
-    points: F64, column: tuple[int, int], x: float, y: float, z: float, best: float, at: int
+    points: F64,
+    column: tuple[int, int],
+    p: tuple[float, float, float],
+    best: float,
+    number: int,
 ) -> tuple[float, int]:
-    """Squared distance and number of the nearest point to (x, y, z), of those in ``column`` and the
-    one ``at`` that is ``best`` so far.
+    """Squared distance and number of the nearest point to ``p``, of those in ``column``.
+
+    Point ``number`` at the squared distance ``best`` is the nearest so far.
     """
     for i in range(column[0], column[1]):
-        d = (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2 + (points[i, 2] - z) ** 2
+        d = (points[i, 0] - p[0]) ** 2 + (points[i, 1] - p[1]) ** 2 + (points[i, 2] - p[2]) ** 2
         if d < best:
-            best, at = d, i
-    return best, at
+            best = d
+            number = i
+    return best, number
 
 
 @njit(cache=True, nogil=True)
 def _around(points: F64, cells: Cells, wanted: I64) -> I64:
-    """The nearest points (m, NEIGHBOURS) of the points ``wanted``, themselves among them, -1 where
-    there are fewer in RINGS cells.
+    """The nearest points (m, NEIGHBOURS) of the points ``wanted``, themselves among them.
+
+    They are -1 where fewer points lie in RINGS cells.
     """
     cell, low, _, _ = cells
-    found = np.full((len(wanted), NEIGHBOURS), -1, np.int64)
+    nearest = np.full((len(wanted), NEIGHBOURS), -1, np.int64)
     distance = np.empty(NEIGHBOURS)
     for n in range(len(wanted)):
         p = points[wanted[n]]
@@ -319,22 +362,22 @@ def _around(points: F64, cells: Cells, wanted: I64) -> I64:
                     for dz in range(-ring, ring + 1, step):
                         if axy + _gap(dz, gz, cell) ** 2 < distance[-1]:
                             first, end = _column(cells, x + dx, y + dy, z + dz, z + dz)
-                            _take(points, p, first, end, distance, found[n])
+                            _take(points, p, (first, end), distance, nearest[n])
             if ((ring + margin) * cell) ** 2 >= distance[-1]:
                 break
-    return found
+    return nearest
 
 
 @njit(cache=True, nogil=True)
-def _take(points: F64, p: F64, first: int, end: int, distance: F64, found: I64) -> None:
-    """Insert points ``first`` to ``end`` into the list of the nearest, ascending by squared
-    ``distance``.
-    """
-    for i in range(first, end):
+def _take(points: F64, p: F64, column: tuple[int, int], distance: F64, nearest: I64) -> None:
+    """Insert the points of ``column`` into the ``nearest``, ascending by squared ``distance``."""
+    for i in range(column[0], column[1]):
         d = (points[i, 0] - p[0]) ** 2 + (points[i, 1] - p[1]) ** 2 + (points[i, 2] - p[2]) ** 2
         if d < distance[-1]:
             k = len(distance) - 1
             while k > 0 and distance[k - 1] > d:
-                distance[k], found[k] = distance[k - 1], found[k - 1]
+                distance[k] = distance[k - 1]
+                nearest[k] = nearest[k - 1]
                 k -= 1
-            distance[k], found[k] = d, i
+            distance[k] = d
+            nearest[k] = i

@@ -37,7 +37,8 @@ def street_sweeps(count: int = 12, points: int = SWEEP_POINTS, seed: int = 8) ->
     within 50 m.
     """
     from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
-    from semloc_logs.simulation.sensors.lidar import MODELS, full_sweep
+    from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
+    from semloc_logs.simulation.sensors.lidar_models import MODELS
     from semloc_logs.simulation.town.road_network import grid_network, lane_path, random_route
     from semloc_logs.simulation.town.street import build_street, street_ground
 
@@ -55,7 +56,7 @@ def street_sweeps(count: int = 12, points: int = SWEEP_POINTS, seed: int = 8) ->
     poses[:, :3, 3] += poses[:, :3, 2] * model.height
     out = []
     for pose in poses:
-        turn = full_sweep(scene, pose, rng, model, columns=points // 50)
+        turn = full_sweep(scene, pose, rng, model, SweepOptions(columns=points // 50))
         some = np.linspace(0, len(turn.points) - 1, min(points, len(turn.points))).astype(np.int64)
         out.append(Scan(turn.points[some], turn.labels[some], pose))
     return out
@@ -67,7 +68,8 @@ def town_sweeps(seed: int, count: int = 3) -> list[Scan]:
     """
     from semloc_logs.simulation.drives.traffic import random_traffic
     from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
-    from semloc_logs.simulation.sensors.lidar import MODELS, full_sweep
+    from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
+    from semloc_logs.simulation.sensors.lidar_models import MODELS
     from semloc_logs.simulation.town.road_network import grid_network, lane_path, random_route
     from semloc_logs.simulation.town.street import build_street, street_ground
 
@@ -85,7 +87,7 @@ def town_sweeps(seed: int, count: int = 3) -> list[Scan]:
     for k, pose in enumerate(poses):
         moving = traffic.scene(5.0 * k, pose)
         pose[:3, 3] += pose[:3, 2] * model.height
-        turn = full_sweep(scene, pose, rng, model, traffic=moving)
+        turn = full_sweep(scene, pose, rng, model, SweepOptions(traffic=moving))
         out.append(Scan(turn.points, turn.labels, pose))
     return out
 

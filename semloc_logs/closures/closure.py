@@ -1,25 +1,84 @@
-"""Alignments of queries in targets: what is decided about and what is reported."""
+"""Alignments of queries in targets, the decisions about them, and what becomes of each."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from enum import Enum
+from typing import Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import (
-    Features,
-)
-
 F64 = NDArray[np.float64]
+Rows = NDArray[np.int64] | NDArray[np.bool_]
+Value = TypeVar("Value", float, F64)  # of one alignment, or the values (n,) of several
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """Base of dataclasses whose fields are floats, or arrays with one row an alignment."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def part(self, rows: Rows) -> Self:
+        """Some of the rows."""
+        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def vector(self) -> F64:
+        """The values (..., d) in the order of the fields, as a model takes them."""
+        return np.stack([getattr(self, f.name) for f in fields(self)], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features(Columns, Generic[Value]):
+    """Evidence for an alignment by itself.
+
+    The columns of the same names are described in ``schemas/parquet/rejected.json``.
+    """
+
+    structure: Value
+    coverage: Value
+    contradiction: Value
+    fit: Value
+    rmse: Value
+    distinct: Value
+    support: Value
+    stiffness: Value
+
+
+FEATURES = tuple(f.name for f in fields(Features))
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement(Columns, Generic[Value]):
+    """How other queries of the session vote on an alignment.
+
+    ``own_probability`` is what the alignment's own features give. ``support`` and ``conflict`` are
+    sums of own probabilities of near neighbours that agree and that do not; ``far_support`` and
+    ``far_conflict`` those farther along the road. ``ambiguity`` in [0, 1] is how much the road
+    around either end matches other places. See ``schemas/parquet/rejected.json``.
+    """
+
+    own_probability: Value
+    neighbours: Value
+    support: Value
+    conflict: Value
+    far_support: Value
+    far_conflict: Value
+    ambiguity: Value
+
+    def row(self: Agreement[F64], k: int) -> Agreement[float]:
+        """The agreement of alignment ``k`` of several."""
+        return Agreement(*(float(getattr(self, f.name)[k]) for f in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """A verified hypothesis with everything that is reported; ``accepted`` or with a ``reason``.
+    """A verified hypothesis before any decision about it.
 
-    ``probability`` is that of the alignment alone until
-    :func:`semloc_logs.closures.acceptance.consistency.decide` has compared all queries.
+    ``probability`` is by the alignment's own features. The keyframes are the query's, and the
+    target's nearest one; ``covariance`` (6, 6) is in the axes of the target's, metres and radians.
     """
 
     query_session: str
@@ -34,13 +93,7 @@ class Alignment:
     probability: float
     inliers: int
     words: int
-    features: Features
-    agreement: Agreement
-    reason: str = "not yet compared with other queries"
-
-    @property
-    def accepted(self) -> bool:
-        return not self.reason
+    features: Features[float]
 
     @property
     def sigma(self) -> float:
@@ -49,18 +102,85 @@ class Alignment:
 
 
 @dataclass(frozen=True, slots=True)
-class Agreement:
-    """What other queries of the session say about an alignment; see
-    ``schemas/parquet/rejected.json``.
+class Decision:
+    """The probability of an alignment after all queries are compared, and its factors.
 
-    ``alone`` is the probability from the alignment's own features; the sums are of the ``alone`` of
-    other queries' alignments.
+    ``probability`` is the product of ``place_probability`` (the place is right),
+    ``position_confidence`` (the position is known well enough) and ``mode_share`` (of the poses
+    that fit this place, this is the right one). At least ``min_probability`` is required.
     """
 
-    alone: float
-    neighbours: int = 0
-    agreeing: float = 0.0
-    opposing: float = 0.0
-    far_agreeing: float = 0.0
-    far_opposing: float = 0.0
-    lookalike: float = 0.0
+    probability: float
+    agreement: Agreement[float]
+    place_probability: float
+    position_confidence: float
+    mode_share: float
+    min_probability: float
+
+
+class Reason(Enum):
+    """Why an alignment is rejected: a sentence with the figures of :meth:`Rejected.figures`."""
+
+    CONTRADICTS_ODOMETRY = "contradicts the session's own odometry"
+    POSE_MODES = "other poses fit this place too: this one has {mode_share:.0f} % of the odds"
+    UNCERTAIN_POSITION = "position uncertainty {sigma:.2f} m (1 sigma) is too large"
+    AMBIGUOUS_PLACE = "ambiguous place: {ambiguity:.0f} % of nearby queries match elsewhere"
+    NEIGHBOURS_CONFLICT = (
+        "neighbouring queries conflict: of {neighbours:.0f}, {support:.1f} support this place and"
+        " {conflict:.1f} match elsewhere"
+    )
+    UNOBSERVED = "only {coverage:.0f} % of the query's structure falls into observed space"
+    STRUCTURE_MISMATCH = (
+        "only {structure:.0f} % of the query's structure lies on structure of its class"
+    )
+    RIVAL_PLACE = "another place fits nearly as well ({rival:.0f} % of this score)"
+    BETTER_RIVAL = "another place fits better (this one has at most {of_rival:.0f} % of its score)"
+    LOOSE_FIT = "only {fit:.0f} % of the points lie on a surface"
+    WEAK_EVIDENCE = "the evidence together is too weak"
+    SECOND_CHOICE = "another place of the same session fits better"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closure:
+    """An accepted alignment."""
+
+    alignment: Alignment
+    decision: Decision
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rejected:
+    """A rejected alignment; ``reason`` is the gate that it did not pass."""
+
+    alignment: Alignment
+    decision: Decision
+    reason: Reason
+
+    @property
+    def sentence(self) -> str:
+        """The reason with its figures."""
+        sentence = self.reason.value.format(**self.figures())
+        if self.reason is Reason.SECOND_CHOICE:
+            return sentence
+        decision = self.decision
+        return (
+            f"probability {decision.probability:.3f} below {decision.min_probability:g}: {sentence}"
+        )
+
+    def figures(self) -> dict[str, float]:
+        """The figures that sentences may have: shares in per cent, ``sigma`` in metres."""
+        features = self.alignment.features
+        agreement = self.decision.agreement
+        return {
+            "mode_share": 100 * self.decision.mode_share,
+            "sigma": self.alignment.sigma,
+            "ambiguity": 100 * agreement.ambiguity,
+            "neighbours": agreement.neighbours,
+            "support": agreement.support,
+            "conflict": agreement.conflict,
+            "coverage": 100 * features.coverage,
+            "structure": 100 * features.structure,
+            "rival": 100 * features.distinct,
+            "of_rival": 100 / max(features.distinct, 1.0),
+            "fit": 100 * features.fit,
+        }

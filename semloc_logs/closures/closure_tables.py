@@ -1,4 +1,4 @@
-"""Closures of all queries together: each place once, as tables, and as rows for the log's channels."""
+"""Closures of all queries together: each place once, and the tables of closures and rejections."""
 
 from __future__ import annotations
 
@@ -9,89 +9,120 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance.calibration import AGREEMENT
-from semloc_logs.closures.closure import Alignment
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.closures.closure import FEATURES, Closure, Rejected
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.store import pose_columns
 
+# columns of rejected.parquet and the fields of Agreement that they hold
+AGREEMENT_COLUMNS = {
+    "alone": "own_probability",
+    "neighbours": "neighbours",
+    "agreeing": "support",
+    "opposing": "conflict",
+    "far_agreeing": "far_support",
+    "far_opposing": "far_conflict",
+    "lookalike": "ambiguity",
+}
+
 
 def unique_closures(
-    accepted: Sequence[Alignment], road: dict[str, NDArray[np.float64]], spacing: float
-) -> list[Alignment]:
-    """Accepted alignments without those found from both ends, sorted by query session and time.
+    accepted: Sequence[Closure], road: dict[str, NDArray[np.float64]], spacing: float
+) -> list[Closure]:
+    """Closures without those found from both ends, sorted by query session and time.
 
     Two are the same when their ends are the same two places to within ``spacing`` metres along the
     road; the more probable one stays. ``road`` gives the keyframes' distances (n,), metres
-    travelled, by session: of a drive with itself both ends lie at one place, and only the way
+    travelled, by session: of a drive with itself both ends lie at one place, and only the road
     between tells them apart.
     """
-    kept: list[Alignment] = []
-    by_ends: dict[tuple[str, str, int], list[Alignment]] = {}
-    for a in sorted(
-        accepted,
-        key=lambda a: (-a.probability, -a.features.structure, a.query_session, a.query_stamp_ns),
-    ):
-        asking = road[a.query_session]
-        asked = road[a.target_session]
-        q = asking[a.query_keyframe]
-        t = asked[a.target_keyframe]
-        near = range(
-            np.searchsorted(asking, q - spacing, "right"),
-            np.searchsorted(asking, q + spacing, "left"),
+    kept: list[Closure] = []
+    by_ends: dict[tuple[str, str, int], list[Closure]] = {}
+    for closure in sorted(accepted, key=_best_first):
+        a = closure.alignment
+        query_road = road[a.query_session]
+        target_road = road[a.target_session]
+        query_distance = query_road[a.query_keyframe]
+        target_distance = target_road[a.target_keyframe]
+
+        # closures of the opposite direction that end near this query, and begin near its target
+        keyframes = range(
+            np.searchsorted(query_road, query_distance - spacing, "right"),
+            np.searchsorted(query_road, query_distance + spacing, "left"),
         )
-        twins = (o for k in near for o in by_ends.get((a.target_session, a.query_session, k), ()))
-        if any(abs(asked[o.query_keyframe] - t) < spacing for o in twins):
+        opposite = (
+            other.alignment
+            for k in keyframes
+            for other in by_ends.get((a.target_session, a.query_session, k), ())
+        )
+        if any(abs(target_road[o.query_keyframe] - target_distance) < spacing for o in opposite):
             continue
-        by_ends.setdefault((a.query_session, a.target_session, a.target_keyframe), []).append(a)
-        kept.append(a)
-    return sorted(
-        kept, key=lambda a: (a.query_session, a.query_stamp_ns, a.target_session, a.target_stamp_ns)
-    )
+
+        ends = (a.query_session, a.target_session, a.target_keyframe)
+        by_ends.setdefault(ends, []).append(closure)
+        kept.append(closure)
+    return sorted(kept, key=_by_time)
 
 
-def _columns(rows: Sequence[Alignment]) -> dict[str, Any]:
+def _best_first(closure: Closure) -> tuple[float, float, str, int]:
+    a = closure.alignment
+    return -closure.decision.probability, -a.features.structure, a.query_session, a.query_stamp_ns
+
+
+def _by_time(closure: Closure) -> tuple[str, int, str, int]:
+    a = closure.alignment
+    return a.query_session, a.query_stamp_ns, a.target_session, a.target_stamp_ns
+
+
+def _columns(rows: Sequence[Closure] | Sequence[Rejected]) -> dict[str, Any]:
+    alignments = [row.alignment for row in rows]
     return {
-        "query_session": [a.query_session for a in rows],
-        "target_session": [a.target_session for a in rows],
-        "query_stamp_ns": [a.query_stamp_ns for a in rows],
-        "target_stamp_ns": [a.target_stamp_ns for a in rows],
-        **pose_columns(np.array([a.target_T_query for a in rows])),
-        "overlap": [a.overlap for a in rows],
-        "probability": [a.probability for a in rows],
-        "inliers": [a.inliers for a in rows],
-        "words": [a.words for a in rows],
+        "query_session": [a.query_session for a in alignments],
+        "target_session": [a.target_session for a in alignments],
+        "query_stamp_ns": [a.query_stamp_ns for a in alignments],
+        "target_stamp_ns": [a.target_stamp_ns for a in alignments],
+        **pose_columns(np.array([a.target_T_query for a in alignments])),
+        "overlap": [a.overlap for a in alignments],
+        "probability": [row.decision.probability for row in rows],
+        "inliers": [a.inliers for a in alignments],
+        "words": [a.words for a in alignments],
     }
 
 
-def write_closures(path: Path, rows: Sequence[Alignment], metadata: dict[str, Any]) -> None:
+def write_closures(path: Path, rows: Sequence[Closure], metadata: dict[str, Any]) -> None:
     """closures.parquet."""
-    columns = _columns(rows) | {"covariance": [a.covariance.ravel().tolist() for a in rows]}
+    columns = _columns(rows)
+    columns["covariance"] = [row.alignment.covariance.ravel().tolist() for row in rows]
     write_table(
         path, contracts.table("closures", columns), metadata, ("query_session", "query_stamp_ns")
     )
 
 
-def write_rejected(path: Path, rows: Sequence[Alignment], metadata: dict[str, Any]) -> None:
-    """rejected.parquet: also the reason and the features that acceptance looked at."""
-    ordered = sorted(
-        rows,
-        key=lambda a: (
-            a.query_session,
-            a.query_stamp_ns,
-            -a.probability,
-            a.target_session,
-            a.target_stamp_ns,
-        ),
-    )
-    columns = _columns(ordered) | {n: [getattr(a, n) for a in ordered] for n in ("sigma", "reason")}
-    columns |= {n: [getattr(a.features, n) for a in ordered] for n in FEATURES}
-    columns |= {n: [getattr(a.agreement, n) for a in ordered] for n in AGREEMENT}
+def write_rejected(path: Path, rows: Sequence[Rejected], metadata: dict[str, Any]) -> None:
+    """rejected.parquet: also the reason and the features that acceptance looks at."""
+    ordered = sorted(rows, key=_query_then_best)
+    alignments = [row.alignment for row in ordered]
+    agreements = [row.decision.agreement for row in ordered]
+
+    columns = _columns(ordered)
+    columns["sigma"] = [a.sigma for a in alignments]
+    columns["reason"] = [row.sentence for row in ordered]
+    columns |= {name: [getattr(a.features, name) for a in alignments] for name in FEATURES}
+    columns |= {
+        column: [getattr(agreement, name) for agreement in agreements]
+        for column, name in AGREEMENT_COLUMNS.items()
+    }
+    columns["neighbours"] = [int(agreement.neighbours) for agreement in agreements]
     write_table(
         path, contracts.table("rejected", columns), metadata, ("query_session", "query_stamp_ns")
     )
+
+
+def _query_then_best(row: Rejected) -> tuple[str, int, float, str, int]:
+    a = row.alignment
+    probability = row.decision.probability
+    return a.query_session, a.query_stamp_ns, -probability, a.target_session, a.target_stamp_ns
 
 
 def read_closures(path: Path) -> list[dict[str, Any]]:

@@ -1,37 +1,30 @@
-"""One query against the database: words -> hypotheses -> verified alignments -> closures and
-rejections (paper 3.4, 3.5).
-"""
+"""One query against the database: words, hypotheses, verified alignments (paper 3.4, 3.5)."""
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.hypotheses import Hypothesis, of_best_groups, pool
+from semloc_logs.alignment.covariance import covariance_of, stiffness
+from semloc_logs.alignment.hypotheses import Hypothesis, keep_best_submaps, pool, same_place
 from semloc_logs.alignment.icp import Fit
-from semloc_logs.alignment.overlap import tau, yaw_between
-from semloc_logs.alignment.verify import (
-    Candidate,
-    Features,
-    Query,
-    Scores,
-    coarse_fit,
-    escaped,
-    fine_fit,
-    measured,
-    same_place,
-    search_hypotheses,
-    structure_scores,
-)
-from semloc_logs.closures.acceptance.calibration import CLOSE, HOPELESS, own_values, shipped
-from semloc_logs.closures.closure import Agreement, Alignment
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit, measured
+from semloc_logs.alignment.scores import Scores, structure_scores
+from semloc_logs.alignment.search import Candidate, search_hypotheses
+from semloc_logs.alignment.tau import tau
+from semloc_logs.closures.acceptance.calibration import MIN_RELATIVE_SCORE, MIN_SCORE, shipped
+from semloc_logs.closures.closure import Alignment, Features
 from semloc_logs.closures.database import Database, open_database
-from semloc_logs.closures.query import SessionMap, build_query
+from semloc_logs.closures.query import build_query
+from semloc_logs.closures.target_surface import target_surface
+from semloc_logs.closures.visibility import Visibility, visible_to
 from semloc_logs.labels.space import cityscapes
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse, turned_about_z
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns
@@ -39,30 +32,64 @@ from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
-# candidates of a target session that are fitted on the points: also hopeless ones tell which
-# streets look like others
-ALIGNED = 4
-LEAST_HYPOTHESES = 16  # for a target session, however many there are
-NORMAL_NOISE = np.radians(2.0)
-INFLATION = 12.0  # of the covariance: neighbouring points share their errors
-# standard deviations that uncertain ranges of a query, and of a target, may all be off by
-SYSTEMATIC = 1.0
-# of the variance of that: what query and target have in common, and cancels where both look the
-# same way
-COMMON = 0.5
-DRIFT = 0.01  # of the way: the odometry of a target
-FLOOR = np.diag([1e-4] * 3 + [1e-6] * 3)  # 1 cm and 1 mrad
+VOTE_CELL = 2.4  # m, at voxels of 0.30 m: edge of the cells that word matches vote in
+# the weight of a word match falls to LEAST_WEIGHT at so many bits between the words
+FAR_WORD = 32.0
+LEAST_WEIGHT = 1e-3
+# voxels of road between two places of a target that may be one, driven again
+DRIVEN_AGAIN = 50
+LEAST_SCORE = 1e-3  # that a rival's score is divided by
+MOST_DISTINCT = 2.0  # a rival's score over an alignment's: more is not worse
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QueryContext:
+    """The query at ``keyframe`` of ``session`` and what it may see.
+
+    ``query_T_base`` (4, 4) is the base in the level frame of the ``query``.
+    """
+
+    visible: Visibility
+    session: SessionMap
+    keyframe: int
+    query: Query
+    query_T_base: F64
+
+    @property
+    def settings(self) -> Resolved:
+        return self.visible.database.settings
+
+    @property
+    def voxel_size(self) -> float:
+        return self.settings.fusion.voxel_size
+
+    @property
+    def ground_z(self) -> float:
+        """Height of the ground under the query in its frame, metres."""
+        base_z = self.session.map_T_base[self.keyframe][2, 3]
+        return float(self.session.ground_z[self.keyframe] - base_z)
+
+    def target_session(self, group: int) -> SessionMap:
+        return self.visible.database.session(group)
+
+
+# how hypotheses of a query are found, and how the words of a query whose ground is at a height are
+# matched; benchmarks compare other ways with the package's own
+FindHypotheses = Callable[[QueryContext], list[Hypothesis]]
+MatchWords = Callable[[Database, str, Allowed, Query, float], tuple[Described, Matches]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A candidate after a fit on the points; ``nearest`` is the target's keyframe nearest to it,
-    ``sees`` (3,) what the query looks at, in the target's map.
+    """A candidate after a fit on the points.
+
+    ``nearest`` is the target's keyframe nearest to it, ``view`` (3,) where the query looks, in the
+    target's map.
     """
 
     candidate: Candidate
     nearest: int
-    sees: F64
+    view: F64
     fit: Fit
     scores: Scores
 
@@ -79,324 +106,291 @@ class CloseTask:
 
 
 def close_queries(task: CloseTask) -> list[list[Alignment]]:
-    """For each keyframe of the task the alignments found, best first; not yet accepted or rejected."""
+    """The alignments of each keyframe of the task, best first; nothing is decided about them."""
     database = open_database(task.work, task.targets, task.settings)
     session = SessionMap(Workspace(task.work).session(task.session))
     return [close_query(database, session, k) for k in task.keyframes]
 
 
-def close_query(database: Database, session: SessionMap, keyframe: int) -> list[Alignment]:
-    """Alignments of the query at ``keyframe`` with every target session, best first."""
-    database = database.asked_by(session, keyframe)
+def close_query(
+    database: Database, session: SessionMap, keyframe: int, find: FindHypotheses | None = None
+) -> list[Alignment]:
+    """Alignments of the query at ``keyframe`` with every target session, best first.
+
+    Hypotheses come from ``find``, by default :func:`find_hypotheses`.
+    """
+    visible = visible_to(database, session, keyframe)
     query, query_T_base = build_query(session, keyframe, database.settings)
     if not len(query.structure[0]):
         return []
-    hypotheses = find_hypotheses(database, session, keyframe, query)
-    candidates = verify_hypotheses(database, query, hypotheses)
-    out: list[Alignment] = []
-    by_session: dict[str, list[Candidate]] = defaultdict(list)
-    for c in candidates:
-        by_session[database.places[c.group].session].append(c)
-    for found in by_session.values():
-        out += _align(database, session, keyframe, query, query_T_base, found)
+
+    context = QueryContext(visible, session, keyframe, query, query_T_base)
+    hypotheses = (find or find_hypotheses)(context)
+    alignments = [
+        alignment
+        for candidates in verify_hypotheses(context, hypotheses)
+        for alignment in align_candidates(context, candidates)
+    ]
     return sorted(
-        out,
+        alignments,
         key=lambda a: (-a.probability, -a.features.structure, a.target_session, a.target_stamp_ns),
     )
 
 
-def allowed_places(database: Database, session: SessionMap) -> dict[str, Allowed]:
-    """Which words may answer, by the variant of the words: semantic where both label sources know
-    classes.
+# -- words
 
-    Of the query's own session those where it came by at another time (:meth:`Database.asked_by`).
+
+def allowed_words(visible: Visibility, session: SessionMap) -> dict[str, Allowed]:
+    """Which words may match, by their variant: semantic where both label sources know classes.
+
+    Of the query's own session only words of another time may (:mod:`.visibility`).
     """
+    database = visible.database
     forced = database.settings.descriptor.variant
     semantic = (
         database.has_classes & session.has_classes
         if forced == "auto"
         else np.full(len(database.places), forced == "semantic")
     )
-    seen = database.seen()
-    groups = {"semantic": seen & semantic, "geometric": seen & ~semantic}
+    submaps = visible.submaps()
+    groups = {"semantic": submaps & semantic, "geometric": submaps & ~semantic}
     return {
-        variant: database.allowed(variant, mine) for variant, mine in groups.items() if mine.any()
+        variant: visible.allowed_words(variant, chosen)
+        for variant, chosen in groups.items()
+        if chosen.any()
     }
 
 
 def match_words(
     database: Database, variant: str, allowed: Allowed, query: Query, ground_z: float
 ) -> tuple[Described, Matches]:
-    """The subvolumes of a query whose ground is at ``ground_z`` (m), described once, and their
-    nearest words in all headings.
+    """The subvolumes of a query, described once, and their nearest words in all headings.
 
-    The matches' ``yaw`` is that of ``target_T_query``.
+    The query's ground is at ``ground_z`` (m). The ``yaw`` of a match is of ``target_T_query``.
     """
-    settings = database.settings
+    described = _described(query, variant, ground_z, database.settings)
+    closures = database.settings.closures
+    index = database.words(variant)
+    quarters = []
+    for turns in range(4):
+        descriptors = quarter_turns(described.descriptor, turns)
+        matches = index.search(descriptors, closures.neighbours, closures.probes, allowed)
+        yaw = np.mod(matches.yaw + turns * np.pi / 2, 2 * np.pi)
+        quarters.append(replace(matches, yaw=yaw))
+    columns = (np.concatenate([getattr(m, f.name) for m in quarters]) for f in fields(Matches))
+    return described, Matches(*columns)
+
+
+def _described(query: Query, variant: str, ground_z: float, settings: Resolved) -> Described:
     descriptor = settings.descriptor
-    closures = settings.closures
     low, high = query.blocks.bounds()
-    state = query.blocks.dense(low, tuple((high - low).tolist()))
-    encoder = load_encoder(variant, descriptor.weights)
-    d = describe_map(
-        state,
+    return describe_map(
+        query.blocks.dense(low, tuple((high - low).tolist())),
         low,
         ground_z,
         settings.fusion.voxel_size,
-        encoder,
+        load_encoder(variant, descriptor.weights),
         descriptor.query_stride,
         descriptor.min_occupied,
     )
-    found = []
-    for turns in range(4):
-        m = database.words(variant).search(
-            quarter_turns(d.descriptor, turns), closures.neighbours, closures.probes, allowed
-        )
-        found.append(replace(m, yaw=np.mod(m.yaw + turns * np.pi / 2, 2 * np.pi)))
-    return d, Matches(
-        *(np.concatenate([getattr(m, f.name) for m in found]) for f in fields(Matches))
+
+
+# -- hypotheses
+
+
+def find_hypotheses(context: QueryContext, match: MatchWords = match_words) -> list[Hypothesis]:
+    """Word matches of the query in all headings, pooled for each target session.
+
+    ``match`` finds the matches.
+    """
+    database = context.visible.database
+    closures = context.settings.closures
+    parts = [
+        _votes(context, variant, allowed, match)
+        for variant, allowed in allowed_words(context.visible, context.session).items()
+    ]
+    if not parts:
+        return []
+    group, yaw, translation, weight = (
+        np.concatenate(column) for column in zip(*parts, strict=True)
+    )
+
+    # each target session has its share, so that one that matches everywhere leaves room for others
+    owner = np.array([place.session for place in database.places], dtype=object)[group]
+    most = max(closures.session_hypotheses, closures.hypotheses // len(database.sessions))
+    cell = VOTE_CELL * context.voxel_size / STREET_VOXEL
+    hypotheses: list[Hypothesis] = []
+    for name in database.sessions:
+        rows = np.flatnonzero(owner == name)
+        hypotheses += pool(group[rows], yaw[rows], translation[rows], weight[rows], cell, most)
+    return keep_best_submaps(hypotheses, closures.places)
+
+
+def _votes(
+    context: QueryContext, variant: str, allowed: Allowed, match: MatchWords
+) -> tuple[NDArray[np.int64], F64, F64, F64]:
+    """Submap (n,), yaw (n,), translation (n, 3) and weight (n,) that each word match votes for."""
+    described, matches = match(
+        context.visible.database, variant, allowed, context.query, context.ground_z
+    )
+    centre = described.centre[matches.query].astype(float) * context.voxel_size
+    translation = matches.centre - turned_about_z(centre, matches.yaw)
+    weight = np.maximum(0.0, 1.0 - matches.distance / FAR_WORD) ** 2 + LEAST_WEIGHT
+    return matches.group, matches.yaw, translation, weight
+
+
+def verify_hypotheses(context: QueryContext, hypotheses: list[Hypothesis]) -> list[list[Candidate]]:
+    """The best candidates in each target session after the search over their voxels, best first."""
+    database = context.visible.database
+    headings = context.settings.descriptor.headings
+    most = context.settings.closures.candidates
+    candidates = []
+    for name in database.sessions:
+        in_session = [h for h in hypotheses if database.places[h.group].session == name]
+        targets = {g: context.visible.target(g) for g in {h.group for h in in_session}}
+        candidates.append(search_hypotheses(in_session, targets, context.query, headings, most))
+    return candidates
+
+
+# -- alignments
+
+
+def align_candidates(context: QueryContext, candidates: list[Candidate]) -> list[Alignment]:
+    """Candidates in one target session, aligned on the points and compared with each other."""
+    coarse = _each_place_once([_coarse(context, c) for c in candidates], context.voxel_size)
+    fine: list[Fitted] = []
+    for fitted in coarse[: max(1, context.settings.closures.rejected_per_query)]:
+        best = max((f.scores.score for f in fine), default=0.0)
+        fine.append(_fine(context, fitted, best))
+    fine = _each_place_once(fine, context.voxel_size)
+    return [_alignment(context, f, _rival_score(context, f, fine)) for f in fine]
+
+
+def _coarse(context: QueryContext, candidate: Candidate) -> Fitted:
+    """A candidate aligned with the target's voxels."""
+    visible = context.visible
+    query = context.query
+    group = candidate.group
+    target = visible.target(group)
+    fit = coarse_fit(candidate, target, query)
+    fit = escaped(fit, candidate, target, query, context.settings.descriptor.headings)
+    return Fitted(
+        candidate,
+        visible.nearest_keyframe(group, candidate.target_T_query[:3, 3]),
+        apply(candidate.target_T_query, query.view_centre[None])[0],
+        fit,
+        structure_scores(query, target, fit.target_T_query),
     )
 
 
-def find_hypotheses(
-    database: Database, session: SessionMap, keyframe: int, query: Query
-) -> list[Hypothesis]:
-    """Word matches of the query in all headings, pooled."""
-    settings = database.settings
-    closures = settings.closures
-    v = settings.fusion.voxel_size
-    parts: list[tuple[NDArray[np.int64], F64, F64, F64]] = []
-    ground = float(session.ground_z[keyframe] - session.map_T_base[keyframe][2, 3])
-    for variant, allowed in allowed_places(database, session).items():
-        d, m = match_words(database, variant, allowed, query, ground)
-        shift = m.centre - turned_about_z(d.centre[m.query].astype(float) * v, m.yaw)
-        parts.append((m.group, m.yaw, shift, np.maximum(0.0, 1.0 - m.distance / 32.0) ** 2 + 1e-3))
-    if not parts:
-        return []
-    group, yaws, shift, weight = (np.concatenate([p[k] for p in parts]) for k in range(4))
-    # each target session has its share, so that one that looks alike everywhere cannot crowd out
-    # the others
-    owner = np.array([place.session for place in database.places], dtype=object)[group]
-    most = max(LEAST_HYPOTHESES, closures.hypotheses // len(database.sessions))
-    found: list[Hypothesis] = []
-    for name in database.sessions:
-        mine = np.flatnonzero(owner == name)
-        found += pool(
-            group[mine], yaws[mine], shift[mine], weight[mine], 2.4 * v / STREET_VOXEL, most
-        )
-    return of_best_groups(found, closures.places)
+def _fine(context: QueryContext, fitted: Fitted, best_score: float) -> Fitted:
+    """A coarse fit aligned with the target's points, if it may be accepted beside ``best_score``.
 
-
-def verify_hypotheses(
-    database: Database, query: Query, hypotheses: list[Hypothesis]
-) -> list[Candidate]:
-    """The best candidates of each target session after the search over their voxels, best first."""
-    out: list[Candidate] = []
-    for name in database.sessions:
-        mine = [h for h in hypotheses if database.places[h.group].session == name]
-        targets = {group: database.target(group) for group in {h.group for h in mine}}
-        out += search_hypotheses(
-            mine, targets, query, database.settings.descriptor.headings, ALIGNED
-        )
-    return out
-
-
-def _align(
-    database: Database,
-    session: SessionMap,
-    keyframe: int,
-    query: Query,
-    query_T_base: F64,
-    candidates: list[Candidate],
-) -> list[Alignment]:
-    """Candidates of one target session, aligned on the points, compared with each other, judged."""
-    v = database.settings.fusion.voxel_size
-    fitted: list[Fitted] = []
-    headings = database.settings.descriptor.headings
-    for c in candidates:
-        near = database.nearest_keyframe(c.group, c.target_T_query[:3, 3])
-        fit = escaped(
-            coarse_fit(c, database.target(c.group), query),
-            c,
-            database.target(c.group),
-            query,
-            headings,
-        )
-        sees = apply(c.target_T_query, query.middle[None])[0]
-        fitted.append(
-            Fitted(
-                c,
-                near,
-                sees,
-                fit,
-                structure_scores(query, database.target(c.group), fit.target_T_query),
-            )
-        )
-    best = _distinct(fitted, v)[: max(1, database.settings.closures.rejected_per_query)]
-    fine: list[Fitted] = []
-    for f in best:
-        target = database.target(f.candidate.group)
-        if f.scores.rank >= max(CLOSE * max((o.scores.rank for o in fine), default=0.0), HOPELESS):
-            fit = fine_fit(f.fit.target_T_query, database.surface(f.candidate.group, f.sees), query)
-            fine.append(
-                replace(f, fit=fit, scores=structure_scores(query, target, fit.target_T_query))
-            )
-        else:  # reading keyframes takes longer than fitting them: not for what cannot be accepted
-            fine.append(replace(f, fit=measured(f.fit.target_T_query, target.surface, query)))
-    fine = _distinct(fine, v)
-    asked = database.sessions[database.places[candidates[0].group].session]
-    return [
-        _judge(database, session, keyframe, query, query_T_base, f, _rival(f, fine, asked, v))
-        for f in fine
-    ]
-
-
-def _rival(one: Fitted, fitted: list[Fitted], target: SessionMap, voxel_size: float) -> float:
-    """The best rank of another place; the same place, driven again and moved by the drift of the
-    target's odometry, is no other one.
+    Reading keyframes takes longer than fitting them, so other fits are only measured on voxels.
     """
-    best = 0.0
-    for other in fitted:
-        a = one.fit.target_T_query
-        b = other.fit.target_T_query
-        road = abs(float(target.distance[one.nearest] - target.distance[other.nearest]))
-        off = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
-        drifted = off < 3.3 * voxel_size + DRIFT * road and yaw_between(a, b) < np.radians(
-            5.0 + 0.02 * road
-        )
-        if other is not one and not (drifted and road > 50 * voxel_size):
-            best = max(best, other.scores.rank)
-    return best
+    query = context.query
+    group = fitted.candidate.group
+    target = context.visible.target(group)
+    start = fitted.fit.target_T_query
+    if fitted.scores.score < max(MIN_RELATIVE_SCORE * best_score, MIN_SCORE):
+        return replace(fitted, fit=measured(start, target.surface, query))
+    surface = target_surface(context.visible, group, fitted.view)
+    fit = fine_fit(start, surface, query)
+    return replace(fitted, fit=fit, scores=structure_scores(query, target, fit.target_T_query))
 
 
-def _distinct(fitted: list[Fitted], voxel_size: float) -> list[Fitted]:
+def _each_place_once(fitted: list[Fitted], voxel_size: float) -> list[Fitted]:
     """Best first, each place once."""
     kept: list[Fitted] = []
-    for f in sorted(fitted, key=lambda f: -f.scores.rank):
-        if not any(
-            same_place(f.fit.target_T_query, o.fit.target_T_query, voxel_size) for o in kept
-        ):
+    for f in sorted(fitted, key=lambda f: -f.scores.score):
+        pose = f.fit.target_T_query
+        if not any(same_place(pose, other.fit.target_T_query, voxel_size) for other in kept):
             kept.append(f)
     return kept
 
 
-def _judge(
-    database: Database,
-    session: SessionMap,
-    keyframe: int,
-    query: Query,
-    query_T_base: F64,
-    fitted: Fitted,
-    second: float,
-) -> Alignment:
+def _rival_score(context: QueryContext, one: Fitted, fitted: list[Fitted]) -> float:
+    """The best score of another place.
+
+    The same place, driven again and moved by the drift of the target's odometry, is not another.
+    """
+    distance = context.target_session(one.candidate.group).distance
+    best = 0.0
+    for other in fitted:
+        if other is one:
+            continue
+        road = abs(float(distance[one.nearest] - distance[other.nearest]))
+        driven_again = road > DRIVEN_AGAIN * context.voxel_size and same_place(
+            one.fit.target_T_query, other.fit.target_T_query, context.voxel_size, road
+        )
+        if not driven_again:
+            best = max(best, other.scores.score)
+    return best
+
+
+def _alignment(context: QueryContext, fitted: Fitted, rival_score: float) -> Alignment:
     """The alignment of one candidate with its features, probability and covariance."""
-    settings = database.settings
-    v = settings.fusion.voxel_size
-    candidate = fitted.candidate
-    fine = fitted.fit
+    visible = context.visible
+    session = context.session
+    group = fitted.candidate.group
+    target_session = context.target_session(group)
+    features = _features(fitted, rival_score, context.voxel_size)
+    overlap, inliers = _overlap(context, fitted)
+
+    map_T_query_base = fitted.fit.target_T_query @ context.query_T_base
+    nearest = visible.nearest_keyframe(group, map_T_query_base[:3, 3])
+    map_T_target = target_session.map_T_base[nearest]
+    viewing = visible.viewing_keyframe(group, fitted.view)
+    road = abs(float(target_session.distance[nearest] - target_session.distance[viewing]))
+    return Alignment(
+        query_session=session.folder.name,
+        target_session=target_session.folder.name,
+        query_keyframe=context.keyframe,
+        target_keyframe=nearest,
+        query_stamp_ns=int(session.stamps_ns[context.keyframe]),
+        target_stamp_ns=int(target_session.stamps_ns[nearest]),
+        target_T_query=inverse(map_T_target) @ map_T_query_base,
+        covariance=covariance_of(
+            fitted.fit, map_T_query_base, map_T_target, context.voxel_size, road
+        ),
+        overlap=overlap,
+        probability=float(shipped().own(features)),
+        inliers=inliers,
+        words=fitted.candidate.votes,
+        features=features,
+    )
+
+
+def _features(fitted: Fitted, rival_score: float, voxel_size: float) -> Features[float]:
     scores = fitted.scores
-    place = database.places[candidate.group]
-    target_session = database.sessions[place.session]
-    target = database.target(candidate.group)
-    T = fine.target_T_query
-    features = Features(
+    fit = fitted.fit
+    distinct = max(rival_score, 0.0) / max(scores.score, LEAST_SCORE)
+    return Features(
         structure=scores.structure,
         coverage=scores.coverage,
         contradiction=scores.contradiction,
-        fit=fine.inliers,
-        rmse=fine.rmse / v,
-        distinct=min(max(second, 0.0) / max(scores.rank, 1e-3), 2.0),
+        fit=fit.inliers,
+        rmse=fit.rmse / voxel_size,
+        distinct=min(distinct, MOST_DISTINCT),
         support=float(np.log10(scores.aligned + 1)),
-        stiffness=float(np.log10(_stiffness(fine) + 1)),
-    )
-    probability = float(shipped().own(own_values(features)))
-    same_source = session.json["label_source"] == target_session.json["label_source"]
-    overlap, inliers = tau(
-        query.occupied,
-        target.blocks,
-        v,
-        T,
-        settings.closures.kappa * v,
-        None if same_source else cityscapes().coarse,
-    )
-    map_T_query_base = T @ query_T_base
-    nearest = database.nearest_keyframe(candidate.group, map_T_query_base[:3, 3])
-    map_T_target = target_session.map_T_base[nearest]
-    looking = database.looking_keyframe(candidate.group, fitted.sees)
-    road = abs(float(target_session.distance[nearest] - target_session.distance[looking]))
-    return Alignment(
-        query_session=session.folder.name,
-        target_session=place.session,
-        query_keyframe=keyframe,
-        target_keyframe=nearest,
-        query_stamp_ns=int(session.stamps_ns[keyframe]),
-        target_stamp_ns=int(target_session.stamps_ns[nearest]),
-        target_T_query=inverse(map_T_target) @ map_T_query_base,
-        covariance=covariance_of(fine, map_T_query_base, map_T_target, v, road),
-        overlap=overlap,
-        probability=probability,
-        inliers=inliers,
-        words=candidate.votes,
-        features=features,
-        agreement=Agreement(probability),
+        stiffness=float(np.log10(stiffness(fit) + 1)),
     )
 
 
-def _stiffness(fit: Fit) -> float:
-    """Least information about the position, the rotation being free: how many points hold the
-    weakest direction.
+def _overlap(context: QueryContext, fitted: Fitted) -> tuple[float, int]:
+    """The paper's tau and the number of aligned voxels.
+
+    Classes are compared as they are where both label sources are the same, else coarsely.
     """
-    H = fit.information
-    if not np.isfinite(H).all() or np.linalg.matrix_rank(H) < 6:
-        return 0.0
-    reduced = H[:3, :3] - H[:3, 3:] @ np.linalg.solve(H[3:, 3:], H[3:, :3])
-    return float(max(np.linalg.eigvalsh(reduced).min(), 0.0))
-
-
-def _beyond_noise(information: F64, pull: F64) -> tuple[F64, F64]:
-    """Information (6, 6) less what normals that are 2 degrees off would pretend, in axes scaled so
-    that lengths and angles compare; and the share of ``pull`` (n, 6) in what is left of it.
-    """
-    points = float(np.trace(information[:3, :3]))
-    arms = float(np.trace(information[3:, 3:]))
-    if points <= 0:
-        return np.zeros((6, 6)), np.zeros_like(pull)
-    scale = np.r_[1.0, 1.0, 1.0, np.full(3, max(np.sqrt(arms / points), 1e-6))]
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    kept = np.maximum(values - points * np.sin(NORMAL_NOISE) ** 2, 0.0)
-    share = np.divide(kept, values, out=np.zeros(6), where=values > 0)
-    return np.asarray((vectors * kept) @ vectors.T * np.outer(scale, scale)), pull / scale @ (
-        vectors * share
-    ) @ vectors.T * scale
-
-
-def covariance_of(
-    fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: float, road: float = 0.0
-) -> F64:
-    """Covariance (6, 6) of target_T_query from the fit's information, in the target's axes (DESIGN:
-    closures.parquet).
-
-    What noisy normals alone would claim to know is taken off first. Where the points then hold
-    nothing (along a corridor) the error is as large as the search lets it be: 3.3 voxels, 5
-    degrees. Uncertain ranges may all be too long or too short, which no number of points averages
-    out. The target's keyframe may lie metres from what was aligned, and ``road`` metres from where
-    that was seen: between them its odometry drifts.
-    """
-    noise = max(fit.rmse if np.isfinite(fit.rmse) else 1.0, 0.02) ** 2
-    prior = np.diag([1 / (3.3 * voxel_size) ** 2] * 3 + [1 / np.radians(5.0) ** 2] * 3)
-    information, pull = _beyond_noise(fit.information, fit.pull)
-    about_centre = np.linalg.inv(information / (INFLATION * noise) + prior)
-    of_query, of_target = SYSTEMATIC * pull / (INFLATION * noise) @ about_centre
-    alone = np.sqrt(1 - COMMON)
-    common = np.sqrt(COMMON)
-    pulled = np.stack([alone * of_query, alone * of_target, common * (of_query - of_target)])
-    about_centre += pulled.T @ pulled
-    x, y, z = map_T_query[:3, 3] - fit.centre
-    A = np.eye(6)
-    A[:3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turned = np.zeros((6, 6))
-    turned[:3, :3] = turned[3:, 3:] = map_T_target[:3, :3].T
-    away = float(np.linalg.norm(map_T_query[:3, 3] - map_T_target[:3, 3])) + road
-    drift = np.diag([(DRIFT * away) ** 2 / 3] * 3 + [0.0] * 3)
-    C = turned @ A @ about_centre @ A.T @ turned.T + drift + FLOOR
-    return np.asarray((C + C.T) / 2)
+    group = fitted.candidate.group
+    sources = (
+        session.json["label_source"] for session in (context.session, context.target_session(group))
+    )
+    return tau(
+        context.query.occupied,
+        context.visible.target(group).blocks,
+        context.voxel_size,
+        fitted.fit.target_T_query,
+        context.settings.closures.kappa * context.voxel_size,
+        None if len(set(sources)) == 1 else cityscapes().coarse,
+    )

@@ -8,8 +8,8 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,24 +18,23 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import FEATURES
 from semloc_logs.closures.acceptance.calibration import (
-    SUPPORT,
-    TOGETHER,
+    NEIGHBOUR_EVIDENCE,
     Calibration,
     Model,
+    NeighbourEvidence,
     fit_logistic,
     has_far,
-    may_be_right,
-    precise,
-    together_values,
-    unrivalled,
+    is_plausible,
+    position_confidence,
+    probability_ignoring_rivals,
 )
-from semloc_logs.closures.acceptance.consistency import agree, shares
-from semloc_logs.closures.acceptance.placements import Placed, strays
+from semloc_logs.closures.acceptance.consistency import count_votes, mode_shares
+from semloc_logs.closures.acceptance.placements import Placed, contradicts_odometry
+from semloc_logs.closures.closure import FEATURES, Agreement, Features
 from semloc_logs.closures.closure_tables import keyframe_at
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, judge_closure, read_truth
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.tables.table import read_metadata, read_table, write_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
@@ -55,7 +54,7 @@ SIGNS = {
     "support": 1,
     "stiffness": 1,
 }
-# of ``TOGETHER``
+# of ``NEIGHBOUR_EVIDENCE``
 TOGETHER_SIGNS = (1, 1, 1, -1, 1, -1)
 NEAR_SIGNS = (0, 1, 1, -1, 0, 0)
 # how towns of copied blocks begin, and how much they count for an alignment by itself
@@ -71,13 +70,13 @@ THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """Alignments (n) of several towns: ``features`` (n, 8), where they lie (``alone`` and
-    ``unrivalled`` there are for the caller to say), whether they are ``right`` (n,), and their
-    errors (n,) in metres and degrees.
+    """Alignments (n) of several towns: ``features`` (n,), where they lie (the caller sets the
+    probabilities there), whether they are ``right`` (n,), and their errors (n,) in metres and
+    degrees.
     """
 
     town: NDArray[np.object_]
-    features: F64
+    features: Features[F64]
     placed: Placed
     right: Bools
     error_m: F64
@@ -106,10 +105,10 @@ class Judged:
 
     def part(self, rows: Bools) -> Judged:
         """Some of them."""
-        columns = {
-            n: getattr(self, n)[rows] for n in ("town", "features", "right", "error_m", "error_deg")
-        }
-        return replace(self, placed=self.placed.part(rows), **columns)
+        columns = {n: getattr(self, n)[rows] for n in ("town", "right", "error_m", "error_deg")}
+        return replace(
+            self, features=self.features.part(rows), placed=self.placed.part(rows), **columns
+        )
 
 
 def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
@@ -199,7 +198,7 @@ def read_judged(paths: Sequence[Path]) -> Judged:
         np.ones(len(table), bool),
     )
     right = column["right"].astype(bool)
-    features = np.stack([column[n] for n in FEATURES], axis=1)
+    features = Features(*(column[n] for n in FEATURES))
     return Judged(
         names["town"],
         features,
@@ -257,30 +256,35 @@ def fit_alone(judged: Judged, rows: Bools) -> Calibration:
     """
     rows = rows & judged.clear
     return fit_signed(
-        judged.features[rows], judged.right[rows], [SIGNS[n] for n in FEATURES], judged.counts[rows]
+        judged.features.part(rows).vector(),
+        judged.right[rows],
+        [SIGNS[n] for n in FEATURES],
+        judged.counts[rows],
     )
 
 
-def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Calibration) -> Model:
-    """The models of the agreement's ``columns`` (7, n), from the clear ones that have neighbours
-    among ``rows`` (n,), beside ``alone``.
+def fit_agreement(
+    judged: Judged, agreement: Agreement[F64], rows: Bools, alone: Calibration
+) -> Model:
+    """The models of the ``agreement`` (n,), from the clear ones that have neighbours among ``rows``
+    (n,), beside ``alone``.
 
     Neighbours in the same copy of a block agree about any copy. So the models are those of streets
     that look like no others. How much like others is too much: the geometric mean of the right ones
     of the ordinary town that has the most of it and the wrong ones that would be accepted of the
     city of copies that has the least: as many times the one as the other is it.
     """
-    rows = rows & judged.clear & (columns[1] > 0)
-    ordinary = _agreement_model(judged, columns, rows & ~judged.copies, alone, 1.0)
-    taken = rows & (ordinary.agreed(columns) >= SURE)
+    rows = rows & judged.clear & (agreement.neighbours > 0)
+    ordinary = _agreement_model(judged, agreement, rows & ~judged.copies, alone, 1.0)
+    taken = rows & (ordinary.agreed(agreement) >= SURE)
     right = taken & judged.right & ~judged.copies
     fooled = taken & ~judged.right & judged.copies
     most = [
-        np.quantile(columns[6][right & (judged.town == town)], 1 - EXTREMES)
+        np.quantile(agreement.ambiguity[right & (judged.town == town)], 1 - EXTREMES)
         for town in sorted(set(judged.town[right]))
     ]
     least = [
-        np.quantile(columns[6][fooled & (judged.town == town)], EXTREMES)
+        np.quantile(agreement.ambiguity[fooled & (judged.town == town)], EXTREMES)
         for town in sorted(set(judged.town[fooled]))
     ]
     # an ordinary town whose streets look like others as much as copies do is given up where they do
@@ -289,19 +293,22 @@ def fit_agreement(judged: Judged, columns: Sequence[F64], rows: Bools, alone: Ca
         if least
         else 1.0
     )
-    return _agreement_model(judged, columns, rows & (columns[6] <= most_alike), alone, most_alike)
+    rows = rows & (agreement.ambiguity <= most_alike)
+    return _agreement_model(judged, agreement, rows, alone, most_alike)
 
 
 def _agreement_model(
-    judged: Judged, columns: Sequence[F64], rows: Bools, alone: Calibration, most_alike: float
+    judged: Judged, agreement: Agreement[F64], rows: Bools, alone: Calibration, most_alike: float
 ) -> Model:
     """Near neighbours add to an alignment's log-odds: they are so often right together that they
     would outweigh what it looks like.
     """
-    values = together_values(columns)[rows]
+    values = NeighbourEvidence.of(agreement).vector()[rows]
     right = judged.right[rows]
     counts = np.ones(rows.sum())
-    near = fit_signed(values, right, NEAR_SIGNS, counts, offset=_log_odds(columns[0][rows]))
+    near = fit_signed(
+        values, right, NEAR_SIGNS, counts, offset=_log_odds(agreement.own_probability[rows])
+    )
     near = replace(
         near,
         weights=(1.0, *near.weights[1:]),
@@ -313,28 +320,34 @@ def _agreement_model(
         alone,
         near,
         together,
-        float(np.quantile(judged.features[judged.right, SUPPORT], FEWEST)),
+        float(np.quantile(judged.features.support[judged.right], FEWEST)),
         most_alike,
     )
 
 
-def agreement_of(judged: Judged, alone: F64, without_rivals: F64) -> list[F64]:
-    """The columns (7, n) of the agreement within each town, when alignments have the probabilities
-    ``alone`` (n,) by themselves.
+def agreement_of(judged: Judged, alone: F64, without_rivals: F64) -> Agreement[F64]:
+    """The agreement (n,) within each town, when alignments have the probabilities ``alone`` (n,) by
+    themselves.
     """
-    out = [np.zeros(len(judged)) for _ in range(7)]
+    out = Agreement(*np.zeros((7, len(judged))))
     for town in sorted(set(judged.town)):
         mine = np.flatnonzero(judged.town == town)
-        part = replace(judged.placed.part(mine), alone=alone[mine], unrivalled=without_rivals[mine])
-        for column, values in zip(out, agree(part, judged.voxel_size), strict=True):
-            column[mine] = values
+        part = replace(
+            judged.placed.part(mine),
+            own_probability=alone[mine],
+            probability_ignoring_rivals=without_rivals[mine],
+        )
+        votes = count_votes(part, judged.voxel_size)
+        for name in (f.name for f in fields(Agreement)):
+            getattr(out, name)[mine] = getattr(votes, name)
     return out
 
 
 def decided_by(model: Model, judged: Judged) -> F64:
     """The probabilities (n,) that the acceptance gives with ``model``."""
     alone = model.own(judged.features)
-    p = model.decided(agreement_of(judged, alone, unrivalled(model.own, judged.features)))
+    without_rivals = probability_ignoring_rivals(model.own, judged.features)
+    p = model.decided(agreement_of(judged, alone, without_rivals))
     return np.where(possible(judged), p * where_right(judged, alone), 0.0)
 
 
@@ -344,15 +357,17 @@ def where_right(judged: Judged, alone: F64) -> F64:
     """
     share = np.ones(len(judged))
     for mine in (np.flatnonzero(judged.town == town) for town in sorted(set(judged.town))):
-        share[mine] = shares(
-            replace(judged.placed.part(mine), alone=alone[mine]), judged.voxel_size
+        share[mine] = mode_shares(
+            replace(judged.placed.part(mine), own_probability=alone[mine]), judged.voxel_size
         )
-    return precise(judged.placed.sigma, judged.voxel_size) * share
+    return position_confidence(judged.placed.sigma, judged.voxel_size) * share
 
 
 def possible(judged: Judged) -> Bools:
     """Which alignments (n,) acceptance considers at all."""
-    return np.asarray(~strays(judged.placed, judged.voxel_size) & may_be_right(judged.features))
+    return np.asarray(
+        ~contradicts_odometry(judged.placed, judged.voxel_size) & is_plausible(judged.features)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -379,23 +394,23 @@ def fit(judged: Judged) -> Fitted:
     alone = np.zeros(len(judged))
     without_rivals = np.zeros(len(judged))
     for mine in held.values():
-        own = fit_alone(judged, ~mine & kept).probability
-        features = judged.features[mine]
-        alone[mine], without_rivals[mine] = own(features), unrivalled(own, features)
+        own = _by_features(fit_alone(judged, ~mine & kept))
+        features = judged.features.part(mine)
+        alone[mine] = own(features)
+        without_rivals[mine] = probability_ignoring_rivals(own, features)
     whole = fit_alone(judged, kept)
     tempered = _temper(whole, alone, judged, kept, judged.counts)
     alone = _tempered(alone, whole, tempered)
     without_rivals = np.where(without_rivals > 0, _tempered(without_rivals, whole, tempered), 0.0)
-    columns = agreement_of(judged, alone, without_rivals)
+    agreement = agreement_of(judged, alone, without_rivals)
     probability = np.zeros(len(judged))
     alike = np.zeros(len(judged), bool)
     for mine in held.values():
-        model = fit_agreement(judged, columns, ~mine & kept, tempered)
-        probability[mine], alike[mine] = (
-            said([c[mine] for c in columns]) for said in (model.agreed, model.alike)
-        )
-    model = fit_agreement(judged, columns, kept, tempered)
-    far = (columns[1] > 0) & has_far(columns)
+        model = fit_agreement(judged, agreement, ~mine & kept, tempered)
+        probability[mine] = model.agreed(agreement.part(mine))
+        alike[mine] = model.is_ambiguous(agreement.part(mine))
+    model = fit_agreement(judged, agreement, kept, tempered)
+    far = (agreement.neighbours > 0) & has_far(agreement)
     together = _temper(
         model.together, probability, judged, kept & far & ~alike, np.ones(len(judged))
     )
@@ -404,6 +419,10 @@ def fit(judged: Judged) -> Fitted:
         kept, np.where(alike, probability / 2, probability) * where_right(judged, alone), 0.0
     )
     return Fitted(replace(model, together=together), alone, probability)
+
+
+def _by_features(model: Calibration) -> Callable[[Features[F64]], F64]:
+    return lambda features: model.probability(features.vector())
 
 
 def _log_odds(p: F64) -> F64:
@@ -508,11 +527,11 @@ def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
     return {
         "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature; 'near' where a query has neighbours, "
         "'together' where it has far ones too; at most a half where lookalike exceeds most_alike",
-        "alone": fitted.model.alone.to_json(FEATURES),
-        "least_support": round(fitted.model.least_support, 4),
-        "most_alike": round(fitted.model.most_alike, 4),
-        "near": fitted.model.near.to_json(TOGETHER),
-        "together": fitted.model.together.to_json(TOGETHER),
+        "alone": fitted.model.own_features.to_json(FEATURES),
+        "least_support": round(fitted.model.min_support, 4),
+        "most_alike": round(fitted.model.max_ambiguity, 4),
+        "near": fitted.model.near.to_json(NEIGHBOUR_EVIDENCE),
+        "together": fitted.model.together.to_json(NEIGHBOUR_EVIDENCE),
         "towns": len(set(judged.town)),
         "alignments": int(judged.clear.sum()),
         "right": int((judged.right & judged.clear).sum()),

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from semloc_logs.closures.closure_tables import read_closures
-from semloc_logs.closures.query import SessionMap, query_keyframes
+from semloc_logs.closures.query import query_keyframes
 from semloc_logs.errors import TruthError, WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import interpolate, inverse, rotation_angle, transform
 from semloc_logs.settings import Resolved, ResolvedClosures, ResolvedQuery
 from semloc_logs.tables.table import read_metadata, read_table

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.tables.table import read_table

@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.voxels.store import read_keyframe
 

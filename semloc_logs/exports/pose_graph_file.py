@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, transform, translation_quaternion
 from semloc_logs.workspace import Workspace
 

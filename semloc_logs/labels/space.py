@@ -24,6 +24,7 @@ ROAD, SIDEWALK, BUILDING, POLE, VEGETATION, TERRAIN = 0, 1, 2, 5, 8, 9
 GROUND = (ROAD, SIDEWALK, TERRAIN)
 # poles, traffic lights and signs, people, vehicles: not larger than some metres
 THINGS = (POLE, 6, 7, *range(11, 19))
+KNOWS_CLASSES = ("log", "onnx")  # label sources with classes that the semantic network understands
 _HIGHEST_ID = 0xFFFF
 
 U8 = NDArray[np.uint8]

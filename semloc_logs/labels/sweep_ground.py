@@ -15,8 +15,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.numerics.cells import by_cell
+
 F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
 
 CELL = 1.0  # of the grid, at street scale (m)
 # points farther than this from the sensor, in x, y or z, are left out, at street scale (m)
@@ -71,7 +73,8 @@ def ground_surface(
         )
     low = p[:, :2].min(0) - cell
     nx, ny = (np.floor((p[:, :2].max(0) - low) / cell) + 2).astype(int).tolist()
-    start, order = _cells(p, low, cell, nx, ny)
+    column = ((p[:, :2] - low) / cell).astype(np.int64)
+    order, start = by_cell(column[:, 0] * ny + column[:, 1], nx * ny)
     lowest = _lowest(p[:, 2].copy(), start, order)
     i, j = np.divmod(np.arange(nx * ny), ny)
     away = np.hypot(low[0] + (i + 0.5) * cell - o[0], low[1] + (j + 0.5) * cell - o[1])
@@ -106,26 +109,7 @@ def _seed(lowest: F64, away: F64, origin_z: float, scale: float) -> float | None
 
 
 @njit(cache=True, nogil=True)
-def _cells(p: F64, low: F64, cell: float, nx: int, ny: int) -> tuple[I32, I32]:
-    """Counting sort: points of cell a are order[start[a] : start[a + 1]]."""
-    n = len(p)
-    address = np.empty(n, np.int32)
-    start = np.zeros(nx * ny + 1, np.int32)
-    for i in range(n):
-        address[i] = int((p[i, 0] - low[0]) / cell) * ny + int((p[i, 1] - low[1]) / cell)
-        start[address[i] + 1] += 1
-    for a in range(nx * ny):
-        start[a + 1] += start[a]
-    fill = start.copy()
-    order = np.empty(n, np.int32)
-    for i in range(n):
-        order[fill[address[i]]] = i
-        fill[address[i]] += 1
-    return start, order
-
-
-@njit(cache=True, nogil=True)
-def _lowest(z: F64, start: I32, order: I32) -> F64:
+def _lowest(z: F64, start: I64, order: I64) -> F64:
     """Lowest height of each cell, infinite where there is no point."""
     out = np.full(len(start) - 1, np.inf)
     for a in range(len(out)):
@@ -158,8 +142,8 @@ def _promise(z: F64, gap: F64, a: int, nx: int, ny: int) -> tuple[float, float]:
 @njit(cache=True, nogil=True)
 def _grow(
     height: F64,
-    start: I32,
-    order: I32,
+    start: I64,
+    order: I64,
     nx: int,
     ny: int,
     sequence: NDArray[np.int64],

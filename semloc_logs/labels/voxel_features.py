@@ -13,7 +13,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.numerics.cells import cell_starts
 from semloc_logs.numerics.eigen import eigen
+from semloc_logs.numerics.local_shape import MOMENTS, add_point, covariance, principal_axes
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -75,10 +77,8 @@ def voxelise(points: F64, size: float) -> Voxels:
     nx, ny, nz = (ijk.max(0) + 1).tolist()
     key, of_point = np.unique((ijk[:, 0] * ny + ijk[:, 1]) * nz + ijk[:, 2], return_inverse=True)
     column = key // nz
-    start = np.r_[0, np.cumsum(np.bincount(column, minlength=nx * ny))]
-    return Voxels(
-        np.stack([column // ny, column % ny, key % nz], 1), of_point.reshape(-1), (nx, ny), start
-    )
+    ijk = np.stack([column // ny, column % ny, key % nz], 1)
+    return Voxels(ijk, of_point.reshape(-1), (nx, ny), cell_starts(column, nx * ny))
 
 
 def voxel_shapes(points: F64, voxels: Voxels, size: float) -> VoxelShapes:
@@ -110,54 +110,41 @@ def voxel_shapes(points: F64, voxels: Voxels, size: float) -> VoxelShapes:
 
 @njit(cache=True, nogil=True)
 def _moments(p: F64, of_point: I64, m: int) -> F64:
-    """Number, sums and sums of products (m, 10) of the points of each voxel."""
-    out = np.zeros((m, 10))
+    """Moments (m, 10) of the points of each voxel."""
+    out = np.zeros((m, MOMENTS))
     for i in range(len(p)):
-        row = out[of_point[i]]
-        x, y, z = p[i]
-        row[0] += 1
-        row[1] += x
-        row[2] += y
-        row[3] += z
-        row[4] += x * x
-        row[5] += x * y
-        row[6] += x * z
-        row[7] += y * y
-        row[8] += y * z
-        row[9] += z * z
+        add_point(out[of_point[i]], p[i, 0], p[i, 1], p[i, 2], 1.0)
     return out
 
 
 @njit(cache=True, nogil=True)
 def _normals(ijk: I64, moments: F64, start: I64, nx: int, ny: int) -> tuple[F64, F64]:
-    """Least standard deviation (m,) of the points of 3^3 voxels and its direction (m, 3), zero
-    where the points are too few.
+    """Least standard deviation (m,) of the points of 3^3 voxels, and its direction (m, 3).
+
+    The direction is zero where the points are too few.
     """
     m = len(ijk)
     rough = np.empty(m)
-    normal = np.empty((m, 3))
-    total = np.empty(10)
+    normal = np.zeros((m, 3))
+    total = np.empty(MOMENTS)
+    mean = np.empty(3)
+    spread = np.empty(3)
     a = np.empty((3, 3))
-    values = np.empty(3)
-    vectors = np.empty((3, 3))
+    axes = np.empty((3, 3))
     for k in range(m):
         i, j, z = ijk[k]
         total[:] = 0.0
         for u in range(max(i - 1, 0), min(i + 2, nx)):
             for q in range(start[u * ny + max(j - 1, 0)], start[u * ny + min(j + 1, ny - 1) + 1]):
                 if abs(ijk[q, 2] - z) <= 1:
-                    for t in range(10):
+                    for t in range(MOMENTS):
                         total[t] += moments[q, t]
-        n = total[0]
-        t = 4
-        for r in range(3):
-            for c in range(r, 3):
-                a[r, c] = a[c, r] = total[t] / n - total[1 + r] / n * total[1 + c] / n
-                t += 1
-        eigen(a, values, vectors)
-        rough[k] = np.sqrt(max(values[0], 0.0))
-        for t in range(3):
-            normal[k, t] = vectors[t, 0] if n >= LEAST else 0.0
+        covariance(total, mean, a)
+        principal_axes(a, spread, axes)
+        rough[k] = spread[0]
+        if total[0] >= LEAST:
+            for t in range(3):
+                normal[k, t] = axes[t, 0]
     return rough, normal
 
 
@@ -174,7 +161,8 @@ def _surroundings(
     outer = np.empty((m, 7))
     near = np.empty(7)
     wide = np.empty(7)
-    tall = np.empty(10)
+    tall = np.empty(MOMENTS)
+    mean = np.empty(3)
     for k in range(m):
         x, y, z = normal[k]
         outer[k] = np.array((x * x, x * y, x * z, y * y, y * z, z * z, x * x + y * y + z * z))
@@ -194,7 +182,7 @@ def _surroundings(
                     for t in range(7):
                         wide[t] += outer[q, t]
                     if d <= 1:
-                        for t in range(10):
+                        for t in range(MOMENTS):
                             tall[t] += moments[q, t]
                 if d <= 2 and abs(dz) <= 2:
                     for t in range(7):
@@ -205,7 +193,8 @@ def _surroundings(
                     counts[k, 1] += 1
         out[k, 0], out[k, 1] = _order(near, a, values, vectors)
         out[k, 2], out[k, 3] = _order(wide, a, values, vectors)
-        out[k, 4], out[k, 5] = _thickness(tall)
+        covariance(tall, mean, a)
+        out[k, 4], out[k, 5] = _thickness(a)
     return out, counts
 
 
@@ -227,18 +216,12 @@ def _order(total: F64, a: F64, values: F64, vectors: F64) -> tuple[float, float]
 
 
 @njit(cache=True, nogil=True)
-def _thickness(total: F64) -> tuple[float, float]:
-    """Standard deviations of summed points: horizontally along the longer axis, and vertically."""
-    n = total[0]
-    x = total[1] / n
-    y = total[2] / n
-    z = total[3] / n
-    xx = total[4] / n - x * x
-    xy = total[5] / n - x * y
-    yy = total[7] / n - y * y
-    zz = total[9] / n - z * z
-    longer = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    return np.sqrt(max(longer, 0.0)), np.sqrt(max(zz, 0.0))
+def _thickness(a: F64) -> tuple[float, float]:
+    """Standard deviations of a covariance: horizontally along the longer axis, and vertically."""
+    longer = 0.5 * (a[0, 0] + a[1, 1]) + np.sqrt(
+        0.25 * (a[0, 0] - a[1, 1]) ** 2 + a[0, 1] * a[0, 1]
+    )
+    return np.sqrt(max(longer, 0.0)), np.sqrt(max(a[2, 2], 0.0))
 
 
 @njit(cache=True, nogil=True)

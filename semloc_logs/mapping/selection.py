@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from semloc_logs.numerics.hash_table import EMPTY, empty_table, place_of
 from semloc_logs.numerics.transforms import inverse, rotation_angle
 from semloc_logs.settings import ResolvedFusion
 
@@ -19,28 +20,22 @@ def thin(points: NDArray[np.floating], cell: float) -> NDArray[np.int64]:
 
 @njit(cache=True, nogil=True)
 def _first_in_cells(points: NDArray[np.float32], cell: np.float32) -> NDArray[np.int64]:
-    """A hash table of cells, open addressing: sorting the cells takes ten times as long."""
-    size = 1024
-    while size < 2 * len(points):
-        size *= 2
-    keys = np.empty(size, np.int64)
-    filled = np.zeros(size, np.bool_)
+    """By a hash table of the cells: sorting them takes ten times as long."""
+    table = empty_table(len(points))
     kept = np.empty(len(points), np.int64)
     count = 0
-    last = np.int64(-1)
+    last = np.int64(EMPTY)
     for i in range(len(points)):
         x = np.int64(np.floor(points[i, 0] / cell))
         y = np.int64(np.floor(points[i, 1] / cell))
         z = np.int64(np.floor(points[i, 2] / cell))
         key = (x << 42) + (y << 21) + z
-        if count and key == last:
+        if key == last:
             continue
         last = key
-        h = ((key * 0x9E3779B97F4A7C1) >> 20) & (size - 1)
-        while filled[h] and keys[h] != key:
-            h = (h + 1) & (size - 1)
-        if not filled[h]:
-            filled[h], keys[h] = True, key
+        place = place_of(table, key)
+        if table[place] == EMPTY:
+            table[place] = key
             kept[count] = i
             count += 1
     return kept[:count]

@@ -5,7 +5,6 @@ frame convention).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.mapping.selection import thin
@@ -92,37 +91,3 @@ def _agreement(dot: F64, weight: F64) -> float:
     return float(
         (weight * (np.exp(-(1 - np.abs(dot)) * 2 / wide) + 0.5 * np.exp(-(dot**2) / wide))).sum()
     )
-
-
-def ground_height(
-    level_points: NDArray[np.floating], origin: NDArray[np.floating], scale: float = 1.0
-) -> float:
-    """Height of the ground below a sensor at ``origin`` (3,) from points (n, 3) in a level frame,
-    metres.
-
-    The mode of the heights of what is at least 0.3 m below the sensor and within 15 m, else the
-    lowest 2 %.
-    """
-    z = _heights_near(np.ascontiguousarray(level_points), np.asarray(origin, float), 15 * scale)
-    if not len(z):
-        return float(origin[2]) - 1.7 * scale
-    low = z[(z < origin[2] - 0.3 * scale) & (z > origin[2] - 5 * scale)]
-    if len(low) < 100:
-        return float(np.percentile(z, 2))
-    step = 0.1 * scale
-    bins = np.floor(low / step).astype(np.int64)
-    values, counts = np.unique(bins, return_counts=True)
-    best = values[np.argmax(counts)]
-    return float(np.median(low[np.abs(bins - best) <= 1]))
-
-
-@njit(cache=True, nogil=True)
-def _heights_near(points: F64, origin: F64, radius: float) -> F64:
-    """Heights of the points (n, 3) within ``radius`` of ``origin`` (3,) on the level."""
-    out = np.empty(len(points))
-    count = 0
-    for i in range(len(points)):
-        if (points[i, 0] - origin[0]) ** 2 + (points[i, 1] - origin[1]) ** 2 < radius * radius:
-            out[count] = points[i, 2]
-            count += 1
-    return out[:count]

@@ -4,13 +4,28 @@ asked for.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import TypeVar
 
 T = TypeVar("T")
 _END = object()
+_IN_CALLERS_THREAD = ContextVar("in_callers_thread", default=False)
+
+
+@contextmanager
+def in_callers_thread() -> Iterator[None]:
+    """Within it :func:`ahead` makes each item when the caller takes it, for profilers: these see one
+    thread.
+    """
+    token = _IN_CALLERS_THREAD.set(True)
+    try:
+        yield
+    finally:
+        _IN_CALLERS_THREAD.reset(token)
 
 
 def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
@@ -21,6 +36,9 @@ def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
     What ``items`` raises is raised here; an iterator that is left early stops the other thread
     before it returns.
     """
+    if _IN_CALLERS_THREAD.get():
+        yield from items
+        return
     queue: Queue[object] = Queue(depth)
     left = Event()
     failure: list[BaseException] = []

@@ -12,12 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import Query, Target
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.alignment.target_map import Target
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.matching import allowed_places, match_words
-from semloc_logs.closures.query import SessionMap, build_query, query_members
+from semloc_logs.closures.matching import allowed_words, match_words
+from semloc_logs.closures.query import build_query, query_members
+from semloc_logs.closures.visibility import Visibility, visible_to
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, turned_about_z
 from semloc_logs.settings import Resolved, Settings
 from semloc_logs.subvolumes.completed import completed, load_completion, states_of
@@ -208,11 +211,12 @@ def closure_view(
     )
     asking = keyframe_at(session, row["query_stamp_ns"])
     asked = keyframe_at(target, row["target_stamp_ns"])
-    database = Database(work, (row["target_session"],), settings).asked_by(session, asking)
+    database = Database(work, (row["target_session"],), settings)
+    visible = visible_to(database, session, asking)
     query, query_T_base = build_query(session, asking, settings)
     map_T_target = target.map_T_base[asked]
     map_T_query = map_T_target @ choice.target_T_query @ inverse(query_T_base)
-    group = _group(database, asked)
+    group = _group(visible, asked)
     before = np.eye(4)
     if session.folder.name == target.folder.name:
         before[:3, 3] = session.map_T_base[asking, :3, 3]  # as odometry says
@@ -225,13 +229,13 @@ def closure_view(
     return ClosureView(
         choice,
         query,
-        database.target(group),
+        visible.target(group),
         map_T_query,
         before,
         query_T_base,
         map_T_target[:3, :3],
         (target.map_T_base[:, :3, 3], road),
-        tuple(_matches(database, session, query, ground, map_T_query, group, most_matches)),
+        tuple(_matches(visible, session, query, ground, map_T_query, group, most_matches)),
         str(target.json["label_source"]),
     )
 
@@ -244,18 +248,18 @@ def drawn(view: ClosureView) -> dict[str, Any]:
     return {**view.choice.row, "accepted": view.choice.accepted, "matches": matches}
 
 
-def _group(database: Database, keyframe: int) -> int:
+def _group(visible: Visibility, keyframe: int) -> int:
     """The submap in whose middle a keyframe of the only target session is."""
 
     def off(g: int) -> int:
-        seen = database.keyframes(g)
+        seen = visible.keyframes(g)
         return min(keyframe - seen[0], seen[-1] - keyframe) if len(seen) else -len(seen) - 1
 
-    return max(range(len(database.places)), key=off)
+    return max(range(len(visible.database.places)), key=off)
 
 
 def _matches(
-    database: Database,
+    visible: Visibility,
     session: SessionMap,
     query: Query,
     ground: float,
@@ -264,14 +268,14 @@ def _matches(
     most: int,
 ) -> list[Match]:
     """Word matches that agree with the alignment, nearest first, none beside another."""
-    settings = database.settings
-    v = database.settings.fusion.voxel_size
-    places = allowed_places(database, session)
+    settings = visible.database.settings
+    v = settings.fusion.voxel_size
+    places = allowed_words(visible, session)
     if not places or not most:
         return []
     # a single target session is asked with one kind of words
     variant, allowed = next(iter(places.items()))
-    d, m = match_words(database, variant, allowed, query, ground)
+    d, m = match_words(visible.database, variant, allowed, query, ground)
     aligned = float(np.arctan2(map_T_query[1, 0], map_T_query[0, 0]))
     # voxels, in the map's axes
     laid = turned_about_z(d.centre.astype(float), np.full(len(d.centre), aligned))
@@ -293,7 +297,7 @@ def _matches(
     box, corner = _turned(query, aligned)
     corners = np.round(laid[asking[chosen]]).astype(int) - corner - SIZE // 2
     given = np.stack([_cut(box, c, SIZE // 2) for c in corners])
-    blocks = database.target(group).blocks
+    blocks = visible.target(group).blocks
     theirs = np.stack(
         [blocks.dense(np.round(c / v).astype(int) - SIZE // 2, (SIZE, SIZE, SIZE)) for c in centres]
     )

@@ -10,7 +10,9 @@ import numpy as np
 
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drives.trajectory import smooth_line
-from semloc_logs.simulation.sessions import Sensor, Session, write_sessions
+from semloc_logs.simulation.plan import Plan, Session
+from semloc_logs.simulation.sensors.sensor import Sensor
+from semloc_logs.simulation.sessions import write_sessions
 from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path
 
 
@@ -27,14 +29,8 @@ def simulate_demo(directory: Path | str, seed: int = 0) -> list[Path]:
         Session("monday.mcap", smooth_line(lane_path(network, monday)), Condition(0)),
         Session("tuesday.bag", smooth_line(lane_path(network, half)), Condition(1)),
     ]
-    truth = write_sessions(
-        directory,
-        network,
-        sessions,
-        seed=seed,
-        sensor=Sensor("hdl32", rate_hz=1.6, columns=1100),
-        overwrite=True,
-    )
+    sensor = Sensor("hdl32", rate_hz=1.6, columns=1100)
+    truth = write_sessions(directory, Plan(network, sessions, seed), sensor, overwrite=True)
     folder = Path(directory)
     return [
         folder / "monday.mcap",

@@ -11,7 +11,6 @@ import numpy as np
 
 import semloc_logs
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.logs.annotation.annotate import (
     AnnotateReport,
@@ -22,6 +21,7 @@ from semloc_logs.logs.annotation.annotate import (
     annotate_sidecar,
     recover,
 )
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import session_name

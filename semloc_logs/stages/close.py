@@ -11,8 +11,8 @@ import numpy as np
 
 import semloc_logs
 from semloc_logs import progress
-from semloc_logs.closures.acceptance.consistency import decide
-from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.acceptance.decide import decide
+from semloc_logs.closures.closure import Alignment, Closure, Rejected
 from semloc_logs.closures.closure_tables import (
     read_closures,
     unique_closures,
@@ -20,9 +20,10 @@ from semloc_logs.closures.closure_tables import (
     write_rejected,
 )
 from semloc_logs.closures.matching import CloseTask, close_queries
-from semloc_logs.closures.query import SessionMap, query_keyframes
+from semloc_logs.closures.query import query_keyframes
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.pictures.closures_picture import draw_closures
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of, recorded_fingerprint
@@ -75,12 +76,13 @@ def close(
     decided = decide(_search(tasks, engine), maps, settings)
 
     road = {name: session_map.distance for name, session_map in maps.items()}
-    accepted = [alignment for alignment in decided if alignment.accepted]
+    accepted = [outcome for outcome in decided if isinstance(outcome, Closure)]
+    rejected = [outcome for outcome in decided if isinstance(outcome, Rejected)]
     closures = unique_closures(accepted, road, settings.query.every)
     metadata = _metadata(settings, maps, sum(len(task.keyframes) for task in tasks))
     metadata["fingerprint"] = fingerprint
     # closures.parquet comes last: with its fingerprint it vouches for the other two
-    write_rejected(work.rejected, [a for a in decided if not a.accepted], metadata)
+    write_rejected(work.rejected, rejected, metadata)
     draw_closures(work, closures, maps)
     write_closures(work.closures, closures, metadata)
     return Report(done=["closures"], closures=len(closures))

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from semloc_logs import progress
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of, recorded_fingerprint
 from semloc_logs.stages.report import Report

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.labels.space import KNOWS_CLASSES
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.voxels.store import blocks_path, read_blocks
 from semloc_logs.workspace import SessionFolder
-
-KNOWS_CLASSES = ("log", "onnx")  # label sources that the semantic network understands
 
 
 @dataclass(frozen=True, slots=True, eq=False)

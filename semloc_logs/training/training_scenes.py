@@ -22,7 +22,7 @@ from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
 from semloc_logs.simulation.meshes.world import F64, Scene, World
 from semloc_logs.simulation.sensors.camera import CAMERAS, CameraModel, camera_points
 from semloc_logs.simulation.sensors.label_errors import corrupt_labels
-from semloc_logs.simulation.sensors.lidar import full_sweep
+from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
 from semloc_logs.simulation.sensors.lidar_models import MODELS, LidarModel
 from semloc_logs.simulation.town.forest import build_forest
 from semloc_logs.simulation.town.hall import build_hall, hall_walk
@@ -38,6 +38,7 @@ from semloc_logs.simulation.town.street import build_street, street_ground
 
 RAYS = 60_000  # a sweep at most
 RANGE = 60.0  # m
+CAMERA_STEP = 3  # every third pixel and row of a camera is cast
 ASKED = 36  # frames of the second drive
 LABEL_NOISE = 0.02, 0.2  # share of wrong labels of a session, least and most
 KINDS = {5: "hall", 8: "forest", 11: "room"}  # by seed modulo 12; the others are streets
@@ -79,14 +80,11 @@ class _Drive:
 
 @dataclass(frozen=True, slots=True)
 class _Rig:
-    """A sensor on a vehicle; a camera is turned to the left by ``yaw`` radians. ``sector``:
-    azimuths that a lidar is limited to.
-    """
+    """A sensor on a vehicle; ``columns`` and ``sector`` (azimuths) limit a lidar."""
 
     model: LidarModel | CameraModel
     columns: int = 0
     sector: tuple[float, float] | None = None
-    yaw: float = 0.0
     label_noise: float = 0.0
 
     def frame(
@@ -95,22 +93,14 @@ class _Rig:
         """What it sees from ``pose`` (4, 4) of the base."""
         if isinstance(self.model, CameraModel):
             points, origin, labels, sigma = camera_points(
-                scene, pose, rng, self.model, yaw=self.yaw, traffic=moving, step=3
+                scene, pose, rng, self.model, traffic=moving, step=CAMERA_STEP
             )
         else:
             base_T_lidar = np.eye(4)
             base_T_lidar[2, 3] = self.model.height
             lidar = pose @ base_T_lidar
-            turn = full_sweep(
-                scene,
-                lidar,
-                rng,
-                self.model,
-                columns=self.columns,
-                max_range=RANGE,
-                sector=self.sector,
-                traffic=moving,
-            )
+            options = SweepOptions(self.columns, RANGE, self.sector, moving)
+            turn = full_sweep(scene, lidar, rng, self.model, options)
             origin = base_T_lidar[:3, 3].astype(np.float32)
             points = turn.points + origin
             labels = turn.labels
@@ -163,9 +153,9 @@ def _rig(rng: Rng, kind: str) -> _Rig:
     noise = float(rng.uniform(*LABEL_NOISE))
     if rng.random() < (0.8 if kind == "room" else 0.34):
         camera = CAMERAS["depth" if kind in ("hall", "room") else "stereo"]
-        camera = replace(camera, mount_height=camera.mount_height + rng.uniform(-0.3, 0.4))
+        height = camera.mount_height + rng.uniform(-0.3, 0.4)
         yaw = float(rng.choice([0.0, 0.0, math.pi / 2, -math.pi / 2, math.pi]))
-        return _Rig(camera, yaw=yaw, label_noise=noise)
+        return _Rig(replace(camera, mount_height=height, yaw=yaw), label_noise=noise)
     model = MODELS[
         str(rng.choice(["hdl64", "hdl64", "hdl32", "vlp32", "vlp16", "vlp16", "rosette", "raster"]))
     ]

@@ -1,53 +1,88 @@
-"""Ray carving of one frame: which voxels its rays end in (occupied) and which they pass (free). The
-hot loop of fusion.
+"""Ray carving of one frame: which voxels its rays end in (occupied) and which they pass (free).
 
-A frame is marked in a grid of its own first, hits winning over passes, and the marks are then added
-to hashed blocks: each voxel changes once a frame, as in OctoMap (paper 3.1). The grid lies in
-memory block by block, so that a block is flushed as one run of 4096 bytes; the address of a voxel
-is the sum of three table look-ups, one an axis. One ray is walked for each end voxel, that of its
-first point: the others would pass nearly the same voxels.
+The hot loop of fusion. A frame is marked in a grid of its own first, hits winning over passes, and
+the marks are then added to hashed blocks: each voxel changes once a frame, as in OctoMap (paper
+3.1). The grid lies in memory block by block, so that a block is flushed as one run of 4096 bytes;
+the address of a voxel is the sum of three table look-ups, one an axis. One ray is walked for each
+end voxel, the ray of its first point: the others would pass nearly the same voxels.
 
-A mark is a byte: bit 0 says that a ray passed, the bits above hold the weight of the best hit in
+A mark is a byte: bit 0 is set where a ray passed, the bits above hold the weight of the best hit in
 sixteenths (0: none).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import GROUND
+from semloc_logs.numerics.hash_table import EMPTY, empty_table, place_of
 from semloc_logs.settings import ResolvedFusion
 from semloc_logs.voxels.keys import BLOCK
 
 BITS = 12  # of an address within a block
 CLASSES = 20  # of the votes of a frame: 19 and the unlabelled
+VOTE_CLASSES = 32  # numbers of classes in a key of the votes: a power of two
 FULL_WEIGHT = 16
+UNOBSERVED = -128  # in log-odds
+MARGIN = 1e-3  # voxels around the rays, as positions from the grid's corner are rounded once more
+LEVEL = np.isin(np.arange(256), GROUND)  # classes whose surfaces are level
 
 U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-
-
-LEVEL = np.isin(np.arange(256), GROUND)  # classes whose surfaces are level
+Votes = NDArray[np.uint32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marks:
-    """What the rays of one frame say, until the next frame is carved: ``grid`` of marks, in runs of
-    4096 bytes; ``runs`` (m,) of it hold any, those of the blocks ``blocks`` (m, 3); ``ends`` (n,) 2
-    * address + is_hit of the end voxels and their ``votes`` (n, 20).
+    """What the rays of one frame observed, until the next frame is carved.
+
+    ``grid`` of marks, in runs of 4096 bytes; the ``runs`` (m,) of it that hold any are the blocks
+    ``blocks`` (m, 3); ``ends`` (n,) are 2 * address + is_hit of the end voxels, with their
+    ``votes`` (n, 20).
     """
 
     grid: U8
     runs: I64
     blocks: I64
     ends: I64
-    votes: NDArray[np.uint32]
+    votes: Votes
+
+
+class Grid(NamedTuple):
+    """The grid of a frame, for compiled functions.
+
+    ``marks`` in runs of 4096 bytes; ``touched`` (runs,) is 1 where a run holds any; voxel (x, y, z)
+    is at byte ``ax[x] + ay[y] + az[z]``.
+    """
+
+    marks: U8
+    touched: U8
+    ax: I64
+    ay: I64
+    az: I64
+
+
+class Rays(NamedTuple):
+    """Rays in voxels from ``start`` (3,) in the grid, for compiled functions.
+
+    ``offset`` (n, 3) to their ends, cut at ``limit``; ``length`` (n,) before the cut, nan where the
+    end is not finite; ``label`` (n,) and ``sigma`` (n,), the standard deviation of the length, of
+    their echoes; ``sigma`` (0,) where all are certain.
+    """
+
+    start: F64
+    offset: F64
+    length: F64
+    limit: float
+    label: U8
+    sigma: F32
 
 
 class Carver:
@@ -56,7 +91,8 @@ class Carver:
     def __init__(self, fusion: ResolvedFusion) -> None:
         self._per_metre = 1.0 / fusion.voxel_size
         self._limit = fusion.max_range / fusion.voxel_size
-        self._grid, self._used = np.zeros(0, np.uint8), np.zeros(0, np.int64)
+        self._marks = np.zeros(0, np.uint8)
+        self._used = np.zeros(0, np.int64)
 
     def marks(
         self,
@@ -64,16 +100,16 @@ class Carver:
         label: U8,
         origin: NDArray[np.floating],
         sigma: NDArray[np.floating] | None = None,
-        map_T_points: NDArray[np.float64] | None = None,
+        map_T_points: F64 | None = None,
     ) -> Marks:
-        """Carve ``points`` (n, 3) with classes ``label`` (n,) (255 unknown), seen from ``origin``
-        (3,); both are in the map frame unless ``map_T_points`` (4, 4) takes them there.
+        """Carve ``points`` (n, 3) with classes ``label`` (n,) (255 unknown), seen from ``origin``.
 
-        Points beyond the maximum range carve and do not hit; points that are not finite are left
-        out. ``sigma`` (n,) is the standard deviation of the range in metres: uncertain points count
-        less.
+        ``points`` and ``origin`` (3,) are in the map frame unless ``map_T_points`` (4, 4) takes
+        them there. Points beyond the maximum range carve and do not hit; points that are not finite
+        are left out. ``sigma`` (n,) is the standard deviation of the range in metres: uncertain
+        points count less.
         """
-        self._grid.reshape(-1, 1 << BITS)[self._used] = 0
+        self._marks.reshape(-1, 1 << BITS)[self._used] = 0
         pose = np.eye(4) if map_T_points is None else np.ascontiguousarray(map_T_points, np.float64)
         start = (pose[:3, :3] @ np.asarray(origin, float) + pose[:3, 3]) * self._per_metre
         if not np.isfinite(start).all():
@@ -81,48 +117,37 @@ class Carver:
             label = label[:0]
             sigma = None
             start = np.zeros(3)
-        rays, length, lowest, highest = to_rays(
+        offset, length, lowest, highest = to_rays(
             np.ascontiguousarray(points), pose, start, self._per_metre, self._limit
         )
-        # a thousandth of a voxel to spare, as positions from the corner are rounded once more
-        low = np.floor((lowest - 1e-3) / BLOCK).astype(np.int64) * BLOCK
-        blocks: tuple[int, int, int] = tuple(
-            (np.floor((highest + 1e-3 - low) / BLOCK).astype(np.int64) + 1).tolist()
-        )
-        count = blocks[0] * blocks[1] * blocks[2]
-        if count << BITS > len(self._grid):
-            self._grid = np.zeros(count << BITS, np.uint8)
-        tables = addresses(blocks)
-        touched = np.zeros(count, np.uint8)
+
+        # the blocks that the rays reach, and their grid
+        low = np.floor((lowest - MARGIN) / BLOCK).astype(np.int64) * BLOCK
+        counts = np.floor((highest + MARGIN - low) / BLOCK).astype(np.int64) + 1
+        nx, ny, nz = counts.tolist()
+        grid = self._grid((nx, ny, nz))
+
+        spread = np.zeros(0, np.float32)
+        if sigma is not None:
+            spread = np.asarray(sigma * self._per_metre, np.float32)
+        rays = Rays(start - low, offset, length, self._limit, label, spread)
         votes = np.zeros((len(points), CLASSES), np.uint32)
-        spread = (
-            np.zeros(0, np.float32)
-            if sigma is None
-            else np.asarray(sigma * self._per_metre, np.float32)
-        )
-        ends, carved = mark_ends(
-            self._grid,
-            touched,
-            tables,
-            rays,
-            length,
-            label,
-            spread,
-            LEVEL,
-            start - low,
-            self._limit,
-            votes,
-        )
-        carve(self._grid, touched, tables, start - low, carved)
-        self._used = np.flatnonzero(touched)
-        found = np.stack(np.unravel_index(self._used, blocks), 1) + low // BLOCK
-        return Marks(self._grid, self._used, found, ends, votes[: len(ends)])
+        ends, carved = mark_ends(grid, rays, votes)
+        carve(grid, rays.start, carved)
+        self._used = np.flatnonzero(grid.touched)
+        blocks = np.stack(np.unravel_index(self._used, (nx, ny, nz)), 1) + low // BLOCK
+        return Marks(self._marks, self._used, blocks, ends, votes[: len(ends)])
+
+    def _grid(self, blocks: tuple[int, int, int]) -> Grid:
+        """An empty grid of so many blocks along each axis."""
+        count = blocks[0] * blocks[1] * blocks[2]
+        if count << BITS > len(self._marks):
+            self._marks = np.zeros(count << BITS, np.uint8)
+        return Grid(self._marks, np.zeros(count, np.uint8), *addresses(blocks))
 
 
 def addresses(blocks: tuple[int, int, int]) -> tuple[I64, I64, I64]:
-    """Tables for the axes of a grid of ``blocks``: voxel (x, y, z) is at byte ``ax[x] + ay[y] +
-    az[z]``.
-    """
+    """Tables ax, ay, az of a grid of ``blocks``: voxel (x, y, z) is at ax[x] + ay[y] + az[z]."""
     _, ny, nz = blocks
     outer = (ny * nz, nz, 1)
     inner = (BLOCK * BLOCK, BLOCK, 1)
@@ -138,9 +163,11 @@ def addresses(blocks: tuple[int, int, int]) -> tuple[I64, I64, I64]:
 def to_rays(
     points: F32, pose: F64, start: F64, per_metre: float, limit: float
 ) -> tuple[F64, F64, F64, F64]:
-    """Rays in voxels: (n, 3) from ``start`` (3,) to ``points`` (n, 3) metres that ``pose`` (4, 4)
-    takes into the map, cut at ``limit``; their full lengths (n,), nan where a point is not finite;
-    lowest and highest coordinate (3,) that they reach, the start included.
+    """Rays in voxels from ``start`` (3,) to ``points`` (n, 3), cut at ``limit``.
+
+    ``pose`` (4, 4) takes the points, metres, into the map. Returns the rays (n, 3); their full
+    lengths (n,), nan where a point is not finite; the lowest and highest coordinate (3,) that they
+    reach, the start included.
     """
     rays = np.empty((len(points), 3))
     length = np.empty(len(points))
@@ -150,15 +177,12 @@ def to_rays(
         px = float(points[i, 0])
         py = float(points[i, 1])
         pz = float(points[i, 2])
-        dx = (pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]) * per_metre - start[
-            0
-        ]
-        dy = (pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]) * per_metre - start[
-            1
-        ]
-        dz = (pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]) * per_metre - start[
-            2
-        ]
+        x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
+        y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
+        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        dx = x * per_metre - start[0]
+        dy = y * per_metre - start[1]
+        dz = z * per_metre - start[2]
         far = np.sqrt(dx * dx + dy * dy + dz * dz)
         if not np.isfinite(far):
             length[i] = np.nan
@@ -168,120 +192,97 @@ def to_rays(
             dx = dx * scale
             dy = dy * scale
             dz = dz * scale
-        rays[i, 0], rays[i, 1], rays[i, 2], length[i] = dx, dy, dz, far
-        low[0], low[1], low[2] = (
-            min(low[0], start[0] + dx),
-            min(low[1], start[1] + dy),
-            min(low[2], start[2] + dz),
-        )
-        high[0], high[1], high[2] = (
-            max(high[0], start[0] + dx),
-            max(high[1], start[1] + dy),
-            max(high[2], start[2] + dz),
-        )
+        rays[i] = dx, dy, dz
+        length[i] = far
+        for k in range(3):
+            reached = start[k] + rays[i, k]
+            low[k] = min(low[k], reached)
+            high[k] = max(high[k], reached)
     return rays, length, low, high
 
 
 @njit(cache=True, nogil=True)
-def _slot(table: NDArray[np.int32], addresses_of: I64, address: int) -> int:
-    """Where ``address`` is in an open hash table of ray numbers, or the empty place (-1) for it."""
-    mask = len(table) - 1
-    h = (address * 0x9E3779B1 >> 7) & mask
-    while table[h] >= 0 and addresses_of[table[h]] != address:
-        h = (h + 1) & mask
-    return h
+def _weight_and_reach(length: float, dz: float, sigma: float, level: bool) -> tuple[int, float]:
+    """The weight of a hit in sixteenths, and the share of the ray's ``length`` that it carves.
+
+    A length of standard deviation ``sigma`` (voxels) has the weight min(1, 1 / 2 sigma), the share
+    of its density that the end voxel holds at most, and carves up to 2 sigma before its end. Rays
+    that end on a ``level`` surface carve down to a voxel above it.
+    """
+    weight = FULL_WEIGHT
+    carved = 1.0
+    if sigma > 0.5:
+        spread = 2 * sigma
+        weight = max(1, int(FULL_WEIGHT / spread))
+        carved = max(0.0, 1.0 - spread / max(length, 1e-9))
+    if level:
+        # a ray that grazes the ground runs within its voxels for metres: they stay unobserved
+        carved = max(0.0, min(carved, 1.0 - 1.0 / max(abs(dz), 1.0)))
+    return weight, carved
 
 
 @njit(cache=True, nogil=True)
-def mark_ends(
-    marks: U8,
-    touched: U8,
-    tables: tuple[I64, I64, I64],
-    rays: F64,
-    length: F64,
-    label: U8,
-    sigma: F32,
-    level: NDArray[np.bool_],
-    start: F64,
-    limit: float,
-    voxel_votes: NDArray[np.uint32],
-) -> tuple[I64, F64]:
-    """Mark the end voxels of all rays; returns 2 * address + is_hit (m,) and the ends to carve to
-    (m, 3), one of each end voxel.
+def mark_ends(grid: Grid, rays: Rays, votes: Votes) -> tuple[I64, F64]:
+    """Mark the end voxels of all rays; those longer than the limit do not hit.
 
-    ``rays`` (n, 3) and ``length`` (n,) as :func:`to_rays` gives them, from ``start`` (3,) in the
-    grid, all in voxels; those longer than ``limit`` do not hit. ``label`` (n,); ``sigma`` (n,) in
-    voxels or (0,): a range of standard deviation sigma hits with the weight min(1, 1 / 2 sigma),
-    the share of its density that the end voxel holds at most, and carves up to 2 sigma before its
-    end. ``level`` (256,) says of which classes the surfaces are level: rays that end there carve
-    down to a voxel above them. ``voxel_votes`` (n, 20) zeros: gets the weights of each class in
-    sixteenths, a row a ray.
+    Returns 2 * address + is_hit (m,) and the points to carve to (m, 3), one of each end voxel.
+    ``votes`` (n, 20) zeros: gets the weights of each class in sixteenths, a row an end.
     """
-    ax, ay, az = tables
-    n = len(rays)
-    size = 1024
-    while size < 2 * n:
-        size *= 2
-    hashed = np.full(size, -1, np.int32)
+    marks, touched, ax, ay, az = grid
+    start, offset, length, limit, labels, sigma = rays
+    n = len(offset)
+    table = empty_table(n)
+    row_at = np.empty(len(table), np.int32)
     address_of = np.empty(n, np.int64)
     ends = np.empty((n, 3))
     count, last, row = 0, -1, -1
     for i in range(n):
         if np.isnan(length[i]):
             continue
-        dx = rays[i, 0]
-        dy = rays[i, 1]
-        dz = rays[i, 2]
+        dx = offset[i, 0]
+        dy = offset[i, 1]
+        dz = offset[i, 2]
         is_hit = length[i] <= limit
         weight, carved = FULL_WEIGHT, 1.0
-        if is_hit and len(sigma) and sigma[i] > 0.5:
-            spread = 2 * sigma[i]
-            weight = max(1, int(FULL_WEIGHT / spread))
-            carved = max(0.0, 1.0 - spread / max(length[i], 1e-9))
-        if is_hit and level[label[i]]:
-            # a ray that grazes the ground runs within its voxels for metres: it says nothing about
-            # them
-            carved = max(0.0, min(carved, 1.0 - 1.0 / max(abs(dz), 1.0)))
-        x = start[0] + dx
-        y = start[1] + dy
-        z = start[2] + dz
-        address = ax[int(x)] + ay[int(y)] + az[int(z)]
+        if is_hit:
+            uncertainty = float(sigma[i]) if len(sigma) else 0.0
+            weight, carved = _weight_and_reach(length[i], dz, uncertainty, LEVEL[labels[i]])
+        address = ax[int(start[0] + dx)] + ay[int(start[1] + dy)] + az[int(start[2] + dz)]
         # one ray for a hit and one for a pass that end in the same voxel: they differ in what they
         # carve
         key = address * 2 + is_hit
         if key != last:
             last = key
             touched[address >> BITS] = 1
-            h = _slot(hashed, address_of, key)
-            row = hashed[h]
-            if row < 0:
+            place = place_of(table, key)
+            if table[place] != EMPTY:
+                row = row_at[place]
+            else:
                 row = count
-                hashed[h] = row
+                table[place] = key
+                row_at[place] = row
                 address_of[row] = key
-                ends[row, 0], ends[row, 1], ends[row, 2] = (
-                    start[0] + dx * carved,
-                    start[1] + dy * carved,
-                    start[2] + dz * carved,
-                )
+                ends[row, 0] = start[0] + dx * carved
+                ends[row, 1] = start[1] + dy * carved
+                ends[row, 2] = start[2] + dz * carved
                 count += 1
         if is_hit:
             if (marks[address] >> 1) < weight:
                 marks[address] = weight << 1
-            voxel_votes[row, min(label[i], CLASSES - 1)] += weight
+            votes[row, min(labels[i], CLASSES - 1)] += weight
         elif marks[address] == 0:
             marks[address] = 1
     return address_of[:count], ends[:count]
 
 
 @njit(cache=True, nogil=True)
-def carve(marks: U8, touched: U8, tables: tuple[I64, I64, I64], start: F64, ends: F64) -> None:
-    """Mark the voxels of the rays from ``start`` (3,) to ``ends`` (n, 3), both in voxels within the
-    grid, as passed, and their blocks in ``touched``; not the end voxels themselves, which
-    :func:`mark_ends` has marked.
+def carve(grid: Grid, start: F64, ends: F64) -> None:
+    """Mark the voxels of the rays from ``start`` (3,) to ``ends`` (n, 3), in voxels, as passed.
 
+    Not the end voxels themselves, which :func:`mark_ends` has marked.
     The digital differential analyser of Amanatides and Woo (1987).
     """
-    ax, ay, az = tables
+    marks, touched, ax, ay, az = grid
     x0 = int(start[0])
     y0 = int(start[1])
     z0 = int(start[2])
@@ -323,59 +324,58 @@ def carve(marks: U8, touched: U8, tables: tuple[I64, I64, I64], start: F64, ends
                 tz = tz + stepz if z != z1 else np.inf
 
 
+class LogOddsUnits(NamedTuple):
+    """What a hit adds and a miss takes, and the clamp, in units of 1/20."""
+
+    hit: int
+    miss: int
+    low: int
+    high: int
+
+
 @njit(cache=True, nogil=True)
-def flush(
-    marks: U8,
-    runs: I64,
-    slots: I64,
-    log_odds: NDArray[np.int8],
-    hit: int,
-    miss: int,
-    low: int,
-    high: int,
-) -> None:
-    """Add the marks of ``runs`` (m,) of 4096 bytes to rows ``slots`` (m,) of ``log_odds`` (slots,
-    4096) int8 in units of 1/20, clamped to [low, high]; -128 is unobserved. A hit adds its weight's
-    share of ``hit``, at least 1.
+def flush(marks: U8, runs: I64, slots: I64, log_odds: NDArray[np.int8], by: LogOddsUnits) -> None:
+    """Add the marks of ``runs`` (m,) of 4096 bytes to rows ``slots`` (m,) of ``log_odds``.
+
+    ``log_odds`` (slots, 4096) int8 in units of 1/20, clamped; -128 is unobserved. A hit adds its
+    weight's share of ``by.hit``, at least 1.
     """
     gain = np.empty(256, np.int64)
     for mark in range(256):
-        gain[mark] = (
-            max(1, (hit * (mark >> 1) + FULL_WEIGHT // 2) // FULL_WEIGHT) if mark > 1 else -miss
-        )
+        hit = (by.hit * (mark >> 1) + FULL_WEIGHT // 2) // FULL_WEIGHT
+        gain[mark] = max(1, hit) if mark > 1 else -by.miss
     for b in range(len(runs)):
         row = log_odds[slots[b]]
         run = marks[runs[b] << BITS : (runs[b] + 1) << BITS]
         for n in range(len(run)):
             mark = run[n]
             if mark:
-                old = int(row[n])
-                row[n] = min(max((0 if old == -128 else old) + gain[mark], low), high)
+                old = 0 if row[n] == UNOBSERVED else int(row[n])
+                row[n] = min(max(old + gain[mark], by.low), by.high)
 
 
-@njit(cache=True, nogil=True)
-def _place(keys: I64, key: int) -> int:
-    """Where ``key`` is in an open hash table of :func:`add_votes`, or the empty place for it."""
-    mask = len(keys) - 1
-    h = ((key * 0x9E3779B97F4A7C1) >> 20) & mask
-    while keys[h] >= 0 and keys[h] != key:
-        h = (h + 1) & mask
-    return h
+class VoteTable(NamedTuple):
+    """Votes by voxel and class: a hash table of ``keys``, with their ``counts``.
 
-
-@njit(cache=True, nogil=True)
-def add_votes(
-    keys: I64,
-    counts: NDArray[np.uint32],
-    used: int,
-    ends: I64,
-    voxel_votes: NDArray[np.uint32],
-    slot_of_run: I64,
-) -> int:
-    """Add a frame's votes to a hash table of ``keys`` ((slot * 4096 + cell) * 32 + class, -1 empty)
-    and ``counts``; returns how many places are used. The table must be large enough. A class gets
-    at least one vote where it has any weight.
+    A key is (slot * 4096 + cell) * 32 + class.
     """
+
+    keys: I64
+    counts: Votes
+
+
+def vote_table(places: int) -> VoteTable:
+    """An empty table; ``places`` is a power of two."""
+    return VoteTable(np.full(places, EMPTY, np.int64), np.zeros(places, np.uint32))
+
+
+@njit(cache=True, nogil=True)
+def add_votes(table: VoteTable, ends: I64, voxel_votes: Votes, slot_of_run: I64) -> int:
+    """Add a frame's votes to a table with room for them; returns how many keys are new.
+
+    A class gets at least one vote where it has any weight.
+    """
+    new = 0
     for r in range(len(ends)):
         if not ends[r] & 1:
             continue
@@ -385,21 +385,20 @@ def add_votes(
             weight = voxel_votes[r, label]
             if weight == 0:
                 continue
-            key = voxel * 32 + label
-            h = _place(keys, key)
-            if keys[h] < 0:
-                keys[h] = key
-                used += 1
-            counts[h] += (weight + FULL_WEIGHT - 1) // FULL_WEIGHT
-    return used
+            key = voxel * VOTE_CLASSES + label
+            place = place_of(table.keys, key)
+            if table.keys[place] == EMPTY:
+                table.keys[place] = key
+                new += 1
+            table.counts[place] += (weight + FULL_WEIGHT - 1) // FULL_WEIGHT
+    return new
 
 
 @njit(cache=True, nogil=True)
-def rehash(
-    keys: I64, counts: NDArray[np.uint32], new_keys: I64, new_counts: NDArray[np.uint32]
-) -> None:
-    """Move a table of :func:`add_votes` into a larger, empty one."""
-    for i in range(len(keys)):
-        if keys[i] >= 0:
-            h = _place(new_keys, keys[i])
-            new_keys[h], new_counts[h] = keys[i], counts[i]
+def rehash(table: VoteTable, larger: VoteTable) -> None:
+    """Move a table into a larger, empty one."""
+    for i in range(len(table.keys)):
+        if table.keys[i] != EMPTY:
+            place = place_of(larger.keys, table.keys[i])
+            larger.keys[place] = table.keys[i]
+            larger.counts[place] = table.counts[i]

@@ -17,7 +17,8 @@ import zstandard
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import UNLABELLED
-from semloc_logs.voxels.grid import UNOBSERVED, BlockMap, winners
+from semloc_logs.voxels.carve import UNOBSERVED
+from semloc_logs.voxels.grid import BlockMap, winners
 from semloc_logs.voxels.keys import BLOCK, morton, unpack
 
 CELLS = BLOCK**3

@@ -1,23 +1,34 @@
-"""A semantic occupancy map in hashed blocks: log-odds of every observed voxel, class votes of every
-hit (paper 3.1).
-"""
+"""A semantic occupancy map in hashed blocks: log-odds and class votes of voxels (paper 3.1)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import UNLABELLED
+from semloc_logs.numerics.hash_table import EMPTY
 from semloc_logs.settings import ResolvedFusion
-from semloc_logs.voxels.carve import BITS, CLASSES, Carver, Marks, add_votes, flush, rehash
+from semloc_logs.voxels.carve import (
+    BITS,
+    CLASSES,
+    UNOBSERVED,
+    VOTE_CLASSES,
+    Carver,
+    LogOddsUnits,
+    Marks,
+    add_votes,
+    flush,
+    rehash,
+    vote_table,
+)
 from semloc_logs.voxels.keys import BLOCK, pack, unpack
 
 FREE_STATE, UNOBSERVED_STATE = 254, 253
-UNOBSERVED = -128  # in log-odds
 SCALE = 20  # int8 log-odds are in units of 1/20
+FIRST_PLACES = 1 << 15  # of the table of votes, which grows
 
 U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
@@ -25,12 +36,12 @@ I64 = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockMap:
-    """A finished map: ``keys`` (n,) packed block coordinates ascending, ``log_odds`` (n, 4096) int8
-    (-128 unobserved), ``state`` (n, 4096) uint8: a class, 255 unlabelled, 254 free, 253 unobserved;
-    and the class votes of every voxel that was ever hit: ``ballots`` (m,) int64 ascending, ``(row *
-    4096 + cell) * 256 + class``, with their numbers ``votes`` (m,).
+    """A finished map, block by block; voxel (i, j, k) of a block is at (i * 16 + j) * 16 + k.
 
-    Voxel (i, j, k) of a block is at index (i * 16 + j) * 16 + k.
+    ``keys`` (n,) packed block coordinates ascending; ``log_odds`` (n, 4096) int8 (-128 unobserved);
+    ``state`` (n, 4096) uint8: a class, 255 unlabelled, 254 free, 253 unobserved; and the class
+    votes of every voxel that was ever hit: ``ballots`` (m,) int64 ascending, ``(row * 4096 + cell)
+    * 256 + class``, with their numbers ``votes`` (m,).
     """
 
     keys: I64
@@ -51,9 +62,7 @@ class BlockMap:
         return b.min(0) * BLOCK, (b.max(0) + 1) * BLOCK
 
     def dense(self, low: NDArray[np.integer], shape: tuple[int, int, int]) -> U8:
-        """State of the box of ``shape`` voxels from voxel ``low``, unobserved where there is no
-        block.
-        """
+        """State of ``shape`` voxels from voxel ``low`` on, unobserved without a block."""
         out = np.full(shape, UNOBSERVED_STATE, np.uint8)
         corner = unpack(self.keys).astype(np.int64) * BLOCK - np.asarray(low, np.int64)
         inside = np.flatnonzero(((corner > -BLOCK) & (corner < np.array(shape))).all(1))
@@ -63,9 +72,7 @@ class BlockMap:
 
 @njit(cache=True, nogil=True)
 def _occupied(corner: NDArray[np.int32], state: U8) -> tuple[NDArray[np.int32], U8]:
-    """Coordinates (m, 3) and classes (m,) of the occupied voxels of blocks with their corner at
-    ``corner`` (n, 3).
-    """
+    """Coordinates (m, 3) and classes of occupied voxels; blocks lie at ``corner`` (n, 3)."""
     count = 0
     for value in state.ravel():
         count += value != FREE_STATE and value != UNOBSERVED_STATE
@@ -76,11 +83,9 @@ def _occupied(corner: NDArray[np.int32], state: U8) -> tuple[NDArray[np.int32], 
         for m in range(state.shape[1]):
             value = state[n, m]
             if value != FREE_STATE and value != UNOBSERVED_STATE:
-                ijk[at, 0], ijk[at, 1], ijk[at, 2] = (
-                    corner[n, 0] + m // 256,
-                    corner[n, 1] + m // 16 % 16,
-                    corner[n, 2] + m % 16,
-                )
+                ijk[at, 0] = corner[n, 0] + m // 256
+                ijk[at, 1] = corner[n, 1] + m // 16 % 16
+                ijk[at, 2] = corner[n, 2] + m % 16
                 label[at] = value
                 at += 1
     return ijk, label
@@ -88,9 +93,7 @@ def _occupied(corner: NDArray[np.int32], state: U8) -> tuple[NDArray[np.int32], 
 
 @njit(cache=True, nogil=True)
 def _copy_blocks(out: U8, corner: I64, state: U8, rows: I64) -> None:
-    """The ``rows`` (m,) of ``state``, blocks with their corner at ``corner`` (m, 3) of ``out``, as
-    far as they lie in it.
-    """
+    """Copy blocks, ``rows`` (m,) of ``state``, to ``corner`` (m, 3) of ``out``, where inside it."""
     nx, ny, nz = out.shape
     flat = out.ravel()
     for n in range(len(rows)):
@@ -117,7 +120,6 @@ def empty_map() -> BlockMap:
     return BlockMap(nothing, np.zeros(shape, np.int8), np.zeros(shape, np.uint8), nothing, nothing)
 
 
-@dataclass(slots=True, eq=False)
 class Fuser:
     """Fuses labelled points frame by frame; :meth:`finish` gives the map.
 
@@ -125,13 +127,15 @@ class Fuser:
     the frames.
     """
 
-    fusion: ResolvedFusion
-    _slots: dict[int, int] = field(default_factory=dict)
-    _log_odds: NDArray[np.int8] = field(default_factory=lambda: np.zeros((0, BLOCK**3), np.int8))
-    _vote_keys: I64 = field(default_factory=lambda: np.full(1 << 15, -1, np.int64))
-    _vote_counts: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(1 << 15, np.uint32))
-    _votes: int = 0
-    _carver: Carver | None = None
+    def __init__(self, fusion: ResolvedFusion) -> None:
+        self._units = LogOddsUnits(
+            *(round(SCALE * a) for a in (fusion.hit, fusion.miss, fusion.clamp[0], fusion.clamp[1]))
+        )
+        self._carver = Carver(fusion)
+        self._slots: dict[int, int] = {}  # row of _log_odds of each packed block
+        self._log_odds = np.zeros((0, BLOCK**3), np.int8)
+        self._votes = vote_table(FIRST_PLACES)
+        self._voted = 0  # keys in the table of votes
 
     def add(
         self,
@@ -142,26 +146,16 @@ class Fuser:
         map_T_points: NDArray[np.float64] | None = None,
     ) -> None:
         """Integrate a frame; the arguments are those of :meth:`Carver.marks`."""
-        self._carver = self._carver or Carver(self.fusion)
         self.take(self._carver.marks(points, label, origin, sigma, map_T_points))
 
     def take(self, marks: Marks) -> None:
         """Integrate a frame that is carved already: maps that overlap share the work."""
         slots = self._slots_of(marks.blocks)
-        f = self.fusion
-        flush(
-            marks.grid,
-            marks.runs,
-            slots,
-            self._log_odds,
-            *(round(SCALE * a) for a in (f.hit, f.miss, f.clamp[0], f.clamp[1])),
-        )
+        flush(marks.grid, marks.runs, slots, self._log_odds, self._units)
         slot_of_run = np.zeros(len(marks.grid) >> BITS, np.int64)
         slot_of_run[marks.runs] = slots
         self._reserve_votes(int(np.count_nonzero(marks.votes)))
-        self._votes = add_votes(
-            self._vote_keys, self._vote_counts, self._votes, marks.ends, marks.votes, slot_of_run
-        )
+        self._voted += add_votes(self._votes, marks.ends, marks.votes, slot_of_run)
 
     def _slots_of(self, block: NDArray[np.integer]) -> I64:
         """Rows of ``_log_odds`` of blocks (m, 3), made where they are new."""
@@ -175,44 +169,46 @@ class Fuser:
         return slots
 
     def _reserve_votes(self, more: int) -> None:
-        """Room in the hash table of votes for ``more`` at a load of at most a half."""
-        size = len(self._vote_keys)
-        while size < 2 * (self._votes + more):
-            size *= 2
-        if size > len(self._vote_keys):
-            keys = np.full(size, -1, np.int64)
-            counts = np.zeros(size, np.uint32)
-            rehash(self._vote_keys, self._vote_counts, keys, counts)
-            self._vote_keys, self._vote_counts = keys, counts
+        """Room in the table of votes for ``more`` keys, with half of it empty."""
+        places = len(self._votes.keys)
+        while places < 2 * (self._voted + more):
+            places *= 2
+        if places > len(self._votes.keys):
+            larger = vote_table(places)
+            rehash(self._votes, larger)
+            self._votes = larger
 
     def finish(self) -> BlockMap:
-        """The fused map. A voxel is occupied where its log-odds are positive; its class has the
-        most votes (the lower id wins a tie).
+        """The fused map.
+
+        A voxel is occupied where its log-odds are positive; its class has the most votes (the lower
+        id wins a tie).
         """
         if not self._slots:
             return empty_map()
-        keys = np.fromiter(self._slots.keys(), np.int64, len(self._slots))
+        count = len(self._slots)
+        keys = np.fromiter(self._slots.keys(), np.int64, count)
         order = np.argsort(keys)
-        log_odds = self._log_odds[
-            np.fromiter(self._slots.values(), np.int64, len(self._slots))[order]
-        ]
-        used = self._vote_keys >= 0
-        key = self._vote_keys[used]
-        count = self._vote_counts[used]
-        row = np.argsort(order)[key >> (BITS + 5)]
-        label = key & 31
-        cell = key >> 5 & (BLOCK**3 - 1)
-        ballots = (row * BLOCK**3 + cell) * 256 + np.where(label == CLASSES - 1, UNLABELLED, label)
-        sort = np.argsort(ballots)
-        ballots = ballots[sort]
-        votes = count[sort].astype(np.int64)
-        state = np.where(
-            log_odds > 0, UNLABELLED, np.where(log_odds == UNOBSERVED, UNOBSERVED_STATE, FREE_STATE)
-        ).astype(np.uint8)
+        log_odds = self._log_odds[np.fromiter(self._slots.values(), np.int64, count)[order]]
+        ballots, votes = self._ballots(np.argsort(order))
+
+        is_observed = log_odds != UNOBSERVED
+        state = np.where(is_observed, np.uint8(FREE_STATE), np.uint8(UNOBSERVED_STATE))
+        state[log_odds > 0] = UNLABELLED
         voxel, winner, _ = winners(ballots, votes)
         occupied = log_odds.reshape(-1)[voxel] > 0
         state.reshape(-1)[voxel[occupied]] = winner[occupied]
         return BlockMap(keys[order], log_odds, state, ballots, votes)
+
+    def _ballots(self, row_of_slot: I64) -> tuple[I64, I64]:
+        """Ballots (m,) in order, as in :class:`BlockMap`, and their votes (m,)."""
+        used = self._votes.keys != EMPTY
+        voxel, label = np.divmod(self._votes.keys[used], VOTE_CLASSES)
+        slot, cell = np.divmod(voxel, BLOCK**3)
+        label = np.where(label == CLASSES - 1, UNLABELLED, label)
+        ballots = (row_of_slot[slot] * BLOCK**3 + cell) * 256 + label
+        order = np.argsort(ballots)
+        return ballots[order], self._votes.counts[used][order].astype(np.int64)
 
 
 def winners(ballots: I64, votes: I64) -> tuple[I64, U8, I64]:

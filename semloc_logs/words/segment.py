@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.numerics.cells import cell_starts
 from semloc_logs.tables.atomic_files import replacing_file
 
 MAGIC, VERSION = b"SEMLOCIX", 1
@@ -105,7 +106,7 @@ def in_order(columns: Columns) -> Columns:
 
 def starts_of(word: NDArray[np.integer]) -> NDArray[np.uint32]:
     """Where the entries of each word start, and the end (65537,)."""
-    return np.concatenate([[0], np.cumsum(np.bincount(word, minlength=WORDS))]).astype(np.uint32)
+    return cell_starts(word, WORDS).astype(np.uint32)
 
 
 def segment_in_memory(sessions: tuple[Held, ...], columns: Columns) -> Segment:

@@ -29,6 +29,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from semloc_logs.errors import SettingsError
+from semloc_logs.numerics.cells import by_cell
 from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.words.kmeans import BLOCK, grid, kmeans, nearest_centroids
 
@@ -84,7 +85,7 @@ class Vocabulary:
         if not len(descriptors):
             return np.zeros(0, np.uint16), np.zeros(0, np.uint64)
         cell = self.nearest_cells(descriptors, 1)[:, 0]
-        order, starts = _by_cell(cell, len(self.cells))
+        order, starts = by_cell(cell, len(self.cells))
         projected = grid(self.projected(descriptors))
         child = np.zeros(len(cell), np.int64)
         for c in np.flatnonzero(np.diff(starts)):
@@ -120,12 +121,6 @@ def _largest(similarity: F32, out: NDArray[np.int32]) -> None:
                     j -= 1
                 best[j] = s
                 out[i, j] = c
-
-
-def _by_cell(cell: NDArray[np.integer], cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows in the order of their cells, and where each cell starts (cells + 1,)."""
-    order = np.argsort(cell, kind="stable")
-    return order, np.searchsorted(cell[order], np.arange(cells + 1))
 
 
 def _directions(descriptors: F32, cells: F32, rng: np.random.Generator) -> F32:
@@ -166,7 +161,7 @@ def train_vocabulary(
         block = grid(descriptors[i : i + BLOCK])
         projected[i : i + BLOCK] = block @ projection.T
         _largest(block @ centroids.T, cell[i : i + BLOCK, None])
-    order, starts = _by_cell(cell, cells)
+    order, starts = by_cell(cell, cells)
     thresholds = np.tile(np.median(projected, axis=0), (cells, 1)).astype(np.float32)
     kids = np.zeros((cells, children, BITS), np.float32)
     for c in range(cells):

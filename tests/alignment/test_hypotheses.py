@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semloc_logs.alignment.hypotheses import Hypothesis, of_best_groups, pool
+from semloc_logs.alignment.hypotheses import Hypothesis, keep_best_submaps, pool
 
 
 def slow_pool(
     group: list[int], yaw: list[float], t: np.ndarray, weight: list[float], cell: float
 ) -> list[tuple[float, int, float, tuple[float, ...]]]:
-    """Votes of every cell of both grids, in dictionaries: (weight, group, yaw, mean translation)."""
+    """Votes of every cell of both grids by dictionaries: (weight, group, yaw, mean translation)."""
     out = []
     for offset in (0.0, 0.5):
         votes = defaultdict(list)
@@ -90,6 +90,6 @@ def test_the_submaps_with_the_heaviest_hypotheses_are_looked_into() -> None:
         Hypothesis(group, (0.0, float(k), 0.0, 0.0), 1, weight)
         for k, (group, weight) in enumerate([(7, 1.0), (2, 3.0), (7, 4.0), (5, 3.0)])
     ]
-    assert [h.group for h in of_best_groups(found, 2)] == [7, 2, 7]
-    assert of_best_groups(found, 9) == found
-    assert of_best_groups([], 3) == []
+    assert [h.group for h in keep_best_submaps(found, 2)] == [7, 2, 7]
+    assert keep_best_submaps(found, 9) == found
+    assert keep_best_submaps([], 3) == []

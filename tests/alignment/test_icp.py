@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.icp import Fit, Step, _add_point, align
+from semloc_logs.alignment.covariance import COMMON_BIAS, RANGE_BIAS, covariance_of
+from semloc_logs.alignment.hypotheses import SAME_PLACE_VOXELS
+from semloc_logs.alignment.icp import Fit, Step, Weighting, _add_point, align
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.alignment.refine import fine_fit
 from semloc_logs.alignment.surface import flattened_surface, surface_of
-from semloc_logs.alignment.verify import Query, fine_fit, points_surface
-from semloc_logs.closures.matching import COMMON, SYSTEMATIC, covariance_of
+from semloc_logs.alignment.target_map import point_surface
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import Fuser
@@ -358,7 +361,7 @@ def test_uncertain_points_are_aligned_through_the_slab_they_lie_in() -> None:
     here, here_spread = seen_by_a_camera(
         rng, room(rng, 3000) * [2, 2, 1], np.array([6.0, 0.5, 1.5]), 0.04
     )
-    surface = points_surface(there, there_spread, v)
+    surface = point_surface(there, there_spread, v)
     assert surface.sigma > 0.25 * v
     query = Query(Fuser(Settings().resolved().fusion).finish(), here, v, here_spread)
     found = fine_fit(start, surface, query).target_T_query
@@ -381,7 +384,7 @@ def test_a_certain_point_weighs_as_many_uncertain_ones_as_it_is_more_certain() -
     spread = np.r_[np.zeros((40, 3)), np.tile([0.2, 0.0, 0.0], (40, 1))]
     # so wide a kernel takes all as they are; the last step measures what was found
     wide = (Step(100.0, 15), Step(100.0, 0))
-    found = align(query, surface_of(grid, CELL), np.eye(4), wide, spread, 0.1)
+    found = align(query, surface_of(grid, CELL), np.eye(4), wide, spread, Weighting(0.1))
     assert found.target_T_query[0, 3] == pytest.approx(-0.1 * 0.2 / 1.2, rel=0.02)
     assert found.rmse == pytest.approx(
         np.sqrt((0.1 * 0.2 / 1.2) ** 2 / 2 + 0.2 * (0.1 / 1.2) ** 2 / 2), rel=0.02
@@ -397,7 +400,8 @@ def test_a_start_holds_where_little_says_otherwise() -> None:
     )
     rng = np.random.default_rng(0)
     query = np.c_[np.full(40, 0.1), rng.uniform(-1.5, 1.5, 40), rng.uniform(0.2, 1.8, 40)]
-    found = align(query, surface_of(grid, CELL), np.eye(4), (Step(100.0, 15),), hold=40.0)
+    hold = Weighting(hold=40.0)
+    found = align(query, surface_of(grid, CELL), np.eye(4), (Step(100.0, 15),), weighting=hold)
     assert found.target_T_query[0, 3] == pytest.approx(-0.05, rel=0.01)
 
 
@@ -411,7 +415,7 @@ def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
     query = grid[::3]
     along = np.array([0.1, 0.0, 0.0])
     certain = align(query, surface_of(grid, CELL), np.eye(4), STEPS)
-    assert not certain.pull.any()
+    assert not certain.range_bias.any()
     least = covariance_of(certain, np.eye(4), np.eye(4), 0.3)[0, 0]
     mapped = flattened_surface(
         grid, np.tile(along, (len(grid), 1)), np.arange(len(grid)), CELL, 0.05
@@ -421,7 +425,7 @@ def test_ranges_that_are_all_too_long_widen_the_covariance_along_them() -> None:
         align(query, mapped, np.eye(4), STEPS),
     ):
         more = covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] - least
-        assert np.sqrt(more) == pytest.approx(SYSTEMATIC * 0.1, rel=0.1)
+        assert np.sqrt(more) == pytest.approx(RANGE_BIAS * 0.1, rel=0.1)
 
 
 def test_what_ranges_of_both_sides_have_in_common_counts_where_they_look_from_opposite_sides() -> (
@@ -449,9 +453,9 @@ def test_what_ranges_of_both_sides_have_in_common_counts_where_they_look_from_op
         )
         for ray in (along, -along)
     )
-    assert same == pytest.approx(SYSTEMATIC * 0.1 * np.sqrt(2 * (1 - COMMON)), rel=0.1)
+    assert same == pytest.approx(RANGE_BIAS * 0.1 * np.sqrt(2 * (1 - COMMON_BIAS)), rel=0.1)
     assert opposite == pytest.approx(
-        SYSTEMATIC * 0.1 * np.sqrt(2 * (1 - COMMON) + 4 * COMMON), rel=0.1
+        RANGE_BIAS * 0.1 * np.sqrt(2 * (1 - COMMON_BIAS) + 4 * COMMON_BIAS), rel=0.1
     )
 
 
@@ -466,7 +470,7 @@ def test_an_uncertain_wall_of_the_target_weighs_less_than_a_certain_one() -> Non
     spread = np.r_[np.zeros_like(side), np.tile([0.2, 0.0, 0.0], (len(side), 1))]
     mapped = walls + np.r_[np.zeros_like(side), np.tile([0.1, 0.0, 0.0], (len(side), 1))]
     surface = flattened_surface(mapped, spread, np.arange(len(mapped)), CELL, 0.1)
-    found = align(walls[::3], surface, np.eye(4), (Step(100.0, 15),), noise=0.1)
+    found = align(walls[::3], surface, np.eye(4), (Step(100.0, 15),), weighting=Weighting(0.1))
     assert found.target_T_query[0, 3] == pytest.approx(0.1 * 0.2 / 1.2, rel=0.05)
 
 
@@ -478,7 +482,9 @@ def test_ranges_pull_no_farther_than_points_hold() -> None:
     points = room(rng, 700, corridor=True)
     far = 0.1 * points / np.linalg.norm(points, axis=1)[:, None]
     found = align(points, surface_of(room(rng, 1500, corridor=True), CELL), np.eye(4), STEPS, far)
-    assert covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] < 2 * (3.3 * 0.3) ** 2
+    assert (
+        covariance_of(found, np.eye(4), np.eye(4), 0.3)[0, 0] < 2 * (SAME_PLACE_VOXELS * 0.3) ** 2
+    )
 
 
 def test_a_fit_that_meets_too_little_knows_nothing() -> None:
@@ -493,7 +499,7 @@ def test_a_fit_that_meets_too_little_knows_nothing() -> None:
     )
     assert (found.inliers, found.rmse) == (0.0, float("inf"))
     assert not found.information.any()
-    assert not found.pull.any()
+    assert not found.range_bias.any()
 
 
 def test_what_was_seen_farther_along_the_road_is_less_certain_by_the_drift_between() -> None:

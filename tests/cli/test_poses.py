@@ -142,6 +142,7 @@ def test_a_good_log_is_0(tmp_path: Path) -> None:
     assert session["skipped"] == []
     assert session["pose_source"] == {"kind": "log"}
     assert "Warning" not in done.stderr
+    assert (tmp_path / "work" / "sessions" / "a" / "map.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -235,6 +236,7 @@ def test_no_poses_is_0_with_a_note(tmp_path: Path) -> None:
     assert "--odometry lidar" in done.stderr
     assert "--poses FILE" in done.stderr
     assert not session["posed"]
+    assert (tmp_path / "work" / "sessions" / "a" / "map.png").exists()
 
 
 def tum(path: Path, x0: float = 0.0) -> Path:

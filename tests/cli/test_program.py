@@ -337,3 +337,36 @@ def test_workers_leave_with_a_killed_parent(tmp_path: Path) -> None:
         started.kill()
         started.communicate()
         assert list((tmp_path / "busy").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("simulate", "-o"),
+        ("demo", "-o"),
+        ("train", "--variant", "semantic", "-o"),
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_without_the_ray_caster_a_command_names_the_extra_and_writes_nothing(
+    arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    done = semloc(*arguments, str(tmp_path / "out"))
+    assert done.exit_code == 1
+    assert (
+        f"semloc {arguments[0]} needs the extra 'sim': pip install 'semloc_logs[sim]'"
+        in " ".join(done.stderr.split())
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_simulation_is_imported_without_the_ray_caster() -> None:
+    code = (
+        "import sys; sys.modules['embreex'] = None\n"
+        "import semloc_logs.simulation.demo, semloc_logs.training.training_scenes\n"
+        "from semloc_logs.simulation.town.hall import build_hall\n"
+        "print(len(build_hall(1).triangles) > 100)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"

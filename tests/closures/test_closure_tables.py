@@ -2,15 +2,22 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from semloc_logs.alignment.verify import FEATURES, Features
-from semloc_logs.closures.acceptance.calibration import AGREEMENT
-from semloc_logs.closures.closure import Agreement, Alignment
+from semloc_logs.closures.closure import (
+    FEATURES,
+    Agreement,
+    Alignment,
+    Closure,
+    Decision,
+    Features,
+    Reason,
+    Rejected,
+)
 from semloc_logs.closures.closure_tables import (
+    AGREEMENT_COLUMNS,
     read_closures,
     unique_closures,
     write_closures,
@@ -25,13 +32,11 @@ SECOND = 10**9
 ROAD = dict.fromkeys("abc", np.arange(100.0))
 
 
-def alignment(
-    query: str, i: int, target: str, j: int, probability: float = 0.995, **more: Any
-) -> Alignment:
+def alignment(query: str, i: int, target: str, j: int) -> Alignment:
     rng = np.random.default_rng(i)
     half = rng.standard_normal((6, 6))
     features = Features(0.9, 0.9, 0.0, 0.9, 0.1, 0.2, 3.0, 3.0)
-    made = Alignment(
+    return Alignment(
         query_session=query,
         target_session=target,
         query_keyframe=i,
@@ -41,24 +46,33 @@ def alignment(
         target_T_query=yaw_transform(0.1 * i, (0.5, 0.25, -0.1)),
         covariance=half @ half.T,
         overlap=0.75,
-        probability=probability,
+        probability=0.9,
         inliers=1000 + i,
         words=i,
         features=features,
-        agreement=Agreement(0.9, 7, 5.0, 1.0, 2.0, 0.5, 0.25),
-        reason="",
     )
-    return dataclasses.replace(made, **more)
 
 
-def keys(rows: list[Alignment]) -> list[tuple[str, int, str, int]]:
-    return [(a.query_session, a.query_keyframe, a.target_session, a.target_keyframe) for a in rows]
+def decision(probability: float) -> Decision:
+    agreement = Agreement(0.9, 7.0, 5.0, 1.0, 2.0, 0.5, 0.25)
+    return Decision(probability, agreement, probability, 1.0, 1.0, 0.99)
+
+
+def closure(query: str, i: int, target: str, j: int, probability: float = 0.995) -> Closure:
+    return Closure(alignment(query, i, target, j), decision(probability))
+
+
+def keys(rows: list[Closure]) -> list[tuple[str, int, str, int]]:
+    alignments = [c.alignment for c in rows]
+    return [
+        (a.query_session, a.query_keyframe, a.target_session, a.target_keyframe) for a in alignments
+    ]
 
 
 @pytest.mark.parametrize("swap", [False, True])
 def test_of_a_closure_found_from_both_ends_the_more_probable_stays(swap: bool) -> None:
-    one = alignment("a", 10, "b", 40, 0.995)
-    other = alignment("b", 41, "a", 11, 0.999)
+    one = closure("a", 10, "b", 40, 0.995)
+    other = closure("b", 41, "a", 11, 0.999)
     rows = [other, one] if swap else [one, other]
     assert keys(unique_closures(rows, ROAD, 2.0)) == [("b", 41, "a", 11)]
 
@@ -76,24 +90,24 @@ def test_of_a_closure_found_from_both_ends_the_more_probable_stays(swap: bool) -
     ],
 )
 def test_what_is_not_a_twin_stays(rows: list[tuple[str, int, str, int]]) -> None:
-    assert sorted(keys(unique_closures([alignment(*r) for r in rows], ROAD, 2.0))) == sorted(rows)
+    assert sorted(keys(unique_closures([closure(*r) for r in rows], ROAD, 2.0))) == sorted(rows)
 
 
 def test_a_session_that_closes_with_itself() -> None:
     rows = [
-        alignment("a", 10, "a", 60, 0.993),
-        alignment("a", 60, "a", 10, 0.996),
-        alignment("a", 90, "a", 10),
+        closure("a", 10, "a", 60, 0.993),
+        closure("a", 60, "a", 10, 0.996),
+        closure("a", 90, "a", 10),
     ]
     assert keys(unique_closures(rows, ROAD, 2.0)) == [("a", 60, "a", 10), ("a", 90, "a", 10)]
 
 
 def test_closures_are_sorted_by_session_and_time_whatever_the_order() -> None:
     rows = [
-        alignment("b", 5, "a", 50),
-        alignment("a", 30, "b", 80),
-        alignment("a", 7, "c", 20),
-        alignment("a", 7, "b", 90),
+        closure("b", 5, "a", 50),
+        closure("a", 30, "b", 80),
+        closure("a", 7, "c", 20),
+        closure("a", 7, "b", 90),
     ]
     expected = [("a", 7, "b", 90), ("a", 7, "c", 20), ("a", 30, "b", 80), ("b", 5, "a", 50)]
     for order in ([0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]):
@@ -104,24 +118,25 @@ def test_closures_are_sorted_by_session_and_time_whatever_the_order() -> None:
 def test_many_closures_of_one_pair_of_sessions_take_no_quadratic_time() -> None:
     n = 3000
     road = np.linspace(0.0, 5.0 * n, n, endpoint=False)
-    rows = [alignment("a", i, "b", i, 0.995) for i in range(n)] + [
-        alignment("b", i, "a", i, 0.994) for i in range(n)
+    rows = [closure("a", i, "b", i, 0.995) for i in range(n)] + [
+        closure("b", i, "a", i, 0.994) for i in range(n)
     ]
     kept = unique_closures(rows, {"a": road, "b": road}, 2.0)
     assert len(kept) == n
-    assert {a.query_session for a in kept} == {"a"}
+    assert {c.alignment.query_session for c in kept} == {"a"}
 
 
 @pytest.mark.parametrize("n", [0, 3])
 def test_closures_as_a_table(n: int, tmp_path: Path) -> None:
-    rows = [alignment("a", i, "b", i + 50) for i in range(n)]
+    rows = [closure("a", i, "b", i + 50) for i in range(n)]
     write_closures(tmp_path / "closures.parquet", rows, {"schema_version": 1})
     table = read_table(tmp_path / "closures.parquet")
     assert table.schema.equals(contracts.schema("closures"))
     assert read_metadata(tmp_path / "closures.parquet") == {"schema_version": 1}
     found = read_closures(tmp_path / "closures.parquet")
     assert len(found) == n
-    for a, row in zip(rows, found, strict=True):
+    for c, row in zip(rows, found, strict=True):
+        a = c.alignment
         assert (row["query_session"], row["target_session"], row["query_stamp_ns"]) == (
             "a",
             "b",
@@ -141,18 +156,25 @@ def test_closures_as_a_table(n: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("n", [0, 3])
 def test_rejections_as_a_table(n: int, tmp_path: Path) -> None:
-    rows = [alignment("a", 5, "b", i, 0.1 * i, reason=f"because {i}") for i in range(n)]
+    rows = [
+        Rejected(
+            dataclasses.replace(alignment("a", 5, "b", i), covariance=np.eye(6) * (i + 1) ** 2),
+            decision(0.1 * i),
+            Reason.UNCERTAIN_POSITION,
+        )
+        for i in range(n)
+    ]
     write_rejected(tmp_path / "rejected.parquet", rows, {})
     table = read_table(tmp_path / "rejected.parquet")
     assert table.schema.equals(contracts.schema("rejected"))
     # the most probable first
-    assert table["reason"].to_pylist() == [f"because {i}" for i in reversed(range(n))]
+    assert table["reason"].to_pylist() == [
+        f"probability 0.{i}00 below 0.99: position uncertainty {i + 1}.00 m (1 sigma) is too large"
+        for i in reversed(range(n))
+    ]
     for name in FEATURES:
-        assert table[name].to_pylist() == [getattr(a.features, name) for a in rows]
-    for name in AGREEMENT:
-        assert (
-            table[name].to_pylist() == [getattr(rows[0].agreement, name)] * n
-            if n
-            else not table.num_rows
-        )
-    assert table["sigma"].to_pylist() == pytest.approx([a.sigma for a in reversed(rows)])
+        assert table[name].to_pylist() == [getattr(r.alignment.features, name) for r in rows]
+    votes = dict(zip(AGREEMENT_COLUMNS, (0.9, 7, 5.0, 1.0, 2.0, 0.5, 0.25), strict=True))
+    for column, value in votes.items():
+        assert table[column].to_pylist() == [value] * n
+    assert table["sigma"].to_pylist() == pytest.approx([i + 1 for i in reversed(range(n))])

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import looked_at
-from semloc_logs.closures.database import Database
-from semloc_logs.closures.matching import allowed_places
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.alignment.hypotheses import Hypothesis
+from semloc_logs.alignment.query_map import view_centres
+from semloc_logs.alignment.verify import Query
+from semloc_logs.closures.database import Database, Recent
+from semloc_logs.closures.matching import allowed_places, allowed_words, close_query
+from semloc_logs.closures.target_surface import target_surface
+from semloc_logs.closures.visibility import everything, visible_to
 from semloc_logs.mapping.selection import road_distance
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.tables import contracts
@@ -95,16 +99,16 @@ def test_a_query_sees_its_own_drive_but_for_what_is_near_in_time_and_road(
     out_and_back: tuple[Database, SessionMap],
 ) -> None:
     database, session = out_and_back
-    seen = database.asked_by(session, 59).keyframes(0)
+    seen = visible_to(database, session, 59).keyframes(0)
     # 30 s: keyframes 30 to 59; 50 m of road are fewer; what else lies in the same stretch of 16
     # voxels goes with them
     assert seen[0] == 0
     assert 28 <= seen[-1] <= 29
     assert np.array_equal(seen, np.arange(seen[-1] + 1))
-    middle = database.asked_by(session, 5).keyframes(0)
+    middle = visible_to(database, session, 5).keyframes(0)
     assert 35 <= middle[0] <= 36
     assert middle[-1] == 59
-    assert len(database.keyframes(0)) == 60  # the database itself is as it was
+    assert len(everything(database).keyframes(0)) == 60
 
 
 @pytest.mark.parametrize(
@@ -143,8 +147,8 @@ def test_submaps_of_which_nothing_may_be_seen_are_left_out(tmp_path: Path) -> No
     session = drive_session(Workspace(tmp_path), "a", road, [(0, 30), (30, 60)], [none, none])
     drive_session(Workspace(tmp_path), "b", road, [(0, 60)], [none])
     database = Database(Workspace(tmp_path), ("a", "b"), Settings().resolved())
-    assert database.seen().tolist() == [True, True, True]
-    assert database.asked_by(session, 0).seen().tolist() == [False, True, True]
+    assert everything(database).submaps().tolist() == [True, True, True]
+    assert visible_to(database, session, 0).submaps().tolist() == [False, True, True]
 
 
 def test_a_target_keyframe_is_never_near_the_query_in_time(
@@ -152,7 +156,7 @@ def test_a_target_keyframe_is_never_near_the_query_in_time(
 ) -> None:
     database, session = out_and_back
     for keyframe in range(60):
-        view = database.asked_by(session, keyframe)
+        view = visible_to(database, session, keyframe)
         if len(view.keyframes(0)):
             found = view.nearest_keyframe(0, session.map_T_base[keyframe, :3, 3])
             assert abs(found - keyframe) >= 30
@@ -163,9 +167,11 @@ def test_of_two_passes_the_one_that_looks_at_a_place_is_found(
 ) -> None:
     database, session = out_and_back
     at = session.map_T_base[20, :3, 3]
-    found = database.looking_keyframe(0, at + VIEW)
+    found = everything(database).viewing_keyframe(0, at + VIEW)
     np.testing.assert_allclose(session.map_T_base[found, :3, 3], at)
-    assert database.looking_keyframe(0, at + VIEW) != database.nearest_keyframe(0, at + VIEW)
+    assert everything(database).viewing_keyframe(0, at + VIEW) != everything(
+        database
+    ).nearest_keyframe(0, at + VIEW)
 
 
 def test_the_keyframe_nearest_to_a_place_may_lie_in_the_next_submap_but_is_never_hidden(
@@ -175,12 +181,12 @@ def test_the_keyframe_nearest_to_a_place_may_lie_in_the_next_submap_but_is_never
     none = np.zeros((0, 3))
     session = drive_session(Workspace(tmp_path), "a", road, [(0, 30), (30, 60)], [none, none])
     database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
-    assert database.nearest_keyframe(0, np.array([128.0, 0.0, 0.0])) == 32
-    assert database.nearest_keyframe(1, np.array([108.0, 0.0, 0.0])) == 27
+    assert everything(database).nearest_keyframe(0, np.array([128.0, 0.0, 0.0])) == 32
+    assert everything(database).nearest_keyframe(1, np.array([108.0, 0.0, 0.0])) == 27
     # 28.8 m of road beyond the last one
-    assert database.nearest_keyframe(0, np.array([200.0, 0.0, 0.0])) == 36
+    assert everything(database).nearest_keyframe(0, np.array([200.0, 0.0, 0.0])) == 36
     # hides 30 to 59 and what shares a stretch of 4.8 m with them
-    view = database.asked_by(session, 59)
+    view = visible_to(database, session, 59)
     assert 28 <= view.nearest_keyframe(0, np.array([128.0, 0.0, 0.0])) < 30
 
 
@@ -191,15 +197,32 @@ def test_beyond_the_end_of_a_drive_a_surface_has_what_was_seen_from_afar(tmp_pat
     )
     database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
     at_the_end, beyond = (
-        database.surface(0, np.array([x, 0.0, 0.0])).points[:, 0].max() for x in (36.0, 70.0)
+        target_surface(everything(database), 0, np.array([x, 0.0, 0.0])).points[:, 0].max()
+        for x in (36.0, 70.0)
     )
     assert at_the_end == 36.0  # of each keyframe what lies within 28.8 m of it
     assert beyond == 36.0 + 45.0
 
 
+def test_a_surface_is_made_from_so_many_keyframes(tmp_path: Path) -> None:
+    """Keyframe i saw a point at a height of i decimetres; the nearest ones are about number 5."""
+    road = np.stack([np.arange(10) * 4.0, np.zeros(10)], 1)
+    drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [np.zeros((0, 3))])
+
+    def heights(count: int) -> list[int]:
+        settings = Settings.model_validate({"closures": {"surface_keyframes": count}}).resolved()
+        database = Database(Workspace(tmp_path), ("a",), settings)
+        surface = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW)
+        return sorted(np.rint(surface.points[:, 2] * 10).astype(int).tolist())
+
+    assert heights(1) == [5]
+    assert heights(3) == [4, 5, 6]
+    assert heights(100) == list(range(10))
+
+
 def test_what_looks_all_around_looks_where_it_is() -> None:
     """At 0.30 m voxels a mean of the points 6 m ahead is a view, one of 5 m is not."""
-    found = looked_at(np.zeros((2, 3)), np.array([[5.9, 0.0, 0.0], [6.1, 0.0, 0.0]]), 0.3)
+    found = view_centres(np.zeros((2, 3)), np.array([[5.9, 0.0, 0.0], [6.1, 0.0, 0.0]]), 0.3)
     np.testing.assert_allclose(found, [[0.0, 0.0, 0.0], [6.1, 0.0, 0.0]])
 
 
@@ -209,8 +232,8 @@ def test_words_answer_where_the_drive_came_by_at_another_time(
     database, session = out_and_back
 
     def answering(keyframe: int) -> list[float]:
-        view = database.asked_by(session, keyframe)
-        rows = allowed_places(view, session)["semantic"].rows[0]
+        view = visible_to(database, session, keyframe)
+        rows = allowed_words(view, session)["semantic"].rows[0]
         return sorted(
             read_table(session.folder.words / "submap-00000.parquet")["x"].to_numpy()[rows].tolist()
         )
@@ -225,7 +248,7 @@ def test_the_map_of_a_submap_that_comes_near_the_query_is_made_without_what_it_m
     out_and_back: tuple[Database, SessionMap],
 ) -> None:
     database, session = out_and_back
-    view = database.asked_by(session, 59)
+    view = visible_to(database, session, 59)
     ijk, _ = view.target(0).blocks.occupied()
     newest = view.keyframes(0)[-1]
     assert set(ijk[:, 2].tolist()) == {int(0.1 * i / 0.3 + 1e-6) for i in range(newest + 1)}
@@ -236,8 +259,24 @@ def test_a_drive_without_revisits_does_not_answer_itself(tmp_path: Path) -> None
     session = drive_session(
         Workspace(tmp_path), "a", road, [(0, 20)], [np.array([[40.0, 2.0, 1.0]])]
     )
-    view = Database(Workspace(tmp_path), ("a",), Settings().resolved()).asked_by(session, 10)
-    assert allowed_places(view, session) == {}
+    view = visible_to(Database(Workspace(tmp_path), ("a",), Settings().resolved()), session, 10)
+    assert allowed_words(view, session) == {}
+
+
+def test_recent_values_are_made_once_and_the_oldest_is_forgotten() -> None:
+    recent: Recent[int] = Recent(2)
+    made: list[str] = []
+
+    def value(key: str) -> int:
+        def make() -> int:
+            made.append(key)
+            return len(made)
+
+        return recent.get(key, make)
+
+    assert [value(k) for k in "aabab"] == [1, 1, 2, 1, 2]
+    assert (value("c"), value("b"), value("a")) == (3, 2, 4)
+    assert made == ["a", "b", "c", "a"]
 
 
 def test_other_sessions_answer_whatever_their_time(tmp_path: Path) -> None:
@@ -245,8 +284,8 @@ def test_other_sessions_answer_whatever_their_time(tmp_path: Path) -> None:
     road = np.stack([np.arange(20) * 4.0, np.zeros(20)], 1)
     word = np.array([[40.0, 2.0, 1.0]])
     sessions = {name: drive_session(work, name, road, [(0, 20)], [word]) for name in "ab"}
-    view = Database(work, ("a", "b"), Settings().resolved()).asked_by(sessions["a"], 10)
-    allowed = allowed_places(view, sessions["a"])["semantic"]
+    view = visible_to(Database(work, ("a", "b"), Settings().resolved()), sessions["a"], 10)
+    allowed = allowed_words(view, sessions["a"])["semantic"]
     assert (allowed.groups.tolist(), allowed.rows) == ([False, True], {})
     assert len(view.keyframes(1)) == 20
 
@@ -290,3 +329,15 @@ def test_classes_are_compared_where_both_sides_know_them(
     assert {variant: allowed.groups.tolist() for variant, allowed in found.items()} == {
         k: x for k, x in expected.items() if x
     }
+
+
+def test_a_query_searches_where_it_is_told(out_and_back: tuple[Database, SessionMap]) -> None:
+    database, session = out_and_back
+    searched = []
+
+    def find(view: Database, of: SessionMap, keyframe: int, query: Query) -> list[Hypothesis]:
+        searched.append((of, keyframe, len(view.keyframes(0)) < 60, len(query.structure[0]) > 0))
+        return []
+
+    assert close_query(database, session, 5, find) == []
+    assert searched == [(session, 5, True, True)]

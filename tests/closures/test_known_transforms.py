@@ -29,10 +29,11 @@ from semloc_logs.closures.matching import (
     find_hypotheses,
     match_words,
 )
-from semloc_logs.closures.query import SessionMap, build_query
+from semloc_logs.closures.query import build_query
 from semloc_logs.engines import make_engine
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.mapping.selection import road_distance
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import Resolved, Settings
 from semloc_logs.stages.describe import describe

@@ -17,6 +17,8 @@ from mcap.writer import Writer
 from semloc_logs.engines import make_engine
 from semloc_logs.evaluation.truth import Evaluation, Judged, evaluate_closures
 from semloc_logs.settings import load
+from semloc_logs.simulation.plan import Route, Town
+from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.stages.run import run
@@ -55,9 +57,8 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Evaluation]
     folder = tmp_path_factory.mktemp("closing")
     logs = {name: [folder / f"{name}.mcap"] for name in ("map", "camera", "frames")}
     for name, sensor in (("map", "hdl32"), ("camera", "depth")):
-        simulate_sessions(
-            folder / sensor, seed=300, sessions=1, length_m=60.0, sensor=sensor, label_noise=0.05
-        )
+        carried = Sensor(sensor, label_noise=0.05)
+        simulate_sessions(folder / sensor, Town(300), Route(1, 60.0), carried)
         shutil.move(folder / sensor / "session_0.mcap", logs[name][0])
     without(POSES, logs["map"][0], logs["frames"][0])
     settings = load(assignments={"query.every": "4"}).resolved()

@@ -8,9 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.closures.closure_tables import keyframe_at
-from semloc_logs.closures.query import SessionMap, build_query, query_keyframes, query_members
+from semloc_logs.closures.query import build_query, query_keyframes, query_members
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.mapping.selection import road_distance
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import Resolved, Settings
 from semloc_logs.tables import contracts

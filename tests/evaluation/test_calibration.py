@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance.calibration import TOGETHER, Calibration
+from semloc_logs.closures.acceptance.calibration import NEIGHBOUR_EVIDENCE, Calibration
 from semloc_logs.closures.acceptance.placements import Placed
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.closures.closure import FEATURES, Features
 from semloc_logs.evaluation import calibration
 from semloc_logs.evaluation.calibration import (
     Judged,
@@ -24,6 +23,7 @@ from semloc_logs.evaluation.calibration import (
     recall_at,
     reliability,
 )
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.pictures.reliability_diagram import draw_reliability
 from semloc_logs.tables import contracts
@@ -62,7 +62,9 @@ def judged(n: int = 1500, seed: int = 0, towns: int = 3) -> Judged:
         np.zeros(n),
         np.ones(n, bool),
     )
-    return Judged(town, features, placed, right, np.where(right, 0.1, 50.0), np.zeros(n), 0.3)
+    return Judged(
+        town, Features(*features.T), placed, right, np.where(right, 0.1, 50.0), np.zeros(n), 0.3
+    )
 
 
 def test_neighbours_find_more_at_the_same_reliability_and_probabilities_mean_what_they_say() -> (
@@ -82,7 +84,7 @@ def test_neighbours_find_more_at_the_same_reliability_and_probabilities_mean_wha
         int(data.right.sum()),
     )
     assert set(content["alone"]["features"]) == set(FEATURES)
-    assert Calibration.from_json(content["together"], TOGETHER).weights[0] == round(
+    assert Calibration.from_json(content["together"], NEIGHBOUR_EVIDENCE).weights[0] == round(
         fitted.model.together.weights[0], 4
     )
 
@@ -120,7 +122,7 @@ def test_copied_blocks_teach_when_to_abstain_and_cost_nothing_elsewhere() -> Non
     }
     both = Judged(
         np.concatenate([data.town, town]),
-        np.concatenate([data.features, features]),
+        Features(*np.concatenate([data.features.vector(), features]).T),
         Placed(**poses),
         np.concatenate([data.right, ~copy]),
         np.concatenate([data.error_m, np.where(copy, 85.0, 0.1)]),
@@ -128,11 +130,11 @@ def test_copied_blocks_teach_when_to_abstain_and_cost_nothing_elsewhere() -> Non
         0.3,
     )
     fitted = fit(both)
-    assert 0 < fitted.model.most_alike <= 0.5
+    assert 0 < fitted.model.max_ambiguity <= 0.5
     accepted = fitted.probability >= 0.99
     assert not accepted[len(data) :].any()
     without = fit(data)
-    assert without.model.most_alike == 1.0
+    assert without.model.max_ambiguity == 1.0
     assert accepted.sum() > 0.9 * (without.probability >= 0.99).sum()
 
 

@@ -210,7 +210,7 @@ def test_only_what_lies_in_the_bounds(form: str, tmp_path: Path) -> None:
 
 
 def test_bounds_skip_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from semloc_logs.closures.query import SessionMap
+    from semloc_logs.mapping.session_map import SessionMap
 
     make(Workspace(tmp_path), NEAR)
     points = SessionPoints(

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import level
-from semloc_logs.mapping.up_direction import find_up, ground_height
+from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.settings import load
 
 F64 = NDArray[np.float64]
@@ -86,28 +86,6 @@ def test_with_nothing_to_see_the_prior_stays() -> None:
     few = np.tile(UP, (20, 1))
     np.testing.assert_allclose(find_up(few, np.ones(20), prior), unit)
     np.testing.assert_allclose(find_up(np.tile(UP, (500, 1)), np.zeros(500), prior), unit)
-
-
-@pytest.mark.parametrize("scale", [1.0, 1 / 6])
-def test_ground_height(scale: float) -> None:
-    rng = np.random.default_rng(0)
-    ground = np.c_[rng.uniform(-20, 20, (3000, 2)), rng.normal(-1.73, 0.02, 3000)]
-    house = np.c_[rng.uniform(5, 6, (4000, 2)), rng.uniform(-1.7, 6, 4000)]
-    below = np.c_[rng.uniform(-20, 20, (40, 2)), rng.uniform(-4, -2, 40)]
-    far = np.c_[rng.uniform(30, 40, (9000, 2)), np.full(9000, -3.0)]  # down the hill
-    points = scale * np.concatenate([ground, house, below, far])
-    assert ground_height(points, np.zeros(3), scale) == pytest.approx(
-        -1.73 * scale, abs=0.02 * scale
-    )
-    there = np.array([40.0, -3.0, 7.0])
-    assert ground_height(points + there, there, scale) == pytest.approx(
-        7 - 1.73 * scale, abs=0.02 * scale
-    )
-    assert ground_height(np.zeros((0, 3)), np.array([0, 0, 2.0]), scale) == pytest.approx(
-        2 - 1.7 * scale
-    )
-    few = scale * np.c_[np.zeros((50, 2)), np.linspace(-2, 0, 50)]
-    assert ground_height(few, np.zeros(3), scale) == pytest.approx(np.percentile(few[:, 2], 2))
 
 
 def test_two_drives_through_a_basement_agree_on_up(shared: Callable[[str], Path]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from semloc_logs.numerics.prefetch import ahead
+from semloc_logs.numerics.prefetch import ahead, in_callers_thread
 
 
 def test_items_come_in_their_order() -> None:
@@ -54,3 +54,21 @@ def test_leaving_early_closes_the_source_and_ends_the_thread() -> None:
     coming.close()
     assert closed.is_set()
     assert not [t for t in threading.enumerate() if t.name == "semloc-ahead"]
+
+
+def test_items_are_made_as_they_are_taken_where_one_thread_is_wanted() -> None:
+    threads = []
+
+    def items() -> Iterator[int]:
+        for i in range(3):
+            threads.append(threading.current_thread())
+            yield i
+
+    with in_callers_thread():
+        coming = ahead(items())
+        assert next(coming) == 0
+        assert threads == [threading.current_thread()]
+        assert list(coming) == [1, 2]
+    assert set(threads) == {threading.current_thread()}
+    list(ahead(items()))
+    assert threads[-1] is not threading.current_thread()

@@ -9,7 +9,8 @@ import pyarrow as pa
 import pytest
 from click.testing import CliRunner
 
-from semloc_logs.alignment.verify import Query, Target
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.alignment.target_map import Target
 from semloc_logs.cli.main import program
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import yaw_transform
@@ -122,7 +123,7 @@ def test_nothing_to_show(work: Workspace, tmp_path: Path) -> None:
 
 
 def view(shift: float, *, accepted: bool) -> ClosureView:
-    """A square of walls seen from its middle, that lies ``shift`` metres off before it is aligned."""
+    """A square of walls seen from its middle, ``shift`` metres off before the alignment."""
     side = np.linspace(-4.0, 4.0, 60)
     walls = [
         np.stack(np.broadcast_arrays(*xy, z), -1)

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.pictures.map_picture import LARGE, Canvas, Caption, colour_table, draw_map
+from semloc_logs.pictures.canvas import Canvas
+from semloc_logs.pictures.colours import class_colours, class_legend
+from semloc_logs.pictures.map_picture import LARGE_MAP, Caption, draw_map
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
 
@@ -69,7 +71,8 @@ def share(image: NDArray[np.uint8], label: int) -> float:
     pixels = pixels[(pixels < 245).any(1) & (pixels > 60).any(1)]
     names = (0, 2, 8)
     nearest = np.argmax(
-        direction(pixels) @ np.stack([direction(colour_table()[c].astype(float)) for c in names]).T,
+        direction(pixels)
+        @ np.stack([direction(class_colours()[c].astype(float)) for c in names]).T,
         1,
     )
     return float(np.mean(nearest == names.index(label)))
@@ -85,7 +88,8 @@ def test_the_highest_voxel_shows_and_the_lowest_class_id_among_equals() -> None:
     assert canvas.top[1].tolist()[:2] == [5, 2]
     assert canvas.label.tolist() == [[255, 255, 255, 13], [2, 0, 255, 255]]  # y points up
     assert canvas.seen.tolist() == [[False, False, False, True], [True, True, False, False]]
-    assert canvas.classes() == [0, 2, 13]
+    names = [name for name, _ in class_legend(canvas.label[canvas.seen])]
+    assert names == ["road", "building", "car"]
     assert (canvas.image()[~canvas.seen] == 255).all()
     assert (canvas.image()[canvas.seen] < 255).all()
 
@@ -133,8 +137,8 @@ def test_the_picture_of_a_long_drive_is_bounded(tmp_path: Path) -> None:
         tmp_path / "map.png",
     )
     height, width, _ = drawn(tmp_path / "map.png").shape
-    assert LARGE < width < 1.2 * LARGE
-    assert height < LARGE
+    assert LARGE_MAP < width < 1.2 * LARGE_MAP
+    assert height < LARGE_MAP
 
 
 @pytest.mark.parametrize("drive", [np.zeros((0, 3)), np.zeros((1, 3)), np.zeros((5, 3)), DRIVE])

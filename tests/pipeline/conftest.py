@@ -39,7 +39,7 @@ from semloc_logs.simulation.meshes.world import (
     place,
 )
 from semloc_logs.simulation.output.drive_log import write_session
-from semloc_logs.simulation.sensors.lidar import MODELS
+from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.stages import close as close_stage
 from semloc_logs.stages import describe as describe_stage
 from semloc_logs.stages import fuse as fuse_stage
@@ -160,7 +160,7 @@ def simulate(folder: Path, name: str, world: World, format_: str) -> Drive:
     write_session(
         log,
         driven,
-        simulate_drive(world, driven, MODELS["hdl32"], columns=300, seed=number),
+        simulate_drive(world, driven, Sensor("hdl32", columns=300), seed=number),
         format=format_,
     )
     return Drive(name, log, SESSION_T_WORLD[name], driven)

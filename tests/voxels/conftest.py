@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.voxels.carve import CLASSES, addresses, carve, mark_ends, to_rays
+from semloc_logs.voxels.carve import CLASSES, Grid, Rays, addresses, carve, mark_ends, to_rays
 from semloc_logs.voxels.keys import BLOCK
 
 Walk = Callable[..., NDArray[np.uint8]]
@@ -26,30 +26,18 @@ def walk_rays(
     room = np.zeros(count + 2 * guard, np.uint8)
     marks = room[guard : guard + count]
     touched = np.zeros(count >> 12, np.uint8)
-    tables = addresses(blocks)
+    grid = Grid(marks, touched, *addresses(blocks))
     nothing = np.zeros(0, np.float32)
     for end, is_hit in zip(ends, hit, strict=True):
         # a limit of almost the length makes it a ray that ends at its end and does not hit
         limit = 1e9 if is_hit else float(np.linalg.norm(end - origin)) * (1 - 1e-15)
         votes = np.zeros((1, CLASSES), np.uint32)
-        label = np.zeros(1, np.uint8)
-        rays, length, low, high = to_rays(end[None], np.eye(4), origin, 1.0, limit)
-        assert (low <= np.minimum(origin, origin + rays[0])).all()
-        assert (high >= np.maximum(origin, origin + rays[0])).all()
-        _, carved = mark_ends(
-            marks,
-            touched,
-            tables,
-            rays,
-            length,
-            label,
-            nothing,
-            np.zeros(256, bool),
-            origin,
-            limit,
-            votes,
-        )
-        carve(marks, touched, tables, origin, carved)
+        label = np.full(1, 2, np.uint8)  # a class whose surfaces are not level
+        offset, length, low, high = to_rays(end[None], np.eye(4), origin, 1.0, limit)
+        assert (low <= np.minimum(origin, origin + offset[0])).all()
+        assert (high >= np.maximum(origin, origin + offset[0])).all()
+        _, carved = mark_ends(grid, Rays(origin, offset, length, limit, label, nothing), votes)
+        carve(grid, origin, carved)
     assert not room[:guard].any()
     assert not room[guard + count :].any()
     dense = (

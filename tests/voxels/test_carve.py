@@ -9,19 +9,24 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from semloc_logs.numerics.hash_table import EMPTY
 from semloc_logs.voxels.carve import (
     CLASSES,
+    Grid,
+    LogOddsUnits,
+    Rays,
+    VoteTable,
     add_votes,
     addresses,
     flush,
     mark_ends,
     rehash,
     to_rays,
+    vote_table,
 )
 
 EDGE = 16
 FREE, HIT = 1, 2
-NOT_LEVEL = np.zeros(256, bool)
 F64 = NDArray[np.float64]
 Walk = Callable[..., NDArray[np.uint8]]
 
@@ -173,38 +178,24 @@ def test_an_uncertain_range_hits_less_and_carves_less(
     start = np.full(3, 0.5)
     label = np.array([8], np.uint8)
     spread = np.array([sigma], np.float32)
-    ray, length, _, _ = to_rays(np.array([[10.5, 0.5, 0.5]]), np.eye(4), start, 1.0, 50.0)
-    ends, rays = mark_ends(
-        marks,
-        touched,
-        addresses((1, 1, 1)),
-        ray,
-        length,
-        label,
-        spread,
-        NOT_LEVEL,
-        start,
-        50.0,
-        votes,
-    )
+    offset, length, _, _ = to_rays(np.array([[10.5, 0.5, 0.5]]), np.eye(4), start, 1.0, 50.0)
+    rays = Rays(start, offset, length, 50.0, label, spread)
+    ends, carved = mark_ends(Grid(marks, touched, *addresses((1, 1, 1))), rays, votes)
     assert ends.tolist() == [2 * 2560 + 1]  # voxel (10, 0, 0), a hit
     assert marks[2560] == weight << 1
     assert votes[0, 8] == weight
-    np.testing.assert_allclose(rays, [[carved_to, 0.5, 0.5]], atol=1e-6)
+    np.testing.assert_allclose(carved, [[carved_to, 0.5, 0.5]], atol=1e-6)
 
 
 def test_flush_by_hand() -> None:
     marks = np.zeros(6 * 4096, np.uint8)
-    marks[0], marks[5 * 4096 + 4095], marks[5 * 4096 + 4094], marks[7], marks[8] = (
-        1,
-        16 << 1 | 1,
-        1,
-        4 << 1,
-        1 << 1,
-    )
+    marks[0] = marks[5 * 4096 + 4094] = 1
+    marks[5 * 4096 + 4095] = 16 << 1 | 1
+    marks[7] = 4 << 1
+    marks[8] = 1 << 1
     log_odds = np.full((3, 4096), -128, np.int8)
     log_odds[2, 0], log_odds[0, 4095] = -35, 60
-    flush(marks, np.array([0, 5]), np.array([2, 0]), log_odds, 17, 8, -40, 70)
+    flush(marks, np.array([0, 5]), np.array([2, 0]), log_odds, LogOddsUnits(17, 8, -40, 70))
     expected = np.full((3, 4096), -128, np.int8)
     expected[2, 0] = -40  # -35 - 8, clamped
     expected[0, 4095] = 70  # 60 + 17, clamped; the hit wins over the pass
@@ -221,24 +212,24 @@ def test_flush_by_hand() -> None:
     )
 )
 @settings(max_examples=50, deadline=None)
-def test_votes_are_what_a_dictionary_says(frames: list[tuple[int, int, int]]) -> None:
-    keys = np.full(64, -1, np.int64)
-    counts = np.zeros(64, np.uint32)
+def test_votes_are_counted_as_in_a_dictionary(frames: list[tuple[int, int, int]]) -> None:
+    table = vote_table(64)
     used = 0
     expected: dict[int, int] = {}
     for cell, label, weight in frames:
         votes = np.zeros((1, CLASSES), np.uint32)
         votes[0, label] = weight
-        used = add_votes(keys, counts, used, np.array([2 * cell + 1]), votes, np.array([3]))
+        used += add_votes(table, np.array([2 * cell + 1]), votes, np.array([3]))
         key = (3 * 4096 + cell) * 32 + label
         expected[key] = expected.get(key, 0) + -(-weight // 16)
         if used > 32:  # what the fuser does when the table is half full
-            old_keys = keys
-            old_counts = counts
-            size = 4 * len(keys)
-            keys = np.full(size, -1, np.int64)
-            counts = np.zeros(size, np.uint32)
-            rehash(old_keys, old_counts, keys, counts)
-    filled = keys >= 0
-    assert dict(zip(keys[filled].tolist(), counts[filled].tolist(), strict=True)) == expected
+            smaller = table
+            table = vote_table(4 * len(smaller.keys))
+            rehash(smaller, table)
+    assert contents(table) == expected
     assert used == len(expected)
+
+
+def contents(table: VoteTable) -> dict[int, int]:
+    filled = table.keys != EMPTY
+    return dict(zip(table.keys[filled].tolist(), table.counts[filled].tolist(), strict=True))

@@ -12,8 +12,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from semloc_logs.voxels.carve import UNOBSERVED
 from semloc_logs.voxels.evidence import CELLS, CLASSES, Evidence, Tiles, evidence, merge, resolve
-from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED, UNOBSERVED_STATE, BlockMap, empty_map
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, empty_map
 from semloc_logs.voxels.keys import morton, pack
 
 LOW, HIGH = -40, 70

@@ -13,7 +13,8 @@ import pytest
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Settings
 from semloc_logs.tables.table import read_metadata
-from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED, BlockMap, Fuser, empty_map
+from semloc_logs.voxels.carve import UNOBSERVED
+from semloc_logs.voxels.grid import FREE_STATE, BlockMap, Fuser, empty_map
 from semloc_logs.voxels.keys import morton, pack, unpack
 from semloc_logs.voxels.store import (
     PART,

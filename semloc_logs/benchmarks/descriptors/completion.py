@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.benchmarks.descriptors.held_out import simulation_version
+from semloc_logs.benchmarks.versions import simulation_version
 from semloc_logs.pictures.completion_picture import draw_completions
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.completed import Completed, completed, load_completion, states_of

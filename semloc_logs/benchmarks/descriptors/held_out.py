@@ -11,9 +11,8 @@ a step. Streets are kept in a folder.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs import simulation
 from semloc_logs.benchmarks.descriptors.places import (
     HEADINGS,
     Place,
@@ -31,6 +29,7 @@ from semloc_logs.benchmarks.descriptors.places import (
     read_street,
     write_street,
 )
+from semloc_logs.benchmarks.versions import simulation_version
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 from semloc_logs.settings import Resolved
@@ -39,7 +38,8 @@ from semloc_logs.simulation.drives.traffic import Traffic, random_traffic
 from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
 from semloc_logs.simulation.meshes.world import Scene
 from semloc_logs.simulation.sensors.camera import CAMERAS, camera_points
-from semloc_logs.simulation.sensors.lidar import MODELS, full_sweep
+from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
+from semloc_logs.simulation.sensors.lidar_models import MODELS
 from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path
 from semloc_logs.simulation.town.street import build_street, street_ground
 from semloc_logs.simulation.town.terrain import Ground
@@ -61,6 +61,7 @@ SPACING, QUERY_SPACING = 1.5, 1.0  # m between frames
 FRAMES = (1, 5)  # of queries
 LIDAR = MODELS["hdl64"]
 COLUMNS = 900
+MAX_RANGE = 60.0  # m
 SUMMER = Condition(0)
 LATER = Condition(1)
 SNOW = Condition(2, "snow")
@@ -143,14 +144,6 @@ def held_out(
     return HeldOut(tuple(paths), settings, database, queries)
 
 
-def simulation_version() -> str:
-    """Of the simulation: a hash of its modules."""
-    package = Path(simulation.__file__).parent
-    return hashlib.sha256(
-        b"".join(path.read_bytes() for path in sorted(package.glob("*.py")))
-    ).hexdigest()[:12]
-
-
 def _is_made(path: Path, note: dict[str, Any]) -> bool:
     try:
         content = read_metadata(path)
@@ -197,22 +190,14 @@ class _Drive:
         return poses_along(self.line, at, self.height, self.rng)
 
     def camera(self, pose: F64, yaw: float) -> Cloud:
-        return camera_points(
-            self.scene, pose, self.rng, CAMERAS["stereo"], yaw=yaw, traffic=self._moving(pose)
-        )
+        model = replace(CAMERAS["stereo"], yaw=yaw)
+        return camera_points(self.scene, pose, self.rng, model, traffic=self._moving(pose))
 
     def lidar(self, pose: F64) -> Cloud:
         mounted = np.eye(4)
         mounted[2, 3] = LIDAR.height
-        seen = full_sweep(
-            self.scene,
-            pose @ mounted,
-            self.rng,
-            LIDAR,
-            columns=COLUMNS,
-            max_range=60.0,
-            traffic=self._moving(pose),
-        )
+        options = SweepOptions(COLUMNS, MAX_RANGE, traffic=self._moving(pose))
+        seen = full_sweep(self.scene, pose @ mounted, self.rng, LIDAR, options)
         origin = mounted[:3, 3].astype(np.float32)
         return seen.points + origin, origin, seen.labels, None
 

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.errors import LogError
 from semloc_logs.labels.from_geometry import classify
 from semloc_logs.labels.space import UNLABELLED, cityscapes
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.voxels.grid import BlockMap, Fuser

@@ -24,8 +24,9 @@ from semloc_logs.benchmarks.localisation.city import (
     UNSEEN,
     WorldDrive,
 )
-from semloc_logs.closures.query import SessionMap, query_keyframes
+from semloc_logs.closures.query import query_keyframes
 from semloc_logs.evaluation.truth import read_tum
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, rotation_angle
 from semloc_logs.settings import Resolved
 from semloc_logs.workspace import Workspace

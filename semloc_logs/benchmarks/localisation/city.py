@@ -19,7 +19,9 @@ from scipy.ndimage import gaussian_filter1d
 
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.meshes.objects import resample
-from semloc_logs.simulation.sessions import Sensor, Session, write_sessions
+from semloc_logs.simulation.plan import Plan, Session
+from semloc_logs.simulation.sensors.sensor import Sensor
+from semloc_logs.simulation.sessions import write_sessions
 from semloc_logs.simulation.town.road_network import left_of
 from semloc_logs.simulation.town.survey import drive_network, opposite_lane
 from semloc_logs.tables.atomic_files import replacing_folder
@@ -133,5 +135,5 @@ def simulate_drive_log(drive: WorldDrive) -> str:
     )
     session = Session(drive.log.name, _line(path[:, :2], first, drive.condition), condition)
     with replacing_folder(drive.log.parent) as temporary:
-        write_sessions(temporary, network, [session], seed=seed, sensor=SENSORS[drive.sensor])
+        write_sessions(temporary, Plan(network, [session], seed), SENSORS[drive.sensor])
     return drive.name

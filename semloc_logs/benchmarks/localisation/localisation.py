@@ -1,21 +1,20 @@
 """`semloc benchmark localisation`: whole localisation beside its peers, on the same keyframes of an
 unseen simulated city.
 
-Worlds, clouds and answers are kept in a folder, so that a run goes on where it was stopped; other
-weights, or another version of what a system consists of, have answers of their own.
+Worlds, clouds and answers are kept in a folder, so that an interrupted run continues; other
+weights, or another version of the code of a system, have answers of their own.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
 
-import semloc_logs
-from semloc_logs.benchmarks.descriptors.held_out import simulation_version
+from semloc_logs.benchmarks.fused_sessions import fuse_sessions
 from semloc_logs.benchmarks.localisation.answers import UNITS, Answer, figures_of, read_world
 from semloc_logs.benchmarks.localisation.city import (
     CONDITIONS,
@@ -37,37 +36,25 @@ from semloc_logs.benchmarks.localisation.our_method import (
 )
 from semloc_logs.benchmarks.localisation.peer_methods import PEERS, PeerSystem, PeerTask
 from semloc_logs.benchmarks.peers.peer_process import runner
+from semloc_logs.benchmarks.versions import code_version, files_version, simulation_version
+from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Resolved
+from semloc_logs.stages.describe import describe
 from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
 
 Figures = dict[str, dict[str, float | str]]
 Note = Callable[[str], None]
 Task = OurTask | PeerTask
-FUSION = ("labels", "voxels")
+FUSION = ("labels", "mapping", "numerics", "voxels")  # packages that decide about fused maps
+LOCALISATION = (*FUSION, "subvolumes", "words", "alignment", "closures")
 TIMED = ("ours", "ours, one frame", "ours, every heading described")
-
-
-class Run(Protocol):
-    """An engine's ``map`` and number of ``jobs``."""
-
-    jobs: int
-
-    def map(self, function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]: ...
-
-
-class Prepare(Protocol):
-    """Fuses ``logs`` (session -> log) into a workspace, or describes its sessions ``names``."""
-
-    def fuse(self, logs: Mapping[str, Path], work: Workspace, settings: Resolved) -> None: ...
-
-    def describe(self, work: Workspace, names: Sequence[str], settings: Resolved) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """What one system answers to one drive; the answers are kept in ``path``."""
+    """The queries of one drive by one system; the answers are kept in ``path``."""
 
     task: Task
     path: Path
@@ -78,7 +65,7 @@ class Unit:
 
 
 def run_unit(unit: Unit) -> str:
-    """Ask, and keep the answers; returns what was done."""
+    """Run the queries and keep the answers; returns the name of the unit."""
     write_json(unit.path, {"answers": [a.to_json() for a in unit.task.answers()]})
     return f"{unit.task.drive.name}: {unit.task.system.name}"
 
@@ -95,7 +82,8 @@ def profile_unit(unit: Unit) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Localisation:
-    """The benchmark in the folder ``work`` with ``queries`` for each condition, run by an engine;
+    """The benchmark in the folder ``work``, with ``queries`` for each condition, run by an engine.
+
     ``peers``: the Python of each runner.
     """
 
@@ -103,14 +91,11 @@ class Localisation:
     queries: int
     peers: Mapping[str, str]
     settings: Resolved
-    engine: Run
-    prepare: Prepare
+    engine: Engine
     note: Note
 
     def figures(self) -> Figures:
-        """Everything that is missing is made; then the figures of all. SettingsError for unknown
-        peers.
-        """
+        """Make everything that is missing; the figures of all. SettingsError for unknown peers."""
         unknown = set(self.peers) - {p.runner for p in PEERS}
         if unknown:
             known = ", ".join(sorted({p.runner for p in PEERS}))
@@ -142,11 +127,12 @@ class Localisation:
         for system in OURS:
             fused = self._fused(system)
             settings = settings_of(system, self.settings, self.folder / f"random-{our_version()}")
-            self.prepare.fuse({d.name: d.log for d in self.drives}, fused, settings)
+            sessions = {drive.name: [drive.log] for drive in self.drives}
+            fuse_sessions(sessions, fused, settings, self.engine)
             write_random(fused, settings)
             work = self._workspace(system)
             link_workspace(fused, work)
-            self.prepare.describe(work, [DATABASE], settings)
+            describe(work, [DATABASE], settings, self.engine)
             self.note(f"{system.name}: the database is described")
 
     def _workspace(self, system: OurSystem) -> Workspace:
@@ -158,37 +144,34 @@ class Localisation:
         return Workspace(self.folder / f"fused-{system.labels}-{code_version(FUSION)}")
 
     def units(self) -> list[Unit]:
-        """Every system under every condition; all systems of one condition after each other, so
-        that times compare.
+        """Every system under every condition.
+
+        All systems of one condition follow each other, so that their times compare.
         """
         reference = self._fused(OURS[0]).path
-        out = []
+        units: list[Unit] = []
         for drive in self.drives[1:]:
             keyframes = tuple(read_world(reference, drive).keyframes(self.settings, self.queries))
-            if not keyframes:
-                continue
-            for ours in OURS:
-                settings = settings_of(ours, self.settings, self.folder / f"random-{our_version()}")
-                task = OurTask(self._workspace(ours).path, drive, ours, keyframes, settings)
-                out.append(self._unit(task, our_version()))
-            for peer in PEERS:
-                if peer.runner in self.peers and not (peer.told and drive.condition == UNSEEN):
-                    python = self.peers[peer.runner]
-                    out.append(
-                        self._unit(
-                            PeerTask(
-                                reference,
-                                self.folder,
-                                drive,
-                                peer,
-                                python,
-                                keyframes,
-                                self.settings,
-                            ),
-                            _hash([runner(peer.runner)]),
-                        )
-                    )
-        return out
+            if keyframes:
+                units += self._our_units(drive, keyframes)
+                units += self._peer_units(drive, keyframes, reference)
+        return units
+
+    def _our_units(self, drive: WorldDrive, keyframes: tuple[int, ...]) -> Iterator[Unit]:
+        version = our_version()
+        for system in OURS:
+            settings = settings_of(system, self.settings, self.folder / f"random-{version}")
+            work = self._workspace(system).path
+            yield self._unit(OurTask(work, drive, system, keyframes, settings), version)
+
+    def _peer_units(
+        self, drive: WorldDrive, keyframes: tuple[int, ...], work: Path
+    ) -> Iterator[Unit]:
+        for peer in PEERS:
+            if peer.runner in self.peers and not (peer.told and drive.condition == UNSEEN):
+                python = self.peers[peer.runner]
+                task = PeerTask(work, self.folder, drive, peer, python, keyframes, self.settings)
+                yield self._unit(task, files_version([runner(peer.runner)]))
 
     def _unit(self, task: Task, version: str) -> Unit:
         name = "".join(c if c.isalnum() else "-" for c in task.system.name)
@@ -205,86 +188,77 @@ class Localisation:
         systems: list[OurSystem | PeerSystem] = [*OURS, *PEERS]
         figures: Figures = {}
         for sensor in SENSORS:
-            for condition in CONDITIONS:
-                for system in systems:
-                    elsewhere = answers.get((UNSEEN, sensor, system.name), [])
-                    found = (
-                        figures_of(answers.get((condition, sensor, system.name), []), elsewhere)
-                        if condition != UNSEEN
-                        else {}
-                    )
-                    for figure, value in found.items():
+            for condition in (c for c in CONDITIONS if c != UNSEEN):
+                for name in (system.name for system in systems):
+                    unseen = answers.get((UNSEEN, sensor, name), [])
+                    values = figures_of(answers.get((condition, sensor, name), []), unseen)
+                    for figure, value in values.items():
                         row = figures.setdefault(
                             f"{condition}, {sensor}: {figure}",
                             {"unit": UNITS.get(figure, "share of queries")},
                         )
-                        row[system.name] = value
+                        row[name] = value
         return figures | self._speed(units)
 
     def _speed(self, units: Sequence[Unit]) -> Figures:
-        """Queries a second of ours with all cores at work, and where the time of a query goes."""
+        """Queries a second of ours with all cores at work, and the parts of a query's time."""
         figures: Figures = {}
-
-        def say(name: str, unit: str, system: str, value: float) -> None:
-            figures.setdefault(name, {"unit": unit})[system] = value
-
         jobs = self.engine.jobs
+        with_jobs = f"with {jobs} processes"
         for sensor in SENSORS:
             for system in (s for s in OURS if s.name in TIMED):
-                mine = [
+                of_system = [
                     u
                     for u in units
                     if u.task.system == system
                     and u.task.drive.sensor == sensor
                     and u.task.drive.condition != UNSEEN
                 ]
-                seconds = [a.seconds for u in mine for a in read_unit(u)]
+                seconds = [a.seconds for u in of_system for a in read_unit(u)]
                 if not seconds:
                     continue
-                said = list(self.engine.map(profile_unit, mine[:1] * jobs))  # all at once
-                apart = len(seconds) / sum(seconds)
-                along = jobs / sum(parts[WHOLE] for parts in said)
-                say(
-                    f"{sensor}: queries far apart a second",
-                    f"with {jobs} processes",
-                    system.name,
-                    jobs * apart,
-                )
-                say(
-                    f"{sensor}: queries along the road a second",
-                    f"with {jobs} processes",
-                    system.name,
-                    jobs * along,
-                )
-                for part in (p for p in said[0] if p != WHOLE):
-                    taken = sum(parts[part] for parts in said) / jobs
-                    say(
-                        f"{sensor}: {part}",
-                        "s a query along the road, under the profiler",
-                        system.name,
-                        taken,
-                    )
+                # as many processes as jobs, all at once
+                profiles = list(self.engine.map(profile_unit, of_system[:1] * jobs))
+                far_apart = len(seconds) / sum(seconds)
+                along = jobs / sum(parts[WHOLE] for parts in profiles)
+                rows = {
+                    "queries far apart a second": (with_jobs, jobs * far_apart),
+                    "queries along the road a second": (with_jobs, jobs * along),
+                }
+                for part in (p for p in profiles[0] if p != WHOLE):
+                    taken = sum(parts[part] for parts in profiles) / jobs
+                    rows[part] = "s a query along the road, under the profiler", taken
+                for name, (unit, value) in rows.items():
+                    figures.setdefault(f"{sensor}: {name}", {"unit": unit})[system.name] = value
         return figures
 
 
+@contextmanager
+def all_cores() -> Iterator[Engine]:
+    """An engine with a process for each core."""
+    engine = make_engine("processes")
+    try:
+        yield engine
+    finally:
+        engine.close()
+
+
+def localisation_benchmark(
+    work: Path | None, queries: int, peers: Mapping[str, str], settings: Resolved, note: Note
+) -> Figures:
+    """Whole localisation beside ``peers`` (runner -> Python), ``queries`` for each condition.
+
+    On all cores; everything is kept in ``work``, if given.
+    """
+    with (
+        tempfile.TemporaryDirectory(prefix="semloc-localisation-") as folder,
+        all_cores() as engine,
+    ):
+        return Localisation(
+            work or Path(folder), queries, peers, settings.resolved(), engine, note
+        ).figures()
+
+
 def our_version() -> str:
-    """Of what our localisation consists of: code, weights, vocabularies."""
-    return code_version((*FUSION, "subvolumes", "words", "alignment", "closures"))
-
-
-def code_version(packages: Sequence[str]) -> str:
-    """A hash of the files of some of our packages."""
-    folders = [Path(semloc_logs.__file__).parent / name for name in packages]
-    return _hash(
-        path
-        for folder in folders
-        for path in sorted(folder.rglob("*"))
-        if path.suffix in (".py", ".json", ".safetensors")
-    )
-
-
-def _hash(paths: Iterable[Path]) -> str:
-    digest = hashlib.sha256()
-    for path in paths:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
+    """Of the code, weights and vocabularies of our localisation."""
+    return code_version(LOCALISATION)

@@ -1,66 +1,86 @@
-"""Our localisation in the benchmark: as it is, with parts of it replaced, and where its time goes."""
+"""Our localisation in the benchmark: as it is, with parts replaced, and where its time goes."""
 
 from __future__ import annotations
 
 import cProfile
 import os
-import pstats
 import shutil
 import time
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
-from unittest.mock import patch
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
 
 from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.verify import Query
+from semloc_logs.alignment.query_map import Query
 from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
 from semloc_logs.benchmarks.localisation.city import DATABASE, WorldDrive
-from semloc_logs.closures import matching
-from semloc_logs.closures.acceptance.consistency import decide
-from semloc_logs.closures.closure import Alignment
+from semloc_logs.benchmarks.spans import FunctionTimes, Span, span_seconds
+from semloc_logs.closures.acceptance.decide import decide
+from semloc_logs.closures.closure import Alignment, Closure
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.query import SessionMap, query_keyframes
+from semloc_logs.closures.matching import (
+    FindHypotheses,
+    QueryContext,
+    align_candidates,
+    close_query,
+    find_hypotheses,
+    verify_hypotheses,
+)
+from semloc_logs.closures.query import build_query, query_keyframes
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
 from semloc_logs.subvolumes.network import Completion
 from semloc_logs.subvolumes.submap_descriptors import describe_submap
 from semloc_logs.subvolumes.weight_files import save_weights
-from semloc_logs.words.index import Allowed, Matches
+from semloc_logs.words.index import Allowed, Index, Matches
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import Workspace
 
+Arrays = TypeVar("Arrays", Described, Matches)
 STEP = 4.0  # m between hypotheses of the grid along the road, and across it
+GRID_SEED = 7  # of the random choice among the hypotheses of the grid
 PROFILED = 30  # queries, one after the other along the road
 WHOLE = "whole query"
-PARTS = {  # of a query, by the functions that do them
-    "fuse": ("queries.py build_query",),
-    "describe": ("describe.py describe_map", "cut.py turn"),
-    "search words": ("index.py search",),
-    "verify": ("closing.py verify_hypotheses",),
-    "align and judge": ("closing.py _align",),
-}
+SPANS = (  # of a query
+    Span("fuse", (build_query,)),
+    Span("describe", (describe_map, turned_map)),
+    Span("search words", (Index.search,)),
+    Span("verify", (verify_hypotheses,)),
+    Span("align and judge", (align_candidates,)),
+)
 
 
 @dataclass(frozen=True, slots=True)
 class OurSystem:
-    """A way of asking: ``labels`` of the log or from geometry; how a query is fused, ``weights``
-    trained or random; ``hypotheses`` by words, by words of the query described again in every
-    heading, of a grid over all of the road, or as many of that grid as words give.
+    """A variant of our localisation.
+
+    ``query``: settings of how a query is fused; ``labels``: their source; ``weights``: of the
+    network. ``hypotheses`` come from words, from words of the query described again in every
+    heading (sweep), from a grid over all of the road (all), or from as many places of that grid as
+    there are hypotheses from words (some).
     """
 
     name: str
     query: tuple[tuple[str, Any], ...] = (("length", 20.0),)
-    labels: str = "auto"
-    weights: str = "trained"
-    hypotheses: str = "words"
+    labels: Literal["auto", "geometry"] = "auto"
+    weights: Literal["trained", "random"] = "trained"
+    hypotheses: Literal["words", "sweep", "some", "all"] = "words"
+
+    def search(self, settings: Resolved) -> FindHypotheses:
+        """The function that finds its hypotheses."""
+        if self.hypotheses == "words":
+            return find_hypotheses
+        if self.hypotheses == "sweep":
+            return partial(find_hypotheses, match=sweep_words)
+        count = settings.closures.hypotheses if self.hypotheses == "some" else None
+        return partial(grid_hypotheses, count=count)
 
 
 OURS = (
@@ -85,66 +105,71 @@ class OurTask:
     settings: Resolved  # of the system
 
     def answers(self) -> list[Answer]:
-        """One for each keyframe; the first query is asked twice, to warm up."""
+        """One for each keyframe; the first query runs twice, the first time to warm up."""
         world = read_world(self.work, self.drive)
-        database = Database(world.work, (DATABASE,), self.settings)
-        matching.close_query(database, world.query, self.keyframes[0])
-        with self._hypotheses():
-            asked = [self._ask(database, world, k) for k in self.keyframes]
+        query = self._query_function(world)
+        query(self.keyframes[0])
+
+        alignments: list[list[Alignment]] = []
+        seconds = []
+        for keyframe in self.keyframes:
+            begin = time.perf_counter()
+            alignments.append(query(keyframe))
+            seconds.append(time.perf_counter() - begin)
+
         maps = {self.drive.name: world.query, DATABASE: world.database}
-        decided = decide([a for _, found in asked for a in found], maps, self.settings)
-        accepted = {a.query_keyframe: a for a in decided if a.accepted}
+        decided = decide([a for of_query in alignments for a in of_query], maps, self.settings)
+        accepted = {
+            c.alignment.query_keyframe: c.alignment for c in decided if isinstance(c, Closure)
+        }
         return [
-            self._answer(world, k, *said, accepted.get(k))
-            for k, said in zip(self.keyframes, asked, strict=True)
+            self._answer(
+                world, keyframe, duration, of_query[0] if of_query else None, accepted.get(keyframe)
+            )
+            for keyframe, duration, of_query in zip(
+                self.keyframes, seconds, alignments, strict=True
+            )
         ]
 
     def profile(self) -> dict[str, float]:
-        """Seconds of a query when they come one after the other, as `semloc close` asks, and of its
-        parts, under the profiler.
+        """Seconds of a whole query and of its parts, under the profiler.
+
+        The queries come one after the other along the road, as in `semloc close`.
         """
         world = read_world(self.work, self.drive)
-        database = Database(world.work, (DATABASE,), self.settings)
-        every = query_keyframes(world.query, self.settings)
-        asked = every[max(0, (len(every) - PROFILED) // 2) :][:PROFILED]
-        profiler = cProfile.Profile()
-        with self._hypotheses():
-            matching.close_query(database, world.query, asked[0])
-            begin = time.perf_counter()
-            for keyframe in asked:
-                matching.close_query(database, world.query, keyframe)
-            whole = (time.perf_counter() - begin) / len(asked)
-            for keyframe in asked:
-                profiler.runcall(matching.close_query, database, world.query, keyframe)
-        return {WHOLE: whole} | {
-            part: seconds / len(asked) for part, seconds in _parts(profiler).items()
-        }
+        query = self._query_function(world)
+        possible = query_keyframes(world.query, self.settings)
+        keyframes = possible[max(0, (len(possible) - PROFILED) // 2) :][:PROFILED]
+        query(keyframes[0])
 
-    def _hypotheses(self) -> Any:
-        if self.system.hypotheses == "words":
-            return nullcontext()
-        if self.system.hypotheses == "sweep":
-            return patch.object(matching, "match_words", sweep_words)
-        most = self.settings.closures.hypotheses if self.system.hypotheses == "some" else None
-        return patch.object(matching, "find_hypotheses", partial(grid_hypotheses, most=most))
-
-    def _ask(
-        self, database: Database, world: World, keyframe: int
-    ) -> tuple[float, list[Alignment]]:
         begin = time.perf_counter()
-        found = matching.close_query(database, world.query, keyframe)
-        return time.perf_counter() - begin, found
+        for keyframe in keyframes:
+            query(keyframe)
+        whole = (time.perf_counter() - begin) / len(keyframes)
+
+        profiler = cProfile.Profile()
+        for keyframe in keyframes:
+            profiler.runcall(query, keyframe)
+        parts = span_seconds(SPANS, FunctionTimes(profiler), close_query)
+        return {WHOLE: whole} | {part: total / len(keyframes) for part, total in parts.items()}
+
+    def _query_function(self, world: World) -> Callable[[int], list[Alignment]]:
+        """The alignments of the query at a keyframe, by this system."""
+        database = Database(world.work, (DATABASE,), self.settings)
+        find = self.system.search(self.settings)
+        return partial(close_query, database, world.query, find=find)
 
     def _answer(
         self,
         world: World,
         keyframe: int,
         seconds: float,
-        found: list[Alignment],
+        first: Alignment | None,
         accepted: Alignment | None,
     ) -> Answer:
-        """First is what is most probable by itself, which is its score; accepted may be another
-        one, that other queries agree with.
+        """The answer of which ``first`` is most probable by itself, which is its score.
+
+        ``accepted`` may be another alignment, one that is consistent with other queries.
         """
 
         def errors(alignment: Alignment | None) -> tuple[float, float] | tuple[None, None]:
@@ -155,36 +180,27 @@ class OurTask:
                 world.database.map_T_base[alignment.target_keyframe] @ alignment.target_T_query,
             )
 
-        first = found[0] if found else None
-        (m, deg), (accepted_m, accepted_deg) = errors(first), errors(accepted)
+        error_m, error_deg = errors(first)
+        accepted_m, accepted_deg = errors(accepted)
         return Answer(
             keyframe,
             seconds,
             first.probability if first else -np.inf,
-            m,
-            deg,
+            error_m,
+            error_deg,
             True,
             accepted_m,
             accepted_deg,
         )
 
 
-def _parts(profiler: cProfile.Profile) -> dict[str, float]:
-    """Seconds of each of ``PARTS`` and of the rest."""
-    total: dict[str, float] = {}
-    for (path, _, name), (_, _, _, cumulative, _) in pstats.Stats(profiler).stats.items():  # type: ignore[attr-defined]
-        key = f"{Path(path).name} {name}"
-        total[key] = total.get(key, 0.0) + cumulative
-    out = {part: sum(total.get(f, 0.0) for f in functions) for part, functions in PARTS.items()}
-    return out | {"rest": max(0.0, total.get("closing.py close_query", 0.0) - sum(out.values()))}
-
-
 def sweep_words(
     database: Database, variant: str, allowed: Allowed, query: Query, ground_z: float
 ) -> tuple[Described, Matches]:
-    """What :func:`semloc_logs.closures.matching.match_words` finds when the query is turned into
-    every heading and described there, as by the paper (4), instead of once: what an encoder that
-    turns with its input saves.
+    """Word matches of a query that is turned into every heading and described there (paper 4).
+
+    :func:`semloc_logs.closures.matching.match_words` describes it once: the difference is the gain
+    by an encoder that turns with its input.
     """
     settings = database.settings
     descriptor = settings.descriptor
@@ -194,12 +210,12 @@ def sweep_words(
     state = query.blocks.dense(low, tuple((high - low).tolist()))
     encoder = load_encoder(variant, descriptor.weights)
     step = 2 * np.pi / descriptor.headings
-    words = []
-    found = []
+    described = []
+    matches = []
     rows = 0
     for heading in range(descriptor.headings):
         turned = turned_map(state, low, heading * step)
-        d = describe_map(
+        words = describe_map(
             turned.state,
             turned.low,
             ground_z,
@@ -208,27 +224,28 @@ def sweep_words(
             descriptor.query_stride,
             descriptor.min_occupied,
         )
-        m = database.words(variant).search(
-            d.descriptor, closures.neighbours, closures.probes, allowed
+        nearest = database.words(variant).search(
+            words.descriptor, closures.neighbours, closures.probes, allowed
         )
-        yaw = (np.round(m.yaw / step).astype(int) - heading) % descriptor.headings * step
-        found.append(replace(m, query=m.query + np.int32(rows), yaw=yaw))
-        words.append(Described(turned.to_map(d.centre), d.descriptor))
-        rows += len(d.descriptor)
-    described = Described(
-        *(np.concatenate([getattr(d, f.name) for d in words]) for f in fields(Described))
-    )
-    return described, Matches(
-        *(np.concatenate([getattr(m, f.name) for m in found]) for f in fields(Matches))
-    )
+        yaw = (np.round(nearest.yaw / step).astype(int) - heading) % descriptor.headings * step
+        matches.append(replace(nearest, query=nearest.query + np.int32(rows), yaw=yaw))
+        described.append(Described(turned.to_map(words.centre), words.descriptor))
+        rows += len(words.descriptor)
+    return _joined(described), _joined(matches)
 
 
-def grid_hypotheses(
-    database: Database, session: SessionMap, keyframe: int, query: Query, most: int | None = None
-) -> list[Hypothesis]:
-    """Instead of word matches: every heading every few metres along and across the database's road,
-    or ``most`` of these at random.
+def _joined(parts: Sequence[Arrays]) -> Arrays:
+    """Dataclasses of arrays, one after the other."""
+    kind = type(parts[0])
+    return kind(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(kind)))
+
+
+def grid_hypotheses(context: QueryContext, count: int | None = None) -> list[Hypothesis]:
+    """Every heading every few metres along and across the database's road, without words.
+
+    With ``count``, so many of them at random.
     """
+    database = context.visible.database
     settings = database.settings
     step = STEP * settings.fusion.voxel_size / STREET_VOXEL
     yaws = np.split(
@@ -243,21 +260,20 @@ def grid_hypotheses(
         _, first = np.unique(np.floor(target.distance[ids] / step), return_index=True)
         for pose in target.map_T_base[ids[first]]:
             for across in (-step, 0.0, step):
-                # opposite headings lie between each other: the search takes two at one place for
-                # the same
+                # places of opposite headings alternate: the search merges hypotheses at one place
                 for half in (0, 1):
                     x, y, z = (
                         pose[:3, 3] + across * pose[:3, 1] + half * step / 2 * pose[:3, 0]
                     ).tolist()
                     out += [Hypothesis(group, (float(yaw), x, y, z), 0, 0.0) for yaw in yaws[half]]
-    if most is None or len(out) <= most:
+    if count is None or len(out) <= count:
         return out
-    rng = np.random.default_rng([7, keyframe])
-    return [out[i] for i in np.sort(rng.choice(len(out), most, replace=False))]
+    rng = np.random.default_rng([GRID_SEED, context.keyframe])
+    return [out[i] for i in np.sort(rng.choice(len(out), count, replace=False))]
 
 
 def settings_of(system: OurSystem, settings: Resolved, folder: Path) -> Resolved:
-    """The settings that ``system`` asks with; random weights are kept in ``folder``."""
+    """The settings of the queries of ``system``; random weights are kept in ``folder``."""
     update: dict[str, Any] = {
         "query": settings.query.model_copy(update=dict(system.query)),
         "labels": settings.labels.model_copy(update={"source": system.labels}),
@@ -272,8 +288,9 @@ def settings_of(system: OurSystem, settings: Resolved, folder: Path) -> Resolved
 
 
 def write_random(work: Workspace, settings: Resolved) -> None:
-    """Random weights and a vocabulary of the database's descriptors by them, where ``settings``
-    (see :func:`settings_of`) name them.
+    """Write random weights, and a vocabulary of the database's descriptors by them.
+
+    Only where ``settings`` (see :func:`settings_of`) name them.
     """
     weights = settings.descriptor.weights
     vocabulary = settings.descriptor.vocabulary
@@ -298,9 +315,7 @@ def write_random(work: Workspace, settings: Resolved) -> None:
 
 
 def link_workspace(source: Workspace, target: Workspace) -> None:
-    """The sessions of ``source`` without their words, as hard links in ``target``, unless they are
-    there.
-    """
+    """Link the sessions of ``source`` without their words into ``target``, unless they exist there."""
     for session in source.sessions():
         goal = target.session(session.name)
         if not goal.session_json.exists():

@@ -23,9 +23,10 @@ from semloc_logs.benchmarks.localisation.answers import Answer, World, read_worl
 from semloc_logs.benchmarks.localisation.city import WorldDrive
 from semloc_logs.benchmarks.peers.peer_process import run_peer
 from semloc_logs.benchmarks.peers.scan_context import nearest_contexts, scan_context
-from semloc_logs.closures.query import SessionMap, query_members
+from semloc_logs.closures.query import query_members
 from semloc_logs.errors import SemlocError
 from semloc_logs.mapping.selection import thin
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Resolved
 from semloc_logs.tables.atomic_files import replacing_file

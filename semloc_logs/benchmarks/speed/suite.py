@@ -36,9 +36,11 @@ def _seconds(action: Callable[[], Any], repeats: int = REPEATS) -> float:
 
 
 def _drive(folder: Path, length_m: float = 120.0, seed: int = 3) -> Path:
+    from semloc_logs.simulation.plan import Route, Town
+    from semloc_logs.simulation.sensors.sensor import Sensor
     from semloc_logs.simulation.sessions import simulate_sessions
 
-    simulate_sessions(folder, seed=seed, sessions=1, length_m=length_m, rate_hz=4.0, overwrite=True)
+    simulate_sessions(folder, Town(seed), Route(1, length_m), Sensor(rate_hz=4.0), overwrite=True)
     return folder / "session_0.mcap"
 
 

@@ -9,10 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.overlap import pose_matrix, tau
+from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.alignment.refine import coarse_fit, fine_fit
+from semloc_logs.alignment.search import search_hypotheses
 from semloc_logs.alignment.surface import surface_of
-from semloc_logs.alignment.verify import Query, Target, coarse_fit, fine_fit, search_hypotheses
+from semloc_logs.alignment.target_map import Target
+from semloc_logs.alignment.tau import tau
 from semloc_logs.benchmarks.speed.search_speed import timed
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Resolved
@@ -21,12 +24,6 @@ from semloc_logs.voxels.grid import BlockMap, Fuser
 Figures = dict[str, dict[str, float | str]]
 F64 = NDArray[np.float64]
 ROAD, BUILDING, POLE, TREE = 0, 2, 5, 8
-FRONTS = (
-    (-20.0, 9.0, -3.0, 9.0, 6.0),
-    (6.0, 8.0, 20.0, 10.0, 8.0),
-    (-18.0, -8.0, -2.0, -8.0, 5.0),
-    (6.0, -9.0, 6.0, -20.0, 7.0),
-)
 TRUTH = np.array([0.6, 5.0, -3.0, 0.2])  # target_T_query of the place: yaw, x, y, z
 
 
@@ -138,7 +135,7 @@ def verification_speed(settings: Resolved) -> Figures:
     kappa = settings.closures.kappa * v
     actions = {
         f"search, {len(s.hypotheses)} hypotheses": search,
-        "masks of a submap": lambda: Target(blocks, v).level,
+        "masks of a submap": lambda: Target(blocks, v).mask_grid,
         "coarse fit": lambda: coarse_fit(best, s.target, s.query),
         "surface of a place": lambda: surface_of(s.points, 2 * v),
         "fine fit": lambda: fine_fit(start, surface, s.query),

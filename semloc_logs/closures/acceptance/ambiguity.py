@@ -1,8 +1,8 @@
-"""Streets that look like others: where whatever agrees may as well agree in a copy of the place.
+"""Ambiguous places: where alignments that agree may as well agree in a copy of the place.
 
 Two drives through copies of a street, one block apart, agree in every query, and nothing in them
-tells. What gives copies away is a third place: a session that came through several copies has two
-places with support for one query, or what three sessions say of each other does not close.
+tells. A third place reveals copies: a session that came through several copies has two places with
+support for one query, or the alignments of three sessions contradict each other.
 """
 
 from __future__ import annotations
@@ -12,7 +12,14 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.acceptance.placements import ARM, DRIFT, FAR, Pairs, Placed, strays
+from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT
+from semloc_logs.closures.acceptance.placements import (
+    ARM,
+    FAR,
+    Pairs,
+    Placed,
+    contradicts_odometry,
+)
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL
 
@@ -25,12 +32,13 @@ APART = 20.0
 BEYOND_DOUBT = 0.7  # support of alignments that may contradict others
 
 
-def lookalike(
-    placed: Placed, pairs: Pairs, asked: Mapping[str, F64], support: F64, voxel_size: float
+def ambiguity(
+    placed: Placed, pairs: Pairs, roads: Mapping[str, F64], support: F64, voxel_size: float
 ) -> F64:
-    """How much the streets about either end of each alignment look like others (n,), in [0, 1];
-    ``support`` (n,) is how probable an alignment would be without rivals, times the share of near
-    neighbours that agree.
+    """How ambiguous the road around either end of each alignment is (n,), in [0, 1].
+
+    ``support`` (n,) is the probability of an alignment ignoring rivals, times the share of near
+    neighbours that agree; :func:`.placements.query_roads` makes ``roads``.
 
     It is the mean over the queries about an end of the support of a second place in one session, or
     the share of them that three sessions contradict each other about; the session that shows it
@@ -41,33 +49,34 @@ def lookalike(
     shown: dict[str, list[tuple[F64, F64, F64]]] = {}
     for (query, target), rows in pairs.items():
         first, second, much = _second_places(placed, rows, support, voxel_size)
-        shown.setdefault(query, []).append((asked[query], placed.road[first], much))
-        if target != query:  # of what it was asked too: at both places
+        shown.setdefault(query, []).append((roads[query], placed.road[first], much))
+        if target != query:  # the target shows it too, at both places
             both = np.concatenate([first, second[much > 0]])
             shown.setdefault(target, []).append(
                 (placed.target_road[first], placed.target_road[both], np.r_[much, much[much > 0]])
             )
     for session, road in _contradicted(placed, pairs, support, voxel_size).items():
-        shown.setdefault(session, []).append((asked[session], road, np.ones(len(road))))
+        shown.setdefault(session, []).append((roads[session], road, np.ones(len(road))))
     out = np.zeros(len(placed))
-    for sessions, roads in (
+    for sessions, end_roads in (
         (placed.query_session, placed.road),
         (placed.target_session, placed.target_road),
     ):
         for session in sorted(set(sessions)):
             mine = np.flatnonzero(sessions == session)
-            of_all = _about(asked.get(session, np.zeros(0)), roads[mine], reach)
+            of_all = _about(roads.get(session, np.zeros(0)), end_roads[mine], reach)
             for everyone, at, much in shown.get(session, []):
-                share = _about(at, roads[mine], reach, much) / np.maximum(
-                    np.maximum(of_all, _about(everyone, roads[mine], reach)), 1.0
+                share = _about(at, end_roads[mine], reach, much) / np.maximum(
+                    np.maximum(of_all, _about(everyone, end_roads[mine], reach)), 1.0
                 )
                 out[mine] = np.maximum(out[mine], np.minimum(share, 1.0))
     return out
 
 
 def _about(at: F64, road: F64, reach: float, much: F64 | None = None) -> F64:
-    """How many of ``at`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,); or the
-    sums of how ``much`` (m,) they show.
+    """How many of ``at`` (m,), metres of road, lie within ``reach`` of each ``road`` (n,).
+
+    With ``much`` (m,) the sums of how much they show.
     """
     order = np.argsort(at, kind="stable")
     sums = np.r_[0.0, np.cumsum(np.ones(len(at)) if much is None else much[order])]
@@ -81,23 +90,24 @@ def _about(at: F64, road: F64, reach: float, much: F64 | None = None) -> F64:
 def _second_places(
     placed: Placed, rows: I64, support: F64, voxel_size: float
 ) -> tuple[I64, I64, F64]:
-    """Of each query in one target the rows of two places, a view apart, of which the second has as
-    much support as possible, and how much.
+    """Of each query in one target the rows of two places, a view apart, and the second's support.
 
-    Where a session is asked about itself, the first place is where it is by odometry, so any other
-    one is a second place.
+    The second has as much support as possible. Where a session queries itself, the first place is
+    where it is by odometry, so any other one is a second place.
     """
     apart = APART * voxel_size / STREET_VOXEL
-    astray = strays(placed.part(rows), voxel_size)
+    contradicting = contradicts_odometry(placed.part(rows), voxel_size)
     cuts = np.flatnonzero(np.diff(placed.query[rows])) + 1
     found = []
-    for places, wrong in zip(np.split(rows, cuts), np.split(astray, cuts), strict=True):
+    for places, wrong in zip(np.split(rows, cuts), np.split(contradicting, cuts), strict=True):
         at = placed.target_T_query[places, :3, 3]
         road = placed.target_road[places]
         mine = support[places]
         off = np.linalg.norm(at[:, None] - at, axis=2)
         lesser = np.where(
-            off > apart + DRIFT * np.abs(road[:, None] - road), np.minimum(mine[:, None], mine), 0.0
+            off > apart + ODOMETRY_DRIFT * np.abs(road[:, None] - road),
+            np.minimum(mine[:, None], mine),
+            0.0,
         )
         a, b = np.unravel_index(int(np.argmax(lesser)), lesser.shape)
         best = int(np.argmax(mine))
@@ -110,8 +120,7 @@ def _second_places(
 
 
 def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float) -> dict[str, F64]:
-    """Roads of the queries whose place in one session is not where it has to be by another's: by
-    what the latter says of the former.
+    """Roads of the queries whose places in two sessions contradict the alignments between these.
 
     Of three sessions a, g, h those alignments are compared that hardly anybody doubts: a query of a
     in g, the nearest one of a in h, and the nearest one of g in h; odometry leads from one to the
@@ -145,7 +154,7 @@ def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float)
             h_T_y = placed.target_T_query[z] @ inverse(placed.map_T_query[z]) @ g_T_y
             off = np.linalg.norm(h_T_y[:, :3, 3] - placed.target_T_query[y, :3, 3], axis=1)
             way = along[0] + along[1] + np.abs(placed.target_road[z] - placed.target_road[y])
-            wrong = (off > APART * scale + (DRIFT + ARM) * way) & (
+            wrong = (off > APART * scale + (ODOMETRY_DRIFT + ARM) * way) & (
                 np.maximum(*along) <= FAR * scale
             )
             found.setdefault(a, set()).update(placed.road[x[wrong]].tolist())
@@ -155,7 +164,8 @@ def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float)
 
 
 def _nearest(values: F64, wanted: F64) -> I64:
-    """Numbers (n,) of the ascending ``values`` nearest to the ``wanted`` ones (n,), of equally near
-    ones the first.
+    """Numbers (n,) of the ascending ``values`` nearest to the ``wanted`` ones (n,).
+
+    Of equally near ones it is the first.
     """
     return np.searchsorted((values[1:] + values[:-1]) / 2, wanted)

@@ -1,12 +1,10 @@
-"""The probability that an alignment is right: from its own features, then together with what
-neighbouring queries say.
-"""
+"""The probability that an alignment is right: by its own features, and with neighbours' votes."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -15,25 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from semloc_logs.alignment.verify import FEATURES, Features, rank
-from semloc_logs.closures.closure import Agreement
+from semloc_logs.alignment.scores import alignment_score
+from semloc_logs.closures.closure import FEATURES, Agreement, Columns, Features
 from semloc_logs.settings import STREET_VOXEL
 
 F64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
-
-AGREEMENT = (
-    "alone",
-    "neighbours",
-    "agreeing",
-    "opposing",
-    "far_agreeing",
-    "far_opposing",
-    "lookalike",
-)
-SUPPORT = FEATURES.index("support")
-DISTINCT = FEATURES.index("distinct")
-TOGETHER = (
+# names in calibration.json of the fields of NeighbourEvidence
+NEIGHBOUR_EVIDENCE = (
     "log_odds",
     "log_agreeing",
     "share",
@@ -41,71 +29,78 @@ TOGETHER = (
     "log_far_agreeing",
     "log_far_opposing",
 )
-AS_GOOD = 0.7  # of the best rank: what looks like a copy of the best place
-CLOSE, HOPELESS = 0.8, 0.3  # of the best rank, and rank: below them nothing is right
+RIVAL_RATIO = 0.7  # of the best score: what looks like a copy of the best place
+# of the best score, and a score: no right alignment has less
+MIN_RELATIVE_SCORE = 0.8
+MIN_SCORE = 0.3
 RIGHT_WITHIN = 1.0  # m, at voxels of 0.30 m: what a right closure is (DESIGN: closures.parquet)
 # standard deviations that count as one: from 0.2 m on 99 % of errors in simulated towns are within
 # 2.2, of normal ones 2.6
 MARGIN = 1.2
 # below both the points hold nothing: the right place, but a metre off
-LOOSE_FIT, LOOSE_STIFFNESS = 0.12, 0.3
+LOOSE_FIT = 0.12
+LOOSE_STIFFNESS = 0.3
+LEAST_ODDS = 1e-6  # probabilities are clipped to it and its complement before their logarithm
 
 
-def precise(sigma: F64 | float, voxel_size: float) -> F64:
-    """Probability that positions of standard deviation ``sigma`` (n,) in their worst direction,
-    metres, are within the bound of right ones.
+@dataclass(frozen=True, slots=True, eq=False)
+class NeighbourEvidence(Columns):
+    """What the models with neighbours look at (n,): log-odds of the own probability, votes."""
 
-    A place may be right, and where in it not known: 1 m at voxels of 0.30 m.
+    log_odds: F64
+    log_support: F64
+    support_share: F64
+    log_conflict: F64
+    log_far_support: F64
+    log_far_conflict: F64
+
+    @classmethod
+    def of(cls, agreement: Agreement[F64]) -> NeighbourEvidence:
+        """The evidence in an agreement; of no neighbours the share is 0."""
+        p = np.clip(agreement.own_probability, LEAST_ODDS, 1 - LEAST_ODDS)
+        return cls(
+            log_odds=np.log(p / (1 - p)),
+            log_support=np.log1p(agreement.support),
+            support_share=agreement.support / np.maximum(agreement.neighbours, 1),
+            log_conflict=np.log1p(agreement.conflict),
+            log_far_support=np.log1p(agreement.far_support),
+            log_far_conflict=np.log1p(agreement.far_conflict),
+        )
+
+
+def position_confidence(sigma: F64 | float, voxel_size: float) -> F64:
+    """Probability (n,) that positions are within the bound of right ones.
+
+    ``sigma`` (n,) is their standard deviation in the worst direction, metres. A place may be right
+    and the position in it uncertain. The bound is 1 m at voxels of 0.30 m.
     """
     bound = RIGHT_WITHIN * voxel_size / STREET_VOXEL
     return np.asarray(erf(bound / (np.sqrt(2) * MARGIN * np.maximum(sigma, 1e-6))))
 
 
-def own_values(features: Features) -> F64:
-    """The features (8,) in the order of ``FEATURES``."""
-    return np.array([getattr(features, name) for name in FEATURES])
+def is_plausible(features: Features[F64]) -> Bools:
+    """Which alignments (n,) score near the best of their query, and are held by their points."""
+    score = alignment_score(features.structure, features.coverage, features.contradiction)
+    loose = (features.fit < LOOSE_FIT) & (features.stiffness < LOOSE_STIFFNESS)
+    return np.asarray((score >= MIN_SCORE) & ~loose & ~(features.distinct > 1 / MIN_RELATIVE_SCORE))
 
 
-def may_be_right(values: F64) -> NDArray[np.bool_]:
-    """Whether alignments with features (..., 8) are close to the best of their query, not hopeless
-    and held by their points.
-    """
-    of = {name: values[..., k] for k, name in enumerate(FEATURES)}
-    hopeful = rank(of["structure"], of["coverage"], of["contradiction"]) >= HOPELESS
-    loose = (of["fit"] < LOOSE_FIT) & (of["stiffness"] < LOOSE_STIFFNESS)
-    return np.asarray(hopeful & ~loose & ~(of["distinct"] > 1 / CLOSE))
+def probability_ignoring_rivals(
+    own: Callable[[Features[F64]], F64], features: Features[F64]
+) -> F64:
+    """The probability ``own`` (n,) if no other place fitted; 0 where another fits far better."""
+    without = replace(features, distinct=np.zeros_like(features.distinct))
+    return np.where(features.distinct > 1 / RIVAL_RATIO, 0.0, own(without))
 
 
-def unrivalled(own: Callable[[F64], F64], values: F64) -> F64:
-    """What ``own`` would say of features (..., 8) if no other place fitted; 0 where another one
-    fits better by far.
-    """
-    alone = np.where(np.arange(len(FEATURES)) == DISTINCT, 0.0, values)
-    return np.where(values[..., DISTINCT] > 1 / AS_GOOD, 0.0, own(alone))
-
-
-def together_values(columns: Sequence[F64]) -> F64:
-    """Values (n, 6) in the order of ``TOGETHER`` from the columns (7, n) of ``AGREEMENT``."""
-    alone, neighbours, agreeing, opposing, far_agreeing, far_opposing, _ = (
-        np.asarray(c, float) for c in columns
-    )
-    p = np.clip(alone, 1e-6, 1 - 1e-6)
-    counts = [np.log1p(c) for c in (agreeing, opposing, far_agreeing, far_opposing)]
-    return np.stack(
-        [np.log(p / (1 - p)), counts[0], agreeing / np.maximum(neighbours, 1), *counts[1:]], axis=-1
-    )
-
-
-def has_far(columns: Sequence[F64]) -> NDArray[np.bool_]:
-    """Where queries far along the road have been placed at all (n,), by the columns (7, n) of
-    ``AGREEMENT``.
-    """
-    return np.asarray(columns[4]) + np.asarray(columns[5]) > 0
+def has_far(agreement: Agreement[F64]) -> Bools:
+    """Where queries far along the road have been placed at all (n,)."""
+    return np.asarray(agreement.far_support + agreement.far_conflict > 0)
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A logistic model: ``weights`` of values after clipping to ``low`` .. ``high``, and ``bias``."""
+    """A logistic model: ``weights`` of values clipped to ``low`` .. ``high``, and ``bias``."""
 
     weights: tuple[float, ...]
     low: tuple[float, ...]
@@ -135,49 +130,47 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """``alone`` of an alignment's own features; ``near`` of that probability's log-odds and near
-    neighbours, ``together`` of far ones too.
+    """Three logistic models: of an alignment's own features, and with near and far neighbours.
 
-    A short log has no far ones, and that says nothing against it. With less support than
-    ``least_support`` hardly any right alignment was ever seen: a handful of voxels fits anywhere,
-    and the probability is 0. Where streets look like others by more than ``most_alike`` the drive
-    may as well have been in a copy: whatever agrees, the probability is at most a half.
+    ``own_features`` is of the alignment alone; ``near`` of its log-odds and near neighbours;
+    ``together`` of far ones too. A short log has no far neighbours, which is not evidence against
+    an alignment. With less support than ``min_support`` hardly any right alignment was ever seen: a
+    handful of voxels fits anywhere, and the probability is 0. Where the ambiguity exceeds
+    ``max_ambiguity`` the drive may as well have been in a copy of the place: whatever agrees, the
+    probability is at most a half.
     """
 
-    alone: Calibration
+    own_features: Calibration
     near: Calibration
     together: Calibration
-    least_support: float
-    most_alike: float
+    min_support: float
+    max_ambiguity: float
 
-    def own(self, values: F64) -> F64:
-        """Probability of an alignment by its own features, values (..., 8) in the order of
-        ``FEATURES``.
-        """
+    def own(self, features: Features[Any]) -> F64:
+        """Probability of alignments by their own features: of one, or of several (n,)."""
         return np.where(
-            values[..., SUPPORT] < self.least_support, 0.0, self.alone.probability(values)
+            features.support < self.min_support,
+            0.0,
+            self.own_features.probability(features.vector()),
         )
 
-    def agreed(self, columns: Sequence[F64]) -> F64:
-        """Probabilities (n,) from the columns (7, n) of ``AGREEMENT``: that of the alignment alone
-        where there are no neighbours.
-        """
-        values = together_values(columns)
+    def agreed(self, agreement: Agreement[F64]) -> F64:
+        """Probabilities (n,) with all votes; without neighbours the own ones."""
+        values = NeighbourEvidence.of(agreement).vector()
         by_neighbours = np.where(
-            has_far(columns), self.together.probability(values), self.near.probability(values)
+            has_far(agreement), self.together.probability(values), self.near.probability(values)
         )
-        return np.where(
-            (np.asarray(columns[1]) > 0) & (np.asarray(columns[0]) > 0), by_neighbours, columns[0]
-        )
+        has_votes = (agreement.neighbours > 0) & (agreement.own_probability > 0)
+        return np.where(has_votes, by_neighbours, agreement.own_probability)
 
-    def decided(self, columns: Sequence[F64]) -> F64:
-        """The same, at most a half where streets look like others."""
-        p = self.agreed(columns)
-        return np.where(self.alike(columns), p / 2, p)
+    def decided(self, agreement: Agreement[F64]) -> F64:
+        """The same, at most a half in ambiguous places."""
+        p = self.agreed(agreement)
+        return np.where(self.is_ambiguous(agreement), p / 2, p)
 
-    def alike(self, columns: Sequence[F64]) -> NDArray[np.bool_]:
-        """Where streets look like others (n,), by the columns (7, n) of ``AGREEMENT``."""
-        return np.asarray(np.asarray(columns[-1]) > self.most_alike)
+    def is_ambiguous(self, agreement: Agreement[F64]) -> Bools:
+        """Which places are ambiguous (n,)."""
+        return np.asarray(agreement.ambiguity > self.max_ambiguity)
 
 
 @cache
@@ -188,48 +181,11 @@ def shipped() -> Model:
     )
     return Model(
         Calibration.from_json(content["alone"], FEATURES),
-        Calibration.from_json(content["near"], TOGETHER),
-        Calibration.from_json(content["together"], TOGETHER),
+        Calibration.from_json(content["near"], NEIGHBOUR_EVIDENCE),
+        Calibration.from_json(content["together"], NEIGHBOUR_EVIDENCE),
         float(content["least_support"]),
         float(content["most_alike"]),
     )
-
-
-def reason(
-    features: Features,
-    probability: float,
-    least: float,
-    agreement: Agreement,
-    sigma: float = 0.0,
-    precision: float = 1.0,
-    share: float = 1.0,
-) -> str:
-    """One sentence that says why a hypothesis was rejected; ``precision`` is that of
-    :func:`precise` for ``sigma`` (m), ``share`` what it is worth beside other poses in the same
-    place.
-    """
-    f, a = features, agreement
-    of_place = probability / max(precision * share, 1e-9)
-    if of_place >= least and share < precision:
-        why = f"of the poses in this place it is right with {share:.0%}"
-    elif of_place >= least:
-        why = f"where in this place is known to {sigma:.2f} m only"
-    elif a.lookalike > shipped().most_alike and 2 * of_place >= least:
-        # else it would be rejected anyway
-        why = f"streets about it look like others ({a.lookalike:.0%})"
-    elif a.alone >= least and a.neighbours:
-        why = f"of {a.neighbours} neighbouring queries {a.agreeing:.1f} agree and {a.opposing:.1f} lie elsewhere"
-    elif f.coverage < 0.2:
-        why = f"only {f.coverage:.0%} of the query's structure falls into observed space"
-    elif f.structure < 0.5:
-        why = f"only {f.structure:.0%} of the query's structure lies on structure of its class"
-    elif f.distinct > 0.85:
-        why = f"another place fits nearly as well ({f.distinct:.0%})"
-    elif f.fit < 0.5:
-        why = f"only {f.fit:.0%} of the points lie on a surface"
-    else:
-        why = "the evidence together is too weak"
-    return f"probability {probability:.3f} below {least:g}: {why}"
 
 
 def fit_logistic(
@@ -239,10 +195,9 @@ def fit_logistic(
     counts: F64 | None = None,
     offset: F64 | float = 0.0,
 ) -> tuple[F64, float]:
-    """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d), by
-    Newton's method.
+    """Weights (d,) and bias of a ridge logistic regression of ``right`` (n,) on ``x`` (n, d).
 
-    Row i counts ``counts`` (n,) times; ``offset`` (n,) is added to its log-odds.
+    By Newton's method. Row i counts ``counts`` (n,) times; ``offset`` (n,) adds to the log-odds.
     """
     counts = np.ones(len(x)) if counts is None else counts
     mean = x.mean(0)

@@ -1,5 +1,4 @@
-"""Neighbouring queries of a session against each other: together they lie where odometry and one
-transform of the sessions put them.
+"""Votes of neighbouring queries: right ones lie where odometry and one transform put them.
 
 Two alignments of a session with the same target agree when the first one and the odometry between
 the two queries predict the second one, to within their standard deviations and what odometry may
@@ -9,103 +8,93 @@ road instead of all pairs).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.closures.acceptance.ambiguity import lookalike
-from semloc_logs.closures.acceptance.calibration import (
-    AGREEMENT,
-    may_be_right,
-    precise,
-    reason,
-    shipped,
-)
-from semloc_logs.closures.acceptance.placements import (
-    ARM,
-    DRIFT,
-    FAR,
-    Placed,
-    asked_roads,
-    features_of,
-    pairs_of,
-    place,
-    strays,
-)
-from semloc_logs.closures.closure import Agreement, Alignment
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT, SAME_PLACE_VOXELS
+from semloc_logs.closures.acceptance.ambiguity import ambiguity
+from semloc_logs.closures.acceptance.calibration import LEAST_ODDS
+from semloc_logs.closures.acceptance.placements import ARM, FAR, Placed, pairs_of, query_roads
+from semloc_logs.closures.closure import Agreement
 from semloc_logs.numerics.transforms import inverse
-from semloc_logs.settings import STREET_VOXEL, Resolved
+from semloc_logs.settings import STREET_VOXEL
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 NEAR = 25.0  # m of road from a query to its neighbours, at voxels of 0.30 m
 # voxels between two alignments of one place, without and with their standard deviations
-SLACK, MOST_SLACK = 1.7, 3.3
+SLACK = 1.7
+MOST_SLACK = SAME_PLACE_VOXELS
 # rad, and rad a metre
 TURN = np.radians(4.0)
 TURN_DRIFT = np.radians(0.02)
-LEAST = 0.02  # alignments less probable than this say nothing about others
+MIN_VOTE = 0.02  # alignments less probable than this do not vote
 
 
-def agree(placed: Placed, voxel_size: float) -> list[F64]:
-    """The columns (7, n) of ``AGREEMENT``; whatever the order of the alignments."""
-    out = [placed.alone.copy(), *(np.zeros(len(placed)) for _ in AGREEMENT[1:])]
-    support = np.zeros(len(placed))
+def count_votes(placed: Placed, voxel_size: float) -> Agreement[F64]:
+    """The votes on each alignment (n,); the order of the alignments does not matter."""
+    n = len(placed)
+    votes = Agreement(placed.own_probability.copy(), *np.zeros((6, n)))
+    support = np.zeros(n)
     pairs = pairs_of(placed)
-    asked = asked_roads(placed)
+    roads = query_roads(placed)
     for (query, _), rows in pairs.items():
         group = placed.part(rows)
-        road = asked[query]
+        road = roads[query]
         near = NEAR * voxel_size / STREET_VOXEL
-        out[1][rows] = (
+        votes.neighbours[rows] = (
             np.searchsorted(road, group.road + near, "right")
             - np.searchsorted(road, group.road - near, "left")
             - 1.0
         )
-        (out[2][rows], out[3][rows], out[4][rows], out[5][rows]), alike = _sums(
-            group, (group.alone, group.unrivalled), voxel_size
+        sums, sums_ignoring_rivals = _sums(
+            group, (group.own_probability, group.probability_ignoring_rivals), voxel_size
         )
-        support[rows] = group.unrivalled * alike[0] / np.maximum(out[1][rows], 1)
-    out[6] = lookalike(placed, pairs, asked, support, voxel_size)
-    return out
+        votes.support[rows] = sums[0]
+        votes.conflict[rows] = sums[1]
+        votes.far_support[rows] = sums[2]
+        votes.far_conflict[rows] = sums[3]
+        support[rows] = (
+            group.probability_ignoring_rivals
+            * sums_ignoring_rivals[0]
+            / np.maximum(votes.neighbours[rows], 1)
+        )
+    return replace(votes, ambiguity=ambiguity(placed, pairs, roads, support, voxel_size))
 
 
 def _sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> list[F64]:
-    """For each of the ``probabilities`` (n,) those of other queries' alignments that agree with
-    each and that do not, near it and far from it (4, n); the ``group`` is ordered by query, and so
-    by road.
+    """Sums of votes on each alignment, by each of the ``probabilities`` (n,) of the voters.
 
-    Of each query the most probable alignment of either kind counts, and as opposing only if it is
-    more probable than an agreeing one.
+    Each is (4, n): near support, near conflict, far support, far conflict. The ``group`` is ordered
+    by query, and so by road. Of each query the most probable alignment of either kind votes, and
+    as a conflict only if it is more probable than a supporting one.
     """
     scale = voxel_size / STREET_VOXEL
-    p = np.where(np.array(probabilities) >= LEAST, np.array(probabilities), 0.0)
-    loud = np.flatnonzero(p.max(axis=0) >= LEAST)
-    v = group.part(loud)
-    first = np.searchsorted(v.road, group.road - FAR * scale, "left")
-    end = np.searchsorted(v.road, group.road + FAR * scale, "right")
+    p = np.where(np.array(probabilities) >= MIN_VOTE, np.array(probabilities), 0.0)
+    voting = np.flatnonzero(p.max(axis=0) >= MIN_VOTE)
+    voters = group.part(voting)
+    first = np.searchsorted(voters.road, group.road - FAR * scale, "left")
+    end = np.searchsorted(voters.road, group.road + FAR * scale, "right")
     out = np.zeros((len(p), 4, len(group)))
     target_T_map = group.target_T_query @ inverse(group.map_T_query)  # as each alignment has it
-    voices = (
-        v.query,
-        v.road,
-        v.target_road,
-        v.map_T_query,
-        v.target_T_query,
-        v.sigma,
-        np.ascontiguousarray(p[:, loud]),
-    )
-    _add_voices(
+    _add_votes(
         out,
         (group.query, group.road, group.target_road, target_T_map, group.sigma),
-        voices,
-        first,
-        end,
+        (
+            voters.query,
+            voters.road,
+            voters.target_road,
+            voters.map_T_query,
+            voters.target_T_query,
+            voters.sigma,
+            np.ascontiguousarray(p[:, voting]),
+        ),
+        (first, end),
         voxel_size,
         scale,
     )
@@ -113,29 +102,34 @@ def _sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> lis
 
 
 @njit(cache=True, nogil=True)
-def _add_voices(
+def _add_votes(
     out: F64,
     group: tuple[I64, F64, F64, F64, F64],
-    voices: tuple[I64, F64, F64, F64, F64, F64, F64],
-    first: I64,
-    end: I64,
+    voters: tuple[I64, F64, F64, F64, F64, F64, F64],
+    stretch: tuple[I64, I64],
     voxel_size: float,
     scale: float,
 ) -> None:
-    """Add to ``out`` (probabilities, 4, n) the voices ``first`` to ``end`` of each alignment's
-    stretch of road.
+    """Add to ``out`` (probabilities, 4, n) the votes of each alignment's stretch of road.
+
+    The voters of alignment k are numbers ``stretch[0][k]`` to ``stretch[1][k]``.
     """
     query, road, target_road, target_T_map, sigma = group
-    by, at, target_at, map_T_query, target_T_query, doubt, said = voices
-    for_it = np.zeros(len(said))
-    against = np.zeros(len(said))
+    voter_query, voter_road, voter_target_road, map_T_query, target_T_query, voter_sigma, p = voters
+    first, end = stretch
+    support = np.zeros(len(p))
+    conflict = np.zeros(len(p))
     for k in range(len(query)):
         for n in range(first[k], end[k]):
-            if by[n] != query[k]:
-                along = abs(at[n] - road[k])
-                drift = DRIFT * (along + abs(target_at[n] - target_road[k])) + ARM * along
+            if voter_query[n] != query[k]:
+                along = abs(voter_road[n] - road[k])
+                drift = (
+                    ODOMETRY_DRIFT * (along + abs(voter_target_road[n] - target_road[k]))
+                    + ARM * along
+                )
                 slack = min(
-                    SLACK * voxel_size + 2 * np.hypot(sigma[k], doubt[n]), MOST_SLACK * voxel_size
+                    SLACK * voxel_size + 2 * np.hypot(sigma[k], voter_sigma[n]),
+                    MOST_SLACK * voxel_size,
                 )
                 agrees = _agrees(
                     target_T_map[k],
@@ -144,25 +138,26 @@ def _add_voices(
                     slack + drift,
                     TURN + TURN_DRIFT * along / scale,
                 )
-                for i in range(len(said)):
+                for i in range(len(p)):
                     if agrees:
-                        for_it[i] = max(for_it[i], said[i, n])
+                        support[i] = max(support[i], p[i, n])
                     else:
-                        against[i] = max(against[i], said[i, n])
-            if n + 1 == end[k] or by[n + 1] != by[n]:  # the last voice of a query
-                far = 2 if abs(at[n] - road[k]) > NEAR * scale else 0
-                for i in range(len(said)):
-                    out[i, far, k] += for_it[i]
-                    out[i, far + 1, k] += against[i] if against[i] > for_it[i] else 0.0
-                    for_it[i] = against[i] = 0.0
+                        conflict[i] = max(conflict[i], p[i, n])
+            if n + 1 == end[k] or voter_query[n + 1] != voter_query[n]:  # the last one of a query
+                far = 2 if abs(voter_road[n] - road[k]) > NEAR * scale else 0
+                for i in range(len(p)):
+                    out[i, far, k] += support[i]
+                    out[i, far + 1, k] += conflict[i] if conflict[i] > support[i] else 0.0
+                    support[i] = conflict[i] = 0.0
 
 
 @njit(cache=True, nogil=True)
 def _agrees(
     target_T_map: F64, map_T_query: F64, target_T_query: F64, most: float, turn: float
 ) -> bool:
-    """Whether the query lies where ``target_T_map`` and its odometry put it, to within ``most``
-    metres and ``turn`` radians.
+    """Whether the query lies where ``target_T_map`` and its odometry put it.
+
+    To within ``most`` metres and ``turn`` radians.
     """
     off, trace = 0.0, 0.0
     for i in range(3):
@@ -177,16 +172,15 @@ def _agrees(
     return bool(off <= most * most and np.arccos(min(max((trace - 1) / 2, -1.0), 1.0)) <= turn)
 
 
-def shares(placed: Placed, voxel_size: float) -> F64:
-    """Share (n,) of each alignment in the odds that the poses of its query beside it have alone,
-    its own included: one of them is right.
+def mode_shares(placed: Placed, voxel_size: float) -> F64:
+    """Share (n,) of each pose mode in the odds of all poses of its query in the same place.
 
-    Neighbours tell which place is right, not which of two poses that they agree with as well: a
-    metre along the road, where each camera saw the other sides of things. That only the alignments
-    themselves tell.
+    One of them is right. Neighbours tell which place is right, not which of two poses in it that
+    they support equally: a metre along the road, where each camera saw the other sides of things.
+    Only the own probabilities of the alignments tell that.
     """
-    alone = np.clip(placed.alone, 0.0, 1 - 1e-6)
-    odds = alone / (1 - alone)
+    own = np.clip(placed.own_probability, 0.0, 1 - LEAST_ODDS)
+    odds = own / (1 - own)
     out = np.ones(len(placed))
     for rows in pairs_of(placed).values():
         group = placed.part(rows)
@@ -198,8 +192,9 @@ def shares(placed: Placed, voxel_size: float) -> F64:
 
 @njit(cache=True, nogil=True)
 def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float) -> F64:
-    """Of alignments ordered by ``query`` (n,); beside each other are those within ``most`` metres
-    and ``turn`` radians about z.
+    """Mode shares of alignments ordered by ``query`` (n,).
+
+    In one place are poses within ``most`` metres and ``turn`` radians about z.
     """
     out = np.ones(len(query))
     first = 0
@@ -221,56 +216,3 @@ def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float
             n += 1
         out[k] = odds[k] / total if total > 0 else 1.0
     return out
-
-
-def decide(
-    alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Resolved
-) -> list[Alignment]:
-    """The alignments of all queries, best first for each query: at most one accepted for each
-    target session, the others with a reason.
-    """
-    v = settings.fusion.voxel_size
-    least = settings.closures.min_probability
-    placed = place(alignments, maps)
-    columns = agree(placed, v)
-    astray = strays(placed, v)
-    fitted = may_be_right(features_of(alignments))
-    precision = precise(placed.sigma, v)
-    share = shares(placed, v)
-    probability = np.where(astray | ~fitted, 0.0, shipped().decided(columns) * precision * share)
-    order = sorted(
-        range(len(alignments)), key=lambda k: _rank(alignments[k], float(probability[k]))
-    )
-    answered: set[tuple[str, int, str]] = set()
-    out = []
-    for k in order:
-        a = alignments[k]
-        alone, neighbours, *rest = (float(c[k]) for c in columns)
-        agreement = Agreement(alone, int(neighbours), *rest)
-        asked = (a.query_session, a.query_keyframe, a.target_session)
-        p = float(probability[k])
-        if astray[k]:
-            why = (
-                f"probability {p:.3f} below {least:g}: the session's own odometry puts it elsewhere"
-            )
-        elif not p >= least:  # nor what is no number
-            why = reason(
-                a.features, p, least, agreement, a.sigma, float(precision[k]), float(share[k])
-            )
-        else:
-            why = "another place of the same session fits better" if asked in answered else ""
-        answered.add(asked)
-        out.append(replace(a, probability=p, agreement=agreement, reason=why))
-    return out
-
-
-def _rank(a: Alignment, probability: float) -> tuple[str, int, float, float, str, int]:
-    """Order of the alignments: by query, then the most probable first."""
-    return (
-        a.query_session,
-        a.query_stamp_ns,
-        -probability,
-        -a.features.structure,
-        a.target_session,
-        a.target_stamp_ns,
-    )

@@ -1,4 +1,4 @@
-"""Where alignments put their queries, as columns: what agreement and look-alikes are counted from."""
+"""Where alignments put their queries, as columns: votes and ambiguity are counted from them."""
 
 from __future__ import annotations
 
@@ -8,31 +8,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import FEATURES
-from semloc_logs.closures.acceptance.calibration import own_values, shipped, unrivalled
-from semloc_logs.closures.closure import Alignment
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.closures.acceptance.calibration import probability_ignoring_rivals, shipped
+from semloc_logs.closures.closure import FEATURES, Alignment, Columns, Features
+from semloc_logs.mapping.session_map import SessionMap
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 FAR = 200.0  # m of road, at voxels of 0.30 m: odometry still ties together what lies so far apart
-DRIFT, ARM = 0.01, 0.015  # of the way: odometry, and an alignment's error of heading (rad)
-# of the way, and voxels: farther off in its own map no query can be
+ARM = 0.015  # of the way: an alignment's error of heading (rad)
+# of the way, and voxels: no query lies farther off in its own map
 OWN_DRIFT, OWN_SLACK = 0.05, 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
-    """Alignments (n) as agreement sees them: which query of which session lies where in which
-    target's map.
+class Placed(Columns):
+    """Alignments (n): which query of which session lies where in which target's map.
 
     ``query`` (n,) numbers a session's queries, ``road`` and ``target_road`` (n,) are metres along
     the two drives, ``map_T_query`` and ``target_T_query`` (n, 4, 4) the query's base in its own map
     by odometry and in the target's by alignment, ``sigma`` (n,) the standard deviation of the
-    latter's position in metres, ``alone`` (n,) its probability by itself and ``unrivalled`` (n,)
-    the same if no other place fitted nearly as well. ``posed``: whether odometry is known.
+    latter's position in metres, ``own_probability`` (n,) the probability of its own features and
+    ``probability_ignoring_rivals`` (n,) the same if no other place fitted nearly as well.
+    ``posed``: whether odometry is known.
     """
 
     query_session: NDArray[np.object_]
@@ -43,21 +42,16 @@ class Placed:
     map_T_query: F64
     target_T_query: F64
     sigma: F64
-    alone: F64
-    unrivalled: F64
+    own_probability: F64
+    probability_ignoring_rivals: F64
     posed: Bools
 
-    def __len__(self) -> int:
-        return len(self.query)
 
-    def part(self, index: I64 | Bools) -> Placed:
-        """Some of them."""
-        return Placed(*(getattr(self, name)[index] for name in self.__slots__))
-
-
-def features_of(alignments: Sequence[Alignment]) -> F64:
-    """Their features (n, 8) in the order of ``FEATURES``."""
-    return np.array([own_values(a.features) for a in alignments]).reshape(-1, len(FEATURES))
+def features_of(alignments: Sequence[Alignment]) -> Features[F64]:
+    """The features of alignments as columns (n,)."""
+    return Features(
+        *(np.array([getattr(a.features, name) for a in alignments], float) for name in FEATURES)
+    )
 
 
 def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Placed:
@@ -84,8 +78,8 @@ def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Pl
             ]
         ),
         np.array([a.sigma for a in alignments], float),
-        np.array([a.agreement.alone for a in alignments], float),
-        unrivalled(shipped().own, features_of(alignments)),
+        np.array([a.probability for a in alignments], float),
+        probability_ignoring_rivals(shipped().own, features_of(alignments)),
         np.array([q.posed for q, _, _, _ in ends], bool),
     )
 
@@ -94,8 +88,9 @@ Pairs = dict[tuple[str, str], I64]
 
 
 def pairs_of(placed: Placed) -> Pairs:
-    """Rows of each query session and target session with odometry, by query and then by place, in
-    the order of names.
+    """Rows of each query session and target session with odometry, in the order of names.
+
+    They are ordered by query, and then by place.
     """
     names, number = np.unique(
         np.concatenate([placed.query_session, placed.target_session]).astype(str),
@@ -114,23 +109,21 @@ def pairs_of(placed: Placed) -> Pairs:
     }
 
 
-def asked_roads(placed: Placed) -> dict[str, F64]:
-    """The roads, ascending, of the queries of each session that have an alignment with any target."""
+def query_roads(placed: Placed) -> dict[str, F64]:
+    """Roads, ascending, of each session's queries that have an alignment with any target."""
     out: dict[str, dict[int, float]] = {}
     for session, query, road in zip(
         placed.query_session, placed.query.tolist(), placed.road.tolist(), strict=True
     ):
         out.setdefault(str(session), {})[query] = road
     return {
-        session: np.sort(np.fromiter(found.values(), float, len(found)))
-        for session, found in out.items()
+        session: np.sort(np.fromiter(roads.values(), float, len(roads)))
+        for session, roads in out.items()
     }
 
 
-def strays(placed: Placed, voxel_size: float) -> Bools:
-    """Which alignments of a session with itself (n,) are farther from where the odometry is than it
-    can have drifted.
-    """
+def contradicts_odometry(placed: Placed, voxel_size: float) -> Bools:
+    """Which alignments of a session with itself (n,) lie farther off than its odometry drifts."""
     own = (placed.query_session == placed.target_session) & placed.posed
     off = np.linalg.norm(placed.map_T_query[:, :3, 3] - placed.target_T_query[:, :3, 3], axis=1)
     return np.asarray(

@@ -27,6 +27,7 @@ from semloc_logs.simulation.sensors.camera import (
 )
 from semloc_logs.simulation.sensors.label_errors import corrupt_labels
 from semloc_logs.simulation.sensors.rendered_images import Painter
+from semloc_logs.simulation.sensors.sensor import Sensor
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -53,40 +54,38 @@ class CameraShot:
 def simulate_cameras(
     world: World,
     trajectory: Trajectory,
-    sensor: str,
+    sensor: Sensor,
     *,
-    rate_hz: float = 2.0,
     seed: int = 0,
     condition: Condition | None = None,
     traffic: Traffic | None = None,
-    label_noise: float = 0.0,
 ) -> Iterator[CameraShot]:
-    """Shots at ``rate_hz`` along a trajectory of a ``stereo`` pair or a camera with ``depth``
-    (names in ``camera.CAMERAS``), one at a time.
+    """Shots of a ``stereo`` pair or a camera with ``depth`` along a trajectory, one at a time.
 
-    ``condition`` gives light and season of the pictures, ``label_noise`` the share of wrong labels.
+    ``condition`` gives light and season of the pictures.
     """
-    model = CAMERAS[sensor]
-    mounted = base_T_camera(CAMERAS[sensor])
+    model = CAMERAS[sensor.name]
+    mounted = base_T_camera(model)
     painter = Painter(Scene(world), condition)
     rng = np.random.default_rng([seed, 43])
     rays = pixel_rays(model)
     stamps = trajectory.stamps_ns
     first = int(stamps[0])
-    for number, stamp in enumerate(range(first, int(stamps[-1]) + 1, round(1e9 / rate_hz))):
+    for number, stamp in enumerate(range(first, int(stamps[-1]) + 1, round(1e9 / sensor.rate_hz))):
         pose = interpolate(stamps, trajectory.world_T_base, np.array([stamp]))[0]
         moving = traffic.scene((stamp - first) * 1e-9, pose) if traffic else None
         left = pose @ mounted
         hits = first_hits(painter.scene, left, rays, moving)
         picture = painter.picture(left, rng, model, traffic=moving, hits=hits)
-        right, depth = None, None
-        if sensor == "depth":
+        right = None
+        depth = None
+        if sensor.name == "depth":
             depth = measure(hits, rays, left, rng, model).depth
         else:
             other = left.copy()
             other[:3, 3] += model.baseline * left[:3, 0]
             right = painter.picture(other, rng, model, traffic=moving)
-        labels = wrong_label_image(hits, rays, left, seed, label_noise, number)
+        labels = wrong_label_image(hits, rays, left, seed, sensor.label_noise, number)
         yield CameraShot(stamp, model, mounted, picture, right, depth, labels)
 
 

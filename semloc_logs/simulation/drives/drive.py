@@ -8,15 +8,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semloc_logs.numerics.transforms import apply, interpolate
 from semloc_logs.simulation.drives.traffic import Traffic
 from semloc_logs.simulation.drives.trajectory import Trajectory
 from semloc_logs.simulation.meshes.world import F64, Scene, World
-from semloc_logs.simulation.sensors.lidar import LidarModel, Sweep, corrupt_labels, full_sweep
+from semloc_logs.simulation.sensors.label_errors import corrupt_labels
+from semloc_logs.simulation.sensors.lidar import Sweep, SweepOptions, full_sweep
+from semloc_logs.simulation.sensors.lidar_models import MODELS, LidarModel
+from semloc_logs.simulation.sensors.sensor import Sensor
 
 TURN_NS = 100_000_000  # duration of a sweep
+PHASE = 0.37  # s by which the sensors of two drives of consecutive seeds begin apart
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,11 +34,6 @@ class DriveFrame:
     base_T_lidar: F64
     sweep: Sweep
 
-    @property
-    def points_base(self) -> NDArray[np.float32]:
-        """Points (n, 3) in the base frame, the motion during the sweep left in."""
-        return apply(self.base_T_lidar, self.sweep.points).astype(np.float32)
-
 
 def mounting(model: LidarModel) -> F64:
     """``base_T_lidar`` (4, 4): the sensor over the front axle at the model's height."""
@@ -47,28 +45,20 @@ def mounting(model: LidarModel) -> F64:
 def simulate_drive(
     world: World,
     trajectory: Trajectory,
-    model: LidarModel,
+    sensor: Sensor,
     *,
-    rate_hz: float = 2.0,
     seed: int = 0,
-    columns: int | None = None,
     traffic: Traffic | None = None,
-    label_noise: float = 0.0,
-    wet: float = 0.0,
 ) -> Iterator[DriveFrame]:
-    """Sweeps at ``rate_hz`` along a trajectory, one at a time; ``label_noise`` is the share of
-    wrong labels.
-
-    About half of these errors are fixed to places, the others belong to one sweep. ``wet`` in [0,
-    1] is how wet the road is.
-    """
+    """Sweeps of a lidar along a trajectory, one at a time."""
     scene = Scene(world)
+    model = MODELS[sensor.name]
     base_T_lidar = mounting(model)
     rng = np.random.default_rng([seed, 41])
     stamps = trajectory.stamps_ns
     first = int(stamps[0])
     for number, stamp in enumerate(
-        range(first, int(stamps[-1]) - TURN_NS + 1, round(1e9 / rate_hz))
+        range(first, int(stamps[-1]) - TURN_NS + 1, round(1e9 / sensor.rate_hz))
     ):
         start, end = interpolate(
             stamps, trajectory.world_T_base, np.array([stamp, stamp + TURN_NS])
@@ -76,24 +66,23 @@ def simulate_drive(
         moment = (stamp - first) * 1e-9
         moving = traffic.scene(moment, start) if traffic else None
         lidar = start @ base_T_lidar
-        turn = full_sweep(
-            scene,
-            lidar,
-            rng,
-            model,
-            columns=columns,
+        options = SweepOptions(
+            columns=sensor.columns,
             traffic=moving,
             world_T_end=end @ base_T_lidar,
-            moment=moment + 0.37 * seed,
-            wet=wet,
+            moment=moment + PHASE * seed,
+            wet=sensor.wet,
         )
-        if label_noise > 0:
-            where = apply(lidar, turn.points)
-            turn = replace(
-                turn,
-                labels=corrupt_labels(
-                    where, turn.labels, seed, label_noise, frame=number, beyond=turn.beyond
-                ),
+        turn = full_sweep(scene, lidar, rng, model, options)
+        if sensor.label_noise > 0:
+            labels = corrupt_labels(
+                apply(lidar, turn.points),
+                turn.labels,
+                seed,
+                sensor.label_noise,
+                frame=number,
+                beyond=turn.beyond,
             )
+            turn = replace(turn, labels=labels)
         odom = interpolate(stamps, trajectory.odom_T_base, np.array([stamp]))[0]
         yield DriveFrame(stamp, start, odom, base_T_lidar, turn)

@@ -16,6 +16,8 @@ from semloc_logs.numerics.transforms import inverse
 from semloc_logs.simulation.meshes.objects import resample
 from semloc_logs.simulation.meshes.world import F64
 
+POSES_HZ = 20.0  # of a trajectory
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
@@ -84,14 +86,13 @@ def drive(
     rng: np.random.Generator,
     *,
     start_ns: int,
-    rate_hz: float = 20.0,
     speed: float = 7.0,
     drift: float = 0.007,
 ) -> Trajectory:
-    """A car drives all of a smooth line at about ``speed`` m/s, slower in bends; poses at
-    ``rate_hz`` from ``start_ns`` on.
+    """A car drives all of a smooth line at about ``speed`` m/s, slower in bends.
 
-    ``drift`` is that of the odometry (:func:`drifting_odometry`).
+    Poses come at ``POSES_HZ`` from ``start_ns`` on; the odometry has a ``drift``
+    (:func:`drifting_odometry`).
     """
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     tangent = np.gradient(line, along, axis=0)
@@ -102,7 +103,7 @@ def drive(
     )
     pace = gaussian_filter1d(pace, 8, mode="nearest")
     seconds = np.concatenate([[0.0], np.cumsum(np.diff(along) / pace[1:])])
-    at = np.arange(0.0, seconds[-1], 1.0 / rate_hz)
+    at = np.arange(0.0, seconds[-1], 1.0 / POSES_HZ)
     poses = poses_along(line, np.interp(at, seconds, along), height, rng)
     stamps = start_ns + np.round(at * 1e9).astype(np.int64)
     return Trajectory(stamps, poses, drifting_odometry(poses, rng, drift))

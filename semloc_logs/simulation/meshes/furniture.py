@@ -74,29 +74,12 @@ def person(rng: Rng) -> Parts:
     return parts
 
 
-POLES = (
-    "lamp",
-    "lamp",
-    "double",
-    "park",
-    "sign",
-    "signals",
-    "bollard",
-    "mast",
-    "flag",
-    "gantry",
-    "crossing",
-    "parking",
-    "street",
-)
-
-
 def pole(rng: Rng, kind: str) -> Parts:
-    """One of ``POLES``; arms and faces look along +y.
+    """A pole of a ``kind``; arms and faces look along +y.
 
     ``lamp``, ``double`` and ``park`` give light, ``mast`` carries wires, ``signals`` traffic
     lights; ``sign``, ``crossing``, ``parking``, ``street`` (a name) and ``gantry`` (over the
-    carriageway) carry signs.
+    carriageway) carry signs; ``flag`` and ``bollard``.
     """
     makers = {
         "lamp": _lamp,

@@ -12,23 +12,14 @@ from semloc_logs.simulation.meshes.shapes import Rng, boxes, joined, loft, trian
 from semloc_logs.simulation.meshes.world import F64, Mesh, gabled_roof, place
 
 Rectangle = tuple[float, float, float, float]
-ROOFS = (
-    "gable",
-    "cross",
-    "hip",
-    "half-hip",
-    "mansard",
-    "gambrel",
-    "lean-to",
-    "flat",
-    "saw",
-    "barrel",
-)
 STEEPEST = 8.0  # m that a roof rises at most
 
 
 def roof(rng: Rng, kind: str, where: Rectangle, z: float) -> tuple[Mesh, float]:
-    """A roof of one of ``ROOFS`` with its gable walls, and its height over z."""
+    """A roof of a ``kind`` with its gable walls, and its height over z.
+
+    gable, cross, hip, half-hip, mansard, gambrel, lean-to, flat, saw or barrel.
+    """
     x0, x1, y0, y1 = where
     over = float(rng.uniform(0.1, 0.7))
     if kind == "flat":

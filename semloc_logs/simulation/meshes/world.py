@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,20 +49,24 @@ class World:
     objects: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
 
+def require_ray_caster(what: str) -> None:
+    """SemlocError naming the extra that ``what`` needs, when its package is not installed."""
+    if find_spec("embreex") is None:
+        raise SemlocError(f"{what} needs the extra 'sim': pip install 'semloc_logs[sim]'")
+
+
 class Scene:
     """A world that rays can be cast into."""
 
     def __init__(self, world: World) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise SemlocError(
-                "simulating a lidar needs the package embreex, which is not installed: run `pip install embreex`"
-            ) from error
+        require_ray_caster("the simulation of a sensor")
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
         if not len(world.triangles):
             raise SemlocError(
-                "the world to simulate has no triangles, so there is nothing to scan: give it at least a ground"
+                "the world to simulate has no triangles, so there is nothing to scan: "
+                "give it at least a ground"
             )
         self.world = world
         self.labels = world.labels
@@ -285,28 +290,3 @@ def ribbon(path: F64, section: F64) -> Mesh:
     return Mesh(
         vertices, np.concatenate([_grid_triangles(len(path), k, closed=True), fan, fan + last])
     )
-
-
-def leaf_cloud(
-    rng: np.random.Generator,
-    radii: tuple[float, float, float],
-    count: int,
-    size: float,
-    *,
-    hollow: float = 0.55,
-) -> Mesh:
-    """``count`` small triangles of about ``size`` metres in a lumpy ellipsoid about the origin:
-    rays pass partly, as through leaves.
-
-    ``hollow`` is the share of the radius below which there are hardly any.
-    """
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    lumps = np.ones(count)
-    for _ in range(3):
-        wave = rng.normal(size=3) * rng.uniform(1.0, 3.0)
-        lumps += 0.16 * np.sin(direction @ wave + rng.uniform(0, 2 * np.pi))
-    radius = lumps * (hollow + (1 - hollow) * rng.uniform(0, 1, count) ** 0.7)
-    centre = direction * radius[:, None] * np.asarray(radii)
-    corners = centre[:, None, :] + rng.uniform(-0.8, 0.8, (count, 3, 3)) * size
-    return Mesh(corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int64).reshape(-1, 3))

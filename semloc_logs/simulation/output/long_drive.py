@@ -14,7 +14,8 @@ from semloc_logs.simulation.drives.drive import DriveFrame, mounting
 from semloc_logs.simulation.drives.trajectory import Trajectory, poses_along, smooth_line
 from semloc_logs.simulation.meshes.world import F64, Scene
 from semloc_logs.simulation.output.drive_log import write_session
-from semloc_logs.simulation.sensors.lidar import MODELS, Sweep, full_sweep
+from semloc_logs.simulation.sensors.lidar import Sweep, SweepOptions, full_sweep
+from semloc_logs.simulation.sensors.lidar_models import MODELS
 from semloc_logs.simulation.town.road_network import lane_path, path_network
 from semloc_logs.simulation.town.street import build_street, street_ground
 
@@ -52,7 +53,7 @@ class Lap:
         self.sweeps = []
         for pose in self.poses[:-1:_POSES]:
             turn = full_sweep(
-                scene, pose @ self.base_T_lidar, rng, MODELS["hdl32"], columns=columns
+                scene, pose @ self.base_T_lidar, rng, MODELS["hdl32"], SweepOptions(columns)
             )
             # all points at once: there is no motion to undo, whichever way the lap is driven
             self.sweeps.append(Sweep(turn.points, turn.labels, turn.ring, np.zeros_like(turn.turn)))

@@ -34,6 +34,8 @@ F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
 
+MOUNT_AHEAD = 0.3  # m before the base frame's origin, over the front axle
+
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
@@ -41,7 +43,8 @@ class CameraModel:
 
     Pixels, horizontal field of view in radians, height over ground, ``baseline`` and ranges (along
     the axis) in metres, ``disparity_noise`` in pixels, ``bleed``: pixels by which surfaces in front
-    grow at most.
+    grow at most. ``yaw`` radians turn it to the left about the base's z axis: 0 looks ahead, pi / 2
+    to the left, pi back.
     """
 
     name: str
@@ -54,6 +57,7 @@ class CameraModel:
     min_range: float = 0.5
     disparity_noise: float = 0.25
     bleed: int = 3
+    yaw: float = 0.0
 
     @property
     def focal(self) -> float:
@@ -122,19 +126,17 @@ class CameraFrame:
     sigma: F32
 
 
-def base_T_camera(model: CameraModel, yaw: float = 0.0, ahead: float = 0.3) -> F64:
-    """Pose (4, 4) of the optical frame on a vehicle: looking ahead, turned to the left by ``yaw``
-    radians about the base's z axis.
-    """
-    c = math.cos(yaw)
-    s = math.sin(yaw)
+def base_T_camera(model: CameraModel) -> F64:
+    """Pose (4, 4) of the optical frame on a vehicle."""
+    c = math.cos(model.yaw)
+    s = math.sin(model.yaw)
     pose = np.eye(4)
     pose[:3, :3] = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ [
         [0.0, 0.0, 1.0],
         [-1.0, 0.0, 0.0],
         [0.0, -1.0, 0.0],
     ]
-    pose[:3, 3] = ahead * c, ahead * s, model.mount_height
+    pose[:3, 3] = MOUNT_AHEAD * c, MOUNT_AHEAD * s, model.mount_height
     return pose
 
 
@@ -229,17 +231,15 @@ def camera_points(
     rng: np.random.Generator,
     model: CameraModel,
     *,
-    yaw: float = 0.0,
     traffic: Scene | None = None,
     step: int = 3,
 ) -> tuple[F32, F32, U8, F32]:
-    """A depth frame as a thinned cloud in the base frame: points (n, 3), the camera's place (3,),
-    labels (n,), sigma along the ray (n,).
+    """A depth frame as a thinned cloud in the base frame.
 
-    ``yaw`` radians turns the camera to the left: 0 looks ahead, pi / 2 to the left, pi back. Only
-    every ``step``-th pixel is cast.
+    Points (n, 3), the camera's place (3,), labels (n,), sigma along the ray (n,). Only every
+    ``step``-th pixel is cast.
     """
-    mounted = base_T_camera(model, yaw)
+    mounted = base_T_camera(model)
     frame = depth_frame(scene, world_T_base @ mounted, rng, model, traffic=traffic, step=step)
     points = frame.points @ mounted[:3, :3].T.astype(np.float32) + mounted[:3, 3].astype(np.float32)
     return points, mounted[:3, 3].astype(np.float32), frame.labels, frame.sigma

@@ -13,12 +13,7 @@ from numpy.typing import NDArray
 from semloc_logs.numerics.transforms import interpolate
 from semloc_logs.simulation.meshes.world import F64, Scene
 from semloc_logs.simulation.sensors.echoes import beyond_edges, is_heard, mixed_ranges, reflectance
-from semloc_logs.simulation.sensors.label_errors import CONFUSIONS as CONFUSIONS
-from semloc_logs.simulation.sensors.label_errors import corrupt_labels as corrupt_labels
-from semloc_logs.simulation.sensors.lidar_models import MODELS as MODELS
-from semloc_logs.simulation.sensors.lidar_models import LidarModel as LidarModel
-from semloc_logs.simulation.sensors.lidar_models import beam_directions as beam_directions
-from semloc_logs.simulation.sensors.lidar_models import is_blocked
+from semloc_logs.simulation.sensors.lidar_models import LidarModel, beam_directions, is_blocked
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -39,33 +34,39 @@ class Sweep:
     beyond: U8 | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepOptions:
+    """How one turn of a sensor differs from a whole one of a standing sensor on a dry road.
+
+    Fewer ``columns``, a shorter ``max_range`` (m), an azimuth ``sector`` (rad). ``traffic`` is a
+    second scene, of what moves, that hides the first where it is nearer. With ``world_T_end``
+    (4, 4) the sensor moves during the turn and each point is in the frame of its own moment, as
+    real ones are. ``moment``: seconds into its pattern at which the sensor begins (None: at
+    random); ``wet`` in [0, 1]: how wet the road is.
+    """
+
+    columns: int | None = None
+    max_range: float | None = None
+    sector: tuple[float, float] | None = None
+    traffic: Scene | None = None
+    world_T_end: F64 | None = None
+    moment: float | None = None
+    wet: float = 0.0
+
+
 def full_sweep(
     scene: Scene,
     world_T_lidar: F64,
     rng: np.random.Generator,
     model: LidarModel,
-    *,
-    columns: int | None = None,
-    max_range: float | None = None,
-    sector: tuple[float, float] | None = None,
-    traffic: Scene | None = None,
-    world_T_end: F64 | None = None,
-    moment: float | None = None,
-    wet: float = 0.0,
+    options: SweepOptions = SweepOptions(),
 ) -> Sweep:
-    """One turn of the sensor standing at ``world_T_lidar`` (4, 4); fewer ``columns``, a shorter
-    range, an azimuth ``sector`` if asked.
-
-    ``traffic`` is a second scene, of what moves, that hides the first where it is nearer. With
-    ``world_T_end`` the sensor moves during the turn and each point is in the frame of its own
-    moment, as real ones are. ``moment`` in seconds says where in its pattern the sensor begins
-    (any, if not given); ``wet`` in [0, 1] how wet the road is.
-    """
-    moment = float(rng.uniform(0, 1000)) if moment is None else moment
-    count = columns or model.columns
-    directions, ring, turn = beam_directions(model, count, sector, moment)
+    """One turn of the sensor standing at ``world_T_lidar`` (4, 4)."""
+    moment = float(rng.uniform(0, 1000)) if options.moment is None else options.moment
+    count = options.columns or model.columns
+    directions, ring, turn = beam_directions(model, count, options.sector, moment)
     beams = len(model.elevations_deg)
-    far = min(max_range or model.max_range, model.max_range)
+    far = min(options.max_range or model.max_range, model.max_range)
     lift = np.zeros((beams, 3), np.float32)
     if model.lift:
         lift[:, 2] = model.lift
@@ -75,9 +76,9 @@ def full_sweep(
         ring,
         turn,
         world_T_lidar,
-        world_T_end,
+        options.world_T_end,
     )
-    distance, labels, normal = _cast(scene, traffic, origin, rays)
+    distance, labels, normal = _cast(scene, options.traffic, origin, rays)
     distance[is_blocked(model, directions)] = np.inf
     grid = distance.reshape(-1, beams)
     # an edge is cut by the beams of the columns on both sides of it; in a rosette columns follow
@@ -97,7 +98,7 @@ def full_sweep(
         np.linalg.norm(normal, axis=1), 1e-12
     )
     end = origin[hit] + ray * measured[hit, None]
-    kept = is_heard(rng, measured[hit], cosine, reflectance(end, seen, wet), seen)
+    kept = is_heard(rng, measured[hit], cosine, reflectance(end, seen, options.wet), seen)
     hit = hit[kept]
     cosine = cosine[kept]
     noise = rng.normal(size=len(hit)) * model.noise * (1 + 0.5 * (1 - cosine))
@@ -155,13 +156,3 @@ def _rays(
     return np.einsum("nij,nj->ni", rotation, directions), rotation[:, :, 2] * lift[
         ring, 2:
     ] + poses[:, :3, 3]
-
-
-def sweep(
-    scene: Scene, world_T_lidar: F64, rng: np.random.Generator, model: LidarModel, **options: object
-) -> tuple[F32, U8]:
-    """Points (n, 3) in the sensor frame and labels (n,) of :func:`full_sweep`, which has the
-    options.
-    """
-    result = full_sweep(scene, world_T_lidar, rng, model, **options)  # type: ignore[arg-type]
-    return result.points, result.labels

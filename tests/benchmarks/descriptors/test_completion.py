@@ -9,7 +9,9 @@ import pytest
 from semloc_logs.benchmarks.descriptors import completion as module
 from semloc_logs.benchmarks.descriptors.completion import completion_benchmark, completion_figures
 from semloc_logs.errors import SettingsError
-from semloc_logs.pictures.completion_picture import colours, draw_completions, render
+from semloc_logs.pictures.boxes import draw_boxes
+from semloc_logs.pictures.colours import class_colours
+from semloc_logs.pictures.completion_picture import draw_completions
 from semloc_logs.settings import Settings
 from semloc_logs.subvolumes.completed import Completed, completed, load_completion
 from semloc_logs.training.pairs import BROAD, write_shard
@@ -100,7 +102,7 @@ def test_the_benchmark_draws_what_it_measured(
     }
     image = cv2.imread(str(picture))
     assert image is not None
-    tops = colours()[[0, 2]][:, ::-1]
+    tops = class_colours()[[0, 2]][:, ::-1]
     for colour in tops:  # road and building show with the tops of their boxes
         assert (image == colour).all(2).any()
 
@@ -108,12 +110,12 @@ def test_the_benchmark_draws_what_it_measured(
 def test_boxes_hide_what_is_behind_and_below() -> None:
     state = np.full((4, 4, 4), 254, np.uint8)
     state[0, 0, 0] = 8
-    assert (render(state) == colours()[8]).all(2).sum() > 50
+    assert (draw_boxes(state) == class_colours()[8]).all(2).sum() > 50
     state[1, 1, 1] = 2  # on the line of sight
-    hidden = render(state)
-    assert not (hidden == colours()[8]).all(2).any()
-    assert (hidden == colours()[2]).all(2).sum() > 50
-    empty = render(np.full((4, 4, 4), 253, np.uint8))
+    hidden = draw_boxes(state)
+    assert not (hidden == class_colours()[8]).all(2).any()
+    assert (hidden == class_colours()[2]).all(2).sum() > 50
+    empty = draw_boxes(np.full((4, 4, 4), 253, np.uint8))
     assert (empty.min(2) >= 200).all()
 
 

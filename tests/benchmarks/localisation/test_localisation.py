@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -35,6 +37,7 @@ from semloc_logs.benchmarks.localisation.our_method import (
 from semloc_logs.benchmarks.localisation.peer_methods import cloud_frame, database_keyframes
 from semloc_logs.benchmarks.peers import peer_process
 from semloc_logs.benchmarks.peers.scan_context import nearest_contexts, scan_context
+from semloc_logs.closures.matching import QueryContext, find_hypotheses
 from semloc_logs.errors import SemlocError, SettingsError
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import load
@@ -164,13 +167,16 @@ def test_a_grid_has_every_heading_along_and_beside_the_road() -> None:
     database = SimpleNamespace(
         settings=settings, places=[SimpleNamespace(session="a", submap=0)], sessions={"a": session}
     )
-    found = grid_hypotheses(database, None, 0, None)  # type: ignore[arg-type]
+    context = cast(
+        QueryContext, SimpleNamespace(visible=SimpleNamespace(database=database), keyframe=0)
+    )
+    found = grid_hypotheses(context)
     assert len(found) == 5 * 3 * settings.descriptor.headings
     assert {h.pose[1] for h in found if h.pose[0] < 3} == {0.0, 4.0, 8.0, 12.0, 16.0}
     assert {h.pose[1] for h in found if h.pose[0] > 3.2} == {2.0, 6.0, 10.0, 14.0, 18.0}
     assert len({h.pose[0] for h in found}) == settings.descriptor.headings
     assert {h.pose[2] for h in found} == {-4.0, 0.0, 4.0}
-    some = grid_hypotheses(database, None, 0, None, most=10)  # type: ignore[arg-type]
+    some = grid_hypotheses(context, count=10)
     assert len(some) == 10
     assert set(some) <= set(found)
 
@@ -224,6 +230,25 @@ def test_a_sweep_finds_a_map_that_was_described_at_another_heading() -> None:
     np.testing.assert_allclose(
         described.centre[found.query[same]] * 0.3, found.centre[same], atol=1e-4
     )
+
+
+def test_systems_differ_in_where_their_hypotheses_come_from() -> None:
+    settings = load().resolved()
+    searches = {s.name: s.search(settings) for s in OURS}
+    assert searches["ours"] is searches["random weights"] is find_hypotheses
+    assert called(searches["ours, every heading described"]) == (
+        find_hypotheses,
+        {"match": sweep_words},
+    )
+    most = settings.closures.hypotheses
+    assert called(searches["grid, as many"]) == (grid_hypotheses, {"count": most})
+    assert called(searches["grid, exhaustive"]) == (grid_hypotheses, {"count": None})
+
+
+def called(search: object) -> tuple[object, dict[str, object]]:
+    """The function and the arguments of a partial call."""
+    assert isinstance(search, partial)
+    return search.func, search.keywords
 
 
 def test_systems_differ_only_in_what_they_say() -> None:

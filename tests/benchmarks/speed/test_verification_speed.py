@@ -10,17 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.overlap import pose_matrix, tau, yaw_between
+from semloc_logs.alignment.hypotheses import pose_matrix, same_place, yaw_between
+from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit
+from semloc_logs.alignment.scores import structure_scores
+from semloc_logs.alignment.search import search_hypotheses
 from semloc_logs.alignment.surface import surface_of
-from semloc_logs.alignment.verify import (
-    FINE_RADII,
-    coarse_fit,
-    escaped,
-    fine_fit,
-    same_place,
-    search_hypotheses,
-    structure_scores,
-)
+from semloc_logs.alignment.target_map import FINE_RADII
+from semloc_logs.alignment.tau import tau
 from semloc_logs.benchmarks.speed.verification_speed import TRUTH, Scene, scene
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import Settings

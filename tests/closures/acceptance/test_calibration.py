@@ -1,26 +1,28 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from importlib.resources import files
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import FEATURES, Features
 from semloc_logs.closures.acceptance.calibration import (
-    AGREEMENT,
-    TOGETHER,
+    NEIGHBOUR_EVIDENCE,
     Calibration,
+    NeighbourEvidence,
     fit_logistic,
-    may_be_right,
-    own_values,
-    precise,
-    reason,
+    is_plausible,
+    position_confidence,
+    probability_ignoring_rivals,
     shipped,
-    together_values,
-    unrivalled,
 )
-from semloc_logs.closures.closure import Agreement
+from semloc_logs.closures.closure import FEATURES, Agreement, Features
+from semloc_logs.closures.closure_tables import AGREEMENT_COLUMNS
+from semloc_logs.tables import contracts
+
+F64 = NDArray[np.float64]
 
 GOOD = Features(
     structure=0.95,
@@ -34,45 +36,71 @@ GOOD = Features(
 )
 
 
-def alone(features: Features, model: Calibration | None = None) -> float:
-    return float((model or shipped().alone).probability(own_values(features)))
+def columns(*features: Features[float]) -> Features[F64]:
+    return Features(*(np.array([getattr(f, name) for f in features]) for name in FEATURES))
 
 
-def decided(**agreement: float) -> float:
-    a = Agreement(**agreement)  # type: ignore[arg-type]
-    return float(shipped().decided([np.array([getattr(a, n)]) for n in AGREEMENT])[0])
+def alone(features: Features[float], model: Calibration | None = None) -> float:
+    return float((model or shipped().own_features).probability(features.vector()))
 
 
-def test_features_are_named_in_their_order() -> None:
-    assert tuple(f.name for f in dataclasses.fields(Features)) == FEATURES
-    assert tuple(f.name for f in dataclasses.fields(Agreement)) == AGREEMENT
+def decided(**votes: float) -> float:
+    names = [f.name for f in dataclasses.fields(Agreement)]
+    return float(shipped().decided(Agreement(*(np.array([votes.get(n, 0.0)]) for n in names)))[0])
+
+
+def test_features_and_votes_are_named_as_in_the_files_and_in_their_order() -> None:
+    content = json.loads(
+        files("semloc_logs.closures.acceptance").joinpath("calibration.json").read_text()
+    )
+    assert tuple(content["alone"]["features"]) == FEATURES
+    assert tuple(content["together"]["features"]) == NEIGHBOUR_EVIDENCE
+    assert len(dataclasses.fields(NeighbourEvidence)) == len(NEIGHBOUR_EVIDENCE)
+    table = [c["name"] for c in contracts.contract("rejected")["columns"]]
+    assert [n for n in table if n in FEATURES] == list(FEATURES)
+    assert [n for n in table if n in AGREEMENT_COLUMNS] == list(AGREEMENT_COLUMNS)
+    names = tuple(f.name for f in dataclasses.fields(Agreement))
+    assert tuple(AGREEMENT_COLUMNS.values()) == names
+
+
+def test_rows_of_columns() -> None:
+    votes = Agreement(*(np.array([10.0 * i, 10.0 * i + 1]) for i in range(7)))
+    assert len(votes) == 2
+    assert votes.row(1) == Agreement(1.0, 11.0, 21.0, 31.0, 41.0, 51.0, 61.0)
+    some = votes.part(np.array([1]))
+    assert (len(some), some.ambiguity.tolist()) == (1, [61.0])
+    assert GOOD.vector().tolist() == [0.95, 0.9, 0.02, 0.95, 0.1, 0.2, 3.0, 3.0]
+    assert columns(GOOD, GOOD).vector().shape == (2, 8)
 
 
 def test_values_of_the_agreement_by_hand() -> None:
-    columns = [np.array([x, x]) for x in (0.75, 4.0, 3.0, 1.0, np.e - 1, 0.0, 0.5)]
-    values = together_values(columns)
-    assert values.shape == (2, len(TOGETHER))
+    votes = Agreement(*(np.array([x, x]) for x in (0.75, 4.0, 3.0, 1.0, np.e - 1, 0.0, 0.5)))
+    values = NeighbourEvidence.of(votes).vector()
+    assert values.shape == (2, len(NEIGHBOUR_EVIDENCE))
     np.testing.assert_allclose(values[1], [np.log(3), np.log(4), 0.75, np.log(2), 1.0, 0.0])
 
 
 def test_without_neighbours_the_alignment_alone_decides() -> None:
-    assert decided(alone=0.4321) == 0.4321
-    assert decided(alone=0.995, lookalike=shipped().most_alike) == 0.995
+    assert decided(own_probability=0.4321) == 0.4321
+    assert decided(own_probability=0.995, ambiguity=shipped().max_ambiguity) == 0.995
 
 
-def test_in_streets_that_look_like_others_nothing_is_more_probable_than_a_half() -> None:
-    assert decided(alone=0.995, lookalike=0.9) == 0.995 / 2
+def test_in_ambiguous_places_nothing_is_more_probable_than_a_half() -> None:
+    assert decided(own_probability=0.995, ambiguity=0.9) == 0.995 / 2
     assert (
-        decided(alone=0.9999, neighbours=12, agreeing=12.0, far_agreeing=80.0, lookalike=0.9) <= 0.5
+        decided(
+            own_probability=0.9999, neighbours=12, support=12.0, far_support=80.0, ambiguity=0.9
+        )
+        <= 0.5
     )
 
 
 def test_without_rivals_an_alignment_is_judged_as_if_it_were_the_only_one() -> None:
-    def own(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return 1.0 - values[..., FEATURES.index("distinct")] / 10
+    def own(features: Features[F64]) -> F64:
+        return np.asarray(1.0 - features.distinct / 10)
 
-    values = np.array([own_values(dataclasses.replace(GOOD, distinct=d)) for d in (0.2, 1.4, 1.5)])
-    np.testing.assert_allclose(unrivalled(own, values), [1.0, 1.0, 0.0])
+    several = columns(*(dataclasses.replace(GOOD, distinct=d) for d in (0.2, 1.4, 1.5)))
+    np.testing.assert_allclose(probability_ignoring_rivals(own, several), [1.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -87,18 +115,18 @@ def test_without_rivals_an_alignment_is_judged_as_if_it_were_the_only_one() -> N
         ({"fit": 0.1, "stiffness": 0.2}, False),
     ],
 )
-def test_what_may_be_right_at_all(change: dict[str, float], possible: bool) -> None:
-    assert bool(may_be_right(own_values(dataclasses.replace(GOOD, **change)))) == possible
+def test_which_alignments_are_plausible(change: dict[str, float], possible: bool) -> None:
+    assert is_plausible(columns(dataclasses.replace(GOOD, **change))).tolist() == [possible]
 
 
 def test_neighbours_add_and_take() -> None:
-    several = {"alone": 0.9, "neighbours": 12}
+    several = {"own_probability": 0.9, "neighbours": 12}
     assert (
-        decided(**several, agreeing=9.0)
-        > decided(**several, agreeing=3.0)
-        > decided(**several, agreeing=3.0, opposing=6.0)
+        decided(**several, support=9.0)
+        > decided(**several, support=3.0)
+        > decided(**several, support=3.0, conflict=6.0)
     )
-    assert decided(alone=0.97, neighbours=12, opposing=10.0) < 0.9
+    assert decided(own_probability=0.97, neighbours=12, conflict=10.0) < 0.9
 
 
 def test_less_support_than_the_least_is_never_right() -> None:
@@ -196,7 +224,7 @@ def test_logistic_regression_counts_rows_and_takes_offsets() -> None:
 
 def test_a_model_as_json_and_back() -> None:
     model = shipped().together
-    assert Calibration.from_json(model.to_json(TOGETHER), TOGETHER) == model
+    assert Calibration.from_json(model.to_json(NEIGHBOUR_EVIDENCE), NEIGHBOUR_EVIDENCE) == model
 
 
 def test_probability_by_hand() -> None:
@@ -231,28 +259,6 @@ def test_the_shipped_calibration_knows_good_from_bad() -> None:
         assert alone(dataclasses.replace(GOOD, **{name: worse})) <= alone(GOOD)
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"coverage": 0.1}, "10% of the query's structure falls into observed space"),
-        ({"structure": 0.3}, "30% of the query's structure lies on structure"),
-        ({"distinct": 0.9}, "another place fits nearly as well"),
-        ({"fit": 0.4}, "40% of the points lie on a surface"),
-        ({}, "too weak"),
-    ],
-)
-def test_reasons(change: dict[str, float], said: str) -> None:
-    text = reason(dataclasses.replace(GOOD, **change), 0.1234, 0.99, Agreement(0.1234))
-    assert said in text
-    assert text.startswith("probability 0.123 below 0.99: ")
-
-
-def test_reasons_of_the_neighbours() -> None:
-    text = reason(GOOD, 0.5, 0.99, Agreement(0.995, 12, agreeing=1.04, opposing=7.96))
-    assert "of 12 neighbouring queries 1.0 agree and 8.0 lie elsewhere" in text
-    assert "look like others (90%)" in reason(GOOD, 0.5, 0.99, Agreement(0.995, 12, lookalike=0.9))
-
-
 def test_logistic_regression_recovers_known_weights() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(0, 1, (20_000, 3)) * [1, 5, 0.1] + [0, 20, -1]
@@ -275,20 +281,13 @@ def test_logistic_regression_of_separable_and_of_constant_features_stays_finite(
     assert (1 / (1 + np.exp(-(x @ w + b))) > 0.99).all()
 
 
-def test_a_place_that_is_not_known_to_a_metre_is_no_closure() -> None:
+def test_a_position_that_is_not_known_to_a_metre_is_not_a_closure() -> None:
     """Within 1 m = one of 1.2 standard deviations of 0.833 m: 68.3 %; in a room of 5 cm voxels the
     bound is a sixth.
     """
     np.testing.assert_allclose(
-        precise(np.array([1 / 1.2, 0.5 / 1.2, 0.0]), 0.30), [0.6827, 0.9545, 1.0], atol=1e-4
+        position_confidence(np.array([1 / 1.2, 0.5 / 1.2, 0.0]), 0.30),
+        [0.6827, 0.9545, 1.0],
+        atol=1e-4,
     )
-    assert precise(1 / 1.2 / 6, 0.05) == pytest.approx(0.6827, abs=1e-4)
-    text = reason(GOOD, 0.682, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)
-    assert text == "probability 0.682 below 0.99: where in this place is known to 0.80 m only"
-    # nor is it the place
-    assert "0.80 m" not in reason(GOOD, 0.3, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.8, 0.6827)
-    nearly = reason(GOOD, 0.986, 0.99, Agreement(0.999, 12, agreeing=12.0), 0.29, 0.994)
-    assert "known to 0.29 m" in nearly  # the place alone would do
-    assert "look like others" in reason(
-        GOOD, 0.34, 0.99, Agreement(0.999, 12, agreeing=12.0, lookalike=0.9), 0.8, 0.68
-    )
+    assert position_confidence(1 / 1.2 / 6, 0.05) == pytest.approx(0.6827, abs=1e-4)

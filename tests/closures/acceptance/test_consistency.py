@@ -11,36 +11,33 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.verify import Features
-from semloc_logs.closures.acceptance.calibration import AGREEMENT
+from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT
 from semloc_logs.closures.acceptance.consistency import (
-    LEAST,
+    MIN_VOTE,
     MOST_SLACK,
     NEAR,
     SLACK,
     TURN,
     TURN_DRIFT,
     _sums,
-    agree,
-    decide,
-    shares,
+    count_votes,
+    mode_shares,
 )
+from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.acceptance.placements import (
     ARM,
-    DRIFT,
     FAR,
     Placed,
-    asked_roads,
-    pairs_of,
+    contradicts_odometry,
     place,
-    strays,
 )
-from semloc_logs.closures.closure import Agreement, Alignment
-from semloc_logs.closures.query import SessionMap
+from semloc_logs.closures.closure import Agreement, Alignment, Closure, Features, Rejected
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import STREET_VOXEL, Settings
 
 F64 = NDArray[np.float64]
+Outcome = Closure | Rejected
 SETTINGS = Settings().resolved()
 MAP = yaw_transform(0.7, (40.0, -20.0, 1.0))  # target map from query map
 GOOD = Features(0.9, 0.9, 0.0, 0.9, 0.1, 0.2, 3.5, 3.0)
@@ -92,44 +89,52 @@ def alignment(
         900,
         5,
         GOOD,
-        Agreement(alone),
     )
 
 
 def decided(
     rows: list[Alignment], maps: dict[str, SessionMap] | None = None
-) -> dict[tuple[int, int], Alignment]:
+) -> dict[tuple[int, int], Outcome]:
     out = decide(rows, maps or MAPS, SETTINGS)
     assert len(out) == len(rows)
-    return {(a.query_keyframe, a.target_keyframe): a for a in out}
+    return {(o.alignment.query_keyframe, o.alignment.target_keyframe): o for o in out}
+
+
+def accepted(outcome: Outcome) -> bool:
+    return isinstance(outcome, Closure)
+
+
+def sentence(outcome: Outcome) -> str:
+    assert isinstance(outcome, Rejected)
+    return outcome.sentence
 
 
 def test_neighbours_of_one_transform_agree_and_are_counted_by_hand() -> None:
     found = decided([alignment(k, 0.5) for k in range(20, 31)])
-    middle = found[25, 25].agreement
-    assert (middle.neighbours, round(middle.agreeing, 9), middle.opposing) == (10, 5.0, 0.0)
-    assert found[20, 20].agreement.neighbours == 10  # all within 25 m of road
-    far = decided([alignment(k, 0.5) for k in (10, 30, 50)])[30, 30].agreement
-    assert (far.neighbours, far.agreeing, round(far.far_agreeing, 9)) == (0, 0.0, 1.0)
+    middle = found[25, 25].decision.agreement
+    assert (middle.neighbours, round(middle.support, 9), middle.conflict) == (10, 5.0, 0.0)
+    assert found[20, 20].decision.agreement.neighbours == 10  # all within 25 m of road
+    far = decided([alignment(k, 0.5) for k in (10, 30, 50)])[30, 30].decision.agreement
+    assert (far.neighbours, far.support, round(far.far_support, 9)) == (0, 0.0, 1.0)
 
 
 def test_one_that_lies_elsewhere_opposes_and_is_opposed() -> None:
     moved = yaw_transform(0.0, (8.0, 0.0, 0.0))
     rows = [alignment(k, 0.9, moved if k == 25 else None) for k in range(20, 31)]
     found = decided(rows)
-    assert found[25, 25].agreement.opposing == pytest.approx(9.0)
-    assert found[25, 25].agreement.agreeing == 0.0
-    assert found[24, 24].agreement.opposing == pytest.approx(0.9)
-    assert found[24, 24].agreement.agreeing == pytest.approx(0.9 * 9)
-    assert found[25, 25].probability < found[24, 24].probability
+    assert found[25, 25].decision.agreement.conflict == pytest.approx(9.0)
+    assert found[25, 25].decision.agreement.support == 0.0
+    assert found[24, 24].decision.agreement.conflict == pytest.approx(0.9)
+    assert found[24, 24].decision.agreement.support == pytest.approx(0.9 * 9)
+    assert found[25, 25].decision.probability < found[24, 24].decision.probability
 
 
 @pytest.mark.parametrize(("off", "agrees"), [(0.3, True), (3.0, False)])
 def test_what_odometry_may_drift_is_no_contradiction(off: float, agrees: bool) -> None:
     rows = [alignment(20, 0.9), alignment(24, 0.9, yaw_transform(0.0, (off, 0.0, 0.0)))]
-    a = decided(rows)[20, 20].agreement
-    assert (a.agreeing > 0) == agrees
-    assert (a.opposing > 0) == (not agrees)
+    a = decided(rows)[20, 20].decision.agreement
+    assert (a.support > 0) == agrees
+    assert (a.conflict > 0) == (not agrees)
 
 
 def test_a_turned_neighbour_does_not_agree() -> None:
@@ -137,7 +142,7 @@ def test_a_turned_neighbour_does_not_agree() -> None:
     turned = here @ yaw_transform(0.4) @ inverse(here)
     assert decided([alignment(20, 0.9), alignment(24, 0.9, turned)])[
         20, 20
-    ].agreement.opposing == pytest.approx(0.9)
+    ].decision.agreement.conflict == pytest.approx(0.9)
 
 
 def test_neighbours_rescue_a_right_one_and_a_second_choice_that_agrees_is_promoted() -> None:
@@ -146,16 +151,20 @@ def test_neighbours_rescue_a_right_one_and_a_second_choice_that_agrees_is_promot
         alignment(25, 0.95, at=50),
     ]
     lenient = Settings.model_validate({"closures": {"min_probability": 0.91}}).resolved()
-    first, second = (a for a in decide(rows, MAPS, lenient) if a.query_keyframe == 25)
-    assert (first.target_keyframe, first.accepted, first.agreement.alone) == (25, True, 0.9)
-    assert (second.target_keyframe, second.accepted) == (50, False)
-    assert first.probability > 0.91 > second.probability
+    first, second = (o for o in decide(rows, MAPS, lenient) if o.alignment.query_keyframe == 25)
+    assert (first.alignment.target_keyframe, first.decision.agreement.own_probability) == (25, 0.9)
+    assert (second.alignment.target_keyframe, accepted(first), accepted(second)) == (
+        50,
+        True,
+        False,
+    )
+    assert first.decision.probability > 0.91 > second.decision.probability
 
 
 def test_of_a_query_one_place_of_each_target_is_accepted() -> None:
     found = decided([alignment(25, 0.999), alignment(25, 0.998, at=50)])
-    assert found[25, 25].accepted
-    assert "fits better" in found[25, 50].reason
+    assert accepted(found[25, 25])
+    assert sentence(found[25, 50]) == "another place of the same session fits better"
 
 
 @pytest.mark.parametrize(
@@ -169,11 +178,13 @@ def test_of_a_query_one_place_of_each_target_is_accepted() -> None:
 )
 def test_of_two_poses_in_a_place_each_has_its_share(beside: F64, share: float) -> None:
     two = [alignment(25, 0.6), alignment(25, 0.2, beside)]
-    assert shares(place(two, MAPS), 0.3) == pytest.approx([share, 1 - share if share < 1 else 1])
+    assert mode_shares(place(two, MAPS), 0.3) == pytest.approx(
+        [share, 1 - share if share < 1 else 1]
+    )
     turned = dataclasses.replace(alignment(25, 0.2), target_T_query=yaw_transform(np.radians(9.0)))
-    assert shares(place([two[0], turned], MAPS), 0.3).tolist() == [1, 1]
+    assert mode_shares(place([two[0], turned], MAPS), 0.3).tolist() == [1, 1]
     others = [alignment(25, 0.6), alignment(26, 0.2), alignment(25, 0.2, query="b", target="a")]
-    assert shares(place(others, MAPS), 0.3).tolist() == [1, 1, 1]
+    assert mode_shares(place(others, MAPS), 0.3).tolist() == [1, 1, 1]
 
 
 def test_neighbours_do_not_choose_among_the_poses_of_a_place() -> None:
@@ -182,16 +193,16 @@ def test_neighbours_do_not_choose_among_the_poses_of_a_place() -> None:
     """
     sure = [alignment(k, 0.999) for k in range(20, 31) if k != 25]
     alone = decide([*sure, alignment(25, 0.6)], MAPS, SETTINGS)
-    assert [a.accepted for a in alone if a.query_keyframe == 25] == [True]
+    assert [accepted(o) for o in alone if o.alignment.query_keyframe == 25] == [True]
     both = decide(
         [*sure, alignment(25, 0.6), alignment(25, 0.2, yaw_transform(0.0, (1.0, 0.0, 0.0)))],
         MAPS,
         SETTINGS,
     )
-    reasons = [a.reason for a in both if a.query_keyframe == 25]
+    reasons = [sentence(o) for o in both if o.alignment.query_keyframe == 25]
     assert len(reasons) == 2
-    assert "of the poses in this place it is right with 86%" in reasons[0]
-    assert all(a.accepted for a in both if a.query_keyframe != 25)
+    assert "other poses fit this place too: this one has 86 % of the odds" in reasons[0]
+    assert all(accepted(o) for o in both if o.alignment.query_keyframe != 25)
 
 
 def test_sessions_that_overlap_each_other_do_not_contradict() -> None:
@@ -199,7 +210,7 @@ def test_sessions_that_overlap_each_other_do_not_contradict() -> None:
     rows = [alignment(k, 0.99) for k in range(20, 31)]
     both = rows + [dataclasses.replace(a, target_session="c") for a in rows]
     for a in decide(both, maps, SETTINGS):
-        assert (a.agreement.neighbours, a.agreement.opposing) == (10, 0.0)
+        assert (a.decision.agreement.neighbours, a.decision.agreement.conflict) == (10, 0.0)
 
 
 STRAIGHT = np.array([yaw_transform(0.0, (2.0 * i, 0.0, 0.0)) for i in range(100)])
@@ -221,11 +232,11 @@ def in_street(k: int, at: int, query: str = "a", target: str = "b") -> Alignment
 def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself() -> None:
     refuted, right = sorted(
         decide([in_street(5, 50, target="a"), in_street(5, 5)], STREETS, SETTINGS),
-        key=lambda a: a.target_session,
+        key=lambda o: o.alignment.target_session,
     )
-    assert refuted.probability == 0.0
-    assert "odometry" in refuted.reason
-    assert right.probability > 0.9
+    assert refuted.decision.probability == 0.0
+    assert "contradicts the session's own odometry" in sentence(refuted)
+    assert right.decision.probability > 0.9
 
 
 @pytest.mark.parametrize(
@@ -293,59 +304,62 @@ def test_alignments_of_one_pair_of_sessions_belong_together() -> None:
 
 def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_else() -> None:
     once = [in_street(k, k, target="c") for k in COPIED]
-    assert all(a.accepted and a.agreement.lookalike == 0 for a in decide(once, STREETS, SETTINGS))
+    assert all(
+        accepted(a) and a.decision.agreement.ambiguity == 0 for a in decide(once, STREETS, SETTINGS)
+    )
     twice = [in_street(k, at) for k in COPIED for at in (k, k + 30)]
     there = [in_street(k, k, "c", "a") for k in COPIED]
     back = [in_street(k, k, "b", "c") for k in COPIED]
     for a in decide(once + twice + there + back, STREETS, SETTINGS):
-        assert a.agreement.lookalike > 0.9
-        assert not a.accepted
-        assert "look like others" in a.reason
+        assert a.decision.agreement.ambiguity > 0.9
+        assert "ambiguous place" in sentence(a)
 
 
 def test_two_queries_of_a_street_do_not_make_all_of_it_look_like_others() -> None:
     right = [in_street(k, k, target="c") for k in range(2, 60)]
     twice = [in_street(k, at) for k in (30, 31) for at in (k - 25, k + 15)]
-    found = [a for a in decide(right + twice, STREETS, SETTINGS) if a.target_session == "c"]
-    assert all(a.accepted and a.agreement.lookalike < 0.05 for a in found)
+    found = [
+        a for a in decide(right + twice, STREETS, SETTINGS) if a.alignment.target_session == "c"
+    ]
+    assert all(accepted(a) and a.decision.agreement.ambiguity < 0.05 for a in found)
 
 
 @pytest.mark.parametrize(("road", "alike"), [(0.0, True), (2000.0, False)])
 def test_a_second_place_as_far_off_as_the_target_may_have_drifted_is_the_same(
     road: float, alike: bool
 ) -> None:
-    """The target drove the street twice; the second time it lies 24 m on, after so much ``road``."""
+    """The target drove the street twice; the second time it lies 24 m on, after ``road`` metres."""
     twice = SimpleNamespace(
         map_T_base=np.tile(STRAIGHT, (2, 1, 1)),
         distance=np.r_[STREETS["b"].distance, road + STREETS["b"].distance],
     )
     rows = [in_street(k, at) for k in COPIED for at in (k, 100 + k + 12)]
     found = decide(rows, {**STREETS, "b": cast(SessionMap, twice)}, SETTINGS)
-    assert all((a.agreement.lookalike > 0.9) == alike for a in found)
+    assert all((a.decision.agreement.ambiguity > 0.9) == alike for a in found)
 
 
 def test_three_sessions_that_contradict_each_other_look_like_others() -> None:
     """Of b and c, which lie on each other, a is in b where it is, and in c one block on."""
     rows = [in_street(k, k) for k in COPIED] + [in_street(k, k, "b", "c") for k in COPIED]
     consistent = decide(rows + [in_street(k, k, target="c") for k in COPIED], STREETS, SETTINGS)
-    assert all(a.accepted and a.agreement.lookalike == 0 for a in consistent)
+    assert all(accepted(a) and a.decision.agreement.ambiguity == 0 for a in consistent)
     for a in decide(rows + [in_street(k, k + 40, target="c") for k in COPIED], STREETS, SETTINGS):
-        if "a" in (a.query_session, a.target_session):
-            assert a.agreement.lookalike > 0.9
-            assert not a.accepted
+        if "a" in (a.alignment.query_session, a.alignment.target_session):
+            assert a.decision.agreement.ambiguity > 0.9
+            assert not accepted(a)
 
 
-def test_streets_that_a_session_itself_has_twice_look_alike() -> None:
+def test_streets_that_a_session_itself_has_twice_are_ambiguous() -> None:
     rows = [in_street(k, k) for k in COPIED] + [in_street(k, k + 40, target="a") for k in COPIED]
     for a in decide(rows, STREETS, SETTINGS):
-        assert a.agreement.lookalike > 0.9
-        assert not a.accepted
+        assert a.decision.agreement.ambiguity > 0.9
+        assert not accepted(a)
 
 
 @pytest.mark.parametrize("at", [lambda k: (7 * k) % 100, lambda k: k + 9])
 def test_second_places_that_do_not_agree_or_lie_in_the_same_view_are_no_copies(at: Any) -> None:
     rows = [in_street(k, where) for k in COPIED for where in (k, at(k))]
-    assert all(a.agreement.lookalike < 0.02 for a in decide(rows, STREETS, SETTINGS))
+    assert all(a.decision.agreement.ambiguity < 0.02 for a in decide(rows, STREETS, SETTINGS))
 
 
 def test_a_second_place_that_fits_much_worse_is_no_copy() -> None:
@@ -353,14 +367,14 @@ def test_a_second_place_that_fits_much_worse_is_no_copy() -> None:
     rows = [in_street(k, k) for k in COPIED] + [
         dataclasses.replace(in_street(k, k + 30), features=worse) for k in COPIED
     ]
-    assert all(a.agreement.lookalike == 0 for a in decide(rows, STREETS, SETTINGS))
+    assert all(a.decision.agreement.ambiguity == 0 for a in decide(rows, STREETS, SETTINGS))
 
 
 def test_without_odometry_nobody_is_a_neighbour() -> None:
     maps = {"a": session(ROAD, posed=False), "b": MAPS["b"]}
     for a in decide([alignment(k, 0.992) for k in range(20, 24)], maps, SETTINGS):
-        assert a.agreement == Agreement(0.992)
-        assert a.accepted
+        assert a.decision.agreement == Agreement(0.992, 0, 0, 0, 0, 0, 0)
+        assert accepted(a)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -378,10 +392,15 @@ def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
     ]
     shuffled = [rows[k] for k in rng.permutation(len(rows))]
 
-    def keys(found: list[Alignment]) -> list[Any]:
+    def keys(found: list[Outcome]) -> list[Any]:
         return [
-            (a.query_keyframe, a.target_keyframe, a.probability, a.agreement, a.reason)
-            for a in found
+            (
+                o.alignment.query_keyframe,
+                o.alignment.target_keyframe,
+                o.decision,
+                accepted(o) or sentence(o),
+            )
+            for o in found
         ]
 
     maps = {**STREETS, **MAPS, "b": STREETS["b"]}
@@ -391,8 +410,8 @@ def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
 def test_of_none() -> None:
     assert decide([], MAPS, SETTINGS) == []
     nothing = place([], {})
-    assert len(agree(nothing, 0.3)) == len(AGREEMENT)
-    assert not strays(nothing, 0.3).any()
+    assert len(count_votes(nothing, 0.3)) == 0
+    assert not contradicts_odometry(nothing, 0.3).any()
 
 
 def slow_sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> list[F64]:
@@ -403,31 +422,31 @@ def slow_sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) ->
     more probable than an agreeing one.
     """
     scale = voxel_size / STREET_VOXEL
-    loud = np.max(probabilities, axis=0) >= LEAST
-    voices = group.part(loud)
-    said = [np.where(p >= LEAST, p, 0.0)[loud] for p in probabilities]
+    voting = np.max(probabilities, axis=0) >= MIN_VOTE
+    voters = group.part(voting)
+    votes = [np.where(p >= MIN_VOTE, p, 0.0)[voting] for p in probabilities]
     out = [np.zeros((4, len(group))) for _ in probabilities]
     for k in range(len(group)):
-        along = np.abs(voices.road - group.road[k])
-        there = np.flatnonzero((along <= FAR * scale) & (voices.query != group.query[k]))
+        along = np.abs(voters.road - group.road[k])
+        there = np.flatnonzero((along <= FAR * scale) & (voters.query != group.query[k]))
         if not len(there):
             continue
-        heard = voices.part(there)
+        others_there = voters.part(there)
         along = along[there]
-        agrees = slow_agrees(group.part(np.array([k])), heard, along, voxel_size)
-        _, first, number = np.unique(heard.query, return_index=True, return_inverse=True)
+        agrees = slow_agrees(group.part(np.array([k])), others_there, along, voxel_size)
+        _, first, number = np.unique(others_there.query, return_index=True, return_inverse=True)
         near = along[first] <= NEAR * scale
-        for sums, p in zip(out, said, strict=True):
-            for_it = np.zeros(len(first))
-            against = np.zeros(len(first))
-            np.maximum.at(for_it, number, np.where(agrees, p[there], 0.0))
-            np.maximum.at(against, number, np.where(agrees, 0.0, p[there]))
-            against[against <= for_it] = 0.0
+        for sums, p in zip(out, votes, strict=True):
+            support = np.zeros(len(first))
+            conflict = np.zeros(len(first))
+            np.maximum.at(support, number, np.where(agrees, p[there], 0.0))
+            np.maximum.at(conflict, number, np.where(agrees, 0.0, p[there]))
+            conflict[conflict <= support] = 0.0
             sums[:, k] = [
-                for_it[near].sum(),
-                against[near].sum(),
-                for_it[~near].sum(),
-                against[~near].sum(),
+                support[near].sum(),
+                conflict[near].sum(),
+                support[~near].sum(),
+                conflict[~near].sum(),
             ]
     return out
 
@@ -442,7 +461,7 @@ def slow_agrees(one: Placed, others: Placed, along: F64, voxel_size: float) -> N
     turn = np.arccos(np.clip((trace - 1) / 2, -1, 1))
     sigma = np.hypot(one.sigma[0], others.sigma)
     allowed = np.minimum(SLACK * voxel_size + 2 * sigma, MOST_SLACK * voxel_size)
-    drift = DRIFT * (along + np.abs(others.target_road - one.target_road[0])) + ARM * along
+    drift = ODOMETRY_DRIFT * (along + np.abs(others.target_road - one.target_road[0])) + ARM * along
     return np.asarray(
         (off <= allowed + drift) & (turn <= TURN + TURN_DRIFT * along * STREET_VOXEL / voxel_size)
     )
@@ -450,7 +469,7 @@ def slow_agrees(one: Placed, others: Placed, along: F64, voxel_size: float) -> N
 
 @given(st.integers(0, 10_000), st.sampled_from([0.3, 0.05]))
 @settings(max_examples=40, deadline=None)
-def test_voices_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
+def test_voters_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
     """Alignments of a bent road, right, moved, turned or in other places, as many as three of a
     query, against the slow count.
     """
@@ -480,7 +499,7 @@ def test_voices_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
         rng.uniform(0, 1, 50) ** 4,
         np.ones(50, bool),
     )
-    probabilities = placed.alone, placed.unrivalled
+    probabilities = placed.own_probability, placed.probability_ignoring_rivals
     for found, expected in zip(
         _sums(placed, probabilities, voxel_size),
         slow_sums(placed, probabilities, voxel_size),

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from semloc_logs.simulation.meshes import landmarks, objects
 from semloc_logs.simulation.meshes.buildings import building
 from semloc_logs.simulation.meshes.fences import FENCES
-from semloc_logs.simulation.meshes.furniture import CLUTTER, POLES
+from semloc_logs.simulation.meshes.furniture import CLUTTER
 from semloc_logs.simulation.meshes.shapes import Parts, Rng, boxes, loft, snow_cover, tubes
 from semloc_logs.simulation.meshes.trees import SPECIES
 from semloc_logs.simulation.meshes.world import (
@@ -115,9 +115,23 @@ SIZES: dict[str, tuple[Make, Span, Span, Span, set[int]]] = {
         {BUILDING, VEGETATION},
     ),
 }
+POLES = [
+    "lamp",
+    "double",
+    "park",
+    "sign",
+    "signals",
+    "bollard",
+    "mast",
+    "flag",
+    "gantry",
+    "crossing",
+    "parking",
+    "street",
+]
 STANDING: dict[str, Make] = {
     **{name: row[0] for name, row in SIZES.items()},
-    **{kind: partial(objects.pole, kind=kind) for kind in dict.fromkeys(POLES)},
+    **{kind: partial(objects.pole, kind=kind) for kind in POLES},
     **{kind: partial(objects.street_clutter, kind=kind) for kind in CLUTTER},
     "bicycle_stand": objects.bicycle_stand,
 }

@@ -129,9 +129,9 @@ def test_an_empty_world_is_refused() -> None:
         Scene(MeshBuilder(lambda x, y: x).build())
 
 
-def test_without_embreex_the_error_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
-    with pytest.raises(SemlocError, match="embreex"):
+def test_without_embreex_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    with pytest.raises(SemlocError, match=r"the extra 'sim': pip install 'semloc_logs\[sim\]'"):
         Scene(
             World(
                 np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32), np.zeros(1, np.uint8)

@@ -25,6 +25,7 @@ from semloc_logs.simulation.meshes.world import (
 )
 from semloc_logs.simulation.output.drive_log import FORMATS, write_session
 from semloc_logs.simulation.sensors.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
+from semloc_logs.simulation.sensors.sensor import Sensor
 
 SECOND = 10**9
 
@@ -79,7 +80,7 @@ def test_cameras_see_floor_and_walls_where_they_are(
         path,
         trajectory,
         [],
-        shots=simulate_cameras(yard, trajectory, sensor, rate_hz=2.0),
+        shots=simulate_cameras(yard, trajectory, Sensor(sensor)),
         format=format_,
     )
     seen = clouds(path)

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semloc_logs.closures.query import SessionMap
 from semloc_logs.errors import LogError
 from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.drives.drive import simulate_drive
@@ -21,7 +21,8 @@ from semloc_logs.simulation.drives.trajectory import drive, smooth_line
 from semloc_logs.simulation.drives.vehicle_sensors import VehicleSensors
 from semloc_logs.simulation.meshes.world import BUILDING, ROAD, MeshBuilder, World, box
 from semloc_logs.simulation.output.drive_log import FORMATS, write_session
-from semloc_logs.simulation.sensors.lidar import MODELS
+from semloc_logs.simulation.plan import Route, Town
+from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.voxels.store import Keyframe, read_keyframe
 from semloc_logs.workspace import Workspace
@@ -48,7 +49,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     out = {}
     for name, suffix in FORMATS.items():
         out[name] = folder / f"{name}{suffix}"
-        frames = simulate_drive(yard(), trajectory, MODELS["vlp16"], rate_hz=2.0, columns=300)
+        frames = simulate_drive(yard(), trajectory, Sensor("vlp16", 2.0, 300))
         write_session(
             out[name],
             trajectory,
@@ -150,14 +151,10 @@ def test_sessions_come_as_ros2_bags_and_are_replaced(
     for overwrite in (False, True):
         truth = simulate_sessions(
             tmp_path,
-            seed=1,
-            sessions=1,
-            length_m=50,
-            sensor="vlp16",
-            rate_hz=0.2,
+            Town(1),
+            Route(1, 50),
+            Sensor("vlp16", 0.2, drift=0.0, imu_hz=50.0),
             format="ros2",
-            drift=0.0,
-            imu_hz=50.0,
             overwrite=overwrite,
         )
     assert sorted(p.name for p in tmp_path.iterdir()) == [

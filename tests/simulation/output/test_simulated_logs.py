@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,9 @@ from semloc_logs.simulation.drives.drive import DriveFrame, mounting, simulate_d
 from semloc_logs.simulation.drives.trajectory import Trajectory, drive, smooth_line
 from semloc_logs.simulation.meshes.world import ROAD, WALL, MeshBuilder, World, box
 from semloc_logs.simulation.output.drive_log import write_session, write_truth
-from semloc_logs.simulation.sensors.lidar import MODELS
+from semloc_logs.simulation.plan import Route, Town, plan_sessions
+from semloc_logs.simulation.sensors.lidar_models import MODELS
+from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions
 
 START = 1_760_000_000_123_456_789
@@ -48,7 +50,7 @@ def yard() -> World:
 
 @pytest.fixture(scope="module")
 def frames(yard: World, trajectory: Trajectory) -> list[DriveFrame]:
-    return list(simulate_drive(yard, trajectory, MODELS["vlp16"], rate_hz=2.0, columns=300))
+    return list(simulate_drive(yard, trajectory, Sensor("vlp16", 2.0, 300)))
 
 
 def test_drive_frames_are_on_time_and_in_place(
@@ -57,18 +59,15 @@ def test_drive_frames_are_on_time_and_in_place(
     assert [f.stamp_ns for f in frames[:3]] == [START, START + 500_000_000, START + 1_000_000_000]
     assert frames[-1].stamp_ns + 100_000_000 <= trajectory.stamps_ns[-1]
     for frame in frames:
-        walls = apply(frame.world_T_base, frame.points_base)[frame.sweep.labels == WALL]
+        points = apply(frame.world_T_base @ frame.base_T_lidar, frame.sweep.points)
+        walls = points[frame.sweep.labels == WALL]
         assert np.median(np.abs(walls[:, 1])) == pytest.approx(5.5, abs=0.05)
 
 
 def test_label_noise_leaves_the_points(
     yard: World, trajectory: Trajectory, frames: list[DriveFrame]
 ) -> None:
-    noisy = list(
-        simulate_drive(
-            yard, trajectory, MODELS["vlp16"], rate_hz=2.0, columns=300, label_noise=0.15
-        )
-    )
+    noisy = list(simulate_drive(yard, trajectory, Sensor("vlp16", 2.0, 300, label_noise=0.15)))
     wrong = np.concatenate(
         [a.sweep.labels != b.sweep.labels for a, b in zip(frames, noisy, strict=True)]
     )
@@ -214,9 +213,8 @@ def test_a_folder_that_is_not_there_is_an_error(tmp_path: Path, trajectory: Traj
 
 
 def test_sessions_share_a_town_and_have_truth(tmp_path: Path) -> None:
-    truth = simulate_sessions(
-        tmp_path, seed=2, sessions=2, length_m=60, sensor="vlp16", rate_hz=0.5
-    )
+    drives = Town(2), Route(2, 60), Sensor("vlp16", 0.5)
+    truth = simulate_sessions(tmp_path, *drives)
     entries = json.loads(truth.read_text())
     assert entries == {f"session_{k}.mcap": {"trajectory": f"session_{k}.tum"} for k in (0, 1)}
     for k in (0, 1):
@@ -225,24 +223,34 @@ def test_sessions_share_a_town_and_have_truth(tmp_path: Path) -> None:
             60, abs=8
         )
     with pytest.raises(SemlocError, match="already has"):
-        simulate_sessions(tmp_path, seed=2, sessions=2, length_m=60, sensor="vlp16", rate_hz=0.5)
+        simulate_sessions(tmp_path, *drives)
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"sessions": 0},
-        {"length_m": float("nan")},
-        {"length_m": 1e9},
-        {"sensor": "sonar"},
-        {"rate_hz": 0.0},
-        {"format": "db3"},
-        {"label_noise": 2.0},
+        lambda: Route(0),
+        lambda: Route(length_m=float("nan")),
+        lambda: Route(length_m=1e9),
+        lambda: Sensor("sonar"),
+        lambda: Sensor(rate_hz=0.0),
+        lambda: Sensor(label_noise=2.0),
+        lambda: Sensor(drift=0.3),
+        lambda: Sensor(wet=1.1),
+        lambda: Sensor(imu_hz=0.5),
+        lambda: plan_sessions(Town(), Route(), "db3"),
+        lambda: plan_sessions(Town(seasons=()), Route()),
+        lambda: plan_sessions(Town(daytimes=("midnight",)), Route()),
     ],
 )
-def test_impossible_settings_are_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
+def test_impossible_settings_are_refused(wrong: Callable[[], object]) -> None:
     with pytest.raises(SettingsError):
-        simulate_sessions(tmp_path / "out", **wrong)
+        wrong()
+
+
+def test_an_unknown_format_writes_nothing(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="choose one of mcap"):
+        simulate_sessions(tmp_path / "out", Town(), Route(), Sensor(), format="db3")
     assert not (tmp_path / "out").exists()
 
 

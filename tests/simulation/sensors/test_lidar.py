@@ -9,14 +9,9 @@ import pytest
 
 from semloc_logs.numerics.transforms import apply, interpolate, yaw_transform
 from semloc_logs.simulation.meshes.world import CAR, POLE, SIDEWALK, WALL, MeshBuilder, Scene, box
-from semloc_logs.simulation.sensors.lidar import (
-    CONFUSIONS,
-    MODELS,
-    beam_directions,
-    corrupt_labels,
-    full_sweep,
-    sweep,
-)
+from semloc_logs.simulation.sensors.label_errors import CONFUSIONS, corrupt_labels
+from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
+from semloc_logs.simulation.sensors.lidar_models import MODELS, beam_directions
 
 QUIET = replace(MODELS["hdl32"], noise=0.0, beam_bias=0.0, pointing_deg=0.0, divergence=0.0)
 
@@ -46,7 +41,8 @@ def misplaced(points: np.ndarray, labels: np.ndarray) -> float:
 
 def test_points_lie_on_the_walls_of_their_label() -> None:
     pose = yaw_transform(0.7, (1.0, -2.0, 1.9))
-    points, labels = sweep(room(), pose, np.random.default_rng(0), QUIET)
+    turn = full_sweep(room(), pose, np.random.default_rng(0), QUIET)
+    points, labels = turn.points, turn.labels
     assert points.dtype == np.float32
     assert set(np.unique(labels)) == {SIDEWALK, WALL, POLE}
     assert len(points) > 0.8 * 32 * 1500
@@ -56,7 +52,8 @@ def test_points_lie_on_the_walls_of_their_label() -> None:
 def test_noise_has_its_size() -> None:
     noisy = replace(QUIET, noise=0.05)
     pose = yaw_transform(0.0, (0.0, 0.0, 1.9))
-    points, labels = sweep(room(), pose, np.random.default_rng(0), noisy)
+    turn = full_sweep(room(), pose, np.random.default_rng(0), noisy)
+    points, labels = turn.points, turn.labels
     straight = (labels == WALL) & (np.abs(points[:, 0]) < 0.5) & (np.abs(points[:, 2]) < 0.5)
     assert np.std(np.abs(points[straight, 1])) == pytest.approx(0.05, rel=0.2)
 
@@ -65,7 +62,7 @@ def test_the_same_generator_gives_the_same_sweep() -> None:
     pose = yaw_transform(0.0, (0.0, 0.0, 1.9))
     scene = room()
     first, again = (
-        sweep(scene, pose, np.random.default_rng(5), MODELS["vlp16"])[0] for _ in range(2)
+        full_sweep(scene, pose, np.random.default_rng(5), MODELS["vlp16"]).points for _ in range(2)
     )
     np.testing.assert_array_equal(first, again)
 
@@ -76,8 +73,7 @@ def test_range_and_sector_are_kept() -> None:
         yaw_transform(0.0, (0.0, 0.0, 1.9)),
         np.random.default_rng(0),
         QUIET,
-        max_range=7.0,
-        sector=(-0.8, 0.8),
+        SweepOptions(max_range=7.0, sector=(-0.8, 0.8)),
     )
     distance = np.linalg.norm(turn.points, axis=1)
     assert distance.max() < 7.0
@@ -100,7 +96,9 @@ def test_traffic_hides_what_is_behind_it() -> None:
     builder = MeshBuilder(lambda x, y: np.zeros_like(x))
     builder.add(box(1.0, 2.0, 4.0, x=5.0), CAR, ground="none")
     pose = yaw_transform(0.0, (0.0, 0.0, 1.9))
-    turn = full_sweep(room(), pose, np.random.default_rng(0), QUIET, traffic=Scene(builder.build()))
+    turn = full_sweep(
+        room(), pose, np.random.default_rng(0), QUIET, SweepOptions(traffic=Scene(builder.build()))
+    )
     cars = turn.points[turn.labels == CAR]
     front = cars[np.abs(cars[:, 1]) < 0.9]
     assert front[:, 0] == pytest.approx(4.5, abs=1e-3)
@@ -111,7 +109,7 @@ def test_traffic_hides_what_is_behind_it() -> None:
 def test_a_moving_sensor_measures_in_the_frame_of_each_moment() -> None:
     start = yaw_transform(0.0, (0.0, 0.0, 1.9))
     end = yaw_transform(0.1, (0.8, 0.1, 1.9))
-    turn = full_sweep(room(), start, np.random.default_rng(0), QUIET, world_T_end=end)
+    turn = full_sweep(room(), start, np.random.default_rng(0), QUIET, SweepOptions(world_T_end=end))
     still = apply(start, turn.points)
     poses = interpolate(
         np.array([0, 10**9]), np.stack([start, end]), (turn.turn * 1e9).astype(np.int64)

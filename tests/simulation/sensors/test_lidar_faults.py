@@ -27,8 +27,8 @@ from semloc_logs.simulation.sensors.echoes import (
     reflectance,
 )
 from semloc_logs.simulation.sensors.label_errors import CONFUSIONS, corrupt_labels
-from semloc_logs.simulation.sensors.lidar import MODELS, full_sweep
-from semloc_logs.simulation.sensors.lidar_models import beam_directions, is_blocked
+from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
+from semloc_logs.simulation.sensors.lidar_models import MODELS, beam_directions, is_blocked
 
 PERFECT = replace(
     MODELS["hdl64"], noise=0.0, beam_bias=0.0, pointing_deg=0.0, divergence=0.0, lift=(), blocked=()
@@ -44,7 +44,8 @@ def wall(x: float = 10.0) -> MeshBuilder:
 
 def ahead(scene: Scene, model: str = "hdl64", **changes: Any) -> np.ndarray:
     sensor = replace(PERFECT, **changes)
-    return full_sweep(scene, np.eye(4), np.random.default_rng(3), sensor, sector=(-0.5, 0.5)).points
+    options = SweepOptions(sector=(-0.5, 0.5))
+    return full_sweep(scene, np.eye(4), np.random.default_rng(3), sensor, options).points
 
 
 def test_noise_is_along_the_beam() -> None:
@@ -62,7 +63,7 @@ def test_every_beam_has_a_bias_of_its_own() -> None:
         np.eye(4),
         np.random.default_rng(0),
         replace(PERFECT, beam_bias=0.02),
-        sector=(-0.3, 0.3),
+        SweepOptions(sector=(-0.3, 0.3)),
     )
     error = np.linalg.norm(turn.points, axis=1) * (1 - 10.0 / turn.points[:, 0])
     per_beam = np.array([error[turn.ring == k].mean() for k in range(64)])

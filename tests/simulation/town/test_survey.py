@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from semloc_logs.errors import LogError, SettingsError
 from semloc_logs.simulation.drives.trajectory import poses_along
 from semloc_logs.simulation.meshes.world import ROAD, Scene
+from semloc_logs.simulation.plan import Route, Town, plan_sessions
+from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.simulation.town.road_network import RoadNetwork
 from semloc_logs.simulation.town.street import build_street, street_ground
@@ -166,13 +168,9 @@ def test_sessions_drive_the_same_part_there_and_back(tmp_path: Path) -> None:
     path = write_kitti(tmp_path / "a.txt", eight(30.0))
     simulate_sessions(
         tmp_path / "s",
-        sessions=2,
-        trajectory=path,
-        part_m=(20, 90),
-        there_and_back=True,
-        sensor="vlp16",
-        rate_hz=0.2,
-        seasons=("summer", "snow"),
+        Town(seasons=("summer", "snow")),
+        Route(2, trajectory=path, part_m=(20, 90), there_and_back=True),
+        Sensor("vlp16", 0.2),
     )
     there, back = (np.loadtxt(tmp_path / "s" / f"session_{k}.tum")[:, 1:4] for k in (0, 1))
     for way in (there, back):
@@ -180,9 +178,9 @@ def test_sessions_drive_the_same_part_there_and_back(tmp_path: Path) -> None:
     assert 2.5 < np.linalg.norm(there[0] - back[-1]) < 5
     assert 2.5 < np.linalg.norm(there[-1] - back[0]) < 5
     with pytest.raises(SettingsError, match="give a part"):
-        simulate_sessions(tmp_path / "t", trajectory=path, part_m=(5000, 6000))
+        plan_sessions(Town(), Route(trajectory=path, part_m=(5000, 6000)))
     with pytest.raises(SettingsError, match="cannot go"):
-        simulate_sessions(tmp_path / "t", trajectory=path, part_m=(10, float("nan")))
+        plan_sessions(Town(), Route(trajectory=path, part_m=(10, float("nan"))))
 
 
 def test_a_drive_of_kitti_becomes_a_network(shared: Callable[[str], Path]) -> None:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semloc_logs.mapping.selection import submap_ranges
-from semloc_logs.mapping.session_fusion import fuse_ranges
+from semloc_logs.mapping.submap_fusion import fuse_ranges
 from semloc_logs.settings import Fusion, Settings
 from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import Keyframe

@@ -1,11 +1,12 @@
-"""Figures of whole logs: fusing beside what it cannot do without, and memory."""
+"""Whole logs: fusing beside its necessary parts, and memory."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from semloc_logs.benchmarks.whole_logs import _PARTS, peak_memory, profile_fuse
+from semloc_logs.benchmarks.speed.memory import peak_memory
+from semloc_logs.benchmarks.speed.profiles import SPANS, profile_fuse
 from semloc_logs.errors import SemlocError
 from semloc_logs.logs.session.session import open_session
 from semloc_logs.settings import Settings
@@ -48,9 +49,9 @@ def test_fusing_is_split_into_parts(lap: Lap, tmp_path: Path) -> None:
     )
     assert value["whole"] > value["reading"] > 0
     parts = {k: v for k, v in value.items() if k.startswith("part: ")}
-    # a renamed function would be missing
-    assert parts.keys() == {"part: rest", *(f"part: {p}" for p in _PARTS)}
-    assert min(parts.values()) >= 0
+    assert parts.keys() == {"part: rest", *(f"part: {span.name}" for span in SPANS)}
+    # a function that is no longer called takes no time
+    assert {part for part, seconds in parts.items() if seconds <= 0} <= {"part: picture"}
     assert parts["part: rest"] < 0.5 * sum(parts.values())
     assert len(rows) == 12
 

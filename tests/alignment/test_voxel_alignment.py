@@ -31,7 +31,19 @@ from semloc_logs.alignment.verify import (
     structure_mask,
     structure_scores,
     thin_points,
+from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix, same_place, yaw_between
+from semloc_logs.alignment.mask_grid import (
+    ANY_BIT,
+    FREE_BIT,
+    build_mask_grid,
+    class_bits,
+    look_up,
 )
+from semloc_logs.alignment.query_map import Query, structure_mask
+from semloc_logs.alignment.scores import structure_scores
+from semloc_logs.alignment.search import search, search_hypotheses
+from semloc_logs.alignment.target_map import Target
+from semloc_logs.alignment.tau import tau
 from semloc_logs.labels.space import UNLABELLED, cityscapes
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, empty_map
@@ -90,9 +102,9 @@ def test_class_bits_by_hand() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_masks_are_those_of_slow_loops(seed: int) -> None:
     cells = random_cells(seed)
-    level = build_level(block_map(cells), V, COARSE)
-    corner = np.rint(level.corner / V).astype(int)
-    expected = np.zeros(level.mask.shape, np.uint8)
+    grid = build_mask_grid(block_map(cells), V, COARSE)
+    corner = np.rint(grid.corner / V).astype(int)
+    expected = np.zeros(grid.mask.shape, np.uint8)
     for ijk, state in cells.items():
         if occupied(state):
             for d in np.ndindex(3, 3, 3):
@@ -103,11 +115,11 @@ def test_masks_are_those_of_slow_loops(seed: int) -> None:
         at = tuple(np.array(ijk) - corner)
         if state == FREE_STATE and expected[at] == 0:
             expected[at] = FREE_BIT
-    np.testing.assert_array_equal(level.mask, expected)
+    np.testing.assert_array_equal(grid.mask, expected)
 
 
 def test_look_ups_of_points() -> None:
-    level = build_level(block_map({(0, 0, 0): 2, (9, 9, 9): 254}), V, COARSE)
+    grid = build_mask_grid(block_map({(0, 0, 0): 2, (9, 9, 9): 254}), V, COARSE)
     points = np.array(
         [
             [0.25, 0.25, 0.25],
@@ -118,7 +130,7 @@ def test_look_ups_of_points() -> None:
             [-1e6, 0, 0],
         ]
     )
-    assert look_up(level, points).tolist() == [ANY_BIT | 2, ANY_BIT | 2, 0, FREE_BIT, 0, 0]
+    assert look_up(grid, points).tolist() == [ANY_BIT | 2, ANY_BIT | 2, 0, FREE_BIT, 0, 0]
 
 
 def slow_tau(
@@ -247,13 +259,15 @@ def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
     query_cells = moved(town(), truth)
     query = Query(block_map(query_cells), points_of(query_cells), V)
     start = np.array([yaw + 0.12, 3.3 + 1.1, -2.1 - 0.9, 0.4 + 0.4])
-    score, pose = search(target.level, query.evidence, start, (-0.12, 0.0, 0.12), 2)
-    score, pose = search(target.level, query.evidence, pose, np.linspace(-0.1, 0.1, 9).tolist(), 1)
+    score, pose = search(target.mask_grid, query.evidence, start, (-0.12, 0.0, 0.12), 2)
+    score, pose = search(
+        target.mask_grid, query.evidence, pose, np.linspace(-0.1, 0.1, 9).tolist(), 1
+    )
     assert score > 0.9
     found = pose_matrix(pose)
     assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 2.5 * V
     assert yaw_between(found, truth) < np.radians(5)
-    away, _ = search(target.level, query.evidence, start + np.array([0.5, 6, 6, 2]), (0.0,), 1)
+    away, _ = search(target.mask_grid, query.evidence, start + np.array([0.5, 6, 6, 2]), (0.0,), 1)
     assert away < 0.7 * score
 
     wrong = [Hypothesis(0, (yaw + 1.2 * k, 9.0 - k, 6.0 * k, 0.0), 3, 1.0) for k in (1, 2, 3)]
@@ -461,4 +475,9 @@ def test_the_same_place() -> None:
     assert same_place(a, yaw_transform(1.0 + np.radians(4), (2.0 + 3 * V, 3.0, 0.0)), V)
     assert not same_place(a, yaw_transform(1.0, (2.0 + 3.5 * V, 3.0, 0.0)), V)
     assert not same_place(a, yaw_transform(1.0 - np.radians(6), (2.0, 3.0, 0.0)), V)
+    # 100 m of road between them: 1 m and 2 degrees more
+    driven = yaw_transform(1.0 + np.radians(6), (2.0 + 3.5 * V, 3.0, 0.0))
+    assert not same_place(a, driven, V)
+    assert same_place(a, driven, V, 100.0)
+    assert not same_place(a, yaw_transform(1.0, (2.0 + 3.5 * V + 1.0, 3.0, 0.0)), V, 100.0)
     assert yaw_between(yaw_transform(3.1), yaw_transform(-3.1)) == pytest.approx(2 * np.pi - 6.2)

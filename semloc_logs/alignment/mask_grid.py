@@ -1,0 +1,118 @@
+"""A target map as a dense grid of bit masks, to look query voxels up in.
+
+Bit c of a cell is set where a voxel of coarse class c lies in the cell or beside it, so one look-up
+tells whether a query voxel is aligned to within a cell; another bit tells that it contradicts free
+space. The finest grid is the only one: coarser ones know nothing of contradictions, and in halls
+they lost places that a few hundred look-ups in the finest find.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
+from semloc_logs.voxels.keys import BLOCK, unpack
+
+FREE_BIT = 128  # observed free and nothing occupied beside it
+ANY_BIT = 64  # occupied, unlabelled included
+CLASS_BITS = 6  # of a mask
+# cells that a search may shift by; a grid is padded by twice as many, so that no look-up leaves it
+REACH = 4
+
+U8 = NDArray[np.uint8]
+F64 = NDArray[np.float64]
+Arrays = tuple[U8, F64, float]  # of a grid, in the order of its fields
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaskGrid:
+    """``mask`` (x, y, z) uint8 of a map, in cells of ``cell`` metres.
+
+    Cell (0, 0, 0) has its corner at ``corner`` (3,), metres in the map frame.
+    """
+
+    mask: U8
+    corner: F64
+    cell: float
+
+    @property
+    def arrays(self) -> Arrays:
+        """All of it, for compiled functions."""
+        return self.mask, self.corner, self.cell
+
+
+def class_bits(state: U8, coarse: U8) -> U8:
+    """Bit masks of voxel states: 1 << coarse class with ``ANY_BIT``; 0 where not occupied.
+
+    ``coarse`` (256,) maps classes to 0..5, or to more for none.
+    """
+    table = np.zeros(256, np.uint8)
+    for label in range(256):
+        if label not in (FREE_STATE, UNOBSERVED_STATE):
+            table[label] = ANY_BIT | (1 << coarse[label] if coarse[label] < CLASS_BITS else 0)
+    return table[state]
+
+
+def wanted_bits(state: U8, coarse: U8) -> U8:
+    """Bits that a target cell must share with query voxels: the class, or anything occupied.
+
+    The latter is for voxels of unknown class.
+    """
+    bits = class_bits(state, coarse)
+    known = bits & (ANY_BIT - 1)
+    return np.where(known, known, bits)
+
+
+def build_mask_grid(blocks: BlockMap, voxel_size: float, coarse: U8) -> MaskGrid:
+    """The masks of a map, with a margin that a search cannot leave."""
+    low, high = blocks.bounds()
+    margin = 2 * REACH
+    mask = np.zeros(tuple((high - low + 2 * margin).tolist()), np.uint8)
+    corners = unpack(blocks.keys).astype(np.int64) * BLOCK - low + margin
+    _fill(mask, corners, blocks.state, class_bits(np.arange(256, dtype=np.uint8), coarse))
+    return MaskGrid(mask, (low - margin).astype(float) * voxel_size, voxel_size)
+
+
+@njit(cache=True, nogil=True)
+def _fill(mask: U8, corners: NDArray[np.int64], state: U8, bits: U8) -> None:
+    """Set the bits of occupied voxels in their cells and the 26 beside; then the free cells'.
+
+    Blocks (n,) have their corner cells at ``corners`` (n, 3).
+    """
+    for want_free in (False, True):
+        for n in range(len(corners)):
+            for m in range(state.shape[1]):
+                value = state[n, m]
+                x = corners[n, 0] + m // BLOCK**2
+                y = corners[n, 1] + m // BLOCK % BLOCK
+                z = corners[n, 2] + m % BLOCK
+                if not want_free and bits[value]:
+                    for dx in range(-1, 2):
+                        for dy in range(-1, 2):
+                            for dz in range(-1, 2):
+                                mask[x + dx, y + dy, z + dz] |= bits[value]
+                elif want_free and value == FREE_STATE and mask[x, y, z] == 0:
+                    mask[x, y, z] = FREE_BIT
+
+
+@njit(cache=True, nogil=True)
+def _look_up(mask: U8, corner: F64, cell: float, points: F64) -> U8:
+    out = np.zeros(len(points), np.uint8)
+    for n in range(len(points)):
+        x = int(np.floor((points[n, 0] - corner[0]) / cell))
+        y = int(np.floor((points[n, 1] - corner[1]) / cell))
+        z = int(np.floor((points[n, 2] - corner[2]) / cell))
+        if 0 <= x < mask.shape[0] and 0 <= y < mask.shape[1] and 0 <= z < mask.shape[2]:
+            out[n] = mask[x, y, z]
+    return out
+
+
+def look_up(grid: MaskGrid, points: F64) -> U8:
+    """Masks (n,) at ``points`` (n, 3) in the target's frame, 0 outside."""
+    return np.asarray(
+        _look_up(grid.mask, grid.corner, grid.cell, np.ascontiguousarray(points, float))
+    )

@@ -1,0 +1,120 @@
+"""A fused session as later stages read it: its keyframes, poses and submaps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.labels.space import KNOWS_CLASSES
+from semloc_logs.tables.table import read_json, read_table
+from semloc_logs.voxels.store import Keyframe, poses_of, read_keyframe
+from semloc_logs.workspace import SessionFolder
+
+F64 = NDArray[np.float64]
+KEPT = 64  # keyframes in memory: a query of 20 m and the next one
+
+
+@dataclass(eq=False)
+class SessionMap:
+    """A fused session: what its tables and its session.json hold, read when it is needed."""
+
+    folder: SessionFolder
+
+    @cached_property
+    def json(self) -> dict[str, Any]:
+        """The content of session.json."""
+        return read_json(self.folder.session_json)
+
+    @cached_property
+    def frames(self) -> pa.Table:
+        """The table of keyframes."""
+        return read_table(self.folder.frames)
+
+    @cached_property
+    def map_T_base(self) -> F64:
+        """Poses (n, 4, 4) of the keyframes."""
+        return poses_of(self.frames)
+
+    @cached_property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """When each keyframe (n,) was measured."""
+        return np.asarray(self.frames["stamp_ns"].to_numpy())
+
+    @cached_property
+    def distance(self) -> F64:
+        """Road travelled up to each keyframe (n,), metres."""
+        return np.asarray(self.frames["distance"].to_numpy())
+
+    @cached_property
+    def ground_z(self) -> F64:
+        """Height of the ground below each keyframe (n,), metres in the map frame."""
+        return np.asarray(self.frames["ground_z"].to_numpy())
+
+    @cached_property
+    def origins(self) -> F64:
+        """Centres (n, 3) of the sensor in the base frame, metres."""
+        return self._vectors("origin")
+
+    def _vectors(self, name: str) -> F64:
+        """The columns name_x, name_y, name_z (n, 3) of the keyframes."""
+        return np.stack([self.frames[f"{name}_{c}"].to_numpy() for c in "xyz"], 1).astype(float)
+
+    @cached_property
+    def topics(self) -> NDArray[np.object_]:
+        """The stream (n,) of each keyframe's points."""
+        return np.array(self.frames["topic"].to_pylist(), object)
+
+    @cached_property
+    def views(self) -> F64:
+        """Means (n, 3) of the points around the sensor of each keyframe, metres in the map frame.
+
+        Raises WorkspaceError when an earlier version fused the session.
+        """
+        self.check_version()
+        view = self._vectors("view")
+        rotated = np.einsum("nij,nj->ni", self.map_T_base[:, :3, :3], view)
+        return np.asarray(rotated + self.map_T_base[:, :3, 3])
+
+    def check_version(self) -> None:
+        """Raises WorkspaceError when an earlier version fused the session."""
+        if "view_x" not in self.frames.column_names:
+            raise WorkspaceError(
+                f"{self.folder.frames} is of an earlier version:"
+                f" fuse session {self.folder.name} again with --overwrite."
+            )
+
+    @property
+    def label_source(self) -> str:
+        """Source of the classes, such as ``log`` or ``geometry``."""
+        return str(self.json["label_source"])
+
+    @cached_property
+    def keyframe(self) -> Callable[[int], Keyframe]:
+        """Reads a keyframe; the last ones stay in memory, as neighbouring queries share them."""
+        return lru_cache(maxsize=KEPT)(partial(read_keyframe, self.folder.keyframes))
+
+    @property
+    def posed(self) -> bool:
+        """Whether the log has poses."""
+        return bool(self.json["posed"])
+
+    @property
+    def submaps(self) -> list[dict[str, Any]]:
+        """Number, first and last keyframe, ground and blocks of each submap."""
+        return list(self.json["submaps"])
+
+    def road(self, submap: dict[str, Any]) -> F64:
+        """Positions (m, 2) of a submap's keyframes in the map frame, metres."""
+        return self.map_T_base[submap["first"] : submap["last"] + 1, :2, 3]
+
+    @property
+    def has_classes(self) -> bool:
+        """Whether labels come from a log or a model, as the semantic network needs them."""
+        return self.json["label_source"] in KNOWS_CLASSES

@@ -1,0 +1,111 @@
+"""Hypotheses and candidates of a query, by hand: how many, which is a rival, which one place."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from semloc_logs.alignment.hypotheses import Hypothesis
+from semloc_logs.alignment.icp import Fit
+from semloc_logs.alignment.scores import Scores
+from semloc_logs.alignment.search import Candidate
+from semloc_logs.closures import matching
+from semloc_logs.closures.matching import (
+    Fitted,
+    QueryContext,
+    _each_place_once,
+    _rival_score,
+    find_hypotheses,
+    verify_hypotheses,
+)
+from semloc_logs.numerics.transforms import yaw_transform
+from semloc_logs.settings import Resolved, Settings
+
+
+def settings(**closures: Any) -> Resolved:
+    return Settings.model_validate({"closures": closures}).resolved()
+
+
+def context(made: Resolved, road: tuple[float, ...] = (0.0, 2000.0)) -> QueryContext:
+    """A query in the sessions a, submap 0, and b, submap 1; its targets' drives have this road."""
+    places = [SimpleNamespace(session="a"), SimpleNamespace(session="b")]
+    database = SimpleNamespace(
+        sessions={"a": None, "b": None},
+        places=places,
+        settings=made,
+        session=lambda group: SimpleNamespace(distance=np.array(road)),
+    )
+    visible = SimpleNamespace(database=database, target=lambda group: f"map {group}")
+    return QueryContext(cast(Any, visible), cast(Any, None), 0, cast(Any, "query"), np.eye(4))
+
+
+def fitted(x: float, score: float, nearest: int = 0) -> Fitted:
+    """A fit at ``x`` metres; the score is the structure where all of it is observed."""
+    none = np.zeros((6, 6))
+    fit = Fit(yaw_transform(0.0, (x, 0, 0)), 1.0, 100, 0.1, none, np.zeros(3), np.zeros((2, 6)))
+    scores = Scores(score, 1.0, 0.0, 100)
+    return Fitted(Candidate(0, np.eye(4), 0.5, 3), nearest, np.zeros(3), fit, scores)
+
+
+def test_the_best_fit_of_each_place_is_kept() -> None:
+    rows = [fitted(0.5, 0.4), fitted(0.0, 0.6), fitted(9.0, 0.5)]
+    assert [f.scores.score for f in _each_place_once(rows, 0.3)] == [0.6, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("x", "road", "rival"),
+    [
+        (30.0, 2000.0, 0.4),  # farther than 2 km of road may drift, 20 m
+        (15.0, 2000.0, 0.0),  # the same place, driven again
+        (15.0, 1000.0, 0.4),  # 10 m of drift and 1 m
+        (0.5, 10.0, 0.4),  # on the same pass
+    ],
+)
+def test_a_rival_is_another_place(x: float, road: float, rival: float) -> None:
+    one = fitted(0.0, 0.6)
+    other = fitted(x, 0.4, nearest=1)
+    found = _rival_score(context(settings(), (0.0, road)), one, [one, other])
+    assert found == pytest.approx(rival)
+
+
+def test_candidates_of_each_session_are_as_many_as_the_settings_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls: list[tuple[list[int], dict[int, str], int]] = []
+
+    def search(
+        hypotheses: list[Hypothesis], targets: dict[int, str], query: str, headings: int, most: int
+    ) -> list[Candidate]:
+        calls.append(([h.group for h in hypotheses], targets, most))
+        return []
+
+    monkeypatch.setattr(matching, "search_hypotheses", search)
+    rows = [Hypothesis(group, (0.0, 0.0, 0.0, 0.0), 1, 1.0) for group in (1, 0, 1)]
+    assert verify_hypotheses(context(settings(candidates=7)), rows) == [[], []]
+    assert calls == [([0], {0: "map 0"}, 7), ([1, 1], {1: "map 1"}, 7)]
+
+
+@pytest.mark.parametrize(
+    ("made", "most"),
+    [({}, 48), ({"hypotheses": 20}, 16), ({"hypotheses": 20, "session_hypotheses": 3}, 10)],
+)
+def test_each_session_has_its_share_of_the_hypotheses(
+    made: dict[str, int], most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    group = np.array([0, 1, 1])
+    votes = (group, np.zeros(3), np.zeros((3, 3)), np.ones(3))
+    monkeypatch.setattr(matching, "allowed_words", lambda visible, session: {"semantic": None})
+    monkeypatch.setattr(matching, "_votes", lambda context, variant, allowed: votes)
+    calls: list[tuple[list[int], float, int]] = []
+
+    def pool(group: Any, yaw: Any, translation: Any, weight: Any, cell: float, most: int) -> Any:
+        calls.append((group.tolist(), cell, most))
+        return []
+
+    monkeypatch.setattr(matching, "pool", pool)
+    assert find_hypotheses(context(settings(**made))) == []
+    assert [(groups, n) for groups, _, n in calls] == [([0], most), ([1, 1], most)]
+    assert [cell for _, cell, _ in calls] == pytest.approx([2.4, 2.4])
