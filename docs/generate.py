@@ -1,4 +1,4 @@
-"""Write the generated pages of the reference: settings, tables, channels, label spaces.
+"""Write the generated pages of the reference: settings, tables, messages, reasons and others.
 
     python docs/generate.py
 
@@ -8,6 +8,7 @@ A test compares the pages with the code and the schemas.
 from __future__ import annotations
 
 import json
+import re
 import types
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 import yaml
 from pydantic.fields import FieldInfo
 
+from semloc_logs.closures.closure import Reason
 from semloc_logs.logs.roles import ROLES
 from semloc_logs.schemas import names, read_text
 from semloc_logs.settings import Settings
@@ -33,6 +35,7 @@ FILES_OF_TABLES = {  # table -> where it lies in a workspace
     "ground": "sessions/NAME/ground.parquet",
     "blocks": "sessions/NAME/blocks/",
 }
+_FIGURE = re.compile(r"\{[^}]*\}")  # a place for a figure in a sentence
 LANGUAGES = {".msg": "text", ".proto": "protobuf", ".json": "json"}
 ENCODINGS = {
     ".msg": "ROS 2 and ROS 1 logs",
@@ -49,6 +52,7 @@ def pages() -> dict[str, str]:
         "messages.md": messages_page(),
         "label_spaces.md": label_spaces_page(),
         "roles.md": roles_page(),
+        "reasons.md": reasons_page(),
     }
 
 
@@ -184,6 +188,18 @@ ROLE_USES = {
     "imu": "acceleration, for the direction of gravity",
     "gnss": "fixes, where there are no other poses",
 }
+
+
+def reasons_page() -> str:
+    """The sentences of the column ``reason`` of rejected.parquet."""
+    rows = [(f"`{reason.name}`", _FIGURE.sub("x", reason.value)) for reason in Reason]
+    parts = [
+        "# Reasons for rejection",
+        "The column `reason` of `rejected.parquet` has one of these sentences, with figures in place"
+        " of x. [Acceptance](../explanation/acceptance.md) explains the gates.",
+        _table(("reason", "sentence"), rows),
+    ]
+    return _page(parts)
 
 
 def _page(parts: Iterable[str]) -> str:
