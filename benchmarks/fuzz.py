@@ -31,7 +31,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages.decode import Decoder
-from semloc_logs.logs.problems import Problems
+from semloc_logs.logs.problems import Problem, Problems, sentences
 
 # of processor time; a log's twenty definitions take one of them
 LIMIT_S = {"decoders": 2.0, "layouts": 2.0, "logs": 10.0}
@@ -56,11 +56,11 @@ def decode(message: Message, *, is_known: bool = False) -> None:
     decoder = Decoder(problems)
     if is_known:
         decoder, problems = _decoders.setdefault(id(message.definition), (decoder, problems))
-        problems.forget_skipped("decoding", None)
+        problems.forget_skipped(None)
     decoder.frames(message)
-    told = problems.sentences()
-    if any("MemoryError" in sentence for sentence in told):
-        raise AssertionError(f"memory was asked for: {told}")
+    texts = sentences(problems)
+    if any("MemoryError" in text for text in texts):
+        raise AssertionError(f"too much memory was requested: {texts}")
 
 
 def read(files: dict[str, bytes]) -> None:
@@ -76,8 +76,8 @@ def read(files: dict[str, bytes]) -> None:
         try:
             for _ in log.frames():
                 pass
-            if not all(isinstance(sentence, str) for sentence in log.problems):
-                raise AssertionError("a problem is no sentence")
+            if not all(isinstance(problem, Problem) for problem in log.problems):
+                raise AssertionError("a problem has another type")
         except LogError:
             pass
         finally:

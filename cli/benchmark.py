@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,9 +11,8 @@ from .console import console
 from .options import Command, console_options, json_option, pairs, path_option, settings_options
 
 if TYPE_CHECKING:
+    from semloc_logs.benchmarks.named import Outcome
     from semloc_logs.settings import Resolved
-
-Rows = list[tuple[float, int, str]]
 
 
 def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ...]:
@@ -97,8 +96,8 @@ def command(
 ) -> int:
     """Figures of speed and quality, measured here and now, beside what else does the same.
 
-    NAME is reading, fusion, encoder, search or annotate (on simulated data; fusion takes sweeps of
-    LOGs too), memory (peak of fusing drives of several lengths), fuse (one session of the LOGs,
+    NAME is reading, fusion, encoder, search, verification or annotate (on simulated data; fusion
+    takes sweeps of LOGs too), memory (peak of fusing drives of several lengths), fuse (one session of the LOGs,
     beside reading and integrating alone), pipeline (seconds, memory and profile of a run on the
     LOGs), words (recall of word matches between two LOGs whose truth is known, trained weights
     beside random ones), labels (classes from geometry against the labels recorded in the LOGs),
@@ -118,116 +117,47 @@ def command(
               semloc benchmark retrieval --work streets --peer fpfh=open3d/bin/python
               semloc benchmark localisation --work city --peer kiss_matcher=kiss/bin/python
     """
-    if name == "words" and (len(logs) != 2 or truth is None):
-        raise click.UsageError("words needs two logs and --truth FILE.")
-    if name == "retrieval" and ((truth is None) != (not logs) or len(logs) not in (0, 2)):
-        raise click.UsageError("retrieval takes two logs and --truth FILE, or neither.")
-    if name == "completion" and variant == "both":
-        raise click.UsageError(
-            "completion is of one variant: give --variant semantic or --variant geometric."
-        )
-    if name in ("pipeline", "fuse", "labels", "realism") and not logs:
-        raise click.UsageError(f"{name} needs at least one log.")
-    with console.progress():
-        if name == "retrieval":
-            from semloc_logs.benchmarks.descriptors.real_logs import real_streets
-            from semloc_logs.benchmarks.descriptors.retrieval import (
-                RetrievalChoice,
-                retrieval_benchmark,
-            )
+    from semloc_logs.benchmarks.named import Request, run_named
 
-            variants = ("semantic", "geometric") if variant == "both" else (variant,)
-            real = real_streets(logs, truth, settings) if truth is not None else None
-            rows: Rows = []
-            figures = retrieval_benchmark(
-                RetrievalChoice(variants, weights, database, queries or 2000, work),
-                peers,
-                settings,
-                real,
-                console.note,
-            )
-        elif name == "completion":
-            from semloc_logs.benchmarks.descriptors.completion import completion_benchmark
-
-            figures = completion_benchmark(variant, settings, weights, work, picture, console.note)
-            rows = []
-        elif name == "scaling":
-            from semloc_logs.benchmarks.speed.search_scaling import scaling_benchmark
-
-            figures = scaling_benchmark(settings, work, console.note)
-            rows = []
-        elif name == "localisation":
-            from semloc_logs.benchmarks.localisation.localisation import localisation_benchmark
-
-            figures = localisation_benchmark(work, queries or 40, peers, settings, console.note)
-            rows = []
-        else:
-            figures, rows = _measure(name, logs, truth, peers, lengths, settings)
-    if as_json:
-        console.result_json(figures)
-        return 0
-    columns = sorted(
-        dict.fromkeys(p for row in figures.values() for p in row if p != "unit"),
-        key=lambda p: p != "ours",
+    request = Request(
+        settings,
+        logs,
+        truth,
+        peers,
+        lengths,
+        variant,
+        weights,
+        database,
+        queries,
+        picture,
+        work,
+        console.note,
     )
-    drawn = [
-        (figure, *(_number(row.get(column)) for column in columns), str(row["unit"]))
-        for figure, row in figures.items()
-    ]
-    console.table(name, ("figure", *(f"{p}#" for p in columns), "unit"), drawn)
-    if rows:
-        console.table(
-            "where the time goes",
-            ("s#", "calls#", "function"),
-            [(f"{own:.2f}", str(calls), where) for own, calls, where in rows],
-        )
+    with console.progress():
+        outcome = run_named(name, request)
+    if as_json:
+        console.result_json(outcome.figures)
+    else:
+        _show(name, outcome)
     return 0
 
 
-def _measure(
-    name: str,
-    logs: tuple[Path, ...],
-    truth: Path | None,
-    peers: dict[str, str],
-    lengths: tuple[int, ...],
-    settings: Resolved,
-) -> tuple[dict[str, dict[str, Any]], Rows]:
-    """The figures of benchmark ``name`` and, of a profile, the functions that took most time."""
-    if name == "pipeline":
-        from semloc_logs.benchmarks.speed.profiles import profile_pipeline
-
-        return profile_pipeline(logs, settings)
-    if name == "fuse":
-        from semloc_logs.benchmarks.speed.profiles import profile_fuse
-
-        return profile_fuse(logs, settings)
-    if name == "memory":
-        from semloc_logs.benchmarks.speed.memory import memory_curve
-
-        return memory_curve(lengths, settings), []
-    if name == "words" and truth is not None:
-        from semloc_logs.benchmarks.descriptors.real_logs import word_recalls
-
-        return word_recalls(logs, truth, settings), []
-    if name == "labels":
-        from semloc_logs.benchmarks.labels.label_quality import measure_labels
-
-        return measure_labels(logs, settings), []
-    if name == "realism":
-        from semloc_logs.benchmarks.labels.realism import measure_realism
-
-        return measure_realism(logs, settings), []
-    if name == "fusion":
-        from semloc_logs.benchmarks.speed.fusion_speed import fusion_speed
-
-        return fusion_speed(settings, logs, peers), []
-    if name == "search":
-        from semloc_logs.benchmarks.speed.search_speed import search_speed
-
-        return search_speed(settings, peers=peers), []
-    from semloc_logs.benchmarks.speed.suite import run_benchmark
-
-    return run_benchmark(name, settings), []
+def _show(name: str, outcome: Outcome) -> None:
+    """A table of the figures, ours first, and one of the busiest functions."""
+    systems = dict.fromkeys(
+        system for row in outcome.figures.values() for system in row if system != "unit"
+    )
+    columns = sorted(systems, key=lambda system: system != "ours")
+    rows = [
+        (figure, *(_number(row.get(column)) for column in columns), str(row["unit"]))
+        for figure, row in outcome.figures.items()
+    ]
+    console.table(name, ("figure", *(f"{column}#" for column in columns), "unit"), rows)
+    if outcome.busiest:
+        busiest = [
+            (f"{seconds:.2f}", str(calls), function) for seconds, calls, function in outcome.busiest
+        ]
+        console.table("where the time goes", ("s#", "calls#", "function"), busiest)
 
 
 def _number(value: float | str | None) -> str | None:

@@ -1,13 +1,13 @@
-"""What a log is made of once decoded: small frozen types, stamps in integer nanoseconds, lengths in
-metres.
+"""The decoded frames of a log: small frozen types.
 
-``stamp_ns`` is the sensor time of the message header, ``log_time_ns`` the receive time of the log.
-Arrays are never written to.
+Stamps are integer nanoseconds, lengths metres. ``stamp_ns`` is the sensor time of the message
+header, ``log_time_ns`` the receive time of the log. Arrays are never written to.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Header:
-    """Where and when a message comes from."""
+    """Topic, times and coordinate frame of a message."""
 
     topic: str
     stamp_ns: int
@@ -26,13 +26,19 @@ class Header:
     frame_id: str
 
 
+class PointTimeRemark(Enum):
+    """Why the recorded point times of a sweep are not used as they are."""
+
+    OTHER_CLOCK = "other clock"  # the first point is taken to be measured at the header's time
+    UNUSABLE = "unusable"  # no unit and origin makes them times within a sweep
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarFrame:
-    """One sweep. ``points`` (n, 3) in the sensor frame; rows with NaN, infinity or exactly zero are
-    already gone.
+    """One sweep: ``points`` (n, 3) in the sensor frame.
 
-    ``lost`` counts those that were not finite in a cloud that calls itself dense; ``remark`` is a
-    key of what is to be said of it.
+    Rows with NaN, infinity or exactly zero are already gone. ``lost`` counts the points that were
+    not finite although their cloud calls itself dense.
     """
 
     header: Header
@@ -41,7 +47,7 @@ class LidarFrame:
     offset_ns: NDArray[np.int64] | None = None  # time of each point minus header.stamp_ns
     ring: NDArray[np.uint16] | None = None
     lost: int = 0
-    remark: str = ""
+    remark: PointTimeRemark | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +61,7 @@ class ImageFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthFrame:
-    """Depth along the optical axis in metres (h, w) float32; 0 where there is none."""
+    """Depth along the optical axis in metres (h, w) float32; 0 where nothing was measured."""
 
     header: Header
     depth: F32
@@ -63,8 +69,9 @@ class DepthFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A CameraInfo or CameraCalibration: ``K`` (3, 3), ``P`` (3, 4), ``R`` (3, 3), distortion ``D``
-    of ``model``.
+    """A CameraInfo or CameraCalibration.
+
+    ``K`` (3, 3), ``P`` (3, 4), ``R`` (3, 3), distortion coefficients ``D`` of ``model``.
     """
 
     header: Header
@@ -79,8 +86,9 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSample:
-    """``frame_T_child`` (4, 4): pose of ``child_frame_id`` in ``header.frame_id``; child is "" for
-    PoseStamped.
+    """``frame_T_child`` (4, 4): pose of ``child_frame_id`` in ``header.frame_id``.
+
+    ``child_frame_id`` is "" for a PoseStamped.
     """
 
     header: Header
@@ -128,9 +136,7 @@ class NavSatSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelNames:
-    """What the ids of a label topic mean: the ``names`` of classes by id, or the name of a label
-    ``space``.
-    """
+    """The meaning of the ids of a label topic: ``names`` of classes by id, or a label ``space``."""
 
     header: Header
     space: str = ""
@@ -150,16 +156,22 @@ Frame = (
 )
 
 
+class LabelForm(Enum):
+    """How the labels of a cloud are recorded."""
+
+    IDS = "ids"
+    COLOURS = "colours"  # packed: red in bits 16 to 23, green in 8 to 15, blue in 0 to 7
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedCloud:
-    """Labelled or unlabelled points of one sensor at one time in the base frame: what fusion eats.
+    """Points of one sensor at one time in the base frame, with or without labels: fusion's input.
 
-    ``points`` (n, 3) float32 and ``origin`` (3,), the sensor's centre, in the base frame; ``label``
-    (n,) ids as recorded or None; ``session_T_base`` (4, 4) or None in a log without poses;
-    ``sigma`` (n,) standard deviation of the measured range along the ray in metres, None where it
-    is small beside a voxel (LIDAR). ``extra`` names the ``label_topic`` of labels that come from
-    pictures, and says ``label_form`` = colours where they are packed colours (logs/depth.py)
-    instead of ids.
+    ``points`` (n, 3) float32 and ``origin`` (3,), the sensor's centre, in the base frame;
+    ``session_T_base`` (4, 4) or None in a log without poses; ``label`` (n,) as recorded, in
+    ``label_form``, on the label image topic ``label_topic`` (None: in the cloud itself); ``sigma``
+    (n,) standard deviation of the measured range along the ray in metres, None where it is small
+    beside a voxel (LIDAR).
     """
 
     header: Header
@@ -167,5 +179,6 @@ class PosedCloud:
     origin: F32
     session_T_base: F64 | None
     label: NDArray[np.uint32] | None = None
-    extra: dict[str, str] = field(default_factory=dict)
+    label_topic: str | None = None
+    label_form: LabelForm = LabelForm.IDS
     sigma: F32 | None = None

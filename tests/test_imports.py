@@ -41,8 +41,9 @@ ORDER = [
 # sub-rooms and modules of a room that stands in an order of its own; what is not named stands last
 INNER_ORDER = {
     "logs": [
-        "log",
         "problems",
+        "log",
+        "topic_pairs",
         "roles",
         "messages",
         "containers",
@@ -72,6 +73,7 @@ INNER_ORDER = {
         "labels",
         "localisation",
         "speed",
+        "named",
     ],
     "alignment": [
         "hypotheses",

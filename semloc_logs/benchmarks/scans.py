@@ -159,9 +159,9 @@ def log_sweeps(log: Path, count: int = 12, *, repeat: bool = True) -> list[Scan]
     scan meets a map of itself only. LogError when there is no cloud.
     """
     from semloc_logs.labels.space import guess_space, to_cityscapes
-    from semloc_logs.logs.session.session import open_session
+    from semloc_logs.logs.session.session import SessionOptions, open_session
 
-    session = open_session([log], {}, max_range=100.0)
+    session = open_session([log], SessionOptions(max_range=100.0))
     seen: list[Scan] = []
     try:
         for cloud in session.clouds():

@@ -1,12 +1,11 @@
-"""Pictures of a session's cameras, kept until the clouds of their time come, and painted onto
-those.
-"""
+"""Pictures of a session's cameras, kept until the clouds of their time come and painted on them."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from semloc_logs.frames import F64, Camera, ImageFrame, PosedCloud
 from semloc_logs.labels.painting import U32, Viewpoint, paint, without_borders
 from semloc_logs.labels.projection import Projector
 from semloc_logs.labels.space import UNPAINTED
+from semloc_logs.logs.problems import ProblemKind, Problems
 from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import inverse
 
@@ -23,14 +23,17 @@ from semloc_logs.numerics.transforms import inverse
 POSED_TOLERANCE_NS = 250_000_000
 UNPOSED_TOLERANCE_NS = 50_000_000  # and where nothing does: half a period at 10 Hz
 _MOST_BYTES = 512 << 20  # of pictures that wait for their clouds
-CAMERA_SHIFT = 24  # painted labels have the number of their camera in the upper bits
+_MOST_CAMERAS = 255  # whose numbers fit a byte
+# labels of points: an id or a packed colour, or UNPAINTED; the number of the camera; and whether
+# the label may belong to something nearer
+PAINTED = np.dtype([("label", np.uint32), ("camera", np.uint8), ("is_doubtful", np.bool_)])
+Painted = NDArray[np.void]  # (n,) of PAINTED
+PointLabels = NDArray[Any]  # (n,) of uint32 as recorded with the points, or of PAINTED
 
 
 @dataclass(slots=True, eq=False)
 class _Camera:
-    """One topic's pictures that wait, its projector, the newest label image, and how much it has
-    painted.
-    """
+    """The waiting pictures of a topic, its projector, its newest label image, and counts."""
 
     number: int
     waiting: deque[ImageFrame] = field(default_factory=deque)
@@ -41,13 +44,10 @@ class _Camera:
 
 
 class Pictures:
-    """Paints the pictures of ``topics`` onto clouds; ``label_of`` makes the labels (h, w) of a
-    picture, at most 24 bits or UNPAINTED.
+    """Paints the pictures of ``topics`` onto clouds.
 
-    The number of the camera stands above them, and DOUBTFUL above that (labels/painting.py).
-
-    ``erode``: pixels next to where two labels meet that do not count. ``notes`` are sentences about
-    pictures that cannot be used.
+    ``label_of`` makes the labels (h, w) of a picture, or UNPAINTED. ``erode``: pixels next to where
+    two labels meet that do not count. ``problems`` name the pictures that cannot be used.
     """
 
     def __init__(
@@ -57,10 +57,12 @@ class Pictures:
         label_of: Callable[[ImageFrame], U32],
         erode: int,
     ) -> None:
-        self.topics = topics[:127]
-        self.notes: dict[str, None] = {}
+        self.topics = topics[:_MOST_CAMERAS]
+        self.problems = Problems()
         self.seen = self.painted = self.inside = 0  # points
-        self._session, self._label_of, self._erode = session, label_of, erode
+        self._session = session
+        self._label_of = label_of
+        self._erode = erode
         self._cameras = {topic: _Camera(i) for i, topic in enumerate(self.topics)}
         self._bytes = 0
 
@@ -72,19 +74,18 @@ class Pictures:
             fullest = max(self._cameras.values(), key=lambda c: len(c.waiting))
             self._bytes -= fullest.waiting.popleft().image.nbytes
 
-    def labels(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> U32 | None:
-        """Labels of ``cloud.points[keep]`` with the camera's number above them, UNPAINTED where no
-        camera sees; None without a picture.
-        """
-        out = np.full(len(keep), UNPAINTED, np.uint32)
+    def labels(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> Painted | None:
+        """Labels of ``cloud.points[keep]``, of the first camera that sees each, or None."""
+        out: Painted = np.zeros(len(keep), PAINTED)
+        out["label"] = UNPAINTED
         inside = np.zeros(len(keep), bool)
         viewpoint = None
         for topic, camera in self._cameras.items():
             self._forget(camera, cloud.header.stamp_ns)
-            found = self._picture(topic, camera, cloud)
-            if found is None:
+            match = self._picture(topic, camera, cloud)
+            if match is None:
                 continue
-            picture, camera_T_base, projector = found
+            picture, camera_T_base, projector = match
             viewpoint = viewpoint or Viewpoint(cloud.origin, self._axis(cloud))
             if camera.newest is None or camera.newest[0] != picture.header.stamp_ns:
                 camera.newest = (
@@ -92,28 +93,24 @@ class Pictures:
                     without_borders(self._label_of(picture), self._erode),
                 )
                 camera.pictures += 1
-            open_ = np.flatnonzero(out == UNPAINTED)
-            got, got_inside = paint(
-                cloud.points, keep[open_], viewpoint, camera.newest[1], camera_T_base, projector
+            unpainted = np.flatnonzero(out["label"] == UNPAINTED)
+            painted = paint(
+                cloud.points, keep[unpainted], viewpoint, camera.newest[1], camera_T_base, projector
             )
-            out[open_] = np.where(
-                got == UNPAINTED,
-                np.uint32(UNPAINTED),
-                got | np.uint32(camera.number << CAMERA_SHIFT),
-            )
-            inside[open_] |= got_inside
-            camera.points += int((got != UNPAINTED).sum())
+            out["label"][unpainted] = painted.label
+            out["is_doubtful"][unpainted] = painted.is_doubtful
+            out["camera"][unpainted] = camera.number
+            inside[unpainted] |= painted.is_inside
+            camera.points += int((painted.label != UNPAINTED).sum())
         if viewpoint is None:
             return None
         self.seen += len(out)
         self.inside += int(inside.sum())
-        self.painted += int((out != UNPAINTED).sum())
+        self.painted += int((out["label"] != UNPAINTED).sum())
         return out
 
     def to_json(self) -> dict[str, object]:
-        """Points of keyframes with a picture, of which in a picture, of which painted; and by
-        camera.
-        """
+        """Counts of keyframe points: with a picture, within one, painted; and by camera."""
         cameras = {
             topic: {"pictures": c.pictures, "points": c.points}
             for topic, c in self._cameras.items()
@@ -144,21 +141,22 @@ class Pictures:
     def _picture(
         self, topic: str, camera: _Camera, cloud: PosedCloud
     ) -> tuple[ImageFrame, F64, Projector] | None:
-        """The picture nearest in time to a cloud, ``camera_T_base`` (4, 4) from the cloud's base
-        frame, and the projector.
-        """
+        """The picture nearest in time to a cloud, ``camera_T_base`` (4, 4), and the projector."""
         stamp_ns = cloud.header.stamp_ns
         posed = cloud.session_T_base is not None
         tolerance = POSED_TOLERANCE_NS if posed else UNPOSED_TOLERANCE_NS
-        near = [p for p in camera.waiting if abs(p.header.stamp_ns - stamp_ns) <= tolerance]
+        candidates = [p for p in camera.waiting if abs(p.header.stamp_ns - stamp_ns) <= tolerance]
         calibration = self._session.cameras.get(topic)
         if calibration is None:
-            if near:
-                self.notes.setdefault(
-                    f"{topic} has no CameraInfo: its pictures give no labels; name one with --topic camera_info=TOPIC."
+            if candidates:
+                self._cannot_use(
+                    topic,
+                    ProblemKind.CALIBRATION,
+                    f"{topic} has no CameraInfo: its pictures give no labels; "
+                    f"name one with --topic camera_info=TOPIC.",
                 )
             return None
-        for picture in sorted(near, key=lambda p: abs(p.header.stamp_ns - stamp_ns)):
+        for picture in sorted(candidates, key=lambda p: abs(p.header.stamp_ns - stamp_ns)):
             moved = np.eye(4)
             if cloud.session_T_base is not None:
                 pose = self._session.pose_at(picture.header.stamp_ns)
@@ -168,9 +166,12 @@ class Pictures:
             frame_id = picture.header.frame_id or calibration.header.frame_id
             base_T_camera = self._session.base_T(frame_id, picture.header.stamp_ns)
             if base_T_camera is None:
-                self.notes.setdefault(
-                    f"No transform connects the camera frame '{frame_id}' of {topic} with '{self._session.base_frame}': "
-                    f"its pictures give no labels; record /tf_static."
+                self._cannot_use(
+                    topic,
+                    ProblemKind.TRANSFORM,
+                    f"No transform connects the camera frame '{frame_id}' of {topic} with "
+                    f"'{self._session.base_frame}': its pictures give no labels; "
+                    f"record /tf_static.",
                 )
                 return None
             projector = self._projector(topic, camera, calibration, picture.image.shape)
@@ -178,6 +179,9 @@ class Pictures:
                 None if projector is None else (picture, inverse(base_T_camera) @ moved, projector)
             )
         return None
+
+    def _cannot_use(self, topic: str, kind: ProblemKind, text: str) -> None:
+        self.problems.add(text, topic=topic, kind=kind, lost=False)
 
     def _projector(
         self, topic: str, camera: _Camera, calibration: Camera, shape: tuple[int, ...]
@@ -189,6 +193,6 @@ class Pictures:
         try:
             projector = Projector(calibration, shape[0], shape[1], rectified="rect" in topic)
         except LogError as error:
-            self.notes.setdefault(str(error))
+            self._cannot_use(topic, ProblemKind.CALIBRATION, str(error))
         camera.known = calibration, shape, projector
         return projector

@@ -1,21 +1,19 @@
-"""The classes of one session, from whatever source: what the log's points or pictures say, the
-user's model, or geometry.
-"""
+"""The classes of one session: recorded with points or pictures, from a model, or from geometry."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
-from semloc_logs.frames import ImageFrame, PosedCloud
-from semloc_logs.labels.camera_labels import CAMERA_SHIFT, Pictures
+from semloc_logs.frames import ImageFrame, LabelForm, PosedCloud
+from semloc_logs.labels.camera_labels import Painted, Pictures, PointLabels
 from semloc_logs.labels.from_geometry import classify
-from semloc_logs.labels.painting import DOUBTFUL
 from semloc_logs.labels.segmentation import Segmenter
 from semloc_logs.labels.space import (
     SKY,
@@ -32,24 +30,42 @@ from semloc_logs.labels.space import (
     spaces,
 )
 from semloc_logs.labels.sweep_ground import GroundSurface
+from semloc_logs.logs.problems import Problem, ProblemKind, Problems, sentences
 from semloc_logs.logs.sensors.depth import label_ids
 from semloc_logs.logs.session.session import Session
 from semloc_logs.settings import Labels
 
 _MOST_COLOURS = 4096  # that are remembered of one topic, to guess the palette
-_LOW = (1 << CAMERA_SHIFT) - 1
+_HALF = 0xFFFF  # the lower half of an id is the class, the upper an instance (SemanticKITTI)
+
+
+class _LabelSource(Enum):
+    """Where the labels of a keyframe come from."""
+
+    NONE = "none"
+    CLOUD = "cloud"  # recorded with the points, or with the depth image
+    CAMERAS = "cameras"  # painted
+
+
+class _DecidedBy(Enum):
+    """Who decided what the labels of a topic mean."""
+
+    NOBODY = ""
+    SETTING = "setting"
+    LOG = "log"
+    GUESS = "guess"
 
 
 @dataclass(slots=True, eq=False)
 class _Topic:
-    """What has been seen of the labels of one topic, and what they mean in the end."""
+    """The labels of one topic as far as seen, and their meaning in the end."""
 
-    low: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(1 << 16, bool))
+    low: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(_HALF + 1, bool))
     has_instances: bool = False
     colours: dict[int, int] = field(default_factory=dict)
     is_coloured: bool = False
     space: LabelSpace | None = None
-    said_by: str = ""
+    decided_by: _DecidedBy = _DecidedBy.NOBODY
     strange: dict[int, int] = field(default_factory=dict)
 
     def see(self, ids: U32, is_coloured: bool) -> None:
@@ -60,8 +76,8 @@ class _Topic:
                 if colour in self.colours or len(self.colours) < _MOST_COLOURS:
                     self.colours[colour] = self.colours.get(colour, 0) + count
         else:
-            self.low[values & 0xFFFF] = True
-            self.has_instances |= bool((values > 0xFFFF).any())
+            self.low[values & _HALF] = True
+            self.has_instances |= bool((values > _HALF).any())
 
     def is_empty(self) -> bool:
         """Whether nothing but zeros was ever recorded."""
@@ -69,19 +85,20 @@ class _Topic:
 
 
 class Labeller:
-    """Gives the points of every keyframe their classes. During the pass over the log :meth:`take`
-    each keyframe, with :attr:`on_image` and :attr:`images` for the session's pass; :meth:`conclude`
-    after it; then ask for :meth:`labels`.
+    """Gives the points of every keyframe their classes.
 
-    LogError and SettingsError when the source that the settings demand cannot be had.
+    During the pass over the log :meth:`take` each keyframe, with :attr:`on_image` and
+    :attr:`images` for the session's pass; :meth:`conclude` after it; then get the :meth:`labels`.
+    LogError and SettingsError when the source that the settings demand is not available.
     """
 
     def __init__(self, settings: Labels, session: Session) -> None:
         self.source = settings.source
-        self._settings, self._session = settings, session
+        self._settings = settings
+        self._session = session
         self._topics: dict[str, _Topic] = {}
-        # topic and form of the labels: ids, colours, painted or ""
-        self._keyframes: list[tuple[str, str]] = []
+        # of each keyframe, with the topic of labels that come with the cloud
+        self._keyframes: list[tuple[_LabelSource, str]] = []
         self._model: Segmenter | None = None
         self._pictures: Pictures | None = None
         if settings.space is not None:
@@ -92,8 +109,9 @@ class Labeller:
             topics = tuple(t for t in roles.image if t in roles.info_of)
             if not topics:
                 raise LogError(
-                    f"{session.name} has no camera pictures with a CameraInfo for the model: name them with --topic image=TOPIC "
-                    f"and --topic camera_info=TOPIC, or use --set labels.source=geometry."
+                    f"{session.name} has no camera pictures with a CameraInfo for the model: "
+                    f"name them with --topic image=TOPIC and --topic camera_info=TOPIC, or use "
+                    f"--set labels.source=geometry."
                 )
             self._pictures = Pictures(session, topics, self._predict, settings.erode)
         elif settings.source in ("auto", "log"):
@@ -108,127 +126,131 @@ class Labeller:
 
     @property
     def on_image(self) -> Callable[[ImageFrame], None] | None:
-        """What takes the pictures during the pass; None when none are needed."""
+        """The function for the pictures of the pass; None when none are needed."""
         return self._pictures.take if self._pictures else None
 
     @property
-    def notes(self) -> list[str]:
-        """Sentences about what was assumed and what could not be used."""
-        said = [*self._pictures.notes] if self._pictures else []
-        for topic, t in sorted(self._topics.items()):
-            if t.space is None or self.source != "log":
+    def problems(self) -> list[Problem]:
+        """Pictures that cannot be used, guessed meanings, and labels without a class."""
+        problems = Problems()
+        for name, topic in sorted(self._topics.items()):
+            if topic.space is None or self.source != "log":
                 continue
-            if t.said_by == "guess":
-                said.append(
-                    f"The labels of {topic} are taken as {t.space.name} by their looks; --set labels.space=NAME says otherwise."
-                )
-            if t.space.unknown and t.said_by == "log":
-                said.append(
-                    f"Classes of {topic} that mean nothing here are unlabelled: {_some(t.space.unknown)}."
-                )
-            if t.strange:
-                names = [
-                    f"({c >> 16}, {c >> 8 & 255}, {c & 255})"
-                    for c in sorted(t.strange, key=lambda c: (-t.strange[c], c))
-                ]
-                total = sum(t.strange.values())
-                said.append(
-                    f"{total} points have colours of {topic} that {t.space.name} does not have and are unlabelled: {_some(names)}."
-                )
-        return said
+            for text in _doubts(name, topic, topic.space):
+                problems.add(text, topic=name, kind=ProblemKind.LABEL, lost=False)
+        return [*(self._pictures.problems if self._pictures else ()), *problems]
 
-    def take(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> U32 | None:
-        """Labels of ``cloud.points[keep]`` as recorded or painted, to be kept for :meth:`labels`;
-        of every keyframe in turn.
+    def take(self, cloud: PosedCloud, keep: NDArray[np.integer]) -> PointLabels | None:
+        """Labels of ``cloud.points[keep]`` of the next keyframe, to be kept for :meth:`labels`.
+
+        As recorded with the cloud, or painted by the cameras.
         """
-        ids, topic, form = None, "", ""
         if cloud.label is not None and self.source in ("auto", "log"):
-            ids = cloud.label[keep]
-            form = cloud.extra.get("label_form", "ids")
-            topic = cloud.extra.get("label_topic", cloud.header.topic)
-            self._topics.setdefault(topic, _Topic()).see(ids, form == "colours")
-        elif self._pictures is not None:
-            ids = self._pictures.labels(cloud, keep)
-            form = "painted" if ids is not None else ""
-            if ids is not None and self.source != "onnx":
-                for number, name in enumerate(self.images):
-                    own = ids[_of_camera(ids, number)] & np.uint32(_LOW)
-                    self._topics.setdefault(name, _Topic()).see(
-                        own, self._topics.setdefault(name, _Topic()).is_coloured
-                    )
-        self._keyframes.append((topic, form))
-        return ids
+            ids: U32 = cloud.label[keep]
+            topic = cloud.label_topic or cloud.header.topic
+            self._topic(topic).see(ids, cloud.label_form is LabelForm.COLOURS)
+            self._keyframes.append((_LabelSource.CLOUD, topic))
+            return ids
+
+        painted = None if self._pictures is None else self._pictures.labels(cloud, keep)
+        if painted is None:
+            self._keyframes.append((_LabelSource.NONE, ""))
+            return None
+        if self.source != "onnx":
+            for number, name in enumerate(self.images):
+                topic_labels = self._topic(name)
+                own = painted["label"][_of_camera(painted, number)]
+                topic_labels.see(own, topic_labels.is_coloured)
+        self._keyframes.append((_LabelSource.CAMERAS, ""))
+        return painted
 
     def conclude(self) -> None:
-        """Settles the source and what the labels mean, now that all have been seen."""
+        """Settles the source and the meaning of the labels, after the last keyframe."""
         if self.source == "onnx":
-            if self._pictures is None or not self._pictures.painted:
-                why = " ".join(self._pictures.notes) if self._pictures else ""
-                raise LogError(
-                    f"{self._session.name}: no point was labelled by the model: "
-                    f"{why or 'no camera picture shows points of the same time; use --set labels.source=geometry.'}"
-                )
+            self._check_painted()
             return
         if self.source not in ("auto", "log"):
             return
-        has_labels = any(form for _, form in self._keyframes) and any(
-            not t.is_empty() for t in self._topics.values()
+        has_labels = any(source is not _LabelSource.NONE for source, _ in self._keyframes) and any(
+            not topic.is_empty() for topic in self._topics.values()
         )
         if not has_labels and self.source == "log":
             raise LogError(
-                f"{self._session.name} has no labels (a 'label' field of the points or a label image): use --set labels.source=geometry."
+                f"{self._session.name} has no labels (a 'label' field of the points or a label "
+                f"image): use --set labels.source=geometry."
             )
         self.source = "log" if has_labels else "geometry"
         for name, topic in self._topics.items():
-            topic.space, topic.said_by = self._space(name, topic)
+            topic.space, topic.decided_by = self._space(name, topic)
+
+    def _check_painted(self) -> None:
+        """LogError when the model labelled no point."""
+        if self._pictures is not None and self._pictures.painted:
+            return
+        reasons = " ".join(sentences(self._pictures.problems)) if self._pictures else ""
+        raise LogError(
+            f"{self._session.name}: no point was labelled by the model: "
+            + (
+                reasons
+                or "no camera picture shows points of the same time; "
+                "use --set labels.source=geometry."
+            )
+        )
 
     def labels(
         self,
         keyframe: int,
         points: NDArray[np.floating],
         origin: NDArray[np.floating],
-        ids: U32 | None,
+        labels: PointLabels | None,
         scale: float,
         ground: GroundSurface | None = None,
     ) -> U8:
-        """Classes (n,) of the level ``points`` (n, 3) of a keyframe seen from ``origin`` (3,), from
-        what :meth:`take` gave.
+        """Classes (n,) of the level ``points`` (n, 3) of a keyframe seen from ``origin`` (3,).
 
-        ``scale`` is the voxel size over 0.30 m; ``ground`` saves finding the ground below the
-        points again.
+        ``labels`` are from :meth:`take`. ``scale`` is the voxel size over 0.30 m; ``ground`` saves
+        the search for the ground below the points.
         """
         if self.source == "geometry":
             return classify(points, origin, scale, ground)
-        if self.source == "uniform" or ids is None:
+        if self.source == "uniform" or labels is None:
             return np.full(len(points), UNLABELLED, np.uint8)
-        topic, form = self._keyframes[keyframe]
-        if form != "painted":
-            return self._train_ids(topic, ids)
-        out = np.full(len(ids), UNLABELLED, np.uint8)
-        for number, name in enumerate(self.images):
-            own = _of_camera(ids, number)
-            out[own] = (
-                (ids[own] & np.uint32(_LOW)).astype(np.uint8)
-                if self.source == "onnx"
-                else self._train_ids(name, ids[own] & np.uint32(_LOW))
-            )
-        out[out == SKY] = UNLABELLED  # what gave a return is no sky
-        # a car's class on what is seen through its windows; a road has no windows, and is always
-        # behind a nearer piece of itself
-        out[(ids & DOUBTFUL > 0) & np.isin(out, THINGS)] = UNLABELLED
+        source, topic = self._keyframes[keyframe]
+        if source is not _LabelSource.CAMERAS:
+            return self._train_ids(topic, labels)
+
+        out = self._classes_of_painted(labels)
         if self._settings.unseen == "geometry":
-            unseen = ids == UNPAINTED
+            unseen = labels["label"] == UNPAINTED
             out[unseen] = classify(points, origin, scale, ground)[unseen]
         return out
 
+    def _classes_of_painted(self, painted: Painted) -> U8:
+        out = np.full(len(painted), UNLABELLED, np.uint8)
+        for number, name in enumerate(self.images):
+            own = _of_camera(painted, number)
+            ids = painted["label"][own]
+            is_class = self.source == "onnx"
+            out[own] = ids.astype(np.uint8) if is_class else self._train_ids(name, ids)
+        out[out == SKY] = UNLABELLED  # sky gives no return
+        # a car's class on things that are seen through its windows; a road has no windows, and is
+        # always behind a nearer piece of itself
+        out[painted["is_doubtful"] & np.isin(out, THINGS)] = UNLABELLED
+        return out
+
     def to_json(self) -> dict[str, Any]:
-        """What the labels are from, for session.json: the source, the label space of each topic and
-        who said so, what was painted.
+        """The source of the labels, for session.json.
+
+        With the label space of each topic, who decided it, and counts of painted points.
         """
         spaces = {
-            name: {"space": t.space.name, "said_by": t.said_by, "colours": t.is_coloured}
-            for name, t in sorted(self._topics.items())
-            if t.space is not None and self.source == "log"
+            name: {
+                "space": topic.space.name,
+                "said_by": topic.decided_by.value,
+                "colours": topic.is_coloured,
+            }
+            for name, topic in sorted(self._topics.items())
+            if topic.space is not None and self.source == "log"
         }
         content: dict[str, Any] = {"source": self.source, "spaces": spaces}
         if self._model is not None:
@@ -243,22 +265,26 @@ class Labeller:
 
     def _read(self, frame: ImageFrame) -> U32:
         if frame.image.ndim == 3:
-            self._topics.setdefault(frame.header.topic, _Topic()).is_coloured = True
+            self._topic(frame.header.topic).is_coloured = True
         return label_ids(frame)
 
-    def _space(self, name: str, topic: _Topic) -> tuple[LabelSpace, str]:
-        """What the labels of a topic mean, and who said so: setting, log or guess."""
+    def _topic(self, name: str) -> _Topic:
+        return self._topics.setdefault(name, _Topic())
+
+    def _space(self, name: str, topic: _Topic) -> tuple[LabelSpace, _DecidedBy]:
+        """The meaning of the labels of a topic, and who decided it."""
         if self._settings.space is not None:
-            return read_space(self._settings.space), "setting"
-        said = self._session.label_names.get(name)
-        if said is not None and said.names and not topic.is_coloured:
-            return space_of_names(said.names, said.header.topic), "log"
-        if said is not None and said.space in spaces():  # a log may name what is shipped, no file
-            return read_space(said.space), "log"
+            return read_space(self._settings.space), _DecidedBy.SETTING
+        recorded = self._session.label_names.get(name)
+        if recorded is not None and recorded.names and not topic.is_coloured:
+            return space_of_names(recorded.names, recorded.header.topic), _DecidedBy.LOG
+        # a log may name a shipped space, not a file
+        if recorded is not None and recorded.space in spaces():
+            return read_space(recorded.space), _DecidedBy.LOG
         if topic.is_coloured:
-            return read_space(guess_palette(topic.colours) or "cityscapes"), "guess"
-        seen = np.flatnonzero(topic.low) + (1 << 16 if topic.has_instances else 0)
-        return read_space(guess_space(seen)), "guess"
+            return read_space(guess_palette(topic.colours) or "cityscapes"), _DecidedBy.GUESS
+        seen = np.flatnonzero(topic.low) + (_HALF + 1 if topic.has_instances else 0)
+        return read_space(guess_space(seen)), _DecidedBy.GUESS
 
     def _train_ids(self, name: str, ids: U32) -> U8:
         topic = self._topics[name]
@@ -271,9 +297,27 @@ class Labeller:
         return out
 
 
-def _of_camera(ids: U32, number: int) -> NDArray[np.bool_]:
-    cameras = (ids & np.uint32(0xFFFFFFFF ^ DOUBTFUL)) >> np.uint32(CAMERA_SHIFT)
-    return np.asarray((cameras == number) & (ids != UNPAINTED))
+def _of_camera(painted: Painted, number: int) -> NDArray[np.bool_]:
+    """Which points (n,) have their label from a camera."""
+    return np.asarray((painted["camera"] == number) & (painted["label"] != UNPAINTED))
+
+
+def _doubts(name: str, topic: _Topic, space: LabelSpace) -> Iterator[str]:
+    """Sentences about a guessed label space, and about labels that it does not have."""
+    if topic.decided_by is _DecidedBy.GUESS:
+        yield (
+            f"The labels of {name} are taken as {space.name} by their looks; "
+            f"--set labels.space=NAME chooses another."
+        )
+    if space.unknown and topic.decided_by is _DecidedBy.LOG:
+        yield f"Classes of {name} that mean nothing here are unlabelled: {_some(space.unknown)}."
+    if topic.strange:
+        colours = sorted(topic.strange, key=lambda c: (-topic.strange[c], c))
+        names = [f"({c >> 16}, {c >> 8 & 255}, {c & 255})" for c in colours]
+        yield (
+            f"{sum(topic.strange.values())} points have colours of {name} that {space.name} does "
+            f"not have and are unlabelled: {_some(names)}."
+        )
 
 
 def _some(names: Any, most: int = 8) -> str:

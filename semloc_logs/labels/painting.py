@@ -1,21 +1,21 @@
-"""Label images -> labels of points that another sensor measured from elsewhere, where the camera
-can see them.
+"""Label images -> labels of points of another sensor, where the camera can see them.
 
-A LIDAR beside a camera looks past the edges of near things at what is hidden from the camera, and
-its points are sparse: through the gaps between the points of a near thing, a plain depth test lets
-the hidden points take the near thing's class. So the surfaces that the LIDAR saw are drawn into a
-depth image without gaps: in columns of equal azimuth, as seen from the LIDAR, each point is joined
-with the next one above it that continues the same surface, and this strip is as wide as a column. A
-point is hidden where a strip is much nearer.
+A LIDAR beside a camera looks past the edges of near things at points that are hidden from the
+camera, and its points are sparse: through the gaps between the points of a near thing, a plain
+depth test lets the hidden points take the near thing's class. So the surfaces that the LIDAR saw
+are drawn into a depth image without gaps: in columns of equal azimuth, as seen from the LIDAR, each
+point is joined with the next one above it that continues the same surface, and this strip is as
+wide as a column. A point is hidden where a strip is much nearer.
 
 A LIDAR also looks through the windows of cars, and gets nothing back from black paint: there is no
 surface where the picture has one. A point that lies behind a near surface of the very label that it
-would get, and beside it by less than a thing's size, is marked DOUBTFUL.
+would get, and beside it by less than a thing's size, is marked doubtful.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -33,12 +33,13 @@ _ENDS, _STEPS = -1, -2
 _LEAST_GAP = np.radians(0.08)
 _LOOK_AHEAD = 16  # points of a column that are tried as the continuation of a surface
 _CELL = np.radians(0.16)  # of the depth image
-_NEARER = 0.25  # what hides a point is nearer by so much (m),
+_NEARER = 0.25  # a surface that hides a point is nearer by so much (m),
 _NEARER_SHARE = 0.04  # and by this share of the distance
-DOUBTFUL = 1 << 31  # set in a label that may be that of something nearer
-_THING = 0.8  # m, half the size of what has windows
+_THING = 0.8  # m, half the size of things with windows
 # around a point, for near surfaces of which _THING is as large as that
 _REACH = (np.radians(6.0), np.radians(3.0), np.radians(1.5))
+_NOTHING = 1e9  # m, the depth of cells without a surface
+_BEHIND_SHARE = 1.1  # of the depth of the nearer surface, and
 _BEHIND = 3.0  # m, so that the side of a truck is not behind its own rear
 _MOST_LABELS = 40  # of a picture that are looked at: more are noise
 
@@ -47,17 +48,17 @@ U32 = NDArray[np.uint32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Viewpoint:
-    """Where points were measured from: ``origin`` (3,) of the sensor in their frame, and ``axis``
-    (3,), a unit vector, about which its azimuth is counted.
+    """Where points were measured from.
+
+    ``origin`` (3,) of the sensor in their frame, and ``axis`` (3,), a unit vector, about which its
+    azimuth is counted.
     """
 
     origin: NDArray[np.floating]
     axis: NDArray[np.floating]
 
     def columns(self, points: F32) -> tuple[NDArray[np.int32], F32, F32]:
-        """Column of equal azimuth, elevation (rad) and distance (m) of ``points`` (n, 3), each
-        (n,).
-        """
+        """Column of equal azimuth, elevation (rad) and distance (m) of points (n, 3), each (n,)."""
         rays = points - np.asarray(self.origin, np.float32)
         side = np.cross(self.axis, (1.0, 0.0, 0.0) if abs(self.axis[0]) < 0.9 else (0.0, 1.0, 0.0))
         side /= np.linalg.norm(side)
@@ -77,27 +78,26 @@ class Viewpoint:
 def nearest_depth(
     points: F32, camera: F32, pixels: F64, viewpoint: Viewpoint, projector: Projector
 ) -> tuple[F32, float]:
-    """Depth (m along the optical axis) of the nearest surface in each cell of the picture, infinite
-    where there is none, and the edge of a cell in pixels.
+    """Depth of the nearest surface in each cell of the picture, and the edge of a cell in pixels.
 
-    ``camera`` and ``pixels`` are where all the ``points`` (n, 3) of a cloud lie in the camera's
-    frame and in its picture.
+    Depth in m along the optical axis, infinite where there is no surface. ``camera`` and ``pixels``
+    are the places of all ``points`` (n, 3) of a cloud in the camera's frame and in its picture.
     """
     cell = max(1.0, float(round(projector.focal * _CELL)))
     shape = int(np.ceil(projector.height / cell)), int(np.ceil(projector.width / cell))
     depth = np.full(shape, np.inf, np.float32)
-    near = np.flatnonzero(np.isfinite(pixels[:, 0]))
-    column, elevation, distance = viewpoint.columns(points[near])
+    shown = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    column, elevation, distance = viewpoint.columns(points[shown])
     order = np.lexsort((elevation, column))
-    near = near[order]
+    shown = shown[order]
     column = column[order]
     elevation = elevation[order]
     distance = distance[order]
-    z = camera[near, 2].astype(float)
+    z = camera[shown, 2].astype(float)
     # off the axis a picture is stretched by the square of the ray's length over its depth
-    stretch = np.linalg.norm(camera[near], axis=1) / z
+    stretch = np.linalg.norm(camera[shown], axis=1) / z
     half = np.maximum(projector.focal / cell * (COLUMN / 2) * distance / z * stretch, 0.5)
-    _draw(depth, (pixels[near] + 0.5) / cell, z, distance, column, elevation, half)
+    _draw(depth, (pixels[shown] + 0.5) / cell, z, distance, column, elevation, half)
     return depth, cell
 
 
@@ -133,9 +133,10 @@ def _continues(
     i: int,
     step: int,
 ) -> int:
-    """The next point of another ring, upwards or downwards, that is on the same surface as point
-    ``i``; _ENDS where the next ring sees something much farther or nothing, and _STEPS where it
-    sees something else.
+    """The next point of another ring that is on the same surface as point ``i``.
+
+    Upwards or downwards by ``step``; _ENDS where the next ring sees something much farther or
+    nothing, and _STEPS where it sees something else.
     """
     ends = _ENDS
     for k in range(1, _LOOK_AHEAD + 1):
@@ -165,8 +166,9 @@ def _strip(
     half_a: float,
     half_b: float,
 ) -> None:
-    """Joins two points: in each row of cells the farthest depth that the line has there, which is
-    linear in 1 / z; in each column where the line lies rather than stands.
+    """Joins two points: in each row of cells the farthest depth that the line has there.
+
+    It is linear in 1 / z; where the line is flat, in each column instead.
     """
     main = 1 if abs(b[1] - a[1]) >= abs(b[0] - a[0]) else 0
     first = int(np.floor(min(a[main], b[main])))
@@ -198,6 +200,18 @@ def _line(
             depth[row, column] = z
 
 
+class PaintedPoints(NamedTuple):
+    """Labels (m,) or UNPAINTED, and what else is known about each point.
+
+    ``is_doubtful`` (m,): the label may belong to something nearer; ``is_inside`` (m,): the point is
+    in the picture at all, visible or hidden.
+    """
+
+    label: U32
+    is_doubtful: NDArray[np.bool_]
+    is_inside: NDArray[np.bool_]
+
+
 def paint(
     points: F32,
     wanted: NDArray[np.integer],
@@ -205,13 +219,11 @@ def paint(
     labels: U32,
     camera_T_base: F64,
     projector: Projector,
-) -> tuple[U32, NDArray[np.bool_]]:
-    """Labels (m,) of ``points[wanted]`` in the base frame from the picture ``labels`` (h, w), and
-    which points are in the picture at all.
+) -> PaintedPoints:
+    """Labels of ``points[wanted]`` (m,) in the base frame from the picture ``labels`` (h, w).
 
-    ``points`` (n, 3) are all that the sensor at ``viewpoint`` measured: they hide each other.
-    UNPAINTED where the picture does not show the point: outside of it, or hidden. DOUBTFUL is added
-    to labels that may be those of something nearer.
+    ``points`` (n, 3) are all points that the sensor at ``viewpoint`` measured: they hide each
+    other. UNPAINTED where the picture does not show the point: outside of it, or hidden.
     """
     out = np.full(len(wanted), UNPAINTED, np.uint32)
     camera = in_base(camera_T_base, points)
@@ -224,16 +236,17 @@ def paint(
     column, row = np.floor((pixels[inside] + 0.5) / cell).astype(int).T
     z = camera[inside, 2]
     visible = depth[row, column] * (1 + _NEARER_SHARE) + _NEARER >= z
-    at = np.flatnonzero(inside)[visible]
-    u, v = np.rint(pixels[at]).astype(int).T
-    out[at] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
-    known = at[out[at] != UNPAINTED]
+    seen = np.flatnonzero(inside)[visible]
+    u, v = np.rint(pixels[seen]).astype(int).T
+    out[seen] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
+    known = seen[out[seen] != UNPAINTED]
     column, row = np.floor((pixels[known] + 0.5) / cell).astype(int).T
     doubtful = _behind_its_own(
         depth, cell, labels, out[known], row, column, camera[known, 2], projector.focal
     )
-    out[known[doubtful]] |= np.uint32(DOUBTFUL)
-    return out, inside
+    is_doubtful = np.zeros(len(wanted), bool)
+    is_doubtful[known[doubtful]] = True
+    return PaintedPoints(out, is_doubtful, inside)
 
 
 def _behind_its_own(
@@ -246,8 +259,9 @@ def _behind_its_own(
     z: F32,
     focal: float,
 ) -> NDArray[np.bool_]:
-    """Which points (n,) with the labels ``own`` at cells (``row``, ``column``) have a much nearer
-    surface of the same label beside them.
+    """Which points (n,) have a much nearer surface of the same label beside them.
+
+    ``own``: their labels, at cells (``row``, ``column``).
     """
     out = np.zeros(len(own), bool)
     half = int(cell) // 2
@@ -257,25 +271,26 @@ def _behind_its_own(
     )
     values, counts = np.unique(own, return_counts=True)
     for label in values[np.argsort(-counts, kind="stable")][:_MOST_LABELS]:
-        mine = np.flatnonzero(own == label)
+        of_label = np.flatnonzero(own == label)
         surface = np.where(
             coarse[: depth.shape[0], : depth.shape[1]] == label, depth, np.float32(np.inf)
         )
         for reach in _REACH:
-            near = np.where(surface < _THING / np.tan(reach), surface, np.float32(1e9))
+            close = np.where(surface < _THING / np.tan(reach), surface, np.float32(_NOTHING))
             size = 2 * int(focal * reach / cell) + 1
             around = cv2.erode(
-                near,
+                close,
                 np.ones((size, size), np.uint8),
                 borderType=cv2.BORDER_CONSTANT,
-                borderValue=1e9,
+                borderValue=_NOTHING,
             )
-            out[mine] |= np.asarray(around)[row[mine], column[mine]] * 1.1 + _BEHIND < z[mine]
+            nearest = np.asarray(around)[row[of_label], column[of_label]]
+            out[of_label] |= nearest * _BEHIND_SHARE + _BEHIND < z[of_label]
     return out
 
 
 def without_borders(labels: U32, width: int) -> U32:
-    """The picture (h, w) of labels with UNPAINTED within ``width`` pixels of where two labels meet."""
+    """The picture (h, w) of labels, UNPAINTED within ``width`` pixels of where two labels meet."""
     if width <= 0:
         return labels
     border: NDArray[np.uint8] = np.zeros(labels.shape, np.uint8)

@@ -1,3 +1,4 @@
-"""Log -> typed frames, and results -> channels of a log: the only code that knows containers and
-messages.
+"""Log -> typed frames, and results -> channels of a log.
+
+The only code that knows containers and messages.
 """

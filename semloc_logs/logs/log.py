@@ -1,6 +1,4 @@
-"""A recorded log whatever its container: its streams, its messages in log-time order, and the
-frames that they decode to.
-"""
+"""A recorded log, whatever its container: streams, messages in log-time order, decoded frames."""
 
 from __future__ import annotations
 
@@ -10,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from semloc_logs.frames import Frame
+from semloc_logs.logs.problems import Problem
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +17,8 @@ class Stream:
 
     ``type`` is spelled as in ROS 2 (``sensor_msgs/msg/PointCloud2``) for ROS logs of both
     generations, ``foxglove.PointCloud`` for Foxglove's protobuf and JSON messages, "" when unknown.
-    ``encoding`` is that of the messages: ``cdr``, ``ros1``, ``protobuf``, ``json`` or whatever the
-    log claims. ``count`` is the number of messages that can be read.
+    ``encoding`` of the messages: ``cdr``, ``ros1``, ``protobuf``, ``json`` or whatever the log
+    claims. ``count`` is the number of messages that can be read.
     """
 
     topic: str
@@ -30,8 +29,9 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """How the messages of a stream are laid out: ``text`` in the schema language ``encoding``; both
-    empty when the log has none.
+    """The layout of the messages of a stream: ``text`` in the schema language ``encoding``.
+
+    Both are empty when the log has no definition.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Definition:
 
 
 class Message(NamedTuple):
-    """A message as recorded; ``type`` and ``encoding`` are those of its :class:`Stream`."""
+    """A message as recorded; ``type`` and ``encoding`` as in its :class:`Stream`."""
 
     topic: str
     type: str
@@ -63,9 +63,7 @@ class Log(Protocol):
 
     @property
     def encoding(self) -> str:
-        """``ros2``, ``ros1``, ``protobuf`` or ``json``: what most streams are recorded in; "" when
-        there are none.
-        """
+        """Encoding of most streams: ``ros2``, ``ros1``, ``protobuf``, ``json``; "" without."""
 
     @property
     def start_ns(self) -> int | None:
@@ -80,13 +78,13 @@ class Log(Protocol):
         """Sorted by topic. A topic with several types has several streams."""
 
     @property
-    def problems(self) -> list[str]:
-        """What was skipped and why, in sentences; grows while messages are read."""
+    def problems(self) -> list[Problem]:
+        """Skipped input and the reasons; grows while messages are read."""
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` (None: of all) in log-time order.
 
-        Damage ends the iteration early with a sentence in ``problems``, it raises nothing.
+        Damage ends the iteration early and is named in ``problems``; it raises nothing.
         """
 
     def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:

@@ -1,42 +1,172 @@
-"""What was skipped while reading a log, in sentences for the user."""
+"""Problems of a log: lost input and assumptions."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+
+
+class ProblemKind(Enum):
+    """What a problem is about."""
+
+    FILE = "file"  # a file of the log is damaged or missing; the text begins with its name
+    MESSAGE = "message"  # messages that cannot be read or decoded
+    FRAME = "frame"  # decoded frames, or points of them, that are not used
+    POINT_TIME = "point time"  # times of the points of a sweep
+    CALIBRATION = "calibration"
+    LABEL = "label"
+    TRANSFORM = "transform"
+    POSE = "pose"
+    ROLE = "role"  # which topic plays which role
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One problem: ``text`` is a sentence for the user, ``topic`` is "" for the whole log.
+
+    ``lost``: input was lost. A command that met such a problem ends with exit code 3.
+    """
+
+    topic: str
+    kind: ProblemKind
+    text: str
+    lost: bool
+
+    def of_log(self, name: str) -> Problem:
+        """The same with the log's ``name`` in front, unless the text names its file itself."""
+        if self.kind is ProblemKind.FILE:
+            return self
+        return replace(self, text=f"{name}: {self.text}")
+
+
+def sentences(problems: Iterable[Problem]) -> list[str]:
+    """The texts, as session.json and ``inspect --json`` list them."""
+    return [problem.text for problem in problems]
+
+
+def lost(problems: Iterable[Problem]) -> list[Problem]:
+    """The problems that lost input."""
+    return [problem for problem in problems if problem.lost]
+
+
+def sorted_problems(problems: Iterable[Problem]) -> list[Problem]:
+    """Each text once: lost input first, then assumptions, otherwise in the given order."""
+    first_of_text: dict[str, Problem] = {}
+    for problem in sorted(problems, key=lambda p: not p.lost):
+        first_of_text.setdefault(problem.text, problem)
+    return list(first_of_text.values())
+
+
+def without_loss_of(unused: Collection[str], problems: Iterable[Problem]) -> list[Problem]:
+    """The problems; those of the topics ``unused`` lose nothing."""
+    return [replace(p, lost=p.lost and p.topic not in unused) for p in problems]
+
+
+class NoCloud(Enum):
+    """Reason why a frame gives no cloud: its ``key`` in session.json, and the end of a sentence."""
+
+    NO_POSE = (
+        "no pose",
+        "no pose is known at their time (frames {frames}, poses {poses}): the pose stream has a "
+        "gap there, or its clock differs from the clock of the sensor",
+    )
+    NO_TRANSFORM = (
+        "no transform",
+        "no transform leads from their frame to the base frame: record /tf_static, or leave the "
+        "topic out with --topic",
+    )
+    NO_CALIBRATION = (
+        "no calibration",
+        "no CameraInfo belongs to them: record it, or name it with --topic camera_info=TOPIC",
+    )
+    UNUSABLE_CALIBRATION = ("unusable calibration", "their CameraInfo cannot be used")
+    NO_DEPTH = (
+        "no depth",
+        "they are colour or 8-bit pictures, not depth: choose another topic with "
+        "--topic depth=TOPIC",
+    )
+    NO_RIGHT_CALIBRATION = (
+        "no calibration of the right",
+        "no CameraInfo belongs to the right camera: record it, or name both by "
+        "--topic camera_info=TOPIC,TOPIC",
+    )
+    NO_PICTURE = (
+        "no picture",
+        "they are depth images, not pictures: choose another topic with --topic stereo_left=TOPIC",
+    )
+    NO_PARTNER = (
+        "no partner",
+        "the right camera has no picture within half a frame period of theirs",
+    )
+    OTHER_SIZE = ("other size", "the picture of the right camera has another size")
+    SAME_PICTURE = (
+        "same picture",
+        "the right camera has the very same picture: choose two cameras with "
+        "--topic stereo_left=TOPIC stereo_right=TOPIC",
+    )
+    UNUSABLE_PAIR = ("unusable pair", "the calibrations of the pair cannot be used")
+    NO_POINTS = ("no points", "they have no points within the range limits")
+    BACK_IN_TIME = (
+        "back in time",
+        "their stamps fall back behind the stamps of earlier frames: the clock was set back; "
+        "cut the log there",
+    )
+    EMPTY = ("empty", "they hold no points, or none whose position is a number")
+    # frames of a topic that repeats another topic: nothing is lost, so there is no sentence
+    DUPLICATE = ("copy", "")
+
+    def __init__(self, key: str, because: str) -> None:
+        self.key = key
+        self.because = because
 
 
 class Problems:
-    """Sentences in the order in which they arose; skipped messages are counted per topic and named
-    once.
+    """Collects problems in the order in which they arise, each once.
+
+    Skipped messages are counted by topic and named once for each topic.
     """
 
     def __init__(self) -> None:
-        self._said: dict[str, None] = {}
-        self._skipped: dict[tuple[str, str], tuple[int, str]] = {}
+        self._added: dict[Problem, None] = {}
+        self._skipped: dict[tuple[str, str], _Skipped] = {}
 
-    def add(self, sentence: str) -> None:
-        """Adds a sentence unless it is there."""
-        self._said.setdefault(sentence)
+    def add(
+        self,
+        text: str,
+        *,
+        topic: str = "",
+        kind: ProblemKind = ProblemKind.FILE,
+        lost: bool = True,
+    ) -> None:
+        """Adds a problem unless it is known."""
+        self._added.setdefault(Problem(topic, kind, text, lost))
 
-    def skip(self, stage: str, topic: str, reason: str) -> None:
-        """Counts one message of ``topic`` that ``stage`` (reading, decoding) skipped; the first
-        ``reason`` is the one that is told.
+    def skip(self, topic: str, reason: str, *, file: str = "") -> None:
+        """Counts one skipped message of ``topic``; the first ``reason`` is the one in the text.
+
+        ``file`` is the file that the message could not be read from; "": it could not be decoded.
         """
-        count, first = self._skipped.get((stage, topic), (0, reason))
-        self._skipped[stage, topic] = (count + 1, first)
+        self._skipped.setdefault((file, topic), _Skipped(reason)).count += 1
 
-    def forget_skipped(self, stage: str, topics: Collection[str] | None) -> None:
-        """Starts the counts of ``topics`` (None: all) anew, before another pass meets the same
-        messages again.
-        """
+    def forget_skipped(self, topics: Collection[str] | None, *, file: str = "") -> None:
+        """Starts the counts of ``topics`` (None: all) anew, before the messages are met again."""
         for key in list(self._skipped):
-            if key[0] == stage and (topics is None or key[1] in topics):
+            if key[0] == file and (topics is None or key[1] in topics):
                 del self._skipped[key]
 
-    def sentences(self) -> list[str]:
-        """All of them."""
-        counted = [
-            f"{topic}: {count} message{'s' if count > 1 else ''} skipped; {'the first because ' if count > 1 else ''}{reason}."
-            for (_, topic), (count, reason) in self._skipped.items()
-        ]
-        return [*self._said, *counted]
+    def __iter__(self) -> Iterator[Problem]:
+        yield from self._added
+        for (_, topic), skipped in self._skipped.items():
+            yield Problem(topic, ProblemKind.MESSAGE, f"{topic}: {skipped.text()}", lost=True)
+
+
+@dataclass(slots=True)
+class _Skipped:
+    reason: str
+    count: int = 0
+
+    def text(self) -> str:
+        if self.count == 1:
+            return f"1 message skipped; {self.reason}."
+        return f"{self.count} messages skipped; the first because {self.reason}."

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.frames import Header, PosedCloud
+from semloc_logs.labels.camera_labels import PointLabels
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.selection import KeyframeSelector, thin
@@ -24,7 +25,6 @@ from semloc_logs.settings import ResolvedFusion
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-U32 = NDArray[np.uint32]
 MOST_NORMALS = 20  # keyframes whose normals say where up is
 
 
@@ -44,10 +44,10 @@ class Collected:
     def __len__(self) -> int:
         return len(self.headers)
 
-    def add(self, cloud: PosedCloud, kept: NDArray[np.int64], label: U32 | None = None) -> None:
-        """A keyframe: the points ``kept`` (m,) of ``cloud``, and their labels (m,) as recorded, if
-        any.
-        """
+    def add(
+        self, cloud: PosedCloud, kept: NDArray[np.int64], label: PointLabels | None = None
+    ) -> None:
+        """A keyframe: points ``kept`` (m,) of ``cloud``, their labels (m,) from the labeller if any."""
         number = len(self)
         self._save(number, "points", cloud.points[kept])
         self._save(number, "label", label)
@@ -56,7 +56,7 @@ class Collected:
         self.poses.append(cloud.session_T_base)
         self.origins.append(cloud.origin)
 
-    def load(self, keyframe: int) -> tuple[F32, U32 | None, F32 | None]:
+    def load(self, keyframe: int) -> tuple[F32, PointLabels | None, F32 | None]:
         """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of
         their range, where there are any.
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
+from semloc_logs.logs.messages.stamps import utc
 from semloc_logs.logs.session.session import Session
-from semloc_logs.logs.session.tally import span
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.up_direction import find_up
 from semloc_logs.numerics.transforms import inverse, rotation_between
@@ -64,7 +64,7 @@ def check_reach(session: Session, collected: Collected, voxel_size: float) -> No
         first = pose[:3, 3] if first is None else first
         away = float(np.linalg.norm(pose[:3, 3] - first))
         if away > reach:
-            when = span(header.stamp_ns, header.stamp_ns).split(" to ")[0]
+            when = utc(header.stamp_ns)
             raise LogError(
                 f"{session.name}: the poses have come {away / 1e3:.0f} km from the first at {when}, "
                 f"but a map of {voxel_size:g} m voxels reaches {reach / 1e3:.0f} km: cut the log there, or give poses with --poses FILE."

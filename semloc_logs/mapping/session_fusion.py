@@ -17,8 +17,9 @@ import semloc_logs
 from semloc_logs.errors import LogError
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.logs.problems import Problem, lost, sentences
 from semloc_logs.logs.sensors.depth import RangeNoise
-from semloc_logs.logs.session.session import Session, open_session
+from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import check_reach, level
 from semloc_logs.mapping.map_tables import LevelSession, Progress, write_map
@@ -44,12 +45,20 @@ class FuseTask:
     poses: TrajectoryFile | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class FusedSession:
+    """The ``content`` of session.json, and the ``problems`` that it lists as sentences."""
+
+    content: dict[str, Any]
+    problems: tuple[Problem, ...]
+
+
 def fuse_session(
     task: FuseTask,
     on_progress: Progress = lambda _: None,
     on_tables: Callable[[dict[str, Any]], None] = lambda _: None,
-) -> dict[str, Any]:
-    """Write every table and, last, session.json; returns the latter.
+) -> FusedSession:
+    """Write every table and, last, session.json.
 
     ``on_tables`` is called with its content just before that, when all tables are there. Raises
     LogError when the log has nothing to fuse, RoleError when its streams leave open what to use.
@@ -58,36 +67,35 @@ def fuse_session(
         labeller = Labeller(task.settings.labels, session)
         metadata, content = _fused(task, session, labeller, on_progress)
         _write_trajectory(task.folder, session, metadata)
-        for note in labeller.notes:
-            on_progress(note)
+        problems = [*session.problems, *labeller.problems]
         content = {
             **session.to_json(),
-            "problems": [*session.problems, *labeller.notes],
+            "problems": sentences(problems),
             "labels": labeller.to_json(),
             "name": task.folder.name,
             "fingerprint": task.fingerprint,
             "settings": task.settings.model_dump(mode="json", include={"fusion", "labels"}),
             **metadata,
             **content,
-            "skipped": session.skipped,
+            "skipped": sentences(lost(problems)),
         }
     on_tables(content)
     write_json(task.folder.session_json, content)
-    return content
+    return FusedSession(content, tuple(problems))
 
 
 def _opened(task: FuseTask) -> Session:
     """The session of the task's logs."""
     fusion = task.settings.fusion
-    return open_session(
-        [*task.logs],
-        task.topics,
+    options = SessionOptions(
+        topics=task.topics,
         min_range=fusion.min_range,
         max_range=READ_RANGE * fusion.max_range,
         noise=RangeNoise(fusion.depth_noise, fusion.disparity_noise),
         poses=task.poses,
         odometry=fusion.odometry,
     )
+    return open_session([*task.logs], options)
 
 
 def _fused(
@@ -98,7 +106,7 @@ def _fused(
     with _scratch(task.folder) as scratch:
         collected = collect(session, labeller, fusion, scratch, on_progress)
         if not len(collected):
-            reasons = "; ".join(session.problems) or "its sensor streams are empty"
+            reasons = "; ".join(sentences(session.problems)) or "its sensor streams are empty"
             raise LogError(f"{session.name} gave no usable points: {reasons}")
         check_reach(session, collected, fusion.voxel_size)
         labeller.conclude()

@@ -13,7 +13,8 @@ from semloc_logs.engines import Engine
 from semloc_logs.errors import LogError, SemlocError
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import content_fingerprint, recover
-from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
+from semloc_logs.logs.problems import lost, sentences
+from semloc_logs.mapping.session_fusion import FusedSession, FuseTask, fuse_session
 from semloc_logs.pictures.map_picture import Caption, draw_map
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import SessionInput, fingerprint_of, recorded_fingerprint
@@ -54,7 +55,7 @@ def fuse(
                 LOGGER.info("%s: %s", task.folder.name, outcome)
         else:
             report.done.append(task.folder.name)
-            report.skipped += outcome["skipped"]
+            report.skipped += sentences(lost(outcome.problems))
             _log_outcome(task.folder.name, outcome)
     if report.failed and not report.done and not report.kept:
         raise LogError(" ".join(report.failed))
@@ -80,7 +81,7 @@ def _task(session: SessionInput, folder: SessionFolder, settings: Resolved) -> F
     return FuseTask(logs, folder, settings, dict(session.topics), fingerprint, session.poses)
 
 
-def _fuse_one(task: FuseTask) -> dict[str, Any] | SemlocError:
+def _fuse_one(task: FuseTask) -> FusedSession | SemlocError:
     """An expected error is a result: one bad log does not end the night's work."""
 
     def draw(content: dict[str, Any]) -> None:
@@ -96,7 +97,8 @@ def _fuse_one(task: FuseTask) -> dict[str, Any] | SemlocError:
         return problem
 
 
-def _log_outcome(name: str, content: dict[str, Any]) -> None:
+def _log_outcome(name: str, fused: FusedSession) -> None:
+    content = fused.content
     LOGGER.info(
         "%s: %d keyframes, %d submaps, %d voxels, labels from %s",
         name,
@@ -105,6 +107,6 @@ def _log_outcome(name: str, content: dict[str, Any]) -> None:
         content["voxels"],
         content["label_source"],
     )
-    for problem in content["problems"]:
-        if problem not in content["skipped"]:
-            LOGGER.info(problem if problem.startswith(name) else f"{name}: {problem}")
+    for problem in fused.problems:
+        if not problem.lost:
+            LOGGER.info("%s: %s", name, problem.text)

@@ -16,6 +16,7 @@ import yaml
 from click.testing import CliRunner, Result
 from mcap.writer import Writer
 
+from semloc_logs.benchmarks.named import Outcome
 from semloc_logs.cli.main import program
 from semloc_logs.logs.annotation.annotate import AnnotateReport
 from semloc_logs.stages.annotate import Annotation, AnnotationMode
@@ -478,12 +479,12 @@ def test_vocabulary_needs_a_variant(tmp_path: Path) -> None:
 
 
 def test_benchmark_prints_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = {
+    figures: dict[str, dict[str, float | str]] = {
         "messages": {"ours": 400.0, "unit": "MB/s", "peer": 200.0},
         "clouds": {"ours": 2.5, "unit": "ms"},
     }
     monkeypatch.setattr(
-        "semloc_logs.benchmarks.speed.suite.BENCHMARKS", {"reading": lambda _: figures}
+        "semloc_logs.benchmarks.named.BENCHMARKS", {"reading": lambda _: Outcome(figures)}
     )
     assert json.loads(semloc("benchmark", "reading", "--json").stdout) == figures
     assert "200" in semloc("benchmark", "reading").stdout

@@ -232,7 +232,7 @@ def test_sweeps_whose_clock_jumps_are_3_and_a_sentence(
 def test_no_poses_is_0_with_a_note(tmp_path: Path) -> None:
     done, session = fuse(drive(tmp_path / "a.mcap"))
     assert done.exit_code == 0, done.stderr
-    assert "a.mcap has no pose stream" in done.stderr
+    assert "a: The log has no pose stream" in done.stderr
     assert "--odometry lidar" in done.stderr
     assert "--poses FILE" in done.stderr
     assert not session["posed"]

@@ -1,6 +1,4 @@
-"""Where the classes of a session come from, over logs in memory and over the real drive with a
-camera.
-"""
+"""The source of the classes of a session, over logs in memory and over a real drive."""
 
 from __future__ import annotations
 
@@ -28,6 +26,7 @@ from semloc_logs.frames import (
 )
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.problems import Problem, sentences
 from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Labels
@@ -55,7 +54,7 @@ class FakeLog:
         self.path = Path("drive.mcap")
         self.format = "mcap"
         self.encoding = "ros2"
-        self.start_ns, self.end_ns, self.problems = 0, 10**10, list[str]()
+        self.start_ns, self.end_ns, self.problems = 0, 10**10, list[Problem]()
         topics = [f.header.topic for f in frames]
         kinds = {f.header.topic: TYPES[type(f)] for f in frames}
         if "/lidar/label_space" in kinds:
@@ -116,7 +115,7 @@ def halves(
 
 
 def classes(frames: Sequence[Frame], **settings: Any) -> tuple[list[list[int]], Labeller]:
-    """Classes of the points of every cloud, and the labeller that said so."""
+    """Classes of the points of every cloud, and their labeller."""
     session = Session([FakeLog(frames)])
     labeller = Labeller(Labels(**settings), session)
     taken = [
@@ -131,7 +130,7 @@ def classes(frames: Sequence[Frame], **settings: Any) -> tuple[list[list[int]], 
     ], labeller
 
 
-def test_the_log_says_what_its_ids_mean() -> None:
+def test_the_log_names_the_meaning_of_its_ids() -> None:
     names = {0: "unlabeled", 1: "Tree", 2: "street", 3: "quux"}
     found, labeller = classes(
         [LabelNames(header("/lidar/label_info", 0), names=names), sweep(10, [1, 2, 3])]
@@ -142,18 +141,18 @@ def test_the_log_says_what_its_ids_mean() -> None:
         "said_by": "log",
         "colours": False,
     }
-    assert labeller.notes == [
+    assert sentences(labeller.problems) == [
         "Classes of /lidar/points that mean nothing here are unlabelled: quux."
     ]
 
 
 def test_a_space_that_the_log_names_instead_of_a_guess() -> None:
-    ids = [7, 8, 11]  # looks like the full ids, and is said to be train ids
-    said = LabelNames(header("/lidar/label_space", 0), space="cityscapes")
-    found, labeller = classes([said, sweep(10, ids)])
+    ids = [7, 8, 11]  # looks like the full ids, and is named train ids
+    named = LabelNames(header("/lidar/label_space", 0), space="cityscapes")
+    found, labeller = classes([named, sweep(10, ids)])
     assert found == [[7, 8, 11]]
     assert labeller.to_json()["spaces"]["/lidar/points"]["said_by"] == "log"
-    found, _ = classes([said, sweep(10, ids)], space="cityscapes_ids")
+    found, _ = classes([named, sweep(10, ids)], space="cityscapes_ids")
     assert found == [[ROAD, 1, BUILDING]]
     found, labeller = classes(
         [LabelNames(header("/lidar/label_space", 0), space="/etc/passwd.yaml"), sweep(10, ids)]
@@ -174,7 +173,7 @@ def test_a_guess_looks_at_all_keyframes_and_is_recorded() -> None:
         "said_by": "guess",
         "colours": False,
     }
-    assert "semantickitti by their looks" in labeller.notes[0]
+    assert "semantickitti by their looks" in sentences(labeller.problems)[0]
 
 
 def test_labels_that_are_all_zero_are_none() -> None:
@@ -217,8 +216,9 @@ def test_colours_and_those_that_the_palette_does_not_have() -> None:
         "colours": True,
     }
     assert (
-        labeller.notes[1]
-        == "1 points have colours of /cam/labels that cityscapes does not have and are unlabelled: (1, 2, 3)."
+        sentences(labeller.problems)[1]
+        == "1 points have colours of /cam/labels that cityscapes does not have and "
+        "are unlabelled: (1, 2, 3)."
     )
 
 
@@ -230,8 +230,9 @@ def test_without_poses_the_picture_has_to_be_of_the_same_time() -> None:
 
 
 def test_with_poses_the_motion_between_picture_and_cloud_is_taken_out() -> None:
-    """The vehicle turns by 90 degrees a second; 200 ms later what was on the left lies straight
-    ahead, 18 degrees further right.
+    """The vehicle turns by 90 degrees a second.
+
+    200 ms later the things on the left lie straight ahead, 18 degrees further right.
     """
     poses = [
         PoseSample(header("/odom", ms, "odom"), "base_link", yaw_transform(np.radians(0.09 * ms)))
@@ -278,10 +279,31 @@ def test_two_cameras() -> None:
     assert [c["points"] for c in labeller.to_json()["cameras"].values()] == [2, 1]
 
 
-def test_cameras_that_cannot_be_placed_are_said() -> None:
+def test_painted_points_have_the_number_of_their_camera() -> None:
+    frames: list[Frame] = [
+        static(),
+        static("rear", yaw_transform(np.pi) @ OPTICAL),
+        camera(),
+        camera("/rear/camera_info", "rear"),
+        sweep(0),
+        halves(0, 5, 2),
+        halves(0, 13, 13, "/rear/labels", "rear"),
+    ]
+    session = Session([FakeLog(frames)])
+    labeller = Labeller(Labels(), session)
+    assert labeller.images == ("/cam/labels", "/rear/labels")
+    [cloud] = session.clouds(labeller.on_image, labeller.images)
+    painted = labeller.take(cloud, np.array([0, 2]))
+    assert painted is not None
+    assert painted["label"].tolist() == [5, 13]
+    assert painted["camera"].tolist() == [0, 1]
+    assert painted["is_doubtful"].tolist() == [False, False]
+
+
+def test_cameras_that_cannot_be_placed_are_named() -> None:
     found, labeller = classes([camera(), halves(0, 5, 2), sweep(0)])
     assert labeller.source == "geometry"
-    assert "No transform connects the camera frame 'optical'" in labeller.notes[0]
+    assert "No transform connects the camera frame 'optical'" in sentences(labeller.problems)[0]
     assert len(found) == 1
 
 
@@ -289,7 +311,7 @@ def test_cameras_that_cannot_be_placed_are_said() -> None:
 
 
 def by_brightness(folder: Path, rows: int, columns: int) -> dict[str, Any]:
-    """A model that calls what is bright building and what is dark car."""
+    """A model that labels bright pixels building and dark pixels car."""
     weights = np.stack([np.full((3, 1, 1), 1 / 3, np.float32), np.zeros((3, 1, 1), np.float32)])
     stored = [
         numpy_helper.from_array(weights, "w"),
@@ -309,16 +331,16 @@ def by_brightness(folder: Path, rows: int, columns: int) -> dict[str, Any]:
     return {"source": "onnx", "model": folder / "model.onnx", "spec": folder / "spec.yaml"}
 
 
-def test_the_model_labels_what_the_camera_shows(tmp_path: Path) -> None:
+def test_the_model_labels_the_points_in_the_picture(tmp_path: Path) -> None:
     settings = by_brightness(tmp_path, 100, 100)
     picture = halves(0, (200, 200, 200), (10, 10, 10), "/cam/image")
     found, labeller = classes([static(), camera(), picture, sweep(0, [40, 40, 40])], **settings)
-    assert found == [[BUILDING, CAR, 255]]  # whatever the points of the log say
+    assert found == [[BUILDING, CAR, 255]]  # whatever labels the points have
     assert labeller.source == "onnx"
     assert labeller.to_json()["model"]["unknown_classes"] == []
 
 
-def test_what_the_model_lacks_is_said(tmp_path: Path) -> None:
+def test_missing_parts_of_a_model_are_named(tmp_path: Path) -> None:
     settings = by_brightness(tmp_path, 100, 100)
     picture = halves(0, (200, 200, 200), (10, 10, 10), "/cam/image")
     with pytest.raises(LogError, match="no camera pictures with a CameraInfo"):
@@ -332,11 +354,12 @@ def test_what_the_model_lacks_is_said(tmp_path: Path) -> None:
 
 
 def test_a_real_drive_without_poses(shared: Callable[[str], Path], tmp_path: Path) -> None:
-    from semloc_logs.logs.session.session import open_session
+    from semloc_logs.logs.session.session import SessionOptions, open_session
 
     settings = by_brightness(tmp_path, 94, 311)
     session = open_session(
-        [shared("logs/kitti_drive_camera_lidar.mcap")], min_range=0.9, max_range=80.0
+        [shared("logs/kitti_drive_camera_lidar.mcap")],
+        SessionOptions(min_range=0.9, max_range=80.0),
     )
     try:
         labeller = Labeller(Labels(**settings), session)

@@ -77,7 +77,7 @@ def test_scaled_and_rectified_pictures() -> None:
     np.testing.assert_allclose(rectified[0], [2 * 319.5 + 100, 2 * 239.5 - 50])
 
 
-def test_what_cannot_be_used_is_said() -> None:
+def test_unusable_calibrations_are_named() -> None:
     with pytest.raises(LogError, match="640 x 480 pixels but its picture has 640 x 640"):
         Projector(camera(), 640, 640)
     with pytest.raises(LogError, match="'double_sphere'"):

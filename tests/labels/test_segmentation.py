@@ -1,6 +1,4 @@
-"""A model that classifies by colour: its input as the spec says, its output as classes, and what is
-said when they do not fit.
-"""
+"""A model that classifies by colour: input by its spec, output as classes, and errors."""
 
 from __future__ import annotations
 
@@ -35,9 +33,7 @@ def save_model(
     times: int = 1,
     plus: int = 0,
 ) -> Path:
-    """Class k of three is the channel that is brightest; more classes never win. Ids are k
-    ``times`` this ``plus`` that.
-    """
+    """Class k of three is the brightest channel, with id ``times`` k ``plus`` a number."""
     weights = np.zeros((classes, 3, 1, 1), np.float32)
     weights[:3, :, 0, 0] = np.eye(3)
     bias = np.where(np.arange(classes) < 3, 0, -100).astype(np.float32)
@@ -216,7 +212,7 @@ def test_a_space_by_name_and_beside_the_spec(tmp_path: Path) -> None:
         ({}, {"classes": None, "space": "marskitti"}, "marskitti"),
     ],
 )
-def test_what_does_not_fit_is_said(
+def test_a_model_and_a_spec_that_do_not_fit(
     tmp_path: Path, model: dict[str, Any], spec: dict[str, Any], match: str
 ) -> None:
     with pytest.raises(SettingsError, match=match):

@@ -222,7 +222,10 @@ def test_guessing_palettes_and_full_ids() -> None:
 
 def test_a_space_of_the_user(tmp_path: Path) -> None:
     file = tmp_path / "ours.yaml"
-    classes = "1: {name: asphalt}, 2: {name: truss, to: pole, colour: [1, 2, 3]}, 3: gizmo, 7: {name: deer, to: null, dynamic: true}"
+    classes = (
+        "1: {name: asphalt}, 2: {name: truss, to: pole, colour: [1, 2, 3]}, 3: gizmo, "
+        "7: {name: deer, to: null, dynamic: true}"
+    )
     file.write_text(f"classes: {{{classes}}}")
     space = read_space(str(file))
     assert space.train_ids(np.array([0, 1, 2, 3, 7, 99])).tolist() == [255, 0, 5, 255, 255, 255]

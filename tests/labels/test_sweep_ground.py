@@ -61,7 +61,7 @@ def test_a_ceiling_is_no_ground() -> None:
     assert np.abs(surface.height_at(ceiling[:, :2])).max() < 0.1
 
 
-def test_what_is_seen_and_what_is_not() -> None:
+def test_seen_and_unseen_ground() -> None:
     p = field(np.random.default_rng(4), half=8)
     p = p[p[:, 0] < 0]
     wall = np.array([[7.0, 0.0, 2.0]])

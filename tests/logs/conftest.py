@@ -24,9 +24,7 @@ FOXGLOVE = {"u1": 1, "i1": 2, "u2": 3, "i2": 4, "u4": 5, "i4": 6, "f4": 7, "f8":
 
 
 class Recorder:
-    """A log of ``kind`` ros2, ros1 or protobuf; messages are kept and written in log-time order by
-    :meth:`write`.
-    """
+    """A log of ``kind`` ros2, ros1 or protobuf; :meth:`write` sorts messages by log time."""
 
     def __init__(self, path: Path, kind: str = "ros2") -> None:
         self.kind, self.path = kind, path.with_suffix(".bag" if kind == "ros1" else ".mcap")
@@ -61,9 +59,7 @@ class Recorder:
         late_ns: int = 150_000_000,
         **changes: Any,
     ) -> None:
-        """A cloud of records such as ``[('x', '<f4'), ...]``; ``changes`` replaces fields of
-        PointCloud2.
-        """
+        """A cloud of records such as ``[('x', '<f4'), ...]``; ``changes`` replaces fields."""
         named = [
             (n, points.dtype.fields[n]) for n in points.dtype.names or () if points.dtype.fields
         ]
@@ -264,7 +260,10 @@ def _ros1_type(m: Any, store: Any) -> Mapping[str, Any]:
         text, _ = store.generate_msgdef("geometry_msgs/msg/TransformStamped", ros_version=1)
         separator = "=" * 80
         head, _, rest = text.partition(separator)
-        text = f"geometry_msgs/TransformStamped[] transforms\n{separator}\nMSG: geometry_msgs/TransformStamped\n{head}{separator}{rest}"
+        text = (
+            f"geometry_msgs/TransformStamped[] transforms\n{separator}\n"
+            f"MSG: geometry_msgs/TransformStamped\n{head}{separator}{rest}"
+        )
         return {"msgdef": text, "md5sum": "94810edda583a504dfda3829e70d7eec"}
     return {"typestore": store}
 

@@ -6,6 +6,7 @@ import pytest
 
 from semloc_logs.errors import RoleError
 from semloc_logs.logs.log import Stream
+from semloc_logs.logs.problems import sentences
 from semloc_logs.logs.roles import Roles, find_roles, guess_roles
 
 CLOUD, IMAGE, JPEG, INFO = (
@@ -33,27 +34,42 @@ def roles(topics: dict[str, str], **overrides: str) -> Roles:
 def test_a_car_with_everything() -> None:
     found = roles(
         {
-            "/lidar_top/points": CLOUD, "/lidar_rear/points": CLOUD, "/map": CLOUD, "/odometry": ODOM, "/tf": TF, "/tf_static": TF,
-            "/imu/data": IMU, "/imu/data_raw": IMU, "/fix": FIX, "/cam_front/image_raw/compressed": JPEG, "/cam_front/camera_info": INFO,
-            "/cam_back/image_raw/compressed": JPEG, "/cam_back/camera_info": INFO, "/rosout": "rosgraph_msgs/msg/Log",
+            "/lidar_top/points": CLOUD,
+            "/lidar_rear/points": CLOUD,
+            "/map": CLOUD,
+            "/odometry": ODOM,
+            "/tf": TF,
+            "/tf_static": TF,
+            "/imu/data": IMU,
+            "/imu/data_raw": IMU,
+            "/fix": FIX,
+            "/cam_front/image_raw/compressed": JPEG,
+            "/cam_front/camera_info": INFO,
+            "/cam_back/image_raw/compressed": JPEG,
+            "/cam_back/camera_info": INFO,
+            "/rosout": "rosgraph_msgs/msg/Log",
         }
-    )  # fmt: skip
+    )
     assert found.lidar == ("/lidar_rear/points", "/lidar_top/points")
     assert (found.pose, found.imu, found.gnss) == ("/odometry", "/imu/data", "/fix")
     assert (found.tf, found.tf_static) == (("/tf",), ("/tf_static",))
     assert found.info_of["/cam_back/image_raw/compressed"] == "/cam_back/camera_info"
     assert found.role_of("/rosout") is None
     assert found.role_of("/map") is None
-    assert any("--topic lidar=/map" in note for note in found.notes)
+    assert any("--topic lidar=/map" in note for note in sentences(found.notes))
 
 
 def test_depth_camera_with_both_infos_and_a_posestamped() -> None:
     found = roles(
         {
-            "/camera/pose": POSE, "/camera/color/image/compressed": JPEG, "/camera/depth/image/compressedDepth": JPEG,
-            "/camera/color/camera_info": INFO, "/camera/depth/camera_info": INFO, "/camera/depth/points": CLOUD,
+            "/camera/pose": POSE,
+            "/camera/color/image/compressed": JPEG,
+            "/camera/depth/image/compressedDepth": JPEG,
+            "/camera/color/camera_info": INFO,
+            "/camera/depth/camera_info": INFO,
+            "/camera/depth/points": CLOUD,
         }
-    )  # fmt: skip
+    )
     assert found.depth == ("/camera/depth/image/compressedDepth",)
     assert found.image == ("/camera/color/image/compressed",)
     assert found.info_of[found.depth[0]] == "/camera/depth/camera_info"
@@ -126,12 +142,12 @@ def test_a_stereo_pair_beside_ranges_stays_two_images_unless_it_is_named() -> No
         assert found.image == ("/left/image_raw", "/right/image_raw")
         assert found.ranging == tuple(ranges)
         for named in ({"stereo_left": "/left/image_raw"}, {"stereo_right": "/right/image_raw"}):
-            asked = roles(pair | ranges, **named)
-            assert (asked.stereo_left, asked.stereo_right) == (
+            named_pair = roles(pair | ranges, **named)
+            assert (named_pair.stereo_left, named_pair.stereo_right) == (
                 "/left/image_raw",
                 "/right/image_raw",
             )
-            assert asked.ranging == (*ranges, "/left/image_raw")
+            assert named_pair.ranging == (*ranges, "/left/image_raw")
     assert roles(pair, stereo_left="none").ranging == ()
 
 
@@ -221,7 +237,7 @@ def test_fixes_named_as_the_pose() -> None:
 
 def test_overrides_that_cannot_be() -> None:
     topics = {"/points": CLOUD, "/odom": ODOM}
-    with pytest.raises(RoleError, match=r"no role 'laser'.*lidar, depth"):
+    with pytest.raises(RoleError, match=r"role 'laser' is unknown.*lidar, depth"):
         roles(topics, laser="/points")
     with pytest.raises(
         RoleError, match=r"no topic '/pionts'.*/odom \(nav_msgs/msg/Odometry\), /points"
@@ -258,11 +274,18 @@ def test_streams_without_messages_play_no_role() -> None:
 def test_foxglove_types() -> None:
     found = roles(
         {
-            "/lidar": "foxglove.PointCloud", "/cam": "foxglove.CompressedImage", "/cam_calibration": "foxglove.CameraCalibration",
-            "/tf": "foxglove.FrameTransforms", "/gps": "foxglove.LocationFix",
+            "/lidar": "foxglove.PointCloud",
+            "/cam": "foxglove.CompressedImage",
+            "/cam_calibration": "foxglove.CameraCalibration",
+            "/tf": "foxglove.FrameTransforms",
+            "/gps": "foxglove.LocationFix",
         }
-    )  # fmt: skip
+    )
     assert found.to_json() == {
-        "lidar": ["/lidar"], "image": ["/cam"], "camera_info": ["/cam_calibration"], "tf": ["/tf"], "gnss": ["/gps"],
-    }  # fmt: skip
+        "lidar": ["/lidar"],
+        "image": ["/cam"],
+        "camera_info": ["/cam_calibration"],
+        "tf": ["/tf"],
+        "gnss": ["/gps"],
+    }
     assert found.info_of == {"/cam": "/cam_calibration"}

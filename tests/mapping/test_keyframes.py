@@ -16,9 +16,6 @@ CLOUD = PosedCloud(
     np.arange(12, dtype=np.float32).reshape(4, 3),
     np.zeros(3, np.float32),
     None,
-    None,
-    {},
-    None,
 )
 
 

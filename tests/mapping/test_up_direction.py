@@ -105,9 +105,11 @@ def test_two_drives_through_a_basement_agree_on_up(shared: Callable[[str], Path]
         scratch = Path(tempfile.mkdtemp())
         try:
             from semloc_logs.labels.labeller import Labeller
-            from semloc_logs.logs.session.session import open_session
+            from semloc_logs.logs.session.session import SessionOptions, open_session
 
-            session = open_session([shared(f"logs/{name}")], {}, min_range=0.9, max_range=30.0)
+            session = open_session(
+                [shared(f"logs/{name}")], SessionOptions(min_range=0.9, max_range=30.0)
+            )
             try:
                 collected = collect(
                     session,

@@ -19,7 +19,7 @@ from semloc_logs.engines import make_engine
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.logs.annotation.annotate import content_fingerprint
-from semloc_logs.logs.session.session import Session, open_session
+from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.mapping import session_fusion
 from semloc_logs.mapping.ground import GroundMapper, ground_height
 from semloc_logs.mapping.keyframes import Collected
@@ -166,9 +166,8 @@ def profile_fuse(
 def _read(logs: Sequence[Path], settings: Resolved) -> int:
     """Read all clouds of ``logs``; their number."""
     fusion = settings.fusion
-    session = open_session(
-        [*logs], {}, min_range=fusion.min_range, max_range=2.0 * fusion.max_range
-    )
+    options = SessionOptions(min_range=fusion.min_range, max_range=2.0 * fusion.max_range)
+    session = open_session([*logs], options)
     try:
         return sum(1 for _ in session.clouds())
     finally:

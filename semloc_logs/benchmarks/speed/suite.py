@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Resolved
 
 if TYPE_CHECKING:
@@ -69,7 +68,7 @@ def reading(settings: Resolved) -> Figures:
                 return sum(len(m.data) for _, _, m in make_reader(file).iter_messages())
 
         def clouds() -> int:
-            session = open_session([log], {})
+            session = open_session([log])
             try:
                 return sum(1 for _ in session.clouds())
             finally:
@@ -199,20 +198,3 @@ def _annotated(log: Path, records: Sequence[ClosureRecord]) -> float:
         Results(records, "session_0", {}, {r.query_stamp_ns: r.query_stamp_ns for r in records}),
     )
     return time.perf_counter() - start
-
-
-BENCHMARKS: dict[str, Callable[[Resolved], Figures]] = {
-    "reading": reading,
-    "fusion": fusion,
-    "encoder": encoder,
-    "search": search,
-    "verification": verification,
-    "annotate": annotate,
-}
-
-
-def run_benchmark(name: str, settings: Resolved) -> Figures:
-    """The figures of one benchmark; SettingsError when there is none of that name."""
-    if name not in BENCHMARKS:
-        raise SettingsError(f"There is no benchmark '{name}': there are {', '.join(BENCHMARKS)}.")
-    return BENCHMARKS[name](settings)

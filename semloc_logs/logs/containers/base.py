@@ -1,12 +1,11 @@
-"""What all containers share: problems by topic, messages of several parts in log-time order,
-careful decompression.
-"""
+"""Parts of all containers: problems, messages of several parts in order, safe decompression."""
 
 from __future__ import annotations
 
 import bz2
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heappop, heappush, heapreplace
 from pathlib import Path
@@ -17,13 +16,14 @@ import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Frame
-from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.log import Log, Message, Stream
 from semloc_logs.logs.messages.decode import Decoder
-from semloc_logs.logs.problems import Problems
+from semloc_logs.logs.problems import Problem, Problems
 
 # no recorder writes chunks of 2 GiB; a larger claim is damage or a decompression bomb
 MAX_CHUNK = 2 << 30
 _STEP = 1 << 22
+_PLAUSIBLE_GROWTH = 64  # point clouds and pictures shrink by less
 
 
 class BaseLog(ABC):
@@ -40,9 +40,9 @@ class BaseLog(ABC):
         self._decoder = Decoder(self._problems)
 
     @property
-    def problems(self) -> list[str]:
-        """What was skipped and why, in sentences."""
-        return self._problems.sentences()
+    def problems(self) -> list[Problem]:
+        """Skipped input and the reasons."""
+        return list(self._problems)
 
     @abstractmethod
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
@@ -50,7 +50,7 @@ class BaseLog(ABC):
 
     def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
         """The decoded messages of ``topics`` in log-time order."""
-        self._problems.forget_skipped("decoding", topics)
+        self._problems.forget_skipped(topics)
         for message in self.messages(topics):
             yield from self._decoder.frames(message)
 
@@ -69,9 +69,7 @@ def open_file(path: Path) -> BinaryIO:
 
 @contextmanager
 def closed_on_error(file: BinaryIO, path: Path) -> Iterator[None]:
-    """Closes ``file`` when it turns out to be no log, and says so as a LogError that names
-    ``path``.
-    """
+    """Closes ``file`` when it turns out not to be a log; the LogError names ``path``."""
     try:
         yield
     except (LogError, OSError) as error:
@@ -90,22 +88,28 @@ class SizedFile(Protocol):
 
 
 def encoding_of(streams: Iterable[Stream]) -> str:
-    """``ros2``, ``ros1``, ``protobuf`` or ``json``: what most streams are recorded in, "" without
-    streams that are.
-    """
+    """Encoding of most streams: ``ros2``, ``ros1``, ``protobuf`` or ``json``; "" without any."""
     names = {"cdr": "ros2", "ros1": "ros1", "protobuf": "protobuf", "json": "json"}
-    found = [names[s.encoding] for s in streams if s.encoding in names]
-    return max(sorted(set(found)), key=found.count, default="")
+    encodings = [names[s.encoding] for s in streams if s.encoding in names]
+    return max(sorted(set(encodings)), key=encodings.count, default="")
+
+
+def merged_streams(logs: Sequence[Log]) -> list[Stream]:
+    """The streams of all logs sorted by topic; counts of the same topic and type add up."""
+    counts: Counter[tuple[str, str, str]] = Counter()
+    for log in logs:
+        for s in log.streams:
+            counts[s.topic, s.type, s.encoding] += s.count
+    return [Stream(*key, count) for key, count in sorted(counts.items())]
 
 
 def in_log_time_order(
     parts: Iterable[tuple[int, Callable[[], Iterator[Message]]]],
 ) -> Iterator[Message]:
-    """Merges parts, each (a lower bound of its log times, a function that opens it), each in
-    log-time order by itself.
+    """Merges parts: each a lower bound of its log times and a function that opens it.
 
-    A part is opened when its time has come, so memory holds only parts that overlap; equal times
-    keep the order of the parts.
+    Each part is in log-time order by itself. It is opened when its time has come, so memory holds
+    only parts that overlap; equal times keep the order of the parts.
     """
     waiting = sorted(
         ((start, k, part) for k, (start, part) in enumerate(parts)),
@@ -113,12 +117,16 @@ def in_log_time_order(
         reverse=True,
     )
     heap: list[tuple[int, int, Message, Iterator[Message]]] = []
-    while waiting or heap:
+
+    def open_due() -> None:
         while waiting and (not heap or waiting[-1][0] <= heap[0][0]):
             _, order, part = waiting.pop()
             opened = iter(part())
             if (first := next(opened, None)) is not None:
                 heappush(heap, (first.log_time_ns, order, first, opened))
+
+    while waiting or heap:
+        open_due()
         if not heap:
             continue
         _, order, message, opened = heap[0]
@@ -140,9 +148,7 @@ def in_log_time_order(
 
 
 def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> bytes:
-    """``size`` bytes at ``offset``; LogError when the file does not have them (nothing is allocated
-    for the claim).
-    """
+    """``size`` bytes at ``offset``; LogError when the file is shorter, before any allocation."""
     if offset < 0 or size < 0 or offset + size > file_size:
         raise LogError(
             f"{size} bytes are claimed at byte {offset}, but the file ends at byte {file_size}"
@@ -155,8 +161,9 @@ def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> byt
 
 
 def decompress(data: bytes, compression: str, size: int) -> bytes:
-    """The ``size`` bytes that ``data`` holds; LogError for another size, a claim beyond reason or
-    damaged data.
+    """The ``size`` bytes that ``data`` holds.
+
+    LogError for another size, a claim beyond reason or damaged data.
     """
     if compression in ("", "none"):
         unpacked = data
@@ -182,8 +189,8 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
 
 
 def _unpack(data: bytes, compression: str, size: int) -> bytes:
-    """Decompresses at once what is plausible, and in steps what claims to grow more than 64-fold."""
-    plausible = size <= max(64 * len(data), _STEP)
+    """Decompresses plausible sizes at once, and claims to grow by more than that in steps."""
+    plausible = size <= max(_PLAUSIBLE_GROWTH * len(data), _STEP)
     if compression == "zstd":
         if plausible and zstandard.frame_content_size(data) in (size, -1):
             return bytes(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
@@ -204,6 +211,7 @@ class _Engine(Protocol):
 
 
 def _feed(engine: _Engine, data: bytes) -> Callable[[int], bytes]:
+    """A function that reads at most so many decompressed bytes of ``data``."""
     rest = [data]
 
     def read(size: int) -> bytes:

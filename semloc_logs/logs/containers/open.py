@@ -1,4 +1,4 @@
-"""Opens whatever log a path names, by its content rather than its suffix."""
+"""Opens the log at a path, by its content rather than its suffix."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ _SQLITE = b"SQLite format 3\0"
 
 
 def open_log(path: str | Path) -> Log:
-    """The log at ``path``.
+    """The log at ``path``: an MCAP file, a ROS 1 bag, a ROS 2 bag directory or one of its files.
 
-    An MCAP file, a ROS 1 bag, a ROS 2 bag directory, its metadata.yaml, or one of its files.
-    LogError says what it is instead, or what is wrong with it.
+    LogError describes the file where it is not a log, or its damage.
     """
     path = Path(path)
     if path.is_dir():
@@ -42,10 +41,10 @@ def open_log(path: str | Path) -> Log:
         return Rosbag1Log(path)
     if head.startswith(_SQLITE):
         return SqliteLog(path)
-    raise LogError(f"{path} {_what_it_is(head)}")
+    raise LogError(f"{path} {_description(head)}")
 
 
-def _what_it_is(head: bytes) -> str:
+def _description(head: bytes) -> str:
     if not head:
         return "is empty; record or copy it again."
     if head.startswith(b"version https://git-lfs"):
@@ -59,6 +58,6 @@ def _what_it_is(head: bytes) -> str:
     if MAGIC.startswith(head) or rosbag1.MAGIC.startswith(head):
         return "is cut off within its first bytes; record or copy it again."
     return (
-        "is no log: it starts neither like an MCAP file nor like a ROS 1 bag "
-        "nor like a ROS 2 sqlite3 bag."
+        "is not a log: it starts neither like an MCAP file nor like a ROS 1 bag nor like a ROS 2 "
+        "sqlite3 bag."
     )

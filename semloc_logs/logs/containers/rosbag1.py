@@ -1,5 +1,6 @@
-"""ROS 1 bags (format 2.0): by their index, or, when it is missing or damaged, by walking over the
-chunks that are readable.
+"""ROS 1 bags (format 2.0), read by their index.
+
+Where it is missing or damaged, the readable chunks are found by a walk over the file.
 """
 
 from __future__ import annotations
@@ -55,8 +56,9 @@ class Rosbag1Log(BaseLog):
             self._open()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
-        """The messages of ``topics`` (None: of all) in log-time order; a damaged chunk is skipped
-        and named in ``problems``.
+        """The messages of ``topics`` (None: of all) in log-time order.
+
+        A damaged chunk is skipped and named in ``problems``.
         """
         wanted = None if topics is None else frozenset(topics)
         ids = {
@@ -81,6 +83,7 @@ class Rosbag1Log(BaseLog):
                 if known
                 else "it does not start like a ROS 1 bag"
             )
+
         counts = None
         try:
             head, _, _ = self._record(len(MAGIC))
@@ -93,6 +96,7 @@ class Rosbag1Log(BaseLog):
             )
         if counts is None:
             counts = self._scan()
+
         grouped: Counter[tuple[str, str]] = Counter()
         for connection, (topic, type_, _) in self._connections.items():
             grouped[topic, type_] += counts.get(connection, 0)
@@ -100,10 +104,8 @@ class Rosbag1Log(BaseLog):
             Stream(topic, type_, "ros1", count) for (topic, type_), count in sorted(grouped.items())
         ]
         if self._parts:
-            self.start_ns, self.end_ns = (
-                min(p.start_ns for p in self._parts),
-                max(p.end_ns for p in self._parts),
-            )
+            self.start_ns = min(p.start_ns for p in self._parts)
+            self.end_ns = max(p.end_ns for p in self._parts)
 
     def _read_index(self, head: Fields) -> Counter[int] | None:
         """Message counts by connection; None when the bag was not closed."""
@@ -155,9 +157,7 @@ class Rosbag1Log(BaseLog):
             )
 
     def _scan(self) -> Counter[int]:
-        """Walks over all records and decompresses every chunk once: parts and counts of what can be
-        read.
-        """
+        """Walks over all records, decompresses each chunk once and counts readable messages."""
         self._parts.clear()
         counts: Counter[int] = Counter()
         position = len(MAGIC)
@@ -181,17 +181,18 @@ class Rosbag1Log(BaseLog):
 
     def _scan_chunk(self, offset: int, counts: Counter[int]) -> None:
         try:
-            found = self._walk(self._unpack_chunk(offset), offset)
+            messages = self._walk(self._unpack_chunk(offset), offset)
         except LogError as error:
             self._problems.add(
                 f"{self.path.name}: the chunk at byte {offset} was skipped: {error}."
             )
             return
-        found = [f for f in found if f[1] in self._connections]
-        if found:
-            times = [f[0] for f in found]
-            counts.update(f[1] for f in found)
-            self._parts.append(Part(offset, min(times), max(times), frozenset(f[1] for f in found)))
+        known = [(time, c) for time, c, _, _ in messages if c in self._connections]
+        if known:
+            times = [time for time, _ in known]
+            counts.update(connection for _, connection in known)
+            connections = frozenset(connection for _, connection in known)
+            self._parts.append(Part(offset, min(times), max(times), connections))
 
     # -- reading
 
@@ -204,9 +205,9 @@ class Rosbag1Log(BaseLog):
             )
             return
         view = memoryview(data)
-        found = self._walk(data, part.offset)
-        found.sort(key=lambda f: f[0])  # stable, and nearly free for what is in order already
-        for log_time, connection, start, end in found:
+        messages = self._walk(data, part.offset)
+        messages.sort(key=lambda m: m[0])  # stable, and nearly free where they are in order already
+        for log_time, connection, start, end in messages:
             if connection in wanted:
                 topic, type_, definition = self._connections[connection]
                 yield Message(topic, type_, "ros1", log_time, view[start:end], definition)
@@ -223,10 +224,8 @@ class Rosbag1Log(BaseLog):
         )
 
     def _walk(self, data: bytes, offset: int) -> list[tuple[int, int, int, int]]:
-        """(log time, connection, start, end) of the messages in ``data``; learns of connections on
-        the way.
-        """
-        found = []
+        """(log time, connection, start, end) of the messages in ``data``; takes connections."""
+        messages = []
         position = 0
         size = len(data)
         try:
@@ -234,9 +233,8 @@ class Rosbag1Log(BaseLog):
                 fields, start, end = _split(data, position)
                 op = fields.get(b"op")
                 if op == b"\x02":
-                    found.append(
-                        (_time(fields, b"time"), _number(fields, b"conn", "<I"), start, end)
-                    )
+                    connection = _number(fields, b"conn", "<I")
+                    messages.append((_time(fields, b"time"), connection, start, end))
                 elif op == b"\x07":
                     connection = _number(fields, b"conn", "<I")
                     if connection not in self._connections:
@@ -244,9 +242,10 @@ class Rosbag1Log(BaseLog):
                 position = end
         except _DamageError as error:
             self._problems.add(
-                f"{self.path.name}: the chunk at byte {offset} is damaged inside: {error}; {len(found)} messages of it are used."
+                f"{self.path.name}: the chunk at byte {offset} is damaged inside: {error}; "
+                f"{len(messages)} messages of it are used."
             )
-        return found
+        return messages
 
     def _record(self, offset: int) -> tuple[Fields, int, int]:
         """Fields, start and end of the data of the record at ``offset`` of the file."""

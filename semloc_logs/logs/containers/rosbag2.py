@@ -1,12 +1,12 @@
-"""ROS 2 bags: directories of sqlite3 or MCAP files, split or not, compressed or not, with or
-without metadata.yaml; or one file.
+"""ROS 2 bags: directories of sqlite3 or MCAP files, or one such file.
+
+Split or not, compressed or not, with or without metadata.yaml.
 """
 
 from __future__ import annotations
 
 import shutil
 import tempfile
-from collections import Counter
 from collections.abc import Collection, Iterator
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -16,10 +16,16 @@ import yaml
 import zstandard
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.containers.base import MAX_CHUNK, BaseLog, encoding_of, in_log_time_order
+from semloc_logs.logs.containers.base import (
+    MAX_CHUNK,
+    BaseLog,
+    encoding_of,
+    in_log_time_order,
+    merged_streams,
+)
 from semloc_logs.logs.containers.mcap import McapLog
 from semloc_logs.logs.containers.sqlite import SqliteLog
-from semloc_logs.logs.log import Log, Message, Stream
+from semloc_logs.logs.log import Log, Message
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".db3", ".mcap")
@@ -57,7 +63,22 @@ class Rosbag2Log(BaseLog):
 
     def _open(self) -> None:
         metadata = self._metadata()
-        paths = self._listed(metadata) if metadata else self._found()
+        self._open_files(self._listed(metadata) if metadata else self._found())
+        self.streams = merged_streams(self._files)
+        self.encoding = encoding_of(self.streams) or self._files[0].encoding
+        starts = [f.start_ns for f in self._files if f.start_ns is not None]
+        self.start_ns = min(starts, default=None)
+        self.end_ns = max((f.end_ns for f in self._files if f.end_ns is not None), default=None)
+        claimed = metadata.get("message_count")
+        count = sum(s.count for s in self.streams)
+        if isinstance(claimed, int) and claimed != count:
+            self._problems.add(
+                f"{self.path / 'metadata.yaml'} claims {claimed} messages, but the files hold "
+                f"{count}; the files count."
+            )
+
+    def _open_files(self, paths: list[Path]) -> None:
+        """Opens the files that can be read; LogError when there are none."""
         failures = []
         for path in paths:
             try:
@@ -72,20 +93,6 @@ class Rosbag2Log(BaseLog):
             )
         for failure in failures:
             self._problems.add(failure)
-        counts: Counter[tuple[str, str, str]] = Counter()
-        for file in self._files:
-            for s in file.streams:
-                counts[s.topic, s.type, s.encoding] += s.count
-        self.streams = [Stream(*key, count) for key, count in sorted(counts.items())]
-        self.encoding = encoding_of(self.streams) or self._files[0].encoding
-        starts = [f.start_ns for f in self._files if f.start_ns is not None]
-        self.start_ns = min(starts, default=None)
-        self.end_ns = max((f.end_ns for f in self._files if f.end_ns is not None), default=None)
-        claimed = metadata.get("message_count")
-        if isinstance(claimed, int) and claimed != sum(counts.values()):
-            self._problems.add(
-                f"{self.path / 'metadata.yaml'} claims {claimed} messages, but the files hold {sum(counts.values())}; the files count."
-            )
 
     def _metadata(self) -> dict[str, Any]:
         """The information of metadata.yaml; empty when it is missing or unusable."""
@@ -120,18 +127,16 @@ class Rosbag2Log(BaseLog):
         return information
 
     def _listed(self, metadata: dict[str, Any]) -> list[Path]:
-        """The files that metadata.yaml names and that are there, whatever folder they were recorded
-        in.
-        """
+        """The files that metadata.yaml names and that exist, whatever their folder was."""
         listed = metadata.get("relative_file_paths")
         names = (
             [PurePosixPath(p).name for p in listed if isinstance(p, str)]
             if isinstance(listed, list)
             else []
         )
-        found = self._found()
+        existing = self._found()
         if not names:
-            return found
+            return existing
         paths = []
         for name in dict.fromkeys(names):
             candidates = [
@@ -143,19 +148,18 @@ class Rosbag2Log(BaseLog):
                 paths.append(self.path / candidates[0])
             else:
                 self._problems.add(
-                    f"{self.path / name} is missing although metadata.yaml names it; the other files were read."
+                    f"{self.path / name} is missing although metadata.yaml names it; "
+                    f"the other files were read."
                 )
         if not paths:
-            return found
-        for path in found:
+            return existing
+        for path in existing:
             if path not in paths and path.with_suffix("") not in paths:
                 self._problems.add(f"{path} was not read because metadata.yaml does not name it.")
         return paths
 
     def _found(self) -> list[Path]:
-        """All files that may belong to the bag; of a file that is there twice, the one that is not
-        compressed.
-        """
+        """All files that may belong to the bag; the plain one of a file that is also compressed."""
         try:
             every = sorted(p for p in self.path.iterdir() if p.is_file())
         except OSError as error:
@@ -199,13 +203,16 @@ class Rosbag2Log(BaseLog):
                     free = shutil.disk_usage(self._folder.name).free
                     if free < MAX_CHUNK // 8:
                         raise LogError(
-                            f"{path} needs more than the {written} bytes that {self._folder.name} can take; decompress it first."
+                            f"{path} needs more than the {written} bytes that "
+                            f"{self._folder.name} can take; decompress it first."
                         )
                     plain.write(piece)
         except (zstandard.ZstdError, OSError) as error:
             if not target.exists() or target.stat().st_size == 0:
                 raise LogError(f"{path} cannot be decompressed: {error}.") from error
-            self._problems.add(f"{path} is damaged ({error}); what could be decompressed is used.")
+            self._problems.add(
+                f"{path} is damaged ({error}); the part that could be decompressed is used."
+            )
         return target
 
     def _load(self, file: Log, topics: Collection[str] | None) -> Iterator[Message]:

@@ -1,5 +1,6 @@
-"""One sqlite3 file of a ROS 2 bag, read without its metadata.yaml; messages may be zstd-compressed
-one by one.
+"""One sqlite3 file of a ROS 2 bag, read without its metadata.yaml.
+
+Its messages may be zstd-compressed one by one.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from semloc_logs.logs.containers.base import MAX_CHUNK, BaseLog, decompress
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.messages.definitions import is_standard
 from semloc_logs.logs.messages.type_names import ros2_type
-from semloc_logs.logs.problems import Problems
+from semloc_logs.logs.problems import ProblemKind, Problems
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message starts like this
-# the sentence of an error quotes the file, so that it may itself be no UTF-8
+# the text of an error quotes the file, so that it may itself not be UTF-8
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError)
 
 
@@ -38,7 +39,8 @@ class SqliteLog(BaseLog):
             self._database = _connect(path)
         except (*_DAMAGE, OSError) as error:
             raise LogError(
-                f"{path} cannot be read as a sqlite3 bag: {error}; try to recover it with 'sqlite3 FILE .recover'."
+                f"{path} cannot be read as a sqlite3 bag: {error}; "
+                f"try to recover it with 'sqlite3 FILE .recover'."
             ) from error
         try:
             self._open()
@@ -48,40 +50,36 @@ class SqliteLog(BaseLog):
         self._name_undefined()
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
-        """The messages of ``topics`` (None: of all) in log-time order; damage ends the iteration
-        with a sentence.
-        """
+        """The messages of ``topics`` (None: of all) in log-time order, up to any damage."""
         wanted = [i for i, (topic, *_) in self._topics.items() if topics is None or topic in topics]
         if not wanted:
             return
-        stage = f"reading {self._name}"
-        self._problems.forget_skipped(stage, topics)
+        self._problems.forget_skipped(topics, file=self._name)
         read = 0
         try:
             for topic_id, log_time, data in self._rows(wanted):
                 topic, type_, encoding, definition = self._topics[topic_id]
                 read += 1
                 if not isinstance(data, bytes) or not isinstance(log_time, int):
-                    self._problems.skip(
-                        stage, topic, f"row {read} of {self._name} holds no bytes or no time"
-                    )
+                    reason = f"row {read} of {self._name} holds no bytes or no time"
+                    self._problems.skip(topic, reason, file=self._name)
                     continue
                 if data.startswith(ZSTD_MAGIC):
                     try:
                         data = _decompress(data)
                     except LogError as error:
-                        self._problems.skip(stage, topic, f"at {log_time} ns {error}")
+                        reason = f"at {log_time} ns {error}"
+                        self._problems.skip(topic, reason, file=self._name)
                         continue
                 yield Message(topic, type_, encoding, log_time, data, definition)
         except _DAMAGE as error:
             self._problems.add(
-                f"{self._name}: reading ended after {read} messages because the file is damaged ({error})."
+                f"{self._name}: reading ended after {read} messages because the file is damaged "
+                f"({error})."
             )
 
     def _rows(self, topic_ids: list[int]) -> Iterator[tuple[int, Any, Any]]:
-        """(topic id, log time, data) in log-time order; the order of recording breaks ties, so that
-        two readings agree.
-        """
+        """(topic id, log time, data) in log-time order; the order of recording breaks ties."""
         marks = ",".join("?" * len(topic_ids))
         columns = "SELECT topic_id, timestamp, data FROM messages"
         where = f"WHERE topic_id IN ({marks})"
@@ -90,7 +88,7 @@ class SqliteLog(BaseLog):
                 f"{columns} {where} ORDER BY timestamp, id", topic_ids
             )
             return
-        # an index may be what is damaged: without it, and only as far as the table can be read
+        # an index may be damaged: without it, and only as far as the table can be read
         times: list[tuple[int, int]] = []
         with contextlib.suppress(*_DAMAGE):
             for time, row in self._database.execute(
@@ -131,7 +129,7 @@ class SqliteLog(BaseLog):
                     counts[self._topics[id_][:3]] += count
             start, end = execute("SELECT MIN(timestamp), MAX(timestamp) FROM messages").fetchone()
             if any(counts.values()) and not (isinstance(start, int) and isinstance(end, int)):
-                raise sqlite3.DatabaseError("time stamps are no integers")
+                raise sqlite3.DatabaseError("time stamps are not integers")
             self.start_ns, self.end_ns = start, end
         except _DAMAGE as error:
             self._recount(counts, error)
@@ -141,21 +139,22 @@ class SqliteLog(BaseLog):
         self.encoding = "ros2"
 
     def _name_undefined(self) -> None:
-        """Bags of old distributions hold no definitions: what is not a standard type cannot be
-        decoded by anybody.
-        """
+        """Names the types that cannot be decoded: not standard, in a bag without definitions."""
         for topic, type_, encoding, definition in self._topics.values():
             counted = any(s.count for s in self.streams if (s.topic, s.type) == (topic, type_))
             if counted and encoding == "cdr" and not definition.text and not is_standard(type_):
                 self._problems.add(
-                    f"{topic}: messages of type {type_} cannot be decoded because the log does not define the type."
+                    f"{topic}: messages of type {type_} cannot be decoded because the log does not "
+                    f"define the type.",
+                    topic=topic,
+                    kind=ProblemKind.MESSAGE,
                 )
 
     def _recount(self, counts: Counter[tuple[str, str, str]], error: BaseException) -> None:
-        """Counts what a damaged file still gives away."""
+        """Counts the messages of a damaged file that can still be read."""
         self._damaged = True
         self._problems.add(
-            f"{self._name}: the file is damaged ({error}); what can be read of it is used."
+            f"{self._name}: the file is damaged ({error}); the readable part is used."
         )
         counts.clear()
         self.start_ns = self.end_ns = None
@@ -165,20 +164,22 @@ class SqliteLog(BaseLog):
             self.end_ns = message.log_time_ns
 
     def _definitions(self) -> dict[str, Definition]:
-        found = {}
+        definitions = {}
         rows = self._database.execute(
             "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         )
         for type_, encoding, text in rows:
             name = ros2_type(str(type_))
             if isinstance(text, str) and text.strip():
-                found[name] = Definition(name, str(encoding), text.encode())
-        return found
+                definitions[name] = Definition(name, str(encoding), text.encode())
+        return definitions
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    """Opens for reading only; a bag in a folder that cannot be written needs ``immutable``, one
-    with a journal must not have it.
+    """Opens for reading only.
+
+    A bag in a folder that cannot be written needs ``immutable``, one with a journal must not have
+    it.
     """
     _refuse_cut_off(path)
     address = f"file:{quote(str(path.absolute()))}"
@@ -201,7 +202,7 @@ def _connect(path: Path) -> sqlite3.Connection:
 
 
 def _refuse_cut_off(path: Path) -> None:
-    """sqlite3 only says that such a file is malformed."""
+    """LogError for a file that is cut off; sqlite3 itself only calls it malformed."""
     with path.open("rb") as file:
         head = file.read(100)
         size = file.seek(0, 2)
@@ -220,5 +221,5 @@ def _decompress(data: bytes) -> bytes:
     except zstandard.ZstdError as error:
         raise LogError(f"its zstd data are damaged ({error})") from error
     if not 0 <= size <= MAX_CHUNK:
-        raise LogError("its zstd data do not say their size")
+        raise LogError("its zstd data do not contain their size")
     return decompress(data, "zstd", size)

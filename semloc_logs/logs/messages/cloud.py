@@ -13,7 +13,7 @@ from semloc_logs.logs.messages import livox
 from semloc_logs.logs.messages.definitions import binary
 from semloc_logs.logs.messages.headers import Convert, check_time, foxglove, ros, transform
 from semloc_logs.logs.messages.point_fields import Field, Layout, decode_points
-from semloc_logs.logs.messages.point_times import SWEEP_NS
+from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.numerics import transforms
 
 # sensor_msgs/PointField
@@ -31,7 +31,13 @@ def _point_cloud2(header: Header, m: Any) -> Iterator[Frame]:
     layout = Layout(m.width, m.height, m.point_step, m.row_step, bool(m.is_bigendian))
     p = decode_points(binary(m.data), layout, fields, header.stamp_ns)
     yield LidarFrame(
-        header, p.points, p.label, p.offset_ns, p.ring, p.not_finite if m.is_dense else 0, p.remark
+        header,
+        p.points,
+        p.label,
+        p.offset_ns,
+        p.ring,
+        lost=p.not_finite if m.is_dense else 0,
+        remark=p.remark,
     )
 
 
@@ -66,7 +72,7 @@ def _livox(m: Any, message: Message) -> Iterator[Frame]:
     offset = m.points["offset_time"].astype(np.int64)
     # the base of the times is the stamp unless the sensor has a clock of its own
     start = m.timebase_ns - header.stamp_ns
-    if abs(start) < SWEEP_NS:
+    if abs(start) < LONGEST_SWEEP_NS:
         offset += start
     xyz = np.stack([m.points[axis] for axis in "xyz"], axis=1).astype(np.float32)
     finite = np.isfinite(xyz).all(axis=1)

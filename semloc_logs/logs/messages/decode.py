@@ -1,6 +1,4 @@
-"""Messages to frames: one small function for each message type, found in a table by the type's
-name.
-"""
+"""Messages to frames: one small function for each message type, in a table by type name."""
 
 from __future__ import annotations
 
@@ -18,43 +16,39 @@ from semloc_logs.logs.problems import Problems
 
 
 class Decoder:
-    """Decodes the messages of one log; what it cannot decode is counted in ``problems`` by topic."""
+    """Decodes the messages of one log; ``problems`` counts the undecodable ones by topic."""
 
     def __init__(self, problems: Problems) -> None:
         self._problems = problems
         self._parsers: dict[tuple[str, str, int], Parser | UndecodableError] = {}
-        self._definitions: list[Definition] = []  # keeps those alive whose id is a key
+        self._definitions: list[Definition] = []  # alive as long as their ids are keys
         self._times = PointTimes()
 
     def frames(self, message: Message) -> list[Frame]:
-        """The frames in ``message``; none when its type is of no use here, or when it cannot be
-        decoded.
-        """
+        """The frames in ``message``; none when its type is not used or it cannot be decoded."""
         convert = CONVERTERS.get(
             json_type(message.type) if message.encoding in ("protobuf", "json") else message.type
         )
-        # any other text is of no use here
+        # no other text is used
         if convert is None or (convert is _text and not message.topic.endswith("/label_space")):
             return []
-        found: list[Frame] = []  # keeps what a message gives before its damaged part
+        decoded: list[Frame] = []  # keeps the frames before the damaged part of a message
         try:
             check_time(message.log_time_ns)
             frames = convert(self._parse(message), message)
-            found.extend(
+            decoded.extend(
                 self._times.checked(frame) if isinstance(frame, LidarFrame) else frame
                 for frame in frames
             )
-            return found
+            return decoded
         except UndecodableError as error:
             reason = str(error)
         except BAD_VALUES as error:
             reason = f"its values make no sense ({type(error).__name__}: {str(error)[:120]})"
         self._problems.skip(
-            "decoding",
-            message.topic,
-            f"{message.type} at log time {message.log_time_ns} ns: {reason}",
+            message.topic, f"{message.type} at log time {message.log_time_ns} ns: {reason}"
         )
-        return found
+        return decoded
 
     def _parse(self, message: Message) -> Any:
         key = (message.encoding, message.type, id(message.definition))
@@ -72,7 +66,7 @@ class Decoder:
         return known(message.data)
 
 
-# -- what labels mean
+# -- meaning of labels
 
 
 def _label_info(header: Header, m: Any) -> Iterator[Frame]:

@@ -1,6 +1,4 @@
-"""From a stream's definition to a function that turns its bytes into an object with the fields as
-attributes.
-"""
+"""From the definition of a stream to a function that parses its bytes into an object."""
 
 from __future__ import annotations
 
@@ -31,13 +29,11 @@ _IDL_SEPARATOR = "=" * 80 + "\n"
 
 
 class UndecodableError(Exception):
-    """A message or a whole stream cannot be decoded; ``str`` is the reason, a part of a sentence."""
+    """A message or a whole stream cannot be decoded; ``str`` is the reason, part of a sentence."""
 
 
 def parser(encoding: str, type_: str, definition: Definition) -> Parser:
-    """Parses messages of ``encoding``. Raises UndecodableError where that is not possible; so may
-    the parser.
-    """
+    """Parses messages of ``encoding``; it, or the parser, raises UndecodableError."""
     if encoding in ("cdr", "ros1"):
         return _ros_parser(encoding, type_, definition)
     if encoding == "protobuf":
@@ -47,7 +43,7 @@ def parser(encoding: str, type_: str, definition: Definition) -> Parser:
     raise UndecodableError(
         f"the encoding {encoding[:40]!r} is not supported"
         if encoding
-        else "the log does not say its encoding"
+        else "the log does not name its encoding"
     )
 
 
@@ -78,8 +74,9 @@ def _ros_parser(encoding: str, type_: str, definition: Definition) -> Parser:
 
 
 def ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, Any]:
-    """The definitions that ``type_`` needs: from the log where it has them, else the standard ones.
-    UndecodableError without.
+    """The definitions that ``type_`` needs: from the log where it has them, else standard ones.
+
+    UndecodableError where a definition is missing.
     """
     try:
         return _ros_types(encoding, type_, definition)
@@ -126,13 +123,13 @@ def _refuse_lists_of_nothing(types: dict[str, Any]) -> None:
     empty: set[str] = set()
     grown = True
     while grown:
-        found = {
+        without_bytes = {
             name
             for name, (_, fields) in types.items()
             if all(_has_no_bytes(kind, empty) for _, kind in fields)
         }
-        grown = found != empty
-        empty = found
+        grown = without_bytes != empty
+        empty = without_bytes
     for name, (_, fields) in types.items():
         for field, (kind, content) in fields:
             if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and _has_no_bytes(content[0], empty):
@@ -160,8 +157,9 @@ def _idl_types(text: str) -> dict[str, Any]:
 
 
 def _names(field: Any) -> list[str]:
-    """The message types that a field refers to; UndecodableError for arrays that would be unrolled
-    without end.
+    """The message types that a field refers to.
+
+    UndecodableError for arrays that would be unrolled without end.
     """
     kind, content = field
     if kind == Nodetype.NAME:
@@ -260,9 +258,7 @@ def binary(value: Any) -> bytes | memoryview:
 
 
 def json_type(type_: str) -> str:
-    """``foxglove.PointCloud`` for the names under which Foxglove's messages are found in JSON and
-    protobuf streams.
-    """
+    """``foxglove.PointCloud`` for the other names of Foxglove's messages in JSON and protobuf."""
     name = ros2_type(type_)
     for prefix in ("foxglove_msgs/msg/", "foxglove/msg/", "foxglove_schemas."):
         if name.startswith(prefix):

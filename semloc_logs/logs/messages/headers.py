@@ -1,6 +1,4 @@
-"""Parts that messages of several types share, headers above all, and how a converter of one type
-comes about.
-"""
+"""Parts that messages of several types share, and how to make a converter of one type."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ Convert = Callable[[Any, Message], Iterator[Frame]]
 # the same where the header is all that is needed of the latter
 Body = Callable[[Header, Any], Iterator[Frame]]
 
-# what hostile values in a well-formed message may raise in converters
+# errors that hostile values in a well-formed message may raise in converters
 BAD_VALUES = (
     ArithmeticError,
     AttributeError,
@@ -39,7 +37,7 @@ def ros(body: Body) -> Convert:
 
 
 def foxglove(body: Body, frame: str = "frame_id") -> Convert:
-    """A converter of Foxglove's messages, whose time and ``frame`` stand among their other fields."""
+    """A converter of Foxglove's messages, with time and ``frame`` among their other fields."""
     return lambda m, message: body(foxglove_header(m, message, getattr(m, frame)), m)
 
 
@@ -51,9 +49,7 @@ def check_time(time_ns: int) -> int:
 
 
 def stamp_ns(time: Any, message: Message) -> int:
-    """Nanoseconds of a ROS time, a protobuf timestamp or a JSON {sec, nsec}; log time where a
-    message has none.
-    """
+    """Nanoseconds of a ROS time, protobuf timestamp or JSON {sec, nsec}; without one, log time."""
     if time is None:
         return message.log_time_ns
     for seconds, nanoseconds in (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec")):
@@ -72,19 +68,19 @@ def ros_header(m: Any, message: Message) -> Header:
 
 
 def foxglove_header(m: Any, message: Message, frame_id: Any) -> Header:
-    """The header of a message with a ``timestamp``; anything but a string is no ``frame_id``."""
+    """The header of a message with a ``timestamp``; ``frame_id`` is "" unless it is a string."""
     if not isinstance(frame_id, str):
         frame_id = ""
     return Header(message.topic, stamp_ns(m.timestamp, message), message.log_time_ns, frame_id)
 
 
 def vector(v: Any) -> F64:
-    """x, y, z (3,); what is not there is 0."""
+    """x, y, z (3,); a missing value is 0."""
     return np.array([v.x or 0.0, v.y or 0.0, v.z or 0.0], float)
 
 
 def quaternion(q: Any) -> F64:
-    """x, y, z, w (4,), of any length; what is not there is 0."""
+    """x, y, z, w (4,), of any length; a missing value is 0."""
     return np.array([q.x or 0.0, q.y or 0.0, q.z or 0.0, q.w or 0.0], float)
 
 

@@ -57,8 +57,9 @@ _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
 def decode_raw(
     data: bytes | memoryview, width: int, height: int, step: int, encoding: str, big_endian: bool
 ) -> Image | F32:
-    """(h, w), (h, w, 3) RGB, or float32 (h, w) for 32FC1. UndecodableError when the size does not
-    fit the data.
+    """(h, w), (h, w, 3) RGB, or float32 (h, w) for 32FC1.
+
+    UndecodableError when the size does not fit the data.
     """
     try:
         kind, channels, conversion = _RAW[encoding.strip().lower()]
@@ -108,8 +109,9 @@ def decode_compressed(data: bytes | memoryview) -> Image:
 
 
 def decode_compressed_depth(data: bytes | memoryview, format_: str) -> F32:
-    """Metres of ROS's compressedDepth: 12 bytes of quantisation parameters, then a PNG or RVL
-    picture of 16 bits.
+    """Metres (h, w) of ROS's compressedDepth.
+
+    12 bytes of quantisation parameters, then a PNG or RVL picture of 16 bits.
     """
     if len(data) < _COMPRESSED_DEPTH_HEAD.size:
         raise UndecodableError("its depth image is cut off")
@@ -117,7 +119,7 @@ def decode_compressed_depth(data: bytes | memoryview, format_: str) -> F32:
     body = data[_COMPRESSED_DEPTH_HEAD.size :]
     raw = decode_rvl(body) if "rvl" in format_.lower() else decode_compressed(body)
     if raw.ndim != 2 or raw.dtype != np.uint16:
-        raise UndecodableError("its depth image is no picture of 16 bits")
+        raise UndecodableError("its depth image is not a picture of 16 bits")
     if format_.strip().lower().startswith("32fc1"):  # stored as inverse depth
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             metres = np.float32(quant_a) / (raw.astype(np.float32) - np.float32(quant_b))
@@ -127,7 +129,7 @@ def decode_compressed_depth(data: bytes | memoryview, format_: str) -> F32:
 
 
 def depth_metres(raw: Image | F32) -> F32:
-    """Metres (h, w) of millimetres (uint16) or metres (float32); what is not measured becomes 0."""
+    """Metres (h, w) of millimetres (uint16) or metres (float32); 0 where nothing was measured."""
     if raw.dtype == np.uint16:
         metres = raw.astype(np.float32) * np.float32(0.001)
         metres[raw == 65535] = 0
@@ -138,8 +140,9 @@ def depth_metres(raw: Image | F32) -> F32:
 
 
 def is_depth(topic: str, encoding: str) -> bool:
-    """Whether a raw picture is depth: 32FC1, and 16 bits unless they are called labels; mono16 only
-    if called depth.
+    """Whether a raw picture is depth.
+
+    32FC1, 16 bits unless they are called labels, mono16 only if called depth.
     """
     name = topic.lower()
     encoding = encoding.strip().lower()
@@ -151,8 +154,9 @@ def is_depth(topic: str, encoding: str) -> bool:
 
 
 def _check_claim(data: bytes) -> None:
-    """UndecodableError when the size in the head of a JPEG or PNG cannot be true, before anything
-    is allocated for it.
+    """UndecodableError when the size in the head of a JPEG or PNG cannot be true.
+
+    Before anything is allocated for it.
     """
     if data.startswith(b"\x89PNG\r\n\x1a\n"):
         if len(data) < 33 or data[12:16] != b"IHDR" or data[25] not in _PNG_CHANNELS:
@@ -172,8 +176,9 @@ def _check_claim(data: bytes) -> None:
 
 
 def _check_chunks(data: bytes) -> None:
-    """UndecodableError when a chunk of a PNG claims more bytes than there are: the decoder would
-    make room for them.
+    """UndecodableError when a chunk of a PNG claims more bytes than there are.
+
+    The decoder would allocate memory for them.
     """
     position = 8
     while position + 12 <= len(data):

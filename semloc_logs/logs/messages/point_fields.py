@@ -1,6 +1,4 @@
-"""Point clouds as recorded, a block of bytes and a list of fields, to arrays; without a loop over
-points.
-"""
+"""Recorded point clouds, a block of bytes and a list of fields, to arrays without a loop."""
 
 from __future__ import annotations
 
@@ -10,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F32
+from semloc_logs.frames import F32, PointTimeRemark
 from semloc_logs.logs.messages.definitions import UndecodableError
-from semloc_logs.logs.messages.point_times import NO_SENSE, OTHER_CLOCK, offsets_ns
+from semloc_logs.logs.messages.point_times import offsets_ns
 
 LABELS = ("label", "semantic", "class", "objtag")
 RINGS = ("ring", "line")
 TIMES = (
-    "t", "time", "timestamp", "time_stamp", "offset_time", "time_offset", "time_offset_ns", "timestamp_offset", "point_time_offset",
-    "relative_timestamp",
+    "t", "time", "timestamp", "time_stamp", "offset_time", "time_offset", "time_offset_ns",
+    "timestamp_offset", "point_time_offset", "relative_timestamp",
 )  # fmt: skip
 _USED = {"x", "y", "z", *LABELS, *RINGS, *TIMES}
 
@@ -36,8 +34,7 @@ class Field:
 class Points:
     """``points`` (n, 3) with label, time (relative to the header stamp) and ring where recorded.
 
-    ``not_finite`` counts the positions with NaN or infinity, ``remark`` says what is wrong with the
-    times.
+    ``not_finite`` counts the positions with NaN or infinity, ``remark`` is about the times.
     """
 
     points: F32
@@ -45,7 +42,7 @@ class Points:
     offset_ns: NDArray[np.int64] | None
     ring: NDArray[np.uint16] | None
     not_finite: int = 0
-    remark: str = ""
+    remark: PointTimeRemark | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +59,9 @@ class Layout:
 def decode_points(
     data: bytes | memoryview, layout: Layout, fields: Sequence[Field], stamp_ns: int
 ) -> Points:
-    """Points whose position is finite and not exactly zero. UndecodableError when the layout does
-    not fit the data.
+    """Points whose position is finite and not exactly zero.
+
+    UndecodableError when the layout does not fit the data.
     """
     if layout.width == 0 or layout.height == 0:
         # its fields may be missing too
@@ -77,7 +75,7 @@ def decode_points(
             )
         if rows.dtype[columns[axis]].kind != "f":
             raise UndecodableError(
-                f"its field {axis} is no floating point number but {rows.dtype[columns[axis]].name}"
+                f"its field {axis} is {rows.dtype[columns[axis]].name}, not floating point"
             )
     xyz = np.empty((rows.size, 3), np.float32)
     # float64 beyond float32 becomes infinite and is dropped below
@@ -112,12 +110,14 @@ def decode_points(
 
 def _offsets(
     time: NDArray[np.generic] | None, stamp_ns: int
-) -> tuple[NDArray[np.int64] | None, str]:
-    """Times relative to ``stamp_ns`` where they make sense, and a remark where they do not at once."""
+) -> tuple[NDArray[np.int64] | None, PointTimeRemark | None]:
+    """Times relative to ``stamp_ns`` where they make sense, and a remark where they are unusual."""
     if time is None:
-        return None, ""
+        return None, None
     offset, is_other_clock = offsets_ns(time, stamp_ns)
-    return offset, NO_SENSE if offset is None else OTHER_CLOCK if is_other_clock else ""
+    if offset is None:
+        return None, PointTimeRemark.UNUSABLE
+    return offset, PointTimeRemark.OTHER_CLOCK if is_other_clock else None
 
 
 def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> NDArray[np.void]:

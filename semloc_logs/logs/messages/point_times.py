@@ -1,6 +1,4 @@
-"""When each point of a sweep was measured: units and origins of recorded point times, and whether
-they can be believed.
-"""
+"""Times of the points of a sweep: unit, origin, and whether they are plausible."""
 
 from __future__ import annotations
 
@@ -10,26 +8,24 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F32, LidarFrame
+from semloc_logs.frames import F32, LidarFrame, PointTimeRemark
 
-SWEEP_NS = 1_000_000_000  # no time of a point is further from its header than a second
-# a sweep takes longer than this, which tells milliseconds from microseconds
+# the points of a sweep are within a second, and within a second of their header
+LONGEST_SWEEP_NS = 1_000_000_000
+# a sweep takes longer than this, so milliseconds and microseconds are not confused
 _LEAST_SPAN_NS = 5_000_000
 _PERIODS_PER_SWEEP = 1.5  # a sweep is over when the next one begins, give or take
 _PERIODS_KEPT = 16
 # the share of neighbours measured nearly together: above 0.9 in sweeps, 0.1 where times are noise
 _ORDERED = 0.5
 _NEARLY = 0.05  # of the sweep's span
+_FEWEST = 100  # points of a sweep whose order can be judged
 _LOOKED_AT = 20_000  # points that are compared
 _CELLS = 180  # cells of azimuth of 2 degrees
 
-NO_SENSE = "times"  # remarks of a LidarFrame, see semloc_logs.logs.session.tally
-OTHER_CLOCK = "clock"
-
 
 def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int64] | None, bool]:
-    """Times of points relative to ``stamp_ns``, whatever their unit and origin, and whether the
-    origin is that of another clock.
+    """Times (n,) of points relative to ``stamp_ns``; and whether they are of another clock.
 
     None when nothing makes sense of them. The unit (s, ms, us, ns) and origin (the stamp, or the
     epoch) are those with which the points span more than 5 ms and stay within a second of the
@@ -46,21 +42,25 @@ def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int
     # in integers, because nanoseconds since 1970 do not fit a float64; the parts of a second are
     # exact enough as float
     ranges = [(unit, _to_ns(low, unit), _to_ns(high, unit)) for unit in _units(time)]
-    near = [
-        (u, o)
-        for u, first, last in ranges
-        for o in (0, stamp_ns)
-        if max(abs(first - o), abs(last - o)) < SWEEP_NS
+    # units and origins that put all points within a second of the stamp
+    plausible = [
+        (unit, origin)
+        for unit, first, last in ranges
+        for origin in (0, stamp_ns)
+        if max(abs(first - origin), abs(last - origin)) < LONGEST_SWEEP_NS
     ]
+    # first point, by the units with which the points span as long as a sweep
     sweeps = {
-        u: first for u, first, last in ranges if _LEAST_SPAN_NS <= last - first < 2 * SWEEP_NS
+        unit: first
+        for unit, first, last in ranges
+        if _LEAST_SPAN_NS <= last - first < 2 * LONGEST_SWEEP_NS
     }
-    for unit, origin in near:
+    for unit, origin in plausible:
         if unit in sweeps:
             return _shift(time, unit, origin), False
     for unit, first in sweeps.items():
         return _shift(time, unit, first), True
-    return (_shift(time, *near[0]), False) if near else (None, False)
+    return (_shift(time, *plausible[0]), False) if plausible else (None, False)
 
 
 def _units(time: NDArray[np.generic]) -> tuple[int, ...]:
@@ -91,18 +91,18 @@ def _shift(time: NDArray[np.generic], unit: int, origin: int) -> NDArray[np.int6
 
 
 class PointTimes:
-    """Compares the point times of the sweeps of a log with what sweeps are like, topic by topic."""
+    """Checks the point times of the sweeps of a log, topic by topic."""
 
     def __init__(self) -> None:
         self._newest: dict[tuple[str, str], int] = {}
         self._periods: dict[tuple[str, str], deque[int]] = {}
 
     def checked(self, frame: LidarFrame) -> LidarFrame:
-        """The sweep as it is, or without times and remarked when they cannot be believed.
+        """The sweep as it is, or without times and with a remark when they are not plausible.
 
         A sweep does not take much longer than the time to the next one; clouds gathered from
         several sweeps do. And points recorded one after the other, or seen in the same direction,
-        were measured nearly together; where they were not, it is no time.
+        were measured nearly together; where they were not, the values are not times.
         """
         key = (frame.header.topic, frame.header.frame_id)
         stamp_ns = frame.header.stamp_ns
@@ -115,22 +115,23 @@ class PointTimes:
         if offset is None or not len(offset):
             return frame
         # the longest of some: several sensors on one topic come in bursts
-        longest = _PERIODS_PER_SWEEP * max(periods) if len(periods) > 1 else SWEEP_NS
+        longest = _PERIODS_PER_SWEEP * max(periods) if len(periods) > 1 else LONGEST_SWEEP_NS
         if int(offset.max()) - int(offset.min()) <= longest and in_order(offset, frame.points):
             return frame
-        return replace(frame, offset_ns=None, remark=NO_SENSE)
+        return replace(frame, offset_ns=None, remark=PointTimeRemark.UNUSABLE)
 
 
 def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:
-    """Whether neighbours among ``points`` (n, 3), as recorded or by their direction, have nearly
-    the same time.
+    """Whether neighbours among ``points`` (n, 3) have nearly the same time.
+
+    Neighbours in the recorded order, or by their direction.
     """
     span = int(offset_ns.max()) - int(offset_ns.min())
-    if span == 0 or len(offset_ns) < 100:
+    if span == 0 or len(offset_ns) < _FEWEST:
         return True
-    near = max(1.0, _NEARLY * span)
+    together = max(1.0, _NEARLY * span)  # ns
     some = slice(0, _LOOKED_AT)
-    if float(np.mean(np.abs(np.diff(offset_ns[some])) < near)) > _ORDERED:
+    if float(np.mean(np.abs(np.diff(offset_ns[some])) < together)) > _ORDERED:
         return True
     every = max(1, len(offset_ns) // _LOOKED_AT)
     cell = (
@@ -142,4 +143,4 @@ def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:
     middle = starts + np.diff(starts, append=len(order)) // 2
     median = np.zeros(int(cell.max()) + 1, np.int64)
     median[cell[order[starts]]] = time[order[middle]]
-    return float(np.mean(np.abs(time - median[cell]) < near)) > _ORDERED
+    return float(np.mean(np.abs(time - median[cell]) < together)) > _ORDERED

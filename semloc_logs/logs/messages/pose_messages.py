@@ -1,4 +1,4 @@
-"""Messages that say where the vehicle is: poses, transforms, inertial and satellite measurements."""
+"""Messages with poses and transforms, inertial and satellite measurements."""
 
 from __future__ import annotations
 
@@ -64,8 +64,9 @@ def _is_static(header: Header) -> bool:
 
 
 def _each(convert: Convert) -> Convert:
-    """The transforms that make sense, and then the error of the first that does not: one bad edge
-    does not cost the others.
+    """Converts all transforms that make sense, then raises the error of the first bad one.
+
+    One bad edge does not cost the others.
     """
 
     def convert_all(m: Any, message: Message) -> Iterator[Frame]:
@@ -96,8 +97,9 @@ def _imu(header: Header, m: Any) -> Iterator[Frame]:
 
 
 def _imu_orientation(m: Any) -> F64 | None:
-    """The quaternion of an IMU that reports one: without, the first element of its covariance is
-    -1, or it is no unit quaternion.
+    """The quaternion xyzw of an IMU that reports one, else None.
+
+    Without one the first element of its covariance is -1, or its length is not 1.
     """
     q = getattr(m, "orientation", None)
     covariance = getattr(m, "orientation_covariance", None)
@@ -112,7 +114,7 @@ def _nav_sat(header: Header, m: Any) -> Iterator[Frame]:
     longitude = float(m.longitude or 0.0)
     altitude = float(m.altitude or 0.0)
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and math.isfinite(altitude)):
-        raise UndecodableError("its latitude, longitude or altitude is no number on Earth")
+        raise UndecodableError("its latitude, longitude or altitude is not on Earth")
     yield NavSatSample(header, latitude, longitude, altitude, _fix_covariance(m))
 
 
@@ -128,7 +130,7 @@ def _fix_covariance(m: Any) -> F64 | None:
 
 
 def _nav_sat_fix(header: Header, m: Any) -> Iterator[Frame]:
-    if m.status.status >= 0:  # below: the receiver itself says that it has no fix
+    if m.status.status >= 0:  # below: the receiver itself reports that it has no fix
         yield from _nav_sat(header, m)
 
 

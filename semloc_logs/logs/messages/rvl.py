@@ -1,5 +1,6 @@
-"""RVL, the run-length code of ROS's compressedDepth: runs of zeros, then runs of differences as
-variable-length numbers.
+"""RVL, the run-length code of ROS's compressedDepth.
+
+Runs of zeros, then runs of differences as variable-length numbers.
 """
 
 from __future__ import annotations
@@ -39,33 +40,30 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
 
 
 def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[list[int], list[int], list[int]]:
-    """For each run of values its first pixel, the place of its first number, and how many there
-    are.
-    """
+    """For each run of values its first pixel, the index of its first number, and its length."""
     starts: list[int] = []
     firsts: list[int] = []
     counts: list[int] = []
-    at = position = 0
+    index = 0  # of the numbers
+    position = 0  # of the pixels
     while position < pixels:
-        if at + 2 > len(numbers):
+        if index + 2 > len(numbers):
             raise UndecodableError("its RVL picture is cut off")
-        zeros = int(numbers[at])
-        values = int(numbers[at + 1])
+        zeros = int(numbers[index])
+        values = int(numbers[index + 1])
         position += zeros
-        if zeros + values == 0 or position + values > pixels or at + 2 + values > len(numbers):
+        if zeros + values == 0 or position + values > pixels or index + 2 + values > len(numbers):
             raise UndecodableError("its RVL picture is damaged")
         starts.append(position)
-        firsts.append(at + 2)
+        firsts.append(index + 2)
         counts.append(values)
         position += values
-        at += 2 + values
+        index += 2 + values
     return starts, firsts, counts
 
 
 def _numbers(code: bytes | memoryview) -> NDArray[np.int64]:
-    """All numbers of the code: 3 bits a nibble, low ones first, the fourth says that another nibble
-    follows.
-    """
+    """All numbers of the code: 3 bits a nibble, low ones first, the fourth marks a continuation."""
     words = np.frombuffer(code, "<u4", count=len(code) // 4)
     shifts = np.arange(28, -1, -4, dtype=np.uint32)  # the first nibble of a word is its highest
     nibbles = ((words[:, None] >> shifts) & 15).astype(np.int64).reshape(-1)

@@ -1,8 +1,8 @@
-"""Whether the time of a stream goes on: stamps that leap and come back are outliers, stamps that
-fall back for good are another clock.
-"""
+"""Order of the stamps of a stream: outliers, and clocks that were set back."""
 
 from __future__ import annotations
+
+from datetime import UTC, datetime
 
 LEAP_NS = 10_000_000_000  # a stamp so far ahead counts once the next one confirms it
 _REORDERED_NS = 1_000_000_000  # messages may overtake each other by this
@@ -13,25 +13,43 @@ class StampOrder:
 
     def __init__(self) -> None:
         self._newest: int | None = None
-        self._ahead: int | None = None
+        self._leapt: int | None = None  # a stamp far ahead that no other has confirmed yet
         self._run = 0  # stamps that have led to the newest one
 
     def accepts(self, stamp_ns: int) -> bool:
-        """False for a stamp that lies more than a second before what the stream had reached."""
+        """False for a stamp more than a second before the newest stamp of the stream."""
         newest = self._newest
-        ahead = self._ahead
-        self._ahead = None
+        leapt = self._leapt
+        self._leapt = None
+
         # the first stamp itself leapt
         is_lone = self._run == 1 and newest is not None and stamp_ns < newest - LEAP_NS
         if newest is None or is_lone:
-            self._newest, self._run = stamp_ns, 1
+            self._newest = stamp_ns
+            self._run = 1
             return True
-        if stamp_ns > newest + LEAP_NS and (
-            ahead is None or not ahead <= stamp_ns <= ahead + LEAP_NS
-        ):
-            self._ahead = stamp_ns
+
+        is_confirmed = leapt is not None and leapt <= stamp_ns <= leapt + LEAP_NS
+        if stamp_ns > newest + LEAP_NS and not is_confirmed:
+            self._leapt = stamp_ns
             return True
         if stamp_ns >= newest:
             self._newest = stamp_ns
-            self._run = self._run + 1
+            self._run += 1
         return stamp_ns >= newest - _REORDERED_NS
+
+
+def time_range(start_ns: int | None, end_ns: int | None) -> str:
+    """A time range for people, in UTC."""
+    if start_ns is None or end_ns is None:
+        return "none"
+    return f"{utc(start_ns)} to {utc(end_ns)}"
+
+
+def utc(stamp_ns: int) -> str:
+    """A time for people: UTC to the millisecond, or nanoseconds where no calendar has it."""
+    try:
+        time = datetime.fromtimestamp(stamp_ns / 1e9, UTC)
+    except (OverflowError, ValueError, OSError):
+        return f"{stamp_ns} ns"
+    return time.strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"

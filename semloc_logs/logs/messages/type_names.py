@@ -4,8 +4,9 @@ from __future__ import annotations
 
 
 def ros2_type(name: str) -> str:
-    """``sensor_msgs/msg/Image`` for ``sensor_msgs/Image``, ``sensor_msgs/msg/Image`` and
-    ``sensor_msgs::msg::dds_::Image_``.
+    """``sensor_msgs/msg/Image`` for all spellings of a type.
+
+    ``sensor_msgs/Image``, ``sensor_msgs/msg/Image`` and ``sensor_msgs::msg::dds_::Image_``.
     """
     if "::" in name:
         name = "/".join(part.rstrip("_") for part in name.split("::") if part != "dds_")

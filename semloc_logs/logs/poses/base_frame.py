@@ -1,4 +1,4 @@
-"""Which frame of a log is the vehicle, the base frame, and where it is at any time."""
+"""The base frame of a log, the vehicle, and its pose at any time."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, PoseSample, TransformSample
 from semloc_logs.logs.poses.tf_tree import Edge, TransformTree, frame_name
 from semloc_logs.logs.poses.track import PoseTrack
+from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.logs.roles import Roles
 
 BASE_LINK = "base_link"
@@ -24,56 +25,74 @@ class BaseFrame:
     """``name`` of the base frame; ``pose_frame`` whose pose the stream gives (None without poses).
 
     ``assumed`` is the one sensor frame that nothing connects with the base and that is therefore
-    taken to be the base itself. ``notes`` say in sentences what was assumed.
+    taken to be the base itself. ``problems`` name the assumptions.
     """
 
     name: str
     pose_frame: str | None
     assumed: str | None = None
-    notes: tuple[str, ...] = ()
+    problems: tuple[Problem, ...] = ()
 
 
 def choose_base_frame(
     tree: TransformTree, sensors: Sequence[str], pose_child: str | None, pose_topic: str | None
 ) -> BaseFrame:
-    """The base frame as documented: ``base_link`` where TF connects it with a sensor and the pose;
-    else the frame that the pose is of; the sensor's own frame where the pose does not say
-    (``pose_child`` ""), or there is none (None).
+    """The base frame: ``base_link`` where TF connects it with a sensor and the pose.
 
-    ``sensors``: frame ids of the range sensors, the most important first.
+    Else the frame that the pose belongs to; the sensor's own frame where the pose names none
+    (``pose_child`` ""), or where there is no pose (None). ``sensors``: frame ids of the range
+    sensors, the most important first.
     """
     sensors = [frame_name(s) for s in sensors]
-    reachable = any(tree.connected(BASE_LINK, s) for s in sensors) or (
-        not sensors and BASE_LINK in tree.frames
-    )
+    reachable = _has_base_link(tree, sensors)
     first = sensors[0] if sensors else (BASE_LINK if reachable else "")
     if pose_child is None:
         return BaseFrame(BASE_LINK if reachable else first, None)
+
     child = frame_name(pose_child)
     if not child:
-        notes = []
-        if reachable and first != BASE_LINK:
-            notes.append(
-                f"{pose_topic} does not name the frame that it is the pose of: it is taken as that of the sensor frame '{first}'; "
-                f"record nav_msgs/Odometry with child_frame_id if it is another."
-            )
-        return BaseFrame(first, first, notes=tuple(notes))
+        is_doubtful = reachable and first != BASE_LINK
+        return BaseFrame(
+            first, first, problems=(_unnamed_child(pose_topic, first),) if is_doubtful else ()
+        )
+
     name = BASE_LINK if reachable and tree.connected(BASE_LINK, child) else child
     if not sensors or any(tree.connected(name, s) for s in sensors):
         return BaseFrame(name, child)
-    note = (
-        f"No transform connects the sensor frame '{first}' with '{child}', the frame of {pose_topic}: they are taken as one; "
-        f"record /tf_static if the sensor sits elsewhere."
+    return BaseFrame(
+        child, child, assumed=first, problems=(_unconnected_sensor(first, child, pose_topic),)
     )
-    return BaseFrame(child, child, assumed=first, notes=(note,))
+
+
+def _has_base_link(tree: TransformTree, sensors: Sequence[str]) -> bool:
+    """Whether ``base_link`` is connected with a sensor, or known where there are none."""
+    if not sensors:
+        return BASE_LINK in tree.frames
+    return any(tree.connected(BASE_LINK, sensor) for sensor in sensors)
+
+
+def _unnamed_child(pose_topic: str | None, sensor: str) -> Problem:
+    text = (
+        f"{pose_topic} does not name its child frame: it is taken as the pose of the sensor frame "
+        f"'{sensor}'; record nav_msgs/Odometry with child_frame_id if it is another."
+    )
+    return Problem(pose_topic or "", ProblemKind.POSE, text, lost=False)
+
+
+def _unconnected_sensor(sensor: str, child: str, pose_topic: str | None) -> Problem:
+    text = (
+        f"No transform connects the sensor frame '{sensor}' with '{child}', the frame of "
+        f"{pose_topic}: they are taken as one; record /tf_static if the sensor sits elsewhere."
+    )
+    return Problem("", ProblemKind.TRANSFORM, text, lost=False)
 
 
 class PoseSource(Protocol):
-    """Poses that are not a stream of the log: of a file, or made from what the log has.
+    """Poses that are not a stream of the log: of a file, or made from other streams.
 
-    ``name`` is what sentences call it; ``child`` the frame that its poses are of, "" for the base
-    frame, None while nobody knows; ``is_over`` says that no more poses will come. ``problems`` are
-    about poses that are missing, ``notes`` about what was assumed.
+    ``name`` is used in sentences; ``child`` is the frame that its poses belong to, "" for the base
+    frame, None while it is unknown; ``is_over``: no more poses will come. ``problems`` are missing
+    poses (lost) and assumptions.
     """
 
     @property
@@ -85,16 +104,15 @@ class PoseSource(Protocol):
     @property
     def is_over(self) -> bool: ...
     @property
-    def problems(self) -> list[str]: ...
-    @property
-    def notes(self) -> list[str]: ...
+    def problems(self) -> list[Problem]: ...
 
     def take(self, frame: Frame) -> None:
         """A frame of the log, in the order of recording."""
 
     def poses(self, base_T: Callable[[str, int], F64 | None]) -> Iterator[tuple[int, F64]]:
-        """Stamps (ns) and ``session_T_child`` (4, 4) that are new since the last call; ``base_T``
-        gives ``base_T_frame`` at a time.
+        """Stamps (ns) and ``session_T_child`` (4, 4) that are new since the last call.
+
+        ``base_T`` gives ``base_T_frame`` of a frame at a time.
         """
 
     def finish(self) -> None:
@@ -108,7 +126,7 @@ class BasePoses:
     """Poses and transforms of a log as they come -> ``session_T_base`` and ``base_T_sensor``.
 
     Poses stay raw until :meth:`settle` has chosen the base frame. ``static_count``: static TF
-    messages that are still to come, from the log's own statistics; once they are all there, nobody
+    messages that are still to come, from the log's own statistics; once all have come, no frame
     has to wait for more. ``source`` gives the poses instead of the log's pose topic and TF,
     ``fallback`` gives them when neither has any.
     """
@@ -143,10 +161,8 @@ class BasePoses:
         header = sample.header
         if self._has_topic and header.topic == self._roles.pose:
             if self._child is None:
-                self._child, self.session_frame = (
-                    frame_name(sample.child_frame_id),
-                    frame_name(header.frame_id),
-                )
+                self._child = frame_name(sample.child_frame_id)
+                self.session_frame = frame_name(header.frame_id)
             self._raw.append((header.stamp_ns, sample.frame_T_child))
             self._move()
         elif isinstance(sample, TransformSample):
@@ -162,48 +178,50 @@ class BasePoses:
                 self._move()
 
     def settle(self, sensors: Sequence[str], *, is_patient: bool, must: bool) -> bool:
-        """Chooses the base frame once the transforms that decide it are there, or now if it
-        ``must``; False: not yet.
+        """Chooses the base frame once its transforms have come, or now if it ``must``.
 
-        ``is_patient``: a pose edge in TF that is not called odom may still be topped by a better
-        one. With a pose topic that has nothing yet, the answer stays False even if it must: its
-        frame is unknown.
+        False: not yet. ``is_patient``: a pose edge in TF that is not called odom may still be
+        topped by a better one. With a pose topic that has no message yet, the result stays False
+        even if it must: its frame is unknown.
         """
         edge = None
-        if self.source is not None:
-            child = self.source.child
-            if child is None:
-                return False
-        elif self._has_topic:
-            child = self._child
+        has_pose_stream = self.source is not None or self._has_topic
+        if has_pose_stream:
+            child = self._child if self.source is None else self.source.child
             if child is None:
                 return False
         else:
             edge = self._pose_edge(sensors)
-            if (
-                not must
-                and self._roles.tf
-                and (edge is None or (is_patient and not edge[0].endswith("odom")))
-            ):
+            may_improve = edge is None or (is_patient and not edge[0].endswith("odom"))
+            if not must and self._roles.tf and may_improve:
                 return False
-            child = edge[1] if edge else None
-            if edge is None and self._fallback is not None:
-                child = self._fallback.child
+            child = self._child_of(edge)
+
         if not must and not self._is_settled(sensors, child):
             return False
-        if not self._has_topic and edge is None and self.source is None:
+        if not has_pose_stream and edge is None:
             self.source = self._fallback
         self._fallback = None
         self.base = self._choose(sensors, child)
         if edge is not None:
-            self._edge = edge
-            self.session_frame = edge[0]
-            track = self.tree.track(*edge)
-            if track is not None:
-                self._raw.extend(zip(track.stamps_ns.tolist(), track.poses, strict=True))
+            self._follow(edge)
         self._pull()
         self._move()
         return True
+
+    def _child_of(self, edge: Edge | None) -> str | None:
+        """The frame that the poses of a TF edge, or without one of the fallback, belong to."""
+        if edge is not None:
+            return edge[1]
+        return None if self._fallback is None else self._fallback.child
+
+    def _follow(self, edge: Edge) -> None:
+        """Takes the poses of a TF edge, beginning with the remembered ones."""
+        self._edge = edge
+        self.session_frame = edge[0]
+        track = self.tree.track(*edge)
+        if track is not None:
+            self._raw.extend(zip(track.stamps_ns.tolist(), track.poses, strict=True))
 
     def _choose(self, sensors: Sequence[str], child: str | None) -> BaseFrame:
         source = self.source
@@ -216,19 +234,20 @@ class BasePoses:
         known = {*self.tree.frames, *map(frame_name, sensors)}
         if frame_name(child) not in known:
             raise LogError(
-                f"{source.name} gives the poses of '{child}', but the log has no such frame: name one of {', '.join(sorted(known))}."
+                f"{source.name} gives the poses of '{child}', but the log has no such frame: "
+                f"name one of {', '.join(sorted(known))}."
             )
         return choose_base_frame(self.tree, sensors, child, source.name)
 
-    def show(self, frame: Frame) -> None:
-        """A frame of the log that poses may be made of."""
+    def take_measurement(self, frame: Frame) -> None:
+        """A frame of the log that a source may make poses from."""
         source = self.source or self._fallback
         if source is not None:
             source.take(frame)
             self._pull()
 
     def _pull(self) -> None:
-        """Takes what is new from the source of poses, if there is one."""
+        """Takes the new poses of the source, if there is one."""
         if self.source is not None and self.base is not None:
             new = list(self.source.poses(self.base_T))
             if new:
@@ -236,14 +255,14 @@ class BasePoses:
                 self._move()
 
     def finish(self) -> None:
-        """No more transforms will come: poses that wait for one are given up."""
+        """No more transforms will come: poses that wait for one are dropped."""
         if self.source is not None:
             self.source.finish()
             self._pull()
         self._move(is_end=True)
 
     def base_T(self, frame_id: str, stamp_ns: int) -> F64 | None:
-        """``base_T_frame`` (4, 4) at a time; None when nothing says where that frame is."""
+        """``base_T_frame`` (4, 4) at a time; None when no transform leads to that frame."""
         if self.base is None:
             return None
         if self.base.assumed is not None and frame_name(frame_id) == self.base.assumed:
@@ -280,9 +299,7 @@ class BasePoses:
         return not self._roles.tf and len(self._static_times) >= self._static_count
 
     def _move(self, is_end: bool = False) -> None:
-        """Raw poses -> poses of the base frame, as soon as the transform between the two is known
-        at their time.
-        """
+        """Raw poses -> poses of the base frame, once the transform at their time is known."""
         base = self.base
         if base is None or base.pose_frame is None:
             return

@@ -1,6 +1,4 @@
-"""Which way is up, from the accelerometer: at rest and on average it feels nothing but the ground's
-push.
-"""
+"""The direction of up from the accelerometer: at rest and on average it measures gravity only."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ _MIN_FORCE, _MAX_FORCE = 0.5, 30.0
 
 
 class Accelerometer:
-    """Specific force over a log, evenly thinned; ``frame_id`` of the first sample counts."""
+    """Specific force over a log, evenly thinned; the ``frame_id`` of the first sample counts."""
 
     def __init__(self) -> None:
         self.frame_id: str | None = None
@@ -50,11 +48,10 @@ class Accelerometer:
         self,
         rotations_at: Callable[[NDArray[np.int64]], tuple[F64, NDArray[np.bool_]]] | None = None,
     ) -> F64 | None:
-        """Unit vector (3,) of the mean force in the IMU frame, or in a frame that ``rotations_at``
-        turns the samples into.
+        """Unit vector (3,) of the mean force in the IMU frame, or turned by ``rotations_at``.
 
         ``rotations_at`` gives rotations (m, 3, 3) at stamps (m,) and which are known. None without
-        enough to say.
+        enough samples.
         """
         if not self._stamps:
             return None
@@ -66,17 +63,16 @@ class Accelerometer:
 
 
 def up_in_base(accelerometer: Accelerometer, where: BasePoses) -> F64 | None:
-    """Unit vector (3,) that points up in the base frame: the robust mean of the accelerometer; None
-    without a usable IMU.
-    """
+    """Unit vector (3,) that points up in the base frame; None without a usable IMU."""
     base_T_imu = _base_T_imu(accelerometer, where)
     up = accelerometer.up()
     return None if base_T_imu is None or up is None else base_T_imu[:3, :3] @ up
 
 
 def up_in_session(accelerometer: Accelerometer, where: BasePoses) -> F64 | None:
-    """As :func:`up_in_base`, in the session frame: every sample is turned by the pose at its time,
-    so the base may tilt.
+    """As :func:`up_in_base`, in the session frame.
+
+    Every sample is turned by the pose at its time, so the base may tilt.
     """
     base_T_imu = _base_T_imu(accelerometer, where)
     if base_T_imu is None or not len(where.track):

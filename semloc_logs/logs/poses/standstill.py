@@ -19,9 +19,7 @@ _QUANTILE = 0.8
 
 
 class Standstill:
-    """Compares clouds with the first one, in the session frame, as long as the poses say that the
-    vehicle stands.
-    """
+    """Compares clouds with the first one, in the session frame, while the poses do not move."""
 
     def __init__(self) -> None:
         self._first: cKDTree | None = None
@@ -31,9 +29,7 @@ class Standstill:
 
     @property
     def shift(self) -> float:
-        """How far (m) points have come from the first cloud's, if at least half of the clouds have
-        moved; else 0.
-        """
+        """Distance (m) of moved clouds from the first; 0 unless at least half of them moved."""
         least = _TIMES * (self._noise or 0.0) + _MARGIN
         moved = [d for d in self._distances if d > least]
         return max(moved) if 2 * len(moved) >= max(len(self._distances), 4) else 0.0

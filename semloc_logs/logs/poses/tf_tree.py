@@ -1,7 +1,7 @@
-"""The TF tree of a log: which frame is where in which other frame, at any time.
+"""The TF tree of a log: where a frame is in another frame, at any time.
 
 Frame names are compared without leading slash. Edges form an undirected graph, so that a log whose
-publishers contradict the rule "one parent each" (loops, two parents) still gives an answer, and
+publishers contradict the rule "one parent each" (loops, two parents) still gives a result, and
 disconnected frames give None.
 """
 
@@ -73,32 +73,29 @@ class TransformTree:
         )
 
     def connected(self, target: str, source: str) -> bool:
-        """Whether edges lead from one frame to the other; a frame is always connected with itself."""
+        """Whether edges lead from one frame to the other; a frame is connected with itself."""
         return self._path(frame_name(target), frame_name(source)) is not None
 
-    def is_static(self, target: str, source: str) -> bool:
-        """Whether the frames are connected by static edges alone."""
-        path = self._path(frame_name(target), frame_name(source))
-        return path is not None and not any(self._moving_edge(a, b) for a, b in pairwise(path))
-
     def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
-        """``target_T_source`` (4, 4), dynamic edges interpolated at ``stamp_ns``; None when
-        unconnected or unknown at that time.
+        """``target_T_source`` (4, 4), dynamic edges interpolated at ``stamp_ns``.
+
+        None when unconnected or unknown at that time.
         """
         path = self._path(frame_name(target), frame_name(source))
         if path is None:
             return None
         result = np.eye(4)
-        for here, there in pairwise(path):
-            step = self._step(here, there, stamp_ns)
+        for frame, following in pairwise(path):
+            step = self._step(frame, following, stamp_ns)
             if step is None:
                 return None
             result = result @ step
         return result
 
     def has_passed(self, target: str, source: str, stamp_ns: int) -> bool:
-        """Whether the frames are connected and all dynamic edges between them have reached
-        ``stamp_ns``: a lookup will not change.
+        """Whether a lookup at ``stamp_ns`` will not change any more.
+
+        The frames are connected and all dynamic edges between them have reached that time.
         """
         path = self._path(frame_name(target), frame_name(source))
         edges = (
@@ -112,30 +109,27 @@ class TransformTree:
         return self._moving.get((frame_name(parent), frame_name(child)))
 
     def pose_edge(self, frame: str) -> Edge | None:
-        """The dynamic edge that says where ``frame`` drives: below ``odom`` if there is one above
-        it, else the topmost dynamic edge.
+        """The dynamic edge of a moving ``frame``: below ``odom`` if there is one, else the topmost.
 
         ``odom`` first, because odometry is continuous, whereas ``map`` -> ``odom`` jumps with every
         correction.
         """
         chain: list[Edge] = []
-        here = frame_name(frame)
-        seen = {frame_name(frame)}
-        while parents := [p for p in self._parents.get(here, []) if p not in seen]:
+        child = frame_name(frame)
+        seen = {child}
+        while parents := [p for p in self._parents.get(child, []) if p not in seen]:
             parent = next((p for p in parents if p.endswith("odom")), parents[0])
-            if (parent, here) in self._moving:
-                chain.append((parent, here))
+            if (parent, child) in self._moving:
+                chain.append((parent, child))
             seen.add(parent)
-            here = parent
+            child = parent
         return next(
             (edge for edge in chain if edge[0].endswith("odom")), chain[-1] if chain else None
         )
 
-    def _moving_edge(self, here: str, there: str) -> bool:
-        return (here, there) in self._moving or (there, here) in self._moving
-
-    def _step(self, here: str, there: str, stamp_ns: int) -> F64 | None:
-        for edge, is_forward in (((here, there), True), ((there, here), False)):
+    def _step(self, target: str, source: str, stamp_ns: int) -> F64 | None:
+        """``target_T_source`` (4, 4) of two neighbours."""
+        for edge, is_forward in (((target, source), True), ((source, target), False)):
             pose = self._static.get(edge)
             if edge in self._moving:
                 pose = self._moving[edge].at(stamp_ns)
@@ -153,11 +147,11 @@ class TransformTree:
             came_from = {target: target}
             queue = deque([target])
             while queue and source not in came_from:
-                here = queue.popleft()
-                for there in self._neighbours[here]:
-                    if there not in came_from:
-                        came_from[there] = here
-                        queue.append(there)
+                frame = queue.popleft()
+                for neighbour in self._neighbours[frame]:
+                    if neighbour not in came_from:
+                        came_from[neighbour] = frame
+                        queue.append(neighbour)
             self._paths[target, source] = (
                 _walk_back(came_from, target, source) if source in came_from else None
             )

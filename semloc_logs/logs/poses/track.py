@@ -1,4 +1,4 @@
-"""A pose stream: where a frame was at any time, and an honest None where nobody knows."""
+"""A pose stream: where a frame was at any time, and None where that is unknown."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ EDGE_NS = 100_000_000  # a stamp may lie this far outside of the stream: the nea
 PERIODS_PER_GAP = 3.0
 # s; nothing that drives is interpolated over more than this, however slow its stream
 LONGEST_GAP = 5.0
+_DETERMINANT = 1e-3  # of a rotation, off 1: floats of a message are more exact
 _FARTHEST = 1e8  # m; positions in Earth-centred frames are below 1e7
 # the years 1933 to 2116: sums and differences still fit 64 bits
 _FIRST_NS = -(1 << 60)
@@ -27,14 +28,20 @@ def is_time(stamp_ns: int) -> bool:
     return _FIRST_NS < stamp_ns < _LAST_NS
 
 
+def _is_rigid(pose: F64) -> bool:
+    """Whether a pose (4, 4) is finite, on Earth, and its rotation keeps volumes."""
+    is_on_earth = bool(np.isfinite(pose).all()) and np.abs(pose[:3, 3]).max() < _FARTHEST
+    return is_on_earth and abs(np.linalg.det(pose[:3, :3]) - 1.0) <= _DETERMINANT
+
+
 class PoseTrack:
     """Poses at strictly increasing stamps, which may still grow.
 
     ``max_gap`` (s) is the longest hole that is interpolated, or three median periods of a slow
     stream. With ``keep_seconds`` only the newest stretch is remembered (at least that long), so
-    memory is bounded. ``duplicates``, ``backwards`` and ``invalid`` count what was refused: equal
-    stamps, stamps before the newest one, and matrices that are no rigid transforms; ``ahead`` what
-    was taken back.
+    memory is bounded. ``duplicates``, ``backwards`` and ``invalid`` count refused poses: equal
+    stamps, stamps before the newest one, and matrices that are not rigid transforms; ``ahead``
+    counts poses that were taken back.
     """
 
     def __init__(self, max_gap: float = 1.0, keep_seconds: float | None = None) -> None:
@@ -54,27 +61,23 @@ class PoseTrack:
         return self._n
 
     def add(self, sample: PoseSample | TransformSample) -> bool:
-        """Appends the sample's ``frame_T_child`` at its header stamp; False when it was refused and
-        counted.
-        """
+        """Appends ``frame_T_child`` at the header stamp; False when it was refused and counted."""
         return self.append(sample.header.stamp_ns, sample.frame_T_child)
 
     def append(self, stamp_ns: int, pose: F64) -> bool:
         """Appends a pose (4, 4); False when it was refused and counted."""
-        if self._n and is_time(stamp_ns) and stamp_ns <= self._stamps[self._n - 1]:
+        if self._is_late(stamp_ns):
             self._drop_ahead(stamp_ns)
-        if self._n and is_time(stamp_ns) and stamp_ns <= self._stamps[self._n - 1]:
+        if self._is_late(stamp_ns):
             if stamp_ns == self._stamps[self._n - 1]:
                 self.duplicates += 1
             else:
                 self.backwards += 1
             return False
-        is_number = (
-            np.isfinite(pose).all() and np.abs(pose[:3, 3]).max() < _FARTHEST and is_time(stamp_ns)
-        )
-        if not is_number or abs(np.linalg.det(pose[:3, :3]) - 1.0) > 1e-3:
+        if not is_time(stamp_ns) or not _is_rigid(pose):
             self.invalid += 1
             return False
+
         if self._n == len(self._stamps):
             self._make_room()
         self._stamps[self._n] = stamp_ns
@@ -83,9 +86,12 @@ class PoseTrack:
         self.moves = self.moves or bool((pose[:3, 3] != self._rows[0, :, 3]).any())
         return True
 
+    def _is_late(self, stamp_ns: int) -> bool:
+        """Whether a stamp is not after the newest one."""
+        return self._n > 0 and is_time(stamp_ns) and stamp_ns <= int(self._stamps[self._n - 1])
+
     def _drop_ahead(self, stamp_ns: int) -> None:
-        """Takes back the newest poses, a few at most, when they lie so far ahead of ``stamp_ns``
-        that a glitch of the clock stamped them.
+        """Takes back the newest poses, a few at most, that a glitch of the clock stamped far ahead.
 
         One pose from the next century would otherwise make all that follow it too old.
         """
@@ -105,8 +111,11 @@ class PoseTrack:
         size = max(16, 2 * kept)
         stamps = np.empty(size, np.int64)
         rows = np.empty((size, 3, 4))
-        stamps[:kept], rows[:kept] = self._stamps[first : self._n], self._rows[first : self._n]
-        self._stamps, self._rows, self._n = stamps, rows, kept
+        stamps[:kept] = self._stamps[first : self._n]
+        rows[:kept] = self._rows[first : self._n]
+        self._stamps = stamps
+        self._rows = rows
+        self._n = kept
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -129,8 +138,9 @@ class PoseTrack:
         return int(self._stamps[self._n - 1]) if self._n else None
 
     def gap_limit_ns(self) -> int:
-        """The longest hole between two poses that is interpolated: ``max_gap`` or three median
-        periods, at most 5 s.
+        """The longest hole between two poses that is interpolated.
+
+        ``max_gap`` or three median periods, at most 5 s.
         """
         # the estimate is renewed now and then: a median for every frame would cost more than the
         # interpolation
@@ -145,33 +155,31 @@ class PoseTrack:
         return self._limit[1]
 
     def at(self, stamp_ns: int) -> F64 | None:
-        """The pose (4, 4) at ``stamp_ns``; None in a gap and more than 0.1 s outside of the stream."""
+        """The pose (4, 4) at ``stamp_ns``; None in a gap and over 0.1 s outside of the stream."""
         if not is_time(stamp_ns):
             return None
         poses, known = self.at_many(np.array([stamp_ns], np.int64))
         return poses[0] if known[0] else None
 
     def at_many(self, stamps_ns: NDArray[np.int64]) -> tuple[F64, NDArray[np.bool_]]:
-        """Poses (m, 4, 4) at ``stamps_ns`` (m,) and which of them are known (m,); unknown ones are
-        identity.
-        """
-        at = np.asarray(stamps_ns, np.int64)
-        poses = np.tile(np.eye(4), (len(at), 1, 1))
+        """Poses (m, 4, 4) at ``stamps_ns`` (m,), and which are known (m,); else identity."""
+        wanted = np.asarray(stamps_ns, np.int64)
+        poses = np.tile(np.eye(4), (len(wanted), 1, 1))
         if self._n == 0:
-            return poses, np.zeros(len(at), bool)
+            return poses, np.zeros(len(wanted), bool)
         stamps = self.stamps_ns
-        right = np.searchsorted(stamps, at, side="left")
-        left = np.clip(
-            np.where(stamps[np.minimum(right, self._n - 1)] == at, right, right - 1), 0, self._n - 1
-        )
-        right = np.clip(right, 0, self._n - 1)
-        known = (at >= stamps[0] - EDGE_NS) & (at <= stamps[-1] + EDGE_NS)
+        newest = self._n - 1
+        right = np.searchsorted(stamps, wanted, side="left")
+        is_exact = stamps[np.minimum(right, newest)] == wanted
+        left = np.clip(np.where(is_exact, right, right - 1), 0, newest)
+        right = np.clip(right, 0, newest)
+        known = (wanted >= stamps[0] - EDGE_NS) & (wanted <= stamps[-1] + EDGE_NS)
         known &= stamps[right] - stamps[left] <= self.gap_limit_ns()
         if known.any():
             first = int(left[known].min())
             last = int(right[known].max()) + 1
             poses[known] = transforms.interpolate(
-                stamps[first:last], self._matrices(first, last), at[known]
+                stamps[first:last], self._matrices(first, last), wanted[known]
             )
         return poses, known
 
@@ -189,12 +197,19 @@ class PoseTrack:
         return float(steps[np.diff(stamps) <= self.gap_limit_ns()].sum())
 
     def to_json(self) -> dict[str, object]:
-        """What is known about the stream, in numbers."""
+        """The stream in numbers, for session.json."""
         gaps = [[before, after] for before, after in self.gaps()]
         return {
-            "count": self._n, "start_ns": self.start_ns, "end_ns": self.end_ns, "gaps": gaps, "length_m": round(self.length(), 3),
-            "duplicates": self.duplicates, "backwards": self.backwards, "invalid": self.invalid, "ahead": self.ahead,
-        }  # fmt: skip
+            "count": self._n,
+            "start_ns": self.start_ns,
+            "end_ns": self.end_ns,
+            "gaps": gaps,
+            "length_m": round(self.length(), 3),
+            "duplicates": self.duplicates,
+            "backwards": self.backwards,
+            "invalid": self.invalid,
+            "ahead": self.ahead,
+        }
 
     def _matrices(self, first: int, last: int) -> F64:
         out = np.zeros((last - first, 4, 4))

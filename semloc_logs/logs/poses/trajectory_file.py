@@ -1,17 +1,16 @@
-"""Trajectories that come as a file beside the log: TUM (a stamp and a pose a line) or KITTI (twelve
-numbers a line, stamps elsewhere).
+"""Trajectories in a file beside the log: TUM (stamp and pose a line) or KITTI (twelve numbers).
 
 TUM: ``stamp t_x t_y t_z q_x q_y q_z q_w``, seconds and metres, lines that start with ``#`` are
 comments (TUM RGB-D benchmark, file formats). KITTI: the upper 3 x 4 of the pose, row-major (KITTI
 odometry development kit); line i belongs to the i-th frame of the main range sensor, unless a file
-of times, one number of seconds a line, says when each pose was.
+of times, one number of seconds a line, gives the time of each pose.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -21,19 +20,22 @@ from numpy.typing import NDArray
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, DepthFrame, Frame, ImageFrame, LidarFrame
 from semloc_logs.logs.poses.track import is_time
+from semloc_logs.logs.problems import Problem
 from semloc_logs.numerics import transforms
 
-TUM, KITTI = 8, 12  # numbers a line
+TUM = 8  # numbers a line
+KITTI = 12
 _LONGEST_LINE = 4096  # characters; a line of either format has about 150
-_MOST_POSES = 50_000_000  # a kilohertz over half a day; more is no trajectory
+_MOST_POSES = 50_000_000  # a kilohertz over half a day; a trajectory has fewer
 # a quaternion's length may be off by so much, a rotation matrix' R R^T from the identity
 _UNIT = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryFile:
-    """Where poses are: ``path``, for KITTI poses perhaps ``times``, and ``frame``, the frame that
-    they are the poses of ("": the base).
+    """The files of a trajectory: ``path``, and for KITTI poses perhaps ``times``.
+
+    ``frame`` is the frame whose poses they are ("": the base frame).
     """
 
     path: Path
@@ -46,7 +48,7 @@ class TrajectoryFile:
         for path in (self.path, *([self.times] if self.times else [])):
             if path.exists() and not path.is_file():
                 # a pipe can be read only once
-                raise LogError(f"{path} is no regular file: give the path of a file of poses.")
+                raise LogError(f"{path} is not a regular file: give the path of a file of poses.")
             try:
                 with path.open("rb") as file:
                     digest.update(hashlib.file_digest(file, "sha256").digest())
@@ -57,11 +59,11 @@ class TrajectoryFile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """``poses`` (n, 4, 4) at ``stamps_ns`` (n,), in the order of the file; no stamps: one pose for
-    each frame of the main sensor.
+    """``poses`` (n, 4, 4) at ``stamps_ns`` (n,), in the order of the file.
 
-    ``is_relative``: the stamps count from the first frame's, as KITTI's ``times.txt`` does, whose
-    first number is zero.
+    Without stamps there is one pose for each frame of the main sensor. ``is_relative``: the stamps
+    count from the stamp of the first frame, as in KITTI's ``times.txt``, whose first number is
+    zero.
     """
 
     poses: F64
@@ -70,59 +72,76 @@ class Trajectory:
 
 
 def read_trajectory(source: TrajectoryFile) -> Trajectory:
-    """Reads TUM or KITTI poses, told apart by the numbers a line; LogError names the file and line
-    that cannot be read.
+    """Reads TUM or KITTI poses, distinguished by the numbers a line.
+
+    LogError names the file and line that cannot be read.
     """
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    width = 0
-    for number, words in _lines(source.path):
-        width = width or len(words)
-        if width not in (TUM, KITTI) or len(words) != width:
-            wanted = (
-                f"{width} numbers like the lines before"
-                if rows
-                else f"{TUM} (TUM) or {KITTI} (KITTI) numbers"
-            )
-            raise LogError(
-                f"{source.path}, line {number} has {len(words)} numbers: give a file with {wanted} in each line."
-            )
-        if width == TUM:
-            stamps.append(seconds_to_ns(words[0], source.path, number))
-        rows.append(_floats(words[1:] if width == TUM else words, source.path, number))
-        lines.append(number)
-        if len(rows) > _MOST_POSES:
-            raise LogError(
-                f"{source.path} has more than {_MOST_POSES} poses: that is no trajectory."
-            )
-    if not rows:
+    rows = _read_rows(source.path)
+    if not rows.values:
         raise LogError(f"{source.path} has no poses: give a file in TUM or KITTI format.")
-    values = np.array(rows)
-    if width == TUM:
+    values = np.array(rows.values)
+    if rows.stamps:
         if source.times is not None:
             raise LogError(
-                f"{source.path} has stamps of its own (TUM format): leave --pose-times {source.times} out."
+                f"{source.path} has stamps of its own (TUM format): "
+                f"leave --pose-times {source.times} out."
             )
-        return Trajectory(_from_quaternions(values, source.path, lines), np.array(stamps, np.int64))
-    poses = _from_matrices(values, source.path, lines)
+        poses = _from_quaternions(values, source.path, rows.lines)
+        return Trajectory(poses, np.array(rows.stamps, np.int64))
+
+    poses = _from_matrices(values, source.path, rows.lines)
     if source.times is None:
         return Trajectory(poses, None)
     times = _read_times(source.times)
     if len(times) != len(poses):
         raise LogError(
-            f"{source.times} has {len(times)} times but {source.path} has {len(poses)} poses: give one time for each pose."
+            f"{source.times} has {len(times)} times but {source.path} has {len(poses)} poses: "
+            f"give one time for each pose."
         )
     return Trajectory(poses, times, is_relative=bool(times[0] == 0))
 
 
+@dataclass(slots=True)
+class _Rows:
+    """Numbers of each pose, its line in the file, and for TUM its stamp (ns)."""
+
+    values: list[list[float]] = field(default_factory=list)
+    lines: list[int] = field(default_factory=list)
+    stamps: list[int] = field(default_factory=list)
+
+
+def _read_rows(path: Path) -> _Rows:
+    rows = _Rows()
+    width = 0
+    for number, words in _lines(path):
+        width = width or len(words)
+        if width not in (TUM, KITTI) or len(words) != width:
+            wanted = (
+                f"{width} numbers like the lines before"
+                if rows.values
+                else f"{TUM} (TUM) or {KITTI} (KITTI) numbers"
+            )
+            raise LogError(
+                f"{path}, line {number} has {len(words)} numbers: "
+                f"give a file with {wanted} in each line."
+            )
+        if width == TUM:
+            rows.stamps.append(seconds_to_ns(words[0], path, number))
+        rows.values.append(_floats(words[1:] if width == TUM else words, path, number))
+        rows.lines.append(number)
+        if len(rows.values) > _MOST_POSES:
+            raise LogError(f"{path} has more than {_MOST_POSES} poses: it is not a trajectory.")
+    return rows
+
+
 def seconds_to_ns(text: str, path: Path, line: int) -> int:
-    """Integer nanoseconds of a decimal number of seconds, exactly: a float64 is 0.2 us off since
-    1970.
+    """Integer nanoseconds of a decimal number of seconds, exactly.
+
+    A float64 of seconds since 1970 would be off by 0.2 us.
     """
     try:
         seconds = Decimal(text)
-        # what is far too large is refused by its exponent, before anyone writes it out
+        # a number that is far too large is refused by its exponent, before it is written out
         stamp_ns = (
             int((seconds * 1_000_000_000).to_integral_value())
             if seconds.is_finite() and seconds.adjusted() < 12
@@ -131,24 +150,25 @@ def seconds_to_ns(text: str, path: Path, line: int) -> int:
     except InvalidOperation:
         stamp_ns = None
     if stamp_ns is None or not is_time(stamp_ns):
-        raise LogError(f"{path}, line {line}: {text[:40]!r} is no time in seconds.")
+        raise LogError(f"{path}, line {line}: {text[:40]!r} is not a time in seconds.")
     return stamp_ns
 
 
 class FilePoses:
-    """The poses of a file as a source of poses for a session; ``topic`` is the main range sensor,
-    of which ``count`` frames are to come.
+    """The poses of a file as a source of poses for a session.
 
-    LogError when KITTI poses and frames cannot be told to belong together.
+    ``topic`` is the main range sensor, of which ``count`` frames are to come. LogError when it is
+    unknown which frames KITTI poses belong to.
     """
 
     def __init__(self, source: TrajectoryFile, topic: str, count: int) -> None:
         self.name = str(source.path)
         self.session_frame = "trajectory"
         self.child: str | None = source.frame
-        self.problems: list[str] = []
-        self.notes: list[str] = []
-        self._source, self._topic, self._count = source, topic, count
+        self.problems: list[Problem] = []  # none: a file with a mistake is an error
+        self._source = source
+        self._topic = topic
+        self._count = count
         self._trajectory = read_trajectory(source)
         self._frames = 0
         self._given = 0
@@ -158,7 +178,8 @@ class FilePoses:
         if self._trajectory.stamps_ns is None and n != count:
             raise LogError(
                 f"{source.path} has {n} poses without stamps but {topic} has {count} frames: "
-                f"give one pose for each frame, a TUM file, or the times of the poses with --pose-times FILE."
+                f"give one pose for each frame, a TUM file, or the times of the poses with "
+                f"--pose-times FILE."
             )
 
     @property
@@ -167,7 +188,7 @@ class FilePoses:
         return self._given == len(self._trajectory.poses)
 
     def take(self, frame: Frame) -> None:
-        """A frame of the log: those of the main sensor date poses that have no stamps."""
+        """A frame of the log: frames of the main sensor date poses that have no stamps."""
         if frame.header.topic == self._topic and isinstance(
             frame, LidarFrame | DepthFrame | ImageFrame
         ):
@@ -198,8 +219,9 @@ class FilePoses:
         """All frames of the log have been seen."""
         if self._trajectory.stamps_ns is None and self._frames != self._count:
             raise LogError(
-                f"Only {self._frames} of {self._count} frames of {self._topic} can be read, so the poses of {self._source.path} cannot be "
-                f"told to belong to them: give a TUM file, or the times of the poses with --pose-times FILE."
+                f"Only {self._frames} of {self._count} frames of {self._topic} can be read, so it "
+                f"is unknown which frames the poses of {self._source.path} belong to: give a TUM "
+                f"file, or the times of the poses with --pose-times FILE."
             )
 
     def to_json(self) -> dict[str, object]:
@@ -214,7 +236,7 @@ class FilePoses:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number and words of every line that is not empty and no comment."""
+    """Line number and words of every line, without comments and empty lines."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             number = 0
@@ -222,13 +244,14 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
                 number += 1
                 if len(line) >= _LONGEST_LINE:
                     raise LogError(
-                        f"{path}, line {number} is longer than {_LONGEST_LINE} characters: that is no file of poses."
+                        f"{path}, line {number} is longer than {_LONGEST_LINE} characters: "
+                        f"it is not a file of poses."
                     )
                 words = line.split("#", 1)[0].split()
                 if words:
                     yield number, words
     except UnicodeDecodeError:
-        raise LogError(f"{path} is no text: give a file in TUM or KITTI format.") from None
+        raise LogError(f"{path} is not text: give a file in TUM or KITTI format.") from None
     except OSError as problem:
         raise _unreadable(path, problem) from None
 
@@ -246,7 +269,8 @@ def _floats(words: list[str], path: Path, line: int) -> list[float]:
         values = [np.nan]
     if not np.isfinite(values).all():
         raise LogError(
-            f"{path}, line {line} has something that is no number: give a file in TUM or KITTI format."
+            f"{path}, line {line} has a word that is not a number: "
+            f"give a file in TUM or KITTI format."
         )
     return values
 
@@ -256,7 +280,8 @@ def _from_quaternions(values: F64, path: Path, lines: list[int]) -> F64:
     bad = np.flatnonzero(np.abs(length - 1.0) > _UNIT)
     if len(bad):
         raise LogError(
-            f"{path}, line {lines[bad[0]]}: the quaternion (x y z w) has the length {length[bad[0]]:.3g}, not 1."
+            f"{path}, line {lines[bad[0]]}: the quaternion (x y z w) has the length "
+            f"{length[bad[0]]:.3g}, not 1."
         )
     return transforms.transform(values[:, :3], values[:, 3:])
 
@@ -269,7 +294,7 @@ def _from_matrices(values: F64, path: Path, lines: list[int]) -> F64:
         off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
         bad = np.flatnonzero(~((off <= _UNIT) & (np.linalg.det(rotation) > 0)))
     if len(bad):
-        raise LogError(f"{path}, line {lines[bad[0]]}: the 3 x 3 part is no rotation.")
+        raise LogError(f"{path}, line {lines[bad[0]]}: the 3 x 3 part is not a rotation.")
     # as written with six digits it is nearly one
     return transforms.transform(*transforms.translation_quaternion(poses))
 

@@ -1,8 +1,9 @@
-"""Everything that turns pictures into points, depth images and stereo pairs alike, behind one door."""
+"""Pictures -> points, from depth images and stereo pairs alike."""
 
 from __future__ import annotations
 
 from semloc_logs.frames import Camera, DepthFrame, ImageFrame
+from semloc_logs.logs.problems import NoCloud, Problem
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.depth import (
     USUAL_NOISE,
@@ -14,11 +15,10 @@ from semloc_logs.logs.sensors.depth import (
 from semloc_logs.logs.sensors.stereo_pairs import RightTLeft, StereoClouds
 
 
-class PictureClouds:
-    """Depth images and stereo pairs -> points with labels, by the calibrations and label images
-    that came with them.
+class CameraClouds:
+    """Depth images and stereo pairs -> points with labels.
 
-    ``cameras``: the newest calibration by CameraInfo topic; ``labels``: the label images;
+    ``calibrations``: the newest one by CameraInfo topic; ``labels``: the label images;
     ``right_T_left`` as in StereoClouds.
     """
 
@@ -33,23 +33,18 @@ class PictureClouds:
         self._roles = roles
         self._depth = DepthClouds(roles, stride, noise)
         self.labels: LabelImages = self._depth.labels
-        self.cameras: dict[str, Camera] = self._depth.cameras
+        self.calibrations: dict[str, Camera] = self._depth.calibrations
         self._stereo = StereoClouds(
-            roles, self.cameras, self.labels, right_T_left, stride=stride, noise=noise
+            roles, self.calibrations, self.labels, right_T_left, stride=stride, noise=noise
         )
 
     @property
-    def lost(self) -> list[str]:
-        """Sentences about calibrations that cannot be used."""
-        return [*self._depth.lost, *self._stereo.lost]
-
-    @property
-    def notes(self) -> list[str]:
-        """Sentences about label images that cannot be used."""
-        return [*self.labels.notes]
+    def problems(self) -> list[Problem]:
+        """Calibrations (lost) and label images that cannot be used."""
+        return [*self._depth.problems, *self._stereo.problems, *self.labels.problems]
 
     def take(self, frame: DepthFrame | ImageFrame) -> None:
-        """Remembers a label image or a picture of a stereo pair; any other is of no use here."""
+        """Remembers a label image or a picture of a stereo pair; any other is ignored."""
         topic = frame.header.topic
         if topic in self._roles.label_of.values():
             self.labels.take(frame)
@@ -60,21 +55,17 @@ class PictureClouds:
                 self._stereo.take_right(frame)
 
     def has_all(self, frame: DepthFrame | ImageFrame) -> bool:
-        """Whether all that a frame needs has come, as far as the log promises it."""
+        """Whether calibration, labels and partner of a frame have come, if the log has them."""
         if frame.header.topic != self._roles.stereo_left:
             return self._depth.has_all(frame)
         return not isinstance(frame, ImageFrame) or self._stereo.has_all(frame)
 
     def points(
         self, frame: DepthFrame | ImageFrame, min_range: float, max_range: float
-    ) -> RangePoints | str:
-        """Points in the optical frame between the ranges (m, along the ray); or the reason why
-        there are none.
-        """
+    ) -> RangePoints | NoCloud:
+        """Points in the optical frame between the ranges (m, along the ray), or the reason."""
         if frame.header.topic != self._roles.stereo_left:
             return self._depth.points(frame, min_range, max_range)
-        return (
-            self._stereo.points(frame, min_range, max_range)
-            if isinstance(frame, ImageFrame)
-            else "no picture"
-        )
+        if not isinstance(frame, ImageFrame):
+            return NoCloud.NO_PICTURE
+        return self._stereo.points(frame, min_range, max_range)

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F32, F64, Camera, DepthFrame, ImageFrame
+from semloc_logs.logs.problems import NoCloud, ProblemKind, Problems
 from semloc_logs.logs.roles import Roles
+from semloc_logs.logs.sensors.rectification import (
+    FISHEYE,
+    FISHEYE_COEFFICIENTS,
+    PINHOLE,
+    PINHOLE_COEFFICIENTS,
+)
 from semloc_logs.logs.sensors.stereo import DISPARITY_NOISE
 
 DENSE_PIXELS = 200_000  # a larger depth image is thinned to every second pixel of every second row
@@ -29,9 +36,10 @@ _LABELS_KEPT = 80  # more than the depth images that may wait for their pose
 
 @dataclass(frozen=True, slots=True)
 class RangeNoise:
-    """How uncertain ranges from pictures are: ``depth`` (1/m), the growth of a depth image's
-    standard deviation with the square of the depth, and ``disparity`` (px), the standard deviation
-    of a stereo pair's disparity where texture is plenty.
+    """How uncertain ranges from pictures are.
+
+    ``depth`` (1/m): growth of a depth image's standard deviation with the square of the depth.
+    ``disparity`` (px): standard deviation of a stereo pair's disparity where texture is plenty.
     """
 
     depth: float = DEPTH_NOISE
@@ -42,9 +50,7 @@ USUAL_NOISE = RangeNoise()
 
 
 class RangePoints(NamedTuple):
-    """``points`` (n, 3) in the optical frame (m), their ``label`` (n,) as recorded or None, and
-    ``sigma`` (n,) of the range (m).
-    """
+    """Points (n, 3) in the optical frame (m), ``label`` (n,) or None, ``sigma`` (n,) of range."""
 
     points: F32
     label: NDArray[np.uint32] | None
@@ -52,9 +58,7 @@ class RangePoints(NamedTuple):
 
 
 def depth_sigma(points: F32, coefficient: float = DEPTH_NOISE) -> F32:
-    """Standard deviation (n,) of the range along the ray of points (n, 3) in the optical frame of a
-    depth camera (m).
-    """
+    """Standard deviation (n,) in m of the range of points (n, 3) in a depth camera's frame."""
     z = points[:, 2]
     axial = np.float32(_LEAST_DEPTH_NOISE) + np.float32(coefficient) * np.square(
         np.maximum(z - np.float32(_NOISE_FREE_DEPTH), 0)
@@ -64,8 +68,7 @@ def depth_sigma(points: F32, coefficient: float = DEPTH_NOISE) -> F32:
 
 
 class Unprojector:
-    """Viewing rays of a depth camera, computed once and used for every image of that height and
-    width.
+    """Viewing rays of a depth camera, computed once for all images of that height and width.
 
     ``rectified``: the picture is undistorted, so the projection matrix P holds, not K and D.
     ``stride`` None thins images of more than 200,000 pixels. LogError when the calibration cannot
@@ -81,11 +84,12 @@ class Unprojector:
         rectified: bool = False,
         stride: int | None = None,
     ) -> None:
-        where = f"CameraInfo {camera.header.topic}"
+        name = f"CameraInfo {camera.header.topic}"
         if camera.width and camera.height and (camera.width, camera.height) != (width, height):
             raise LogError(
-                f"{where} is for {camera.width} x {camera.height} pixels but the depth image has {width} x {height}: "
-                f"record the CameraInfo of the depth image, or name it with --topic camera_info=TOPIC."
+                f"{name} is for {camera.width} x {camera.height} pixels but the depth image has "
+                f"{width} x {height}: record the CameraInfo of the depth image, or name it with "
+                f"--topic camera_info=TOPIC."
             )
         matrix = camera.K
         distortion = np.atleast_1d(np.asarray(camera.D, float))
@@ -94,21 +98,24 @@ class Unprojector:
             distortion = np.zeros(0)
         if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
             raise LogError(
-                f"{where} has no focal length: the camera is not calibrated; name another with --topic camera_info=TOPIC."
+                f"{name} has no focal length: the camera is not calibrated; "
+                f"name another with --topic camera_info=TOPIC."
             )
+
         self._width = width
         self.step = stride or (2 if height * width > DENSE_PIXELS else 1)
         rows, columns = np.mgrid[0 : height : self.step, 0 : width : self.step]
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-        rays = _normalised(pixels, matrix, distortion, camera.model, where)
+        rays = _normalised(pixels, matrix, distortion, camera.model, name)
         self._rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1).astype(np.float32)
         self._lengths = np.linalg.norm(self._rays, axis=1)
 
     def points(
         self, depth: F32, min_range: float, max_range: float
     ) -> tuple[F32, NDArray[np.intp]]:
-        """Points (n, 3) in the optical frame and their flat pixel index (n,); ranges in metres
-        along the ray, no depth is 0.
+        """Points (n, 3) in the optical frame and their flat pixel index (n,).
+
+        ``depth`` (h, w) in m, 0 where unknown; ranges in m along the ray.
         """
         z = depth[:: self.step, :: self.step].reshape(-1)
         with np.errstate(invalid="ignore"):
@@ -119,7 +126,7 @@ class Unprojector:
         return self._rays[kept] * z[kept, None], pixels
 
 
-def _normalised(pixels: F64, matrix: F64, distortion: F64, model: str, where: str) -> F64:
+def _normalised(pixels: F64, matrix: F64, distortion: F64, model: str, calibration: str) -> F64:
     """Pixels (n, 2) -> normalised image coordinates (n, 2)."""
     if not np.any(distortion):
         y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
@@ -129,31 +136,25 @@ def _normalised(pixels: F64, matrix: F64, distortion: F64, model: str, where: st
     name = model.lower()
     rays = None
     try:
-        if name in ("plumb_bob", "rational_polynomial", "thin_prism", "") and len(distortion) in (
-            4,
-            5,
-            8,
-            12,
-            14,
-        ):
+        if name in PINHOLE and len(distortion) in PINHOLE_COEFFICIENTS:
             rays = cv2.undistortPoints(pixels[:, None], matrix, distortion)
-        elif name in ("equidistant", "kannala_brandt", "fisheye") and len(distortion) == 4:
+        elif name in FISHEYE and len(distortion) == FISHEYE_COEFFICIENTS:
             rays = cv2.fisheye.undistortPoints(pixels[:, None], matrix, distortion)
     except cv2.error:
         rays = None
     if rays is None or not np.isfinite(rays).all():
         raise LogError(
-            f"{where} has the distortion model '{model[:40]}' with {len(distortion)} coefficients, which is not supported: "
-            f"record rectified depth, or name another calibration with --topic camera_info=TOPIC."
+            f"{calibration} has the distortion model '{model[:40]}' with {len(distortion)} "
+            f"coefficients, which is not supported: record rectified depth, or name another "
+            f"calibration with --topic camera_info=TOPIC."
         )
     return np.asarray(rays, float).reshape(-1, 2)
 
 
 def label_ids(frame: DepthFrame | ImageFrame) -> NDArray[np.uint32]:
-    """Ids (h, w) of a frame on a label topic, also where a 16-bit picture was decoded as if it were
-    depth.
+    """Ids (h, w) of a frame on a label topic, also of a 16-bit picture that was decoded as depth.
 
-    Of a colour picture the colours: red in bits 16 to 23, green in 8 to 15, blue in 0 to 7.
+    Of a colour picture the packed colours, see :class:`semloc_logs.frames.LabelForm`.
     """
     if isinstance(frame, DepthFrame):
         ids: NDArray[np.uint32] = np.rint(frame.depth * 1e3).astype(np.uint32)
@@ -170,9 +171,7 @@ def is_coloured(frame: DepthFrame | ImageFrame) -> bool:
 
 
 def _metres(frame: DepthFrame | ImageFrame) -> F32 | None:
-    """A 16-bit picture whose name did not say depth is in millimetres all the same, now that the
-    user says so.
-    """
+    """Depth (h, w) in m; a 16-bit picture that the user named as depth is in millimetres."""
     if isinstance(frame, DepthFrame):
         return frame.depth
     if frame.image.ndim == 2 and frame.image.dtype == np.uint16:
@@ -181,12 +180,13 @@ def _metres(frame: DepthFrame | ImageFrame) -> F32 | None:
 
 
 class LabelImages:
-    """Label images as they come, for the pictures that they belong to by name and time. ``notes``:
-    sentences about useless ones.
+    """Label images as they come, for the pictures that they belong to by name and time.
+
+    ``problems`` name the ones that cannot be used.
     """
 
     def __init__(self, roles: Roles) -> None:
-        self.notes: dict[str, None] = {}
+        self.problems = Problems()
         self.coloured: set[str] = set()  # label topics whose labels are colours
         self._roles = roles
         self._frames: dict[str, deque[DepthFrame | ImageFrame]] = {}
@@ -220,49 +220,52 @@ class LabelImages:
             return ids
         # else it is painted by its own calibration
         if nearest.header.topic not in self._roles.info_of:
-            self.notes.setdefault(
-                f"{nearest.header.topic} is not used for labels: it is no picture of the same size as {frame.header.topic}; "
-                f"--topic label_image=TOPIC names another."
+            self.problems.add(
+                f"{nearest.header.topic} is not used for labels: its pictures do not have the size "
+                f"of {frame.header.topic}; --topic label_image=TOPIC names another.",
+                topic=nearest.header.topic,
+                kind=ProblemKind.LABEL,
+                lost=False,
             )
         return None
 
 
 class DepthClouds:
-    """Depth images -> points with labels, by the calibrations and ``labels`` that came with them.
+    """Depth images -> points with labels, by the recorded calibrations and ``labels``.
 
-    ``lost``: sentences about calibrations that cannot be used.
+    ``calibrations``: the newest one by CameraInfo topic; ``problems`` name the unusable ones.
     """
 
     def __init__(
         self, roles: Roles, stride: int | None = None, noise: RangeNoise = USUAL_NOISE
     ) -> None:
-        self.cameras: dict[str, Camera] = {}  # by CameraInfo topic, the newest
+        self.calibrations: dict[str, Camera] = {}
         self.labels = LabelImages(roles)
-        self.lost: dict[str, None] = {}
-        self._roles, self._stride, self._noise = roles, stride, noise
+        self.problems = Problems()
+        self._roles = roles
+        self._stride = stride
+        self._noise = noise
         self._unprojectors: dict[str, tuple[Camera, tuple[int, ...], Unprojector | None]] = {}
 
     def has_all(self, frame: DepthFrame | ImageFrame) -> bool:
-        """Whether calibration and label image of a depth frame have come, as far as the log
-        promises them.
-        """
+        """Whether calibration and label image of a depth frame have come, if the log has them."""
         info = self._roles.info_of.get(frame.header.topic)
-        return (info is None or info in self.cameras) and self.labels.has(frame)
+        return (info is None or info in self.calibrations) and self.labels.has(frame)
 
     def points(
         self, frame: DepthFrame | ImageFrame, min_range: float, max_range: float
-    ) -> RangePoints | str:
-        """Points in the optical frame; or the reason why there are none."""
+    ) -> RangePoints | NoCloud:
+        """Points in the optical frame, or the reason for none."""
         topic = frame.header.topic
         depth = _metres(frame)
         if depth is None:
-            return "no depth"
-        camera = self.cameras.get(self._roles.info_of.get(topic, ""))
+            return NoCloud.NO_DEPTH
+        camera = self.calibrations.get(self._roles.info_of.get(topic, ""))
         if camera is None:
-            return "no calibration"
+            return NoCloud.NO_CALIBRATION
         unprojector = self._unprojector(topic, camera, depth.shape)
         if unprojector is None:
-            return "unusable calibration"
+            return NoCloud.UNUSABLE_CALIBRATION
         points, pixels = unprojector.points(depth, min_range, max_range)
         label = self.labels.of(frame, depth.shape)
         return RangePoints(
@@ -284,13 +287,13 @@ class DepthClouds:
                 camera, shape[0], shape[1], rectified=is_rectified, stride=self._stride
             )
         except LogError as error:
-            self.lost.setdefault(str(error))
+            self.problems.add(str(error), topic=topic, kind=ProblemKind.CALIBRATION)
         self._unprojectors[topic] = (camera, shape, unprojector)
         return unprojector
 
 
 def same_calibration(a: Camera, b: Camera) -> bool:
-    """Whether two calibrations say the same."""
+    """Whether two calibrations are equal, apart from their headers."""
     return a is b or (
         (a.width, a.height, a.model) == (b.width, b.height, b.model)
         and all(np.array_equal(x, y) for x, y in ((a.K, b.K), (a.D, b.D), (a.R, b.R), (a.P, b.P)))

@@ -1,5 +1,4 @@
-"""A pair of calibrated cameras turned, in the computer, until the rows of their pictures
-correspond.
+"""Rectification of a pair of calibrated cameras: turned until the rows of the pictures correspond.
 
 A raw pair is rectified by the R and P of its CameraInfos where these carry a baseline
 (sensor_msgs/CameraInfo: P[0, 3] = -f * baseline), else by the transform between the cameras, with
@@ -21,29 +20,33 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import F32, F64, Camera
 from semloc_logs.numerics.transforms import rotation_angle, rotation_between
 
+# distortion models that OpenCV can undo, and the numbers of their coefficients
 PINHOLE = ("plumb_bob", "rational_polynomial", "thin_prism", "")
+PINHOLE_COEFFICIENTS = (4, 5, 8, 12, 14)
 FISHEYE = ("equidistant", "kannala_brandt", "fisheye")
+FISHEYE_COEFFICIENTS = 4
 _SHORTEST_BASELINE = 1e-3  # m; below, the two frames are one
 SMALLEST = 32  # px, sides of a picture
 _LARGEST_NUMBER = 1e6  # in K (px), D and P
-# between the optical axes, or the baseline and the rows: more is no stereo pair
+# between the optical axes, or the baseline and the rows; a stereo pair has less
 _WIDEST_ANGLE = np.deg2rad(40.0)
 # of the focal length, at least: rectified pictures see more than the middle, at the cost of
 # resolution there
 _WIDER = 0.6
 _SAME = 0.02  # focal lengths of rectified pictures differ by no more than this share
 
+_FARTHEST_MIDDLE = 2.0  # of a picture from the rectified axis, in focal lengths
+
 Maps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectification:
-    """How to rectify both pictures of a pair, and what a disparity d (pixels) means then: z = focal
-    * baseline / (d - offset).
+    """How to rectify both pictures of a pair; then z = focal * baseline / (disparity - offset).
 
     ``focal`` (px), ``centre`` (x, y) of the left rectified picture (px), ``baseline`` (m),
-    ``left_R_rect`` (3, 3) from the rectified to the left optical frame. ``maps`` are what cv2.remap
-    takes, None where the pictures come rectified. ``valid`` (h, w) of left and right: pixels that
+    ``left_R_rect`` (3, 3) from the rectified to the left optical frame. ``maps`` are for cv2.remap,
+    None where the pictures come rectified. ``valid`` (h, w) of left and right: pixels that
     lie on the recorded picture. ``pixels`` (h, w): flat index of the nearest pixel of the recorded
     left picture.
     """
@@ -66,58 +69,70 @@ def rectification(
     *,
     rectified: bool,
 ) -> Rectification:
-    """The rectification of pictures (h, w) of these cameras; ``rectified``: they come so, and P
-    holds.
+    """The rectification of pictures (h, w) of these cameras; ``rectified``: as P describes them.
 
-    ``right_T_left`` (4, 4) between the optical frames, None where nothing says it. LogError where
+    ``right_T_left`` (4, 4) between the optical frames, None where it is unknown. LogError where
     the calibrations do not allow it.
     """
-    names = f"{left.header.topic}, {right.header.topic}"
-    if min(shape) < SMALLEST:
-        raise LogError(
-            f"The pictures of {names} have {shape[1]} x {shape[0]} pixels: too few to be matched."
-        )
-    for camera in (left, right):
-        if camera.width and camera.height and (camera.height, camera.width) != shape:
-            raise LogError(
-                f"CameraInfo {camera.header.topic} is for {camera.width} x {camera.height} pixels but the picture has "
-                f"{shape[1]} x {shape[0]}: record the CameraInfo of the picture, or name it with --topic camera_info=TOPIC."
-            )
-    _check_numbers(left, right, names)
+    pair = _Pair(left, right, shape)
+    _check_sizes(pair)
+    _check_numbers(pair)
     if right_T_left is not None and np.linalg.norm(right_T_left[:3, 3]) < _SHORTEST_BASELINE:
         # the frame ids of both pictures are the same, as stereo_image_proc wants them
         right_T_left = None
     if rectified:
-        return _as_recorded(left, right, shape, right_T_left, names)
+        return _as_recorded(pair, right_T_left)
+
     recorded = _baseline_of_infos(left, right)
     is_turned = any(not np.allclose(camera.R, np.eye(3), atol=1e-9) for camera in (left, right))
     if recorded != 0.0 and (is_turned or right_T_left is None):
-        rotations = (left.R, right.R)
-        matrices = (left.P[:, :3], right.P[:, :3])
-        _check_sides(recorded, names)
-        return _of_maps(left, right, shape, rotations, matrices, recorded, names)
+        _check_sides(recorded, pair)
+        return _of_maps(pair, (left.R, right.R), (left.P[:, :3], right.P[:, :3]), recorded)
     if right_T_left is None:
         raise LogError(
-            f"Nothing says where the cameras of {names} are to each other: record /tf_static between their frames, "
-            f"or CameraInfos whose P has the baseline."
+            f"The transform between the cameras of {pair.names} is unknown: record /tf_static "
+            f"between their frames, or CameraInfos whose P has the baseline."
         )
-    _check_angles(right_T_left, names)
+    _check_angles(right_T_left, pair)
     rotations = bouguet_rotations(right_T_left)
-    matrix = _common_matrix(left, right, shape, rotations, names)
-    return _of_maps(
-        left,
-        right,
-        shape,
-        rotations,
-        (matrix, matrix),
-        float(np.linalg.norm(right_T_left[:3, 3])),
-        names,
-    )
+    matrix = _common_matrix(pair, rotations)
+    baseline = float(np.linalg.norm(right_T_left[:3, 3]))
+    return _of_maps(pair, rotations, (matrix, matrix), baseline)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Two cameras and the size (h, w) of their pictures."""
+
+    left: Camera
+    right: Camera
+    shape: tuple[int, int]
+
+    @property
+    def names(self) -> str:
+        """The topics of the CameraInfos, for sentences."""
+        return f"{self.left.header.topic}, {self.right.header.topic}"
+
+
+def _check_sizes(pair: _Pair) -> None:
+    height, width = pair.shape
+    if min(pair.shape) < SMALLEST:
+        raise LogError(
+            f"The pictures of {pair.names} have {width} x {height} pixels: too few to be matched."
+        )
+    for camera in (pair.left, pair.right):
+        if camera.width and camera.height and (camera.height, camera.width) != pair.shape:
+            raise LogError(
+                f"CameraInfo {camera.header.topic} is for {camera.width} x {camera.height} pixels "
+                f"but the picture has {width} x {height}: record the CameraInfo of the picture, or "
+                f"name it with --topic camera_info=TOPIC."
+            )
 
 
 def bouguet_rotations(right_T_left: F64) -> tuple[F64, F64]:
-    """Rotations (3, 3) of the left and the right optical frame into rectified ones whose x axis is
-    the baseline, left to right.
+    """Rotations (3, 3) of the left and the right optical frame into the rectified frames.
+
+    Their x axis is the baseline, left to right.
     """
     rotation = Rotation.from_matrix(right_T_left[:3, :3])
     half = Rotation.from_rotvec(rotation.as_rotvec() / 2)
@@ -126,11 +141,9 @@ def bouguet_rotations(right_T_left: F64) -> tuple[F64, F64]:
     return rect_R_half @ half.as_matrix(), rect_R_half @ half.inv().as_matrix()
 
 
-def _check_numbers(left: Camera, right: Camera, names: str) -> None:
-    """OpenCV computes with anything; what follows from numbers that no lens has would be garbage,
-    or a crash.
-    """
-    for camera in (left, right):
+def _check_numbers(pair: _Pair) -> None:
+    """LogError for numbers that no lens has: with them OpenCV computes garbage, or crashes."""
+    for camera in (pair.left, pair.right):
         numbers = np.concatenate([camera.K.ravel(), camera.P.ravel(), np.ravel(camera.D)])
         is_rotation = (
             np.allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-2) and np.linalg.det(camera.R) > 0
@@ -140,71 +153,76 @@ def _check_numbers(left: Camera, right: Camera, names: str) -> None:
             or not np.isfinite(numbers).all()
             or np.abs(numbers).max() > _LARGEST_NUMBER
         ):
-            raise LogError(
-                f"The calibrations of {names} make no sense; name others with --topic camera_info=TOPIC,TOPIC."
-            )
+            raise _senseless(pair)
 
 
-def _check_angles(right_T_left: F64, names: str) -> None:
-    """A pair that does not look the same way, or sits one above the other, gives no useful pictures
-    when turned into rows.
-    """
+def _senseless(pair: _Pair) -> LogError:
+    return LogError(
+        f"The calibrations of {pair.names} make no sense; "
+        f"name others with --topic camera_info=TOPIC,TOPIC."
+    )
+
+
+def _check_angles(right_T_left: F64, pair: _Pair) -> None:
+    """LogError for cameras that look different ways, or sit one above the other."""
     centre = -right_T_left[:3, :3].T @ right_T_left[:3, 3]
     from_rows = float(np.arccos(np.clip(abs(centre[0]) / np.linalg.norm(centre), 0.0, 1.0)))
     turned = max(rotation_angle(right_T_left[:3, :3]), from_rows)
     if turned > _WIDEST_ANGLE:
         raise LogError(
-            f"The cameras of {names} are no stereo pair: they would have to be turned by {np.rad2deg(turned):.0f} deg to see the same "
-            f"rows; choose two that look the same way side by side with --topic stereo_left=TOPIC --topic stereo_right=TOPIC."
+            f"The cameras of {pair.names} do not form a stereo pair: they would have to be turned "
+            f"by {np.rad2deg(turned):.0f} deg to see the same rows; choose two that look the same "
+            f"way side by side with --topic stereo_left=TOPIC --topic stereo_right=TOPIC."
         )
-    _check_sides(float(centre[0]), names)
+    _check_sides(float(centre[0]), pair)
 
 
-def _check_sides(baseline: float, names: str) -> None:
+def _check_sides(baseline: float, pair: _Pair) -> None:
     if baseline < 0:
         raise LogError(
-            f"The left camera of {names} sits right of the other: exchange them with --topic stereo_left=TOPIC --topic stereo_right=TOPIC."
+            f"The left camera of {pair.names} sits right of the other: exchange them with "
+            f"--topic stereo_left=TOPIC --topic stereo_right=TOPIC."
         )
 
 
 def _baseline_of_infos(left: Camera, right: Camera) -> float:
-    """Metres from the left to the right camera as their P say it; 0 when they do not."""
+    """Metres from the left to the right camera by their P; 0 when P has no baseline."""
     if left.P[0, 0] <= 0 or right.P[0, 0] <= 0:
         return 0.0
     baseline = float(left.P[0, 3] / left.P[0, 0] - right.P[0, 3] / right.P[0, 0])
     return baseline if abs(baseline) >= _SHORTEST_BASELINE and np.isfinite(baseline) else 0.0
 
 
-def _as_recorded(
-    left: Camera, right: Camera, shape: tuple[int, int], right_T_left: F64 | None, names: str
-) -> Rectification:
+def _as_recorded(pair: _Pair, right_T_left: F64 | None) -> Rectification:
+    """The rectification of pictures that come rectified."""
+    left = pair.left
+    right = pair.right
     baseline = _baseline_of_infos(left, right)
     if baseline == 0.0 and right_T_left is not None:
         baseline = float(-right_T_left[0, 3])
     if baseline == 0.0:
         raise LogError(
-            f"The CameraInfos {names} have no baseline in P and no transform leads from one camera to the other: "
-            f"record CameraInfos with P[0, 3] = -f * baseline, or /tf_static."
+            f"The CameraInfos {pair.names} have no baseline in P and no transform leads from one "
+            f"camera to the other: record CameraInfos with P[0, 3] = -f * baseline, or /tf_static."
         )
-    _check_sides(baseline, names)
-    _check_projections(left.P[:, :3], right.P[:, :3], names)
-    valid = np.ones(shape, bool)
-    pixels = np.arange(shape[0] * shape[1], dtype=np.intp).reshape(shape)
-    focal = float(left.P[0, 0])
+    _check_sides(baseline, pair)
+    _check_projections(left.P[:, :3], right.P[:, :3], pair)
+    valid = np.ones(pair.shape, bool)
     centre = (float(left.P[0, 2]), float(left.P[1, 2]))
     return Rectification(
-        focal,
-        baseline,
-        centre,
-        centre[0] - float(right.P[0, 2]),
-        np.eye(3),
-        None,
-        (valid, valid),
-        pixels,
+        focal=float(left.P[0, 0]),
+        baseline=baseline,
+        centre=centre,
+        offset=centre[0] - float(right.P[0, 2]),
+        left_R_rect=np.eye(3),
+        maps=None,
+        valid=(valid, valid),
+        pixels=np.arange(valid.size, dtype=np.intp).reshape(pair.shape),
     )
 
 
-def _check_projections(left: F64, right: F64, names: str) -> None:
+def _check_projections(left: F64, right: F64, pair: _Pair) -> None:
+    """LogError unless two K (3, 3) have the same focal length and the same rows."""
     ok = left[0, 0] > 0 and right[0, 0] > 0 and np.isfinite(left).all() and np.isfinite(right).all()
     if (
         not ok
@@ -212,18 +230,20 @@ def _check_projections(left: F64, right: F64, names: str) -> None:
         or abs(left[1, 2] - right[1, 2]) > _SAME * left[0, 0]
     ):
         raise LogError(
-            f"The projections P of the CameraInfos {names} are not those of one rectified pair: their focal lengths or rows differ; "
+            f"The projections P of the CameraInfos {pair.names} do not belong to one rectified "
+            f"pair: their focal lengths or rows differ; "
             f"name the right ones with --topic camera_info=TOPIC,TOPIC."
         )
 
 
-def _common_matrix(
-    left: Camera, right: Camera, shape: tuple[int, int], rotations: tuple[F64, F64], names: str
-) -> F64:
-    """One K for both rectified pictures: the ends of the middle row and column stay in them where
-    the field of view allows it.
+def _common_matrix(pair: _Pair, rotations: tuple[F64, F64]) -> F64:
+    """One K (3, 3) for both rectified pictures.
+
+    The ends of the middle row and column stay in them where the field of view allows it.
     """
-    height, width = shape
+    left = pair.left
+    right = pair.right
+    height, width = pair.shape
     half = np.array([(width - 1) / 2, (height - 1) / 2])
     cross = half + half * [[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]]
     own = float(np.mean([left.K[0, 0], left.K[1, 1], right.K[0, 0], right.K[1, 1]]))
@@ -232,10 +252,8 @@ def _common_matrix(
     for camera, rotation in ((left, rotations[0]), (right, rotations[1])):
         rays = np.hstack([_undistorted(camera, cross), np.ones((5, 1))]) @ rotation.T
         seen = rays[:, :2] / rays[:, 2:]
-        if not np.isfinite(seen[0]).all() or np.abs(seen[0]).max() > 2.0:
-            raise LogError(
-                f"The calibrations of {names} make no sense; name others with --topic camera_info=TOPIC,TOPIC."
-            )
+        if not np.isfinite(seen[0]).all() or np.abs(seen[0]).max() > _FARTHEST_MIDDLE:
+            raise _senseless(pair)
         middles.append(seen[0])
         reach = np.array([seen[2, 0] - seen[1, 0], seen[4, 1] - seen[3, 1]])
         # beyond 90 degrees from the axis of a fisheye the numbers mean nothing
@@ -258,59 +276,53 @@ def _undistorted(camera: Camera, pixels: F64) -> F64:
 
 
 def _coefficients(camera: Camera) -> F64:
-    """D as OpenCV takes it; LogError for a model that it does not have."""
+    """D as OpenCV takes it; LogError for a model that OpenCV does not have."""
     D = np.atleast_1d(np.asarray(camera.D, float))
     model = camera.model.lower()
     if not D.any():
         return np.zeros(4)
-    if (model in PINHOLE and len(D) in (4, 5, 8, 12, 14)) or (model in FISHEYE and len(D) == 4):
+    is_pinhole = model in PINHOLE and len(D) in PINHOLE_COEFFICIENTS
+    if is_pinhole or (model in FISHEYE and len(D) == FISHEYE_COEFFICIENTS):
         return D
     raise LogError(
-        f"CameraInfo {camera.header.topic} has the distortion model '{camera.model[:40]}' with {len(D)} coefficients, which is not "
-        f"supported: record rectified pictures, or name another calibration with --topic camera_info=TOPIC."
+        f"CameraInfo {camera.header.topic} has the distortion model '{camera.model[:40]}' with "
+        f"{len(D)} coefficients, which is not supported: record rectified pictures, or name "
+        f"another calibration with --topic camera_info=TOPIC."
     )
 
 
 def _of_maps(
-    left: Camera,
-    right: Camera,
-    shape: tuple[int, int],
-    rotations: tuple[F64, F64],
-    matrices: tuple[F64, F64],
-    baseline: float,
-    names: str,
+    pair: _Pair, rotations: tuple[F64, F64], matrices: tuple[F64, F64], baseline: float
 ) -> Rectification:
-    _check_projections(*matrices, names)
-    (left_maps, left_valid, pixels), (right_maps, right_valid, _) = (
-        _lookup(camera, shape, rotation, matrix)
-        for camera, rotation, matrix in zip((left, right), rotations, matrices, strict=True)
-    )
+    """The rectification by rotations (3, 3) and the K (3, 3) of the rectified pictures."""
+    left, right = matrices
+    _check_projections(left, right, pair)
+    left_maps, left_valid, pixels = _lookup(pair.left, pair.shape, rotations[0], left)
+    right_maps, right_valid, _ = _lookup(pair.right, pair.shape, rotations[1], right)
     if not (left_valid.any() and right_valid.any()):
         raise LogError(
-            f"Nothing of the pictures is left when they are rectified by the CameraInfos {names}: "
-            f"their K, D, R and P do not fit each other; name others with --topic camera_info=TOPIC,TOPIC."
+            f"Nothing of the pictures is left when they are rectified by the CameraInfos "
+            f"{pair.names}: their K, D, R and P do not fit each other; "
+            f"name others with --topic camera_info=TOPIC,TOPIC."
         )
-    matrix = matrices[0]
-    offset = float(matrix[0, 2] - matrices[1][0, 2])
-    centre = (float(matrix[0, 2]), float(matrix[1, 2]))
-    valid = (left_valid, right_valid)
     return Rectification(
-        float(matrix[0, 0]),
-        baseline,
-        centre,
-        offset,
-        rotations[0].T,
-        (left_maps, right_maps),
-        valid,
-        pixels,
+        focal=float(left[0, 0]),
+        baseline=baseline,
+        centre=(float(left[0, 2]), float(left[1, 2])),
+        offset=float(left[0, 2] - right[0, 2]),
+        left_R_rect=rotations[0].T,
+        maps=(left_maps, right_maps),
+        valid=(left_valid, right_valid),
+        pixels=pixels,
     )
 
 
 def _lookup(
     camera: Camera, shape: tuple[int, int], rotation: F64, matrix: F64
 ) -> tuple[Maps, NDArray[np.bool_], NDArray[np.intp]]:
-    """Where each rectified pixel is in the recorded picture: for cv2.remap, whether it is there at
-    all, and as flat index.
+    """Place of each rectified pixel in the recorded picture.
+
+    For cv2.remap, whether it lies on the picture at all, and as flat index.
     """
     D = _coefficients(camera)
     size = (shape[1], shape[0])
@@ -333,8 +345,9 @@ def _lookup(
 
 
 def _is_one_to_one(x: F32, y: F32) -> NDArray[np.bool_]:
-    """A distortion polynomial beyond the picture that it was fitted to may turn back; there the map
-    mirrors the picture.
+    """Where the map does not mirror the picture.
+
+    A distortion polynomial may turn back beyond the picture that it was fitted to.
     """
     forward: NDArray[np.bool_] = (np.gradient(x, axis=1) > 0) & (np.gradient(y, axis=0) > 0)
     return forward

@@ -1,5 +1,4 @@
-"""Depth from stereo pairs: semi-global matching, checks that reject what was guessed, and how
-uncertain the rest is.
+"""Depth from stereo pairs: semi-global matching, checks that reject guesses, and uncertainty.
 
 Matching is OpenCV's StereoSGBM (Hirschmueller, Stereo Processing by Semiglobal Matching and Mutual
 Information, PAMI 2008, with the pixel cost of Birchfield and Tomasi). A disparity stays when it is
@@ -22,28 +21,31 @@ from semloc_logs.logs.sensors.rectification import SMALLEST, Rectification
 
 # px of the matched pictures, where texture is plenty: interpolation, pixel locking, calibration
 DISPARITY_NOISE = 0.2
-# of the range; beyond that sigma, 1 / disparity is no longer linear enough to speak of one
+# of the range; beyond that sigma, 1 / disparity is not linear enough for a standard deviation
 LARGEST_SHARE = 0.15
 MOST_PIXELS = 500_000  # larger pictures are shrunk before they are matched
 DENSE_PIXELS = 200_000  # of larger ones every second pixel of every second row becomes a point
-_GREY_NOISE = 3.0  # grey levels: noise, and what two cameras see differently
+_GREY_NOISE = 3.0  # grey levels: noise, and differences between the cameras
 _LARGEST_NOISE = 0.8  # px; a disparity that is worse for want of texture is dropped
 _TEXTURE = 9  # px; window that texture is measured in
+_NEAREST = 1e-3  # m; a smaller min_range would search without end
 _BLOCK = 5  # px; matched windows
+_FIXED_POINT = 16  # OpenCV's disparities are in sixteenths of a pixel
 # disparities up to a tenth of the width are searched: from 0.5 m at 11 cm and a lens of 90 degrees
 _SHARE_SEARCHED = 10
 _LEFT_RIGHT = 1.0  # px; largest difference of the disparities from both sides
 _UNIQUENESS = 10  # percent by which the second best match is worse
 _SPECKLE = 0.0004  # share of the picture that a patch of like disparities covers at least
-_RIM = 4  # px along the edge of the recorded picture whose windows see what was not recorded
+_RIM = 4  # px along the edge of the recorded picture whose windows reach beyond it
 
 Grey = NDArray[np.uint8]
 
 
 class StereoPoints(NamedTuple):
-    """``points`` (n, 3) in the left optical frame (m), ``sigma`` (n,) of the range along the ray
-    (m), ``pixels`` (n,): flat index in the left picture as recorded, so that a label image of the
-    left camera belongs to them.
+    """Points of a pair in the left optical frame.
+
+    ``points`` (n, 3) in m, ``sigma`` (n,) of the range along the ray (m), ``pixels`` (n,): flat
+    index in the left picture as recorded, so that a label image of the left camera belongs to them.
     """
 
     points: F32
@@ -71,8 +73,10 @@ class StereoMatcher:
         stride: int | None = None,
         noise: float = DISPARITY_NOISE,
     ) -> None:
-        self._how, self._noise = how, noise
-        self._min_range, self._max_range = min_range, max_range
+        self._how = how
+        self._noise = noise
+        self._min_range = min_range
+        self._max_range = max_range
         height, width = how.pixels.shape
         shrink = stride or math.ceil(math.sqrt(height * width / MOST_PIXELS))
         self.shrink = max(1, min(shrink, height // SMALLEST, width // SMALLEST))
@@ -86,8 +90,9 @@ class StereoMatcher:
         self.least, self.count = self._disparities()
         if abs(self.least) + self.count >= self.width:
             raise LogError(
-                f"The calibrations of the stereo pair put all within {max_range:g} m at disparities of {self.least} pixels and more, "
-                f"too many for pictures {self.width} pixels wide; name others with --topic camera_info=TOPIC,TOPIC."
+                f"The calibrations of the stereo pair put all within {max_range:g} m at "
+                f"disparities of {self.least} pixels and more, too many for pictures "
+                f"{self.width} pixels wide; name others with --topic camera_info=TOPIC,TOPIC."
             )
         self._matcher = _matcher(self.least, self.count)
         self._back_least = math.floor(self.least / 2)
@@ -105,18 +110,20 @@ class StereoMatcher:
         self._set_rays()
 
     def _disparities(self) -> tuple[int, int]:
-        """The least disparity (px, matched picture) and how many: between the ranges, and no more
-        than is worth its time.
+        """The least disparity (px, matched picture) and their number, between the ranges.
+
+        No more than are worth their time.
         """
-        far = self._fb / self._max_range + self._offset
-        near = self._fb / max(self._min_range, 1e-3) + self._offset
-        least = math.floor(max(far - 1, self._offset))
-        most = min(math.ceil(near) + 1, least + self.width // _SHARE_SEARCHED)
+        at_max_range = self._fb / self._max_range + self._offset
+        at_min_range = self._fb / max(self._min_range, _NEAREST) + self._offset
+        least = math.floor(max(at_max_range - 1, self._offset))
+        most = min(math.ceil(at_min_range) + 1, least + self.width // _SHARE_SEARCHED)
         return least, max(16, 16 * math.ceil((most - least) / 16))
 
     def _set_rays(self) -> None:
-        """Viewing rays (n, 3) of the points with z = 1 along the rectified axis, in the left
-        optical frame, and their pixels.
+        """Viewing rays (n, 3) in the left optical frame, and their pixels.
+
+        The points have z = 1 along the rectified axis.
         """
         how = self._how
         s = self._scale
@@ -125,14 +132,13 @@ class StereoMatcher:
         x = (columns + 0.5) * s - 0.5
         y = (rows + 0.5) * how.pixels.shape[0] / self.height - 0.5
         rays = np.ones((len(y), len(x), 3))
-        rays[..., 0], rays[..., 1] = (
-            (x - how.centre[0]) / how.focal,
-            ((y - how.centre[1]) / how.focal)[:, None],
-        )
+        rays[..., 0] = (x - how.centre[0]) / how.focal
+        rays[..., 1] = ((y - how.centre[1]) / how.focal)[:, None]
         self._lengths = np.linalg.norm(rays, axis=2).ravel().astype(np.float32)
         self._rays = np.ascontiguousarray((rays @ how.left_R_rect.T).reshape(-1, 3), np.float32)
-        at = np.ix_(np.rint(y).astype(np.intp), np.rint(x).astype(np.intp))
-        self._pixels, self._left_valid = how.pixels[at].ravel(), _inner(how.valid[0])[at] > 0
+        grid = np.ix_(np.rint(y).astype(np.intp), np.rint(x).astype(np.intp))
+        self._pixels = how.pixels[grid].ravel()
+        self._left_valid = _inner(how.valid[0])[grid] > 0
 
     def points(self, left: Grey, right: Grey) -> StereoPoints:
         """The points that both pictures (h, w) see, as recorded by the cameras at one time."""
@@ -173,20 +179,21 @@ class StereoMatcher:
         )
 
     def disparity(self, left: Grey, right: Grey) -> tuple[F32, F32]:
-        """Disparities (h, w) of rectified pictures (px), NaN where there is none, and their
-        standard deviations.
-        """
-        found = _run(self._matcher, left, right, self.least + self.count)
-        matched = (found >= self.least) & self._same_from_the_right(found, left, right)
+        """Disparities (h, w) of rectified pictures (px), NaN where unknown, and sigma (h, w)."""
+        disparity = _run(self._matcher, left, right, self.least + self.count)
+        matched = (disparity >= self.least) & self._same_from_the_right(disparity, left, right)
         noise = disparity_noise(left, self._noise)
         matched &= noise <= _LARGEST_NOISE
-        fixed = np.where(matched, np.rint(found * 16), (self.least - 1) * 16).astype(np.int16)
-        cv2.filterSpeckles(fixed, (self.least - 1) * 16, int(_SPECKLE * fixed.size), 16)
-        return np.where(fixed >= self.least * 16, found, np.float32(np.nan)), noise
+        rejected = (self.least - 1) * _FIXED_POINT
+        fixed = np.where(matched, np.rint(disparity * _FIXED_POINT), rejected).astype(np.int16)
+        cv2.filterSpeckles(fixed, rejected, int(_SPECKLE * fixed.size), _FIXED_POINT)
+        is_kept = fixed >= self.least * _FIXED_POINT
+        return np.where(is_kept, disparity, np.float32(np.nan)), noise
 
-    def _same_from_the_right(self, found: F32, left: Grey, right: Grey) -> NDArray[np.bool_]:
-        """Whether the right picture, matched on its own at half the size, gives the same disparity;
-        the windows see more there.
+    def _same_from_the_right(self, disparity: F32, left: Grey, right: Grey) -> NDArray[np.bool_]:
+        """Where the right picture, matched on its own, gives the same disparity (h, w).
+
+        At half the size, because the windows see more there.
         """
         size = (self.width // 2, self.height // 2)
         mirrored = [
@@ -199,23 +206,23 @@ class StereoMatcher:
         back = np.where(
             (back >= self._back_least) & self._right_valid, 2 * back, np.float32(np.nan)
         )
-        there = (np.arange(self.width, dtype=np.float32) - found).astype(np.int32) // 2
-        inside = (there >= 0) & (there < size[0])
+        # column of the partner in the right picture at half the size
+        column = (np.arange(self.width, dtype=np.float32) - disparity).astype(np.int32) // 2
+        inside = (column >= 0) & (column < size[0])
         rows = np.minimum(np.arange(self.height) // 2, size[1] - 1)[:, None]
         with np.errstate(invalid="ignore"):
             same: NDArray[np.bool_] = inside & (
-                np.abs(back[rows, np.clip(there, 0, size[0] - 1)] - found) <= _LEFT_RIGHT
+                np.abs(back[rows, np.clip(column, 0, size[0] - 1)] - disparity) <= _LEFT_RIGHT
             )
         return same
 
 
 def disparity_noise(left: Grey, least: float) -> F32:
-    """Standard deviation (h, w) of disparities (px): ``least``, and what grey noise does where the
-    picture changes little along the row.
+    """Standard deviation (h, w) of disparities (px): ``least``, and the effect of grey noise.
 
-    A shift between two windows of noise sigma each can be known to 2 sigma^2 / sum of squared
-    gradients (Cramer-Rao; Foerstner, A feature based correspondence algorithm for image matching,
-    1986).
+    Grey noise matters where the picture changes little along the row. A shift between two windows
+    of noise sigma each can be known to 2 sigma^2 / sum of squared gradients (Cramer-Rao; Foerstner,
+    A feature based correspondence algorithm for image matching, 1986).
     """
     gradient = cv2.Sobel(left, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     energy = cv2.sqrBoxFilter(gradient, cv2.CV_32F, (_TEXTURE, _TEXTURE), normalize=False)
@@ -229,30 +236,30 @@ def _matcher(least: int, count: int) -> cv2.StereoSGBM:
     # as good as five or eight
     area = _BLOCK * _BLOCK
     return cv2.StereoSGBM.create(
-        least,
-        count,
-        _BLOCK,
-        8 * area,
-        32 * area,
-        1,
-        31,
-        _UNIQUENESS,
-        0,
-        0,
-        cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        minDisparity=least,
+        numDisparities=count,
+        blockSize=_BLOCK,
+        P1=8 * area,  # as OpenCV recommends for grey pictures
+        P2=32 * area,
+        disp12MaxDiff=1,
+        preFilterCap=31,
+        uniquenessRatio=_UNIQUENESS,
+        speckleWindowSize=0,  # speckles are removed after the other checks
+        speckleRange=0,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
 
 
 def _run(matcher: cv2.StereoSGBM, left: Grey, right: Grey, most: int) -> F32:
-    """Disparities (h, w) in pixels. The matcher leaves out as many columns as it searches
-    disparities: they are added before.
+    """Disparities (h, w) in pixels.
+
+    The matcher leaves out as many columns as it searches disparities: they are added before.
     """
     margin = max(0, most)
     wide = [cv2.copyMakeBorder(i, 0, 0, margin, 0, cv2.BORDER_REPLICATE) for i in (left, right)]
-    found: F32 = np.asarray(matcher.compute(*wide), np.int16)[:, margin:].astype(
-        np.float32
-    ) / np.float32(16)
-    return found
+    fixed = np.asarray(matcher.compute(*wide), np.int16)[:, margin:]
+    disparity: F32 = fixed.astype(np.float32) / np.float32(_FIXED_POINT)
+    return disparity
 
 
 def _inner(valid: NDArray[np.bool_]) -> Grey:

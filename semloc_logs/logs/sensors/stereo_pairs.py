@@ -1,11 +1,10 @@
-"""Pictures of a stereo pair as they come -> points with labels: partners by time, calibrations by
-topic, and why there are none.
-"""
+"""Pictures of a stereo pair as they come -> points with labels: partners, calibrations, reasons."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Camera, ImageFrame
+from semloc_logs.logs.problems import NoCloud, ProblemKind, Problems
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.depth import (
     USUAL_NOISE,
@@ -36,8 +36,8 @@ class StereoClouds:
     """Finds partners for left pictures and turns both into points.
 
     ``cameras``: the newest calibration by CameraInfo topic, kept by the caller. ``right_T_left``
-    gives the transform (4, 4) from one frame id to another at a time, None where nothing says it.
-    ``lost``: sentences about calibrations that cannot be used.
+    gives the transform (4, 4) from one frame id to another at a time, None where it is unknown.
+    ``problems`` name the calibrations that cannot be used.
     """
 
     def __init__(
@@ -50,18 +50,17 @@ class StereoClouds:
         stride: int | None = None,
         noise: RangeNoise = USUAL_NOISE,
     ) -> None:
-        self.lost: dict[str, None] = {}
-        self._roles, self._cameras, self._labels, self._right_T_left = (
-            roles,
-            cameras,
-            labels,
-            right_T_left,
-        )
-        self._stride, self._noise = stride, noise
+        self.problems = Problems()
+        self._roles = roles
+        self._cameras = cameras
+        self._labels = labels
+        self._right_T_left = right_T_left
+        self._stride = stride
+        self._noise = noise
         self._rights: deque[ImageFrame] = deque()
         self._bytes = 0
         self._left_stamps: deque[int] = deque(maxlen=16)
-        self._known: tuple[Camera, Camera, tuple[int, ...], F64 | None] | None = None
+        self._matched: _Pair | None = None  # the pair that the matcher is for
         self._matcher: StereoMatcher | None = None
 
     def take_left(self, frame: ImageFrame) -> None:
@@ -80,17 +79,13 @@ class StereoClouds:
 
     @property
     def tolerance_ns(self) -> int:
-        """How far apart the stamps of partners may lie: half the period of the left pictures, and
-        no more than 50 ms.
-        """
+        """Largest difference of partners' stamps: half the left pictures' period, at most 50 ms."""
         steps = np.diff(np.array(self._left_stamps, np.int64))
         steps = steps[steps > 0]
         return min(int(np.median(steps)) // 2, _LARGEST_GAP_NS) if len(steps) else _LARGEST_GAP_NS
 
     def has_all(self, left: ImageFrame) -> bool:
-        """Whether right picture, calibrations, label image and the transform between the cameras
-        have come, as far as one may expect.
-        """
+        """Whether the right picture, calibrations, label image and transform have come."""
         stamp_ns = left.header.stamp_ns
         if not self._rights or self._rights[-1].header.stamp_ns < stamp_ns:
             return False
@@ -110,71 +105,83 @@ class StereoClouds:
     def _info(self, topic: str | None) -> str | None:
         return self._roles.info_of.get(topic or "")
 
-    def points(self, left: ImageFrame, min_range: float, max_range: float) -> RangePoints | str:
-        """Points in the left optical frame; or the reason why there are none."""
+    def points(self, left: ImageFrame, min_range: float, max_range: float) -> RangePoints | NoCloud:
+        """Points in the left optical frame, or the reason for none."""
         stamp_ns = left.header.stamp_ns
         right = min(self._rights, key=lambda r: abs(r.header.stamp_ns - stamp_ns), default=None)
         while self._rights and self._rights[0].header.stamp_ns < stamp_ns - _LARGEST_GAP_NS:
             self._forget()
         if right is None or abs(right.header.stamp_ns - stamp_ns) > self.tolerance_ns:
-            return "no partner"
+            return NoCloud.NO_PARTNER
         if left.image.shape[:2] != right.image.shape[:2]:
-            return "other size"
-        cameras = [self._cameras.get(self._info(f.header.topic) or "") for f in (left, right)]
-        if cameras[0] is None or cameras[1] is None:
-            return "no calibration" if cameras[0] is None else "no calibration of the right"
-        matcher = self._matcher_for(left, right, cameras[0], cameras[1], (min_range, max_range))
+            return NoCloud.OTHER_SIZE
+        left_camera = self._cameras.get(self._info(left.header.topic) or "")
+        right_camera = self._cameras.get(self._info(right.header.topic) or "")
+        if left_camera is None:
+            return NoCloud.NO_CALIBRATION
+        if right_camera is None:
+            return NoCloud.NO_RIGHT_CALIBRATION
+        right_T_left = self._right_T_left(right.header.frame_id, left.header.frame_id, stamp_ns)
+        pair = _Pair(left_camera, right_camera, left.image.shape[:2], right_T_left)
+        matcher = self._matcher_for(pair, min_range, max_range)
         if matcher is None:
-            return "unusable pair"
+            return NoCloud.UNUSABLE_PAIR
         if np.array_equal(left.image, right.image):
-            return "same picture"
-        found = matcher.points(*_grey(left.image, right.image))
+            return NoCloud.SAME_PICTURE
+
+        seen = matcher.points(*_grey(left.image, right.image))
         label = self._labels.of(left, left.image.shape[:2])
         return RangePoints(
-            found.points, None if label is None else label.reshape(-1)[found.pixels], found.sigma
+            seen.points, None if label is None else label.reshape(-1)[seen.pixels], seen.sigma
         )
 
-    def _matcher_for(
-        self,
-        left: ImageFrame,
-        right: ImageFrame,
-        left_camera: Camera,
-        right_camera: Camera,
-        ranges: tuple[float, float],
-    ) -> StereoMatcher | None:
-        shape = left.image.shape[:2]
-        right_T_left = self._right_T_left(
-            right.header.frame_id, left.header.frame_id, left.header.stamp_ns
-        )
-        if self._known is not None:
-            a, b, known_shape, known_transform = self._known
-            is_same = (
-                same_calibration(a, left_camera)
-                and same_calibration(b, right_camera)
-                and known_shape == shape
-            )
-            if is_same and _same_transform(known_transform, right_T_left):
-                return self._matcher
-        self._known = (left_camera, right_camera, shape, right_T_left)
+    def _matcher_for(self, pair: _Pair, min_range: float, max_range: float) -> StereoMatcher | None:
+        """The matcher of a pair, made anew when the pair changes; None where it cannot be used."""
+        if self._matched is not None and self._matched.is_same(pair):
+            return self._matcher
+        self._matched = pair
         self._matcher = None
         try:
             how = rectification(
-                left_camera, right_camera, shape, right_T_left, rectified=is_rectified(self._roles)
+                pair.left,
+                pair.right,
+                pair.shape,
+                pair.right_T_left,
+                rectified=is_rectified(self._roles),
             )
             self._matcher = StereoMatcher(
                 how,
-                min_range=ranges[0],
-                max_range=ranges[1],
+                min_range=min_range,
+                max_range=max_range,
                 stride=self._stride,
                 noise=self._noise.disparity,
             )
         except LogError as error:
-            self.lost.setdefault(str(error))
+            topic = self._roles.stereo_left or ""
+            self.problems.add(str(error), topic=topic, kind=ProblemKind.CALIBRATION)
         return self._matcher
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Calibrations of a pair, the size (h, w) of its pictures, and the transform if known."""
+
+    left: Camera
+    right: Camera
+    shape: tuple[int, int]
+    right_T_left: F64 | None
+
+    def is_same(self, other: _Pair) -> bool:
+        return (
+            same_calibration(self.left, other.left)
+            and same_calibration(self.right, other.right)
+            and self.shape == other.shape
+            and _same_transform(self.right_T_left, other.right_T_left)
+        )
+
+
 def is_rectified(roles: Roles) -> bool:
-    """Whether the names of both topics say that their pictures come rectified."""
+    """Whether the pictures come rectified, by the names of both topics."""
     return all("rect" in (topic or "").lower() for topic in (roles.stereo_left, roles.stereo_right))
 
 
@@ -183,7 +190,7 @@ def _same_transform(a: F64 | None, b: F64 | None) -> bool:
 
 
 def _grey(*images: NDArray[np.uint8] | NDArray[np.uint16]) -> tuple[NDArray[np.uint8], ...]:
-    """Pictures of any kind as 8-bit grey; 16 bits lose the same number of low bits in all of them."""
+    """Pictures of any kind as 8-bit grey; 16 bits lose the same number of low bits in all."""
     bits = (
         max(int(i.max()).bit_length() for i in images)
         if any(i.dtype == np.uint16 for i in images)

@@ -9,9 +9,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F32, F64, LidarFrame
+from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.numerics import transforms
 
-LONGEST_SWEEP_NS = 1_000_000_000  # point times that span more are no sweep but garbage
 _BIN_NS = 1_000_000  # within a millisecond a vehicle at 30 m/s moves 3 cm
 
 PosesAt = Callable[[NDArray[np.int64]], tuple[F64, NDArray[np.bool_]]]
@@ -25,8 +25,7 @@ def sweep_in_base(
     min_range: float,
     max_range: float,
 ) -> tuple[F32, NDArray[np.uint32] | None, bool]:
-    """Points (n, 3) of a sweep in the base frame at its stamp, their labels, and whether the motion
-    during the sweep was taken out.
+    """Points (n, 3) of a sweep in the base frame at its stamp, labels, and whether deskewed.
 
     ``poses_at`` gives ``session_T_base`` (m, 4, 4) at stamps (m,) and which of them are known;
     without all of them, or without point times, the sweep stays as it was measured. Points nearer
@@ -47,8 +46,9 @@ def sweep_in_base(
 
 
 def in_base(base_T_sensor: F64, points: F32) -> F32:
-    """Points (n, 3) of a sensor in the base frame, in single precision: a hundred metres to 0.01
-    mm.
+    """Points (n, 3) of a sensor in the base frame.
+
+    In single precision: a hundred metres to 0.01 mm.
     """
     return _move(
         np.ascontiguousarray(points, np.float32),
@@ -59,8 +59,9 @@ def in_base(base_T_sensor: F64, points: F32) -> F32:
 
 @njit(cache=True, nogil=True)
 def _move(points: F32, index: NDArray[np.int64], poses: F64) -> F32:
-    """Points (n, 3), each moved by its pose ``poses[index]`` (m, 4, 4): a loop, because gathered
-    poses are five times the points' bytes.
+    """Points (n, 3), each moved by its pose ``poses[index]`` (m, 4, 4).
+
+    A loop, because gathered poses are five times the points' bytes.
     """
     out = np.empty_like(points)
     for i in range(len(points)):
@@ -76,8 +77,9 @@ def _move(points: F32, index: NDArray[np.int64], poses: F64) -> F32:
 def deskew(
     points: F32, offset_ns: NDArray[np.int64], stamp_ns: int, base_T_sensor: F64, poses_at: PosesAt
 ) -> F32 | None:
-    """Points (n, 3) measured at ``stamp_ns + offset_ns`` in the moving sensor, in the base frame at
-    ``stamp_ns``; None without poses.
+    """Points (n, 3) measured at ``stamp_ns + offset_ns``, in the base frame at ``stamp_ns``.
+
+    None without poses at all of these times.
     """
     first = int(offset_ns.min())
     last = int(offset_ns.max())

@@ -2,22 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from semloc_logs.frames import F64, LidarFrame, PosedCloud
+from semloc_logs.frames import (
+    F32,
+    F64,
+    DepthFrame,
+    ImageFrame,
+    LabelForm,
+    LidarFrame,
+    PosedCloud,
+)
 from semloc_logs.logs.poses.base_frame import BasePoses
 from semloc_logs.logs.poses.standstill import Standstill
+from semloc_logs.logs.problems import NoCloud
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.sensors.camera_clouds import PictureClouds
+from semloc_logs.logs.sensors.camera_clouds import CameraClouds
 from semloc_logs.logs.sensors.sweeps import in_base, sweep_in_base
-from semloc_logs.logs.session.duplicate_topics import Copies
+from semloc_logs.logs.session.duplicate_topics import DuplicateTopics
 from semloc_logs.logs.session.frame_queue import RangeFrame
-from semloc_logs.logs.session.tally import BACK_IN_TIME, COPY
 
 
-class BaseClouds:
-    """Makes clouds of points between ``min_range`` and ``max_range`` (m, from the sensor);
-    ``copies`` finds topics that repeat others.
+@dataclass(frozen=True, slots=True)
+class RangeLimits:
+    """Points nearer to the sensor or farther from it (m) are dropped."""
+
+    nearest: float
+    farthest: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """Poses at the time of a frame: ``base_T_sensor`` (4, 4) and ``session_T_base`` or None."""
+
+    base_T_sensor: F64
+    session_T_base: F64 | None
+
+
+class CloudBuilder:
+    """Makes clouds of the points within ``limits``; ``duplicates`` finds topics that repeat others.
 
     ``sensors``: the last ``base_T_sensor`` (4, 4) of each frame id that gave a cloud; ``deskewed``:
     sweeps freed of the vehicle's motion.
@@ -26,83 +51,98 @@ class BaseClouds:
     def __init__(
         self,
         roles: Roles,
-        where: BasePoses,
-        pictures: PictureClouds,
-        copies: Copies | None,
-        *,
-        min_range: float,
-        max_range: float,
+        poses: BasePoses,
+        cameras: CameraClouds,
+        duplicates: DuplicateTopics | None,
+        limits: RangeLimits,
     ) -> None:
         self.sensors: dict[str, F64] = {}
         self.deskewed = 0
         self.standstill = Standstill()
-        self.copies = copies
+        self.duplicates = duplicates
         self._roles = roles
-        self._where = where
-        self._pictures = pictures
-        self._min_range, self._max_range = min_range, max_range
+        self._poses = poses
+        self._cameras = cameras
+        self._limits = limits
 
-    def cloud(self, frame: RangeFrame, *, is_end: bool, is_set_back: bool) -> PosedCloud | str:
-        """The cloud of a frame, or the reason why there is none; ``is_end``: no more poses will
-        come.
-        """
-        cloud = self._cloud(frame, is_end)
-        if is_set_back and not isinstance(cloud, str) and cloud.session_T_base is not None:
-            return BACK_IN_TIME  # the pose at its time is that of an earlier frame
-        return cloud
-
-    def _cloud(self, frame: RangeFrame, is_end: bool) -> PosedCloud | str:
+    def cloud(self, frame: RangeFrame, *, is_end: bool, is_set_back: bool) -> PosedCloud | NoCloud:
+        """The cloud of a frame, or the reason for none; ``is_end``: no more poses will come."""
         header = frame.header
-        base = self._where.base
-        track = self._where.track
-        if base is None:
-            return "no pose"
-        base_T_sensor = self._where.base_T(header.frame_id, header.stamp_ns)
-        if base_T_sensor is None:
-            return "no transform"
-        # before the poses have come so far, nobody knows whether the frame lies in a gap: the
-        # nearest pose serves at the end only
-        is_known = base.pose_frame is not None and (
-            is_end or self._where.poses_have_passed(header.stamp_ns)
+        place = self._place(frame, is_end=is_end)
+        if isinstance(place, NoCloud):
+            return place
+        cloud = (
+            self._sweep(frame, place)
+            if isinstance(frame, LidarFrame)
+            else self._picture(frame, place)
         )
-        pose = track.at(header.stamp_ns) if is_known else None
-        if base.pose_frame is not None and pose is None:
-            return "no pose"
-        extra: dict[str, str] = {}
-        sigma = None
-        if isinstance(frame, LidarFrame):
-            if self.copies is not None and self.copies.is_copy(
-                header.topic, header.stamp_ns, in_base(base_T_sensor, frame.points)
-            ):
-                return COPY
-            poses_at = None if pose is None else track.at_many
-            limits = {"min_range": self._min_range, "max_range": self._max_range}
-            points, label, is_deskewed = sweep_in_base(frame, base_T_sensor, poses_at, **limits)
-            self.deskewed += is_deskewed
-        else:
-            found = self._pictures.points(frame, self._min_range, self._max_range)
-            if isinstance(found, str):
-                return found
-            points = in_base(base_T_sensor, found.points)
-            label = found.label
-            sigma = found.sigma
-            if label is not None:
-                extra = self._label_source(header.topic)
-        if not len(points):
-            return "no points"
-        self.sensors[header.frame_id] = base_T_sensor
-        if pose is not None and header.topic == self._roles.ranging[0] and not track.moves:
-            self.standstill.add(points, pose)
+        if isinstance(cloud, NoCloud):
+            return cloud
+        if not len(cloud.points):
+            return NoCloud.NO_POINTS
+
+        self.sensors[header.frame_id] = place.base_T_sensor
+        pose = place.session_T_base
+        is_main = header.topic == self._roles.ranging[0]
+        if pose is not None and is_main and not self._poses.track.moves:
+            self.standstill.add(cloud.points, pose)
+        # the pose at the time of a frame that is set back belongs to an earlier frame
+        return NoCloud.BACK_IN_TIME if is_set_back and pose is not None else cloud
+
+    def _place(self, frame: RangeFrame, *, is_end: bool) -> _Place | NoCloud:
+        header = frame.header
+        base = self._poses.base
+        if base is None:
+            return NoCloud.NO_POSE
+        base_T_sensor = self._poses.base_T(header.frame_id, header.stamp_ns)
+        if base_T_sensor is None:
+            return NoCloud.NO_TRANSFORM
+        if base.pose_frame is None:
+            return _Place(base_T_sensor, None)
+
+        # before the poses have come so far, it is unknown whether the frame lies in a gap: the
+        # nearest pose serves at the end only
+        is_known = is_end or self._poses.poses_have_passed(header.stamp_ns)
+        pose = self._poses.track.at(header.stamp_ns) if is_known else None
+        return NoCloud.NO_POSE if pose is None else _Place(base_T_sensor, pose)
+
+    def _sweep(self, sweep: LidarFrame, place: _Place) -> PosedCloud | NoCloud:
+        header = sweep.header
+        if self.duplicates is not None and self.duplicates.is_duplicate(
+            header.topic, header.stamp_ns, in_base(place.base_T_sensor, sweep.points)
+        ):
+            return NoCloud.DUPLICATE
+        points, label, is_deskewed = sweep_in_base(
+            sweep,
+            place.base_T_sensor,
+            None if place.session_T_base is None else self._poses.track.at_many,
+            min_range=self._limits.nearest,
+            max_range=self._limits.farthest,
+        )
+        self.deskewed += is_deskewed
+        return PosedCloud(header, points, _origin(place), place.session_T_base, label)
+
+    def _picture(self, frame: DepthFrame | ImageFrame, place: _Place) -> PosedCloud | NoCloud:
+        seen = self._cameras.points(frame, self._limits.nearest, self._limits.farthest)
+        if isinstance(seen, NoCloud):
+            return seen
+        label_topic = None
+        label_form = LabelForm.IDS
+        if seen.label is not None:
+            label_topic = self._roles.label_of.get(frame.header.topic)
+            if label_topic in self._cameras.labels.coloured:
+                label_form = LabelForm.COLOURS
         return PosedCloud(
-            header, points, base_T_sensor[:3, 3].astype(np.float32), pose, label, extra, sigma
+            frame.header,
+            in_base(place.base_T_sensor, seen.points),
+            _origin(place),
+            place.session_T_base,
+            seen.label,
+            label_topic,
+            label_form,
+            seen.sigma,
         )
 
-    def _label_source(self, topic: str) -> dict[str, str]:
-        """Where the labels of a picture's points come from."""
-        source = self._roles.label_of.get(topic)
-        if source is None:
-            return {}
-        return {
-            "label_topic": source,
-            "label_form": "colours" if source in self._pictures.labels.coloured else "ids",
-        }
+
+def _origin(place: _Place) -> F32:
+    return place.base_T_sensor[:3, 3].astype(np.float32)

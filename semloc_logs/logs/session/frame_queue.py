@@ -1,6 +1,4 @@
-"""Range frames that wait for their poses and transforms, in the order of recording and in bounded
-memory.
-"""
+"""Range frames that wait for their poses and transforms, in order and in bounded memory."""
 
 from __future__ import annotations
 
@@ -15,8 +13,8 @@ MAX_WAITING_BYTES = 512 << 20
 RangeFrame = LidarFrame | DepthFrame | ImageFrame
 
 
-class WaitingFrames:
-    """First come, first served; ``nbytes`` is what they hold."""
+class FrameQueue:
+    """Frames in the order of recording; ``nbytes`` is their size in memory."""
 
     def __init__(self) -> None:
         self.nbytes = 0
@@ -38,39 +36,34 @@ class WaitingFrames:
 
     def add(self, frame: RangeFrame) -> None:
         """The next frame of the recording."""
-        is_set_back = not self._order.setdefault(frame.header.topic, StampOrder()).accepts(
-            frame.header.stamp_ns
-        )
+        order = self._order.setdefault(frame.header.topic, StampOrder())
+        is_set_back = not order.accepts(frame.header.stamp_ns)
         self._frames.append((frame, is_set_back))
         self.nbytes += _size(frame)
 
     def pop(self) -> tuple[RangeFrame, bool]:
-        """Takes the first frame out, and whether its stamp falls back behind those of earlier
-        frames of its topic.
-        """
+        """Takes the first frame out, and whether its stamp falls back behind earlier ones."""
         frame, is_set_back = self._frames.popleft()
         self.nbytes -= _size(frame)
         return frame, is_set_back
 
     def sensors(self, pose_topic: str | None) -> list[str]:
-        """Their frame ids, first those of topics that share the namespace of the pose stream: a
-        pose without child frame is theirs.
+        """Frame ids, first those in the namespace of the pose stream.
+
+        A pose without child frame is taken to be the pose of the first of them.
         """
-        own = (pose_topic or "").strip("/").split("/")[:-1]
+        namespace = (pose_topic or "").strip("/").split("/")[:-1]
 
-        def importance(frame: RangeFrame) -> int:
-            return 0 if own and frame.header.topic.strip("/").split("/")[: len(own)] == own else 1
+        def is_elsewhere(frame: RangeFrame) -> bool:
+            parts = frame.header.topic.strip("/").split("/")
+            return not namespace or parts[: len(namespace)] != namespace
 
-        return list(
-            dict.fromkeys(
-                f.header.frame_id for f in sorted((f for f, _ in self._frames), key=importance)
-            )
-        )
+        ordered = sorted((frame for frame, _ in self._frames), key=is_elsewhere)
+        return list(dict.fromkeys(frame.header.frame_id for frame in ordered))
 
 
 def _size(frame: RangeFrame) -> int:
     if isinstance(frame, LidarFrame):
-        return frame.points.nbytes + sum(
-            a.nbytes for a in (frame.label, frame.offset_ns, frame.ring) if a is not None
-        )
+        columns = (frame.label, frame.offset_ns, frame.ring)
+        return frame.points.nbytes + sum(c.nbytes for c in columns if c is not None)
     return frame.depth.nbytes if isinstance(frame, DepthFrame) else frame.image.nbytes

@@ -1,5 +1,4 @@
-"""What is in a log, at a glance: streams and their roles, calibration, pose coverage, and what
-stands in the way of using it.
+"""What is in a log, at a glance: streams and their roles, calibration, pose coverage, problems.
 
 One pass counts all messages and decodes the small ones (poses, transforms, calibrations). Clouds
 and pictures stay undecoded, apart from the first of each range sensor, whose frame decides the base
@@ -9,7 +8,8 @@ frame.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from semloc_logs.errors import LogError
@@ -27,14 +27,24 @@ from semloc_logs.frames import (
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log, Message
 from semloc_logs.logs.messages.decode import Decoder
+from semloc_logs.logs.messages.stamps import time_range, utc
 from semloc_logs.logs.poses.base_frame import BasePoses
 from semloc_logs.logs.poses.navsat import navsat_poses
-from semloc_logs.logs.problems import Problems
+from semloc_logs.logs.problems import (
+    Problem,
+    ProblemKind,
+    Problems,
+    lost,
+    sentences,
+    sorted_problems,
+    without_loss_of,
+)
 from semloc_logs.logs.roles import guess_roles, no_sensor
 from semloc_logs.logs.sensors.depth import Unprojector
 from semloc_logs.logs.sensors.rectification import rectification
 from semloc_logs.logs.sensors.stereo_pairs import is_rectified
-from semloc_logs.logs.session.tally import never_moves, no_poses, span, without_unused
+from semloc_logs.logs.session.frame_queue import RangeFrame
+from semloc_logs.logs.session.pose_problems import never_moves, no_poses
 
 _TRIES = 5  # messages of a range sensor that are decoded in search of a good one
 # a sensor that starts so far outside of the poses has another clock
@@ -42,13 +52,13 @@ _OTHER_CLOCK_NS = 60_000_000_000
 
 
 def inspect_log(path: str | Path, topics: Mapping[str, str] | None = None) -> dict[str, object]:
-    """The answer of ``semloc inspect --json`` for one log; ``topics`` overrules roles.
+    """The object that ``semloc inspect --json`` prints for one log; ``topics`` overrules roles.
 
     Keys: ``path``, ``format``, ``encoding``, ``start_ns``, ``end_ns``, ``duration_s``, ``streams``
-    (topic, type, role, count as found), ``problems`` (sentences), ``skipped`` (those of them that
-    are about lost data), ``base_frame``, ``session_frame``, ``poses``, ``cameras``, ``sensors``,
-    ``frames`` (of the TF tree). LogError when it is no log, RoleError when an override is
-    impossible.
+    (topic, type, role, count of readable messages), ``problems`` (sentences), ``skipped`` (the ones
+    about lost data), ``base_frame``, ``session_frame``, ``poses``, ``cameras``, ``sensors``,
+    ``frames`` (of the TF tree). LogError for a file that is not a log, RoleError when an override
+    is impossible.
     """
     log = open_log(path)
     try:
@@ -59,46 +69,47 @@ def inspect_log(path: str | Path, topics: Mapping[str, str] | None = None) -> di
 
 class _Inspection:
     def __init__(self, log: Log, topics: Mapping[str, str] | None) -> None:
-        self.log = log
-        self.roles = guess_roles(log.streams, topics)
-        navsat = navsat_poses(self.roles, log.streams)
-        self.where = BasePoses(
-            self.roles, 0, navsat if self.roles.pose is not None else None, navsat
-        )
-        self._makes_poses = navsat is not None
-        self.cameras: dict[str, Camera] = {}
-        self.first: dict[str, LidarFrame | DepthFrame | ImageFrame] = {}
-        self.counts: Counter[tuple[str, str, str]] = Counter()
-        self.empty: Counter[str] = Counter()
-        self.imu_frame: str | None = None
+        self._log = log
+        self._roles = guess_roles(log.streams, topics)
+        navsat = navsat_poses(self._roles, log.streams)
+        named = navsat if self._roles.pose is not None else None
+        self._poses = BasePoses(self._roles, 0, named, navsat)
+        self._has_fixes = navsat is not None
+        self._cameras: dict[str, Camera] = {}
+        self._first: dict[str, RangeFrame] = {}
+        self._counts: Counter[tuple[str, str, str]] = Counter()
+        self._empty: Counter[str] = Counter()
+        self._imu_frame: str | None = None
         self._tries: Counter[str] = Counter()
         self._undecodable = Problems()
         self._decoder = Decoder(self._undecodable)
-        self._pass()
-        # says nothing about the base frame
-        right = self.first.pop(self.roles.stereo_right or "", None)
-        self.right = right if isinstance(right, ImageFrame) else None
-        sensors = list(dict.fromkeys(frame.header.frame_id for frame in self.first.values()))
-        self.where.settle(sensors, is_patient=False, must=True)
-        self.where.finish()
+        self._read()
 
-    def _pass(self) -> None:
-        roles = self.roles
+        # the right camera of a pair does not decide the base frame
+        right = self._first.pop(self._roles.stereo_right or "", None)
+        self._right = right if isinstance(right, ImageFrame) else None
+        sensors = list(dict.fromkeys(frame.header.frame_id for frame in self._first.values()))
+        self._poses.settle(sensors, is_patient=False, must=True)
+        self._poses.finish()
+
+    def _read(self) -> None:
+        """Counts all messages, and decodes the ones that the inspection needs."""
+        roles = self._roles
         small = {*roles.tf, *roles.tf_static, *roles.camera_info, *roles.topics("pose")}
-        if self._makes_poses:
+        if self._has_fixes:
             small |= {*roles.topics("gnss"), *roles.topics("imu")}
-        ranged = {*roles.ranging, *roles.topics("stereo_right")}
-        for message in self.log.messages():
+        ranging = {*roles.ranging, *roles.topics("stereo_right")}
+        for message in self._log.messages():
             topic = message.topic
-            self.counts[topic, message.type, message.encoding] += 1
+            self._counts[topic, message.type, message.encoding] += 1
             if (
                 topic in small
-                or (topic in ranged and topic not in self.first)
-                or (topic == roles.imu and self.imu_frame is None)
+                or (topic in ranging and topic not in self._first)
+                or (topic == roles.imu and self._imu_frame is None)
             ):
-                self._look_at(message, is_large=topic in ranged)
+                self._decode(message, is_large=topic in ranging)
 
-    def _look_at(self, message: Message, *, is_large: bool) -> None:
+    def _decode(self, message: Message, *, is_large: bool) -> None:
         if is_large:
             self._tries[message.topic] += 1
             if self._tries[message.topic] > _TRIES:
@@ -108,134 +119,145 @@ class _Inspection:
 
     def _take(self, frame: Frame) -> None:
         if isinstance(frame, TransformSample | PoseSample):
-            self.where.take(frame)
+            self._poses.take(frame)
         elif isinstance(frame, Camera):
-            self.cameras.setdefault(frame.header.topic, frame)
+            self._cameras.setdefault(frame.header.topic, frame)
         elif isinstance(frame, ImuSample | NavSatSample):
             if isinstance(frame, ImuSample):
-                self.imu_frame = frame.header.frame_id
-            self.where.show(frame)
+                self._imu_frame = frame.header.frame_id
+            self._poses.take_measurement(frame)
         elif isinstance(frame, LidarFrame) and not len(frame.points):
-            self.empty[frame.header.topic] += 1
-        elif isinstance(frame, LidarFrame | DepthFrame | ImageFrame):
-            self.first[frame.header.topic] = frame
+            self._empty[frame.header.topic] += 1
+        elif isinstance(frame, RangeFrame):
+            self._first[frame.header.topic] = frame
 
     def to_json(self) -> dict[str, object]:
-        log = self.log
-        base = self.where.base
-        is_timed = log.start_ns is not None and log.end_ns is not None
-        streams = [
-            {
-                "topic": s.topic,
-                "type": s.type,
-                "role": self.roles.role_of(s.topic),
-                "count": self.counts[s.topic, s.type, s.encoding],
-            }
-            for s in log.streams
-        ]
+        """The object of :func:`inspect_log`."""
+        log = self._log
+        base = self._poses.base
+        problems = self._problems()
         return {
             "path": str(log.path),
             "format": log.format,
             "encoding": log.encoding,
             "start_ns": log.start_ns,
             "end_ns": log.end_ns,
-            "duration_s": round(((log.end_ns or 0) - (log.start_ns or 0)) * 1e-9, 3)
-            if is_timed
-            else 0.0,
-            "streams": streams,
-            "problems": list(
-                dict.fromkeys(
-                    [
-                        *self._skipped(),
-                        *self._obstacles(),
-                        *log.problems,
-                        *self.roles.notes,
-                        *(base.notes if base else ()),
-                    ]
-                )
-            ),
-            "skipped": self._skipped(),
+            "duration_s": _duration_s(log),
+            "streams": [
+                {
+                    "topic": s.topic,
+                    "type": s.type,
+                    "role": self._roles.role_of(s.topic),
+                    "count": self._counts[s.topic, s.type, s.encoding],
+                }
+                for s in log.streams
+            ],
+            "problems": sentences(problems),
+            "skipped": sentences(lost(problems)),
             "base_frame": base.name if base else "",
-            "session_frame": self.where.session_frame,
-            "poses": self.where.track.to_json(),
-            "cameras": {topic: _camera(camera) for topic, camera in sorted(self.cameras.items())},
-            "sensors": {topic: self._sensor(frame) for topic, frame in sorted(self.first.items())},
-            "frames": self.where.tree.frames,
+            "session_frame": self._poses.session_frame,
+            "poses": self._poses.track.to_json(),
+            "cameras": {topic: _camera(camera) for topic, camera in sorted(self._cameras.items())},
+            "sensors": {topic: self._sensor(frame) for topic, frame in sorted(self._first.items())},
+            "frames": self._poses.tree.frames,
         }
 
-    def _skipped(self) -> list[str]:
-        unused = {s.topic for s in self.log.streams if self.roles.role_of(s.topic) is None}
-        skipped = [*without_unused(self.log.problems, unused), *self._undecodable.sentences()]
-        for s in self.log.streams:
-            found = self.counts[s.topic, s.type, s.encoding]
-            if found < s.count:
-                skipped.append(
-                    f"{s.topic}: only {found} of {s.count} messages can be read; what the others held is lost."
-                )
-        return list(dict.fromkeys(skipped))
+    # -- problems
 
-    def _obstacles(self) -> list[str]:
-        """What keeps the log from being fused, or only part of it."""
-        roles = self.roles
-        told = list(self.roles.problems)
-        if not self.counts:
-            return [f"{self.log.path.name} holds no messages."]
-        if not roles.ranging:
-            told.append(no_sensor(self.log.streams))
-        if not len(self.where.track) and not roles.problems:
-            told.append(no_poses(self.log.path.name))
-        for topic, count in sorted(self.empty.items()):
-            told.append(
-                f"{topic}: no point with a position in the first {count} cloud{'s' if count > 1 else ''}."
-            )
-        for topic in roles.depth:
-            told.extend(self._depth_obstacles(topic))
-        told.extend(self._stereo_obstacles())
-        told.extend(self._pose_obstacles())
-        return told
-
-    def _depth_obstacles(self, topic: str) -> list[str]:
-        info = self.roles.info_of.get(topic)
-        frame = self.first.get(topic)
-        if info is None or info not in self.cameras:
-            return [
-                f"{topic} has no CameraInfo: it cannot become points; record it, or name it with --topic camera_info=TOPIC."
+    def _problems(self) -> list[Problem]:
+        unused = {s.topic for s in self._log.streams if self._roles.role_of(s.topic) is None}
+        base = self._poses.base
+        return sorted_problems(
+            [
+                *self._obstacles(),
+                *without_loss_of(unused, self._log.problems),
+                *self._undecodable,
+                *self._unreadable(),
+                *self._roles.notes,
+                *(base.problems if base else ()),
             ]
-        if isinstance(frame, DepthFrame):
-            try:
-                Unprojector(self.cameras[info], *frame.depth.shape, rectified="rect" in topic)
-            except LogError as error:
-                return [str(error)]
-        return []
+        )
 
-    def _stereo_obstacles(self) -> list[str]:
-        roles = self.roles
+    def _unreadable(self) -> Iterator[Problem]:
+        """Streams with fewer messages than the log counts."""
+        for s in self._log.streams:
+            count = self._counts[s.topic, s.type, s.encoding]
+            if count < s.count:
+                text = (
+                    f"{s.topic}: only {count} of {s.count} messages can be read; "
+                    f"the others are lost."
+                )
+                yield Problem(s.topic, ProblemKind.MESSAGE, text, lost=True)
+
+    def _obstacles(self) -> list[Problem]:
+        """Problems that keep the log, or a part of it, from being fused; nothing is lost yet."""
+        roles = self._roles
+        if not self._counts:
+            return [_obstacle("", ProblemKind.FILE, f"{self._log.path.name} holds no messages.")]
+        obstacles = list(roles.problems)
+        if not roles.ranging:
+            obstacles.append(_obstacle("", ProblemKind.ROLE, no_sensor(self._log.streams)))
+        if not len(self._poses.track) and not roles.problems:
+            obstacles.append(no_poses())
+        for topic, count in sorted(self._empty.items()):
+            clouds = f"{count} cloud{'s' if count > 1 else ''}"
+            text = f"{topic}: no point with a position in the first {clouds}."
+            obstacles.append(_obstacle(topic, ProblemKind.FRAME, text))
+        for topic in roles.depth:
+            obstacles += self._depth_obstacles(topic)
+        obstacles += self._stereo_obstacles()
+        obstacles += self._pose_obstacles()
+        for topic, frame in self._first.items():
+            obstacles += self._sensor_obstacles(topic, frame)
+        return obstacles
+
+    def _depth_obstacles(self, topic: str) -> Iterator[Problem]:
+        info = self._roles.info_of.get(topic)
+        frame = self._first.get(topic)
+        if info is None or info not in self._cameras:
+            text = (
+                f"{topic} has no CameraInfo: it cannot become points; record it, or name it with "
+                f"--topic camera_info=TOPIC."
+            )
+            yield _obstacle(topic, ProblemKind.CALIBRATION, text)
+        elif isinstance(frame, DepthFrame):
+            try:
+                Unprojector(self._cameras[info], *frame.depth.shape, rectified="rect" in topic)
+            except LogError as error:
+                yield _obstacle(topic, ProblemKind.CALIBRATION, str(error))
+
+    def _stereo_obstacles(self) -> list[Problem]:
+        roles = self._roles
         if roles.stereo_left is None or roles.stereo_right is None:
             return []
         pair = (roles.stereo_left, roles.stereo_right)
-        cameras = {topic: self.cameras.get(roles.info_of.get(topic, "")) for topic in pair}
-        told = [
-            f"{topic} has no CameraInfo: the pair cannot become points; record it, or name both with --topic camera_info=TOPIC,TOPIC."
-            for topic, camera in cameras.items()
+        left_camera, right_camera = (self._cameras.get(roles.info_of.get(t, "")) for t in pair)
+        obstacles = [
+            _obstacle(
+                topic,
+                ProblemKind.CALIBRATION,
+                f"{topic} has no CameraInfo: the pair cannot become points; record it, or name "
+                f"both with --topic camera_info=TOPIC,TOPIC.",
+            )
+            for topic, camera in zip(pair, (left_camera, right_camera), strict=True)
             if camera is None
         ]
-        left, (left_camera, right_camera) = self.first.get(pair[0]), cameras.values()
-        if (
-            left_camera is None
-            or right_camera is None
-            or not isinstance(left, ImageFrame)
-            or self.right is None
-        ):
-            return told
-        if left.image.shape[:2] != self.right.image.shape[:2]:
-            sizes = " and ".join(
-                f"{i.shape[1]} x {i.shape[0]}" for i in (left.image, self.right.image)
+        left = self._first.get(pair[0])
+        right = self._right
+        if left_camera is None or right_camera is None:
+            return obstacles
+        if not isinstance(left, ImageFrame) or right is None:
+            return obstacles
+
+        if left.image.shape[:2] != right.image.shape[:2]:
+            sizes = " and ".join(f"{i.shape[1]} x {i.shape[0]}" for i in (left.image, right.image))
+            text = (
+                f"{pair[0]}, {pair[1]} have pictures of {sizes} pixels: "
+                f"a stereo pair needs the same size."
             )
-            return [
-                f"{pair[0]}, {pair[1]} have pictures of {sizes} pixels: a stereo pair needs the same size."
-            ]
-        right_T_left = self.where.tree.lookup(
-            self.right.header.frame_id, left.header.frame_id, left.header.stamp_ns
+            return [_obstacle(pair[0], ProblemKind.FRAME, text)]
+        right_T_left = self._poses.tree.lookup(
+            right.header.frame_id, left.header.frame_id, left.header.stamp_ns
         )
         try:
             rectification(
@@ -246,60 +268,77 @@ class _Inspection:
                 rectified=is_rectified(roles),
             )
         except LogError as error:
-            told.append(str(error))
-        return told
+            obstacles.append(_obstacle(pair[0], ProblemKind.CALIBRATION, str(error)))
+        return obstacles
 
-    def _pose_obstacles(self) -> list[str]:
-        track = self.where.track
-        base = self.where.base
-        source = self.where.source
-        told = [*source.problems, *source.notes] if source else []
-        told += never_moves(source.name if source else self.roles.pose or "TF", track)
+    def _pose_obstacles(self) -> list[Problem]:
+        track = self._poses.track
+        source = self._poses.source
+        obstacles = [replace(p, lost=False) for p in source.problems] if source else []
+        name = source.name if source else self._roles.pose or "TF"
+        obstacles += never_moves(name, track)
         if gaps := track.gaps():
             longest = max(gaps, key=lambda gap: gap[1] - gap[0])
             count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
-            told.append(
-                f"The poses have {count} from {span(*longest)}: frames in it get no pose and are left out."
+            text = (
+                f"The poses have {count} from {time_range(*longest)}: "
+                f"frames in it get no pose and are left out."
             )
-        for topic, frame in self.first.items():
-            stamp_ns = frame.header.stamp_ns
-            frame_id = frame.header.frame_id
-            if (
-                base is not None
-                and not self.where.tree.connected(base.name, frame_id)
-                and base.assumed != frame_id.lstrip("/")
-            ):
-                told.append(
-                    f"No transform leads from '{frame_id}', the frame of {topic}, to the base frame '{base.name}': "
-                    f"its frames are left out; record /tf_static."
-                )
-            start_ns = track.start_ns
-            end_ns = track.end_ns
-            if (
-                start_ns is not None
-                and end_ns is not None
-                and not start_ns - _OTHER_CLOCK_NS < stamp_ns < end_ns + _OTHER_CLOCK_NS
-            ):
-                told.append(
-                    f"{topic} starts at {span(stamp_ns, stamp_ns)} but the poses cover {span(start_ns, end_ns)}: "
-                    f"their header stamps come from different clocks; record both with the same."
-                )
-        return told
+            obstacles.append(_obstacle(name, ProblemKind.POSE, text))
+        return obstacles
 
-    def _sensor(self, frame: LidarFrame | DepthFrame | ImageFrame) -> dict[str, object]:
-        base_T_sensor = self.where.base_T(frame.header.frame_id, frame.header.stamp_ns)
-        told: dict[str, object] = {
+    def _sensor_obstacles(self, topic: str, frame: RangeFrame) -> Iterator[Problem]:
+        """A missing transform to the base frame, or another clock than the clock of the poses."""
+        track = self._poses.track
+        base = self._poses.base
+        stamp_ns = frame.header.stamp_ns
+        frame_id = frame.header.frame_id
+        if (
+            base is not None
+            and not self._poses.tree.connected(base.name, frame_id)
+            and base.assumed != frame_id.lstrip("/")
+        ):
+            text = (
+                f"No transform leads from '{frame_id}', the frame of {topic}, to the base frame "
+                f"'{base.name}': its frames are left out; record /tf_static."
+            )
+            yield _obstacle(topic, ProblemKind.TRANSFORM, text)
+        start_ns = track.start_ns
+        end_ns = track.end_ns
+        if start_ns is None or end_ns is None:
+            return
+        if not start_ns - _OTHER_CLOCK_NS < stamp_ns < end_ns + _OTHER_CLOCK_NS:
+            text = (
+                f"{topic} starts at {utc(stamp_ns)} but the poses cover "
+                f"{time_range(start_ns, end_ns)}: their header stamps come from different clocks; "
+                f"record both with the same."
+            )
+            yield _obstacle(topic, ProblemKind.POSE, text)
+
+    def _sensor(self, frame: RangeFrame) -> dict[str, object]:
+        base_T_sensor = self._poses.base_T(frame.header.frame_id, frame.header.stamp_ns)
+        content: dict[str, object] = {
             "frame_id": frame.header.frame_id,
             "base_T_sensor": None if base_T_sensor is None else base_T_sensor.tolist(),
         }
         if isinstance(frame, LidarFrame):
-            return told | {
+            return content | {
                 "points": len(frame.points),
                 "labels": frame.label is not None,
                 "point_times": frame.offset_ns is not None,
             }
         height, width = (frame.depth if isinstance(frame, DepthFrame) else frame.image).shape[:2]
-        return told | {"width": width, "height": height}
+        return content | {"width": width, "height": height}
+
+
+def _obstacle(topic: str, kind: ProblemKind, text: str) -> Problem:
+    return Problem(topic, kind, text, lost=False)
+
+
+def _duration_s(log: Log) -> float:
+    if log.start_ns is None or log.end_ns is None:
+        return 0.0
+    return round((log.end_ns - log.start_ns) * 1e-9, 3)
 
 
 def _camera(camera: Camera) -> dict[str, object]:

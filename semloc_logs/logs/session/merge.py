@@ -6,25 +6,16 @@ from collections.abc import Collection, Iterator, Sequence
 from heapq import heappop, heappush
 
 from semloc_logs.frames import Frame
-from semloc_logs.logs.log import Log, Stream
-
-
-def merged_streams(logs: Sequence[Log]) -> list[Stream]:
-    """The streams of all logs sorted by topic; the counts of the same topic and type add up."""
-    counts: dict[tuple[str, str, str], int] = {}
-    for log in logs:
-        for s in log.streams:
-            key = (s.topic, s.type, s.encoding)
-            counts[key] = counts.get(key, 0) + s.count
-    return [Stream(*key, count) for key, count in sorted(counts.items())]
+from semloc_logs.logs.log import Log
 
 
 def merged_frames(logs: Sequence[Log], topics: Collection[str]) -> Iterator[Frame]:
-    """The frames of ``topics`` in log-time order over all logs, which may overlap. A log is read
-    only once its time has come.
+    """The frames of ``topics`` in log-time order over all logs, which may overlap.
+
+    A log is read only once its time has come.
     """
     waiting = sorted(range(len(logs)), key=lambda i: (logs[i].start_ns or 0, i), reverse=True)
-    # (log time, log, nothing compares further): the log's index keeps equal times in a fixed order
+    # (log time, index of the log): the index keeps equal times in a fixed order
     heads: list[tuple[int, int]] = []
     frames: dict[int, Frame] = {}
     readers: dict[int, Iterator[Frame]] = {}

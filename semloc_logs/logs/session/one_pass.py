@@ -1,6 +1,4 @@
-"""One pass over the frames of a session: what is learned on the way, and the clouds that come of
-it.
-"""
+"""One pass over the frames of a session: poses, transforms, calibrations, and the clouds."""
 
 from __future__ import annotations
 
@@ -17,47 +15,47 @@ from semloc_logs.frames import (
     PoseSample,
     TransformSample,
 )
+from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.logs.poses.base_frame import BasePoses
 from semloc_logs.logs.poses.imu_gravity import Accelerometer
+from semloc_logs.logs.problems import NoCloud
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.sensors.camera_clouds import PictureClouds
-from semloc_logs.logs.sensors.sweeps import LONGEST_SWEEP_NS
-from semloc_logs.logs.session.cloud_builder import BaseClouds
-from semloc_logs.logs.session.frame_queue import RangeFrame, WaitingFrames
-from semloc_logs.logs.session.image_relay import ShownPictures
+from semloc_logs.logs.sensors.camera_clouds import CameraClouds
+from semloc_logs.logs.session.cloud_builder import CloudBuilder
+from semloc_logs.logs.session.frame_queue import FrameQueue, RangeFrame
+from semloc_logs.logs.session.image_relay import ImageRelay
 from semloc_logs.logs.session.tally import Tally
 
 _TF_PATIENCE = 16  # frames to wait for a better pose edge in TF than one that is not called odom
 
 
 class CloudPass:
-    """All that is known as far as the pass has come: ``where`` the vehicle is, ``tally`` of frames,
-    ``meanings`` of labels by topic.
+    """The state of a pass: ``poses``, ``tally`` of frames, ``meanings`` of labels by topic.
 
-    ``made`` makes the clouds, ``shown`` are the pictures to be handed on.
+    ``builder`` makes the clouds, ``relay`` hands pictures on.
     """
 
     def __init__(
         self,
         roles: Roles,
-        where: BasePoses,
-        pictures: PictureClouds,
-        made: BaseClouds,
-        shown: ShownPictures,
+        poses: BasePoses,
+        cameras: CameraClouds,
+        builder: CloudBuilder,
+        relay: ImageRelay,
     ) -> None:
-        self.where = where
-        self.pictures = pictures
-        self.made = made
+        self.poses = poses
+        self.cameras = cameras
+        self.builder = builder
         self.accelerometer = Accelerometer()
         self.tally = Tally()
         self.meanings: dict[str, LabelNames] = {}
-        self.waiting = WaitingFrames()
+        self.waiting = FrameQueue()
         self._roles = roles
-        self._shown = shown
+        self._relay = relay
 
     @property
     def topics(self) -> set[str]:
-        """What has to be decoded."""
+        """The topics that have to be decoded."""
         roles = self._roles
         topics = {
             *roles.ranging,
@@ -66,17 +64,14 @@ class CloudPass:
             *roles.tf,
             *roles.tf_static,
         }
-        topics |= {
-            roles.info_of[t]
-            for t in (*topics, *roles.image, *roles.label_image)
-            if t in roles.info_of
-        }
+        with_calibration = (*topics, *roles.image, *roles.label_image)
+        topics |= {roles.info_of[t] for t in with_calibration if t in roles.info_of}
         return topics | {
             *roles.topics("pose"),
             *roles.topics("imu"),
             *roles.topics("gnss"),
             *roles.label_info,
-            *self._shown.topics,
+            *self._relay.topics,
         }
 
     def clouds(self, frames: Iterable[Frame]) -> Iterator[PosedCloud]:
@@ -84,82 +79,83 @@ class CloudPass:
         for frame in frames:
             self._take(frame)
             yield from self._ready(is_end=False)
-        self.where.finish()
+        self.poses.finish()
         yield from self._ready(is_end=True)
 
     def _take(self, frame: Frame) -> None:
         topic = frame.header.topic
         if isinstance(frame, TransformSample | PoseSample):
-            self.where.take(frame)
+            self.poses.take(frame)
         elif isinstance(frame, Camera):
-            self.pictures.cameras[topic] = frame
+            self.cameras.calibrations[topic] = frame
         elif isinstance(frame, ImuSample):
             self.accelerometer.add(frame)
-            self.where.show(frame)
+            self.poses.take_measurement(frame)
         elif isinstance(frame, NavSatSample):
-            self.where.show(frame)
+            self.poses.take_measurement(frame)
         elif isinstance(frame, LabelNames):
             self.meanings.setdefault(topic, frame)
         elif isinstance(frame, RangeFrame):
             if topic in self._roles.ranging:
                 self._take_range(frame)
             if not isinstance(frame, LidarFrame):
-                self.pictures.take(frame)
-                self._shown.take(frame)
+                self.cameras.take(frame)
+                self._relay.take(frame)
 
     def _take_range(self, frame: RangeFrame) -> None:
         topic = frame.header.topic
         self.tally.saw(topic, frame.header.stamp_ns)
-        self.where.show(frame)
+        self.poses.take_measurement(frame)
         if isinstance(frame, LidarFrame):
             self.tally.measured(frame)
             if not len(frame.points):
-                self.tally.leave_out(topic, "empty")
+                self.tally.leave_out(topic, NoCloud.EMPTY)
                 return
         self.waiting.add(frame)
 
     def _ready(self, *, is_end: bool) -> Iterator[PosedCloud]:
-        """Clouds of the frames that need not wait any longer, first come first served."""
+        """Clouds of the frames that need not wait any longer, in order."""
         while self.waiting:
             must = is_end or self.waiting.is_full
-            if self.where.base is None:
-                sensors = self.waiting.sensors(self._roles.pose)
-                self.where.settle(sensors, is_patient=len(self.waiting) < _TF_PATIENCE, must=must)
+            if self.poses.base is None:
+                self._settle(must=must)
                 # poses that have not even begun are out of reach of a frame that cannot wait
-                if self.where.base is None and not must:
+                if self.poses.base is None and not must:
                     return
             if not must and not self._has_all(self.waiting.first):
                 return
             frame, is_set_back = self.waiting.pop()
-            cloud = self.made.cloud(frame, is_end=is_end, is_set_back=is_set_back)
-            if isinstance(cloud, str):
+            cloud = self.builder.cloud(frame, is_end=is_end, is_set_back=is_set_back)
+            if isinstance(cloud, NoCloud):
                 self.tally.leave_out(frame.header.topic, cloud)
             else:
                 self.tally.used[frame.header.topic] += 1
                 yield cloud
 
+    def _settle(self, *, must: bool) -> None:
+        sensors = self.waiting.sensors(self._roles.pose)
+        is_patient = len(self.waiting) < _TF_PATIENCE
+        self.poses.settle(sensors, is_patient=is_patient, must=must)
+
     def _has_all(self, frame: RangeFrame) -> bool:
+        """Whether everything that the cloud of ``frame`` needs has come."""
         stamp_ns = frame.header.stamp_ns
-        where = self.where
-        if any(
-            self._roles.info_of.get(t) not in {None, *self.pictures.cameras}
-            for t in self._shown.topics
-        ):
+        infos = [self._roles.info_of.get(topic) for topic in self._relay.topics]
+        if any(info not in {None, *self.cameras.calibrations} for info in infos):
             return False
         # poses have to reach the first picture that is not earlier
-        if not all(
-            s is not None and where.poses_have_passed(s) for s in self._shown.following(stamp_ns)
-        ):
+        for picture_ns in self._relay.following(stamp_ns):
+            if picture_ns is None or not self.poses.poses_have_passed(picture_ns):
+                return False
+        if not isinstance(frame, LidarFrame) and not self.cameras.has_all(frame):
             return False
-        if not isinstance(frame, LidarFrame) and not self.pictures.has_all(frame):
-            return False
-        return where.poses_have_passed(
+        return self.poses.poses_have_passed(
             stamp_ns + _sweep_ns(frame)
-        ) and where.transforms_have_passed(frame.header.frame_id, stamp_ns)
+        ) and self.poses.transforms_have_passed(frame.header.frame_id, stamp_ns)
 
 
 def _sweep_ns(frame: RangeFrame) -> int:
-    """How long after the stamp the last point was measured."""
+    """Time from the stamp to the measurement of the last point."""
     if not isinstance(frame, LidarFrame) or frame.offset_ns is None or not len(frame.offset_ns):
         return 0
     return min(max(0, int(frame.offset_ns.max())), LONGEST_SWEEP_NS)

@@ -1,47 +1,39 @@
-"""What a whole pass over a session says in sentences: what was lost, and what was assumed."""
+"""Problems that are known once a whole pass over a session is over."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from semloc_logs.logs.problems import Problem
 from semloc_logs.logs.session.one_pass import CloudPass
-from semloc_logs.logs.session.tally import never_moves, no_poses, refused, smeared
+from semloc_logs.logs.session.pose_problems import (
+    invalid_poses,
+    never_moves,
+    no_poses,
+    refused_poses,
+    smeared,
+)
 
 
-@dataclass(frozen=True, slots=True)
-class Conclusion:
-    """Sentences about data that was ``lost``, and ``notes`` on what was assumed."""
+def conclude(done: CloudPass, pose_topic: str | None) -> list[Problem]:
+    """The problems of a pass that is over; ``pose_topic`` is the topic of its poses."""
+    poses = done.poses
+    track = poses.track
+    builder = done.builder
+    name = poses.source.name if poses.source else pose_topic or "TF"
 
-    lost: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    problems = done.tally.problems((track.start_ns, track.end_ns))
+    if builder.duplicates is not None:
+        problems += builder.duplicates.problems()
+    problems += invalid_poses(name, track)
+    if poses.source is not None:
+        problems += poses.source.problems
+    # every publisher of TF may repeat the transforms of others: nothing is lost by that
+    is_lost = name != "TF" or track.backwards + track.ahead > 0
+    problems += refused_poses(name, track, lost=is_lost)
 
-
-def conclude(done: CloudPass, session: str, pose_topic: str | None) -> Conclusion:
-    """The sentences on a pass that is over; ``session`` and ``pose_topic`` are what they call it
-    and its poses.
-    """
-    where = done.where
-    made = done.made
-    track = where.track
-    source = where.source
-    lost = done.tally.sentences((track.start_ns, track.end_ns))
-    notes = done.tally.remarks()
-    if made.copies is not None:
-        notes += made.copies.sentences()
-    if track.invalid:
-        lost.append(f"{track.invalid} poses are no rigid transforms and were left out.")
-    if source is not None:
-        lost += source.problems
-        notes += source.notes
-    name = source.name if source else pose_topic or "TF"
-    # every publisher of TF may repeat what others said: nothing is lost by that
-    (notes if name == "TF" and not track.backwards + track.ahead else lost).extend(
-        refused(name, track)
-    )
-    if made.standstill.shift and not track.moves:
-        lost.append(smeared(name, made.standstill.shift))
+    if builder.standstill.shift and not track.moves:
+        problems.append(smeared(name, builder.standstill.shift))
     else:
-        notes += never_moves(name, track)
-    if where.base is not None and where.base.pose_frame is None:
-        notes.append(no_poses(session))
-    return Conclusion(tuple(lost), tuple(notes))
+        problems += never_moves(name, track)
+    if poses.base is not None and poses.base.pose_frame is None:
+        problems.append(no_poses())
+    return problems

@@ -8,7 +8,7 @@ import pytest
 from semloc_logs.benchmarks.speed.memory import peak_memory
 from semloc_logs.benchmarks.speed.profiles import SPANS, profile_fuse
 from semloc_logs.errors import SemlocError
-from semloc_logs.logs.session.session import open_session
+from semloc_logs.logs.session.session import SessionOptions, open_session
 from semloc_logs.settings import Settings
 from semloc_logs.simulation.output.long_drive import Lap
 
@@ -22,7 +22,7 @@ def lap() -> Lap:
 def test_laps_join_and_go_on_or_come_back(lap: Lap, onwards: bool, tmp_path: Path) -> None:
     log = tmp_path / "drive.mcap"
     assert lap.write(log, 3, onwards=onwards) == 3 * 20
-    session = open_session([log], {}, min_range=0.5)
+    session = open_session([log], SessionOptions(min_range=0.5))
     try:
         clouds = list(session.clouds())
         _, poses = session.trajectory()

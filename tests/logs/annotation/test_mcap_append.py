@@ -405,7 +405,7 @@ def test_chunk_that_claims_to_be_huge(tmp_path: Path, name: str, claim: int) -> 
     with contextlib.closing(open_log(log)) as opened:
         assert list(opened.messages()) == []
         assert len(opened.problems) == 1
-        assert f"byte {start}" in opened.problems[0]
+        assert f"byte {start}" in opened.problems[0].text
 
 
 def annotate_there(log: Path, results: Results) -> object:

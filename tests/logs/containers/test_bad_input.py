@@ -1,5 +1,6 @@
-"""Logs with one fault each: what is skipped is counted and named, the rest is used, and nothing
-claimed is allocated.
+"""Logs with one fault each: skipped data are counted and named, the rest is used.
+
+Nothing is allocated for a claim.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from semloc_logs.cli.main import program
 from semloc_logs.errors import LogError
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.logs.messages.image_codecs import decode_compressed, decode_compressed_depth
+from semloc_logs.logs.problems import lost, sentences
 from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.logs.session.session import Session, open_session
 from semloc_logs.numerics.transforms import yaw_transform
@@ -60,7 +62,7 @@ def good_and_bad(
     for k in range(bads):
         bad(EPOCH + (k + good) * S // 5)
     clouds, session = all_of(log)
-    return clouds, session.skipped
+    return clouds, sentences(lost(session.problems))
 
 
 @pytest.mark.parametrize("kind", ["ros2", "ros1"])
@@ -96,12 +98,12 @@ def test_layouts_that_do_not_fit(
 
 
 @pytest.mark.parametrize("type_", ["i2", "u4", "i1"])
-def test_whole_numbers_are_no_positions(recorder: Any, type_: str) -> None:
+def test_whole_numbers_are_not_positions(recorder: Any, type_: str) -> None:
     log = recorder()
     whole = rows([(axis, f"<{type_}") for axis in "xyz"])
     clouds, skipped = good_and_bad(log, lambda stamp: log.cloud("/points", stamp, "lidar", whole))
     assert len(clouds) == 3
-    assert f"its field x is no floating point number but {np.dtype(type_).name}" in skipped[0]
+    assert f"its field x is {np.dtype(type_).name}, not floating point" in skipped[0]
 
 
 @pytest.mark.parametrize("kind", ["ros2", "ros1", "protobuf"])
@@ -140,7 +142,8 @@ def test_points_that_are_no_numbers_are_counted(recorder: Any) -> None:
     clouds, skipped = good_and_bad(log, lambda stamp: holes(stamp, is_dense=True))
     assert [len(c.points) for c in clouds] == [60, 60, 60, 56, 56]
     assert skipped == [
-        "/points: 8 of 300 points are left out: they are not finite, although their clouds call themselves dense."
+        "/points: 8 of 300 points are left out: they are not finite, although "
+        "their clouds call themselves dense."
     ]
     log = recorder(name="honest")
     assert good_and_bad(log, lambda stamp: holes(stamp, is_dense=False))[1] == []
@@ -158,11 +161,12 @@ def test_clouds_of_nothing_are_counted(recorder: Any) -> None:
     )
     assert len(clouds) == 3
     assert skipped == [
-        "/points: 2 of 5 frames are left out: they hold no points, or none whose position is a number."
+        "/points: 2 of 5 frames are left out: they hold no points, or none whose "
+        "position is a number."
     ]
 
 
-def test_inspect_and_fuse_say_it_and_exit_with_3(recorder: Any, tmp_path: Path) -> None:
+def test_inspect_and_fuse_name_it_and_exit_with_3(recorder: Any, tmp_path: Path) -> None:
     log = recorder()
     stage(log)
     for k in range(5):
@@ -200,17 +204,17 @@ def test_depth_values_that_are_none(recorder: Any) -> None:
     whole[0, :4] = 0, 65535, 0, 65535
     real = np.full((6, 8), 2.0, np.float32)
     real[0, :6] = np.nan, np.inf, -np.inf, -2.0, 0.0, 1e38
-    for encoding, picture, lost in (("16UC1", whole, 4), ("32FC1", real, 6)):
+    for encoding, picture, missing in (("16UC1", whole, 4), ("32FC1", real, 6)):
         log = recorder(name=encoding)
         depth_log(log, [picture, picture], encoding)
         clouds, session = all_of(log)
-        assert [len(c.points) for c in clouds] == [48 - lost] * 2
-        assert session.skipped == []
+        assert [len(c.points) for c in clouds] == [48 - missing] * 2
+        assert lost(session.problems) == []
     log = recorder(name="nothing")
     depth_log(log, [np.full((6, 8), 65535, np.uint16), whole], "16UC1")
     clouds, session = all_of(log)
     assert len(clouds) == 1
-    assert session.skipped == [
+    assert sentences(lost(session.problems)) == [
         "/cam/depth/image: 1 of 2 frames are left out: they have no points within the range limits."
     ]
 
@@ -220,12 +224,12 @@ def test_a_calibration_of_another_size(recorder: Any) -> None:
     depth_log(log, [np.full((6, 8), 2000, np.uint16)] * 3, "16UC1", info=(16, 12, 5.0))
     clouds, session = all_of(log)
     assert clouds == []
-    assert len(session.skipped) == 2
-    assert session.skipped[0].startswith(
+    assert len(sentences(lost(session.problems))) == 2
+    assert sentences(lost(session.problems))[0].startswith(
         "CameraInfo /cam/depth/camera_info is for 16 x 12 pixels but the depth image has 8 x 6"
     )
     assert (
-        session.skipped[1]
+        sentences(lost(session.problems))[1]
         == "/cam/depth/image: 3 of 3 frames are left out: their CameraInfo cannot be used."
     )
 
@@ -238,10 +242,13 @@ def test_a_calibration_of_zeros(recorder: Any, kind: str) -> None:
     assert clouds == []
     assert (
         "/cam/depth/camera_info: 1 message skipped; sensor_msgs/msg/CameraInfo"
-        in session.skipped[0]
+        in sentences(lost(session.problems))[0]
     )
-    assert "its camera is not calibrated (the focal length is zero)" in session.skipped[0]
-    assert session.skipped[1].startswith(
+    assert (
+        "its camera is not calibrated (the focal length is zero)"
+        in sentences(lost(session.problems))[0]
+    )
+    assert sentences(lost(session.problems))[1].startswith(
         "/cam/depth/image: 3 of 3 frames are left out: no CameraInfo"
     )
 
@@ -259,7 +266,9 @@ def test_one_pose_from_the_future_does_not_end_the_poses(recorder: Any) -> None:
         clouds, session = all_of(log)
         assert len(clouds) == 8, name
         assert all(c.session_T_base is not None for c in clouds)
-        assert any("1 " in p and "pose" in p.lower() for p in session.problems), session.problems
+        assert any("1 " in p and "pose" in p.lower() for p in sentences(session.problems)), (
+            sentences(session.problems)
+        )
 
 
 def test_sweeps_with_impossible_times_are_counted(recorder: Any) -> None:
@@ -270,7 +279,7 @@ def test_sweeps_with_impossible_times_are_counted(recorder: Any) -> None:
         log.cloud("/points", stamp, "lidar", rows(), late_ns=EPOCH + k * S // 5 - stamp)
     clouds, session = all_of(log)
     assert len(clouds) == 5
-    [sentence] = session.skipped
+    [sentence] = sentences(lost(session.problems))
     assert sentence.startswith(
         "/points: 3 of 8 frames are left out: no pose is known at their time"
     )
@@ -287,8 +296,8 @@ def test_a_clock_that_is_set_back(recorder: Any) -> None:
             log.cloud("/points", stamp, "lidar", rows(), late_ns=EPOCH + t - stamp)
     clouds, session = all_of(log)
     assert 10 <= len(clouds) <= 20
-    assert session.skipped
-    assert any("back in time" in p for p in session.problems)
+    assert sentences(lost(session.problems))
+    assert any("back in time" in p for p in sentences(session.problems))
 
 
 def test_poses_that_stop(recorder: Any) -> None:
@@ -298,8 +307,9 @@ def test_poses_that_stop(recorder: Any) -> None:
         log.cloud("/points", EPOCH + k * S // 10, "lidar", rows())
     clouds, session = all_of(log)
     assert 10 <= len(clouds) <= 12
-    assert session.skipped[0].startswith(
-        f"/points: {40 - len(clouds)} of 40 frames are left out: no pose is known at their time (frames 2023"
+    assert sentences(lost(session.problems))[0].startswith(
+        f"/points: {40 - len(clouds)} of 40 frames are left out: no pose is known "
+        f"at their time (frames 2023"
     )
 
 
@@ -317,7 +327,7 @@ def test_one_bad_transform_does_not_cost_its_message(recorder: Any) -> None:
     clouds, session = all_of(log)
     assert len(clouds) == 1
     assert session.base_frame == "base_link"
-    [sentence] = session.skipped
+    [sentence] = sentences(lost(session.problems))
     assert "1 of its 2 transforms cannot be used (the quaternion of its pose is zero)" in sentence
 
 
@@ -373,7 +383,7 @@ BOMBS = {
 
 
 def test_bombs_in_a_log_cost_nothing(recorder: Any) -> None:
-    """Read in a process whose memory is limited to little more than what it has after the imports."""
+    """Read in a process whose memory is limited to little more than its imports need."""
     log = recorder()
     stage(log)
     log.camera_info("/cam/depth/camera_info", EPOCH, "lidar", 8, 6, 5.0)
@@ -399,6 +409,7 @@ def test_bombs_in_a_log_cost_nothing(recorder: Any) -> None:
     path = log.write()
     code = f"""
 import json, resource, sys
+from semloc_logs.logs.problems import lost, sentences
 from semloc_logs.logs.session.session import open_session
 import cv2
 session = open_session([{str(path)!r}])
@@ -406,7 +417,8 @@ held = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (held + (200 << 20),) * 2)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 clouds = list(session.clouds(on_image=lambda image: None))
-print(json.dumps([len(clouds), session.skipped, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before]))
+grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+print(json.dumps([len(clouds), sentences(lost(session.problems)), grown]))
 """
     done = subprocess.run(
         [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=50
@@ -416,17 +428,15 @@ print(json.dumps([len(clouds), session.skipped, resource.getrusage(resource.RUSA
     assert count == 1
     assert not any("MemoryError" in s for s in skipped), skipped
     assert grown_kib < 100 << 10
-    told = " ".join(skipped)
-    assert "/colour/image/compressed: 5 messages skipped" in told
-    assert "/cam/depth/image/compressedDepth: 3 messages skipped" in told
-    assert "/points: 3 messages skipped" in told
+    text = " ".join(skipped)
+    assert "/colour/image/compressed: 5 messages skipped" in text
+    assert "/cam/depth/image/compressedDepth: 3 messages skipped" in text
+    assert "/points: 3 messages skipped" in text
 
 
 @pytest.mark.parametrize("name", BOMBS)
 def test_bombs_are_refused_for_their_claim(name: str) -> None:
-    """Before the decoder of pictures sees them: it would ask for the memory, and say only that it
-    failed.
-    """
+    """Before the decoder of pictures sees them: it would allocate the memory."""
     format_, data = BOMBS[name]
     with pytest.raises(UndecodableError, match=r"claim|cut off"):
         decode_compressed_depth(data, format_) if "Depth" in format_ else decode_compressed(data)
@@ -446,10 +456,11 @@ def test_inspect_names_clouds_without_points(recorder: Any) -> None:
     stage(log)
     for k in range(3):
         log.cloud("/points", EPOCH + k * S // 5, "lidar", rows()[: 0 if k < 2 else 60])
-    told: Any = inspect_log(log.write())
-    assert told["sensors"]["/points"]["points"] == 60
+    inspected: Any = inspect_log(log.write())
+    assert inspected["sensors"]["/points"]["points"] == 60
     assert any(
-        "/points: no point with a position in the first 2 clouds." in p for p in told["problems"]
+        "/points: no point with a position in the first 2 clouds." in p
+        for p in inspected["problems"]
     )
 
 

@@ -28,7 +28,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Definition, Message
 from semloc_logs.logs.messages.decode import Decoder
-from semloc_logs.logs.problems import Problems
+from semloc_logs.logs.problems import Problem, Problems, sentences
 
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -36,7 +36,7 @@ HURRY = settings(max_examples=15, deadline=None, suppress_health_check=list(Heal
 
 
 def ros_messages(store: Any) -> dict[str, Any]:
-    """A message of each kind whose bytes say how much there is."""
+    """A message of each kind whose bytes hold their size."""
     t = store.types
     head = {"seq": 0} if store is ROS1 else {}
     header = t["std_msgs/msg/Header"](
@@ -154,7 +154,7 @@ def test_damaged_logs(kind: str, data: st.DataObject) -> None:
             # a damaged index may lie about times
             assert times == sorted(times) or kind.startswith(("mcap", "rosbag1"))
             list(log.frames())
-            assert all(isinstance(p, str) for p in log.problems)
+            assert all(isinstance(p, Problem) for p in log.problems)
             log.close()
 
 
@@ -268,7 +268,7 @@ def test_definitions_that_cannot_be_parsed_are_named(type_: str) -> None:
     problems = Problems()
     broken = Definition(type_, "ros2msg", b"uint8[ x\n==\nMSG: y\n")
     assert Decoder(problems).frames(Message("/t", type_, "cdr", 1, b"\0\1\0\0", broken)) == []
-    assert "definition in the log" in problems.sentences()[0]
+    assert "definition in the log" in sentences(problems)[0]
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
@@ -284,4 +284,4 @@ def test_lists_of_elements_without_content_are_refused(encoding: str) -> None:
         )
         == []
     )
-    assert "have no content" in problems.sentences()[0]
+    assert "have no content" in sentences(problems)[0]

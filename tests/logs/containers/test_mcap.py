@@ -23,6 +23,7 @@ from semloc_logs.logs.containers.base import decompress, in_log_time_order
 from semloc_logs.logs.containers.mcap import McapLog
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Definition, Message, Stream
+from semloc_logs.logs.problems import sentences
 
 ENTRIES = [
     ("/a", 10),
@@ -132,8 +133,8 @@ def test_a_truncated_file_gives_what_is_before_the_cut(tmp_path: Path, share: fl
     assert len(times) >= 100 * (share - 0.3)
     assert sum(s.count for s in log.streams) == len(times)
     assert len(log.problems) == 1
-    assert "cut.mcap" in log.problems[0]
-    assert f"of {cut.stat().st_size}" in log.problems[0]
+    assert "cut.mcap" in sentences(log.problems)[0]
+    assert f"of {cut.stat().st_size}" in sentences(log.problems)[0]
 
 
 def test_a_damaged_chunk_is_skipped_and_named(tmp_path: Path) -> None:
@@ -150,7 +151,7 @@ def test_a_damaged_chunk_is_skipped_and_named(tmp_path: Path) -> None:
     log = open_log(path)
     lost = range(chunk.message_start_time, chunk.message_end_time + 1)
     assert [m.log_time_ns for m in log.messages()] == [k for k in range(100) if k not in lost]
-    assert log.problems == [
+    assert sentences(log.problems) == [
         f"x.mcap: the chunk at byte {chunk.chunk_start_offset} was skipped: its checksum does not match its data."
     ]
 
@@ -162,7 +163,7 @@ def test_a_damaged_index_is_named_and_not_used(tmp_path: Path) -> None:
     path.write_bytes(data)
     log = open_log(path)
     assert len(list(log.messages())) == len(ENTRIES)
-    assert "does not match its checksum" in log.problems[0]
+    assert "does not match its checksum" in sentences(log.problems)[0]
 
 
 def test_an_index_that_points_behind_the_file_is_not_used(tmp_path: Path) -> None:
@@ -180,7 +181,7 @@ def test_an_index_that_points_behind_the_file_is_not_used(tmp_path: Path) -> Non
     path.write_bytes(data)
     log = open_log(path)
     assert len(list(log.messages())) == len(ENTRIES)
-    assert "is damaged" in log.problems[0]
+    assert "is damaged" in sentences(log.problems)[0]
 
 
 def test_several_encodings_in_one_file(tmp_path: Path) -> None:
@@ -215,7 +216,7 @@ def test_several_encodings_in_one_file(tmp_path: Path) -> None:
         ("/ros1", "std_msgs/msg/String", "ros1"),
     ]
     assert [f.header.topic for f in log.frames()] == ["/json"]
-    [sentence] = log.problems
+    [sentence] = sentences(log.problems)
     assert sentence.startswith("/imu: 1 message skipped; ")
 
 

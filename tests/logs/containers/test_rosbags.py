@@ -18,6 +18,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import PoseSample
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log, Stream
+from semloc_logs.logs.problems import sentences
 
 POSE = "geometry_msgs/msg/PoseStamped"
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
@@ -67,7 +68,7 @@ def bag2(
 
 
 def check(log: Log, times: list[int], encoding: str) -> None:
-    """Everything that a log of ``times`` says."""
+    """The whole content of a log of ``times``."""
     assert [m.log_time_ns for m in log.messages()] == sorted(times)
     assert [m.log_time_ns for m in log.messages(["/b"])] == sorted(times[1::2])
     found = list(log.frames())
@@ -103,7 +104,7 @@ def test_ros1_without_its_index(tmp_path: Path) -> None:
     path.write_bytes(data[:at] + bytes(8) + data[at + 8 :])
     log = open_log(path)
     check(log, TIMES, "ros1")
-    assert "was not closed" in log.problems[0]
+    assert "was not closed" in sentences(log.problems)[0]
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
@@ -115,7 +116,7 @@ def test_ros1_truncated(tmp_path: Path, share: float) -> None:
     times = [m.log_time_ns for m in log.messages()]
     assert times == TIMES[: len(times)]
     assert sum(s.count for s in log.streams) == len(times)
-    assert any("cut.bag" in p and f"of {path.stat().st_size}" in p for p in log.problems)
+    assert any("cut.bag" in p and f"of {path.stat().st_size}" in p for p in sentences(log.problems))
 
 
 def test_ros1_with_a_damaged_chunk(tmp_path: Path) -> None:
@@ -126,7 +127,7 @@ def test_ros1_with_a_damaged_chunk(tmp_path: Path) -> None:
     path.write_bytes(data)
     log = open_log(path)
     assert 0 < len(list(log.messages())) < len(TIMES)
-    [sentence] = log.problems
+    [sentence] = sentences(log.problems)
     assert sentence.startswith("x.bag: the chunk at byte ")
 
 
@@ -176,9 +177,9 @@ def test_missing_and_unlisted_files_are_named(tmp_path: Path) -> None:
     (folder / "split_1.db3").rename(folder / "other_7.db3")
     log = open_log(folder)
     assert [m.log_time_ns for m in log.messages()] == TIMES[:10] + TIMES[20:]
-    assert any("split_1.db3 is missing" in p for p in log.problems)
-    assert any("other_7.db3 was not read" in p for p in log.problems)
-    assert any("claims 30 messages, but the files hold 20" in p for p in log.problems)
+    assert any("split_1.db3 is missing" in p for p in sentences(log.problems))
+    assert any("other_7.db3 was not read" in p for p in sentences(log.problems))
+    assert any("claims 30 messages, but the files hold 20" in p for p in sentences(log.problems))
 
 
 @pytest.mark.parametrize(
@@ -194,13 +195,13 @@ def test_missing_and_unlisted_files_are_named(tmp_path: Path) -> None:
         "a: &a {b: 1}\nc: {<<: [*a, *a]}",
     ],
 )
-def test_unusable_metadata_is_no_obstacle(tmp_path: Path, text: str) -> None:
+def test_unusable_metadata_does_not_matter(tmp_path: Path, text: str) -> None:
     folder = bag2(tmp_path / "x", TIMES)
     (folder / "metadata.yaml").write_text(text)
     log = open_log(folder)
     check(log, TIMES, "cdr")
     assert len(log.problems) == 1
-    assert "metadata.yaml" in log.problems[0]
+    assert "metadata.yaml" in sentences(log.problems)[0]
 
 
 def test_a_damaged_split_leaves_the_others(tmp_path: Path) -> None:
@@ -208,7 +209,7 @@ def test_a_damaged_split_leaves_the_others(tmp_path: Path) -> None:
     (folder / "split_0.db3").write_bytes(b"nothing")
     log = open_log(folder)
     assert [m.log_time_ns for m in log.messages()] == TIMES[10:]
-    assert any("split_0.db3" in p for p in log.problems)
+    assert any("split_0.db3" in p for p in sentences(log.problems))
 
 
 def test_a_damaged_message_is_skipped_alone(tmp_path: Path) -> None:
@@ -221,7 +222,7 @@ def test_a_damaged_message_is_skipped_alone(tmp_path: Path) -> None:
     log = open_log(folder)
     assert len(list(log.frames())) == len(TIMES) - 3
     assert len(list(log.frames())) == len(TIMES) - 3
-    assert sorted(p[:22] for p in log.problems) == ["/a: 1 message skipped;"] * 2 + [
+    assert sorted(p[:22] for p in sentences(log.problems)) == ["/a: 1 message skipped;"] * 2 + [
         "/b: 1 message skipped;"
     ]
 
@@ -242,8 +243,9 @@ def test_undefined_types_are_named(tmp_path: Path) -> None:
         database.execute("DELETE FROM message_definitions")
     log = open_log(folder / "x.db3")
     assert len(list(log.frames())) == 15
-    assert log.problems == [
-        "/b: messages of type foo_msgs/msg/Bar cannot be decoded because the log does not define the type."
+    assert sentences(log.problems) == [
+        "/b: messages of type foo_msgs/msg/Bar cannot be decoded because the log "
+        "does not define the type."
     ]
 
 

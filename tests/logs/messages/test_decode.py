@@ -30,7 +30,7 @@ from semloc_logs.frames import (
 )
 from semloc_logs.logs.log import Definition, Message
 from semloc_logs.logs.messages.decode import Decoder
-from semloc_logs.logs.problems import Problems
+from semloc_logs.logs.problems import Problems, sentences
 
 STORES = {"cdr": get_typestore(Stores.ROS2_HUMBLE), "ros1": get_typestore(Stores.ROS1_NOETIC)}
 NOTHING = Definition("", "", b"")
@@ -118,9 +118,10 @@ def test_impossible_rotations_are_skipped_and_counted(
 ) -> None:
     assert ros.frames(odometry(ros, q)) == []
     assert ros.frames(odometry(ros, q)) == []
-    [sentence] = ros.problems.sentences()
+    [sentence] = sentences(ros.problems)
     assert sentence.startswith(
-        "/t: 2 messages skipped; the first because nav_msgs/msg/Odometry at log time 9000000000 ns: "
+        "/t: 2 messages skipped; the first because nav_msgs/msg/Odometry at log "
+        "time 9000000000 ns: "
     )
 
 
@@ -194,7 +195,7 @@ def test_point_cloud(ros: Ros) -> None:
 
 def test_a_cloud_that_claims_more_than_it_has_is_named(ros: Ros) -> None:
     assert ros.frames(cloud(ros, 2**31, b"\0" * 16)) == []
-    assert "2147483648 x 1 points" in ros.problems.sentences()[0]
+    assert "2147483648 x 1 points" in sentences(ros.problems)[0]
 
 
 def image(ros: Ros, encoding: str, data: bytes, width: int, height: int, step: int) -> Any:
@@ -279,7 +280,7 @@ def test_camera_info(ros: Ros) -> None:
     assert frame.R.tolist() == np.eye(3).tolist()
     assert frame.P.tolist() == [[100, 0, 2, 0], [0, 100, 3, 0], [0, 0, 1, 0]]
     assert ros.frames(camera_info(ros, 0.0)) == []
-    assert "not calibrated" in ros.problems.sentences()[0]
+    assert "not calibrated" in sentences(ros.problems)[0]
 
 
 def test_imu_and_nav_sat(ros: Ros) -> None:
@@ -342,12 +343,16 @@ def test_imu_and_nav_sat(ros: Ros) -> None:
             np.diag([4.0] * 3).tolist() if known else None
         )
     assert fix(-1, 47.25) == []
-    assert ros.problems.sentences() == []  # a receiver without a fix is no problem of the log
+    assert sentences(ros.problems) == []  # a receiver without a fix is not a problem of the log
     assert fix(0, math.nan) == []
-    assert len(ros.problems.sentences()) == 1
+    assert len(sentences(ros.problems)) == 1
 
 
-IMU_LIKE = b"geometry_msgs/Vector3 linear_acceleration\ngeometry_msgs/Vector3 angular_velocity\nstd_msgs/Header header\n"
+IMU_LIKE = (
+    b"geometry_msgs/Vector3 linear_acceleration\n"
+    b"geometry_msgs/Vector3 angular_velocity\n"
+    b"std_msgs/Header header\n"
+)
 
 
 def test_the_definition_in_the_log_beats_the_standard_one() -> None:
@@ -378,7 +383,7 @@ module geometry_msgs { module msg { struct PoseStamped {
         message, "/p", Definition("geometry_msgs/msg/PoseStamped", "ros2idl", idl.encode())
     )
     np.testing.assert_allclose(frame.frame_T_child, TURNED, atol=1e-12)
-    assert ros.problems.sentences() == []
+    assert sentences(ros.problems) == []
 
 
 @pytest.mark.parametrize(
@@ -407,7 +412,7 @@ def test_definitions_that_cannot_be_used_are_named(encoding: str, text: bytes) -
             )
             == []
         )
-    [sentence] = ros.problems.sentences()
+    [sentence] = sentences(ros.problems)
     assert sentence.startswith("/i: 2 messages skipped")
 
 
@@ -422,7 +427,7 @@ def test_cut_off_messages_are_named(ros: Ros) -> None:
             )
             == []
         )
-    assert ros.problems.sentences()[0].startswith(f"/o: {len(data) - 8} messages skipped")
+    assert sentences(ros.problems)[0].startswith(f"/o: {len(data) - 8} messages skipped")
 
 
 # -- Foxglove
@@ -550,7 +555,7 @@ def test_json_messages() -> None:
 def test_json_without_sense_is_named(value: Any) -> None:
     frames, problems = json_frames("foxglove.PoseInFrame", value)
     assert frames == []
-    assert len(problems.sentences()) == 1
+    assert len(sentences(problems)) == 1
 
 
 def test_types_of_no_use_are_no_problem() -> None:
@@ -558,7 +563,7 @@ def test_types_of_no_use_are_no_problem() -> None:
     assert (
         Decoder(problems).frames(Message("/c", "std_msgs/msg/String", "cdr", 1, b"", NOTHING)) == []
     )
-    assert problems.sentences() == []
+    assert sentences(problems) == []
 
 
 def test_impossible_times_are_named() -> None:
@@ -567,10 +572,10 @@ def test_impossible_times_are_named() -> None:
         {"timestamp": {"sec": 1 << 60, "nsec": 0}, "latitude": 1, "longitude": 2},
     )
     assert frames == []
-    assert "is impossible" in problems.sentences()[0]
+    assert "is impossible" in sentences(problems)[0]
 
 
-def test_what_labels_mean() -> None:
+def test_the_meaning_of_labels() -> None:
     """A LabelInfo without a definition in the log, and the name of a label space."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(
@@ -617,4 +622,4 @@ def test_what_labels_mean() -> None:
         )
         == []
     )
-    assert problems.sentences() == []
+    assert sentences(problems) == []

@@ -108,7 +108,7 @@ def test_a_png_that_claims_gigapixels_is_refused_before_it_is_decoded() -> None:
         b"\xff\xd8" + b"\xff" * 40,
     ],
 )
-def test_what_is_no_picture(data: bytes) -> None:
+def test_bytes_that_are_not_a_picture(data: bytes) -> None:
     with pytest.raises(UndecodableError):
         decode_compressed(data)
 
@@ -198,5 +198,5 @@ def test_damaged_rvl_is_refused_or_decoded(data: bytes) -> None:
         ("/camera/depth/image", "mono8", False),
     ],
 )
-def test_what_counts_as_depth(topic: str, encoding: str, expected: bool) -> None:
+def test_which_pictures_are_depth(topic: str, encoding: str, expected: bool) -> None:
     assert is_depth(topic, encoding) is expected

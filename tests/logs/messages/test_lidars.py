@@ -21,9 +21,9 @@ from semloc_logs.errors import RoleError
 from semloc_logs.frames import LidarFrame
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.messages.decode import Decoder
-from semloc_logs.logs.problems import Problems
+from semloc_logs.logs.problems import Problems, lost, sentences
 from semloc_logs.logs.roles import find_roles, guess_roles, no_sensor
-from semloc_logs.logs.session.session import open_session
+from semloc_logs.logs.session.session import SessionOptions, open_session
 from semloc_logs.numerics import transforms
 from semloc_logs.numerics.transforms import Array, yaw_transform
 
@@ -42,9 +42,7 @@ def rows(points: Array) -> NDArray[np.void]:
 
 
 def half_room(world_T_sensor: Array, ahead: float, seed: int) -> Array:
-    """Points (n, 3) of the room's walls, in the sensor frame, with x in the room on the side
-    ``ahead`` (1 or -1).
-    """
+    """Points (n, 3) of the walls on one side, ``ahead`` 1 or -1, in the sensor frame."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (6000, 3)) * HALF
     axis = rng.integers(0, 3, len(points))
@@ -116,9 +114,10 @@ def test_the_fused_map_is_the_room(recorder: Any, tmp_path: Path) -> None:
 def test_a_missing_extrinsic_costs_one_lidar_and_one_sentence(recorder: Any) -> None:
     session = open_session([drive(recorder(), mounts=("front",))])
     assert {c.header.topic for c in session.clouds()} == {"/front/points"}
-    [sentence] = session.skipped
+    [sentence] = sentences(lost(session.problems))
     assert sentence.startswith(
-        "/rear/points: 8 of 8 frames are left out: no transform leads from their frame to the base frame"
+        "/rear/points: 8 of 8 frames are left out: no transform leads from their "
+        "frame to the base frame"
     )
 
 
@@ -164,17 +163,20 @@ def test_one_lidar_twice_is_used_once(
     path = publish_twice(recorder(), change, "/segmented_or_not", frame)
     session = open_session([path])
     assert [c.header.topic for c in session.clouds()] == ["/lidar"] * 6
-    assert session.skipped == []
-    assert any(p.startswith("/segmented_or_not repeats points of /lidar") for p in session.problems)
-    both = open_session([path], {"lidar": "/lidar,/segmented_or_not"})
+    assert lost(session.problems) == []
+    assert any(
+        p.startswith("/segmented_or_not repeats points of /lidar")
+        for p in sentences(session.problems)
+    )
+    both = open_session([path], SessionOptions(topics={"lidar": "/lidar,/segmented_or_not"}))
     assert len(list(both.clouds())) == 12
 
 
-def test_the_name_tells_a_filtered_topic(recorder: Any) -> None:
+def test_a_filtered_topic_by_its_name(recorder: Any) -> None:
     path = publish_twice(recorder(), without_ground, "/lidar_filtered")
     session = open_session([path])
     assert [c.header.topic for c in session.clouds()] == ["/lidar"] * 6
-    assert any(p.startswith("/lidar_filtered is left out") for p in session.problems)
+    assert any(p.startswith("/lidar_filtered is left out") for p in sentences(session.problems))
 
 
 def test_two_sensors_in_one_frame_are_both_used(recorder: Any) -> None:
@@ -189,8 +191,14 @@ def test_two_sensors_in_one_frame_are_both_used(recorder: Any) -> None:
 # -- other messages
 
 CUSTOM = {
-    "ros2": "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n",
-    "point": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n",
+    "ros2": (
+        "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 "
+        "lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+    ),
+    "point": (
+        "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 "
+        "reflectivity\nuint8 tag\nuint8 line\n"
+    ),
 }
 PACKAGES = ["livox_ros_driver", "livox_ros_driver2", "livox_interfaces"]
 
@@ -239,7 +247,7 @@ def test_livox_with_and_without_its_definition(package: str, encoding: str, fram
         frames = Decoder(problems).frames(
             Message("/livox/lidar", f"{package}/msg/CustomMsg", encoding, 1, data, known)
         )
-        assert problems.sentences() == []
+        assert sentences(problems) == []
         [frame] = frames
         assert isinstance(frame, LidarFrame)
         assert (frame.header.stamp_ns, frame.header.frame_id) == (EPOCH + 250, frame_id)
@@ -257,7 +265,7 @@ def test_livox_claims_and_strange_definitions(encoding: str) -> None:
         problems = Problems()
         message = Message("/l", f"{PACKAGES[0]}/msg/CustomMsg", encoding, 1, data[:cut], definition)
         assert Decoder(problems).frames(message) == []
-        assert len(problems.sentences()) == 1
+        assert len(sentences(problems)) == 1
     count = struct.pack("<I", 5)
     at = data.rindex(count, 0, len(data) - 5 * 19)
     problems = Problems()
@@ -278,8 +286,8 @@ def test_livox_claims_and_strange_definitions(encoding: str) -> None:
         == []
     )
     assert (
-        "not that of the Livox drivers" in problems.sentences()[0]
-        or "need" in problems.sentences()[0]
+        "differs from the Livox drivers" in sentences(problems)[0]
+        or "need" in sentences(problems)[0]
     )
 
 
@@ -312,10 +320,10 @@ def test_packets_are_named(type_: str, recorder: Any) -> None:
     assert no_sensor(streams).startswith(f"/packets holds {type_}, packets")
     streams.append(Stream("/points", "sensor_msgs/msg/PointCloud2", "cdr", 3))
     assert guess_roles(streams).lidar == ("/points",)
-    assert any(n.startswith("/packets holds") for n in guess_roles(streams).notes)
+    assert any(n.startswith("/packets holds") for n in sentences(guess_roles(streams).notes))
 
 
-def test_a_log_of_packets_is_refused_with_what_to_do(recorder: Any) -> None:
+def test_a_log_of_packets_is_refused_with_advice(recorder: Any) -> None:
     log = recorder()
     text = "std_msgs/Header header\nVelodynePacket[] packets\n"
     log.store = get_typestore(Stores.ROS2_HUMBLE)
@@ -331,7 +339,10 @@ def test_a_log_of_packets_is_refused_with_what_to_do(recorder: Any) -> None:
     log.add("/velodyne_packets", scan, EPOCH)
     with pytest.raises(
         RoleError,
-        match=r"drive.mcap: /velodyne_packets holds velodyne_msgs/msg/VelodyneScan, packets .* PointCloud2",
+        match=(
+            r"drive.mcap: /velodyne_packets holds velodyne_msgs/msg/VelodyneScan, "
+            r"packets .* PointCloud2"
+        ),
     ):
         open_session([log.write()])
 

@@ -1,4 +1,4 @@
-"""Blocks of bytes to points: layouts, byte orders, what is dropped, and what the times mean."""
+"""Blocks of bytes to points: layouts, byte orders, dropped points and times."""
 
 import struct
 

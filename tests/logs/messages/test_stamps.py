@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semloc_logs.logs.messages.stamps import StampOrder
+from semloc_logs.logs.messages.stamps import StampOrder, time_range, utc
 from semloc_logs.logs.poses.standstill import Standstill
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.numerics.transforms import yaw_transform
@@ -28,7 +28,7 @@ S = 1_000_000_000
         ([0, 1, 3600, 7200, 2, 3], []),
     ],
 )
-def test_what_goes_back_is_refused(seconds: list[float], refused: list[float]) -> None:
+def test_stamps_that_go_back_are_refused(seconds: list[float], refused: list[float]) -> None:
     order = StampOrder()
     assert [s for s in seconds if not order.accepts(round(s * S))] == refused
 
@@ -57,3 +57,11 @@ def test_surroundings_that_move_while_the_poses_stand(speed: float, moves: bool)
         street += rng.normal(0, 0.02, street.shape)
         watch.add((street - [speed * k, 0, 0]).astype(np.float32), yaw_transform(0.0, (7.0, 0, 0)))
     assert (watch.shift > 0) == moves
+
+
+def test_times_for_people() -> None:
+    assert utc(1_700_000_000_123_456_789) == "2023-11-14T22:13:20.123Z"
+    assert utc(1 << 62) == "2116-02-20T23:53:38.427Z"
+    assert utc(1 << 80) == f"{1 << 80} ns"
+    assert time_range(0, 1_500_000_000) == "1970-01-01T00:00:00.000Z to 1970-01-01T00:00:01.500Z"
+    assert time_range(None, 1) == "none"

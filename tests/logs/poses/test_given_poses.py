@@ -23,10 +23,11 @@ from semloc_logs.frames import (
     TransformSample,
 )
 from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.poses import lidar_odometry
+from semloc_logs.logs.poses.lidar_odometry import LidarOdometry
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
-from semloc_logs.logs.session import lidar_odometry
-from semloc_logs.logs.session.lidar_odometry import LidarOdometry
-from semloc_logs.logs.session.session import Session
+from semloc_logs.logs.problems import Problem, lost, sentences
+from semloc_logs.logs.session.session import Session, SessionOptions
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
 S = 1_000_000_000
@@ -34,9 +35,11 @@ EPOCH = 1_700_000_000 * S
 MOUNT = yaw_transform(np.pi / 2, (1.0, 0.0, 2.0))  # base_T_lidar
 POINTS = np.array([[5.0, 0.0, 0.0], [0.0, 7.0, 0.0]], np.float32)
 TYPES: dict[type, str] = {
-    LidarFrame: "sensor_msgs/msg/PointCloud2", TransformSample: "tf2_msgs/msg/TFMessage", PoseSample: "nav_msgs/msg/Odometry",
+    LidarFrame: "sensor_msgs/msg/PointCloud2",
+    TransformSample: "tf2_msgs/msg/TFMessage",
+    PoseSample: "nav_msgs/msg/Odometry",
     NavSatSample: "sensor_msgs/msg/NavSatFix",
-}  # fmt: skip
+}
 
 
 class FakeLog:
@@ -49,7 +52,7 @@ class FakeLog:
         self.encoding = "ros2"
         self.start_ns: int | None = self._frames[0].header.log_time_ns
         self.end_ns: int | None = self._frames[-1].header.log_time_ns
-        self.problems: list[str] = []
+        self.problems: list[Problem] = []
         topics = [f.header.topic for f in frames]
         kinds = {f.header.topic: TYPES[type(f)] for f in frames}
         self.streams = [
@@ -92,7 +95,7 @@ def tum(path: Path, seconds: Collection[float]) -> Path:
 
 def test_a_tum_file_gives_the_poses_of_the_base_frame(tmp_path: Path) -> None:
     poses = TrajectoryFile(tum(tmp_path / "a.tum", np.arange(0, 1.05, 0.05).tolist()))
-    session = Session([FakeLog([STATIC, *sweeps(10)])], poses=poses)
+    session = Session([FakeLog([STATIC, *sweeps(10)])], SessionOptions(poses=poses))
     clouds = list(session.clouds())
     assert len(clouds) == 10
     assert clouds[3].session_T_base is not None
@@ -102,11 +105,11 @@ def test_a_tum_file_gives_the_poses_of_the_base_frame(tmp_path: Path) -> None:
     np.testing.assert_allclose(clouds[3].points[0], [1.0, 5.0, 2.0], atol=1e-5)
     assert (session.base_frame, session.session_frame) == ("base_link", "trajectory")
     assert len(session.trajectory()[0]) == 21
-    assert session.skipped == []
+    assert lost(session.problems) == []
     assert session.problems == []
-    told = session.to_json()["pose_source"]
-    assert isinstance(told, dict)
-    assert (told["kind"], told["path"], told["fingerprint"]) == (
+    content = session.to_json()["pose_source"]
+    assert isinstance(content, dict)
+    assert (content["kind"], content["path"], content["fingerprint"]) == (
         "file",
         str(poses.path),
         poses.fingerprint(),
@@ -115,7 +118,7 @@ def test_a_tum_file_gives_the_poses_of_the_base_frame(tmp_path: Path) -> None:
 
 def test_poses_of_a_named_frame(tmp_path: Path) -> None:
     source = TrajectoryFile(tum(tmp_path / "a.tum", [0.0, 0.5, 1.0]), frame="lidar")
-    session = Session([FakeLog([STATIC, *sweeps(10)])], poses=source)
+    session = Session([FakeLog([STATIC, *sweeps(10)])], SessionOptions(poses=source))
     clouds = list(session.clouds())
     assert session.base_frame == "base_link"
     assert clouds[5].session_T_base is not None
@@ -123,7 +126,8 @@ def test_poses_of_a_named_frame(tmp_path: Path) -> None:
         clouds[5].session_T_base, yaw_transform(0.0, (10.5, 0, 0)) @ inverse(MOUNT), atol=1e-9
     )
     wrong = Session(
-        [FakeLog([STATIC, *sweeps(10)])], poses=TrajectoryFile(source.path, frame="velodine")
+        [FakeLog([STATIC, *sweeps(10)])],
+        SessionOptions(poses=TrajectoryFile(source.path, frame="velodine")),
     )
     with pytest.raises(
         LogError,
@@ -134,13 +138,14 @@ def test_poses_of_a_named_frame(tmp_path: Path) -> None:
 
 def test_a_file_that_covers_part_of_the_log(tmp_path: Path) -> None:
     source = TrajectoryFile(tum(tmp_path / "a.tum", np.arange(2, 4.05, 0.1).tolist()))
-    session = Session([FakeLog([STATIC, *sweeps(100)])], poses=source)
+    session = Session([FakeLog([STATIC, *sweeps(100)])], SessionOptions(poses=source))
     clouds = list(session.clouds())
     stamps = [c.header.stamp_ns - EPOCH for c in clouds]
     # the nearest pose serves a tenth of a second
     assert (min(stamps), max(stamps)) == (19 * S // 10, 41 * S // 10)
     assert any(
-        "77 of 100 frames are left out: no pose is known" in said for said in session.skipped
+        "77 of 100 frames are left out: no pose is known" in problem
+        for problem in sentences(lost(session.problems))
     )
 
 
@@ -155,7 +160,7 @@ def test_the_logs_own_poses_are_not_used_beside_a_file(tmp_path: Path) -> None:
         for k in range(11)
     ]
     source = TrajectoryFile(tum(tmp_path / "a.tum", [0.0, 0.5, 1.0]))
-    session = Session([FakeLog([STATIC, *sweeps(10), *own])], poses=source)
+    session = Session([FakeLog([STATIC, *sweeps(10), *own])], SessionOptions(poses=source))
     clouds = list(session.clouds())
     assert len(clouds) == 10
     assert clouds[-1].session_T_base is not None
@@ -167,8 +172,7 @@ def test_kitti_lines_belong_to_the_frames_of_the_first_lidar(tmp_path: Path) -> 
     path.write_text("".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(10)))
     session = Session(
         [FakeLog([STATIC, *sweeps(10), *sweeps(5, "/rear")])],
-        {"lidar": "/points,/rear"},
-        poses=TrajectoryFile(path),
+        SessionOptions(topics={"lidar": "/points,/rear"}, poses=TrajectoryFile(path)),
     )
     clouds = list(session.clouds())
     assert len(clouds) == 15
@@ -203,7 +207,7 @@ def along(*x: float) -> list[F64]:
 
 def test_odometry_of_the_sensor_becomes_that_of_the_base(engine: Any) -> None:
     engine.steps = along(*(0.2 * np.arange(10)))
-    session = Session([FakeLog([STATIC, *sweeps(10, many=60)])], odometry="lidar")
+    session = Session([FakeLog([STATIC, *sweeps(10, many=60)])], SessionOptions(odometry="lidar"))
     clouds = list(session.clouds())
     assert len(clouds) == len(engine.calls) == 10
     for k, cloud in enumerate(clouds):
@@ -229,7 +233,7 @@ def test_every_sweep_is_registered_and_its_pose_is_that_of_its_last_point(engine
         LidarFrame(header("/points", 0.1 * k, "lidar"), np.tile(POINTS, (60, 1)), offset_ns=offsets)
         for k in range(3)
     ]
-    session = Session([FakeLog(frames)], odometry="lidar")
+    session = Session([FakeLog(frames)], SessionOptions(odometry="lidar"))
     clouds = list(session.clouds())
     stamps, poses = session.trajectory()
     assert ((stamps - EPOCH) / S).tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3])
@@ -240,16 +244,20 @@ def test_every_sweep_is_registered_and_its_pose_is_that_of_its_last_point(engine
     np.testing.assert_allclose(clouds[1].points[-1], [0.1, 7.0, 0.0], atol=2e-3)
 
 
-def test_a_jump_ends_the_poses_and_is_said(engine: Any) -> None:
+def test_a_jump_ends_the_poses_and_is_named(engine: Any) -> None:
     engine.steps = along(*(0.1 * np.arange(6)), 5.0, *([5.0] * 20))
-    session = Session([FakeLog([STATIC, *sweeps(20, many=60)])], odometry="lidar")
+    session = Session([FakeLog([STATIC, *sweeps(20, many=60)])], SessionOptions(odometry="lidar"))
     clouds = list(session.clouds())
     assert len(engine.calls) == 7
     assert len(clouds) == 7  # the nearest pose serves a tenth of a second
     assert any(
-        "LIDAR odometry lost track at 2023-11-14T22:13:20.600Z" in said for said in session.skipped
+        "LIDAR odometry lost track at 2023-11-14T22:13:20.600Z" in problem
+        for problem in sentences(lost(session.problems))
     )
-    assert any("13 of 20 frames are left out: no pose" in said for said in session.skipped)
+    assert any(
+        "13 of 20 frames are left out: no pose" in problem
+        for problem in sentences(lost(session.problems))
+    )
 
 
 def test_a_sweep_that_does_not_lie_on_the_one_before_ends_the_poses(engine: Any) -> None:
@@ -259,13 +267,13 @@ def test_a_sweep_that_does_not_lie_on_the_one_before_ends_the_poses(engine: Any)
     for frame in sweeps(5, many=60):
         made.take(frame)
     assert len(engine.calls) == 4
-    assert "lost track at 2023-11-14T22:13:20.300Z" in made.problems[0]
+    assert "lost track at 2023-11-14T22:13:20.300Z" in sentences(made.problems)[0]
 
 
 @pytest.mark.parametrize(
     "pose", [yaw_transform(1.5), np.full((4, 4), np.nan), yaw_transform(0.0, (30.0, 0, 0))]
 )
-def test_what_no_vehicle_does_is_a_jump(engine: Any, pose: F64) -> None:
+def test_steps_that_no_vehicle_makes_are_jumps(engine: Any, pose: F64) -> None:
     engine.steps = [np.eye(4), pose]
     made = LidarOdometry("/points", min_range=0.5, max_range=80.0)
     for frame in sweeps(2, many=60):
@@ -282,26 +290,29 @@ def test_sparse_and_repeated_sweeps_are_counted(engine: Any) -> None:
         made.take(frame)
     made.finish()
     assert len(list(made.poses(lambda *_: None))) == 2
-    assert made.problems == [
+    assert sentences(made.problems) == [
         "/points: 3 sweeps are too sparse or out of order for LIDAR odometry and were left out."
     ]
 
 
 def test_one_sweep_has_the_identity(engine: Any) -> None:
     engine.steps = [np.eye(4)]
-    session = Session([FakeLog([STATIC, *sweeps(1, many=60)])], odometry="lidar")
+    session = Session([FakeLog([STATIC, *sweeps(1, many=60)])], SessionOptions(odometry="lidar"))
     (cloud,) = session.clouds()
     assert cloud.session_T_base is not None
     np.testing.assert_allclose(cloud.session_T_base, np.eye(4), atol=1e-12)
 
 
-def test_without_kiss_icp_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_kiss_icp_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
     with pytest.raises(
         LogError,
-        match=r"install it with pip install 'semloc_logs\[odometry\]', or give poses with --poses FILE",
+        match=(
+            r"install it with pip install 'semloc_logs\[odometry\]', or give "
+            r"poses with --poses FILE"
+        ),
     ):
-        Session([FakeLog(sweeps(1))], odometry="lidar")
+        Session([FakeLog(sweeps(1))], SessionOptions(odometry="lidar"))
 
 
 # -- KISS-ICP itself
@@ -374,6 +385,6 @@ def test_fixes_serve_where_there_is_nothing_else() -> None:
         session = Session([FakeLog([*frames, *better])])
         assert len(list(session.clouds())) == 40
         assert session.session_frame == "odom"
-        session = Session([FakeLog([*frames, *better])], {"pose": "/fix"})
+        session = Session([FakeLog([*frames, *better])], SessionOptions(topics={"pose": "/fix"}))
         assert len(list(session.clouds())) == 40
         assert session.session_frame == "enu"

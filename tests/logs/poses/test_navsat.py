@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.frames import F64, Frame, Header, ImuSample, NavSatSample
 from semloc_logs.logs.poses.navsat import LocalFrame, NavSatPoses, earth_centred
+from semloc_logs.logs.problems import sentences
 from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
@@ -51,8 +52,9 @@ def test_axes_point_east_north_and_up() -> None:
 
 
 def degrees_of(east: float, north: float) -> tuple[float, float]:
-    """Latitude and longitude of a place near the datum, by the radii of curvature at the datum:
-    good to a millimetre within 100 m.
+    """Latitude and longitude of a place near the datum, by the radii of curvature there.
+
+    Good to a millimetre within 100 m.
     """
     eccentricity = 1.0 - (B / A) ** 2
     w = 1.0 - eccentricity * np.sin(np.radians(LATITUDE)) ** 2
@@ -154,9 +156,8 @@ def test_with_the_orientation_of_a_mounted_imu() -> None:
     assert len(found) == 100
     check(found, position=0.01, angle=0.1)
     assert source.problems == []
-    assert source.notes == []
-    told = source.to_json()
-    assert (told["heading"], told["fixes"]) == ("imu", 100)
+    content = source.to_json()
+    assert (content["heading"], content["fixes"]) == ("imu", 100)
 
 
 def test_with_the_course_and_an_accelerometer() -> None:
@@ -186,29 +187,31 @@ def test_an_imu_of_unknown_mounting_is_not_believed() -> None:
         position=2,
         angle=1,
     )
-    assert any("from 'imu', the IMU's frame" in note for note in source.notes)
-    assert any("from 'gps', the antenna of /fix" in note for note in source.notes)
+    assert any("from 'imu', the IMU's frame" in note for note in sentences(source.problems))
+    assert any("from 'gps', the antenna of /fix" in note for note in sentences(source.problems))
 
 
-def test_a_heading_that_is_not_relative_to_east_is_said() -> None:
+def test_a_heading_that_is_not_relative_to_east() -> None:
     source = NavSatPoses("/fix", 100)
     drive(source, [*fixes(), *samples(with_orientation=True, offset=np.radians(90))])
-    (said,) = source.problems
-    assert re.search(r"off the course over ground by (89|9[0-2]) degrees.*--topic imu=none", said)
+    (problem,) = sentences(source.problems)
+    assert re.search(
+        r"off the course over ground by (89|9[0-2]) degrees.*--topic imu=none", problem
+    )
 
 
 def test_uncertain_and_missing_fixes_are_left_out() -> None:
     frames = fixes()
     frames[10] = fix(2.0, antenna_at(2.0) + np.array([30.0, 0, 0]), sigma=8.0)
     frames[11] = fix(2.2, antenna_at(2.2), sigma=None)
-    # three messages said that there was no fix, so they gave no sample
+    # three messages reported that there was no fix, so they gave no sample
     source = NavSatPoses("/fix", 103)
     found = drive(source, [*frames, *samples(with_orientation=True)])
     assert len(found) == 99
     assert 2.0 not in found
     check(found, position=0.01, angle=0.1)
-    assert source.problems == [
-        "/fix: 3 of 103 messages say that there is no fix; they were left out.",
+    assert sentences(source.problems) == [
+        "/fix: 3 of 103 messages report that there is no fix; they were left out.",
         "/fix: 1 of 103 messages are less certain than 5 m or out of order; they were left out.",
     ]
 
@@ -220,15 +223,15 @@ def test_a_gap_stays_a_gap() -> None:
     check({t: p for t, p in found.items() if 1.5 < t < 18}, position=0.2, angle=6.0)
 
 
-def test_who_never_moves_has_no_heading() -> None:
+def test_a_vehicle_that_never_moves_has_no_heading() -> None:
     source = NavSatPoses("/fix", 50)
     assert drive(source, [fix(0.2 * k, np.zeros(3)) for k in range(50)]) == {}
-    (said,) = source.problems
-    assert "never moves faster than 1 m/s" in said
-    assert "50 fixes give no pose" in said
+    (problem,) = sentences(source.problems)
+    assert "never moves faster than 1 m/s" in problem
+    assert "50 fixes give no pose" in problem
 
 
-def test_who_stands_first_looks_where_he_then_goes() -> None:
+def test_the_heading_before_the_start_is_the_first_course() -> None:
     standing = [fix(0.2 * k - 10, np.zeros(3)) for k in range(50)]
     found = drive(NavSatPoses("/fix", 150), [*standing, *fixes()], knows=())
     assert len(found) == 150
@@ -243,9 +246,7 @@ def test_driving_backwards_is_not_turning() -> None:
 
 
 def test_the_fixes_of_a_husky_agree_with_its_odometry(shared: Callable[[str], Path]) -> None:
-    """Its length by fixes of a metre's noise is longer than by its wheels, but of the same size;
-    fixes are used when named.
-    """
+    """The length by fixes of a metre's noise is longer than by wheels, but of the same size."""
     log = shared("odd_logs/husky_imu_gnss_odometry.bag")
     wheels = inspect_log(log)
     named = inspect_log(log, {"pose": "/fix"})

@@ -114,9 +114,9 @@ def test_length_and_gaps() -> None:
     poses = track(*np.arange(0, 1.01, 0.1), 5.0, 5.5)
     assert poses.gaps() == [(EPOCH + S, EPOCH + 5 * S)]
     assert poses.length() == pytest.approx(2.0 + 1.0)
-    told = poses.to_json()
-    assert told["count"] == 13
-    assert told["length_m"] == 3.0
+    content = poses.to_json()
+    assert content["count"] == 13
+    assert content["length_m"] == 3.0
 
 
 def test_an_empty_track_knows_nothing() -> None:
@@ -131,7 +131,7 @@ def test_an_empty_track_knows_nothing() -> None:
     st.lists(st.integers(0, 4000), min_size=2, max_size=30, unique=True),
     st.lists(st.integers(-300, 4300), min_size=1, max_size=20),
 )
-def test_agrees_with_a_slow_version(milliseconds: list[int], asked: list[int]) -> None:
+def test_agrees_with_a_slow_version(milliseconds: list[int], wanted: list[int]) -> None:
     stamps = np.sort(np.array(milliseconds)) * 1_000_000 + EPOCH
     rng = np.random.default_rng(len(milliseconds))
     rotations = Rotation.random(len(stamps), random_state=rng)
@@ -144,7 +144,7 @@ def test_agrees_with_a_slow_version(milliseconds: list[int], asked: list[int]) -
         pose[:3, :3], pose[:3, 3] = rotation, position
         assert poses.append(stamp, pose)
     limit = poses.gap_limit_ns()
-    for ms in asked:
+    for ms in wanted:
         t = ms * 1_000_000 + EPOCH
         found = poses.at(t)
         inside = int(np.clip(t, stamps[0], stamps[-1]))

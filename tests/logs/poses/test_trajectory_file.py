@@ -1,6 +1,4 @@
-"""Trajectories from files: exact stamps, both formats, what is refused and where, and sessions that
-use them.
-"""
+"""Trajectories from files: exact stamps, both formats, errors with their line, and sessions."""
 
 from __future__ import annotations
 
@@ -48,7 +46,8 @@ def kitti(pose: F64) -> str:
 def test_tum_with_comments_and_blank_lines(tmp_path: Path) -> None:
     found = read(
         tmp_path,
-        f"# stamp tx ty tz qx qy qz qw\n\n{TUM_LINE.format(stamp='1.5')}\n{TUM_LINE.format(stamp='2')} # end\n",
+        f"# stamp tx ty tz qx qy qz qw\n\n{TUM_LINE.format(stamp='1.5')}\n"
+        f"{TUM_LINE.format(stamp='2')} # end\n",
     )
     assert found.stamps_ns is not None
     assert found.stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
@@ -73,8 +72,8 @@ def test_nanoseconds_survive_as_decimals(stamp_ns: int) -> None:
 @pytest.mark.parametrize(
     "text", ["nan", "inf", "1e99999999", "x", "1700000000123456789", "1,5", "-9e99"]
 )
-def test_what_is_no_time(text: str) -> None:
-    with pytest.raises(LogError, match=r"x.tum, line 7: '.*' is no time in seconds\."):
+def test_text_that_is_not_a_time(text: str) -> None:
+    with pytest.raises(LogError, match=r"x.tum, line 7: '.*' is not a time in seconds\."):
         seconds_to_ns(text, Path("x.tum"), 7)
 
 
@@ -94,7 +93,7 @@ def test_kitti_round_trip_with_and_without_times(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("", "poses.txt has no poses"),
         ("# nothing\n", "poses.txt has no poses"),
@@ -105,24 +104,24 @@ def test_kitti_round_trip_with_and_without_times(tmp_path: Path) -> None:
         ),
         (
             "# a\n" + TUM_LINE.format(stamp=1) + "\n2 1 x 3 0 0 0 1\n",
-            "line 3 has something that is no number",
+            "line 3 has a word that is not a number",
         ),
         (
             TUM_LINE.format(stamp=1) + "\n2 1 nan 3 0 0 0 1\n",
-            "line 2 has something that is no number",
+            "line 2 has a word that is not a number",
         ),
         ("1 1 2 3 0 0 0 0\n", "line 1: the quaternion .* has the length 0, not 1"),
         (
             "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 2 0\n",
-            "line 2: the 3 x 3 part is no rotation",
+            "line 2: the 3 x 3 part is not a rotation",
         ),
-        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "line 1: the 3 x 3 part is no rotation"),
-        ("1e200 0 0 0 0 1e200 0 0 0 0 1e200 0\n", "line 1: the 3 x 3 part is no rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "line 1: the 3 x 3 part is not a rotation"),
+        ("1e200 0 0 0 0 1e200 0 0 0 0 1e200 0\n", "line 1: the 3 x 3 part is not a rotation"),
         ("1 " * 5000, "line 1 is longer than 4096 characters"),
     ],
 )
-def test_bad_files_are_one_sentence_with_the_line(tmp_path: Path, text: str, says: str) -> None:
-    with pytest.raises(LogError, match=says) as caught:
+def test_bad_files_are_one_sentence_with_the_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(LogError, match=message) as caught:
         read(tmp_path, text)
     assert str(tmp_path / "poses.txt") in str(caught.value)
 
@@ -133,7 +132,7 @@ def test_other_bad_files(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be read"):
         TrajectoryFile(tmp_path / "none").fingerprint()
     (tmp_path / "binary").write_bytes(bytes(range(256)) * 10)
-    with pytest.raises(LogError, match="is no text"):
+    with pytest.raises(LogError, match="is not text"):
         read_trajectory(TrajectoryFile(tmp_path / "binary"))
     with pytest.raises(LogError, match="cannot be read"):
         read_trajectory(TrajectoryFile(tmp_path))
@@ -200,5 +199,5 @@ def test_times_from_zero_count_from_the_first_frame(tmp_path: Path) -> None:
 def test_a_pipe_is_refused_because_it_cannot_be_read_twice(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.tum")
     for path in (tmp_path / "pipe.tum", Path("/dev/zero"), tmp_path):
-        with pytest.raises(LogError, match="is no regular file"):
+        with pytest.raises(LogError, match="is not a regular file"):
             TrajectoryFile(path).fingerprint()

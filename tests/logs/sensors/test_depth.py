@@ -8,8 +8,15 @@ import pytest
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Camera, DepthFrame, Header, ImageFrame
+from semloc_logs.logs.problems import NoCloud, sentences
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.sensors.depth import DepthClouds, Unprojector, depth_sigma, label_ids
+from semloc_logs.logs.sensors.depth import (
+    DepthClouds,
+    RangePoints,
+    Unprojector,
+    depth_sigma,
+    label_ids,
+)
 
 
 def camera(
@@ -110,7 +117,7 @@ def test_rectified_pictures_use_the_projection_matrix() -> None:
     assert points[0].tolist() == pytest.approx([(6 - 8) / 8 * 2.0, (3 - 6) / 8 * 2.0, 2.0])
 
 
-def test_unusable_calibrations_are_said_so() -> None:
+def test_unusable_calibrations_are_refused() -> None:
     with pytest.raises(LogError, match="is for 8 x 6 pixels but the depth image has 4 x 3"):
         Unprojector(camera(), 3, 4)
     with pytest.raises(LogError, match="no focal length"):
@@ -150,48 +157,48 @@ def label_frame(stamp_ns: int, value: int, shape: tuple[int, ...] = (6, 8)) -> I
 
 def test_labels_come_from_the_nearest_label_image() -> None:
     clouds = DepthClouds(ROLES)
-    clouds.cameras["/d/camera_info"] = camera()
+    clouds.calibrations["/d/camera_info"] = camera()
     ms = 1_000_000
     for k in range(5):
         clouds.labels.take(label_frame(k * 100 * ms, k))
     found = clouds.points(depth_frame(204 * ms), 0.0, 80.0)
-    assert not isinstance(found, str)
+    assert isinstance(found, RangePoints)
     assert found[1] is not None
     assert set(found[1].tolist()) == {2}
     unlabelled = clouds.points(depth_frame(250 * ms), 0.0, 80.0)
-    assert not isinstance(unlabelled, str)
+    assert isinstance(unlabelled, RangePoints)
     assert unlabelled[1] is None
 
 
 def test_each_pixel_gets_its_own_label() -> None:
     clouds = DepthClouds(ROLES, stride=2)
-    clouds.cameras["/d/camera_info"] = camera()
+    clouds.calibrations["/d/camera_info"] = camera()
     ids = np.arange(48, dtype=np.uint8).reshape(6, 8)
     clouds.labels.take(ImageFrame(Header("/d/label", 0, 0, ""), ids, "mono8"))
     found = clouds.points(depth_frame(), 0.0, 80.0)
-    assert not isinstance(found, str)
+    assert isinstance(found, RangePoints)
     assert found[1] is not None
     assert found[1].tolist() == ids[::2, ::2].ravel().tolist()
 
 
 def test_label_images_of_another_size_are_left_out_with_a_note() -> None:
     clouds = DepthClouds(ROLES)
-    clouds.cameras["/d/camera_info"] = camera()
+    clouds.calibrations["/d/camera_info"] = camera()
     clouds.labels.take(label_frame(0, 1, (3, 4)))
     found = clouds.points(depth_frame(), 0.0, 80.0)
-    assert not isinstance(found, str)
+    assert isinstance(found, RangePoints)
     assert found[1] is None
-    assert "--topic label_image=TOPIC" in next(iter(clouds.labels.notes))
+    assert "--topic label_image=TOPIC" in sentences(clouds.labels.problems)[0]
 
 
 def test_colours_of_a_label_image_are_packed() -> None:
     clouds = DepthClouds(ROLES)
-    clouds.cameras["/d/camera_info"] = camera()
+    clouds.calibrations["/d/camera_info"] = camera()
     colours = np.zeros((6, 8, 3), np.uint8)
     colours[..., 0], colours[..., 1], colours[..., 2] = 128, 64, 32
     clouds.labels.take(ImageFrame(Header("/d/label", 0, 0, ""), colours, "rgb8"))
     found = clouds.points(depth_frame(), 0.0, 80.0)
-    assert not isinstance(found, str)
+    assert isinstance(found, RangePoints)
     assert found[1] is not None
     assert set(found[1].tolist()) == {128 * 65536 + 64 * 256 + 32}
     assert clouds.labels.coloured == {"/d/label"}
@@ -199,17 +206,17 @@ def test_colours_of_a_label_image_are_packed() -> None:
 
 def test_reasons() -> None:
     clouds = DepthClouds(ROLES)
-    assert clouds.points(depth_frame(), 0.0, 80.0) == "no calibration"
-    clouds.cameras["/d/camera_info"] = camera()
-    assert clouds.points(depth_frame(shape=(3, 4)), 0.0, 80.0) == "unusable calibration"
-    assert len(clouds.lost) == 1
+    assert clouds.points(depth_frame(), 0.0, 80.0) == NoCloud.NO_CALIBRATION
+    clouds.calibrations["/d/camera_info"] = camera()
+    assert clouds.points(depth_frame(shape=(3, 4)), 0.0, 80.0) == NoCloud.UNUSABLE_CALIBRATION
+    assert len(sentences(clouds.problems)) == 1
     picture = ImageFrame(Header("/d/depth", 0, 0, ""), np.zeros((6, 8, 3), np.uint8), "rgb8")
-    assert clouds.points(picture, 0.0, 80.0) == "no depth"
+    assert clouds.points(picture, 0.0, 80.0) == NoCloud.NO_DEPTH
     millimetres = ImageFrame(
         Header("/d/depth", 0, 0, ""), np.full((6, 8), 1500, np.uint16), "mono16"
     )
     found = clouds.points(millimetres, 0.0, 80.0)
-    assert not isinstance(found, str)
+    assert isinstance(found, RangePoints)
     np.testing.assert_allclose(found[0][:, 2], 1.5)
 
 

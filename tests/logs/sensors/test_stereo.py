@@ -1,4 +1,4 @@
-"""Depth from synthetic pairs: a textured slanted plane, drawn through known lenses, must come back."""
+"""Depth from synthetic pairs: a textured slanted plane, drawn through known lenses."""
 
 from __future__ import annotations
 
@@ -75,9 +75,7 @@ def rays_of(lens: Camera) -> F64:
 def drawn(
     lens: Camera, left_T_camera: F64, seed: int, noise: float = 2.0, contrast: float = 1.0
 ) -> tuple[NDArray[np.uint8], F64]:
-    """The picture of the plane, and the true point of each pixel in the camera's own frame (h * w,
-    3).
-    """
+    """The picture of the plane, and the true point of each pixel in the camera's frame."""
     rays = rays_of(lens)
     normal = left_T_camera[:3, :3].T @ NORMAL
     distance = DISTANCE - NORMAL @ left_T_camera[:3, 3]
@@ -198,8 +196,9 @@ def test_disparities_follow_from_the_ranges(
 
 @pytest.mark.parametrize("shift", [0.0, 12.0, -30.0])
 def test_a_step_by_hand_in_rectified_pictures(shift: float) -> None:
-    """Two layers 20 and 8 pixels apart, at 2 and 5 m when the principal points are the same, and
-    also when they are not.
+    """Two layers 20 and 8 pixels apart, at 2 and 5 m.
+
+    With equal and with different principal points.
     """
     how = _unturned(240, 320, 400.0, 0.1, shift)
     noise = np.random.default_rng(3).integers(0, 255, (240, 700)).astype(np.uint8)
@@ -223,9 +222,7 @@ def test_a_step_by_hand_in_rectified_pictures(shift: float) -> None:
 
 
 def test_sigma_by_hand() -> None:
-    """f b = 40 px m: at 2 m the disparity is 20, and a fifth of a pixel is 4 / 40 / 5 = 2 cm on the
-    axis.
-    """
+    """f b = 40 px m: at 2 m the disparity is 20, a fifth of a pixel is 4 / 40 / 5 = 2 cm."""
     noise = np.random.default_rng(3).integers(0, 255, (240, 700)).astype(np.uint8)
     found = StereoMatcher(_unturned(240, 320), min_range=0.5, max_range=20.0, noise=0.2).points(
         noise[:, 100:420], noise[:, 120:440]
@@ -236,7 +233,7 @@ def test_sigma_by_hand() -> None:
     np.testing.assert_allclose(found.sigma / ray, found.sigma[middle], rtol=0.15)
 
 
-def test_what_cannot_be_matched_gives_nothing() -> None:
+def test_pictures_that_cannot_be_matched_give_nothing() -> None:
     matcher = StereoMatcher(_unturned(240, 320), min_range=0.5, max_range=20.0)
     rng = np.random.default_rng(0)
     flat = np.full((240, 320), 90, np.uint8)
@@ -339,7 +336,7 @@ def test_wide_lenses_keep_their_field_of_view_within_limits() -> None:
     assert wide.valid[0].mean() > 0.9
 
 
-def test_what_is_no_stereo_pair_is_said_in_a_sentence() -> None:
+def test_cameras_that_are_not_a_stereo_pair_are_refused_in_a_sentence() -> None:
     def refused(
         right_T_left: F64 | None, match: str, rectified: bool = False, right: Camera | None = None
     ) -> None:
@@ -354,17 +351,19 @@ def test_what_is_no_stereo_pair_is_said_in_a_sentence() -> None:
         assert str(error.value).endswith(".")
 
     ahead = exp_se3(np.array([-0.2, 0.0, 0.0]), np.zeros(3))
-    refused(None, "Nothing says where the cameras of /cam0/camera_info, /cam1/camera_info are")
-    refused(np.eye(4), "Nothing says where the cameras")
+    refused(
+        None, "The transform between the cameras of /cam0/camera_info, /cam1/camera_info is unknown"
+    )
+    refused(np.eye(4), "The transform between the cameras of")
     refused(None, "no baseline in P and no transform", rectified=True)
     refused(inverse(ahead), "sits right of the other: exchange them")
     refused(
         exp_se3(np.array([-0.2, 0, 0]), np.array([0, 1.9, 0])),
-        "no stereo pair: they would have to be turned by 109 deg",
+        "not form a stereo pair: they would have to be turned by 109 deg",
     )
     refused(
         exp_se3(np.array([-0.01, -0.2, 0]), np.zeros(3)),
-        "no stereo pair: they would have to be turned by 87 deg",
+        "not form a stereo pair: they would have to be turned by 87 deg",
     )
     small = Camera(
         Header("/s", 0, 0, ""),
@@ -391,7 +390,7 @@ def test_what_is_no_stereo_pair_is_said_in_a_sentence() -> None:
     other = camera(
         "plumb_bob", 1, P=np.array([[400.0, 0, 160, -80], [0, 400, 120, 0], [0, 0, 1, 0]])
     )
-    refused(None, "are not those of one rectified pair", rectified=True, right=other)
+    refused(None, "do not belong to one rectified pair", rectified=True, right=other)
     far_off = np.array([[210.0, 0, 1e5], [0, 210, 120], [0, 0, 1]])
     refused(ahead, "Nothing of the pictures is left", right=camera("plumb_bob", 1, K=far_off))
     refused(

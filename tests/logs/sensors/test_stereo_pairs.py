@@ -11,12 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F64, Camera, Header, ImageFrame, PosedCloud
+from semloc_logs.logs.problems import NoCloud, lost, sentences
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.sensors.depth import LabelImages
+from semloc_logs.logs.sensors.depth import LabelImages, RangePoints
 from semloc_logs.logs.sensors.rectification import Rectification, rectification
 from semloc_logs.logs.sensors.stereo_pairs import StereoClouds, _grey
 from semloc_logs.logs.session.inspect import inspect_log
-from semloc_logs.logs.session.session import open_session
+from semloc_logs.logs.session.session import SessionOptions, open_session
 from semloc_logs.logs.session.tally import Tally
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.selection import thin
@@ -27,9 +28,14 @@ MS = 1_000_000
 REAL = "logs/euroc_v101_stereo.bag"
 LEFT, RIGHT = "/left/image_rect", "/right/image_rect"
 ROLES = Roles(
-    image=(LEFT,), stereo_left=LEFT, stereo_right=RIGHT, camera_info=("/l", "/r"), info_of={LEFT: "/l", RIGHT: "/r"},
-    label_image=("/ids",), label_of={LEFT: "/ids"},
-)  # fmt: skip
+    image=(LEFT,),
+    stereo_left=LEFT,
+    stereo_right=RIGHT,
+    camera_info=("/l", "/r"),
+    info_of={LEFT: "/l", RIGHT: "/r"},
+    label_image=("/ids",),
+    label_of={LEFT: "/ids"},
+)
 
 
 def info(topic: str, t: float = 0.0, width: int = 160) -> Camera:
@@ -66,9 +72,9 @@ def test_partners_are_the_nearest_within_half_a_period() -> None:
             stereo.take_right(picture(RIGHT, (k * 40 + 3) * MS, 10))
     assert stereo.tolerance_ns == 20 * MS
     reasons = [stereo.points(picture(LEFT, k * 40 * MS), 0.3, 20.0) for k in range(4)]
-    assert reasons[2] == "no partner"
+    assert reasons[2] == NoCloud.NO_PARTNER
     for found in (reasons[0], reasons[1], reasons[3]):
-        assert not isinstance(found, str)
+        assert isinstance(found, RangePoints)
         # 100 px * 0.2 m / 10 px
         np.testing.assert_allclose(np.median(found.points[:, 2]), 2.0, atol=0.02)
 
@@ -90,13 +96,13 @@ def test_a_pair_waits_for_all_that_belongs_to_it() -> None:
     assert stereo.has_all(left)
 
 
-def test_labels_are_those_of_the_left_pixels() -> None:
+def test_labels_belong_to_the_left_pixels() -> None:
     stereo = clouds()
     ids = np.arange(120 * 160, dtype=np.uint16).reshape(120, 160)
     stereo._labels.take(ImageFrame(Header("/ids", 0, 0, ""), ids, "mono16"))
     stereo.take_right(picture(RIGHT, 0, 10))
     found = stereo.points(picture(LEFT, 0), 0.3, 20.0)
-    assert not isinstance(found, str)
+    assert isinstance(found, RangePoints)
     assert found.label is not None
     column = 100 * found.points[:, 0] / found.points[:, 2] + 80
     np.testing.assert_allclose(found.label % 160, column, atol=1e-3)
@@ -113,28 +119,30 @@ def test_memory_is_bounded_when_no_left_picture_comes() -> None:
 @pytest.mark.parametrize(
     ("right", "cameras", "reason"),
     [
-        (picture(RIGHT, 0, 10, width=120), [info("/l"), info("/r", -20.0)], "other size"),
-        (picture(RIGHT, 0, 10), [info("/r", -20.0)], "no calibration"),
-        (picture(RIGHT, 0, 10), [info("/l")], "no calibration of the right"),
-        (picture(RIGHT, 0, 0), [info("/l"), info("/r", -20.0)], "same picture"),
-        (picture(RIGHT, 0, 10), [info("/l"), info("/r")], "unusable pair"),
-        (picture(RIGHT, 0, 10), [info("/l"), info("/r", 20.0)], "unusable pair"),
-        (picture(RIGHT, 0, 10), [info("/l", width=99), info("/r", -20.0)], "unusable pair"),
+        (picture(RIGHT, 0, 10, width=120), [info("/l"), info("/r", -20.0)], NoCloud.OTHER_SIZE),
+        (picture(RIGHT, 0, 10), [info("/r", -20.0)], NoCloud.NO_CALIBRATION),
+        (picture(RIGHT, 0, 10), [info("/l")], NoCloud.NO_RIGHT_CALIBRATION),
+        (picture(RIGHT, 0, 0), [info("/l"), info("/r", -20.0)], NoCloud.SAME_PICTURE),
+        (picture(RIGHT, 0, 10), [info("/l"), info("/r")], NoCloud.UNUSABLE_PAIR),
+        (picture(RIGHT, 0, 10), [info("/l"), info("/r", 20.0)], NoCloud.UNUSABLE_PAIR),
+        (picture(RIGHT, 0, 10), [info("/l", width=99), info("/r", -20.0)], NoCloud.UNUSABLE_PAIR),
     ],
 )
-def test_why_a_pair_gives_nothing(right: ImageFrame, cameras: list[Camera], reason: str) -> None:
+def test_why_a_pair_gives_nothing(
+    right: ImageFrame, cameras: list[Camera], reason: NoCloud
+) -> None:
     stereo = clouds(cameras=cameras)
     stereo.take_right(right)
     assert stereo.points(picture(LEFT, 0), 0.3, 20.0) == reason
-    assert len(stereo.lost) == (reason == "unusable pair")
+    assert len(sentences(stereo.problems)) == (reason is NoCloud.UNUSABLE_PAIR)
     tally = Tally()
     tally.saw(LEFT, 0)
     tally.leave_out(LEFT, reason)
-    [sentence] = tally.sentences((None, None))
+    [sentence] = sentences(tally.problems((None, None)))
     assert sentence.startswith(f"{LEFT}: 1 of 1 frames are left out: ")
 
 
-def test_transforms_serve_where_the_infos_say_nothing() -> None:
+def test_transforms_serve_where_the_infos_have_no_baseline() -> None:
     right_T_left = np.eye(4)
     right_T_left[0, 3] = -0.2
     for left, right in ((LEFT, RIGHT), ("/left/image_raw", "/right/image_raw")):
@@ -144,7 +152,7 @@ def test_transforms_serve_where_the_infos_say_nothing() -> None:
         stereo = clouds(roles, right_T_left, [info("/l"), info("/r")])
         stereo.take_right(picture(right, 0, 10))
         found = stereo.points(picture(left, 0), 0.3, 20.0)
-        assert not isinstance(found, str)
+        assert isinstance(found, RangePoints)
         assert np.median(found.points[:, 2]) == pytest.approx(2.0, abs=0.02)
 
 
@@ -158,14 +166,14 @@ def test_colour_and_sixteen_bits_become_the_same_grey() -> None:
 
 
 # -- a real pair
-# ------------------------------------------------------------------------------------------------------------------------
 
 
 def planes(
     points: NDArray[np.floating], count: int, width: float = 0.05
 ) -> list[tuple[F64, float, float]]:
-    """The largest planes one after the other, by RANSAC: unit normal, root mean square (m) and
-    share of the points within ``width``.
+    """The largest planes one after the other, by RANSAC.
+
+    Unit normal, root mean square (m) and share of the points within ``width``.
     """
     rng = np.random.default_rng(0)
     found = []
@@ -206,11 +214,12 @@ def tilt(normal: F64) -> float:
 
 
 def is_the_room(points: F64) -> bool:
-    """A level, flat floor at the height of the world's origin, and walls that stand: mattresses,
-    some of which lean by 20 degrees.
+    """A level, flat floor at the height of the world's origin, and upright walls.
+
+    The walls are mattresses, some of which lean by 20 degrees.
     """
     floor, *walls = planes(points, 3)
-    height = np.percentile(points[:, 2], 25)  # the floor is nearly half of what is seen
+    height = np.percentile(points[:, 2], 25)  # the floor is nearly half of the points
     is_floor = tilt(floor[0]) < 2.0 and floor[1] < 0.018 and floor[2] > 0.4 and abs(height) < 0.03
     return (
         bool(is_floor)
@@ -221,10 +230,9 @@ def is_the_room(points: F64) -> bool:
 
 @pytest.fixture(scope="module")
 def room(shared: Callable[[str], Path]) -> list[PosedCloud]:
-    log = shared(REAL)
-    session = open_session([log], max_range=10.0)
+    session = open_session([shared(REAL)], SessionOptions(max_range=10.0))
     found = list(session.clouds())
-    assert session.skipped == []
+    assert lost(session.problems) == []
     session.close()
     return found
 
@@ -300,7 +308,7 @@ def test_the_room_would_not_be_there_with_a_wrong_rectification(
         )
 
     monkeypatch.setattr("semloc_logs.logs.sensors.stereo_pairs.rectification", wrong)
-    session = open_session([log], max_range=10.0)
+    session = open_session([log], SessionOptions(max_range=10.0))
     cloud = next(session.clouds(), None)
     session.close()
     assert cloud is None or len(cloud.points) < 20_000 or not is_the_room(in_world(cloud))
@@ -308,16 +316,16 @@ def test_the_room_would_not_be_there_with_a_wrong_rectification(
 
 def test_inspect_names_the_roles(shared: Callable[[str], Path]) -> None:
     log = shared(REAL)
-    told = inspect_log(log)
-    assert told["problems"] == []
-    streams = told["streams"]
+    content = inspect_log(log)
+    assert content["problems"] == []
+    streams = content["streams"]
     assert isinstance(streams, list)
     roles = {s["topic"]: s["role"] for s in streams}
     assert (roles["/cam0/image_raw"], roles["/cam1/image_raw"]) == ("stereo_left", "stereo_right")
     [sentence] = [
         p
         for p in _listed(inspect_log(log, {"tf_static": "none"})["problems"])
-        if "Nothing says where the cameras" in p
+        if "The transform between the cameras" in p
     ]
     assert sentence.endswith(".")
     swapped = _listed(

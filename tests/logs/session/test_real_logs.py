@@ -13,6 +13,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import DepthFrame, LidarFrame
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log
+from semloc_logs.logs.problems import sentences
 
 
 def frames(log: Log) -> Counter[tuple[str, str]]:
@@ -22,7 +23,7 @@ def frames(log: Log) -> Counter[tuple[str, str]]:
 @pytest.mark.parametrize(
     "name", ["empty-file.bag", "not_a_bag.bag", "lfs_pointer.bag", "lfs_pointer.mcap"]
 )
-def test_what_is_no_log_is_refused(shared: Callable[[str], Path], name: str) -> None:
+def test_files_that_are_not_logs_are_refused(shared: Callable[[str], Path], name: str) -> None:
     with pytest.raises(LogError, match=name):
         open_log(shared(f"odd_logs/{name}"))
 
@@ -98,9 +99,10 @@ def test_a_type_without_definition_is_named_and_the_rest_read(
         ("/odometry", "PoseSample"): 2143,
         ("/vehicle_pose", "PoseSample"): 2034,
     }
-    [sentence] = log.problems
+    [sentence] = sentences(log.problems)
     assert sentence.startswith(
-        "/vehicle_command_ackermann: messages of type ackermann_msgs/msg/AckermannDriveStamped cannot be decoded"
+        "/vehicle_command_ackermann: messages of type "
+        "ackermann_msgs/msg/AckermannDriveStamped cannot be decoded"
     )
 
 
@@ -129,7 +131,7 @@ def test_a_truncated_drive(shared: Callable[[str], Path], tmp_path: Path) -> Non
     assert sum(found.values()) >= 60
     assert {s.topic: s.count for s in log.streams} == found
     assert len(log.problems) == 1
-    assert "cut.mcap" in log.problems[0]
+    assert "cut.mcap" in sentences(log.problems)[0]
 
 
 def test_labels_of_a_real_sweep(shared: Callable[[str], Path]) -> None:

@@ -22,16 +22,21 @@ from semloc_logs.frames import (
     TransformSample,
 )
 from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.problems import Problem, ProblemKind, lost, sentences
 from semloc_logs.logs.session.frame_queue import MAX_WAITING
-from semloc_logs.logs.session.session import Session, open_session
+from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.numerics.transforms import Array, rotation_angle, yaw_transform
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
 TYPES = {
-    LidarFrame: "sensor_msgs/msg/PointCloud2", DepthFrame: "sensor_msgs/msg/Image", ImageFrame: "sensor_msgs/msg/Image",
-    Camera: "sensor_msgs/msg/CameraInfo", TransformSample: "tf2_msgs/msg/TFMessage", ImuSample: "sensor_msgs/msg/Imu",
-}  # fmt: skip
+    LidarFrame: "sensor_msgs/msg/PointCloud2",
+    DepthFrame: "sensor_msgs/msg/Image",
+    ImageFrame: "sensor_msgs/msg/Image",
+    Camera: "sensor_msgs/msg/CameraInfo",
+    TransformSample: "tf2_msgs/msg/TFMessage",
+    ImuSample: "sensor_msgs/msg/Imu",
+}
 
 
 class FakeLog:
@@ -50,7 +55,7 @@ class FakeLog:
         times = [f.header.log_time_ns for f in self._frames]
         self.start_ns: int | None = times[0] if times else None
         self.end_ns: int | None = times[-1] if times else None
-        self.problems: list[str] = []
+        self.problems: list[Problem] = []
         self.given = 0
         kinds = {f.header.topic: TYPES.get(type(f), pose_type) for f in self._frames}
         topics = [f.header.topic for f in self._frames]
@@ -118,7 +123,7 @@ def test_clouds_in_the_base_frame_with_poses() -> None:
     assert len(stamps) == 12
     assert poses[-1, 0, 3] == pytest.approx(1.1)
     assert session.problems == []
-    assert session.skipped == []
+    assert lost(session.problems) == []
     assert json.loads(json.dumps(session.to_json()))["frames"]["/points"] == {
         "seen": 10,
         "used": 10,
@@ -174,8 +179,8 @@ def test_a_gap_in_the_poses_costs_its_frames_and_a_sentence() -> None:
     clouds = list(session.clouds())
     assert len(clouds) == 201  # the frames at both edges of the gap have a pose of their own
     assert session._pass.waiting.nbytes == 0
-    assert len(session.skipped) == 1
-    assert "/points: 99 of 300 frames are left out: no pose" in session.skipped[0]
+    assert len(sentences(lost(session.problems))) == 1
+    assert "/points: 99 of 300 frames are left out: no pose" in sentences(lost(session.problems))[0]
 
 
 def test_poses_that_start_late_and_a_clock_of_its_own() -> None:
@@ -189,7 +194,7 @@ def test_poses_that_start_late_and_a_clock_of_its_own() -> None:
         [FakeLog([*frames, *[odometry(-9000.0 + 0.1 * k, late=9000.0) for k in range(200)]])]
     )
     assert list(other.clouds()) == []
-    assert "2023-11-14T22:13:20.000Z" in other.skipped[0]
+    assert "2023-11-14T22:13:20.000Z" in sentences(lost(other.problems))[0]
 
 
 def test_transforms_that_come_late() -> None:
@@ -229,15 +234,15 @@ def test_the_frame_of_the_pose_is_the_base_without_base_link() -> None:
     np.testing.assert_allclose(session.base_T_sensors()["lidar"], MOUNT)
 
 
-def test_an_unconnected_sensor_is_taken_as_the_base_and_that_is_said() -> None:
+def test_an_unconnected_sensor_is_taken_as_the_base_with_a_problem() -> None:
     session = Session(
         [FakeLog([*[sweep(0.1 * k) for k in range(3)], *[odometry(0.1 * k) for k in range(4)]])]
     )
     clouds = list(session.clouds())
     assert len(clouds) == 3
     np.testing.assert_allclose(clouds[0].points, sweep(0).points)
-    assert any("'lidar' with 'base_link'" in problem for problem in session.problems)
-    assert session.skipped == []
+    assert any("'lidar' with 'base_link'" in problem for problem in sentences(session.problems))
+    assert lost(session.problems) == []
 
 
 def test_a_second_unconnected_sensor_is_not_guessed() -> None:
@@ -249,7 +254,8 @@ def test_a_second_unconnected_sensor_is_not_guessed() -> None:
     session = Session([FakeLog(frames)])
     assert {cloud.header.topic for cloud in session.clouds()} == {"/points"}
     assert any(
-        "/rear: 3 of 3 frames are left out: no transform" in problem for problem in session.skipped
+        "/rear: 3 of 3 frames are left out: no transform" in problem
+        for problem in sentences(lost(session.problems))
     )
 
 
@@ -308,7 +314,7 @@ def test_without_any_pose_stream() -> None:
     assert [cloud.session_T_base for cloud in clouds] == [None, None, None]
     assert session.base_frame == "base_link"
     assert len(session.problems) == 1
-    assert "no pose stream" in session.problems[0]
+    assert "no pose stream" in sentences(session.problems)[0]
     assert len(session.trajectory()[0]) == 0
 
 
@@ -325,10 +331,15 @@ def test_logs_recorded_back_to_back_and_side_by_side() -> None:
         [*[sweep(1 + 0.1 * k) for k in range(10)], *[odometry(1 + 0.1 * k) for k in range(10)]],
         "b.mcap",
     )
-    second.problems.append("the file is cut off at byte 9.")
+    skipped = Problem("/points", ProblemKind.MESSAGE, "/points: 1 message skipped.", lost=True)
+    cut_off = Problem("", ProblemKind.FILE, "b.mcap: the file is cut off at byte 9.", lost=True)
+    second.problems += [skipped, cut_off]
     session = Session([first, second])
     assert len(list(session.clouds())) == 20
-    assert session.skipped == ["b.mcap: the file is cut off at byte 9."]
+    assert sentences(lost(session.problems)) == [
+        "b.mcap: /points: 1 message skipped.",
+        "b.mcap: the file is cut off at byte 9.",
+    ]
     sensors = FakeLog([sweep(0.1 * k + 0.05) for k in range(10)])
     poses = FakeLog([odometry(0.1 * k) for k in range(11)])
     assert len(list(Session([sensors, poses]).clouds())) == 10
@@ -343,8 +354,16 @@ def test_a_later_log_is_not_touched_before_its_time() -> None:
 
 
 def test_depth_camera_with_labels_and_its_own_pose() -> None:
-    info = Camera(header("/camera/depth/camera_info", 0.02, "optical"), 4, 4, np.array([[2.0, 0, 2], [0, 2, 2], [0, 0, 1]]),
-                  np.zeros(5), np.eye(3), np.zeros((3, 4)), "plumb_bob")  # fmt: skip
+    info = Camera(
+        header("/camera/depth/camera_info", 0.02, "optical"),
+        4,
+        4,
+        np.array([[2.0, 0, 2], [0, 2, 2], [0, 0, 1]]),
+        np.zeros(5),
+        np.eye(3),
+        np.zeros((3, 4)),
+        "plumb_bob",
+    )
     frames: list[Frame] = [info]
     for k in range(4):
         frames.append(
@@ -368,14 +387,14 @@ def test_depth_camera_with_labels_and_its_own_pose() -> None:
     assert list(session.cameras) == ["/camera/depth/image", "/camera/label"]
 
 
-def test_depth_without_calibration_is_said() -> None:
+def test_depth_without_calibration_is_named() -> None:
     frames: list[Frame] = [
         DepthFrame(header("/depth", 0.0, "optical"), np.ones((4, 4), np.float32)),
         odometry(0.0, "optical"),
     ]
     session = Session([FakeLog(frames)])
     assert list(session.clouds()) == []
-    assert "no CameraInfo belongs to them" in session.skipped[0]
+    assert "no CameraInfo belongs to them" in sentences(lost(session.problems))[0]
 
 
 def test_images_come_before_their_clouds() -> None:
@@ -421,7 +440,7 @@ def test_up_from_a_tilted_imu_on_a_turning_base() -> None:
         np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=0.02)
 
 
-def test_what_cannot_be_a_session() -> None:
+def test_logs_that_cannot_be_a_session() -> None:
     with pytest.raises(LogError, match="none was named"):
         open_session([])
     with pytest.raises(RoleError, match="no LIDAR and no depth"):
@@ -441,7 +460,9 @@ def test_repeated_and_backward_poses_are_counted() -> None:
     ]
     session = Session([FakeLog(frames)])
     assert len(list(session.clouds())) == 1
-    assert any("1 repeated and 1 back in time" in problem for problem in session.problems)
+    assert any(
+        "1 repeated and 1 back in time" in problem for problem in sentences(session.problems)
+    )
 
 
 def test_the_buffer_is_bounded_when_nothing_ever_comes() -> None:
@@ -473,9 +494,7 @@ class TestRecordedLogs:
     def test_the_two_basements_meet_in_their_common_frame(
         self, shared: Callable[[str], Path]
     ) -> None:
-        """The last sweep of a and the first of b were taken within a second: in the common frame
-        they are the same hall.
-        """
+        """The last sweep of a and the first of b, within a second, show the same hall."""
         from scipy.spatial import cKDTree
 
         truth = json.loads(shared("logs/basement_truth.json").read_text())
@@ -495,7 +514,7 @@ class TestRecordedLogs:
         """Neighbouring depth images, put together by their poses, show the same surfaces."""
         from scipy.spatial import cKDTree
 
-        session = open_session([shared(f"logs/{name}")], stride=8)
+        session = open_session([shared(f"logs/{name}")], SessionOptions(stride=8))
         worlds = []
         for cloud, _ in zip(session.clouds(), range(6), strict=False):
             assert cloud.session_T_base is not None

@@ -1,8 +1,7 @@
-"""LIDAR odometry for logs without usable poses: KISS-ICP (Vizzo et al., RA-L 2023), the extra
-``odometry``.
+"""LIDAR odometry for logs without usable poses: KISS-ICP (Vizzo et al., RA-L 2023).
 
-Every sweep of one LIDAR is registered, in the pass that reads the log. The trajectory begins at the
-identity of the base frame.
+It is installed with the extra ``odometry``. Every sweep of one LIDAR is registered, in the pass
+that reads the log. The trajectory begins at the identity of the base frame.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, LidarFrame
+from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
+from semloc_logs.logs.messages.stamps import utc
 from semloc_logs.logs.poses.track import is_time
-from semloc_logs.logs.sensors.sweeps import LONGEST_SWEEP_NS
-from semloc_logs.logs.session.tally import span
+from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 
 MAX_SPEED = 100.0  # m/s; nothing on wheels is faster
-# m/s from one sweep to the next beyond what 30 m/s^2 explain: no brake and no crash survivor does
-# that
+# m/s from one sweep to the next beyond an acceleration of 30 m/s^2: no brake reaches that
 MAX_SPEED_CHANGE = 12.0
 _MAX_ACCELERATION = 30.0  # m/s^2
 MAX_TURN = 10.0  # rad/s
@@ -37,11 +36,11 @@ _MOST_COMPARED = 20_000  # points of the sweep before
 
 
 class LidarOdometry:
-    """Poses of the LIDAR on ``topic`` from its sweeps. LogError when KISS-ICP is not installed.
+    """Poses of the LIDAR on ``topic`` from its sweeps; LogError when KISS-ICP is not installed.
 
     ``max_range`` and ``min_range`` (m): points that are used. After a jump that no vehicle can
-    make, or once a sweep does not lie on the one before any more, there are no more poses, and
-    ``problems`` says so. Slow drift goes unnoticed.
+    make, or once a sweep does not lie on the sweep before any more, there are no more poses:
+    ``problems`` names the time. Slow drift goes unnoticed.
     """
 
     name = "LIDAR odometry"
@@ -50,24 +49,23 @@ class LidarOdometry:
     def __init__(self, topic: str, *, min_range: float, max_range: float) -> None:
         self.topic = topic
         self.child: str | None = None  # the sensor's frame, once a sweep has come
-        self.problems: list[str] = []
-        self.notes: list[str] = []
+        self.problems: list[Problem] = []
         self.is_over = False
         self._voxel = min(max_range, _LONGEST_RANGE) / _VOXELS_PER_RANGE
         self._engine, self._version = _kiss_icp(
             min_range, min(max_range, _LONGEST_RANGE), self._voxel
         )
-        self._before: cKDTree | None = None  # the sweep before
+        self._last_sweep: cKDTree | None = None
         self._overlaps: list[float] = []
         self._start: F64 | None = None  # base_T_sensor of the first sweep
         self._new: list[tuple[int, F64]] = []
         self._last: tuple[int, F64] | None = None
-        self._speed: F64 | None = None  # of the step before, in the sensor frame
+        self._speed: F64 | None = None  # (3,) of the last step, in the sensor frame
         self._count = 0
-        self._poor = 0
+        self._refused = 0
 
     def take(self, frame: Frame) -> None:
-        """Registers a sweep of the LIDAR; other frames are none of its business."""
+        """Registers a sweep of the LIDAR; other frames are ignored."""
         if frame.header.topic != self.topic or not isinstance(frame, LidarFrame) or self.is_over:
             return
         if self.child is None:
@@ -75,19 +73,21 @@ class LidarOdometry:
         stamp_ns, offsets = _pose_time(frame)
         is_late = self._last is not None and stamp_ns <= self._last[0]
         if len(frame.points) < _FEWEST or is_late or not is_time(stamp_ns):
-            self._poor += 1
+            self._refused += 1
             return
-        whole, some = self._engine.register_frame(frame.points.astype(np.float64), offsets)
+
+        points, keypoints = self._engine.register_frame(frame.points.astype(np.float64), offsets)
         pose = np.array(self._engine.last_pose, float)
         if self._last is not None and (
-            self._is_jump(stamp_ns, pose) or self._is_apart(pose, np.asarray(some))
+            self._is_jump(stamp_ns, pose) or self._is_apart(pose, np.asarray(keypoints))
         ):
             self.is_over = True
-            self.problems.append(
-                f"LIDAR odometry lost track at {span(stamp_ns, stamp_ns).split(' to ')[0]}: frames after that are left out; "
+            self._lose(
+                f"LIDAR odometry lost track at {utc(stamp_ns)}: frames after that are left out; "
                 f"give poses with --poses FILE, or cut the log there."
             )
             return
+
         if self._count == 1 and self._last is not None and len(offsets):
             # the first sweep was measured on the way to its pose: the same motion as in the next
             # step leads there
@@ -95,12 +95,16 @@ class LidarOdometry:
             self._new.insert(0, (2 * first_ns - stamp_ns, first @ inverse(pose) @ first))
         self._new.append((stamp_ns, pose))
         self._last = (stamp_ns, pose)
-        self._before = cKDTree(np.asarray(whole)[:: 1 + len(whole) // _MOST_COMPARED])
+        self._last_sweep = cKDTree(np.asarray(points)[:: 1 + len(points) // _MOST_COMPARED])
         self._count += 1
 
+    def _lose(self, text: str) -> None:
+        self.problems.append(Problem(self.topic, ProblemKind.POSE, text, lost=True))
+
     def poses(self, base_T: Callable[[str, int], F64 | None]) -> Iterator[tuple[int, F64]]:
-        """Stamps and ``session_T_sensor`` that are new since the last call; the first waits for the
-        second.
+        """Stamps and ``session_T_sensor`` that are new since the last call.
+
+        The first pose waits for the second.
         """
         if self._count < 2 and not self.is_over:
             return
@@ -115,9 +119,10 @@ class LidarOdometry:
     def finish(self) -> None:
         """No more sweeps will come: a single one has the identity as its pose."""
         self.is_over = True
-        if self._poor:
-            self.problems.append(
-                f"{self.topic}: {self._poor} sweeps are too sparse or out of order for LIDAR odometry and were left out."
+        if self._refused:
+            self._lose(
+                f"{self.topic}: {self._refused} sweeps are too sparse or out of order for LIDAR "
+                f"odometry and were left out."
             )
 
     def to_json(self) -> dict[str, object]:
@@ -130,7 +135,7 @@ class LidarOdometry:
         }
 
     def _is_jump(self, stamp_ns: int, pose: F64) -> bool:
-        """Whether the step to ``pose`` is none that a vehicle can make."""
+        """Whether no vehicle can make the step to ``pose``."""
         if self._last is None or not np.isfinite(pose).all():
             return True
         seconds = (stamp_ns - self._last[0]) * 1e-9
@@ -145,23 +150,22 @@ class LidarOdometry:
         )
 
     def _is_apart(self, pose: F64, points: F64) -> bool:
-        """Whether ``points`` (n, 3) of the newest sweep at ``pose`` lie on fewer of the sweep
-        before than sweeps have done so far.
-        """
-        if self._last is None or self._before is None or not len(points):
+        """Whether fewer ``points`` (n, 3) at ``pose`` lie on the last sweep than usual."""
+        if self._last is None or self._last_sweep is None or not len(points):
             return False
-        near, _ = self._before.query(
+        distance, _ = self._last_sweep.query(
             apply(inverse(self._last[1]) @ pose, points), distance_upper_bound=self._voxel / 2
         )
-        overlap = float(np.isfinite(near).mean())
+        overlap = float(np.isfinite(distance).mean())
         usual = float(np.median(self._overlaps)) if self._overlaps else overlap
         self._overlaps.append(overlap)
         return overlap < LEAST_OVERLAP * usual
 
 
 def _pose_time(frame: LidarFrame) -> tuple[int, F64]:
-    """When KISS-ICP's pose is, and point times from 0 to 1: it moves the points of a sweep to the
-    time of the last one.
+    """Stamp of the pose that KISS-ICP gives, and point times from 0 to 1.
+
+    KISS-ICP moves the points of a sweep to the time of the last one.
     """
     offset_ns = frame.offset_ns
     if offset_ns is None or not len(offset_ns):
@@ -174,8 +178,9 @@ def _pose_time(frame: LidarFrame) -> tuple[int, F64]:
 
 
 def _kiss_icp(min_range: float, max_range: float, voxel_size: float) -> tuple[Any, str]:
-    """An odometry and the version of the library. One thread, because more of them sum in another
-    order each time.
+    """An odometry and the version of the library.
+
+    One thread, because more of them sum in another order each time.
     """
     try:
         version = str(import_module("kiss_icp").__version__)
@@ -184,8 +189,8 @@ def _kiss_icp(min_range: float, max_range: float, voxel_size: float) -> tuple[An
         module = import_module("kiss_icp.kiss_icp")
     except ImportError as problem:
         raise LogError(
-            f"LIDAR odometry needs KISS-ICP ({problem}): install it with pip install 'semloc_logs[odometry]', "
-            f"or give poses with --poses FILE."
+            f"LIDAR odometry needs KISS-ICP ({problem}): install it with "
+            f"pip install 'semloc_logs[odometry]', or give poses with --poses FILE."
         ) from None
     settings = parser.KISSConfig(
         data=config.DataConfig(max_range=max_range, min_range=min_range, deskew=True),

@@ -1,0 +1,68 @@
+"""Problems of a pose stream: it is missing, its stamps make no sense, or it never moves."""
+
+from __future__ import annotations
+
+from semloc_logs.logs.poses.track import PoseTrack
+from semloc_logs.logs.problems import Problem, ProblemKind
+
+# a vehicle may well stand still so long, but a log of nothing else is suspicious
+_STANDSTILL_NS = 10_000_000_000
+
+
+def no_poses() -> Problem:
+    """The consequence of a log without any pose."""
+    text = (
+        "The log has no pose stream: single frames can be searched, but no map is built; for a map "
+        "use --odometry lidar, give a trajectory with --poses FILE, or name a topic with "
+        "--topic pose=TOPIC."
+    )
+    return Problem("", ProblemKind.POSE, text, lost=False)
+
+
+def refused_poses(topic: str, track: PoseTrack, *, lost: bool) -> list[Problem]:
+    """Poses whose stamps make no sense; empty when all is well."""
+    kinds = (
+        (track.duplicates, "repeated"),
+        (track.backwards, "back in time"),
+        (track.ahead, "far ahead in time"),
+    )
+    counts = [f"{count} {kind}" for count, kind in kinds if count]
+    if not counts:
+        return []
+    text = f"{topic}: poses that are {' and '.join(counts)} were left out."
+    return [Problem(topic, ProblemKind.POSE, text, lost)]
+
+
+def invalid_poses(topic: str, track: PoseTrack) -> list[Problem]:
+    """Poses that are not rigid transforms; empty when all is well."""
+    if not track.invalid:
+        return []
+    text = f"{track.invalid} poses are not rigid transforms and were left out."
+    return [Problem(topic, ProblemKind.POSE, text, lost=True)]
+
+
+def smeared(topic: str, shift: float) -> Problem:
+    """Poses that stand still while the surroundings move by ``shift`` metres or more."""
+    text = (
+        f"{topic} gives the same position all the time, but the surroundings move by {shift:.1f} m "
+        f"or more: its poses, and the map that is built with them, are wrong; "
+        f"use --odometry lidar, give poses with --poses FILE, or name a topic with "
+        f"--topic pose=TOPIC."
+    )
+    return Problem(topic, ProblemKind.POSE, text, lost=True)
+
+
+def never_moves(topic: str, track: PoseTrack) -> list[Problem]:
+    """A pose stream with a constant position, such as odometry that was never filled in."""
+    start_ns = track.start_ns
+    end_ns = track.end_ns
+    if start_ns is None or end_ns is None:
+        return []
+    if end_ns - start_ns < _STANDSTILL_NS or track.length() > 0.0:
+        return []
+    seconds = (end_ns - start_ns) * 1e-9
+    text = (
+        f"{topic} gives the same position for {seconds:.0f} s: "
+        f"name another with --topic pose=TOPIC if the vehicle moved."
+    )
+    return [Problem(topic, ProblemKind.POSE, text, lost=False)]
