@@ -17,7 +17,7 @@ from pathlib import Path
 
 from towns import Place, Town, collect, short_towns
 
-import semloc_logs.closures
+import semloc_logs.closures.acceptance
 from semloc_logs.engines.processes import single_threaded
 from semloc_logs.evaluation.calibration import (
     calibration_json,
@@ -97,7 +97,8 @@ def report(args: argparse.Namespace) -> None:
             print("  " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
     draw_reliability(args.dir / "reliability.png", curves)
     if args.install:
-        (Path(semloc_logs.closures.__file__).parent / "calibration.json").write_text(content)
+        folder = Path(semloc_logs.closures.acceptance.__path__[0])
+        (folder / "calibration.json").write_text(content)
 
 
 def main() -> None:

@@ -112,9 +112,13 @@ def ask_towns(args: argparse.Namespace) -> None:
             print(f"  {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
     accepted = (k for k in answers(judged, p) if p[k] >= SURE)
     for k in (k for k in accepted if not judged.right[k]):
-        ends = f"{judged.placed.query_session[k]} query {judged.placed.query[k]} in {judged.placed.target_session[k]}"
+        ends = (
+            f"{judged.placed.query_session[k]} query {judged.placed.query[k]} in"
+            f" {judged.placed.target_session[k]}"
+        )
         print(
-            f"  false: town {judged.town[k]}, {ends}, probability {p[k]:.4f}, {judged.error_m[k]:.1f} m, {judged.error_deg[k]:.0f} degrees"
+            f"  false: town {judged.town[k]}, {ends}, probability {p[k]:.4f},"
+            f" {judged.error_m[k]:.1f} m, {judged.error_deg[k]:.0f} degrees"
         )
 
 

@@ -174,7 +174,8 @@ def main() -> int:
         seed += 1
     print(f"{seed - options.seed} inputs, {sum(found.values())} findings of {len(found)} kinds")
     print(
-        f"slowest {slowest[0]:.2f} s of processor ({slowest[1]}); peak memory {peak:.0f} MiB, most by {largest[0]:.0f} MiB ({largest[1]})"
+        f"slowest {slowest[0]:.2f} s of processor ({slowest[1]}); peak memory {peak:.0f} MiB, most"
+        f" by {largest[0]:.0f} MiB ({largest[1]})"
     )
     return 1 if found else 0
 

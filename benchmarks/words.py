@@ -86,7 +86,10 @@ def main():
         vocabulary = train_vocabulary(sample, children=children)
         word, code = vocabulary.words(database)
         miss = vocabulary.projected(database) - vocabulary.children[word // 256, word % 256]
-        said = f"{time.perf_counter() - start:.0f} s to train, {(miss**2).sum(1).mean():.3f} squared to the centroid of a word"
+        said = (
+            f"{time.perf_counter() - start:.0f} s to train, {(miss**2).sum(1).mean():.3f}"
+            " squared to the centroid of a word"
+        )
         print(f"256 x {children}: {said}")
         index = index_module.Index(vocabulary, word, code, np.zeros(len(word), np.int64))
         for size in (5, shortlist):  # five: ranked by Hamming distance alone, but for ties
@@ -98,7 +101,8 @@ def main():
                 ms = 1e3 * (time.process_time() - start)
                 partners, same = scores(found, exact, partner)
                 print(
-                    f"  probes {probes:2d}, shortlist {size:2d}: partner {partners:.3f}, exact {same:.3f}, {ms:.0f} ms"
+                    f"  probes {probes:2d}, shortlist {size:2d}: partner {partners:.3f}, exact"
+                    f" {same:.3f}, {ms:.0f} ms"
                 )
 
 

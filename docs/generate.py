@@ -186,7 +186,7 @@ ROLE_USES = {
     "tf": "moving transforms",
     "tf_static": "fixed transforms between sensors and base frame",
     "imu": "acceleration, for the direction of gravity",
-    "gnss": "fixes, where there are no other poses",
+    "gnss": "fixes, used if the log has no other poses",
 }
 
 

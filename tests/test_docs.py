@@ -61,7 +61,7 @@ INLINE = [
 
 def _command(name: str) -> click.Command:
     found: click.Command | None = program.get_command(click.Context(program), name)
-    assert found is not None, f"there is no command semloc {name}"
+    assert found is not None, f"semloc has no command {name}"
     return found
 
 

@@ -44,6 +44,7 @@ INNER_ORDER = {
         "problems",
         "log",
         "topic_pairs",
+        "role_types",
         "roles",
         "messages",
         "containers",

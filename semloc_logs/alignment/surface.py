@@ -32,6 +32,7 @@ LEAST_FLAT = 8
 # and ``start``: points ``start[c]`` to ``start[c + 1]`` lie in cell c. A plain tuple, which
 # compiled functions pass on without a cost.
 Cells = tuple[float, F64, I64, I32]
+Point = tuple[float, float, float]
 Arrays = tuple[F64, F64, F64, Cells, F64]  # of a surface, in the order of its fields
 
 
@@ -137,6 +138,13 @@ def _sorted(points: F64, cell: float) -> tuple[I64, F64, I64, I32]:
 
 
 @njit(cache=True, nogil=True)
+def _in_cells_of(cells: Cells, p: Point) -> Point:
+    """The point ``p`` in units of cells, from where the grid begins."""
+    cell, low, _, _ = cells
+    return (p[0] - low[0]) / cell, (p[1] - low[1]) / cell, (p[2] - low[2]) / cell
+
+
+@njit(cache=True, nogil=True)
 def _column(cells: Cells, x: int, y: int, low: int, high: int) -> tuple[int, int]:
     """The range of points in cells ``low`` to ``high``, both included, of column (x, y).
 
@@ -195,7 +203,7 @@ def _moments(
     around: F64,
     sigma: F64,
     cells: Cells,
-    p: tuple[float, float, float],
+    p: Point,
     noise: float,
     moments: tuple[F64, F64],
 ) -> tuple[float, int]:
@@ -203,11 +211,12 @@ def _moments(
 
     ``moments``: the sums of weighted offsets (3,) and of their products, above the diagonal (3, 3).
     """
-    radius, low, _, _ = cells
+    radius = cells[0]
     mean, a = moments
-    x = int(np.floor((p[0] - low[0]) / radius))
-    y = int(np.floor((p[1] - low[1]) / radius))
-    z = int(np.floor((p[2] - low[2]) / radius))
+    gx, gy, gz = _in_cells_of(cells, p)
+    x = int(np.floor(gx))
+    y = int(np.floor(gy))
+    z = int(np.floor(gz))
     mean[:] = 0.0
     a[:] = 0.0
     total = 0.0
@@ -273,14 +282,12 @@ def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
     It is -1 where none is nearer than ``radius``.
     """
     points, _, _, cells, _ = surface
-    cell, low, _, _ = cells
+    cell = cells[0]
     nearest = np.full(len(query), -1, np.int64)
     rings = int(np.ceil(radius / cell))
     for n in range(len(query)):
         p = (query[n, 0], query[n, 1], query[n, 2])
-        gx = (p[0] - low[0]) / cell
-        gy = (p[1] - low[1]) / cell
-        gz = (p[2] - low[2]) / cell
+        gx, gy, gz = _in_cells_of(cells, p)
         x = int(np.floor(gx))
         y = int(np.floor(gy))
         z = int(np.floor(gz))
@@ -316,7 +323,7 @@ def nearest_points(surface: Arrays, query: F64, radius: float) -> I64:
 def _nearer(
     points: F64,
     column: tuple[int, int],
-    p: tuple[float, float, float],
+    p: Point,
     best: float,
     number: int,
 ) -> tuple[float, int]:
@@ -338,14 +345,12 @@ def _around(points: F64, cells: Cells, wanted: I64) -> I64:
 
     They are -1 where fewer points lie in RINGS cells.
     """
-    cell, low, _, _ = cells
+    cell = cells[0]
     nearest = np.full((len(wanted), NEIGHBOURS), -1, np.int64)
     distance = np.empty(NEIGHBOURS)
     for n in range(len(wanted)):
-        p = points[wanted[n]]
-        gx = (p[0] - low[0]) / cell
-        gy = (p[1] - low[1]) / cell
-        gz = (p[2] - low[2]) / cell
+        p = (points[wanted[n], 0], points[wanted[n], 1], points[wanted[n], 2])
+        gx, gy, gz = _in_cells_of(cells, p)
         x = int(np.floor(gx))
         y = int(np.floor(gy))
         z = int(np.floor(gz))
@@ -369,7 +374,7 @@ def _around(points: F64, cells: Cells, wanted: I64) -> I64:
 
 
 @njit(cache=True, nogil=True)
-def _take(points: F64, p: F64, column: tuple[int, int], distance: F64, nearest: I64) -> None:
+def _take(points: F64, p: Point, column: tuple[int, int], distance: F64, nearest: I64) -> None:
     """Insert the points of ``column`` into the ``nearest``, ascending by squared ``distance``."""
     for i in range(column[0], column[1]):
         d = (points[i, 0] - p[0]) ** 2 + (points[i, 1] - p[1]) ** 2 + (points[i, 2] - p[2]) ** 2

@@ -525,7 +525,8 @@ def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
     high, and what they are made from.
     """
     return {
-        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature; 'near' where a query has neighbours, "
+        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature;"
+        " 'near' where a query has neighbours, "
         "'together' where it has far ones too; at most a half where lookalike exceeds most_alike",
         "alone": fitted.model.own_features.to_json(FEATURES),
         "least_support": round(fitted.model.min_support, 4),

@@ -1,6 +1,4 @@
-"""The points of a session, batch by batch: its occupied voxels or its keyframes' points, in the
-session's or the map's frame.
-"""
+"""The points of a session, batch by batch: its occupied voxels, or the points of its keyframes."""
 
 from __future__ import annotations
 
@@ -26,12 +24,15 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 # x from, y from, x to, y to; metres, the upper ones excluded
 Bounds = tuple[float, float, float, float]
+FLOAT32_FINENESS = 16  # steps of 32-bit coordinates in a voxel, at least
 
 
 @dataclass(eq=False)
 class SessionPoints:
-    """Points of one session. ``what`` is "voxels" (centres) or "keyframes", ``frame`` "session" or
-    "map"; ``bounds`` are in that frame.
+    """Points of one session.
+
+    ``what`` is "voxels" (centres) or "keyframes", ``frame`` "session" or "map"; ``bounds`` are in
+    that frame.
     """
 
     session: SessionMap
@@ -42,7 +43,8 @@ class SessionPoints:
     def __post_init__(self) -> None:
         if self.what == "keyframes" and not self.session.posed:
             raise WorkspaceError(
-                f"Session {self.session.folder.name} has no poses, so its keyframes have no place in one cloud."
+                f"Session {self.session.folder.name} has no poses: its keyframes cannot be put "
+                "into one cloud."
             )
 
     @property
@@ -52,12 +54,10 @@ class SessionPoints:
 
     @cached_property
     def frame_T_map(self) -> F64:
-        """(4, 4)."""
-        return (
-            np.eye(4)
-            if self.frame == "map"
-            else np.array(self.session.json["session_T_map"], float)
-        )
+        """From the map into the chosen frame (4, 4)."""
+        if self.frame == "map":
+            return np.eye(4)
+        return np.array(self.session.json["session_T_map"], float)
 
     @property
     def day(self) -> date:
@@ -67,11 +67,11 @@ class SessionPoints:
 
     @property
     def origin(self) -> F64:
-        """Whole metres (3,) near to the points: the map's origin in the chosen frame."""
+        """Whole metres (3,) close to the points: the map's origin in the chosen frame."""
         return np.asarray(np.floor(self.frame_T_map[:3, 3]))
 
     @cached_property
-    def coarse_in_float32(self) -> float:
+    def float32_step(self) -> float:
         """The distance between neighbouring 32-bit floats at the trajectory, in metres."""
         positions = apply(self.frame_T_map, self.session.map_T_base[:, :3, 3])
         return float(np.spacing(np.float32(np.abs(positions).max(initial=1.0))))
@@ -79,10 +79,10 @@ class SessionPoints:
     @property
     def fits_float32(self) -> bool:
         """Whether 32-bit coordinates are finer than a sixteenth of a voxel."""
-        return self.coarse_in_float32 <= self.voxel_size / 16
+        return self.float32_step <= self.voxel_size / FLOAT32_FINENESS
 
     def count(self) -> int:
-        """How many points :meth:`batches` gives; reads only footers when there are no bounds."""
+        """How many points :meth:`batches` gives; reads only footers without bounds."""
         if self.bounds is not None:
             return sum(len(label) for _, label in self.batches())
         if self.what == "keyframes":
@@ -124,18 +124,17 @@ class SessionPoints:
         ranges = [group.column(k).statistics for k in range(3)]
         if self.bounds is None or any(r is None or not r.has_min_max for r in ranges):
             return True
-        corners = apply(
-            self.frame_T_map,
-            (np.array(list(product(*((r.min, r.max) for r in ranges)))) + 0.5) * self.voxel_size,
-        )
-        (low_x, low_y), (high_x, high_y) = corners[:, :2].min(0), corners[:, :2].max(0)
+        corners = np.array(list(product(*((r.min, r.max) for r in ranges))))
+        placed = apply(self.frame_T_map, (corners + 0.5) * self.voxel_size)
+        low_x, low_y = placed[:, :2].min(0)
+        high_x, high_y = placed[:, :2].max(0)
         x0, y0, x1, y1 = self.bounds
         return bool(low_x < x1 and high_x >= x0 and low_y < y1 and high_y >= y0)
 
     def _keyframes(self) -> Iterator[tuple[F64, U8]]:
-        for keyframe, pose in enumerate(self.session.map_T_base):
-            found = read_keyframe(self.session.folder.keyframes, keyframe)
-            yield apply(pose, found.points.astype(float)), found.label
+        for number, map_T_base in enumerate(self.session.map_T_base):
+            keyframe = read_keyframe(self.session.folder.keyframes, number)
+            yield apply(map_T_base, keyframe.points.astype(float)), keyframe.label
 
 
 def _open(path: Path) -> pq.ParquetFile:
@@ -146,6 +145,5 @@ def _open(path: Path) -> pq.ParquetFile:
 
 
 def _damaged(path: Path, problem: Exception) -> WorkspaceError:
-    return WorkspaceError(
-        f"{path} cannot be read ({str(problem).splitlines()[0]}): run 'semloc fuse' with --overwrite."
-    )
+    reason = str(problem).splitlines()[0]
+    return WorkspaceError(f"{path} cannot be read ({reason}): run 'semloc fuse' with --overwrite.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,20 +19,19 @@ ODOMETRY_SIGMA_RAD = (0.002, 0.002)
 
 
 def pose_graph(sessions: dict[str, SessionMap], work: Workspace) -> str:
-    """g2o text: keyframes as vertices (each session in its own map frame), odometry between
-    neighbours, closures of closures.parquet.
+    """g2o text: keyframes as vertices, odometry between neighbours, closures of closures.parquet.
 
-    Information is of (x y z, rotation vector in radians) in the axes of the edge's second vertex,
-    as GTSAM and Ceres read it. Odometry has no covariance in a workspace; it is given 2 cm + 1 % of
-    the road and 2 mrad + 2 mrad/m.
+    Each session is in its own map frame. Information is of (x y z, rotation vector in radians) in
+    the axes of the edge's second vertex, as GTSAM and Ceres read it. Odometry has no covariance in
+    a workspace; it is given 2 cm + 1 % of the road and 2 mrad + 2 mrad/m.
     """
     lines: list[str] = []
     first: dict[str, int] = {}
+    count = 0
     for name, session in sessions.items():
-        first[name] = sum(len(s.stamps_ns) for s in list(sessions.values())[: len(first)])
-        lines.append(
-            f"# {name}: vertices {first[name]} .. {first[name] + len(session.stamps_ns) - 1}"
-        )
+        first[name] = count
+        count += len(session.stamps_ns)
+        lines.append(f"# {name}: vertices {first[name]} .. {count - 1}")
         lines += [
             f"VERTEX_SE3:QUAT {first[name] + i} {_pose_text(pose)}"
             for i, pose in enumerate(session.map_T_base)
@@ -45,24 +46,29 @@ def pose_graph(sessions: dict[str, SessionMap], work: Workspace) -> str:
                 + keyframe_at(sessions[row[f"{end}_session"]], row[f"{end}_stamp_ns"])
                 for end in ("query", "target")
             )
-            target_T_query = transform(
-                np.array([row[f"t_{c}"] for c in "xyz"]), np.array([row[f"q_{c}"] for c in "xyzw"])
-            )
-            # from the target's axes into the query's
-            turn = np.kron(np.eye(2), target_T_query[:3, :3].T)
-            covariance = turn @ np.array(row["covariance"]).reshape(6, 6) @ turn.T
-            lines.append(_edge(target, query, target_T_query, covariance))
+            lines.append(_closure_edge(target, query, row))
     return "\n".join(lines) + "\n"
 
 
+def _closure_edge(target: int, query: int, row: dict[str, Any]) -> str:
+    """The edge of a row of closures.parquet."""
+    translation = np.array([row[f"t_{c}"] for c in "xyz"])
+    target_T_query = transform(translation, np.array([row[f"q_{c}"] for c in "xyzw"]))
+    # from the target's axes into the query's
+    turn = np.kron(np.eye(2), target_T_query[:3, :3].T)
+    covariance = turn @ np.array(row["covariance"]).reshape(6, 6) @ turn.T
+    return _edge(target, query, target_T_query, covariance)
+
+
 def _odometry(first: int, poses: F64) -> list[str]:
-    out = []
+    """Edges between neighbouring vertices from ``first`` on, at ``poses`` (n, 4, 4)."""
+    edges = []
     for i in range(len(poses) - 1):
         step = inverse(poses[i]) @ poses[i + 1]
         road = float(np.linalg.norm(step[:3, 3]))
         sigma = np.repeat([a + b * road for a, b in (ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD)], 3)
-        out.append(_edge(first + i, first + i + 1, step, np.diag(sigma**2)))
-    return out
+        edges.append(_edge(first + i, first + i + 1, step, np.diag(sigma**2)))
+    return edges
 
 
 def _edge(a: int, b: int, a_T_b: F64, covariance: F64) -> str:

@@ -1,9 +1,8 @@
-"""Classes from geometry alone: ground, wall-like, vegetation-like, pole-like, by local shape and
-height above the ground.
+"""Classes from geometry alone: ground, wall-like, vegetation-like, pole-like.
 
-What stands on the ground is cut into voxels of the map's size; the surroundings of each voxel
-decide (:func:`_class_of`), and then the majority of its neighbours. Vehicles and whatever else is
-neither stay unlabelled. All lengths are at street scale (0.30 m voxels) and follow ``scale``.
+Points above the ground are summed up in voxels of the map's size; the surroundings of each voxel
+decide (:func:`_class_of`), and then the majority of its neighbours. Vehicles and the rest stay
+unlabelled. All lengths are at street scale (0.30 m voxels) and follow ``scale``.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ I64 = NDArray[np.int64]
 VOXEL = 0.30  # (m)
 # points lower than this are ground; a small scale does not make sensors better (m)
 ON_GROUND, LEAST_ON_GROUND = 0.10, 0.04
-# what reaches higher is no car; objects that may be vehicles are cut off here (m)
+# cars are not taller; objects that may be vehicles are lower (m)
 TALL, LOW = 1.8, 2.3
 
 
@@ -33,25 +32,25 @@ def classify(
     scale: float = 1.0,
     ground: GroundSurface | None = None,
 ) -> U8:
-    """Class (n,) of level ``points`` (n, 3), z up, of a sensor at ``origin`` (3,); 255 where the
-    shape says nothing.
+    """Class (n,) of level ``points`` (n, 3), z up, of a sensor at ``origin`` (3,).
 
-    ``scale`` is the voxel size over 0.30 m: a room is a street in miniature. ``ground`` saves
-    finding the ground again. Points beyond 120 m of the sensor (at street scale) stay unlabelled.
+    255 where the shape does not decide. ``scale`` is the voxel size over 0.30 m: a room is a street
+    in miniature. ``ground`` saves estimating the ground again. Points beyond 120 m of the sensor
+    (at street scale) stay unlabelled.
     """
     label = np.full(len(points), UNLABELLED, np.uint8)
     p = np.asarray(points, np.float64)
     o = np.asarray(origin, np.float64)
-    near = np.flatnonzero((np.abs(p - o) <= REACH * scale).all(1))
-    if not len(near):
+    in_reach = np.flatnonzero((np.abs(p - o) <= REACH * scale).all(1))
+    if not len(in_reach):
         return label
-    p = p[near]
+    p = p[in_reach]
     height = p[:, 2] - (ground or ground_surface(p, o, scale)).height_at(p[:, :2])
     low = height < max(ON_GROUND * scale, LEAST_ON_GROUND)
-    label[near[low]] = ROAD
+    label[in_reach[low]] = ROAD
     standing = np.flatnonzero(~low)
     if len(standing):
-        label[near[standing]] = _standing_classes(p[standing], height[standing], scale)
+        label[in_reach[standing]] = _standing_classes(p[standing], height[standing], scale)
     return label
 
 
@@ -60,9 +59,9 @@ def _standing_classes(points: F64, height: F64, scale: float) -> U8:
     size = VOXEL * scale
     voxels = voxelise(points, size)
     mean = np.bincount(voxels.of_point, height) / np.bincount(voxels.of_point)
-    found = _class_of(voxels, voxel_shapes(points, voxels, size), mean, scale)
-    smooth = _majority(voxels.ijk, found, voxels.start, *voxels.shape)
-    return np.where((found == POLE) | (smooth == POLE), found, smooth)[voxels.of_point]
+    own = _class_of(voxels, voxel_shapes(points, voxels, size), mean, scale)
+    smooth = _majority(voxels.ijk, own, voxels.start, *voxels.shape)
+    return np.where((own == POLE) | (smooth == POLE), own, smooth)[voxels.of_point]
 
 
 def _class_of(voxels: Voxels, s: VoxelShapes, height: F64, scale: float) -> U8:
@@ -91,8 +90,9 @@ def _class_of(voxels: Voxels, s: VoxelShapes, height: F64, scale: float) -> U8:
 
 @njit(cache=True, nogil=True)
 def _majority(ijk: I64, label: U8, start: I64, nx: int, ny: int) -> U8:
-    """The class (m,) that most of a voxel and its 26 neighbours have; its own counts twice and wins
-    a tie.
+    """The class (m,) of most of a voxel and its 26 neighbours.
+
+    The voxel's own class counts twice and wins a tie.
     """
     out = label.copy()
     votes = np.zeros(256, np.int64)

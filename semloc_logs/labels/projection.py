@@ -16,11 +16,11 @@ _MARGIN = 1.25
 
 
 class Projector:
-    """Projects points of a camera's optical frame (x right, y down, z forward) into its pictures of
-    ``height`` x ``width`` pixels.
+    """Projects points of a camera's optical frame into its pictures, ``height`` x ``width`` pixels.
 
-    ``rectified``: the picture is undistorted, so R and P hold, not K and D. A picture that was
-    scaled as a whole is allowed for. LogError when the calibration cannot be used.
+    The optical frame has x right, y down, z forward. ``rectified``: the picture is undistorted, so
+    R and P hold, not K and D. A picture that was scaled as a whole is allowed for. LogError when
+    the calibration cannot be used.
     """
 
     def __init__(self, camera: Camera, height: int, width: int, *, rectified: bool = False) -> None:
@@ -37,7 +37,8 @@ class Projector:
         scale = np.array([width / (camera.width or width), height / (camera.height or height)])
         if abs(scale[0] / scale[1] - 1) > 0.02:
             raise LogError(
-                f"{where} is for {camera.width} x {camera.height} pixels but its picture has {width} x {height}: "
+                f"{where} is for {camera.width} x {camera.height} pixels but its picture has "
+                f"{width} x {height}: "
                 f"record the CameraInfo of the picture, or name it with --topic camera_info=TOPIC."
             )
         # pixel centres are whole numbers: the corner of the picture is at -0.5
@@ -45,7 +46,8 @@ class Projector:
         matrix[:2, :2] *= scale[:, None]
         if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
             raise LogError(
-                f"{where} has no focal length: the camera is not calibrated; name another with --topic camera_info=TOPIC."
+                f"{where} has no focal length: the camera is not calibrated; name another with "
+                "--topic camera_info=TOPIC."
             )
         self.height, self.width, self.focal, self._matrix = (
             height,
@@ -64,8 +66,10 @@ class Projector:
         ) and count in (4, 5, 8, 12, 14)
         if np.any(self._distortion) and not (self._fisheye or is_polynomial):
             raise LogError(
-                f"{where} has the distortion model '{camera.model[:40]}' with {count} coefficients, which is not supported: "
-                f"record rectified pictures, or name another calibration with --topic camera_info=TOPIC."
+                f"{where} has the distortion model '{camera.model[:40]}' with {count} "
+                "coefficients, which is not supported: "
+                "record rectified pictures, or name another calibration with --topic "
+                "camera_info=TOPIC."
             )
         corners = (
             np.array([[u, v] for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
@@ -75,10 +79,10 @@ class Projector:
         self._widest = _widest(self._distortion, self._fisheye, _MARGIN * corner)
 
     def pixels(self, points: NDArray[np.floating]) -> tuple[F64, NDArray[np.bool_]]:
-        """Pixel coordinates (n, 2) of ``points`` (n, 3) and which of them are in front of the
-        camera and near its field of view.
+        """Pixels (n, 2) of ``points`` (n, 3), and which of them may be in the picture.
 
-        The others have no pixel coordinates (NaN).
+        These are in front of the camera and near its field of view. The others have no pixel
+        coordinates (NaN).
         """
         p = points if np.array_equal(self._rotation, np.eye(3)) else points @ self._rotation.T
         out = np.full((len(p), 2), np.nan)
@@ -87,21 +91,21 @@ class Projector:
         # surroundings into it
         steepest = np.tan(self._widest)
         front &= np.square(p[:, 0]) + np.square(p[:, 1]) <= np.square(p[:, 2] * steepest)
-        at = np.flatnonzero(front)
-        if not len(at):
+        rows = np.flatnonzero(front)
+        if not len(rows):
             return out, front
-        rays = np.asarray(p[at], float)
+        rays = np.asarray(p[rows], float)
         rays /= rays[:, 2:]
         if not np.any(self._distortion) and not self._fisheye:
             m = self._matrix
-            out[at, 0] = m[0, 0] * rays[:, 0] + m[0, 1] * rays[:, 1] + m[0, 2]
-            out[at, 1] = m[1, 1] * rays[:, 1] + m[1, 2]
+            out[rows, 0] = m[0, 0] * rays[:, 0] + m[0, 1] * rays[:, 1] + m[0, 2]
+            out[rows, 1] = m[1, 1] * rays[:, 1] + m[1, 2]
         else:
             project = cv2.fisheye.projectPoints if self._fisheye else cv2.projectPoints
-            found = project(
+            projected = project(
                 rays[:, None], np.zeros((1, 3)), np.zeros((1, 3)), self._matrix, self._distortion
             )[0]
-            out[at] = np.asarray(found, float).reshape(-1, 2)
+            out[rows] = np.asarray(projected, float).reshape(-1, 2)
         return out, front
 
     def inside(self, pixels: F64) -> NDArray[np.bool_]:
@@ -109,7 +113,10 @@ class Projector:
         return self.near(pixels, 0.0)
 
     def near(self, pixels: F64, margin: float) -> NDArray[np.bool_]:
-        """Which of ``pixels`` (n, 2) lie in the picture or beside it within this share of its size."""
+        """Which of ``pixels`` (n, 2) lie in the picture or beside it.
+
+        ``margin`` is the distance that is allowed, a share of the picture's size.
+        """
         u = pixels[:, 0]
         v = pixels[:, 1]
         x = margin * self.width
@@ -123,8 +130,9 @@ class Projector:
 
 
 def _widest(distortion: F64, fisheye: bool, corner: float) -> float:
-    """Angle from the optical axis (rad) up to which the distorted radius grows, and does not exceed
-    ``corner`` (at focal length 1).
+    """Angle from the optical axis (rad) up to which the distorted radius grows.
+
+    The radius does not exceed ``corner`` (at focal length 1).
     """
     angle = np.linspace(0, _STEEPEST, 2000)
     k = np.zeros(14)

@@ -1,7 +1,7 @@
 """The user's ONNX model: camera picture -> Cityscapes train ids of its pixels.
 
 It runs in onnxruntime (the extra ``onnx``) or, where that is not installed, in OpenCV, in as many
-threads as ``labels.threads`` says.
+threads as ``labels.threads`` allows.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ Net = Callable[[NDArray[Any]], NDArray[Any]]  # a batch of one picture -> the ou
 
 def fingerprint(settings: Labels) -> str:
     """Hashes of the files that ``settings`` name: model, spec, label spaces; "" without any.
+
     SettingsError if one is missing.
     """
     paths = []
@@ -54,14 +55,16 @@ def _digest(path: Path) -> str:
 def _named(settings: Labels) -> tuple[Path, Path]:
     if settings.model is None or settings.spec is None:
         raise SettingsError(
-            "labels.source=onnx needs a model and its spec: give --seg-model MODEL.onnx --seg-spec SPEC.yaml."
+            "labels.source=onnx needs a model and its spec: give --seg-model MODEL.onnx --seg-spec "
+            "SPEC.yaml."
         )
     return settings.model, settings.spec
 
 
 class Segmenter:
-    """A model with its spec. :meth:`train_ids` is a function of the picture alone: the same picture
-    gives the same labels.
+    """A model with its spec.
+
+    :meth:`train_ids` depends on the picture alone: the same picture gives the same labels.
     """
 
     def __init__(
@@ -71,14 +74,15 @@ class Segmenter:
         self._space = spec.label_space(spec_path)
         ignored = spec.ignored(self._space)
         ids = np.arange(max(self._space.targets, default=0) + 1)
-        # the last for what a model itself leaves out
+        # the last is for pixels that a model itself leaves out
         self._table = np.append(self._space.train_ids(ids), np.uint8(UNLABELLED))
         self._table[sorted(ignored)] = UNLABELLED
 
     @classmethod
     def open(cls, settings: Labels) -> Segmenter:
-        """The model that ``labels.model`` and ``labels.spec`` name. SettingsError when one of them
-        is missing or cannot be used.
+        """The model that ``labels.model`` and ``labels.spec`` name.
+
+        SettingsError when one of them is missing or cannot be used.
         """
         model_path, spec_path = _named(settings)
         spec = read_spec(spec_path)
@@ -97,9 +101,7 @@ class Segmenter:
         }
 
     def train_ids(self, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> U32:
-        """Train ids (h, w) of a picture (h, w) or (h, w, 3) RGB; UNPAINTED where the spec crops it
-        off.
-        """
+        """Train ids (h, w) of a picture (h, w) or (h, w, 3) RGB; UNPAINTED where it is cropped."""
         spec = self._spec.input
         height, width = picture.shape[:2]
         top, bottom, left, right = (
@@ -126,8 +128,9 @@ class Segmenter:
         return out
 
     def _batch(self, picture: U8) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
-        """The input of the model, and the share of it that is the picture: first and last of rows
-        and of columns.
+        """The input of the model, and the share of it that the picture fills.
+
+        The share is the first and last of rows and of columns.
         """
         spec = self._spec.input
         rows, columns = spec.size
@@ -157,8 +160,9 @@ class Segmenter:
         return np.ascontiguousarray(values[None]), box
 
     def _ids(self, output: NDArray[Any]) -> NDArray[np.intp]:
-        """Class ids (rows, columns) of what the model gave. SettingsError when it is not of the
-        form that the spec says.
+        """Class ids (rows, columns) of the model's output.
+
+        SettingsError when the output has not the form that the spec describes.
         """
         spec = self._spec.output
         given = " x ".join(map(str, output.shape))
@@ -169,31 +173,37 @@ class Segmenter:
         )
         if not output.size or output.dtype.kind not in "biuf":
             raise SettingsError(
-                f"Model {self._path} gives {given} values of type {output.dtype}: output.name may be that of another."
+                f"Model {self._path} gives {given} values of type {output.dtype}: output.name may "
+                "name another output."
             )
         classes = len(self._table) - 1
         if spec.kind == "ids":
             if image.ndim != 2:
                 raise SettingsError(
-                    f"Model {self._path} gives {given} values, which is no picture of ids: output.kind may be 'logits'."
+                    f"Model {self._path} gives {given} values, not a picture of ids: "
+                    "output.kind may be 'logits'."
                 )
             ids: NDArray[np.intp] = np.rint(image).astype(np.intp)
             left_out = (ids == -1) | ((ids == UNLABELLED) & (classes <= UNLABELLED))
             strange = ids[((ids < 0) | (ids >= classes)) & ~left_out]
             if len(strange):
                 raise SettingsError(
-                    f"Model {self._path} gives the class {strange[0]}, but {self._space.name} ends at {classes - 1}."
+                    f"Model {self._path} gives the class {strange[0]}, but {self._space.name} ends "
+                    f"at {classes - 1}."
                 )
             return np.where(left_out, classes, ids)
         if image.ndim != 3 or (image.shape[0] == 1 and classes > 1):
             raise SettingsError(
-                f"Model {self._path} gives {given} values, not classes x rows x columns: output.kind may be 'ids'."
+                f"Model {self._path} gives {given} values, not classes x rows x columns: "
+                "output.kind may be 'ids'."
             )
         axis = 0 if spec.layout == "CHW" else 2
         if image.shape[axis] != classes:
             raise SettingsError(
-                f"Model {self._path} gives {given} values, {image.shape[axis]} classes in layout {spec.layout}, "
-                f"but {self._space.name} has {classes}: give the model's own list of classes, or another layout."
+                f"Model {self._path} gives {given} values, {image.shape[axis]} classes in layout "
+                f"{spec.layout}, "
+                f"but {self._space.name} has {classes}: give the model's own list of classes, or "
+                "another layout."
             )
         best: NDArray[np.intp] = np.argmax(image, axis=axis)
         return best
@@ -245,12 +255,14 @@ def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, threads: int) -> Net
     name = spec.input.name or (next(iter(inputs)) if len(inputs) == 1 else "")
     if name not in inputs:
         raise SettingsError(
-            f"Model {path} has no input '{name}': name one of {', '.join(inputs)} as input.name in its spec."
+            f"Model {path} has no input '{name}': name one of {', '.join(inputs)} as input.name in "
+            "its spec."
         )
     output = spec.output.name or outputs[0]
     if output not in outputs:
         raise SettingsError(
-            f"Model {path} has no output '{output}': name one of {', '.join(outputs)} as output.name in its spec."
+            f"Model {path} has no output '{output}': name one of {', '.join(outputs)} as "
+            "output.name in its spec."
         )
     _check_shape(path, spec, inputs[name].shape, inputs[name].type)
 
@@ -259,7 +271,8 @@ def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, threads: int) -> Net
             return np.asarray(session.run([output], {name: batch})[0])
         except Exception as error:
             raise SettingsError(
-                f"Model {path} fails on an input of {' x '.join(map(str, batch.shape))}: {_short(error)}."
+                f"Model {path} fails on an input of {' x '.join(map(str, batch.shape))}: "
+                f"{_short(error)}."
             ) from None
 
     return run
@@ -273,13 +286,14 @@ def _check_shape(path: Path, spec: Spec, shape: list[Any], type_: str) -> None:
     )
     if not fits:
         raise SettingsError(
-            f"Model {path} takes an input of {' x '.join(map(str, shape))}, but its spec says {' x '.join(map(str, wanted))} "
+            f"Model {path} takes an input of {' x '.join(map(str, shape))}, but its spec has "
+            f"{' x '.join(map(str, wanted))} "
             f"({spec.input.layout}): correct input.size or input.layout."
         )
     types = {"tensor(float)": "float32", "tensor(uint8)": "uint8"}
     if types.get(type_) != spec.input.type:
         raise SettingsError(
-            f"Model {path} takes {type_}, but its spec says input.type {spec.input.type}."
+            f"Model {path} takes {type_}, but its spec has input.type {spec.input.type}."
         )
 
 
@@ -289,7 +303,8 @@ def _load_cv2(path: Path, spec: Spec, threads: int) -> Net:
         net = cv2.dnn.readNetFromONNX(str(path))
     except (cv2.error, RuntimeError) as error:
         raise SettingsError(
-            f"Model {path} cannot be read by OpenCV: {_short(error)}; install onnxruntime (pip install 'semloc_logs[onnx]')."
+            f"Model {path} cannot be read by OpenCV: {_short(error)}; install onnxruntime (pip "
+            "install 'semloc_logs[onnx]')."
         ) from None
 
     def run(batch: NDArray[Any]) -> NDArray[Any]:
@@ -298,7 +313,8 @@ def _load_cv2(path: Path, spec: Spec, threads: int) -> Net:
             return np.asarray(net.forward(spec.output.name) if spec.output.name else net.forward())
         except (cv2.error, RuntimeError) as error:
             raise SettingsError(
-                f"Model {path} fails in OpenCV: {_short(error)}; install onnxruntime (pip install 'semloc_logs[onnx]')."
+                f"Model {path} fails in OpenCV: {_short(error)}; install onnxruntime (pip install "
+                "'semloc_logs[onnx]')."
             ) from None
 
     return run

@@ -1,4 +1,4 @@
-"""What a segmentation model takes and gives: the user's YAML file beside the model."""
+"""The input and output of a segmentation model: the user's YAML file beside the model."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ class Input(_Part):
     )
     crop: tuple[float, float, float, float] = Field(
         (0.0, 0.0, 0.0, 0.0),
-        description="shares of the picture cut off first: top, bottom, left, right (a bonnet); they get no label",
+        description="shares of the picture cut off first: top, bottom, left, right (a bonnet); "
+        "they get no label",
     )
 
     @model_validator(mode="after")
@@ -50,9 +51,7 @@ class Input(_Part):
 
 
 class Output(_Part):
-    """What the model gives: ``logits`` or probabilities for each class and pixel, or the class
-    ``ids``.
-    """
+    """The model's output: ``logits`` or probabilities by class and pixel, or class ``ids``."""
 
     name: str | None = Field(None, description="name of the output; default: the first")
     kind: Literal["logits", "ids"] = "logits"
@@ -60,8 +59,10 @@ class Output(_Part):
 
 
 class Spec(_Part):
-    """The whole file. Classes are those of a label ``space`` (a name or a YAML file) or a list
-    ``classes`` of names, by id.
+    """The whole file.
+
+    Classes come from a label ``space`` (a name or a YAML file) or from a list ``classes`` of names,
+    by id.
     """
 
     input: Input
@@ -79,8 +80,9 @@ class Spec(_Part):
         return self
 
     def label_space(self, where: Path) -> LabelSpace:
-        """What the ids of the model mean; a YAML file of a space lies relative to the spec file
-        ``where``.
+        """The meaning of the model's ids.
+
+        A YAML file of a space lies relative to the spec file ``where``.
         """
         if self.classes is not None:
             return space_of_names(dict(enumerate(self.classes)), str(where))
@@ -92,22 +94,23 @@ class Spec(_Part):
         """Ids that become unlabelled. SettingsError for a class that is not there."""
         ids = set[int]()
         for wanted in self.ignore:
-            found = {
+            matching = {
                 i
                 for i, n in space.names.items()
                 if i == wanted or (isinstance(wanted, str) and plain(n) == plain(wanted))
             }
-            if not found:
+            if not matching:
                 raise SettingsError(
-                    f"The spec of the model ignores '{wanted}', which is no class of {space.name}."
+                    f"The spec of the model ignores '{wanted}': {space.name} has no such class."
                 )
-            ids |= found
+            ids |= matching
         return ids
 
 
 def read_spec(path: Path) -> Spec:
-    """The spec file ``path``. SettingsError that names the key when it is unknown or its value
-    impossible.
+    """The spec file ``path``.
+
+    SettingsError that names the key when it is unknown or its value impossible.
     """
     content = read_yaml(path, "Spec")
     try:

@@ -33,8 +33,10 @@ U32 = NDArray[np.uint32]
 
 @dataclass(frozen=True, slots=True)
 class Cityscapes:
-    """The label space of every map: names and RGB colours by train id, which are dynamic, and the
-    coarse set (id -> index).
+    """The label space of every map: names and RGB colours by train id.
+
+    ``dynamic`` marks the classes that move; ``coarse`` is the index of each class in the coarse
+    set.
     """
 
     names: tuple[str, ...]
@@ -46,9 +48,11 @@ class Cityscapes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelSpace:
-    """What the ids of a log mean: ``names`` and ``targets`` (Cityscapes train ids, 255 unlabelled)
-    by id, RGB ``colours`` where they are known, ``dynamic`` ids. An id is what is left of the
-    recorded number under ``mask``. ``unknown`` are names that mean nothing here.
+    """The meaning of a log's ids.
+
+    ``names`` and ``targets`` (Cityscapes train ids, 255 unlabelled) by id, RGB ``colours`` where
+    they are known, ``dynamic`` ids. An id is the recorded number under ``mask``. ``unknown`` are
+    names without a class of Cityscapes.
     """
 
     name: str
@@ -69,10 +73,10 @@ class LabelSpace:
         return out
 
     def train_ids_of_colours(self, packed: U32) -> tuple[U8, dict[int, int]]:
-        """Train ids of colours ``packed`` as by :func:`semloc_logs.logs.sensors.depth.label_ids`;
-        and how often which colour is not in the palette.
+        """Train ids of ``packed`` colours, and how often which colour is missing in the palette.
 
-        Black means unlabelled where a palette does not use it.
+        Colours are packed as by :func:`semloc_logs.logs.sensors.depth.label_ids`. Black means
+        unlabelled where a palette does not use it.
         """
         palette = {0: UNLABELLED} | {
             c[0] << 16 | c[1] << 8 | c[2]: self.targets[i]
@@ -81,10 +85,10 @@ class LabelSpace:
         keys = np.array(sorted(palette), np.uint32)
         targets = np.array([palette[int(k)] for k in keys], np.uint8)
         flat = np.asarray(packed, np.uint32).reshape(-1)
-        at = np.minimum(np.searchsorted(keys, flat), len(keys) - 1)
-        known = keys[at] == flat
+        place = np.minimum(np.searchsorted(keys, flat), len(keys) - 1)
+        known = keys[place] == flat
         strange, counts = np.unique(flat[~known & (flat != UNPAINTED)], return_counts=True)
-        out = np.where(known, targets[at], UNLABELLED).astype(np.uint8)
+        out = np.where(known, targets[place], UNLABELLED).astype(np.uint8)
         return out.reshape(np.shape(packed)), dict(
             zip(strange.tolist(), counts.tolist(), strict=True)
         )
@@ -112,13 +116,14 @@ def spaces() -> list[str]:
 
 
 def is_file_name(name: str) -> bool:
-    """Whether ``name`` is that of a YAML file, not of a shipped space."""
+    """Whether ``name`` names a YAML file, not a shipped space."""
     return Path(name).suffix.lower() in (".yaml", ".yml")
 
 
 def read_space(name: str) -> LabelSpace:
-    """The shipped space ``name``, or that of the YAML file ``name``. SettingsError for an unknown
-    name and for a file that is none.
+    """The shipped space ``name``, or the space of the YAML file ``name``.
+
+    SettingsError for an unknown name and for a file that does not hold a space.
     """
     if name in spaces():
         return _shipped(name)
@@ -145,24 +150,25 @@ def _parse(content: Any, where: str, by_name: Mapping[str, int]) -> LabelSpace:
         }
     except (TypeError, KeyError, ValueError, AttributeError, OverflowError):
         raise SettingsError(
-            f"Label space {where} has no 'classes' of the form 'ID: {{name: NAME, to: CITYSCAPES_CLASS}}'."
+            f"Label space {where} has no 'classes' of the form 'ID: {{name: NAME, to: "
+            f"CITYSCAPES_CLASS}}'."
         ) from None
     if not 0 <= mask <= 0xFFFFFFFF:
         raise SettingsError(
             f"Label space {where} has the mask {mask:#x}: it has to be within 32 bits."
         )
-    found = dict[int, str]()
+    class_names = dict[int, str]()
     targets = dict[int, int]()
     colours = dict[int, tuple[int, int, int]]()
     unknown = list[str]()
     for i, row in rows.items():
         if not 0 <= i <= _HIGHEST_ID:
             raise SettingsError(f"Label space {where} has the id {i}: ids are 0 to {_HIGHEST_ID}.")
-        found[i] = str(row.get("name", i))
-        target = _target(row["to"], where, i) if "to" in row else by_name.get(plain(found[i]))
+        class_names[i] = str(row.get("name", i))
+        target = _target(row["to"], where, i) if "to" in row else by_name.get(plain(class_names[i]))
         targets[i] = UNLABELLED if target is None else target
         if target is None:
-            unknown.append(found[i])
+            unknown.append(class_names[i])
         if row.get("colour") is not None:
             colours[i] = _colour(row["colour"], where, i)
     dynamic = frozenset(
@@ -171,7 +177,13 @@ def _parse(content: Any, where: str, by_name: Mapping[str, int]) -> LabelSpace:
         if row.get("dynamic") or (targets[i] < 19 and cityscapes().dynamic[targets[i]])
     )
     return LabelSpace(
-        str(content.get("name", where)), found, targets, colours, dynamic, mask, tuple(unknown)
+        str(content.get("name", where)),
+        class_names,
+        targets,
+        colours,
+        dynamic,
+        mask,
+        tuple(unknown),
     )
 
 
@@ -184,7 +196,8 @@ def _target(value: Any, where: str, i: int) -> int:
     if type(value) is int and 0 <= value < len(own):
         return value
     raise SettingsError(
-        f"Label space {where} maps {i} to {str(value)[:40]!r}, which is no class of Cityscapes: {', '.join(own)}, or null."
+        f"Label space {where} maps {i} to {str(value)[:40]!r}, not a class of Cityscapes: "
+        f"{', '.join(own)}, or null."
     )
 
 
@@ -196,7 +209,8 @@ def _colour(value: Any, where: str, i: int) -> tuple[int, int, int]:
     ):
         return value[0], value[1], value[2]
     raise SettingsError(
-        f"Label space {where} gives {i} the colour {str(value)[:40]!r}: it has to be [red, green, blue], each 0 to 255."
+        f"Label space {where} gives {i} the colour {str(value)[:40]!r}: it has to be [red, green, "
+        "blue], each 0 to 255."
     )
 
 
@@ -210,8 +224,9 @@ def plain(name: str) -> str:
 
 @cache
 def trains_by_name() -> Mapping[str, int]:
-    """Train ids by :func:`plain` name: the classes, their synonyms (schemas/label_names.yaml), the
-    names of the shipped spaces.
+    """Train ids by :func:`plain` name.
+
+    The classes, their synonyms (schemas/label_names.yaml), the names of the shipped spaces.
     """
     own = cityscapes().names
     known = {plain(n): i for i, n in enumerate(own)}
@@ -228,11 +243,10 @@ def trains_by_name() -> Mapping[str, int]:
 
 
 def space_of_names(classes: Mapping[int, str], name: str) -> LabelSpace:
-    """The space of a list of class names; of a path such as ``construction--flat--road`` the last
-    part that is known counts.
+    """The space of a list of class names.
 
-    Ids below 0 or above 65535, which only a damaged log gives, have no meaning and are among the
-    unknown.
+    Of a path such as ``construction--flat--road`` the last part that is known counts. Ids below 0
+    or above 65535, which only a damaged log gives, have no meaning and are among the unknown.
     """
     targets = dict[int, int]()
     unknown = list[str]()
@@ -249,19 +263,21 @@ def space_of_names(classes: Mapping[int, str], name: str) -> LabelSpace:
     return LabelSpace(name, dict(classes), targets, {}, dynamic, unknown=tuple(unknown))
 
 
-# -- of a log that does not say
+# -- of a log that does not name its space
 
 
 def to_cityscapes(ids: NDArray[np.integer], space: str) -> U8:
-    """Train ids (n,) of the ids of a log; 255 where the space does not map them. Raises
+    """Train ids (n,) of the ids of a log; 255 where the space does not map them.
+
     SettingsError for an unknown space.
     """
     return read_space(space).train_ids(ids)
 
 
 def guess_space(ids: NDArray[np.integer]) -> str:
-    """The label space that a log's ids look like: SemanticKITTI has ids above 18 and instances,
-    Cityscapes none but 255.
+    """The label space that a log's ids look like.
+
+    SemanticKITTI has ids above 18 and instances, Cityscapes none but 255.
     """
     every = np.unique(np.asarray(ids, np.int64))
     low = set((every & 0xFFFF).tolist()) - {UNLABELLED}
@@ -275,8 +291,9 @@ def guess_space(ids: NDArray[np.integer]) -> str:
 
 
 def guess_palette(colours: Mapping[int, int]) -> str | None:
-    """The shipped space whose palette knows most pixels of the packed ``colours`` (colour ->
-    count); None if none knows half of them.
+    """The shipped space whose palette knows most pixels of ``colours`` (packed colour -> count).
+
+    None if none knows half of them.
     """
     total = sum(n for colour, n in colours.items() if colour)
     ranked = sorted(

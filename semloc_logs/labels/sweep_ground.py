@@ -2,14 +2,15 @@
 
 Echoes that come by way of a window or a puddle lie metres below the street, and parked cars, hedges
 and fronts of houses hide it. The ground, however, is continuous: from cell to cell it rises or
-falls by little. So it starts with the height that most cells below the sensor have and is followed
-outwards; what is far below the height that the neighbours promise is an echo, what is far above it
-is something that stands on the ground.
+falls by little. So it starts with the height of most cells below the sensor and is followed
+outwards: points far below the height that the neighbours predict are echoes, points far above it
+are objects.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -23,8 +24,8 @@ I64 = NDArray[np.int64]
 CELL = 1.0  # of the grid, at street scale (m)
 # points farther than this from the sensor, in x, y or z, are left out, at street scale (m)
 REACH = 120.0
-SEED_RANGE = 15.0  # cells that say how high the ground is below the sensor (m)
-# m from one cell to the next, and what each unseen cell between adds to it
+SEED_RANGE = 15.0  # of cells that give the height of the ground below the sensor (m)
+# m from one cell to the next, and by how much each unseen cell between widens it
 STEP, WIDENING, MOST_GAP = 0.25, 0.12, 4.0
 LAYER = 0.12  # points this near to the lowest of a cell are ground (m)
 ROUNDS = 16  # of relaxation, two for each way through the grid
@@ -32,9 +33,10 @@ ROUNDS = 16  # of relaxation, two for each way through the grid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundSurface:
-    """Heights ``z`` (nx, ny) at the centres of cells of ``cell`` metres, the grid's corner at
-    ``low`` (2,); ``gap`` (nx, ny) is the way to the nearest cell where the ground was seen, in
-    cells, 0 where it was seen itself.
+    """Heights ``z`` (nx, ny) at the centres of cells of ``cell`` metres.
+
+    The grid's corner is at ``low`` (2,); ``gap`` (nx, ny) is the way to the nearest cell where the
+    ground was seen, in cells, 0 where it was seen itself.
     """
 
     low: F64
@@ -48,20 +50,21 @@ class GroundSurface:
         return np.stack(np.meshgrid(x, y, indexing="ij"), -1)
 
     def height_at(self, xy: NDArray[np.floating]) -> F64:
-        """Height (n,) of the ground at ``xy`` (n, 2), bilinear between cells, that of the border
-        outside.
+        """Height (n,) of the ground at ``xy`` (n, 2), bilinear between cells.
+
+        Outside of the grid the height of its border.
         """
-        at = np.ascontiguousarray(xy, np.float64)
-        return np.asarray(_bilinear(self.z, (at - self.low) / self.cell - 0.5))
+        positions = np.ascontiguousarray(xy, np.float64)
+        return np.asarray(_bilinear(self.z, (positions - self.low) / self.cell - 0.5))
 
 
 def ground_surface(
     points: NDArray[np.floating], origin: NDArray[np.floating], scale: float = 1.0
 ) -> GroundSurface:
-    """The ground below level ``points`` (n, 3), z up, seen from ``origin`` (3,); ``scale`` is the
-    voxel size over 0.30 m.
+    """The ground below level ``points`` (n, 3), z up, seen from ``origin`` (3,).
 
-    Points beyond 120 m (at 0.30 m voxels) of the origin in any axis do not count.
+    ``scale`` is the voxel size over 0.30 m. Points beyond 120 m (at 0.30 m voxels) of the origin in
+    any axis do not count.
     """
     cell = CELL * scale
     o = np.asarray(origin, np.float64)
@@ -75,42 +78,52 @@ def ground_surface(
     nx, ny = (np.floor((p[:, :2].max(0) - low) / cell) + 2).astype(int).tolist()
     column = ((p[:, :2] - low) / cell).astype(np.int64)
     order, start = by_cell(column[:, 0] * ny + column[:, 1], nx * ny)
-    lowest = _lowest(p[:, 2].copy(), start, order)
+    cells = _Cells(p[:, 2].copy(), order, start, nx, ny)
+    lowest = _lowest(cells)
     i, j = np.divmod(np.arange(nx * ny), ny)
     away = np.hypot(low[0] + (i + 0.5) * cell - o[0], low[1] + (j + 0.5) * cell - o[1])
     seed = _seed(lowest, away, float(o[2]), scale)
     if seed is None:
         seed = float(np.percentile(p[:, 2], 2))
-    z, gap = _grow(
-        p[:, 2].copy(), start, order, nx, ny, np.argsort(away, kind="stable"), seed, scale
-    )
-    return GroundSurface(
-        low, cell, _relax(z, gap, nx, ny, scale).reshape(nx, ny), gap.reshape(nx, ny)
-    )
+    z, gap = _grow(cells, np.argsort(away, kind="stable"), seed, scale)
+    smooth = _relax(z, gap, nx, ny, scale)
+    return GroundSurface(low, cell, smooth.reshape(nx, ny), gap.reshape(nx, ny))
+
+
+class _Cells(NamedTuple):
+    """Points of height ``z`` (n,) by cells of a grid (nx, ny), for compiled functions.
+
+    Cell a = i * ny + j holds the points ``order[start[a]:start[a + 1]]``.
+    """
+
+    z: F64
+    order: I64
+    start: I64
+    nx: int
+    ny: int
 
 
 def _seed(lowest: F64, away: F64, origin_z: float, scale: float) -> float | None:
-    """The height that most cells near the sensor have as their lowest point, below the sensor; None
-    if there is none there.
-    """
-    near = lowest[
+    """The most frequent lowest height of the cells around the sensor and below it, if any."""
+    candidates = lowest[
         (away < SEED_RANGE * scale)
         & (lowest < origin_z - 0.3 * scale)
         & (lowest > origin_z - 5 * scale)
     ]
-    if not len(near):
+    if not len(candidates):
         return None
-    bins = np.round(near / (0.1 * scale)).astype(np.int64)
+    bins = np.round(candidates / (0.1 * scale)).astype(np.int64)
     bins -= bins.min()
     count = (
         np.convolve(np.bincount(bins), [1, 2, 1], "same") if bins.max() > 1 else np.bincount(bins)
     )
-    return float(np.median(near[np.abs(bins - int(np.argmax(count))) <= 1]))
+    return float(np.median(candidates[np.abs(bins - int(np.argmax(count))) <= 1]))
 
 
 @njit(cache=True, nogil=True)
-def _lowest(z: F64, start: I64, order: I64) -> F64:
-    """Lowest height of each cell, infinite where there is no point."""
+def _lowest(cells: _Cells) -> F64:
+    """Lowest height of each cell, infinite without points."""
+    z, order, start, _, _ = cells
     out = np.full(len(start) - 1, np.inf)
     for a in range(len(out)):
         for k in range(start[a], start[a + 1]):
@@ -119,9 +132,10 @@ def _lowest(z: F64, start: I64, order: I64) -> F64:
 
 
 @njit(cache=True, nogil=True)
-def _promise(z: F64, gap: F64, a: int, nx: int, ny: int) -> tuple[float, float]:
-    """What the visited cells within two cells of ``a`` say of its height, and how far it is from
-    the nearest seen one (-1: nothing).
+def _predicted(z: F64, gap: F64, a: int, nx: int, ny: int) -> tuple[float, float]:
+    """The height of cell ``a`` by the visited cells within two cells, and the way to a seen one.
+
+    The way is in cells, -1 where none of them was visited.
     """
     i = a // ny
     j = a % ny
@@ -140,31 +154,23 @@ def _promise(z: F64, gap: F64, a: int, nx: int, ny: int) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def _grow(
-    height: F64,
-    start: I64,
-    order: I64,
-    nx: int,
-    ny: int,
-    sequence: NDArray[np.int64],
-    seed: float,
-    scale: float,
-) -> tuple[F64, F64]:
+def _grow(cells: _Cells, sequence: I64, seed: float, scale: float) -> tuple[F64, F64]:
     """Height and gap of all cells, visited in ``sequence``; the first ones lie at ``seed``."""
+    height, order, start, nx, ny = cells
     z = np.empty(nx * ny)
     gap = np.full(nx * ny, -1.0)
     for a in sequence:
-        promised, away = _promise(z, gap, a, nx, ny)
+        predicted, away = _predicted(z, gap, a, nx, ny)
         if away < 0:
-            promised, away = seed, 1.0
+            predicted, away = seed, 1.0
         tolerance = scale * (STEP + WIDENING * min(away, MOST_GAP))
         lowest = np.inf
         for k in range(start[a], start[a + 1]):
             h = height[order[k]]
-            if h > promised - tolerance and h < lowest:
+            if h > predicted - tolerance and h < lowest:
                 lowest = h
-        z[a], gap[a] = promised, away
-        if lowest < promised + tolerance:
+        z[a], gap[a] = predicted, away
+        if lowest < predicted + tolerance:
             total, count = 0.0, 0
             for k in range(start[a], start[a + 1]):
                 h = height[order[k]]
@@ -177,8 +183,9 @@ def _grow(
 
 @njit(cache=True, nogil=True)
 def _relax(z: F64, gap: F64, nx: int, ny: int, scale: float) -> F64:
-    """A membrane through the seen heights, that those above it pull on less: robust least squares
-    by Gauss-Seidel steps.
+    """A membrane through the seen heights: robust least squares by Gauss-Seidel steps.
+
+    Heights above it pull on it less.
     """
     s = z.copy()
     for r in range(ROUNDS):

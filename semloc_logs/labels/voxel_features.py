@@ -1,5 +1,4 @@
-"""Shape of the surroundings of voxels: spread and normals of their points, the columns that they
-stand in, and the objects they belong to.
+"""Shape of the surroundings of voxels: their points, their columns, the objects they belong to.
 
 Points are summed up in voxels first, so that a neighbourhood is a sum over a few voxels and not
 over its points.
@@ -31,8 +30,10 @@ CROWN = 16  # voxels; how far above it something may spread over a trunk
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Voxels:
-    """Occupied voxels (m, 3) from a corner at zero, in columns and from low to high; ``of_point``
-    (n,); column a = i * ny + j holds voxels start[a] .. start[a + 1].
+    """Occupied voxels (m, 3) from a corner at zero, in columns and from low to high.
+
+    ``of_point`` (n,) is the voxel of each point; column a = i * ny + j holds voxels start[a] ..
+    start[a + 1].
     """
 
     ijk: I64
@@ -69,8 +70,9 @@ class VoxelShapes:
 
 
 def voxelise(points: F64, size: float) -> Voxels:
-    """Voxels of ``size`` metres that ``points`` (n, 3), n > 0, occupy; memory goes with the area
-    that they cover.
+    """Voxels of ``size`` metres that ``points`` (n, 3), n > 0, occupy.
+
+    Memory goes with the area that they cover.
     """
     ijk = np.floor(points / size).astype(np.int64)
     ijk -= ijk.min(0)
@@ -82,9 +84,7 @@ def voxelise(points: F64, size: float) -> Voxels:
 
 
 def voxel_shapes(points: F64, voxels: Voxels, size: float) -> VoxelShapes:
-    """Shapes of the surroundings of each of ``voxels`` of ``size`` metres made from ``points`` (n,
-    3).
-    """
+    """Shapes of the surroundings of ``voxels`` of ``size`` metres, made from ``points`` (n, 3)."""
     nx, ny = voxels.shape
     moments = _moments(points - points.mean(0), voxels.of_point, len(voxels.ijk))
     rough, normal = _normals(voxels.ijk, moments, voxels.start, nx, ny)
@@ -152,14 +152,15 @@ def _normals(ijk: I64, moments: F64, start: I64, nx: int, ny: int) -> tuple[F64,
 def _surroundings(
     ijk: I64, moments: F64, normal: F64, start: I64, nx: int, ny: int
 ) -> tuple[F64, I64]:
-    """tilt, disorder, wide tilt, wide disorder, thickness, length (m, 6); voxels beside and in the
-    crown (m, 2).
+    """Values (m, 6) and counts (m, 2) of the surroundings of each voxel.
+
+    Tilt, disorder, wide tilt, wide disorder, thickness, length; voxels beside and in the crown.
     """
     m = len(ijk)
     out = np.empty((m, 6))
     counts = np.zeros((m, 2), np.int64)
     outer = np.empty((m, 7))
-    near = np.empty(7)
+    inner = np.empty(7)
     wide = np.empty(7)
     tall = np.empty(MOMENTS)
     mean = np.empty(3)
@@ -171,7 +172,7 @@ def _surroundings(
     vectors = np.empty((3, 3))
     for k in range(m):
         i, j, z = ijk[k]
-        near[:], wide[:], tall[:] = 0.0, 0.0, 0.0
+        inner[:], wide[:], tall[:] = 0.0, 0.0, 0.0
         for u in range(max(i - 4, 0), min(i + 5, nx)):
             for q in range(start[u * ny + max(j - 4, 0)], start[u * ny + min(j + 4, ny - 1) + 1]):
                 dz = ijk[q, 2] - z
@@ -186,12 +187,12 @@ def _surroundings(
                             tall[t] += moments[q, t]
                 if d <= 2 and abs(dz) <= 2:
                     for t in range(7):
-                        near[t] += outer[q, t]
+                        inner[t] += outer[q, t]
                 if 2 <= d <= 3 and abs(dz) <= 2:
                     counts[k, 0] += 1
                 if d >= 2 and dz >= 3:
                     counts[k, 1] += 1
-        out[k, 0], out[k, 1] = _order(near, a, values, vectors)
+        out[k, 0], out[k, 1] = _order(inner, a, values, vectors)
         out[k, 2], out[k, 3] = _order(wide, a, values, vectors)
         covariance(tall, mean, a)
         out[k, 4], out[k, 5] = _thickness(a)
@@ -200,9 +201,7 @@ def _surroundings(
 
 @njit(cache=True, nogil=True)
 def _order(total: F64, a: F64, values: F64, vectors: F64) -> tuple[float, float]:
-    """Mean squared vertical part of summed normals, and the smallest eigenvalue of their second
-    moments.
-    """
+    """Tilt and disorder of summed normals, as in :class:`VoxelShapes`."""
     if total[6] < 1e-9:
         return NO_TILT, NO_ORDER
     t = 0
@@ -262,11 +261,11 @@ def _columns(ijk: I64, start: I64, nx: int, ny: int) -> tuple[I64, I64]:
 
 
 def objects(voxels: Voxels, member: B, height: F64, size: float) -> tuple[F64, F64, F64]:
-    """Length, width and top (m,) of the object that each ``member`` voxel (m,) belongs to, seen
-    from above; zeros for the others.
+    """Length, width and top (m,) of the object of each ``member`` voxel (m,), seen from above.
 
-    Objects are columns of members that touch, also by their corners. Length and width are those of
-    a rectangle with the same second moments; the top is the greatest ``height`` (m,). Metres.
+    Zeros for the other voxels. Objects are columns of members that touch, also by their corners.
+    Length and width are the sides of a rectangle with the same second moments; the top is the
+    greatest ``height`` (m,). Metres.
     """
     number, count = _label(voxels.ijk, voxels.start, *voxels.shape, member)
     xy = voxels.ijk[:, :2].astype(np.float64)
@@ -285,7 +284,7 @@ def objects(voxels: Voxels, member: B, height: F64, size: float) -> tuple[F64, F
 
 @njit(cache=True, nogil=True)
 def _label(ijk: I64, start: I64, nx: int, ny: int, member: B) -> tuple[I64, int]:
-    """The number (m,) of the object of each voxel, 0 for no member, and how many numbers there are."""
+    """The number (m,) of the object of each voxel, 0 for no member, and the next free number."""
     m = len(ijk)
     number = np.zeros(m, np.int64)
     stack = np.empty(m, np.int64)

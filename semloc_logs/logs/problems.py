@@ -59,7 +59,7 @@ def sorted_problems(problems: Iterable[Problem]) -> list[Problem]:
 
 
 def without_loss_of(unused: Collection[str], problems: Iterable[Problem]) -> list[Problem]:
-    """The problems; those of the topics ``unused`` lose nothing."""
+    """The problems; those about the topics ``unused`` lose nothing."""
     return [replace(p, lost=p.lost and p.topic not in unused) for p in problems]
 
 
@@ -113,7 +113,7 @@ class NoCloud(Enum):
         "cut the log there",
     )
     EMPTY = ("empty", "they hold no points, or none whose position is a number")
-    # frames of a topic that repeats another topic: nothing is lost, so there is no sentence
+    # frames of a topic that repeats another topic: nothing is lost, so it has no sentence
     DUPLICATE = ("copy", "")
 
     def __init__(self, key: str, because: str) -> None:

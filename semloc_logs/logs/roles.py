@@ -9,6 +9,18 @@ from dataclasses import dataclass, field
 from semloc_logs.errors import RoleError
 from semloc_logs.logs.log import Stream
 from semloc_logs.logs.problems import Problem, ProblemKind, sentences
+from semloc_logs.logs.role_types import (
+    CAMERAS,
+    CLOUDS,
+    FIXES,
+    IMAGES,
+    POSES,
+    ROLES,
+    TRANSFORMS,
+    chosen_topics,
+    kind_of,
+    packets,
+)
 from semloc_logs.logs.topic_pairs import (
     calibrations,
     label_meanings,
@@ -18,50 +30,9 @@ from semloc_logs.logs.topic_pairs import (
     stem,
 )
 
-ROLES = (
-    "lidar", "depth", "image", "camera_info", "stereo_left", "stereo_right", "label_image",
-    "label_info", "pose", "tf", "tf_static", "imu", "gnss",
-)  # fmt: skip
-_SINGLE = ("stereo_left", "stereo_right", "pose", "imu", "gnss")  # roles of one topic
 # roles that keep a topic which the user gave to another role
 _SHARED = ("image", "tf", "tf_static")
 OWN_PREFIX = "/semloc/"  # results of an earlier run, never an input
-
-# Message types by their last part: sensor_msgs/msg/PointCloud2, foxglove.PointCloud,
-# tf/msg/tfMessage ...
-_CLOUDS = {"pointcloud2", "pointcloud", "livox"}
-# raw data of a driver, or points packed by a codec
-_PACKETS = re.compile(
-    r"velodynescan|velodynepacket|packetmsg|pandarscan|udppacket|udpframe|rslidarscan|rslidarpacket"
-    r"|nebulapackets?|compressedpointcloud2?$"
-)
-_IMAGES = {"image", "compressedimage", "rawimage"}
-_CAMERAS = {"camerainfo", "cameracalibration"}
-_TRANSFORMS = {"tfmessage", "frametransform", "frametransforms"}
-# rank of types, best first: an Odometry names its child frame, a PoseStamped does not
-_POSES = {
-    "odometry": 0,
-    "posewithcovariancestamped": 1,
-    "posestamped": 2,
-    "poseinframe": 2,
-    "transformstamped": 3,
-}
-_FIXES = {"navsatfix", "locationfix"}
-_TYPES_OF_ROLE: dict[str, set[str]] = {
-    "lidar": _CLOUDS,
-    "depth": _IMAGES,
-    "image": _IMAGES,
-    "camera_info": _CAMERAS,
-    "stereo_left": _IMAGES,
-    "stereo_right": _IMAGES,
-    "label_image": _IMAGES,
-    "label_info": {"labelinfo", "string"},
-    "pose": set(_POSES) | _TRANSFORMS | _FIXES,
-    "tf": _TRANSFORMS,
-    "tf_static": _TRANSFORMS,
-    "imu": {"imu"},
-    "gnss": _FIXES,
-}
 
 _DEPTH = re.compile(r"depth")
 _NOT_DEPTH = re.compile(r"confidence|infra")  # pictures of a depth camera beside its depth
@@ -165,7 +136,7 @@ def guess_roles(streams: Sequence[Stream], overrides: Mapping[str, str] | None =
     or ``none`` to leave a role out. RoleError for an unknown role or topic and for a topic whose
     type cannot play the role.
     """
-    guess = _Guess(streams, _overrides(streams, overrides or {}))
+    guess = _Guess(streams, chosen_topics(streams, overrides or {}))
     for role, rule in _RULES:
         guess.assign(role, rule)
     return guess.roles()
@@ -180,11 +151,11 @@ class _Guess:
     def __init__(self, streams: Sequence[Stream], chosen: Mapping[str, tuple[str, ...]]) -> None:
         self.chosen = chosen
         self.kinds = {
-            s.topic: _kind(s.type)
+            s.topic: kind_of(s.type)
             for s in streams
             if s.count > 0 and not s.topic.startswith(OWN_PREFIX)
         }
-        self.pictures = one_transport(self.of_kind(_IMAGES))
+        self.pictures = one_transport(self.of_kind(IMAGES))
         self.problems: list[Problem] = []
         self.notes: list[Problem] = []
         self._streams = streams
@@ -235,7 +206,7 @@ class _Guess:
         """The roles, once all are assigned."""
         topics = self._topics
         pose = topics["pose"]
-        has_pose_of_fixes = any(self.kinds.get(topic) in _FIXES for topic in pose)
+        has_pose_of_fixes = any(self.kinds.get(topic) in FIXES for topic in pose)
         gnss = pose if has_pose_of_fixes else topics["gnss"]
         return Roles(
             lidar=topics["lidar"],
@@ -269,7 +240,7 @@ class _Guess:
                 forced="label_info" in self.chosen,
             ),
             problems=(*self._pair_problems(), *self.problems),
-            notes=(*self.notes, *_packets(self._streams)),
+            notes=(*self.notes, *packets(self._streams)),
         )
 
     def _pair_problems(self) -> list[Problem]:
@@ -324,7 +295,7 @@ def _camera_of_depth(name: str) -> str:
 
 def _lidar(guess: _Guess) -> list[str]:
     """All clouds that a sensor measures: not maps, derived clouds or a depth image once more."""
-    clouds = guess.of_kind(_CLOUDS)
+    clouds = guess.of_kind(CLOUDS)
     cameras = {_DEPTH.split(t.lower(), maxsplit=1)[0] for t in guess.topics("depth")}
     measured = []
     for topic in clouds:
@@ -391,9 +362,9 @@ def _pose(guess: _Guess) -> list[str]:
         kind = guess.kinds[topic]
         quality = 1 if _REFERENCE_POSE.search(name) else -1 if _FILTERED_POSE.search(name) else 0
         nearness = max((shared(topic, sensor) for sensor in sensors), default=0)
-        return _POSES[kind], quality, -nearness if kind == "posestamped" else 0
+        return POSES[kind], quality, -nearness if kind == "posestamped" else 0
 
-    candidates = [t for t in guess.of_kind(set(_POSES)) if not _NOT_A_POSE.search(t.lower())]
+    candidates = [t for t in guess.of_kind(set(POSES)) if not _NOT_A_POSE.search(t.lower())]
     if not candidates:
         return []
     best = min(rank(topic) for topic in candidates)
@@ -428,12 +399,12 @@ def _imu(guess: _Guess) -> list[str]:
 
 
 def _transforms(guess: _Guess, *, static: bool) -> list[str]:
-    return [t for t in guess.of_kind(_TRANSFORMS) if t.endswith("tf_static") == static]
+    return [t for t in guess.of_kind(TRANSFORMS) if t.endswith("tf_static") == static]
 
 
 # in this order: a rule sees the roles above it
 _RULES: tuple[tuple[str, Callable[[_Guess], Iterable[str]]], ...] = (
-    ("camera_info", lambda guess: guess.of_kind(_CAMERAS)),
+    ("camera_info", lambda guess: guess.of_kind(CAMERAS)),
     ("label_image", _label_images),
     ("depth", _depth_images),
     ("lidar", _lidar),
@@ -445,77 +416,5 @@ _RULES: tuple[tuple[str, Callable[[_Guess], Iterable[str]]], ...] = (
     ("tf", lambda guess: _transforms(guess, static=False)),
     ("tf_static", lambda guess: _transforms(guess, static=True)),
     ("imu", _imu),
-    ("gnss", lambda guess: guess.of_kind(_FIXES)[:1]),
+    ("gnss", lambda guess: guess.of_kind(FIXES)[:1]),
 )
-
-
-# -- types and overrides
-
-
-def no_sensor(streams: Sequence[Stream]) -> str:
-    """Why a log without LIDAR, depth and stereo pair cannot be fused, and which topic to name."""
-    if packets := _packets(streams):
-        return " ".join(sentences(packets))
-    listed = _listed(s for s in streams if s.count)
-    return (
-        f"There is no LIDAR and no depth stream, nor a stereo pair; its topics are {listed}; "
-        f"name one with --topic lidar=TOPIC, --topic depth=TOPIC, or --topic stereo_left=TOPIC "
-        f"--topic stereo_right=TOPIC."
-    )
-
-
-def _packets(streams: Sequence[Stream]) -> list[Problem]:
-    """LIDAR data in a form that only its driver reads."""
-    return [
-        Problem(
-            s.topic,
-            ProblemKind.ROLE,
-            f"{s.topic} holds {s.type}, packets or packed points of a LIDAR that only its driver "
-            f"reads: run the driver on it and record the PointCloud2 that it publishes.",
-            lost=False,
-        )
-        for s in streams
-        if s.count and _PACKETS.search(_kind(s.type))
-    ]
-
-
-def _listed(streams: Iterable[Stream]) -> str:
-    return ", ".join(f"{s.topic} ({s.type or 'unknown type'})" for s in streams) or "none"
-
-
-def _kind(message_type: str) -> str:
-    """The last part of a type, in lower case; ``livox`` for the CustomMsg of its drivers."""
-    last = re.split(r"[/.]", message_type)[-1].lower()
-    return "livox" if last == "custommsg" and message_type.startswith("livox") else last
-
-
-def _overrides(
-    streams: Sequence[Stream], overrides: Mapping[str, str]
-) -> dict[str, tuple[str, ...]]:
-    """The topics of the roles that the user chose; none for a role that is left out."""
-    return {role: _override(streams, role, value) for role, value in overrides.items()}
-
-
-def _override(streams: Sequence[Stream], role: str, value: str) -> tuple[str, ...]:
-    flag = f"--topic {role}={value}"
-    if role not in ROLES:
-        raise RoleError(f"{flag}: the role '{role}' is unknown; the roles are {', '.join(ROLES)}.")
-    if value.strip().lower() in ("", "none"):
-        return ()
-    stream_of = {s.topic: s for s in streams}
-    names = {topic.lstrip("/"): topic for topic in stream_of}
-    listed = _listed(stream_of[topic] for topic in sorted(stream_of))
-    topics = []
-    for wanted in (part.strip() for part in value.split(",")):
-        topic = wanted if wanted in stream_of else names.get(wanted.lstrip("/"))
-        if topic is None:
-            raise RoleError(f"{flag}: the log has no topic '{wanted}'; its topics are {listed}.")
-        type_ = stream_of[topic].type
-        if type_ and _kind(type_) not in _TYPES_OF_ROLE[role]:
-            raise RoleError(
-                f"{flag}: messages of type {type_} cannot be the {role}; the topics are {listed}."
-            )
-        topics.append(topic)
-    if role in _SINGLE and len(topics) > 1:
-        raise RoleError(f"{flag}: the role '{role}' takes one topic, not {len(topics)}.")
-    return tuple(dict.fromkeys(topics))

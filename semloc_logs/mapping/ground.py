@@ -124,14 +124,14 @@ class GroundMapper:
         cell = CELL * self.scale
         centres = surface.centres()[surface.gap == 0]
         distance = np.hypot(*(centres - np.asarray(origin, float)[:2]).T)
-        near = distance <= SEEN_WITHIN * self.scale
-        if not near.any():
+        in_reach = distance <= SEEN_WITHIN * self.scale
+        if not in_reach.any():
             return
         ij, first = np.unique(
-            np.floor(centres[near] / cell).astype(np.int64), axis=0, return_index=True
+            np.floor(centres[in_reach] / cell).astype(np.int64), axis=0, return_index=True
         )
         z = surface.height_at((ij + 0.5) * cell)
-        weight = 1.0 / (1.0 + (distance[near][first] / (NEAR * self.scale)) ** 2)
+        weight = 1.0 / (1.0 + (distance[in_reach][first] / (NEAR * self.scale)) ** 2)
         level = np.floor(z / (LEVEL * self.scale)).astype(np.int64)
         self._rows.append(
             _Rows(pack(np.c_[ij, level]), weight, weight * z, np.ones(len(z), np.int64))
@@ -154,14 +154,14 @@ class GroundMapper:
         frames = rows.frames[best]
         for step in (-1, 1):  # a height near the border of two levels has rows in both
             beside = rows.cell[best] + step
-            at = np.minimum(np.searchsorted(rows.cell, beside), len(rows.cell) - 1)
-            other = rows.total[at] / rows.weight[at]
-            same = (rows.cell[at] == beside) & (
+            row = np.minimum(np.searchsorted(rows.cell, beside), len(rows.cell) - 1)
+            other = rows.total[row] / rows.weight[row]
+            same = (rows.cell[row] == beside) & (
                 np.abs(other - rows.total[best] / rows.weight[best]) < 0.5 * LEVEL * self.scale
             )
-            weight = weight + np.where(same, rows.weight[at], 0.0)
-            total = total + np.where(same, rows.total[at], 0.0)
-            frames = frames + np.where(same, rows.frames[at], 0)
+            weight = weight + np.where(same, rows.weight[row], 0.0)
+            total = total + np.where(same, rows.total[row], 0.0)
+            frames = frames + np.where(same, rows.frames[row], 0)
         return GroundMap(
             cell, ijl[best, :2], total / weight, np.minimum(frames, 2**31 - 1).astype(np.int32)
         )

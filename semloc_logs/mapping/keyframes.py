@@ -1,10 +1,7 @@
-"""The pass over a log: which clouds become keyframes, thinned and kept on disk until gravity and
-the meaning of labels are known.
-"""
+"""The pass over a log: keyframes, thinned and kept on disk until gravity and labels are known."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs import progress
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.labels.camera_labels import PointLabels
@@ -30,9 +28,10 @@ MOST_NORMALS = 20  # keyframes whose normals say where up is
 
 @dataclass(slots=True, eq=False)
 class Collected:
-    """Keyframe by keyframe: ``headers``, ``poses`` session_T_base (4, 4) or None, and ``origins``
-    (3,) of the sensor in the base frame; their points, thinned to one a ``cell`` (m), are in files
-    of the folder ``scratch``.
+    """Keyframe by keyframe: ``headers``, ``poses`` session_T_base (4, 4) or None, ``origins``.
+
+    ``origins`` (3,) are the sensor in the base frame. The points, thinned to one a ``cell`` (m),
+    are in files of the folder ``scratch``.
     """
 
     scratch: Path
@@ -60,7 +59,8 @@ class Collected:
         """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of
         their range, where there are any.
 
-        WorkspaceError when somebody removed them, as a second ``fuse`` of the same session would.
+        The latter two are None where there are none. WorkspaceError when somebody removed the
+        files, as a second ``fuse`` of the same session does.
         """
         points = self._load(keyframe, "points")
         if points is None:
@@ -70,8 +70,9 @@ class Collected:
         return points, self._load(keyframe, "label"), self._load(keyframe, "sigma")
 
     def normals(self, most: int = MOST_NORMALS) -> list[tuple[int, F64, F64]]:
-        """Of ``most`` keyframes, evenly spread: number, unit normals (m, 3) of surfaces in the
-        session frame, or in the base frame without poses, and their weights (m,).
+        """Of ``most`` keyframes, evenly spread: number, unit normals (m, 3) and weights (m,).
+
+        Normals of surfaces are in the session frame, or in the base frame without poses.
         """
         out = []
         for i in np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64)).tolist():
@@ -96,10 +97,11 @@ def collect(
     labeller: Labeller,
     fusion: ResolvedFusion,
     scratch: Path,
-    on_progress: Callable[[str], None],
+    name: str,
 ) -> Collected:
-    """Read the log once: thinned points of its keyframes go to files of ``scratch``, what is small
-    stays in memory.
+    """Read the log once: the thinned points of its keyframes go to files of ``scratch``.
+
+    Progress is reported under the ``name`` of the session.
     """
     collected = Collected(scratch, fusion.keyframe_resolution)
     selector = KeyframeSelector(fusion)
@@ -114,5 +116,5 @@ def collect(
                 kept = thin(cloud.points, collected.cell)
                 collected.add(cloud, kept, labeller.take(cloud, kept))
                 if len(collected) % 50 == 0:
-                    on_progress(f"read {len(collected)} keyframes")
+                    progress.report("fuse", name, len(collected), None, "keyframes read")
     return collected

@@ -1,6 +1,4 @@
-"""The gravity-aligned map frame of a session, from the IMU or from the floors and walls that its
-keyframes show.
-"""
+"""The gravity-aligned map frame of a session, from its IMU or from its floors and walls."""
 
 from __future__ import annotations
 
@@ -53,9 +51,7 @@ def level(session: Session, collected: Collected) -> tuple[F64, F64]:
 
 
 def check_reach(session: Session, collected: Collected, voxel_size: float) -> None:
-    """LogError where the poses leave the space that voxels have numbers for, 3 million of them from
-    the first keyframe.
-    """
+    """LogError where poses leave the space of voxel numbers, 3 million from the first keyframe."""
     reach = REACH * voxel_size
     first = None
     for header, pose in zip(collected.headers, collected.poses, strict=True):
@@ -66,21 +62,24 @@ def check_reach(session: Session, collected: Collected, voxel_size: float) -> No
         if away > reach:
             when = utc(header.stamp_ns)
             raise LogError(
-                f"{session.name}: the poses have come {away / 1e3:.0f} km from the first at {when}, "
-                f"but a map of {voxel_size:g} m voxels reaches {reach / 1e3:.0f} km: cut the log there, or give poses with --poses FILE."
+                f"{session.name}: the poses have come {away / 1e3:.0f} km from the first at "
+                f"{when}, "
+                f"but a map of {voxel_size:g} m voxels reaches {reach / 1e3:.0f} km: cut the log "
+                "there, or give poses with --poses FILE."
             )
 
 
 def _each_level(collected: Collected, up_in_base: F64) -> F64:
-    """Level poses (n, 4, 4) of keyframes without poses, by the nearest keyframe whose direction of
-    gravity was found.
+    """Level poses (n, 4, 4) of keyframes without poses.
+
+    The direction of gravity is the one of the nearest keyframe for which it was estimated.
     """
-    found = {
+    up_of = {
         number: find_up(normals, weights, up_in_base)
         for number, normals, weights in collected.normals()
     }
-    keys = np.array(sorted(found))
+    keys = np.array(sorted(up_of))
     poses = np.tile(np.eye(4), (len(collected), 1, 1))
     for i in range(len(collected)):
-        poses[i, :3, :3] = rotation_between(found[int(keys[np.argmin(np.abs(keys - i))])], UP)
+        poses[i, :3, :3] = rotation_between(up_of[int(keys[np.argmin(np.abs(keys - i))])], UP)
     return poses

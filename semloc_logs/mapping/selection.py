@@ -1,4 +1,4 @@
-"""Which frames of a session become keyframes, which keyframes a submap; thinning of their points."""
+"""Which frames of a session become keyframes, and which keyframes a submap; thinning of points."""
 
 from __future__ import annotations
 
@@ -42,8 +42,9 @@ def _first_in_cells(points: NDArray[np.float32], cell: np.float32) -> NDArray[np
 
 
 class KeyframeSelector:
-    """Says of each frame of a stream in turn whether it has moved or turned enough since the
-    stream's last keyframe.
+    """Decides in turn of each frame of a stream whether it has moved or turned enough.
+
+    The measure is the stream's last keyframe.
     """
 
     def __init__(self, fusion: ResolvedFusion) -> None:
@@ -56,14 +57,14 @@ class KeyframeSelector:
         last_stamp, last = self._last.get(topic, (None, None))
         if last_stamp is not None:
             if session_T_base is None or last is None:
-                near = stamp_ns - last_stamp < UNPOSED_SPACING_NS
+                is_close = stamp_ns - last_stamp < UNPOSED_SPACING_NS
             else:
                 moved = inverse(last) @ session_T_base
-                near = (
+                is_close = (
                     float(np.linalg.norm(moved[:3, 3])) < self._distance
                     and rotation_angle(moved[:3, :3]) < self._angle
                 )
-            if near:
+            if is_close:
                 return False
         self._last[topic] = (stamp_ns, session_T_base)
         return True
@@ -81,10 +82,10 @@ def road_distance(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 def submap_ranges(
     distance: NDArray[np.float64], length: float, overlap: float
 ) -> list[tuple[int, int]]:
-    """Ranges [first, last) of keyframes whose road ``distance`` (n,) lies in stretches of
-    ``length``, each overlapping the next.
+    """Ranges [first, last) of keyframes in overlapping stretches of road of ``length`` metres.
 
-    The last stretch is pulled back to full length, so that no submap is a short remnant.
+    ``distance`` (n,) is the road travelled up to each keyframe. The last stretch is pulled back to
+    full length, so that no submap is a short remnant.
     """
     if not len(distance):
         return []

@@ -23,7 +23,7 @@ KEPT = 64  # keyframes in memory: a query of 20 m and the next one
 
 @dataclass(eq=False)
 class SessionMap:
-    """A fused session: what its tables and its session.json hold, read when it is needed."""
+    """A fused session: the content of its tables and its session.json, read when needed."""
 
     folder: SessionFolder
 

@@ -1,6 +1,4 @@
-"""Which way is up: the direction that the map's own floors and walls agree on, near a prior (IMU or
-frame convention).
-"""
+"""Which way is up: the direction that a map's floors and walls agree on, close to a prior."""
 
 from __future__ import annotations
 
@@ -47,26 +45,26 @@ def surface_normals(
 def find_up(
     normals: NDArray[np.floating], weights: NDArray[np.floating], prior: F64, within: float = 0.7
 ) -> F64:
-    """The unit direction within ``within`` radians of ``prior`` that most horizontal surfaces have
-    as their normal.
+    """The unit direction that most horizontal surfaces have as their normal, close to ``prior``.
 
-    ``normals`` (n, 3) of unit length, any sign, with ``weights`` (n,). Walls count too: their
-    normals are perpendicular to it. The sum of both over candidates taken from the normals is
-    maximised, then the optimum is refined to the least-squares direction of the surfaces within 10,
-    5, 3 and 2 degrees. The prior is returned when there is nothing to see.
+    ``within`` is the largest angle to it, radians. ``normals`` (n, 3) of unit length, any sign,
+    with ``weights`` (n,). Walls count too: their normals are perpendicular to it. The sum of both
+    over candidates taken from the normals is maximised, then the optimum is refined to the
+    least-squares direction of the surfaces within 10, 5, 3 and 2 degrees. The prior is returned
+    when too few normals agree with it.
     """
     prior = np.asarray(prior, float) / np.linalg.norm(prior)
     n = np.asarray(normals, float)
     w = np.asarray(weights, float)
     flip = np.where(n @ prior < 0, -1.0, 1.0)
     n = n * flip[:, None]
-    near = np.flatnonzero((n @ prior > np.cos(within)) & (w > 0))
-    if len(near) < 50:
+    rows = np.flatnonzero((n @ prior > np.cos(within)) & (w > 0))
+    if len(rows) < 50:
         return prior
     rng = np.random.default_rng(0)
     candidates = np.concatenate(
         [
-            n[rng.choice(near, min(500, len(near)), replace=False, p=w[near] / w[near].sum())],
+            n[rng.choice(rows, min(500, len(rows)), replace=False, p=w[rows] / w[rows].sum())],
             prior[None],
         ]
     )
@@ -84,9 +82,7 @@ def find_up(
 
 
 def _agreement(dot: F64, weight: F64) -> float:
-    """How much weight lies within about 3 degrees of horizontal, and half as much of what is
-    vertical.
-    """
+    """The weight within about 3 degrees of horizontal, and half of the weight that is vertical."""
     wide = 2 * 0.05**2
     return float(
         (weight * (np.exp(-(1 - np.abs(dot)) * 2 / wide) + 0.5 * np.exp(-(dot**2) / wide))).sum()

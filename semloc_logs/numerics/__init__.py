@@ -1,3 +1,1 @@
-"""Rigid transforms, bits, small matrices and local shape: arithmetic that knows nothing of logs or
-maps.
-"""
+"""Arithmetic that knows neither logs nor maps: transforms, bits, small matrices, local shape."""

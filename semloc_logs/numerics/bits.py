@@ -1,6 +1,4 @@
-"""Instructions of the processor that count and find bits, where it has them, for compiled
-functions.
-"""
+"""Instructions of the processor that count and find bits, for compiled functions."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ def _count_bits(_: Any, x: Any) -> Any:
 
 def _first_bit(_: Any, x: Any) -> Any:
     def instruction(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        # never asked about 0
+        # undefined for 0, which callers exclude
         return builder.cttz(arguments[0], context.get_constant(types.boolean, True))
 
     return types.int64(types.uint64), instruction

@@ -13,11 +13,10 @@ SWEEPS = 12
 
 @njit(cache=True, nogil=True, inline="never")
 def eigen(a: F64, values: F64, vectors: F64) -> None:
-    """Eigenvalues (3,), ascending, and unit eigenvectors (3, 3), in columns, of the symmetric ``a``
-    (3, 3), which is overwritten.
+    """Eigenvalues (3,), ascending, and unit eigenvectors (3, 3), in columns, of a symmetric matrix.
 
-    Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, 8.5): as accurate for nearly
-    equal eigenvalues as for others.
+    ``a`` (3, 3) is overwritten. Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations,
+    8.5): as accurate for nearly equal eigenvalues as for others.
     """
     for i in range(3):
         for j in range(3):

@@ -1,6 +1,4 @@
-"""Work ahead of its use: an iterator that runs in a thread of its own, a few items before they are
-asked for.
-"""
+"""Prefetching: an iterator that runs in a thread of its own, a few items before their use."""
 
 from __future__ import annotations
 
@@ -29,12 +27,11 @@ def in_callers_thread() -> Iterator[None]:
 
 
 def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
-    """``items`` in their order, made in another thread while the caller works on the earlier ones;
-    at most ``depth`` wait.
+    """``items`` in their order, made in another thread; at most ``depth`` of them wait.
 
-    Reading, decompressing and the compiled loops leave the interpreter free, so two cores are used.
-    What ``items`` raises is raised here; an iterator that is left early stops the other thread
-    before it returns.
+    Reading, decompressing and the compiled loops release the interpreter's lock, so two cores are
+    used. Exceptions of ``items`` are raised here; an iterator that is left early stops the other
+    thread before it returns.
     """
     if _IN_CALLERS_THREAD.get():
         yield from items

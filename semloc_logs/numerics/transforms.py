@@ -1,7 +1,7 @@
-"""Rigid transforms as 4x4 float64 matrices named ``target_T_source``; quaternions are xyzw, angles
-radians.
+"""Rigid transforms as 4x4 float64 matrices named ``target_T_source``.
 
-``p_target = target_T_source @ p_source``. Arrays of transforms have shape (n, 4, 4).
+``p_target = target_T_source @ p_source``. Quaternions are xyzw, angles radians; arrays of
+transforms have shape (n, 4, 4).
 """
 
 from __future__ import annotations
@@ -14,9 +14,7 @@ Array = NDArray[np.float64]
 
 
 def transform(translation: Array, quaternion_xyzw: Array) -> Array:
-    """4x4 matrices from translations (..., 3) in metres and quaternions (..., 4) xyzw of any
-    positive length.
-    """
+    """4x4 matrices from translations (..., 3), m, and quaternions (..., 4) xyzw of any length."""
     t = np.asarray(translation, float)
     q = np.asarray(quaternion_xyzw, float)
     out = np.zeros((*t.shape[:-1], 4, 4))
@@ -27,9 +25,7 @@ def transform(translation: Array, quaternion_xyzw: Array) -> Array:
 
 
 def translation_quaternion(target_T_source: Array) -> tuple[Array, Array]:
-    """Translations (..., 3) and unit quaternions (..., 4) xyzw with w >= 0 of 4x4 matrices (..., 4,
-    4).
-    """
+    """Translations (..., 3) and unit quaternions (..., 4) xyzw, w >= 0, of matrices (..., 4, 4)."""
     m = np.asarray(target_T_source, float)
     q = Rotation.from_matrix(m[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
     return m[..., :3, 3].copy(), q.reshape(*m.shape[:-2], 4)
@@ -73,8 +69,9 @@ def turned_about_z(points: Array, yaw: Array) -> Array:
 
 
 def exp_se3(t: Array, rotation_vector: Array) -> Array:
-    """Left increment of a transform: translation ``t`` and ``Exp(rotation_vector)`` side by side
-    (not the se(3) exponential).
+    """Left increment of a transform: translation ``t`` and ``Exp(rotation_vector)`` side by side.
+
+    This is not the exponential of se(3).
     """
     out = np.eye(4)
     out[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
@@ -88,7 +85,7 @@ def rotation_angle(rotation: Array) -> float:
 
 
 def rotation_between(source: Array, target: Array) -> Array:
-    """The smallest 3x3 rotation that turns the direction ``source`` into the direction ``target``."""
+    """The smallest rotation (3, 3) that turns direction ``source`` into direction ``target``."""
     a = source / np.linalg.norm(source)
     b = target / np.linalg.norm(target)
     axis = np.cross(a, b)
@@ -104,19 +101,19 @@ def rotation_between(source: Array, target: Array) -> Array:
 
 
 def interpolate(stamps_ns: NDArray[np.int64], poses: Array, at_ns: NDArray[np.int64]) -> Array:
-    """Poses (n, 4, 4) at strictly increasing ``stamps_ns`` interpolated on SO(3) x R^3 at ``at_ns``
-    (m,).
+    """Poses (m, 4, 4) at ``at_ns`` (m,), interpolated on SO(3) x R^3.
 
-    Times outside the range take the nearest end; the caller decides what is a gap.
+    ``poses`` (n, 4, 4) are at strictly increasing ``stamps_ns`` (n,). Times outside the range take
+    the nearest end; the caller decides what a gap is.
     """
-    at = np.clip(np.asarray(at_ns, np.int64), stamps_ns[0], stamps_ns[-1])
+    clipped = np.clip(np.asarray(at_ns, np.int64), stamps_ns[0], stamps_ns[-1])
     if len(stamps_ns) == 1:
-        return np.repeat(poses, len(at), axis=0)
+        return np.repeat(poses, len(clipped), axis=0)
     # seconds from the first stamp: nanoseconds since 1970 do not fit float64
     base = np.asarray(stamps_ns[0], np.int64)
     s = (stamps_ns - base) * 1e-9
-    a = (at - base) * 1e-9
-    out = np.zeros((len(at), 4, 4))
+    a = (clipped - base) * 1e-9
+    out = np.zeros((len(clipped), 4, 4))
     out[:, :3, :3] = Slerp(s, Rotation.from_matrix(poses[:, :3, :3]))(a).as_matrix()
     for k in range(3):
         out[:, k, 3] = np.interp(a, s, poses[:, k, 3])

@@ -21,7 +21,7 @@ LOW_SHARE, HIGH_SHARE = 0.02, 0.98
 # brightness of the lowest pixels, and how much brighter the highest are
 GROUND_BRIGHTNESS, GROUND_RANGE = 0.92, 0.12
 BRIGHTNESS, RANGE = 0.75, 0.45
-# what a step of one voxel to the upper or left neighbour adds, up to steps of so many voxels
+# added by a step of one voxel to the upper or left neighbour, up to steps of so many voxels
 SLOPE_LIGHT, MOST_SLOPE = 0.03, 3
 BRIGHTEST = 250  # darker than the white where nothing was observed
 
@@ -116,6 +116,6 @@ def _shaded(z: NDArray[np.float32], label: U8, bottom: float, top: float) -> U8:
 
 
 def _slope_light(step: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """What a ``step`` (voxels) from one pixel to the next adds to the brightness."""
+    """The brightness that a ``step`` (voxels) from one pixel to the next adds."""
     light = SLOPE_LIGHT * np.where(known, np.clip(step, -MOST_SLOPE, MOST_SLOPE), 0)
     return np.asarray(light, np.float32)

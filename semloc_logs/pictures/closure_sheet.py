@@ -86,7 +86,7 @@ def _title(view: ClosureView) -> str:
 
 
 def _facts(view: ClosureView) -> list[str]:
-    """What the table holds of the closure, and the reason of a rejection."""
+    """The closure's row of the table, and the reason of a rejection."""
     row = view.choice.row
     T = view.choice.target_T_query
     yaw = round(float(np.degrees(np.arctan2(T[1, 0], T[0, 0]))), 1) + 0.0  # not -0.0

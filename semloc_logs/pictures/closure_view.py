@@ -1,5 +1,6 @@
-"""What there is to see of a closure or a rejected hypothesis: the query, the map it was laid on,
-and subvolumes that matched.
+"""The content of a picture of a closure or a rejected hypothesis.
+
+The query, the map that it was laid on, and subvolumes that matched.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ TURNED = np.radians(15.0)  # and by how much it may be turned against it
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Row ``row`` of closures.parquet or, if there is a ``reason``, of rejected.parquet;
+    """A row of closures.parquet, or of rejected.parquet if it has a ``reason``.
+
     ``target_T_query`` (4, 4) is its pose.
     """
 
@@ -66,9 +68,11 @@ class Choice:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """States (32, 32, 32) of a subvolume of the query, turned into the target's axes, as the
-    network completes it, and of the target's nearest word; ``distance`` of the words in bits, and
-    the target's centre in its map, metres.
+    """A subvolume of the query and of the target whose words match.
+
+    States (32, 32, 32): of the query, turned into the target's axes; as the network completes it;
+    and of the target. ``distance`` of the words in bits; ``centre`` of the target's subvolume in
+    its map, metres.
     """
 
     query: U8
@@ -80,11 +84,10 @@ class Match:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosureView:
-    """A query in the map of its target: ``map_T_query`` (4, 4) as aligned, ``before`` as it would
-    lie without an alignment.
+    """A query in the map of its target.
 
-    ``roads`` are the positions (n, 3) of the target's and the query's keyframes, the latter in the
-    query's frame.
+    ``map_T_query`` (4, 4) as aligned, ``before`` as it lies without an alignment. ``roads`` are the
+    positions (n, 3) of the target's and the query's keyframes, the latter in the query's frame.
     """
 
     choice: Choice
@@ -101,9 +104,11 @@ class ClosureView:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What to show: closure ``number`` (from 1 on, in the order of closures.parquet); or the answer
-    to the query of ``session`` nearest to ``at`` seconds, of the log or since its first keyframe;
-    or the ``count`` best closures and the best rejected hypothesis.
+    """Which closures to show.
+
+    Closure ``number`` (from 1 on, in the order of closures.parquet); or the result of the query of
+    ``session`` nearest to ``at`` seconds, of the log or since its first keyframe; or the ``count``
+    best closures and the best rejected hypothesis.
     """
 
     session: str | None = None
@@ -113,16 +118,18 @@ class Wanted:
 
 
 def choose(work: Workspace, wanted: Wanted) -> list[Choice]:
-    """The rows to show. The best closures are those of different pairs of sessions first, and the
-    rejected hypothesis is one of a query without a closure, if there is any. WorkspaceError when
-    there is nothing to show.
+    """The rows to show.
+
+    The best closures of different pairs of sessions come first; the rejected hypothesis belongs to
+    a query without a closure, if there is any. WorkspaceError when there is nothing to show.
     """
     accepted = _choices(work, work.closures)
     rejected = _choices(work, work.rejected)
     if wanted.number is not None:
         if not 1 <= wanted.number <= len(accepted):
             raise WorkspaceError(
-                f"{work.closures} has {len(accepted)} closures, and no closure {wanted.number}: give a number from 1 on."
+                f"{work.closures} has {len(accepted)} closures, and no closure {wanted.number}: "
+                "give a number from 1 on."
             )
         return [accepted[wanted.number - 1]]
     if wanted.session is not None:
@@ -131,19 +138,25 @@ def choose(work: Workspace, wanted: Wanted) -> list[Choice]:
             for rows in (accepted, rejected)
         )
     if wanted.at is not None:
-        found = _at(work, accepted + rejected, wanted.at)
+        chosen = _at(work, accepted + rejected, wanted.at)
     else:
-        answered = {(c.row["query_session"], c.row["query_stamp_ns"]) for c in accepted}
-        silent = [
-            c for c in rejected if (c.row["query_session"], c.row["query_stamp_ns"]) not in answered
+        localised = {(c.row["query_session"], c.row["query_stamp_ns"]) for c in accepted}
+        without_closure = [
+            c
+            for c in rejected
+            if (c.row["query_session"], c.row["query_stamp_ns"]) not in localised
         ]
-        found = _varied(_best_first(accepted), wanted.count) + _best_first(silent or rejected)[:1]
-    if not found:
+        chosen = (
+            _varied(_best_first(accepted), wanted.count)
+            + _best_first(without_closure or rejected)[:1]
+        )
+    if not chosen:
         whose = f" of session '{wanted.session}'" if wanted.session else ""
         raise WorkspaceError(
-            f"{work.path} has neither a closure nor a rejected hypothesis{whose}: name another session, or close again."
+            f"{work.path} has neither a closure nor a rejected hypothesis{whose}: name another "
+            "session, or close again."
         )
-    return found
+    return chosen
 
 
 def _choices(work: Workspace, path: Path) -> list[Choice]:
@@ -176,8 +189,8 @@ def _at(work: Workspace, choices: Sequence[Choice], seconds: float) -> list[Choi
         return float(abs(stamp - (seconds if seconds >= first else seconds + first)))
 
     nearest = min(map(away, choices), default=0.0)
-    there = [c for c in choices if away(c) <= nearest + 1e-6]
-    return sorted(there, key=lambda c: (bool(c.reason), -c.row["probability"]))[:1]
+    nearest_choices = [c for c in choices if away(c) <= nearest + 1e-6]
+    return sorted(nearest_choices, key=lambda c: (bool(c.reason), -c.row["probability"]))[:1]
 
 
 def _varied(choices: Sequence[Choice], count: int) -> list[Choice]:
@@ -195,37 +208,37 @@ def closing_settings(work: Workspace) -> Resolved:
         return Settings.model_validate(read_metadata(work.closures)["settings"]).resolved()
     except (KeyError, ValueError):
         raise WorkspaceError(
-            f"{work.closures} does not say how it was made: run 'semloc close -w {work.path} --overwrite'."
+            f"{work.closures} does not hold its settings: run 'semloc close -w {work.path} "
+            "--overwrite'."
         ) from None
 
 
 def closure_view(
     work: Workspace, choice: Choice, settings: Resolved, most_matches: int = 3
 ) -> ClosureView:
-    """All that a picture of ``choice`` needs; ``settings`` are those that the closures were found
-    with.
-    """
+    """All that a picture of ``choice`` needs; ``settings`` are the ones of the closures."""
     row = choice.row
     session, target = (
         SessionMap(work.session(row[f"{end}_session"])) for end in ("query", "target")
     )
-    asking = keyframe_at(session, row["query_stamp_ns"])
-    asked = keyframe_at(target, row["target_stamp_ns"])
+    query_keyframe = keyframe_at(session, row["query_stamp_ns"])
+    target_keyframe = keyframe_at(target, row["target_stamp_ns"])
     database = Database(work, (row["target_session"],), settings)
-    visible = visible_to(database, session, asking)
-    query, query_T_base = build_query(session, asking, settings)
-    map_T_target = target.map_T_base[asked]
+    visible = visible_to(database, session, query_keyframe)
+    query, query_T_base = build_query(session, query_keyframe, settings)
+    map_T_target = target.map_T_base[target_keyframe]
     map_T_query = map_T_target @ choice.target_T_query @ inverse(query_T_base)
-    group = _group(visible, asked)
+    group = _group(visible, target_keyframe)
     before = np.eye(4)
     if session.folder.name == target.folder.name:
-        before[:3, 3] = session.map_T_base[asking, :3, 3]  # as odometry says
+        before[:3, 3] = session.map_T_base[query_keyframe, :3, 3]  # by odometry
     else:
         # as if the query had been at the target's keyframe
         before = map_T_target @ inverse(query_T_base)
-    members = query_members(session, asking, settings)
-    road = session.map_T_base[members, :3, 3] - session.map_T_base[asking, :3, 3]
-    ground = float(session.ground_z[asking] - session.map_T_base[asking, 2, 3])
+    members = query_members(session, query_keyframe, settings)
+    road = session.map_T_base[members, :3, 3] - session.map_T_base[query_keyframe, :3, 3]
+    ground = float(session.ground_z[query_keyframe] - session.map_T_base[query_keyframe, 2, 3])
+    aligned = _Aligned(visible, session, query, ground, map_T_query, group)
     return ClosureView(
         choice,
         query,
@@ -235,15 +248,13 @@ def closure_view(
         query_T_base,
         map_T_target[:3, :3],
         (target.map_T_base[:, :3, 3], road),
-        tuple(_matches(visible, session, query, ground, map_T_query, group, most_matches)),
+        tuple(_matches(aligned, most_matches)),
         str(target.json["label_source"]),
     )
 
 
 def drawn(view: ClosureView) -> dict[str, Any]:
-    """What a picture of the view shows, as JSON has it: the row, ``accepted``, and the word
-    matches.
-    """
+    """The content of a picture for JSON: the row, ``accepted``, and the word matches."""
     matches = [{"bits": m.distance, "target_position_m": list(m.centre)} for m in view.matches]
     return {**view.choice.row, "accepted": view.choice.accepted, "matches": matches}
 
@@ -258,67 +269,91 @@ def _group(visible: Visibility, keyframe: int) -> int:
     return max(range(len(visible.database.places)), key=off)
 
 
-def _matches(
-    visible: Visibility,
-    session: SessionMap,
-    query: Query,
-    ground: float,
-    map_T_query: F64,
-    group: int,
-    most: int,
-) -> list[Match]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Aligned:
+    """A query aligned with submap ``group`` of the only target session of ``visible``.
+
+    ``ground`` is the height of the ground in the query's frame, metres.
+    """
+
+    visible: Visibility
+    session: SessionMap
+    query: Query
+    ground: float
+    map_T_query: F64
+    group: int
+
+    @property
+    def yaw(self) -> float:
+        """Of the query in the target's map, radians."""
+        return float(np.arctan2(self.map_T_query[1, 0], self.map_T_query[0, 0]))
+
+
+def _matches(aligned: _Aligned, most: int) -> list[Match]:
     """Word matches that agree with the alignment, nearest first, none beside another."""
-    settings = visible.database.settings
-    v = settings.fusion.voxel_size
-    places = allowed_words(visible, session)
+    places = allowed_words(aligned.visible, aligned.session)
     if not places or not most:
         return []
-    # a single target session is asked with one kind of words
+    # a single target session has one kind of words
     variant, allowed = next(iter(places.items()))
-    d, m = match_words(visible.database, variant, allowed, query, ground)
-    aligned = float(np.arctan2(map_T_query[1, 0], map_T_query[0, 0]))
-    # voxels, in the map's axes
-    laid = turned_about_z(d.centre.astype(float), np.full(len(d.centre), aligned))
-    off = np.abs(m.centre - laid[m.query] * v - map_T_query[:3, 3]).max(1)
-    turned = np.abs(np.mod(m.yaw - aligned + np.pi, 2 * np.pi) - np.pi)
-    keep = (m.group == group) & (off < AGREES * v) & (turned < TURNED)
-    distance = m.distance[keep]
-    asking = m.query[keep]
-    centre = m.centre[keep]
+    words, matches = match_words(
+        aligned.visible.database, variant, allowed, aligned.query, aligned.ground
+    )
+
+    # the query's subvolumes, voxels in the map's axes, and those that agree
+    laid = turned_about_z(words.centre.astype(float), np.full(len(words.centre), aligned.yaw))
+    size = aligned.visible.database.settings.fusion.voxel_size
+    position = aligned.map_T_query[:3, 3]
+    offset = np.abs(matches.centre - laid[matches.query] * size - position).max(1)
+    turned = np.abs(np.mod(matches.yaw - aligned.yaw + np.pi, 2 * np.pi) - np.pi)
+    agrees = (matches.group == aligned.group) & (offset < AGREES * size) & (turned < TURNED)
+    rows = np.flatnonzero(agrees)
+
+    nearest_first = rows[np.argsort(matches.distance[rows], kind="stable")]
     chosen: list[int] = []
-    for i in np.argsort(distance, kind="stable").tolist():
-        if all(np.abs(laid[asking[i], :2] - laid[asking[o], :2]).max() >= APART for o in chosen):
-            chosen.append(i)
+    for row in nearest_first.tolist():
+        centre = laid[matches.query[row], :2]
+        if all(np.abs(centre - laid[matches.query[o], :2]).max() >= APART for o in chosen):
+            chosen.append(row)
         if len(chosen) == most:
             break
     if not chosen:
         return []
-    centres = centre[chosen]
-    box, corner = _turned(query, aligned)
-    corners = np.round(laid[asking[chosen]]).astype(int) - corner - SIZE // 2
-    given = np.stack([_cut(box, c, SIZE // 2) for c in corners])
-    blocks = visible.target(group).blocks
-    theirs = np.stack(
-        [blocks.dense(np.round(c / v).astype(int) - SIZE // 2, (SIZE, SIZE, SIZE)) for c in centres]
-    )
-    said = completed(load_completion(variant, settings.descriptor.weights), (given, theirs, given))
-    inner = given[:, SIZE // 2 : -SIZE // 2, SIZE // 2 : -SIZE // 2]
-    completions = states_of(said.said, said.classes)
+    centres = matches.centre[chosen]
+    states = _states(aligned, variant, laid[matches.query[chosen]], centres)
     return [
-        Match(
-            inner[i],
-            completions[i],
-            theirs[i],
-            int(distance[k]),
-            (float(c[0]), float(c[1]), float(c[2])),
+        Match(*three, int(distance), (float(x), float(y), float(z)))
+        for three, distance, (x, y, z) in zip(
+            zip(*states, strict=True), matches.distance[chosen], centres, strict=True
         )
-        for i, (k, c) in enumerate(zip(chosen, centres, strict=True))
     ]
 
 
+def _states(aligned: _Aligned, variant: str, laid: F64, centres: F64) -> tuple[U8, U8, U8]:
+    """States (n, 32, 32, 32) of the query's subvolumes, as completed, and of the target's.
+
+    ``laid`` (n, 3) are the query's centres, voxels in the map's axes; ``centres`` (n, 3) the
+    target's, metres in its map.
+    """
+    settings = aligned.visible.database.settings
+    half = SIZE // 2
+    box, corner = _turned(aligned.query, aligned.yaw)
+    corners = np.round(laid).astype(int) - corner - half
+    query = np.stack([_cut(box, c, half) for c in corners])
+    blocks = aligned.visible.target(aligned.group).blocks
+    low = np.round(centres / settings.fusion.voxel_size).astype(int) - half
+    target = np.stack([blocks.dense(c, (SIZE, SIZE, SIZE)) for c in low])
+    completion = completed(
+        load_completion(variant, settings.descriptor.weights), (query, target, query)
+    )
+    inner = query[:, half:-half, half:-half]
+    return inner, states_of(completion.said, completion.classes), target
+
+
 def _turned(query: Query, yaw: float) -> tuple[U8, NDArray[np.int64]]:
-    """States (x, y, z) of the whole query turned by ``yaw`` (rad) about the vertical through its
-    origin, and the corner voxel (3,).
+    """States (x, y, z) of the query turned by ``yaw`` (rad) about its vertical.
+
+    The second value is the corner voxel (3,).
     """
     low, high = query.blocks.bounds()
     state = query.blocks.dense(low, tuple((high - low).tolist()))
@@ -329,8 +364,9 @@ def _turned(query: Query, yaw: float) -> tuple[U8, NDArray[np.int64]]:
 
 
 def _cut(box: U8, corner: NDArray[np.integer], margin: int) -> U8:
-    """States of the subvolume at ``corner`` of ``box`` with a ``margin`` in x and y, unobserved
-    outside.
+    """States of the subvolume at ``corner`` of ``box`` with a ``margin`` in x and y.
+
+    Unobserved outside the box.
     """
     pad = SIZE + margin
     padded = np.pad(box, pad, constant_values=UNOBSERVED_STATE)

@@ -25,7 +25,7 @@ START = (20, 120, 50)
 # of two maps, one laid on the other
 QUERY = (214, 120, 20)
 TARGET = (20, 90, 200)
-PALE = (205, 205, 210)  # what a map fades to under another one
+PALE = (205, 205, 210)  # to which a map fades under another one
 CLOSURE = (214, 39, 40)
 
 # of a query's voxels, by the map that they are laid on

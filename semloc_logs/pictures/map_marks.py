@@ -1,4 +1,4 @@
-"""What is drawn over a map: lines, a drive with its direction, a scale bar."""
+"""Marks over a map: lines, a drive with its direction, a scale bar, an ellipse."""
 
 from __future__ import annotations
 

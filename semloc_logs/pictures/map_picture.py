@@ -39,7 +39,7 @@ U8 = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Caption:
-    """What is written beside the map; ``voxel_size`` in metres."""
+    """The facts written beside a map; ``voxel_size`` in metres."""
 
     session: str
     label_source: str

@@ -48,7 +48,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Lettering:
-    """What is written on a sheet: ``title``, ``facts`` below it, and ``legend``.
+    """The text of a sheet: ``title``, ``facts`` below it, and ``legend``.
 
     A sheet with ``metres``, the width of a pixel of its panels, gets a scale bar and map axes.
     """
@@ -73,7 +73,7 @@ class Sheet:
         body = max([w + g for w, g in zip(widths, gaps, strict=True)], default=0)
         self._width = max(body, self._px(NARROWEST)) + 2 * self._px(PAD)
 
-        # from the bottom up: what lies higher is placed on what lies lower
+        # from the bottom up, each part on the one below it
         top = self._px(PAD)
         top += self._legend(lettering.legend, top)
         foot = top

@@ -1,5 +1,6 @@
-"""Voxels drawn as lit cubes in parallel projection, without a screen: sorted by depth, faces that
-look away left out.
+"""Voxels drawn as lit cubes in parallel projection, without a screen.
+
+Faces are sorted by depth; faces that look away are left out.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solid:
-    """Voxels ``ijk`` (n, 3) of a grid with edge ``size`` (m) and RGB colours (n, 3); ``map_T_grid``
-    (4, 4) lays the grid into the map.
+    """Voxels ``ijk`` (n, 3) of a grid with edge ``size`` (m) and RGB colours (n, 3).
+
+    ``map_T_grid`` (4, 4) lays the grid into the map.
     """
 
     ijk: NDArray[np.int32]
@@ -41,8 +43,9 @@ class Solid:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Seen from direction ``azimuth``, ``elevation`` (rad) onto the point ``at`` (x, y, z); a
-    picture of ``width`` x ``height`` pixels that are ``metres`` wide.
+    """A parallel view from ``azimuth``, ``elevation`` (rad) onto the point ``at`` (x, y, z).
+
+    The picture has ``width`` x ``height`` pixels that are ``metres`` wide.
     """
 
     azimuth: float
@@ -99,8 +102,8 @@ def draw_solids(solids: Sequence[Solid], view: View) -> U8:
         order = np.argsort(centre[:, 2], kind="stable")
         steps = int(np.ceil(max(s.size for s in solids) / large.metres * 1.5)) + 1
         for first in range(0, len(order), AT_ONCE):
-            mine = order[first : first + AT_ONCE]
-            _paint(image, depth, (centre[mine], edges[mine], rgb[mine]), steps)
+            rows = order[first : first + AT_ONCE]
+            _paint(image, depth, (centre[rows], edges[rows], rgb[rows]), steps)
     image = _with_edges(image, depth, 2 * max((s.size for s in solids), default=1.0))
     return np.asarray(
         cv2.resize(image, (view.width, view.height), interpolation=cv2.INTER_AREA), np.uint8
@@ -108,8 +111,9 @@ def draw_solids(solids: Sequence[Solid], view: View) -> U8:
 
 
 def _faces(solid: Solid, view: View) -> list[tuple[F64, F64, F64]]:
-    """For each side of the voxels that shows: centres (n, 3) in pixels and depth, edges (n, 2, 2)
-    in pixels, shaded colours (n, 3).
+    """The visible faces on each side of the voxels.
+
+    Centres (n, 3) in pixels and depth, edges (n, 2, 2) in pixels, shaded colours (n, 3).
     """
     out: list[tuple[F64, F64, F64]] = []
     if not len(solid.ijk):
@@ -150,14 +154,15 @@ def _paint(image: U8, depth: NDArray[np.float32], faces: tuple[F64, F64, F64], s
     y = np.floor(xy[..., 1]).astype(np.int64)
     inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
     face, _ = np.nonzero(inside)  # of equal indices the last assignment stays: the nearest face
-    at = y[inside] * image.shape[1] + x[inside]
-    image.reshape(-1, 3)[at] = rgb[face].astype(np.uint8)
-    depth.reshape(-1)[at] = centre[face, 2]
+    pixel = y[inside] * image.shape[1] + x[inside]
+    image.reshape(-1, 3)[pixel] = rgb[face].astype(np.uint8)
+    depth.reshape(-1)[pixel] = centre[face, 2]
 
 
 def _with_edges(image: U8, depth: NDArray[np.float32], reach: float) -> U8:
-    """Darker where something nearer stands beside: eye-dome lighting (Boucheny 2009), up to
-    ``reach`` metres of difference.
+    """Darker beside something nearer: eye-dome lighting (Boucheny 2009).
+
+    ``reach`` is the largest difference of depth that counts, metres.
     """
     padded = np.pad(depth, SHARPER, mode="edge")
     shade = np.zeros(depth.shape, np.float32)

@@ -36,11 +36,13 @@ class Condition:
             )
         if self.daytime not in DAYTIMES:
             raise SettingsError(
-                f"there is no simulated time of day {self.daytime!r}: choose one of {', '.join(DAYTIMES)}"
+                f"there is no simulated time of day {self.daytime!r}: choose one of"
+                f" {', '.join(DAYTIMES)}"
             )
         if not (math.isfinite(self.roadworks) and 0 <= self.roadworks <= 50):
             raise SettingsError(
-                f"there cannot be {self.roadworks} simulated roadworks a kilometre: give between 0 and 50"
+                f"there cannot be {self.roadworks} simulated roadworks a kilometre: give between 0"
+                " and 50"
             )
         if not 0 <= self.rebuilt <= 1:
             raise SettingsError(

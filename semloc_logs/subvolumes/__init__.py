@@ -1,3 +1,1 @@
-"""Cutting and turning subvolumes; the encoder-decoder and its training (paper 3.2). torch is
-imported here only.
-"""
+"""Cutting and turning subvolumes, the encoder-decoder (paper 3.2); the only room with torch."""

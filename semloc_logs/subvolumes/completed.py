@@ -32,9 +32,10 @@ BALANCED = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Completed:
-    """Network codes (n, 32, 32, 32) of the subvolumes as few frames saw them, as the network
-    completes them, the same with the most probable label of each voxel, and as all frames saw them;
-    ``classes`` is the code of free voxels.
+    """Subvolumes as network codes (n, 32, 32, 32): observed, completed, true.
+
+    As few frames observed them; as the network completes them; the same with the most probable
+    label of each voxel; as all frames observed them. ``classes`` is the code of free voxels.
     """
 
     given: U8
@@ -45,29 +46,32 @@ class Completed:
 
 
 def load_completion(variant: str, weights: Path | None = None) -> Completion:
-    """The shipped network of ``variant`` with its decoder, or that of a file. Raises SettingsError
-    when the file does not hold one.
+    """The shipped network of ``variant`` with its decoder, or the network of a file.
+
+    SettingsError when the file does not hold one.
     """
     return load_weights(Completion, "", variant, weights)
 
 
 @torch.inference_mode()
 def completed(model: Completion, pairs: tuple[U8, U8, U8]) -> Completed:
-    """What the network makes of the incomplete views of ``pairs``, of
-    :func:`semloc_logs.training.pairs.read_shard`.
-    """
+    """The incomplete views of ``pairs``, as :func:`training.pairs.read_shard` gives, completed."""
     table = code_table(model.encoder.variant)
     classes = CLASSES[model.encoder.variant]
     given = table[pairs[0]]
-    said, probable = (np.zeros((len(given), SIZE, SIZE, SIZE), np.uint8) for _ in range(2))
+    predicted, probable = (np.zeros((len(given), SIZE, SIZE, SIZE), np.uint8) for _ in range(2))
     for i in range(0, len(given), BATCH):
         logits = model.complete(torch.from_numpy(given[i : i + BATCH]))[:, : classes + 1]
-        for out, weight in ((said, BALANCED), (probable, COUNTED)):
+        for out, weight in ((predicted, BALANCED), (probable, COUNTED)):
             # an occupied voxel counted so often in training: its odds are too large by that
             excess = torch.tensor([math.log(weight)] * classes + [0.0])
             out[i : i + BATCH] = (logits - excess[:, None, None, None]).argmax(1).numpy()
     return Completed(
-        np.ascontiguousarray(given[:, 16:-16, 16:-16]), said, probable, table[pairs[1]], classes
+        np.ascontiguousarray(given[:, 16:-16, 16:-16]),
+        predicted,
+        probable,
+        table[pairs[1]],
+        classes,
     )
 
 

@@ -1,9 +1,9 @@
-"""Cutting and turning subvolumes: voxel states -> network codes, whole maps turned by a heading,
-single subvolumes for training.
+"""Cutting and turning subvolumes: voxel states -> network codes.
 
-A subvolume is 32^3 voxels. The encoder sees a margin of 8 voxels around it in x and y, which is its
-receptive field, so that the descriptors of a whole map can be computed at once and equal those of
-single subvolumes to rounding.
+Whole maps are turned by a heading; training takes single subvolumes. A subvolume is 32^3 voxels.
+The encoder sees a margin of 8 voxels around it in x and y, which is its receptive field, so that
+the descriptors of a whole map can be computed at once and equal those of single subvolumes to
+rounding.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ U8 = NDArray[np.uint8]
 
 
 def code_table(variant: str) -> U8:
-    """Voxel state (0..255) -> network code: 0..L-1 classes, L free, L + 1 unobserved, L + 2
-    occupied of unknown class.
+    """Voxel state (0..255) -> network code.
 
-    ``geometric`` knows a single class (the paper's uniform semantics).
+    0..L-1 classes, L free, L + 1 unobserved, L + 2 occupied of unknown class. ``geometric`` knows a
+    single class (the paper's uniform semantics).
     """
     classes = CLASSES[variant]
     table = np.full(256, classes + 2, np.uint8)
@@ -47,9 +47,10 @@ def code_table(variant: str) -> U8:
 def turn(
     state: U8, low: NDArray[np.int64], yaw: float, centre: NDArray[np.float64], out: U8
 ) -> None:
-    """Fill ``out`` (x, y, z) with the box of the same centre turned: the voxel at offset d from the
-    middle of ``out`` shows the map's voxel at ``centre`` + R(yaw) d (all in voxels, map
-    coordinates), unobserved outside ``state``, whose corner is ``low``.
+    """Fill ``out`` (x, y, z) with the box of the same centre, turned.
+
+    The voxel at offset d from the middle of ``out`` is the map's voxel at ``centre`` + R(yaw) d
+    (all in voxels, map coordinates), unobserved outside ``state``, whose corner is ``low``.
     """
     c = np.cos(yaw)
     s = np.sin(yaw)
@@ -71,10 +72,10 @@ def turn(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turned:
-    """A map that was turned by -``yaw`` about z: ``state`` (x, y, z) whose corner is voxel ``low``
-    (3,) of the turned map.
+    """A map that was turned by -``yaw`` about z.
 
-    The axis stands at ``middle`` (2,), voxels of the map.
+    ``state`` (x, y, z) with its corner at voxel ``low`` (3,) of the turned map. The axis is at
+    ``middle`` (2,), voxels of the map.
     """
 
     state: U8
@@ -100,11 +101,10 @@ class Turned:
 
 
 def turned_map(state: U8, low: NDArray[np.integer], yaw: float) -> Turned:
-    """The box ``state`` whose corner is voxel ``low`` as a query at heading ``yaw`` sees it, with
-    room for all of it.
+    """The box ``state`` with its corner at voxel ``low``, as a query at heading ``yaw`` sees it.
 
-    Corner and axis are multiples of 8 voxels: what is described of a map that is not turned stays
-    on its grid.
+    There is room for all of it. Corner and axis are multiples of 8 voxels: subvolumes of a map that
+    is not turned stay on its grid.
     """
     shape = np.array(state.shape)
     middle = np.round((np.asarray(low) + shape / 2)[:2] / GRID) * GRID

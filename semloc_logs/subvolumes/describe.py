@@ -1,5 +1,4 @@
-"""Descriptors of a whole map: the encoder run fully convolutionally over it, layer by layer (paper
-3.3).
+"""Descriptors of a whole map: the encoder run over it fully convolutionally (paper 3.3).
 
 Subvolumes lie on a grid in x and y. Their height follows the ground: layers are 8 voxels apart,
 counted from one metre below the ground, and of each column of layers the one is described whose
@@ -35,17 +34,16 @@ PATCH = 256  # voxels along the edge of the part of a map that is encoded at onc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Described:
-    """``centre`` (n, 3) of the subvolumes in voxels (map coordinates) and unit ``descriptor`` (n,
-    latent).
-    """
+    """``centre`` (n, 3) of subvolumes, voxels of the map, and unit ``descriptor`` (n, latent)."""
 
     centre: F32
     descriptor: F32
 
 
 def quarter_turns(descriptor: F32, turns: int) -> F32:
-    """What descriptors (n, latent) become when the map is turned by ``turns`` quarters about z,
-    counter-clockwise: the encoder turns with its input, so nothing is computed again.
+    """Descriptors (n, latent) of a map turned by ``turns`` quarters about z, counter-clockwise.
+
+    The encoder turns with its input, so nothing is computed again.
     """
     return np.roll(descriptor.reshape(len(descriptor), 4, -1), turns, 1).reshape(
         len(descriptor), -1
@@ -54,8 +52,9 @@ def quarter_turns(descriptor: F32, turns: int) -> F32:
 
 @lru_cache(maxsize=8)
 def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
-    """The shipped encoder of ``variant``, or that of a file. Raises SettingsError when the file
-    does not hold one.
+    """The shipped encoder of ``variant``, or the encoder of a file.
+
+    SettingsError when the file does not hold one.
     """
     encoder = load_weights(Encoder, "encoder.", variant, weights)
     # more cores are used by more processes: the same sums in the same order, whatever the engine
@@ -91,8 +90,9 @@ def _filled(state: U8, low: int, high: int) -> NDArray[np.int64]:
 
 @njit(cache=True, nogil=True)
 def _lowest(state: U8) -> NDArray[np.float64]:
-    """The lowest surface in each 4 x 4 columns (x / 4, y / 4): the voxel up to which two are
-    occupied; NaN where there are fewer.
+    """The lowest surface in each 4 x 4 columns (x / 4, y / 4).
+
+    The voxel up to which two are occupied; NaN where there are fewer.
     """
     out = np.full((state.shape[0] // 4, state.shape[1] // 4), np.nan)
     level = np.zeros(state.shape[2], np.uint8)
@@ -115,8 +115,9 @@ def _lowest(state: U8) -> NDArray[np.float64]:
 
 
 def _layers(state: U8, bottom: int, stride: int) -> NDArray[np.int64]:
-    """Layer of each window: the one whose lowest 8 voxels hold the lowest surface (10 % quantile
-    over 4 x 4 columns).
+    """Layer of each window: the one whose lowest 8 voxels hold the lowest surface.
+
+    The lowest surface is the 10 % quantile over 4 x 4 columns.
     """
     lowest = _lowest(state)
     windows = np.lib.stride_tricks.sliding_window_view(lowest, (8, 8))[
@@ -143,81 +144,93 @@ def describe_map(
     road: NDArray[np.floating] | None = None,
     reach: float = np.inf,
 ) -> Described:
-    """Describe the box ``state`` (x, y, z) of voxel states whose corner is voxel ``low`` of the
-    map; ``ground_z`` in metres.
+    """Describe the box ``state`` (x, y, z) of voxel states with its corner at voxel ``low`` (3,).
 
-    ``stride`` is 4 or 8 voxels. Positions are multiples of it in the map's voxel grid only if
-    ``low`` is. With a ``road`` (m, 2), metres, only subvolumes whose centre lies within ``reach``
-    metres of it are described.
+    ``ground_z`` is in metres, ``stride`` 4 or 8 voxels. Positions are multiples of the stride in
+    the map's voxel grid only if ``low`` is. With a ``road`` (m, 2), metres, only subvolumes whose
+    centre lies within ``reach`` metres of it are described.
     """
     if stride not in (4, 8):
         raise SettingsError(f"A stride of {stride} voxels is not possible: 4 or 8.")
-    span = np.argwhere(_filled(state, 0, state.shape[2]))
-    if not len(span):
-        return Described(np.zeros((0, 3), np.float32), np.zeros((0, encoder.latent), np.float32))
-    # crop to what is occupied, with room for windows that hang over the edge, on the stride's grid
-    first = np.maximum((span.min(0) - SIZE // 2) // 8 * 8, -SIZE // 2)
-    size = -(-(span.max(0) + SIZE // 2 - first) // 8) * 8
-    bottom_z = round((ground_z - BELOW_GROUND * voxel_size / STREET_VOXEL) / voxel_size) - int(
-        low[2]
-    )
-    height = state.shape[2] + 2 * SIZE
-    box = np.full((*(size + 2 * MARGIN), height), 253, np.uint8)
-    a = np.maximum(first, 0)
-    b = np.minimum(first + size, state.shape[:2])
-    o = a - first + MARGIN
-    box[o[0] : o[0] + b[0] - a[0], o[1] : o[1] + b[1] - a[1], SIZE : SIZE + state.shape[2]] = state[
-        a[0] : b[0], a[1] : b[1]
-    ]
-    bottom = bottom_z + SIZE  # of layer 0 in the box
+    corner = np.asarray(low)
+    cropped = _cropped(state)
+    if cropped is None:
+        return _nothing(encoder)
+    box, first = cropped
+    height = box.shape[2]
+    below = BELOW_GROUND * voxel_size / STREET_VOXEL
+    bottom = round((ground_z - below) / voxel_size) - int(low[2]) + SIZE  # of layer 0 in the box
     inner = box[MARGIN:-MARGIN, MARGIN:-MARGIN]
     layer = _layers(inner, bottom, stride)
+
+    # windows that are described: enough in them, and close to the road
+    described = _window_sums(_filled(inner, 0, height), stride) >= min_occupied
+    if road is not None:
+        windows = np.moveaxis(np.indices(described.shape), 0, -1) * stride + first + corner[:2]
+        middle = (windows + SIZE / 2) * voxel_size
+        described &= cKDTree(road).query(middle, distance_upper_bound=reach)[0] < reach
+
     table = code_table(encoder.variant)
     centres = []
-    found = []
-    has_enough = _window_sums(_filled(inner, 0, height), stride) >= min_occupied
-    if road is not None:
-        corners = (
-            np.moveaxis(np.indices(has_enough.shape), 0, -1) * stride + first + np.asarray(low)[:2]
-        )
-        has_enough &= (
-            cKDTree(road).query((corners + SIZE / 2) * voxel_size, distance_upper_bound=reach)[0]
-            < reach
-        )
-    values, counts = np.unique(layer[has_enough], return_counts=True)
+    vectors = []
+    values, counts = np.unique(layer[described], return_counts=True)
     for index in values[counts >= RARE * counts.sum()]:
         z = bottom + LAYER * int(index)
         if z < 0 or z + SIZE > height:
             continue
         enough = _window_sums(_filled(inner, z, z + SIZE), stride) >= min_occupied
         # corners of the windows within the inner box
-        wanted = np.argwhere(enough & has_enough & (layer == index)) * stride
+        wanted = np.argwhere(enough & described & (layer == index)) * stride
         if not len(wanted):
             continue
         codes = np.take(table, box[:, :, z : z + SIZE])
-        out = _encode(codes, wanted, encoder, stride)
-        corner = np.concatenate(
-            [wanted + first, np.full((len(wanted), 1), z - SIZE)], 1
-        ) + np.asarray(low)
-        centres.append(corner + SIZE / 2)
-        found.append(out)
+        vectors.append(_encode(codes, wanted, encoder, stride))
+        heights = np.full((len(wanted), 1), z - SIZE)
+        centres.append(np.concatenate([wanted + first, heights], 1) + corner + SIZE / 2)
     if not centres:
-        return Described(np.zeros((0, 3), np.float32), np.zeros((0, encoder.latent), np.float32))
-    return Described(np.concatenate(centres).astype(np.float32), np.concatenate(found))
+        return _nothing(encoder)
+    return Described(np.concatenate(centres).astype(np.float32), np.concatenate(vectors))
+
+
+def _nothing(encoder: Encoder) -> Described:
+    """No subvolumes."""
+    return Described(np.zeros((0, 3), np.float32), np.zeros((0, encoder.latent), np.float32))
+
+
+def _cropped(state: U8) -> tuple[U8, NDArray[np.int64]] | None:
+    """The occupied part of ``state`` with room for windows that reach over its edge.
+
+    The second value is the corner (2,) of the part, without its margin, in ``state``: a multiple of
+    8 voxels. None without an occupied voxel.
+    """
+    span = np.argwhere(_filled(state, 0, state.shape[2]))
+    if not len(span):
+        return None
+    first = np.maximum((span.min(0) - SIZE // 2) // 8 * 8, -SIZE // 2)
+    size = -(-(span.max(0) + SIZE // 2 - first) // 8) * 8
+    box = np.full((*(size + 2 * MARGIN), state.shape[2] + 2 * SIZE), UNOBSERVED_STATE, np.uint8)
+    a = np.maximum(first, 0)
+    b = np.minimum(first + size, state.shape[:2])
+    o = a - first + MARGIN
+    rows = slice(o[0], o[0] + b[0] - a[0])
+    columns = slice(o[1], o[1] + b[1] - a[1])
+    box[rows, columns, SIZE : SIZE + state.shape[2]] = state[a[0] : b[0], a[1] : b[1]]
+    return box, first
 
 
 def _encode(codes: U8, wanted: NDArray[np.int64], encoder: Encoder, stride: int) -> F32:
-    """Descriptors (n, latent) of the windows whose corners within the margin are ``wanted`` (n, 2),
-    patch by patch.
+    """Descriptors (n, latent) of windows, patch by patch.
+
+    Their corners within the margin are ``wanted`` (n, 2).
     """
     out = np.zeros((len(wanted), encoder.latent), np.float32)
     phase = wanted % 8
     for dx in range(0, 8, stride):
         for dy in range(0, 8, stride):
-            mine = np.flatnonzero((phase == (dx, dy)).all(1))
-            patch = wanted[mine] // PATCH
+            phase_rows = np.flatnonzero((phase == (dx, dy)).all(1))
+            patch = wanted[phase_rows] // PATCH
             for px, py in np.unique(patch, axis=0):
-                rows = mine[(patch == (px, py)).all(1)]
+                rows = phase_rows[(patch == (px, py)).all(1)]
                 corner = wanted[rows].min(0)
                 extent = wanted[rows].max(0) - corner + SIZE + 2 * MARGIN
                 part = np.ascontiguousarray(

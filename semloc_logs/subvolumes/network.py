@@ -1,5 +1,4 @@
-"""The paper's variational encoder-decoder (3.2, supplement 1), written so that it can be run over a
-whole map at once.
+"""The paper's variational encoder-decoder (3.2, supplement 1), run over whole maps at once.
 
 Labels enter through a learned embedding (an occupied, free or unobserved voxel is a table look-up,
 not a vector of L + 2 numbers), and the first block maps 2x2x2 voxels at once. Two blocks of 3x3x3
@@ -32,8 +31,9 @@ CHANNELS = (16, 32, 64)
 
 
 class _LookUp(torch.autograd.Function):
-    """``F.embedding`` for a few codes and many voxels: its own backward pass scatters row by row
-    and takes five times as long.
+    """``F.embedding`` for a few codes and many voxels.
+
+    The library's backward pass scatters row by row and takes five times as long.
     """
 
     @staticmethod
@@ -55,8 +55,9 @@ class _LookUp(torch.autograd.Function):
 
 
 def halve(x: Tensor) -> Tensor:
-    """2x2x2 max-pooling; without gradients as three maxima, which take half the time of the
-    library's kernel in bf16.
+    """2x2x2 max-pooling.
+
+    Without gradients as three maxima, which take half the time of the library's kernel in bf16.
     """
     if torch.is_grad_enabled() and x.requires_grad:
         return F.max_pool3d(x, 2)
@@ -66,9 +67,7 @@ def halve(x: Tensor) -> Tensor:
 
 
 def in_eights(volume: Tensor) -> Tensor:
-    """Voxels (b, x, y, z) -> (b, x / 2, y / 2, z / 2, 8), the eight voxels of each cell of twice
-    the size side by side.
-    """
+    """Space to depth: voxels (b, x, y, z) -> (b, x / 2, y / 2, z / 2, 8)."""
     b, x, y, z = volume.shape
     return (
         volume.reshape(b, x // 2, 2, y // 2, 2, z // 2, 2).permute(0, 1, 3, 5, 2, 4, 6).flatten(4)
@@ -86,11 +85,11 @@ def from_eights(cells: Tensor) -> Tensor:
 
 
 def _turned(base: Tensor, group_in: bool) -> Tensor:
-    """Filters (4 * out, 4 * in or in, x, y, z) of a layer that turns with its input, from ``base``
-    (out, [4,] in, x, y, z).
+    """Filters (4 * out, 4 * in or in, x, y, z) of a layer that turns with its input.
 
-    Output channel r * out + i is filter i turned by r quarter turns about z, which also turns what
-    it expects of its input's channels (Cohen and Welling 2016, the group p4).
+    They are made from ``base`` (out, [4,] in, x, y, z). Output channel r * out + i is filter i
+    turned by r quarter turns about z, which also turns its input's channels (Cohen and Welling
+    2016, the group p4).
     """
     turns = []
     for r in range(4):
@@ -100,8 +99,9 @@ def _turned(base: Tensor, group_in: bool) -> Tensor:
 
 
 class Turning(nn.Module):
-    """The parameters of one layer of the encoder: ``base`` filters for one heading and a ``bias``
-    that all headings share.
+    """The parameters of one layer of the encoder, a convolution over quarter turns (P4).
+
+    ``base`` filters for one heading and a ``bias`` that all headings share.
     """
 
     def __init__(
@@ -121,9 +121,10 @@ class Turning(nn.Module):
 
 @njit(cache=True, nogil=True)
 def look_up_cells(codes: U8, table: F32, bias: F32, usual: int, out: F32) -> None:
-    """ReLU(bias + the rows of ``table`` (8, codes, channels) of the 2x2x2 ``codes`` (b, x, y, z) of
-    each cell) into ``out`` (b, x / 2, y / 2, z / 2, channels); cells that hold nothing but the
-    ``usual`` code are made once.
+    """ReLU(bias + the rows of ``table`` of the 2x2x2 codes of each cell) into ``out``.
+
+    ``table`` (8, codes, channels), ``codes`` (b, x, y, z), ``out`` (b, x / 2, y / 2, z / 2,
+    channels). Cells that hold nothing but the ``usual`` code are computed once.
     """
     n = len(bias)
     of_usual = bias.copy()
@@ -153,12 +154,12 @@ def look_up_cells(codes: U8, table: F32, bias: F32, usual: int, out: F32) -> Non
 
 
 class Encoder(nn.Module):
-    """Codes (b, x, y, 32) uint8 with a margin of 8 voxels in x and y -> mu (b, latent, (x - 40) /
-    8, (y - 40) / 8).
+    """Codes (b, x, y, 32) with a margin of 8 voxels in x and y -> mu of the subvolumes.
 
-    Output (i, j) describes the subvolume whose corner is voxel (8 + 8 i, 8 + 8 j, 0). A map turned
-    by a quarter about z has the same descriptors but for the order of their numbers
-    (``describe.quarter_turns``). Another ``layer`` is for comparison.
+    mu is (b, latent, (x - 40) / 8, (y - 40) / 8), codes are uint8. Output (i, j) describes the
+    subvolume with its corner at voxel (8 + 8 i, 8 + 8 j, 0). A map turned by a quarter about z has
+    the same descriptors but for the order of their numbers (``describe.quarter_turns``). Another
+    ``layer`` is for comparison.
     """
 
     def __init__(
@@ -175,15 +176,13 @@ class Encoder(nn.Module):
         self._table: F32 | None = None
 
     def train(self, mode: bool = True) -> Encoder:
-        """As of any module; what was kept of the old weights is forgotten."""
+        """As of any module; kernels made from the old weights are dropped."""
         self._kept = []
         self._table = None
         return super().train(mode)
 
     def _layers(self) -> list[tuple[Tensor, Tensor]]:
-        """Weights and biases of all layers as the kernels want them, made once where they do not
-        change.
-        """
+        """Weights and biases of all layers as the kernels take them, made once where constant."""
         if self._kept:
             return self._kept
         first, *rest = (layer.filters() for layer in (self.first, *self.blocks, self.mean))
@@ -204,8 +203,9 @@ class Encoder(nn.Module):
         return layers
 
     def first_block(self, codes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Codes -> (b, 16, x / 2, y / 2, 16): one linear map of the embeddings of each 2x2x2
-        voxels, at a fraction of the cost of the paper's block, which convolves at full resolution.
+        """Codes -> (b, 16, x / 2, y / 2, 16): a linear map of the embeddings of each 2x2x2 voxels.
+
+        It costs a fraction of the paper's block, which convolves at full resolution.
         """
         device = codes.device.type
         # looked up in the precision of the convolutions: no copy of the volume
@@ -224,8 +224,9 @@ class Encoder(nn.Module):
         return x.permute(0, 4, 1, 2, 3)  # channels last in memory, as the convolutions want it
 
     def _looked_up(self, codes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """The first block and its ReLU as a sum of eight rows of a table: what a voxel of each code
-        adds to the cell it lies in.
+        """The first block and its ReLU as a sum of eight rows of a table.
+
+        A row is the share of a voxel of each code in the cell it lies in.
         """
         if self._table is None:
             table = torch.einsum(
@@ -260,11 +261,10 @@ def latent_mean(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 class Decoder(nn.Module):
-    """Latent code (b, latent) -> logits (L + 2, 8, b, 16, 16, 16) of a subvolume :func:`in_eights`,
-    the eight moved to the front.
+    """Latent code (b, latent) -> logits (L + 2, 8, b, 16, 16, 16) of a subvolume.
 
-    Upsampling by repetition and convolution as in the paper, but the last step says the 2x2x2
-    voxels of each cell at once.
+    The subvolume is :func:`in_eights`, the eight moved to the front. Upsampling by repetition and
+    convolution as in the paper, but the last step gives the 2x2x2 voxels of each cell at once.
     """
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
@@ -291,7 +291,7 @@ class Decoder(nn.Module):
 
 
 def as_volumes(logits: Tensor) -> Tensor:
-    """What the decoder gives -> (b, L + 2, 32, 32, 32)."""
+    """The decoder's output -> (b, L + 2, 32, 32, 32)."""
     return torch.stack([from_eights(of_class.movedim(0, -1)) for of_class in logits], 1)
 
 
@@ -304,7 +304,7 @@ def channels_last(module: nn.Module) -> None:
 
 
 class Completion(nn.Module):
-    """Encoder and decoder: what is trained. ``encoder`` alone describes."""
+    """Encoder and decoder, as they are trained; the ``encoder`` alone describes."""
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
         super().__init__()
@@ -313,15 +313,17 @@ class Completion(nn.Module):
         channels_last(self)
 
     def complete(self, codes: Tensor) -> Tensor:
-        """Logits (b, L + 2, 32, 32, 32) of the completed middle subvolumes of ``codes`` (b, 64, 64,
-        32), as the training weighed voxels.
+        """Logits (b, L + 2, 32, 32, 32) of the middle subvolumes of ``codes`` (b, 64, 64, 32).
+
+        As the training weighed voxels.
         """
         return as_volumes(self(codes, None)[0])
 
     def forward(self, codes: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits of the completed middle subvolume as the decoder gives them, mu (b, latent, 3, 3)
-        of all and log-variance (b, latent) of the middle one of ``codes`` (b, 64, 64, 32); without
-        ``noise`` (b, latent) the mean is decoded.
+        """Logits of the completed middle subvolume, mu of all, log-variance of the middle one.
+
+        Logits as the decoder gives them, mu (b, latent, 3, 3), log-variance (b, latent), of
+        ``codes`` (b, 64, 64, 32). Without ``noise`` (b, latent) the mean is decoded.
         """
         every = self.encoder(codes)
         mu = every[:, :, every.shape[2] // 2, every.shape[3] // 2]

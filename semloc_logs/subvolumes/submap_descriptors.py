@@ -42,10 +42,10 @@ def describe_submap(
     settings: Resolved,
     yaws: Sequence[float] = (0.0,),
 ) -> list[Described]:
-    """Centres (voxels) and descriptors of every described subvolume of a submap, near the
-    keyframes' positions ``road`` (m, 2), metres.
+    """Centres (voxels) and descriptors of the subvolumes of a submap, close to its ``road``.
 
-    One set for each of ``yaws``, as a query at that heading sees the submap.
+    ``road`` (m, 2) are the keyframes' positions, metres. One set for each of ``yaws``, as a query
+    at that heading sees the submap.
     """
     blocks = read_blocks(blocks_path(folder.blocks, submap), states_only=True)
     low, high = blocks.bounds()
@@ -55,11 +55,19 @@ def describe_submap(
     reach = d.reach
     out = []
     for turned in (turned_map(state, low, yaw) for yaw in yaws):
-        near = turned.from_map(road / v) * v
-        found = describe_map(
-            turned.state, turned.low, ground_z, v, encoder, d.stride, d.min_occupied, near, reach
+        positions = turned.from_map(road / v) * v
+        described = describe_map(
+            turned.state,
+            turned.low,
+            ground_z,
+            v,
+            encoder,
+            d.stride,
+            d.min_occupied,
+            positions,
+            reach,
         )
-        out.append(Described(turned.to_map(found.centre), found.descriptor))
+        out.append(Described(turned.to_map(described.centre), described.descriptor))
     return out
 
 

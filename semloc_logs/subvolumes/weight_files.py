@@ -33,11 +33,10 @@ def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
 def load_weights(
     build: Callable[[str, int], Network], part: str, variant: str, weights: Path | None = None
 ) -> Network:
-    """The network that ``build(variant, latent)`` makes, with the shipped weights of ``variant`` or
-    those of a file.
+    """The network that ``build(variant, latent)`` makes, with shipped weights or those of a file.
 
-    ``part`` is ``encoder.`` for the encoder alone, empty for all. Raises SettingsError when the
-    file does not hold them.
+    ``part`` is ``encoder.`` for the encoder alone, empty for all. SettingsError when the file does
+    not hold them.
     """
     try:
         if weights is not None:
@@ -52,8 +51,9 @@ def load_weights(
             {k.removeprefix(part): v.float() for k, v in tensors.items() if k.startswith(part)}
         )
     except (OSError, SafetensorError, KeyError, RuntimeError) as problem:
-        said = str(problem).splitlines()[0]
+        reason = str(problem).splitlines()[0]
         raise SettingsError(
-            f"{weights or 'The shipped weights'}: no weights of the {variant} {part.strip('.') or 'network'} ({said})."
+            f"{weights or 'The shipped weights'}: no weights of the {variant} "
+            f"{part.strip('.') or 'network'} ({reason})."
         ) from None
     return network.eval()

@@ -105,7 +105,8 @@ def session_shards(
     tasks = stretch_tasks(_shard_folder(folder, "sessions", settings), sessions, settings)
     if not tasks:
         raise SettingsError(
-            "No session of the workspace has poses and enough keyframes to train on: fuse longer drives with 'semloc fuse'."
+            "No session of the workspace has poses and enough keyframes to train on: fuse longer"
+            " drives with 'semloc fuse'."
         )
     out = []
     for shard in engine.map(cut_stretch, tasks):
@@ -120,7 +121,8 @@ def given_shards(folder: Path) -> list[Path]:
     shards = sorted(folder.glob("*.parquet"))
     if not shards:
         raise SettingsError(
-            f"{folder}: no shards of packed pairs (.parquet); 'semloc train' leaves them below its checkpoint folder."
+            f"{folder}: no shards of packed pairs (.parquet); 'semloc train' leaves them below its"
+            " checkpoint folder."
         )
     return shards
 
@@ -154,7 +156,8 @@ def learn_descriptor(
     """
     if not len(shards.held_out):
         raise SettingsError(
-            f"Training needs at least {HELD_OUT + 1} scenes or stretches of road, not {len(shards.train)}: two of them only measure."
+            f"Training needs at least {HELD_OUT + 1} scenes or stretches of road, not"
+            f" {len(shards.train)}: two of them only measure."
         )
     training = settings.training
     started = time.monotonic()
@@ -170,9 +173,13 @@ def learn_descriptor(
         if now - spoke >= REPORT_SECONDS or step.samples >= training.samples:
             spoke = now
             rate = (step.samples - first) / max(now - started, 1e-9)
-            losses = f"reconstruction {step.reconstruction:.3f}, contrastive {step.contrastive:.3f}, matched {step.matched:.0%}"
+            losses = (
+                f"reconstruction {step.reconstruction:.3f}, contrastive"
+                f" {step.contrastive:.3f}, matched {step.matched:.0%}"
+            )
             note(
-                f"{variant}: {min(step.samples, training.samples)} of {training.samples} samples, {rate:.0f} a second, {losses}"
+                f"{variant}: {min(step.samples, training.samples)} of {training.samples} samples,"
+                f" {rate:.0f} a second, {losses}"
             )
 
     model = train(
@@ -251,6 +258,7 @@ def device_of(name: str) -> str:
         return "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and not torch.cuda.is_available():
         raise SettingsError(
-            "There is no GPU that torch can use here: train with --device cpu, or install a torch build for this GPU."
+            "There is no GPU that torch can use here: train with --device cpu, or install a torch"
+            " build for this GPU."
         )
     return name

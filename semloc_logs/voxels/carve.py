@@ -41,7 +41,7 @@ Votes = NDArray[np.uint32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Marks:
-    """What the rays of one frame observed, until the next frame is carved.
+    """Observations by the rays of one frame, until the next frame is carved.
 
     ``grid`` of marks, in runs of 4096 bytes; the ``runs`` (m,) of it that hold any are the blocks
     ``blocks`` (m, 3); ``ends`` (n,) are 2 * address + is_hit of the end voxels, with their
@@ -325,7 +325,7 @@ def carve(grid: Grid, start: F64, ends: F64) -> None:
 
 
 class LogOddsUnits(NamedTuple):
-    """What a hit adds and a miss takes, and the clamp, in units of 1/20."""
+    """Log-odds in units of 1/20: added by a hit, taken by a miss, and the clamp."""
 
     hit: int
     miss: int

@@ -1,7 +1,6 @@
-"""What several submaps say of the same voxels, added up: log-odds of occupied and of free space,
-and class votes.
+"""The evidence of several submaps about the same voxels, added up: log-odds and class votes.
 
-The sum is that of OctoMap (Hornung et al. 2013, equation 4) over maps instead of scans: it is
+The sum is the one of OctoMap (Hornung et al. 2013, equation 4) over maps instead of scans: it is
 associative and does not depend on an order, because it is clamped at the end only. So a voxel that
 one submap saw occupied and the next one carved free does not survive.
 """
@@ -43,8 +42,9 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Voxels:
-    """Occupied voxels in Morton order: ``ijk`` (n, 3), ``label`` (n,), ``log_odds`` (n,) clamped,
-    in 1/20, ``hits`` (n,) all votes.
+    """Occupied voxels in Morton order.
+
+    ``ijk`` (n, 3), ``label`` (n,), ``log_odds`` (n,) clamped, in 1/20, ``hits`` (n,) all votes.
     """
 
     ijk: NDArray[np.int32]
@@ -54,8 +54,9 @@ class Voxels:
 
 
 def evidence(blocks: BlockMap, tile: int) -> Iterator[tuple[Tile, Evidence]]:
-    """The evidence of one submap, cut into tiles of ``tile`` voxels (a multiple of 16) in x and y,
-    one after the other.
+    """The evidence of one submap, tile by tile.
+
+    Tiles are ``tile`` voxels wide (a multiple of 16) in x and y.
     """
     row = blocks.ballots // (CELLS * CLASSES)
     where = unpack(blocks.keys)[:, :2] // (tile // BLOCK)
@@ -63,12 +64,17 @@ def evidence(blocks: BlockMap, tile: int) -> Iterator[tuple[Tile, Evidence]]:
         rows = np.flatnonzero((where == (x, y)).all(1))
         log_odds = blocks.log_odds[rows].astype(np.int32)
         log_odds[log_odds == UNOBSERVED] = 0
-        at = np.searchsorted(rows, row)
-        mine = (at < len(rows)) & (rows[np.minimum(at, len(rows) - 1)] == row)
-        moved = (at[mine] - row[mine]) * (CELLS * CLASSES)
+        place = np.searchsorted(rows, row)
+        is_of_tile = (place < len(rows)) & (rows[np.minimum(place, len(rows) - 1)] == row)
+        moved = (place[is_of_tile] - row[is_of_tile]) * (CELLS * CLASSES)
         yield (
             (x, y),
-            Evidence(blocks.keys[rows], log_odds, blocks.ballots[mine] + moved, blocks.votes[mine]),
+            Evidence(
+                blocks.keys[rows],
+                log_odds,
+                blocks.ballots[is_of_tile] + moved,
+                blocks.votes[is_of_tile],
+            ),
         )
 
 
@@ -90,32 +96,32 @@ def merge(a: Evidence, b: Evidence) -> Evidence:
     return Evidence(keys, log_odds, every, total)
 
 
-def resolve(found: Evidence, low: int, high: int) -> Voxels:
-    """The occupied voxels: those whose summed log-odds, clamped to [``low``, ``high``] (1/20), are
-    positive.
+def resolve(evidence_: Evidence, low: int, high: int) -> Voxels:
+    """The occupied voxels: summed log-odds, clamped to [``low``, ``high``] (1/20), are positive.
 
-    The class has most votes; the lowest id wins a tie, and any known class beats unlabelled. Nobody
-    voted: unlabelled.
+    The class has most votes; the lowest id wins a tie, and any known class beats unlabelled.
+    Without votes: unlabelled.
     """
-    row, cell = np.nonzero(found.log_odds > 0)
-    ijk = unpack(found.keys)[row] * BLOCK + np.stack(
+    row, cell = np.nonzero(evidence_.log_odds > 0)
+    ijk = unpack(evidence_.keys)[row] * BLOCK + np.stack(
         [cell // 256, cell // 16 % 16, cell % 16], 1
     ).astype(np.int32)
     order = np.argsort(morton(ijk))
     ijk = ijk[order]
     row = row[order]
     cell = cell[order]
-    voters, label, hits = winners(found.ballots, found.votes)
-    at = np.searchsorted(voters, row * CELLS + cell)
-    at = np.where(np.r_[voters, -1][at] == row * CELLS + cell, at, len(voters))
-    log_odds = np.clip(found.log_odds[row, cell], low, high)
-    return Voxels(ijk, np.r_[label, np.uint8(UNLABELLED)][at], log_odds, np.r_[hits, 0][at])
+    voters, label, hits = winners(evidence_.ballots, evidence_.votes)
+    voter = np.searchsorted(voters, row * CELLS + cell)
+    voter = np.where(np.r_[voters, -1][voter] == row * CELLS + cell, voter, len(voters))
+    log_odds = np.clip(evidence_.log_odds[row, cell], low, high)
+    return Voxels(ijk, np.r_[label, np.uint8(UNLABELLED)][voter], log_odds, np.r_[hits, 0][voter])
 
 
 class Tiles:
-    """Evidence of a whole session by tile. Only the tiles of the last submap are in memory; the
-    others are in files of ``folder``, whose size is bounded by the ground covered, however often it
-    was covered.
+    """Evidence of a whole session by tile.
+
+    Only the tiles of the last submap are in memory; the others are in files of ``folder``, whose
+    size is bounded by the ground covered, however often it was covered.
     """
 
     def __init__(self, folder: Path, tile: int) -> None:
@@ -142,14 +148,14 @@ class Tiles:
         if tile in self._open:
             return self._open.pop(tile)
         path = self._written.pop(tile)
-        found = _load(path)
+        loaded = _load(path)
         path.unlink()
-        return found
+        return loaded
 
 
-def _save(path: Path, found: Evidence) -> None:
+def _save(path: Path, saved: Evidence) -> None:
     with zstandard.open(path, "wb", cctx=zstandard.ZstdCompressor(level=1)) as file:
-        for array in (found.keys, found.log_odds, found.ballots, found.votes):
+        for array in (saved.keys, saved.log_odds, saved.ballots, saved.votes):
             np.lib.format.write_array(file, array, allow_pickle=False)
 
 

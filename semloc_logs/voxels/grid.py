@@ -55,7 +55,7 @@ class BlockMap:
         return _occupied(unpack(self.keys).astype(np.int32) * np.int32(BLOCK), self.state)
 
     def bounds(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Lowest voxel and one past the highest voxel of the blocks; two zeros if there are none."""
+        """Lowest voxel and one past the highest voxel of the blocks; zeros without blocks."""
         if not len(self.keys):
             return np.zeros(3, np.int32), np.zeros(3, np.int32)
         b = unpack(self.keys)
@@ -78,16 +78,16 @@ def _occupied(corner: NDArray[np.int32], state: U8) -> tuple[NDArray[np.int32], 
         count += value != FREE_STATE and value != UNOBSERVED_STATE
     ijk = np.empty((count, 3), np.int32)
     label = np.empty(count, np.uint8)
-    at = 0
+    row = 0
     for n in range(len(state)):
         for m in range(state.shape[1]):
             value = state[n, m]
             if value != FREE_STATE and value != UNOBSERVED_STATE:
-                ijk[at, 0] = corner[n, 0] + m // 256
-                ijk[at, 1] = corner[n, 1] + m // 16 % 16
-                ijk[at, 2] = corner[n, 2] + m % 16
-                label[at] = value
-                at += 1
+                ijk[row, 0] = corner[n, 0] + m // 256
+                ijk[row, 1] = corner[n, 1] + m // 16 % 16
+                ijk[row, 2] = corner[n, 2] + m % 16
+                label[row] = value
+                row += 1
     return ijk, label
 
 
@@ -103,14 +103,14 @@ def _copy_blocks(out: U8, corner: I64, state: U8, rows: I64) -> None:
         block = state[rows[n]]
         for i in range(max(x, 0), min(x + BLOCK, nx)):
             for j in range(max(y, 0), min(y + BLOCK, ny)):
-                at = ((i - x) * BLOCK + j - y) * BLOCK - z
+                source = ((i - x) * BLOCK + j - y) * BLOCK - z
                 to = (i * ny + j) * nz
                 if end - first == BLOCK:  # of a known length: the compiler moves them together
                     for k in range(BLOCK):
-                        flat[np.uint64(to + first + k)] = block[np.uint64(at + first + k)]
+                        flat[np.uint64(to + first + k)] = block[np.uint64(source + first + k)]
                 else:
                     for k in range(first, end):
-                        flat[np.uint64(to + k)] = block[np.uint64(at + k)]
+                        flat[np.uint64(to + k)] = block[np.uint64(source + k)]
 
 
 def empty_map() -> BlockMap:
@@ -212,8 +212,7 @@ class Fuser:
 
 
 def winners(ballots: I64, votes: I64) -> tuple[I64, U8, I64]:
-    """Voxels (row * 4096 + cell, ascending) that have votes, their class and the number of all
-    their votes.
+    """Voxels (row * 4096 + cell, ascending) that have votes, their class, the number of votes.
 
     The class has most votes; the lowest id wins a tie, and any known class beats unlabelled.
     """

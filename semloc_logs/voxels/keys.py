@@ -17,9 +17,7 @@ I64 = NDArray[np.int64]
 
 
 def pack(ijk: NDArray[np.integer]) -> I64:
-    """One int64 for each row of integer coordinates (n, 3) within +-2^20; order is that of (x, y,
-    z).
-    """
+    """One int64 for each row of integers (n, 3) within +-2^20, in the order of (x, y, z)."""
     a = np.asarray(ijk, np.int64) + _BIAS
     return (a[..., 0] << 42) | (a[..., 1] << 21) | a[..., 2]
 

@@ -48,8 +48,9 @@ def poses_of(table: pa.Table) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """Points (n, 3) in the base frame with classes (n,) and, where it is not small, the standard
-    deviation of their range (n,), metres.
+    """Points (n, 3) in the base frame with classes (n,).
+
+    ``sigma`` (n,) is the standard deviation of their range, metres, where it is not small.
     """
 
     points: NDArray[np.float32]
@@ -65,8 +66,9 @@ class Keyframe:
         )
 
     def spread(self, origin: NDArray[np.floating]) -> NDArray[np.float64]:
-        """One standard deviation (n, 3) of each point along its ray from ``origin`` (3,), metres,
-        zeros where it is small.
+        """One standard deviation (n, 3) of each point along its ray from ``origin`` (3,), metres.
+
+        Zeros where it is small.
         """
         if self.sigma is None:
             return np.zeros((len(self.points), 3))
@@ -84,10 +86,10 @@ def part_path(folder: Path, keyframe: int) -> Path:
 def keep_keyframes(
     folder: Path, stamps_ns: Sequence[int], keyframes: Iterable[Keyframe], metadata: dict[str, Any]
 ) -> Iterator[Keyframe]:
-    """Write keyframes to parts in ``folder``, each in a row group of its own, and pass them on as
-    they will be read back.
+    """Write keyframes to parts in ``folder`` and pass them on as they will be read back.
 
-    ``folder`` is renamed later; it is complete when the iterator is exhausted.
+    Each has a row group of its own. ``folder`` is renamed later; it is complete when the iterator
+    is exhausted.
     """
     schema = contracts.schema("keyframes").with_metadata({"semloc": _json(metadata)})
     coming = iter(keyframes)
@@ -136,7 +138,8 @@ def read_keyframe(folder: Path, keyframe: int) -> Keyframe:
         )
     except (OSError, pa.ArrowException) as problem:
         raise WorkspaceError(
-            f"{path} cannot be read ({str(problem).splitlines()[0]}): fuse the session again with --overwrite."
+            f"{path} cannot be read ({str(problem).splitlines()[0]}): fuse the session again with "
+            "--overwrite."
         ) from None
     points = np.stack([table[c].to_numpy() for c in "xyz"], 1)
     sigma = table["sigma"].to_numpy()
@@ -181,8 +184,10 @@ def write_blocks(path: Path, blocks: BlockMap, metadata: dict[str, Any]) -> None
 
 
 def read_blocks(path: Path, states_only: bool = False) -> BlockMap:
-    """Inverse of :func:`write_blocks`; or without log-odds (0, 4096) and votes, which search and
-    verification do not need.
+    """Inverse of :func:`write_blocks`.
+
+    With ``states_only`` without log-odds (0, 4096) and votes, which search and verification do not
+    need.
     """
     names = ["bx", "by", "bz", "state", *([] if states_only else ["log_odds", "votes"])]
     table = read_table(path, names).combine_chunks()
@@ -217,12 +222,12 @@ def read_blocks(path: Path, states_only: bool = False) -> BlockMap:
 def write_voxels(
     folder: Path, submaps: Iterable[BlockMap], metadata: dict[str, Any], clamp: tuple[float, float]
 ) -> int:
-    """The session map: occupied voxels of all ``submaps`` together, in tiles of 256 voxels; returns
-    their number.
+    """Write the session map: occupied voxels of all ``submaps``, in tiles; returns their number.
 
-    Where submaps overlap their evidence adds up (:mod:`semloc_logs.voxels.evidence`), clamped to
-    ``clamp`` (log-odds) at the end. Memory holds a submap and the tiles that it touches, whatever
-    the length of the log and however often it comes back.
+    Tiles are 256 voxels wide. Where submaps overlap their evidence adds up
+    (:mod:`semloc_logs.voxels.evidence`), clamped to ``clamp`` (log-odds) at the end. Memory holds a
+    submap and the tiles that it touches, whatever the length of the log and however often it comes
+    back.
     """
     total = 0
     low, high = (round(SCALE * c) for c in clamp)

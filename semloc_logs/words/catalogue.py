@@ -1,12 +1,11 @@
-"""Which segments hold which sessions: WORK/index/VARIANT, a cache of words/ that any process may
-build, and anyone delete.
+"""Which segments hold which sessions: WORK/index/VARIANT, a cache of words/.
 
-There is no list of segments beside the files: a session is served by the largest segment that holds
-it under the key that its words have now. What no segment holds is built from words/; what no
-session wants any more is passed over and left out of the next merge. After building, segments are
-merged so that each is at least as large as all smaller ones together (Bentley and Saxe 1980): there
-are logarithmically many, and an entry is copied as often. One process at a time builds; the others
-wait for it and find it done.
+Any process may build it, and anyone delete it. The files are the only list of segments: a session
+is served by the largest segment that holds it under the present key of its words. Sessions that no
+segment holds are built from words/; sessions that are not wanted any more are passed over and left
+out of the next merge. After building, segments are merged so that each is at least as large as all
+smaller ones together (Bentley and Saxe 1980): there are logarithmically many, and an entry is
+copied as often. One process at a time builds; the others wait for it and find it done.
 """
 
 from __future__ import annotations
@@ -97,9 +96,10 @@ def session_words(folder: SessionFolder, variant: str) -> SessionWords | None:
 
 @dataclass(slots=True, eq=False)
 class Change:
-    """What :func:`segments` did: sessions ``added``, segments ``merged`` into others, files
-    ``dropped`` as damaged or of no use any more; ``unwritten`` says why segments are in memory
-    alone.
+    """The work of :func:`segments`.
+
+    Sessions ``added``, segments ``merged`` into others, files ``dropped`` as damaged or of no use
+    any more; ``unwritten`` is the reason why segments are in memory alone.
     """
 
     added: int = 0
@@ -127,11 +127,10 @@ class Change:
 def segments(
     work: Workspace, variant: str, names: Sequence[str], change: Change | None = None
 ) -> list[tuple[Segment, frozenset[str]]]:
-    """Segments with the sessions ``names`` that each serves; what lacks is built first, and merged
-    with what there is.
+    """Segments with the sessions ``names`` that each serves; missing ones are built first.
 
-    Sessions that were described in another variant only are left out. ``change`` is told what was
-    done. Raises WorkspaceError when a session was not described.
+    New segments are merged with the present ones. Sessions that were described in another variant
+    only are left out. ``change`` records the work. WorkspaceError when a session was not described.
     """
     change = change or Change()
     folder = work.path / "index" / variant
@@ -203,8 +202,9 @@ def _open_all(folder: Path, variant: str) -> tuple[list[Segment], bool]:
 
 
 def _serving(found: Sequence[Segment], words: Mapping[str, SessionWords]) -> Serving:
-    """The sessions that each segment serves: each session is served by the first that holds its
-    present words.
+    """The sessions that each segment serves.
+
+    Each session is served by the first segment that holds its present words.
     """
     taken: set[str] = set()
     out: Serving = {}
@@ -228,8 +228,9 @@ def _wasteful(serving: Serving) -> bool:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """One process at a time, where files can be locked; elsewhere two may build the same files, and
-    the later rename wins.
+    """One process at a time, where files can be locked.
+
+    Elsewhere two may build the same files, and the later rename wins.
     """
     lock = FileLock(folder / ".lock")
     try:
@@ -251,8 +252,9 @@ def _build(
     names: Sequence[str],
     change: Change,
 ) -> Serving:
-    """Add the sessions that no segment serves, merge, and remove the files that are replaced; the
-    caller has the lock.
+    """Add the sessions that no segment serves, merge, and remove the files that are replaced.
+
+    The caller has the lock.
     """
     for path in folder.glob(f".*{SUFFIX}.*.tmp"):  # of a process that was killed
         path.unlink(missing_ok=True)
@@ -328,8 +330,9 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 
 
 def _plan(serving: Serving) -> list[list[Segment]]:
-    """Segments to be merged, or alone: of the largest first each is as large as all behind it, or
-    merged with them.
+    """Segments to be merged, or alone.
+
+    Of the largest first each is as large as all behind it, or merged with them.
     """
     left = sorted(
         (s for s, served in serving.items() if served),
@@ -360,8 +363,9 @@ def _written(folder: Path, variant: str, segment: Segment, change: Change) -> Se
 
 
 def _merged(folder: Path, variant: str, group: Serving, change: Change) -> Serving:
-    """One segment of the sessions that a ``group`` of segments serves, or the group where it cannot
-    be written.
+    """One segment of the sessions that a ``group`` of segments serves.
+
+    The group itself where it cannot be written.
     """
     sessions = tuple(
         sorted(
@@ -387,9 +391,7 @@ def _merged(folder: Path, variant: str, group: Serving, change: Change) -> Servi
 def _renumbered(
     segment: Segment, served: frozenset[str], sessions: Sequence[Held]
 ) -> NDArray[np.int64]:
-    """The numbers that a segment's places have among those of ``sessions``, -1 for sessions that it
-    does not serve.
-    """
+    """The numbers of a segment's places among ``sessions``, -1 for sessions it does not serve."""
     numbers = {
         place: i
         for i, place in enumerate((h.name, submap) for h in sessions for submap in h.submaps)
@@ -400,7 +402,8 @@ def _renumbered(
 def merged_blocks(
     group: Sequence[Segment], places: Sequence[NDArray[np.int64]], most: int = 1_000_000
 ) -> Iterator[Columns]:
-    """Sorted blocks of about ``most`` entries of several segments, whose places are numbered anew;
+    """Sorted blocks of about ``most`` entries of several segments, whose places are numbered anew.
+
     -1 leaves out.
     """
     ends = sum((s.starts.astype(np.int64) for s in group), np.zeros(WORDS + 1, np.int64))

@@ -1,17 +1,16 @@
-"""Inverted lists over the words of many submaps and the search for the nearest codes in them (paper
-3.4).
+"""Inverted lists over the words of many submaps, and the search for the nearest codes (paper 3.4).
 
 A query looks into the lists of its nearest cells. Where these hold more than a budget of codes, it
 looks at the words of these cells that are nearest to it, as many as hold the budget: so the work of
 a look-up does not grow with the map beyond that. The codes nearest in Hamming distance, with all
-that are as near as the last, are found by counting bits. Of these the nearest are told by the
+that are as near as the last, are found by counting bits. Of these the nearest are chosen by the
 *asymmetric* distance (Gordo et al. 2014): a bit that differs counts as much as the query's
 projection lies off the cell's threshold, as bits of projections close to it mean little. That finds
 more true neighbours than the Hamming distance alone does, for a few microseconds a query; the
 distance to the centroid of an entry's word adds nothing to it (docs/benchmarks.md, Words).
 
-What is found does not depend on how words are spread over segments: the budget counts words of all
-of them, and of equally near entries the first by submap and row is nearer.
+Matches do not depend on how words are spread over segments: the budget counts words of all of them,
+and of equally near entries the first by submap and row is nearer.
 """
 
 from __future__ import annotations
@@ -49,9 +48,11 @@ QUERIES = 1024  # that are looked up together
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """``query`` (m,) rows of the query, ``group`` (m,) submaps, ``entry`` (m,) rows among the words
-    of the submap, their ``centre`` (m, 3), metres, and ``yaw`` (m,), radians, ``distance`` (m,)
-    Hamming; nearest first for each query, by the asymmetric distance.
+    """Matches of a search, for each query the nearest first, by the asymmetric distance.
+
+    ``query`` (m,) rows of the query, ``group`` (m,) submaps, ``entry`` (m,) rows among the words of
+    the submap, their ``centre`` (m, 3), metres, and ``yaw`` (m,), radians, ``distance`` (m,)
+    Hamming.
     """
 
     query: I32
@@ -64,17 +65,19 @@ class Matches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Allowed:
-    """Words that may answer: of submaps ``groups`` (g,), of some of them certain ``rows`` only, a
-    mask (n,) of the words by number.
+    """Words that may match: of submaps ``groups`` (g,), of some of them certain ``rows`` only.
+
+    ``rows`` has a mask (n,) of the words by number.
     """
 
     groups: Bools
     rows: Mapping[int, Bools] = field(default_factory=dict)
 
     def of(self, group: I64) -> tuple[I64, Bools]:
-        """For each place, whose submap is ``group`` (places,): -2 if none of its words may answer,
-        -1 if all may, else where its rows begin in the masks that are returned one behind the
-        other.
+        """For each place, of submap ``group`` (places,): where its rows begin in the masks.
+
+        The masks are returned one behind the other. -2 if none of the words may match, -1 if all
+        may.
         """
         open_ = np.where((group >= 0) & self.groups[group], -1, -2).astype(np.int64)
         masks = [np.zeros(0, bool)]
@@ -89,8 +92,9 @@ class Allowed:
 # sums of multiples of 1 / UNIT are exact in any order
 @njit(cache=True, nogil=True, fastmath={"reassoc"})
 def _word_distances(projected: F32, cell: int, children: F32, square: F32, out: I32) -> None:
-    """Distance of a query, in units and less its own square, to the words of ``cell`` (k,) into
-    ``out``.
+    """Distances of a query to the words of ``cell`` (k,) into ``out``.
+
+    In units, and less its own square.
     """
     for c in range(children.shape[1]):
         dot = np.float32(0.0)
@@ -122,10 +126,10 @@ def _farthest(distance: I32, weight: I64, budget: int) -> int:
 def _choose(
     projected: F32, cells: I32, children: F32, square: F32, live: I64, cell_live: I64, budget: int
 ) -> Ranges:
-    """Ranges of words that each query with ``cells`` (n, p) looks into: its cells, or their nearest
-    words that hold ``budget`` entries.
+    """Ranges of words that each query looks into: its cells, or their nearest words.
 
-    ``live`` (65536,) and ``cell_live`` (256,) are the entries of words and cells.
+    Queries have ``cells`` (n, p); the words hold ``budget`` entries. ``live`` (65536,) and
+    ``cell_live`` (256,) are the entries of words and cells.
     """
     n, p = cells.shape
     k = children.shape[1]
@@ -135,21 +139,21 @@ def _choose(
     first = np.empty(n * p, np.int64)
     last = np.empty(n * p, np.int64)
     probe = np.empty(n * p, np.int64)
-    found = 0
+    chosen = 0
     for q in range(n):
-        if found + p * k > len(first):
+        if chosen + p * k > len(first):
             more = np.empty(max(len(first), p * k), np.int64)
             first = np.concatenate((first, more))
             last = np.concatenate((last, more))
             probe = np.concatenate((probe, more))
         if cell_live[cells[q]].sum() <= budget:
             for j in range(p):
-                first[found], last[found], probe[found] = (
+                first[chosen], last[chosen], probe[chosen] = (
                     cells[q, j] * 256,
                     cells[q, j] * 256 + 256,
                     j,
                 )
-                found += 1
+                chosen += 1
         else:
             for j in range(p):
                 _word_distances(
@@ -162,13 +166,13 @@ def _choose(
                 for c in range(k):
                     if distance[j * k + c] <= bound and weight[j * k + c]:
                         if not begun:
-                            first[found], probe[found], begun = cells[q, j] * 256 + c, j, True
-                            found += 1
-                        last[found - 1] = cells[q, j] * 256 + c + 1
+                            first[chosen], probe[chosen], begun = cells[q, j] * 256 + c, j, True
+                            chosen += 1
+                        last[chosen - 1] = cells[q, j] * 256 + c + 1
                     elif weight[j * k + c]:  # words without entries do not part a range
                         begun = False
-        offsets[q + 1] = found
-    return offsets, first[:found], last[:found], probe[:found]
+        offsets[q + 1] = chosen
+    return offsets, first[:chosen], last[:chosen], probe[:chosen]
 
 
 class _Lists(NamedTuple):
@@ -196,8 +200,9 @@ def _may_answer(lists: _Lists, entry: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def _bound(count: I64, within: int, limit: int, size: int) -> int:
-    """The least distance up to ``limit`` within which ``count`` (66,) has ``size`` entries, of
-    which ``within`` are within ``limit``.
+    """The least distance up to ``limit`` within which ``count`` (66,) has ``size`` entries.
+
+    ``within`` entries are within ``limit``.
     """
     while limit > 0 and within - int(count[limit]) >= size:
         within -= int(count[limit])
@@ -217,12 +222,11 @@ def _look(
     distance: U8,
     at: I64,
 ) -> tuple[int, int]:
-    """Entries of a segment that query ``q`` with codes (p,) may want: their distances, and
-    positions and probes in ``at`` (2, m).
+    """Entries of a segment that query ``q`` with codes (p,) may want.
 
-    ``count`` (66,) entries were found at each distance up to ``limit``. Returns how many are found
-    now and the new limit, within which there are ``size``; the entries of this segment within it
-    have been added to ``count``.
+    Their distances, and positions and probes in ``at`` (2, m). ``count`` (66,) entries were found
+    at each distance up to ``limit``. Returns how many are found now and the new limit, within which
+    there are ``size``; the entries of this segment within it have been added to ``count``.
     """
     offsets, firsts, lasts, probes = ranges
     n = 0
@@ -267,19 +271,18 @@ def _look(
 
 @njit(cache=True, nogil=True)
 def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, count: I64, limit: I64) -> I64:
-    """Queries, positions and probes (3, m) of the entries of one segment that may answer and are
-    among the ``size`` nearest so far.
+    """Queries, positions and probes (3, m) of the entries of a segment among the ``size`` nearest.
 
-    ``count`` (n, 66) and ``limit`` (n,) are those of :func:`_look` and go on from segment to
-    segment.
+    These may match and are the nearest so far. ``count`` (n, 66) and ``limit`` (n,) are those of
+    :func:`_look` and continue from segment to segment.
     """
     offsets, firsts, lasts, _ = ranges
     most = np.int64(0)
     for q in range(len(codes)):
-        here = np.int64(0)
+        entries = np.int64(0)
         for r in range(offsets[q], offsets[q + 1]):
-            here += np.int64(lists.starts[lasts[r]]) - np.int64(lists.starts[firsts[r]])
-        most = max(most, here)
+            entries += np.int64(lists.starts[lasts[r]]) - np.int64(lists.starts[firsts[r]])
+        most = max(most, entries)
     distance = np.empty(most, np.uint8)
     at = np.empty((2, most), np.int64)
     out = np.empty((3, 64 * len(codes) + most), np.int64)
@@ -301,12 +304,11 @@ def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, count: I64, limi
 def _nearest(
     margin: F32, codes: U64, bound: I64, query: I64, probe: I64, code: U64, key: I64, k: int
 ) -> tuple[I64, I32]:
-    """The k nearest candidates (n, k) of each query, -1 where there are fewer, and their Hamming
-    distances, nearest first.
+    """The k nearest candidates (n, k) of each query and their Hamming distances, nearest first.
 
-    ``margin`` (n, p, 64) is how far the query's projections lie off the thresholds of its cells,
-    ``codes`` (n, p) their signs; candidates beyond their query's ``bound`` (n,) are none. Of
-    equally near ones that with the lesser ``key`` is nearer.
+    -1 where there are fewer. ``margin`` (n, p, 64) is how far the query's projections lie off the
+    thresholds of its cells, ``codes`` (n, p) their signs; candidates beyond their query's ``bound``
+    (n,) do not count. Of equally near ones the one with the lesser ``key`` is nearer.
     """
     n = len(codes)
     nearest = np.full((n, k), -1, np.int64)
@@ -353,8 +355,10 @@ def _count_live(starts: U32, place: U32, inside: Bools, live: I64) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A segment in a search: ``group`` (places,) is the number of the submap at each of its places,
-    -1 for those that take no part.
+    """A segment in a search.
+
+    ``group`` (places,) is the number of the submap at each of its places, -1 for those that take no
+    part.
     """
 
     segment: Segment
@@ -362,8 +366,9 @@ class Part:
 
 
 class Index:
-    """Words of a database in segments. A look-up compares at most ``budget`` codes and those of one
-    word more.
+    """Words of a database in segments.
+
+    A look-up compares at most ``budget`` codes and those of one word more.
     """
 
     def __init__(self, vocabulary: Vocabulary, parts: Sequence[Part], budget: int = BUDGET) -> None:
@@ -387,8 +392,9 @@ class Index:
         code: U64,
         group: NDArray[np.integer],
     ) -> Index:
-        """An index in memory of words (n,) and codes (n,) in the submaps ``group`` (n,); ``entry``
-        of matches are their rows.
+        """An index in memory of words (n,) and codes (n,) in the submaps ``group`` (n,).
+
+        ``entry`` of matches are their rows.
         """
         n = len(word)
         groups = np.arange(int(group.max()) + 1 if n else 0)
@@ -407,20 +413,21 @@ class Index:
         return int(self._live.sum())
 
     def search(self, descriptors: F32, k: int, probes: int, allowed: Allowed) -> Matches:
-        """The ``k`` nearest words of each descriptor (n, N) in its ``probes`` nearest cells among
-        the ``allowed`` ones.
+        """The ``k`` nearest ``allowed`` words of each descriptor (n, N).
+
+        They are looked for in its ``probes`` nearest cells.
         """
-        found = [
+        parts = [
             self._search(descriptors[i : i + QUERIES], k, probes, allowed)
             for i in range(0, len(descriptors), QUERIES)
         ]
-        if not found:
-            found = [self._gather(np.zeros((4, 0), np.int64))]
-        query = np.concatenate([m.query + i * QUERIES for i, m in enumerate(found)]).astype(
+        if not parts:
+            parts = [self._gather(np.zeros((4, 0), np.int64))]
+        query = np.concatenate([m.query + i * QUERIES for i, m in enumerate(parts)]).astype(
             np.int32
         )
         rest = (
-            np.concatenate([getattr(m, name) for m in found])
+            np.concatenate([getattr(m, name) for m in parts])
             for name in ("group", "entry", "centre", "yaw", "distance")
         )
         return Matches(query, *rest)
@@ -441,18 +448,18 @@ class Index:
         )
         count = np.zeros((len(codes), BITS + 2), np.int64)
         limit = np.full(len(codes), BITS)
-        found: list[NDArray[np.int64]] = []
-        near: list[tuple[U64, I64]] = []
+        scanned: list[NDArray[np.int64]] = []
+        candidates: list[tuple[U64, I64]] = []
         for number, p in enumerate(self.parts):
             s = p.segment
             lists = _Lists(s.starts, s.code, s.place, s.row, *allowed.of(p.group))
             m = _scan(codes, ranges, lists, max(SHORTLIST, k), count, limit)
-            found.append(np.concatenate([m, np.full((1, m.shape[1]), number)]))
-            near.append((s.code[m[1]], p.group[s.place[m[1]]] << 32 | s.row[m[1]]))
-        if not found:
+            scanned.append(np.concatenate([m, np.full((1, m.shape[1]), number)]))
+            candidates.append((s.code[m[1]], p.group[s.place[m[1]]] << 32 | s.row[m[1]]))
+        if not scanned:
             return self._gather(np.zeros((4, 0), np.int64))
-        m = np.concatenate(found, axis=1)
-        code, key = (np.concatenate([n[i] for n in near]) for i in (0, 1))
+        m = np.concatenate(scanned, axis=1)
+        code, key = (np.concatenate([n[i] for n in candidates]) for i in (0, 1))
         nearest, hamming = _nearest(np.abs(margin), codes, limit, m[0], m[2], code, key, k)
         query, rank = np.nonzero(nearest >= 0)
         chosen = m[:, nearest[query, rank]]
@@ -467,8 +474,8 @@ class Index:
         centre = np.zeros((m, 3))
         yaw = np.zeros(m)
         for i, p in enumerate(self.parts):
-            mine = np.flatnonzero(number == i)
-            at = position[mine]
-            group[mine], entry[mine] = p.group[p.segment.place[at]], p.segment.row[at]
-            centre[mine], yaw[mine] = p.segment.centre[at], p.segment.yaw[at]
+            rows = np.flatnonzero(number == i)
+            place = position[rows]
+            group[rows], entry[rows] = p.group[p.segment.place[place]], p.segment.row[place]
+            centre[rows], yaw[rows] = p.segment.centre[place], p.segment.yaw[place]
         return Matches(query.astype(np.int32), group, entry, centre, yaw, distance.astype(np.int32))

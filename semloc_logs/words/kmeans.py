@@ -1,5 +1,4 @@
-"""k-means whose result does not depend on the number of threads, the BLAS or the block size (Lloyd
-1982).
+"""k-means that does not depend on threads, BLAS or block size (Lloyd 1982).
 
 Points and centroids are multiples of 2^-11 and no longer than 1 (:func:`grid`), so their products
 are multiples of 2^-22 whose partial sums stay below 1 (Cauchy-Schwarz): float32 holds them exactly
@@ -24,8 +23,9 @@ def grid(a: NDArray[np.floating]) -> F32:
 
 
 def nearest_centroids(points: F32, centroids: F32) -> tuple[NDArray[np.int64], F32]:
-    """Row of the nearest of ``centroids`` (k, d) for each of ``points`` (n, d), the first of
-    equals, and the squared distances (n,). Both are multiples of 2^-11.
+    """Row of the nearest of ``centroids`` (k, d) for each of ``points`` (n, d), and its distance.
+
+    The first of equals; squared distances (n,). Both are multiples of 2^-11.
     """
     half = (centroids**2).sum(1) / 2
     nearest = np.zeros(len(points), np.int64)
@@ -53,11 +53,10 @@ def _sums(
 
 
 def kmeans(points: NDArray[np.floating], k: int, rng: np.random.Generator, rounds: int) -> F32:
-    """Centroids (k, d) of ``points`` (n, d), n >= k, no longer than 1, by Lloyd's algorithm from
-    distinct random points.
+    """Centroids (k, d) of ``points`` (n, d), n >= k, no longer than 1, by Lloyd's algorithm.
 
-    A centroid without points takes the point farthest from its own. Points and centroids are
-    rounded to multiples of 2^-11.
+    It starts from distinct random points. A centroid without points takes the point farthest from
+    its own. Points and centroids are rounded to multiples of 2^-11.
     """
     points = grid(points)
     centroids = points[np.sort(rng.choice(len(points), k, replace=False))].copy()

@@ -1,12 +1,11 @@
-"""A segment of the index: the words of some sessions, sorted by word, in one file of plain arrays
-that every process maps into memory.
+"""A segment of the index: the words of some sessions, sorted by word, in one file of plain arrays.
 
-The file, little-endian: 8 bytes ``SEMLOCIX``; uint32 format version, length of the header and
-CRC-32 of it; uint32 CRC-32 of each array; the header, JSON: ``variant``, ``entries``, and
-``sessions``, in the order of their names, each with ``name``, ``key``, its ``submaps`` and number
-of ``entries``; then the arrays of :data:`ARRAYS`, each at a multiple of 64 bytes. Entries are
-sorted by word, session, submap and row, so a segment's bytes depend on what it holds alone. Files
-never change: they appear by rename and vanish.
+Every process maps it into memory. The file, little-endian: 8 bytes ``SEMLOCIX``; uint32 format
+version, length of the header and CRC-32 of it; uint32 CRC-32 of each array; the header, JSON:
+``variant``, ``entries``, and ``sessions``, in the order of their names, each with ``name``,
+``key``, its ``submaps`` and number of ``entries``; then the arrays of :data:`ARRAYS`, each at a
+multiple of 64 bytes. Entries are sorted by word, session, submap and row, so a segment's bytes
+depend on its content alone. Files never change: they appear by rename and vanish.
 """
 
 from __future__ import annotations
@@ -47,9 +46,7 @@ Columns = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """A session in a segment: its name, the key of its words, its submaps' ids and how many words
-    it has.
-    """
+    """A session in a segment: name, key of its words, ids of its submaps, number of its words."""
 
     name: str
     key: str
@@ -59,9 +56,11 @@ class Held:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """``starts`` (65537,) of the words; for each entry ``code``, ``place`` (number in
-    :attr:`places`), ``row`` in the table of its submap, ``centre`` (n, 3), metres in its map frame,
-    and ``yaw``, radians, the heading that the map was turned by.
+    """Entries sorted by word.
+
+    ``starts`` (65537,) of the words; for each entry ``code``, ``place`` (number in :attr:`places`),
+    ``row`` in the table of its submap, ``centre`` (n, 3), metres in its map frame, and ``yaw``,
+    radians, the heading that the map was turned by.
     """
 
     sessions: tuple[Held, ...]
@@ -84,8 +83,9 @@ class Segment:
     def numbered(
         self, numbers: Mapping[tuple[str, int], int], served: Container[str]
     ) -> NDArray[np.int64]:
-        """The ``numbers`` of session and submap at each of the :attr:`places`, -1 for sessions that
-        are not ``served``.
+        """The ``numbers`` of session and submap at each of the :attr:`places`.
+
+        -1 for sessions that are not ``served``.
         """
         return np.array([numbers[p] if p[0] in served else -1 for p in self.places], np.int64)
 
@@ -116,12 +116,12 @@ def segment_in_memory(sessions: tuple[Held, ...], columns: Columns) -> Segment:
         name: np.ascontiguousarray(columns[name], kind) for name, kind, _ in ARRAYS
     } | {"starts": starts_of(columns["word"])}
     for values in arrays.values():
-        values.flags.writeable = False  # as those of files
+        values.flags.writeable = False  # as in files
     return Segment(sessions, **arrays)
 
 
 # -- files
-# -----------------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def _layout(header: int, entries: int) -> tuple[dict[str, int], int]:
@@ -139,7 +139,8 @@ def write_segment(
     path: Path, variant: str, sessions: tuple[Held, ...], blocks: Iterable[Columns]
 ) -> None:
     """Write sorted ``blocks``, whose words rise from one to the next, as one file, by rename.
-    Raises OSError where that cannot be.
+
+    OSError where that is not possible.
     """
     entries = sum(held.entries for held in sessions)
     if entries >= 2**32:
@@ -184,11 +185,10 @@ def write_segment(
 
 
 def open_segment(path: Path, variant: str, check: bool = False) -> Segment:
-    """Map a segment into memory; ``check`` reads all of it and compares the checksums of the
-    arrays.
+    """Map a segment into memory; ``check`` reads all of it and compares the checksums.
 
-    Raises WorkspaceError when the file is damaged, cut off or of another version, FileNotFoundError
-    when it is gone.
+    WorkspaceError when the file is damaged, cut off or of another version, FileNotFoundError when
+    it was removed.
     """
     with path.open("rb") as file:
         try:
@@ -222,7 +222,8 @@ def open_segment(path: Path, variant: str, check: bool = False) -> Segment:
                 raise ValueError("the entries of the words do not follow each other")
         except (ValueError, KeyError, TypeError, struct.error, OverflowError) as problem:
             raise WorkspaceError(
-                f"{path} is no segment of an index ({problem}): delete it; it is built again from the words."
+                f"{path} is not an index segment ({problem}): delete it; it is built again from "
+                "the words."
             ) from None
     return Segment(held, path=path, **arrays)
 

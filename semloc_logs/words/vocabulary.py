@@ -1,9 +1,8 @@
-"""The semantic vocabulary (paper 3.4): hierarchical k-means over descriptors with a 64-bit Hamming
-embedding (Jegou et al. 2008).
+"""The semantic vocabulary: hierarchical k-means with a Hamming embedding (paper 3.4).
 
-The first level has up to 256 cells in the space of the descriptors, the second up to 256 children
-of each in the 64 projected dimensions that the codes are made of: 2^16 words in 4.3 MB, as the
-children are stored in steps of 2^-8, one byte a dimension.
+Codes have 64 bits (Jegou et al. 2008). The first level has up to 256 cells in the space of the
+descriptors, the second up to 256 children of each in the 64 projected dimensions that the codes are
+made of: 2^16 words in 4.3 MB, as the children are stored in steps of 2^-8, one byte a dimension.
 
 Thresholds of the code are the medians of each *cell*, so within a cell half of all bits are set.
 Jegou et al. have them for every word; here a word has a handful of descriptors to take a median of,
@@ -42,9 +41,10 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vocabulary:
-    """``cells`` (c, N) unit centroids and ``projection`` (64, N), multiples of 2^-11,
-    ``thresholds`` (c, 64), ``children`` (c, k, 64) centroids, multiples of 2^-8; N is the dimension
-    of the descriptors, 64 or more.
+    """Cells, and children of cells, for descriptors of N >= 64 dimensions.
+
+    ``cells`` (c, N) unit centroids and ``projection`` (64, N), multiples of 2^-11, ``thresholds``
+    (c, 64), ``children`` (c, k, 64) centroids, multiples of 2^-8.
     """
 
     cells: F32
@@ -53,8 +53,9 @@ class Vocabulary:
     children: F32
 
     def nearest_cells(self, descriptors: F32, probes: int) -> NDArray[np.int32]:
-        """The ``probes`` nearest cells (n, probes) of descriptors (n, N), nearest first, of equals
-        the first.
+        """The ``probes`` nearest cells (n, probes) of descriptors (n, N), nearest first.
+
+        Of equals the first.
         """
         out = np.zeros((len(descriptors), min(probes, len(self.cells))), np.int32)
         for i in range(0, len(descriptors), BLOCK):
@@ -66,8 +67,9 @@ class Vocabulary:
         return np.asarray(grid(descriptors) @ self.projection.T)
 
     def margins(self, descriptors: F32, cell: NDArray[np.integer]) -> F32:
-        """How far the projections of descriptors (n, N) lie above the thresholds of ``cell`` (n,)
-        or (n, p): (n, 64) or (n, p, 64).
+        """How far the projections of descriptors (n, N) lie above the thresholds of ``cell``.
+
+        ``cell`` is (n,) or (n, p); the margins are (n, 64) or (n, p, 64).
         """
         projected = self.projected(descriptors).reshape(
             len(descriptors), *[1] * (cell.ndim - 1), BITS
@@ -75,8 +77,9 @@ class Vocabulary:
         return np.asarray(projected - self.thresholds[cell])
 
     def codes(self, descriptors: F32, cell: NDArray[np.integer]) -> NDArray[np.uint64]:
-        """64-bit codes of descriptors (n, N) under the thresholds of ``cell`` (n,) or (n, p), in
-        its shape; bit b is projection b.
+        """64-bit codes of descriptors (n, N) under the thresholds of ``cell`` (n,) or (n, p).
+
+        They have its shape; bit b is projection b.
         """
         return codes_of(self.margins(descriptors, cell))
 
@@ -89,8 +92,8 @@ class Vocabulary:
         projected = grid(self.projected(descriptors))
         child = np.zeros(len(cell), np.int64)
         for c in np.flatnonzero(np.diff(starts)):
-            mine = order[starts[c] : starts[c + 1]]
-            child[mine] = nearest_centroids(projected[mine], self.children[c])[0]
+            rows = order[starts[c] : starts[c + 1]]
+            child[rows] = nearest_centroids(projected[rows], self.children[c])[0]
         return (cell.astype(np.int64) * 256 + child).astype(np.uint16), self.codes(
             descriptors, cell
         )
@@ -104,8 +107,9 @@ def codes_of(margins: F32) -> NDArray[np.uint64]:
 
 @njit(cache=True, nogil=True)
 def _largest(similarity: F32, out: NDArray[np.int32]) -> None:
-    """Columns of the largest values of each row of ``similarity`` (n, c), largest first, into
-    ``out`` (n, k).
+    """Columns of the largest values of each row of ``similarity`` (n, c) into ``out`` (n, k).
+
+    The largest come first.
     """
     k = out.shape[1]
     best = np.empty(k, np.float32)
@@ -124,8 +128,9 @@ def _largest(similarity: F32, out: NDArray[np.int32]) -> None:
 
 
 def _directions(descriptors: F32, cells: F32, rng: np.random.Generator) -> F32:
-    """Principal directions (64, N) of what is left within the cells, rotated at random so that
-    every bit says equally much.
+    """Principal directions (64, N) of the offsets from the cells, rotated at random.
+
+    The rotation makes all bits equally informative.
     """
     rest = (descriptors - cells[nearest_centroids(descriptors, cells)[0]]).astype(np.float64)
     directions = np.linalg.eigh(rest.T @ rest)[1][:, ::-1][:, :BITS]
@@ -147,7 +152,8 @@ def train_vocabulary(
     n = len(descriptors)
     if n < 256 or descriptors.shape[1] < BITS:
         raise SettingsError(
-            f"A vocabulary needs at least 256 descriptors of {BITS} dimensions, not {n} of {descriptors.shape[1]}: describe more sessions."
+            f"A vocabulary needs at least 256 descriptors of {BITS} dimensions, not {n} of "
+            f"{descriptors.shape[1]}: describe more sessions."
         )
     rng = np.random.default_rng(seed)
     cells = int(min(cells, max(8, n // 64)))
@@ -165,13 +171,13 @@ def train_vocabulary(
     thresholds = np.tile(np.median(projected, axis=0), (cells, 1)).astype(np.float32)
     kids = np.zeros((cells, children, BITS), np.float32)
     for c in range(cells):
-        mine = projected[order[starts[c] : starts[c + 1]]]
-        if len(mine) >= 8:
-            thresholds[c] = np.median(mine, axis=0)
-        if len(mine):
+        members = projected[order[starts[c] : starts[c + 1]]]
+        if len(members) >= 8:
+            thresholds[c] = np.median(members, axis=0)
+        if len(members):
             # single descriptors lie farther from others than their mean does
-            k = min(children, max(1, len(mine) // 2))
-            kids[c, :k] = kmeans(mine, k, rng, 8)
+            k = min(children, max(1, len(members) // 2))
+            kids[c, :k] = kmeans(members, k, rng, 8)
             kids[c, k:] = kids[c, 0]
     return Vocabulary(
         centroids, projection, thresholds, _bytes(kids).astype(np.float32) * np.float32(CHILD_STEP)
@@ -183,9 +189,9 @@ def _bytes(children: F32) -> NDArray[np.int8]:
 
 
 def save_vocabulary(path: Path, vocabulary: Vocabulary, card: dict[str, str]) -> None:
-    """Safetensors of half precision, the children in bytes; ``card`` says what it was trained on."""
-    # safetensors writes the memory as it lies, whatever the strides say: a transposed array would
-    # come back scrambled
+    """Write safetensors, half precision, children in bytes; ``card`` describes the training."""
+    # safetensors writes the memory without regard to strides: a transposed array would come back
+    # scrambled
     arrays = {
         k: np.ascontiguousarray(getattr(vocabulary, k), np.float16)
         for k in ("cells", "projection", "thresholds")
@@ -196,8 +202,9 @@ def save_vocabulary(path: Path, vocabulary: Vocabulary, card: dict[str, str]) ->
 
 @lru_cache(maxsize=8)
 def load_vocabulary(variant: str, path: Path | None = None) -> Vocabulary:
-    """The shipped vocabulary of ``variant``, or that of a file. Raises SettingsError when the file
-    does not hold one.
+    """The shipped vocabulary of ``variant``, or the vocabulary of a file.
+
+    SettingsError when the file does not hold one.
     """
     try:
         if path is not None:
@@ -223,7 +230,7 @@ def load_vocabulary(variant: str, path: Path | None = None) -> Vocabulary:
         ):
             raise ValueError(f"shapes {shapes}, children {children.dtype}")
         if not all(np.isfinite(a).all() for a in (cells, projection, thresholds)):
-            raise ValueError("values that are no numbers")
+            raise ValueError("values that are not finite")
         step = np.float32(CHILD_STEP)
         return Vocabulary(
             grid(cells),
@@ -233,5 +240,6 @@ def load_vocabulary(variant: str, path: Path | None = None) -> Vocabulary:
         )
     except (OSError, SafetensorError, KeyError, IndexError, ValueError) as problem:
         raise SettingsError(
-            f"{path or 'The shipped vocabulary'}: no vocabulary of the {variant} variant ({problem})."
+            f"{path or 'The shipped vocabulary'}: no vocabulary of the {variant} variant "
+            f"({problem})."
         ) from None

@@ -6,32 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.icp import Step, align
-from semloc_logs.alignment.overlap import (
-    ANY_BIT,
-    FREE_BIT,
-    Evidence,
-    build_level,
-    class_bits,
-    look_up,
-    pose_matrix,
-    search,
-    tau,
-    yaw_between,
-)
-from semloc_logs.alignment.verify import (
-    Query,
-    Scores,
-    Target,
-    measured,
-    rank,
-    same_place,
-    search_hypotheses,
-    structure_mask,
-    structure_scores,
-    thin_points,
 from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix, same_place, yaw_between
+from semloc_logs.alignment.icp import Step, align
 from semloc_logs.alignment.mask_grid import (
     ANY_BIT,
     FREE_BIT,
@@ -39,9 +15,11 @@ from semloc_logs.alignment.mask_grid import (
     class_bits,
     look_up,
 )
-from semloc_logs.alignment.query_map import Query, structure_mask
-from semloc_logs.alignment.scores import structure_scores
+from semloc_logs.alignment.query_map import Evidence, Query, structure_mask
+from semloc_logs.alignment.refine import measured
+from semloc_logs.alignment.scores import Scores, alignment_score, structure_scores
 from semloc_logs.alignment.search import search, search_hypotheses
+from semloc_logs.alignment.surface import thin_points
 from semloc_logs.alignment.target_map import Target
 from semloc_logs.alignment.tau import tau
 from semloc_logs.labels.space import UNLABELLED, cityscapes
@@ -304,7 +282,7 @@ def test_what_lies_in_free_space_is_subtracted_from_a_search_score() -> None:
         (40, 0, 0): 0,
         (60, 0, 0): 254,
     }
-    level = build_level(block_map(target), V, COARSE)
+    grid = build_mask_grid(block_map(target), V, COARSE)
     cells: dict[Cell, int] = {
         (0, 0, 0): 2,
         (12, 0, 0): 2,
@@ -313,14 +291,14 @@ def test_what_lies_in_free_space_is_subtracted_from_a_search_score() -> None:
         (40, 0, 0): 0,
         (60, 0, 0): 0,
     }
-    value, pose = search(level, evidence_of(cells, 4), np.zeros(4), (0.0,), 1)
+    value, pose = search(grid, evidence_of(cells, 4), np.zeros(4), (0.0,), 1)
     # one cell aside: free cells are left, walls are not
     assert value == pytest.approx(0.75 * (2 - 0) / 4 + 0.25 * 1 / 2, abs=1e-5)
     assert abs(pose[1:]).max() == V
     free = {(20 + x, y, z): 254 for x in range(-3, 4) for y in range(-3, 4) for z in range(-3, 4)}
     free |= {(60 + x, y, z): 254 for x in range(-3, 4) for y in range(-3, 4) for z in range(-3, 4)}
     value, pose = search(
-        build_level(block_map(target | free), V, COARSE),
+        build_mask_grid(block_map(target | free), V, COARSE),
         evidence_of(cells, 4),
         np.zeros(4),
         (0.0,),
@@ -333,15 +311,15 @@ def test_what_lies_in_free_space_is_subtracted_from_a_search_score() -> None:
 @given(st.integers(0, 10_000), st.sampled_from([1, 2]))
 @settings(max_examples=8, deadline=None)
 def test_a_search_finds_the_best_of_all_its_poses(seed: int, step: int) -> None:
-    """Every turn and shift that is tried, one by one, by look-ups of the turned and moved voxels."""
+    """Every turn and shift that is tried, one by one, by look-ups of turned and moved voxels."""
     rng = np.random.default_rng(seed)
-    level = build_level(block_map(random_cells(seed, 500)), V, COARSE)
+    grid = build_mask_grid(block_map(random_cells(seed, 500)), V, COARSE)
     e = evidence_of({c: s for c, s in random_cells(seed + 1, 30, -6, 7).items() if occupied(s)}, 8)
     start = np.r_[rng.uniform(-3, 3), rng.uniform(-0.5, 0.5, 3)]
     yaws = (-0.2, 0.0, 0.3)
 
     def value(pose: NDArray[np.float64]) -> float:
-        mask = look_up(level, apply(pose_matrix(pose), e.centres))
+        mask = look_up(grid, apply(pose_matrix(pose), e.centres))
         hit = ((mask & e.bits) != 0).astype(int) - (mask == FREE_BIT)
         return float(0.75 * hit[:8].mean() + 0.25 * hit[8:].mean())
 
@@ -353,7 +331,7 @@ def test_a_search_finds_the_best_of_all_its_poses(seed: int, step: int) -> None:
         for y in sides[1]
         for z in sides[2]
     ]
-    found, pose = search(level, e, start, yaws, step)
+    found, pose = search(grid, e, start, yaws, step)
     # of equals the nearest: 1e-6 a cell
     assert found == pytest.approx(max(map(value, poses)), abs=2e-5)
     assert value(pose) == pytest.approx(found, abs=2e-5)
@@ -364,12 +342,12 @@ def test_of_equally_good_poses_the_one_nearest_the_start_is_taken() -> None:
     """A wall along x holds nothing along it: the search stays where it began, and takes the least
     turn.
     """
-    level = build_level(
+    grid = build_mask_grid(
         block_map({(x, 0, z): 2 for x in range(-40, 40) for z in range(10)}), V, COARSE
     )
     cells: dict[Cell, int] = {(x, 0, z): 2 for x in range(-3, 4) for z in range(3, 6)}
     start = np.array([0.0, 0.3, 0.1, 0.2])
-    _, pose = search(level, evidence_of(cells, len(cells)), start, (0.02, -0.01, 0.0, 0.01), 2)
+    _, pose = search(grid, evidence_of(cells, len(cells)), start, (0.02, -0.01, 0.0, 0.01), 2)
     np.testing.assert_array_equal(pose, start)
 
 
@@ -400,16 +378,17 @@ def test_structure_scores_by_hand() -> None:
     ]
 
 
-def test_ranks_by_hand() -> None:
+def test_scores_of_alignments_by_hand() -> None:
     """Below a coverage of a half the structure counts less in proportion; what contradicts free
     space is taken off in full.
     """
-    assert float(rank(0.8, 0.25, 0.1)) == pytest.approx(0.8 * 0.5 - 0.1)
-    assert float(rank(0.8, 0.5, 0.1)) == pytest.approx(0.7)
-    assert float(rank(0.8, 0.9, 0.1)) == pytest.approx(0.7)
-    assert Scores(0.8, 0.25, 0.1, 99).rank == pytest.approx(0.3)
+    assert float(alignment_score(0.8, 0.25, 0.1)) == pytest.approx(0.8 * 0.5 - 0.1)
+    assert float(alignment_score(0.8, 0.5, 0.1)) == pytest.approx(0.7)
+    assert float(alignment_score(0.8, 0.9, 0.1)) == pytest.approx(0.7)
+    assert Scores(0.8, 0.25, 0.1, 99).score == pytest.approx(0.3)
     np.testing.assert_allclose(
-        rank(np.array([1.0, 0.5]), np.array([0.1, 1.0]), np.array([0.0, 0.25])), [0.2, 0.25]
+        alignment_score(np.array([1.0, 0.5]), np.array([0.1, 1.0]), np.array([0.0, 0.25])),
+        [0.2, 0.25],
     )
 
 

@@ -98,7 +98,7 @@ def test_each_session_has_its_share_of_the_hypotheses(
     group = np.array([0, 1, 1])
     votes = (group, np.zeros(3), np.zeros((3, 3)), np.ones(3))
     monkeypatch.setattr(matching, "allowed_words", lambda visible, session: {"semantic": None})
-    monkeypatch.setattr(matching, "_votes", lambda context, variant, allowed: votes)
+    monkeypatch.setattr(matching, "_votes", lambda context, variant, allowed, match: votes)
     calls: list[tuple[list[int], float, int]] = []
 
     def pool(group: Any, yaw: Any, translation: Any, weight: Any, cell: float, most: int) -> Any:

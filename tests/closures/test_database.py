@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.query_map import view_centres
-from semloc_logs.alignment.verify import Query
 from semloc_logs.closures.database import Database, Recent
-from semloc_logs.closures.matching import allowed_places, allowed_words, close_query
+from semloc_logs.closures.matching import QueryContext, allowed_words, close_query
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import everything, visible_to
 from semloc_logs.mapping.selection import road_distance
@@ -132,10 +131,11 @@ def test_time_and_road_each_hide_what_is_nearer_than_their_setting(
     settings = Settings.model_validate(
         {"closures": {"exclude_seconds": seconds, "exclude_distance": distance}}
     ).resolved()
-    seen = Database(Workspace(tmp_path), ("a",), settings).asked_by(session, 59).keyframes(0)
+    database = Database(Workspace(tmp_path), ("a",), settings)
+    seen = visible_to(database, session, 59).keyframes(0)
     # a stretch of 4.8 m is hidden as a whole, and with it one keyframe more at most
     assert seen.tolist() in (list(range(first_hidden)), list(range(first_hidden - 1)))
-    middle = Database(Workspace(tmp_path), ("a",), settings).asked_by(session, 30).keyframes(0)
+    middle = visible_to(database, session, 30).keyframes(0)
     reach = 59 - first_hidden
     assert {30 - reach, 30, 30 + reach}.isdisjoint(middle.tolist())
     assert {30 - reach - 2, 30 + reach + 2} <= set(middle.tolist())
@@ -298,8 +298,9 @@ def test_a_drive_without_poses_does_not_answer_itself(tmp_path: Path) -> None:
     write_json(
         session.folder.session_json, read_json(session.folder.session_json) | {"posed": False}
     )
-    view = Database(work, ("a",), Settings().resolved()).asked_by(SessionMap(session.folder), 99)
-    assert allowed_places(view, session) == {}
+    database = Database(work, ("a",), Settings().resolved())
+    view = visible_to(database, SessionMap(session.folder), 99)
+    assert allowed_words(view, session) == {}
 
 
 @pytest.mark.parametrize(
@@ -322,9 +323,8 @@ def test_classes_are_compared_where_both_sides_know_them(
     for name, source in zip("qab", (query, *targets), strict=True):
         folder = drive_session(work, name, road, [(0, 20)], [np.zeros((0, 3))]).folder
         write_json(folder.session_json, read_json(folder.session_json) | {"label_source": source})
-    found = allowed_places(
-        Database(work, ("a", "b"), Settings().resolved()), SessionMap(work.session("q"))
-    )
+    database = Database(work, ("a", "b"), Settings().resolved())
+    found = allowed_words(everything(database), SessionMap(work.session("q")))
     expected = {"semantic": semantic, "geometric": geometric}
     assert {variant: allowed.groups.tolist() for variant, allowed in found.items()} == {
         k: x for k, x in expected.items() if x
@@ -335,8 +335,10 @@ def test_a_query_searches_where_it_is_told(out_and_back: tuple[Database, Session
     database, session = out_and_back
     searched = []
 
-    def find(view: Database, of: SessionMap, keyframe: int, query: Query) -> list[Hypothesis]:
-        searched.append((of, keyframe, len(view.keyframes(0)) < 60, len(query.structure[0]) > 0))
+    def find(context: QueryContext) -> list[Hypothesis]:
+        sees_less = len(context.visible.keyframes(0)) < 60
+        has_structure = len(context.query.structure[0]) > 0
+        searched.append((context.session, context.keyframe, sees_less, has_structure))
         return []
 
     assert close_query(database, session, 5, find) == []

@@ -13,23 +13,26 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.alignment.covariance import stiffness
 from semloc_logs.alignment.icp import Fit
-from semloc_logs.alignment.verify import Candidate, Scores
+from semloc_logs.alignment.scores import Scores
+from semloc_logs.alignment.search import Candidate
 from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import (
     CloseTask,
     Fitted,
-    _distinct,
-    _rival,
-    _stiffness,
-    allowed_places,
+    QueryContext,
+    _each_place_once,
+    _rival_score,
+    allowed_words,
     close_queries,
     find_hypotheses,
     match_words,
 )
 from semloc_logs.closures.query import build_query
+from semloc_logs.closures.visibility import everything
 from semloc_logs.engines import make_engine
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.mapping.selection import road_distance
@@ -183,7 +186,7 @@ TARGET_T_SCENE = yaw_transform(0.4, (120.0, -60.0, 7.0))
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """Maps of the court: as it is, with a vehicle that looks to its left, and twice in one drive."""
+    """Maps of the court: as it is, from a vehicle that looks left, and twice in one drive."""
     work = Workspace(tmp_path_factory.mktemp("courts"))
     court = courtyard()
     write_session(work, "court", court, drive(), TARGET_T_SCENE)
@@ -323,7 +326,7 @@ def test_a_second_place_that_fits_as_well_is_a_rival(work: Workspace, ask: Ask) 
     assert second.features.distinct == pytest.approx(1.0, abs=0.02)
     assert 0.3 < alone.features.distinct < 0.8
     assert max(first.probability, second.probability) < 0.99 < alone.probability
-    # the better place is the rival of the worse one: its rank by that of the worse
+    # the better place is the rival of the worse one: its score by that of the worse
     worse = ask(here)[1]
     assert worse.features.distinct == pytest.approx(1 / alone.features.distinct, rel=0.02)
 
@@ -336,7 +339,7 @@ def test_a_query_of_little_structure_is_never_probable(ask: Ask) -> None:
         yaw_transform(1.0), settings=Settings.model_validate({"query": {"radius": 10.5}}).resolved()
     )
     assert few
-    assert all(a.features.support < shipped().least_support and a.probability == 0 for a in few)
+    assert all(a.features.support < shipped().min_support and a.probability == 0 for a in few)
 
 
 def test_a_near_word_outweighs_several_far_ones(
@@ -347,7 +350,7 @@ def test_a_near_word_outweighs_several_far_ones(
     """
     settings = SETTINGS
     session = SessionMap(work.session("court"))
-    query, _ = build_query(session, 2, settings)
+    query, query_T_base = build_query(session, 2, settings)
     one = np.array([90.0, -40.0, 7.0])
     several = np.array([150.0, -40.0, 7.0])
 
@@ -366,9 +369,10 @@ def test_a_near_word_outweighs_several_far_ones(
 
     monkeypatch.setattr(Database, "words", lambda *_: Words())
     database = Database(work, ("turned",), settings)
-    allowed = allowed_places(database, session)["semantic"]
+    visible = everything(database)
+    allowed = allowed_words(visible, session)["semantic"]
     described, _ = match_words(database, "semantic", allowed, query, 0.0)
-    found = find_hypotheses(database, session, 2, query)
+    found = find_hypotheses(QueryContext(visible, session, 2, query, query_T_base))
     assert [round(h.weight, 6) for h in found] == [1.001] * 4 + [round(3 * (1 / 64 + 0.001), 6)] * 4
     assert [h.votes for h in found] == [1] * 4 + [3] * 4
     assert sorted(h.pose[0] for h in found[:4]) == pytest.approx(
@@ -381,13 +385,22 @@ def test_a_near_word_outweighs_several_far_ones(
         np.testing.assert_allclose(at, one if h.votes == 1 else several, atol=1e-6)
 
 
-def fitted(rank: float, x: float = 0.0, degrees: float = 0.0, nearest: int = 0) -> Fitted:
+def fitted(score: float, x: float = 0.0, degrees: float = 0.0, nearest: int = 0) -> Fitted:
     """A fit ``x`` metres along the map and turned by ``degrees``, beside keyframe ``nearest``, of
-    this rank.
+    this score.
     """
     T = yaw_transform(np.radians(degrees), (x, 0.0, 0.0))
     fit = Fit(T, 1.0, 1000, 0.1, np.eye(6), np.zeros(3), np.zeros((2, 6)))
-    return Fitted(Candidate(0, T, rank, 1), nearest, np.zeros(3), fit, Scores(rank, 1.0, 0.0, 1000))
+    scores = Scores(score, 1.0, 0.0, 1000)
+    return Fitted(Candidate(0, T, score, 1), nearest, np.zeros(3), fit, scores)
+
+
+def road_of_metres() -> QueryContext:
+    """A query in a target that has a keyframe every metre of its road."""
+    target = SimpleNamespace(distance=np.arange(200.0))
+    database = SimpleNamespace(settings=SETTINGS, session=lambda group: target)
+    visible = SimpleNamespace(database=database)
+    return QueryContext(cast(Any, visible), cast(Any, None), 0, cast(Any, None), np.eye(4))
 
 
 @pytest.mark.parametrize(
@@ -411,24 +424,24 @@ def fitted(rank: float, x: float = 0.0, degrees: float = 0.0, nearest: int = 0) 
 def test_a_later_pass_within_the_drift_of_the_map_is_no_rival(
     other: Fitted, is_rival: bool
 ) -> None:
-    target = cast(SessionMap, SimpleNamespace(distance=np.arange(200.0)))
+    context = road_of_metres()
     one = fitted(0.9)
-    assert _rival(one, [one, other], target, V) == (0.7 if is_rival else 0.0)
-    assert _rival(other, [one, other], target, V) == (0.9 if is_rival else 0.0)
+    assert _rival_score(context, one, [one, other]) == (0.7 if is_rival else 0.0)
+    assert _rival_score(context, other, [one, other]) == (0.9 if is_rival else 0.0)
 
 
 def test_the_best_rival_counts_and_never_itself() -> None:
-    target = cast(SessionMap, SimpleNamespace(distance=np.arange(200.0)))
+    context = road_of_metres()
     every = [
         fitted(0.5, 60.0, nearest=60),
         fitted(0.9),
         fitted(0.6, 120.0, nearest=120),
         fitted(0.4, 180.0, nearest=180),
     ]
-    assert [_rival(f, every, target, V) for f in every] == [0.9, 0.6, 0.9, 0.9]
-    assert _rival(every[1], [every[1]], target, V) == 0.0
+    assert [_rival_score(context, f, every) for f in every] == [0.9, 0.6, 0.9, 0.9]
+    assert _rival_score(context, every[1], [every[1]]) == 0.0
     worst = fitted(-0.2, 60.0, nearest=60)
-    assert _rival(every[1], [every[1], worst], target, V) == 0.0
+    assert _rival_score(context, every[1], [every[1], worst]) == 0.0
 
 
 def test_each_place_is_kept_once_and_the_best_first() -> None:
@@ -440,14 +453,12 @@ def test_each_place_is_kept_once_and_the_best_first() -> None:
         fitted(0.7, 0.9, 6.0),
         fitted(0.8, 0.5, 4.0),
     ]
-    assert [f.scores.rank for f in _distinct(every, V)] == [0.9, 0.7, 0.6]
+    assert [f.scores.score for f in _each_place_once(every, V)] == [0.9, 0.7, 0.6]
 
 
 def test_stiffness_is_what_holds_the_weakest_direction_while_the_rotation_is_free() -> None:
     def of(information: F64) -> float:
-        return _stiffness(
-            Fit(np.eye(4), 1.0, 1000, 0.1, information, np.zeros(3), np.zeros((2, 6)))
-        )
+        return stiffness(Fit(np.eye(4), 1.0, 1000, 0.1, information, np.zeros(3), np.zeros((2, 6))))
 
     H = np.diag([900.0, 400.0, 1600.0, 50.0, 60.0, 70.0])
     assert of(H) == pytest.approx(400.0)

@@ -188,7 +188,7 @@ def test_a_space_by_name_and_beside_the_spec(tmp_path: Path) -> None:
         (
             {},
             {"input": {"size": [8, 8]}},
-            "takes an input of 1 x 3 x 8 x 16, but its spec says 1 x 3 x 8 x 8",
+            "takes an input of 1 x 3 x 8 x 16, but its spec has 1 x 3 x 8 x 8",
         ),
         ({}, {"input": {"size": [8, 16], "layout": "NHWC"}}, r"1 x 8 x 16 x 3 \(NHWC\)"),
         ({}, {"input": {"size": [8, 16], "type": "uint8"}}, r"takes tensor\(float\)"),

@@ -134,7 +134,8 @@ def held_out(
                 counts[kind] += held
             paths.append(path)
             on_progress(
-                f"{min(min(counts.values()), database)} of {database} descriptors' streets are simulated"
+                f"{min(min(counts.values()), database)} of {database} descriptors' streets are"
+                " simulated"
             )
     _scene.cache_clear()  # a town takes hundreds of megabytes
     if min(counts.values()) < database:

@@ -62,11 +62,13 @@ def retrieval_benchmark(
     """
     if set(peers) - {"fpfh"}:
         raise SettingsError(
-            f"Descriptors of '{next(iter(set(peers) - {'fpfh'}))}' cannot be compared with: give --peer fpfh=PYTHON."
+            f"Descriptors of '{next(iter(set(peers) - {'fpfh'}))}' cannot be compared with: give"
+            " --peer fpfh=PYTHON."
         )
     if choice.weights is not None and len(choice.variants) > 1:
         raise SettingsError(
-            "One file of weights is for one variant: give --variant semantic or --variant geometric."
+            "One file of weights is for one variant: give --variant semantic or --variant"
+            " geometric."
         )
     settings = densely(settings).resolved()
     with ExitStack() as stack:

@@ -98,7 +98,8 @@ def measure_labels(logs: Sequence[Path], settings: Resolved) -> Figures:
                 voxels += _measure_session(session, settings, points, taken, sizes)
             else:
                 raise LogError(
-                    f"{log} has no poses, so its labels cannot be fused: give a log with a pose stream."
+                    f"{log} has no poses, so its labels cannot be fused: give a log with a pose"
+                    " stream."
                 )
     figures: Figures = {}
     for what, counts in (("points", points), ("voxels", voxels)):

@@ -71,7 +71,8 @@ def portrait(scan: Scan, fusion: ResolvedFusion) -> Portrait:
     on_ground = (label == ROAD) | (label == SIDEWALK)
     if not (on_ground & (flat < 12)).any():
         raise LogError(
-            "a sweep has no point of a road or pavement within 12 m, so its heights cannot be compared: give labelled sweeps"
+            "a sweep has no point of a road or pavement within 12 m, so its heights cannot be"
+            " compared: give labelled sweeps"
         )
     height = points[:, 2] - float(np.median(points[on_ground & (flat < 12), 2]))
     distance = np.linalg.norm(points, axis=1)
@@ -220,7 +221,8 @@ def measure_realism(
         for scan in log_sweeps(log, 4, repeat=False):
             if (scan.label == UNLABELLED).all():
                 raise LogError(
-                    f"{log} has no labels, so its classes cannot be compared: give a log with a label field."
+                    f"{log} has no labels, so its classes cannot be compared: give a log with a"
+                    " label field."
                 )
             real.append(portrait(scan, fusion))
     simulated = [portrait(scan, fusion) for seed in seeds for scan in town_sweeps(seed, sweeps)]

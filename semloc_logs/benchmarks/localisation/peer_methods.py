@@ -105,7 +105,8 @@ class PeerTask:
             ]
         except (ValueError, KeyError, IndexError, TypeError) as problem:
             raise SemlocError(
-                f"Peer {self.system.runner} answered {said[-200:]!r} ({problem}): see benchmarks/README.md."
+                f"Peer {self.system.runner} answered {said[-200:]!r} ({problem}): see"
+                " benchmarks/README.md."
             ) from None
 
     def _candidates(

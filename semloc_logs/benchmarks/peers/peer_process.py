@@ -84,7 +84,8 @@ def run_peer(name: str, python: str, arguments: Sequence[str], seconds: float) -
     if done.returncode:
         said = done.stderr.strip().splitlines()
         raise SemlocError(
-            f"Peer {name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md."
+            f"Peer {name} failed ({said[-1] if said else 'it said nothing'}): see"
+            " benchmarks/README.md."
         )
     return done.stdout
 
@@ -123,7 +124,8 @@ class Peer:
         except OSError as problem:
             self._errors.close()
             raise SettingsError(
-                f"Peer {name} cannot be started with {python} ({problem.strerror}): give --peer {name}=PYTHON."
+                f"Peer {name} cannot be started with {python} ({problem.strerror}): give --peer"
+                f" {name}=PYTHON."
             ) from None
 
     def __enter__(self) -> Peer:
@@ -155,7 +157,8 @@ class Peer:
         self._errors.seek(0)
         said = self._errors.read().strip().splitlines()
         raise SemlocError(
-            f"Peer {self.name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md."
+            f"Peer {self.name} failed ({said[-1] if said else 'it said nothing'}): see"
+            " benchmarks/README.md."
         )
 
 

@@ -94,7 +94,8 @@ def encoder_speed(settings: Resolved) -> Figures:
         }
         if max(apart, *(float(row.get("difference", 0.0)) for row in figures.values())) > ROUNDING:
             raise SemlocError(
-                f"Descriptors of one map differ by {apart:.3f} between ways to encode it, more than bf16 rounds."
+                f"Descriptors of one map differ by {apart:.3f} between ways to encode it, more"
+                " than bf16 rounds."
             )
         figures |= layers(network, codes)
         return figures

@@ -55,7 +55,8 @@ def search_speed(
     """
     if peers and (set(peers) != {"faiss"} or not RUNNER.exists()):
         raise SettingsError(
-            f"The only peer of search is faiss=PYTHON, run from a checkout (benchmarks/README.md), not {', '.join(peers)}."
+            "The only peer of search is faiss=PYTHON, run from a checkout (benchmarks/README.md),"
+            f" not {', '.join(peers)}."
         )
     # the second level takes no part in a look-up
     vocabulary = train_vocabulary(draw(1, 100_000), children=16)

@@ -26,6 +26,7 @@ from semloc_logs.settings import STREET_VOXEL
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
+# constants, not settings: the models in calibration.json were fitted to votes counted with them
 NEAR = 25.0  # m of road from a query to its neighbours, at voxels of 0.30 m
 # voxels between two alignments of one place, without and with their standard deviations
 SLACK = 1.7

@@ -219,7 +219,7 @@ def _protobuf_parser(definition: Definition) -> Parser:
 
 
 class JsonMessage:
-    """A JSON object whose members are attributes; what is not there is None."""
+    """A JSON object whose members are attributes; a missing member is None."""
 
     def __init__(self, members: dict[str, Any]) -> None:
         self._members = members
@@ -242,9 +242,9 @@ def _parse_json(data: bytes | memoryview) -> Any:
     try:
         value = json.loads(bytes(data))
     except (ValueError, RecursionError) as error:
-        raise UndecodableError(f"it is no JSON ({_short(error)})") from error
+        raise UndecodableError(f"it is not JSON ({_short(error)})") from error
     if not isinstance(value, dict):
-        raise UndecodableError("it is no JSON object")
+        raise UndecodableError("it is not a JSON object")
     return JsonMessage(value)
 
 

@@ -40,7 +40,7 @@ def choose_base_frame(
     """The base frame: ``base_link`` where TF connects it with a sensor and the pose.
 
     Else the frame that the pose belongs to; the sensor's own frame where the pose names none
-    (``pose_child`` ""), or where there is no pose (None). ``sensors``: frame ids of the range
+    (``pose_child`` ""), or without a pose (None). ``sensors``: frame ids of the range
     sensors, the most important first.
     """
     sensors = [frame_name(s) for s in sensors]

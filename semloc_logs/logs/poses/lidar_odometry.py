@@ -39,7 +39,7 @@ class LidarOdometry:
     """Poses of the LIDAR on ``topic`` from its sweeps; LogError when KISS-ICP is not installed.
 
     ``max_range`` and ``min_range`` (m): points that are used. After a jump that no vehicle can
-    make, or once a sweep does not lie on the sweep before any more, there are no more poses:
+    make, or once a sweep does not lie on the sweep before any more, poses end:
     ``problems`` names the time. Slow drift goes unnoticed.
     """
 

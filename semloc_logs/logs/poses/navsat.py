@@ -187,7 +187,7 @@ class NavSatPoses:
         problems = Problems()
         without_fix = max(self._count - self._seen, 0) if self.is_over else 0
         for count, reason in (
-            (without_fix, "report that there is no fix"),
+            (without_fix, "report a missing fix"),
             (self._refused, f"are less certain than {MAX_SIGMA:g} m or out of order"),
         ):
             if count:

@@ -39,7 +39,8 @@ from semloc_logs.logs.problems import (
     sorted_problems,
     without_loss_of,
 )
-from semloc_logs.logs.roles import guess_roles, no_sensor
+from semloc_logs.logs.role_types import no_sensor
+from semloc_logs.logs.roles import guess_roles
 from semloc_logs.logs.sensors.depth import Unprojector
 from semloc_logs.logs.sensors.rectification import rectification
 from semloc_logs.logs.sensors.stereo_pairs import is_rectified

@@ -24,7 +24,8 @@ from semloc_logs.logs.poses.lidar_odometry import LidarOdometry
 from semloc_logs.logs.poses.navsat import navsat_poses
 from semloc_logs.logs.poses.trajectory_file import FilePoses, TrajectoryFile
 from semloc_logs.logs.problems import Problem, sentences, sorted_problems, without_loss_of
-from semloc_logs.logs.roles import Roles, find_roles, no_sensor
+from semloc_logs.logs.role_types import no_sensor
+from semloc_logs.logs.roles import Roles, find_roles
 from semloc_logs.logs.sensors.camera_clouds import CameraClouds
 from semloc_logs.logs.sensors.depth import USUAL_NOISE, RangeNoise
 from semloc_logs.logs.session.cloud_builder import CloudBuilder, RangeLimits

@@ -51,7 +51,8 @@ def read_drive(path: Path) -> F64:
     extent = np.ptp(at[:, :2], axis=0) + 100.0
     if not (np.isfinite(extent).all() and extent.prod() * 4 < _MOST_CELLS):
         raise LogError(
-            f"The drive of {path} spreads over {extent[0]:.0f} m x {extent[1]:.0f} m, which is too much: give a part of it."
+            f"The drive of {path} spreads over {extent[0]:.0f} m x {extent[1]:.0f} m, which is too"
+            " much: give a part of it."
         )
     kept = [0]
     for k in range(1, len(at)):  # what stands or trembles is no way
@@ -66,7 +67,8 @@ def read_drive(path: Path) -> F64:
     leaps = np.linalg.norm(np.diff(at[kept, :2], axis=0), axis=1)
     if leaps.max() > 60:
         raise LogError(
-            f"The drive of {path} leaps by {leaps.max():.0f} m after pose {kept[int(leaps.argmax())]}: give one without gaps."
+            f"The drive of {path} leaps by {leaps.max():.0f} m after pose"
+            f" {kept[int(leaps.argmax())]}: give one without gaps."
         )
     points = resample(at[kept], length / max(1, round(length)))
     return np.column_stack(

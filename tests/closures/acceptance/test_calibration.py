@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from functools import partial
 from importlib.resources import files
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from semloc_logs.closures.acceptance.calibration import (
     NEIGHBOUR_EVIDENCE,
     Calibration,
+    Model,
     NeighbourEvidence,
     fit_logistic,
     is_plausible,
@@ -44,9 +46,14 @@ def alone(features: Features[float], model: Calibration | None = None) -> float:
     return float((model or shipped().own_features).probability(features.vector()))
 
 
-def decided(**votes: float) -> float:
+def decided_by(model: Model, **votes: float) -> float:
     names = [f.name for f in dataclasses.fields(Agreement)]
-    return float(shipped().decided(Agreement(*(np.array([votes.get(n, 0.0)]) for n in names)))[0])
+    assert set(votes) <= set(names)
+    return float(model.decided(Agreement(*(np.array([votes.get(n, 0.0)]) for n in names)))[0])
+
+
+def decided(**votes: float) -> float:
+    return decided_by(shipped(), **votes)
 
 
 def test_features_and_votes_are_named_as_in_the_files_and_in_their_order() -> None:
@@ -131,22 +138,20 @@ def test_neighbours_add_and_take() -> None:
 
 def test_less_support_than_the_least_is_never_right() -> None:
     """However well the rest fits: a handful of voxels fits anywhere."""
-    model = dataclasses.replace(shipped(), least_support=3.0)
-    values = np.array([own_values(dataclasses.replace(GOOD, support=s)) for s in (2.999, 3.0, 4.0)])
-    np.testing.assert_array_equal(model.own(values) > 0.9, [False, True, True])
-    assert model.own(values)[0] == 0.0
-    assert shipped().least_support > 3.0
-    assert (
-        shipped().own(own_values(dataclasses.replace(GOOD, support=shipped().least_support - 1e-4)))
-        == 0.0
-    )
+    model = dataclasses.replace(shipped(), min_support=3.0)
+    features = columns(*(dataclasses.replace(GOOD, support=s) for s in (2.999, 3.0, 4.0)))
+    np.testing.assert_array_equal(model.own(features) > 0.9, [False, True, True])
+    assert model.own(features)[0] == 0.0
+    assert shipped().min_support > 3.0
+    too_few = dataclasses.replace(GOOD, support=shipped().min_support - 1e-4)
+    assert shipped().own(too_few) == 0.0
 
 
 def steep(weights: dict[str, float], bias: float) -> Calibration:
     """A model of some of the values of agreement."""
-    n = len(TOGETHER)
+    n = len(NEIGHBOUR_EVIDENCE)
     return Calibration(
-        tuple(weights.get(name, 0.0) for name in TOGETHER), (-9.0,) * n, (9.0,) * n, bias
+        tuple(weights.get(name, 0.0) for name in NEIGHBOUR_EVIDENCE), (-9.0,) * n, (9.0,) * n, bias
     )
 
 
@@ -155,51 +160,19 @@ def test_which_model_decides() -> None:
     other. No neighbours: the alignment.
     """
     model = dataclasses.replace(
-        shipped(), near=steep({}, -1.0), together=steep({}, 1.0), most_alike=0.5
+        shipped(), near=steep({}, -1.0), together=steep({}, 1.0), max_ambiguity=0.5
     )
-
-    def by(**values: float) -> float:
-        a = Agreement(**values)  # type: ignore[arg-type]
-        return float(model.decided([np.array([getattr(a, n)]) for n in AGREEMENT])[0])
-
+    by = partial(decided_by, model)
     near = 1 / (1 + np.exp(1.0))
     together = 1 / (1 + np.exp(-1.0))
-    assert by(alone=0.7, neighbours=3) == pytest.approx(near)
-    assert by(alone=0.7, neighbours=3, far_agreeing=0.1) == pytest.approx(together)
-    assert by(alone=0.7, neighbours=3, far_opposing=0.1) == pytest.approx(together)
-    assert by(alone=0.7, far_agreeing=5.0) == 0.7
+    assert by(own_probability=0.7, neighbours=3) == pytest.approx(near)
+    assert by(own_probability=0.7, neighbours=3, far_support=0.1) == pytest.approx(together)
+    assert by(own_probability=0.7, neighbours=3, far_conflict=0.1) == pytest.approx(together)
+    assert by(own_probability=0.7, far_support=5.0) == 0.7
     # what is impossible by itself stays so
-    assert by(alone=0.0, neighbours=3, far_agreeing=5.0) == 0.0
-    assert by(alone=0.7, neighbours=3, lookalike=0.5) == pytest.approx(near)
-    assert by(alone=0.7, neighbours=3, lookalike=0.51) == pytest.approx(near / 2)
-
-
-def test_without_agreement_all_counts_are_zero() -> None:
-    assert dataclasses.astuple(Agreement(0.5)) == (0.5, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-def test_the_reason_is_the_first_that_holds() -> None:
-    neighbours = Agreement(0.999, 12, agreeing=3.0, opposing=2.0)
-    assert "neighbouring" not in reason(
-        GOOD, 0.5, 0.99, dataclasses.replace(neighbours, neighbours=0)
-    )
-    assert "neighbouring" not in reason(
-        GOOD, 0.5, 0.99, dataclasses.replace(neighbours, alone=0.98)
-    )
-    assert "neighbouring" in reason(GOOD, 0.5, 0.99, dataclasses.replace(neighbours, alone=0.99))
-    assert "right with 60%" in reason(
-        GOOD, 0.594, 0.99, neighbours, sigma=0.1, precision=0.9999, share=0.6
-    )
-    # the lesser of the two
-    assert "known to 0.50 m" in reason(
-        GOOD, 0.52, 0.99, neighbours, sigma=0.5, precision=0.6, share=0.87
-    )
-    assert "look like others" in reason(
-        GOOD, 0.495, 0.99, dataclasses.replace(neighbours, lookalike=0.9)
-    )
-    assert "look like others" not in reason(
-        GOOD, 0.494, 0.99, dataclasses.replace(neighbours, lookalike=0.9)
-    )
+    assert by(own_probability=0.0, neighbours=3, far_support=5.0) == 0.0
+    assert by(own_probability=0.7, neighbours=3, ambiguity=0.5) == pytest.approx(near)
+    assert by(own_probability=0.7, neighbours=3, ambiguity=0.51) == pytest.approx(near / 2)
 
 
 def test_logistic_regression_counts_rows_and_takes_offsets() -> None:

@@ -29,7 +29,9 @@ from semloc_logs.closures.acceptance.placements import (
     FAR,
     Placed,
     contradicts_odometry,
+    pairs_of,
     place,
+    query_roads,
 )
 from semloc_logs.closures.closure import Agreement, Alignment, Closure, Features, Rejected
 from semloc_logs.mapping.session_map import SessionMap
@@ -240,7 +242,7 @@ def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself() -> None:
 
 
 @pytest.mark.parametrize(
-    ("off", "way", "is_stray"),  # 10 voxels = 3 m, and 5 % of the way
+    ("off", "way", "refuted"),  # 10 voxels = 3 m, and 5 % of the way
     [
         (2.9, 0.0, False),
         (3.1, 0.0, True),
@@ -250,7 +252,7 @@ def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself() -> None:
     ],
 )
 def test_how_far_off_its_own_odometry_a_session_may_be(
-    off: float, way: float, is_stray: bool
+    off: float, way: float, refuted: bool
 ) -> None:
     def placed(query: str, target: str, posed: bool = True) -> Placed:
         at = yaw_transform(0.0, (0.0, off, 0.0))[None]
@@ -269,9 +271,9 @@ def test_how_far_off_its_own_odometry_a_session_may_be(
             np.array([posed]),
         )
 
-    assert strays(placed("a", "a"), 0.3).tolist() == [is_stray]
-    assert strays(placed("a", "b"), 0.3).tolist() == [False]
-    assert strays(placed("a", "a", posed=False), 0.3).tolist() == [False]
+    assert contradicts_odometry(placed("a", "a"), 0.3).tolist() == [refuted]
+    assert contradicts_odometry(placed("a", "b"), 0.3).tolist() == [False]
+    assert contradicts_odometry(placed("a", "a", posed=False), 0.3).tolist() == [False]
 
 
 def test_roads_of_queries_are_counted_once_whatever_answers() -> None:
@@ -281,7 +283,7 @@ def test_roads_of_queries_are_counted_once_whatever_answers() -> None:
         alignment(20, 0.5, at=50),
         alignment(40, 0.5, query="b", target="a"),
     ]
-    roads = asked_roads(place(rows, MAPS))
+    roads = query_roads(place(rows, MAPS))
     assert {name: road.tolist() for name, road in roads.items()} == {"a": [40.0, 60.0], "b": [80.0]}
 
 
@@ -368,6 +370,11 @@ def test_a_second_place_that_fits_much_worse_is_no_copy() -> None:
         dataclasses.replace(in_street(k, k + 30), features=worse) for k in COPIED
     ]
     assert all(a.decision.agreement.ambiguity == 0 for a in decide(rows, STREETS, SETTINGS))
+
+
+def test_without_other_alignments_all_votes_are_zero() -> None:
+    votes = count_votes(place([alignment(20, 0.5)], MAPS), 0.3)
+    assert dataclasses.astuple(votes.row(0)) == (0.5, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_without_odometry_nobody_is_a_neighbour() -> None:

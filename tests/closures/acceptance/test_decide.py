@@ -147,6 +147,30 @@ def test_a_right_place_with_several_pose_modes() -> None:
     )
 
 
+def why(made: Decision, votes: Agreement[float], sigma: float = 0.1) -> str:
+    """Why an alignment of good features is rejected."""
+    made = dataclasses.replace(made, agreement=votes)
+    return sentence(low_probability(weakest_evidence(GOOD), made), made, sigma=sigma)
+
+
+def test_the_reason_is_the_first_that_holds() -> None:
+    votes = Agreement(0.999, 12.0, 3.0, 2.0, 0.0, 0.0, 0.0)
+    low = decision(0.5)
+    assert "neighbouring" not in why(low, dataclasses.replace(votes, neighbours=0.0))
+    assert "neighbouring" not in why(low, dataclasses.replace(votes, own_probability=0.98))
+    assert "neighbouring" in why(low, dataclasses.replace(votes, own_probability=0.99))
+    several = decision(0.594 / (0.9999 * 0.6), confidence=0.9999, share=0.6)
+    assert "this one has 60 % of the odds" in why(several, votes)
+    # the lesser of the two
+    uncertain = decision(0.52 / (0.6 * 0.87), confidence=0.6, share=0.87)
+    assert "position uncertainty 0.50 m" in why(uncertain, votes, sigma=0.5)
+    ambiguous = dataclasses.replace(votes, ambiguity=0.9)
+    assert "ambiguous place" in why(decision(0.495), ambiguous)
+    assert "ambiguous place" not in why(decision(0.494), ambiguous)
+    # the position is uncertain too, but the place comes first
+    assert "ambiguous place" in why(decision(0.34 / 0.68, confidence=0.68), ambiguous, sigma=0.8)
+
+
 @pytest.mark.parametrize("distinct", [0.86, 1.0, 1.01, 2.0])
 def test_no_share_is_more_than_a_hundred_per_cent(distinct: float) -> None:
     features = dataclasses.replace(GOOD, distinct=distinct)

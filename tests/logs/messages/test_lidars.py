@@ -22,7 +22,8 @@ from semloc_logs.frames import LidarFrame
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problems, lost, sentences
-from semloc_logs.logs.roles import find_roles, guess_roles, no_sensor
+from semloc_logs.logs.role_types import no_sensor
+from semloc_logs.logs.roles import find_roles, guess_roles
 from semloc_logs.logs.session.session import SessionOptions, open_session
 from semloc_logs.numerics import transforms
 from semloc_logs.numerics.transforms import Array, yaw_transform
