@@ -85,7 +85,7 @@ class Judged:
 
     @property
     def clear(self) -> Bools:
-        """Right, or wrong by three times the bounds (n,): what is in between teaches neither side."""
+        """Right, or wrong by three times the bounds (n,): the others teach neither side."""
         return np.asarray(
             self.right | (self.error_m > 3 * CORRECT_M) | (self.error_deg > 3 * CORRECT_DEG)
         )

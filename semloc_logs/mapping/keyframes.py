@@ -46,7 +46,7 @@ class Collected:
     def add(
         self, cloud: PosedCloud, kept: NDArray[np.int64], label: PointLabels | None = None
     ) -> None:
-        """A keyframe: points ``kept`` (m,) of ``cloud``, their labels (m,) from the labeller if any."""
+        """Add a keyframe: the points ``kept`` (m,) of ``cloud``, their labels (m,) or None."""
         number = len(self)
         self._save(number, "points", cloud.points[kept])
         self._save(number, "label", label)

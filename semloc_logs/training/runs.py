@@ -117,7 +117,7 @@ def session_shards(
 
 
 def given_shards(folder: Path) -> list[Path]:
-    """The shards (.parquet) of a folder of packed pairs. Raises SettingsError when there is none."""
+    """The shards (.parquet) of a folder of packed pairs. SettingsError without any."""
     shards = sorted(folder.glob("*.parquet"))
     if not shards:
         raise SettingsError(
