@@ -7,7 +7,7 @@ that are as near as the last, are found by counting bits. Of these the nearest a
 *asymmetric* distance (Gordo et al. 2014): a bit that differs counts as much as the query's
 projection lies off the cell's threshold, as bits of projections close to it mean little. That finds
 more true neighbours than the Hamming distance alone does, for a few microseconds a query; the
-distance to the centroid of an entry's word adds nothing to it (benchmarks/README.md, Words).
+distance to the centroid of an entry's word adds nothing to it (docs/benchmarks.md, Words).
 
 Matches do not depend on how words are spread over segments: the budget counts words of all of them,
 and of equally near entries the first by submap and row is nearer.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.benchmarks.descriptors.places import Place, Street, map_place, turned_place
+from semloc_logs.closures.query import build_query, query_keyframes, query_members
 from semloc_logs.evaluation.truth import TrueTrack
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
