@@ -56,6 +56,7 @@ lint: install
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/python .ci/speech.py
 
 format: install
 	$(BIN)/ruff format

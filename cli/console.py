@@ -44,7 +44,7 @@ class Console:
         click.echo(text)
 
     def result_json(self, content: object) -> None:
-        """The answer as JSON; figures that are no numbers become null."""
+        """The answer as JSON; figures without a value become null."""
         click.echo(json.dumps(_finite(content), indent=1, default=str))
 
     def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:

@@ -2,7 +2,7 @@
 many have never been visited.
 
 Every town is judged against its truth into a table of its own; the three logistic models of the
-acceptance are fitted on all of them. What is reported is said of each town by models that never saw
+acceptance are fitted on all of them. The report on each town is by models that never saw
 it.
 """
 
@@ -115,7 +115,7 @@ def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
     """All alignments of a workspace whose closures were made with ``closures.min_probability=1``,
     judged, as the table ``output``.
 
-    Columns: those of rejected.parquet without the neighbours, and town, query, road, target_road,
+    Columns: as in rejected.parquet, without the neighbours, and town, query, road, target_road,
     own_* and at_* (the query in its own map by odometry, in the target's by alignment), error_m,
     error_deg, right.
     """
@@ -269,7 +269,7 @@ def fit_agreement(
     """The models of the ``agreement`` (n,), from the clear ones that have neighbours among ``rows``
     (n,), beside ``alone``.
 
-    Neighbours in the same copy of a block agree about any copy. So the models are those of streets
+    Neighbours in the same copy of a block agree about any copy. So the models are of streets
     that look like no others. How much like others is too much: the geometric mean of the right ones
     of the ordinary town that has the most of it and the wrong ones that would be accepted of the
     city of copies that has the least: as many times the one as the other is it.
@@ -352,8 +352,8 @@ def decided_by(model: Model, judged: Judged) -> F64:
 
 
 def where_right(judged: Judged, alone: F64) -> F64:
-    """Probability (n,) that of the poses in its place an alignment has the right one, by what each
-    says ``alone`` (n,).
+    """Probability (n,) that an alignment has the right pose of its place, by the probabilities
+    ``alone`` (n,) of the poses there.
     """
     share = np.ones(len(judged))
     for mine in (np.flatnonzero(judged.town == town) for town in sorted(set(judged.town))):
@@ -372,7 +372,7 @@ def possible(judged: Judged) -> Bools:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """The model of all towns; and what models that had not seen a town said of it: ``alone`` and
+    """The model of all towns; and the results of models that had not seen a town: ``alone`` and
     ``probability`` (n,).
     """
 
@@ -384,7 +384,7 @@ class Fitted:
 def fit(judged: Judged) -> Fitted:
     """Fit all models, and each of them without each town in turn.
 
-    Those of neighbours learn from what that of an alignment alone said of towns it had not seen.
+    The models of neighbours learn from results of the model alone on towns it had not seen.
     Where the held-out log-odds turn out too sure (Platt, Probabilistic outputs for support vector
     machines, 1999), the first and the last are tempered.
     """

@@ -204,7 +204,7 @@ def _count_queries(
     settings: Resolved,
     self_closures: bool,
 ) -> tuple[int, int, int]:
-    """Queries of known true pose, those of them that are possible, and those of the latter that are
+    """Queries of known true pose, how many of them are possible, and how many of the latter are
     answered.
     """
     positions: dict[str, F64] = {}

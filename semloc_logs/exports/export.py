@@ -32,8 +32,8 @@ FORMATS = ("tum", "kitti", "g2o", *POINT_FORMATS)
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which points: the map's ``voxels`` or those of the ``keyframes``, in which frame, and within
-    which bounds of it (m) if any.
+    """Which points: the ``voxels`` of the map or the points of the ``keyframes``, in which frame,
+    and within which bounds of it (m) if any.
     """
 
     what: Literal["voxels", "keyframes"] = "voxels"

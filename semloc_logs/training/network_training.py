@@ -2,9 +2,9 @@
 GPU, resumable from a checkpoint.
 
 Beside the paper's completion loss a contrastive term (InfoNCE over the batch) pulls the descriptor
-of an incomplete subvolume towards that of the complete one seen a little shifted and turned, which
-is what the database holds; ``training.contrastive_weight=0`` is the paper. Adam replaces ADADELTA
-because the shipped runs see few samples.
+of an incomplete subvolume towards the descriptor of the complete one seen a little shifted and
+turned, which is what the database holds; ``training.contrastive_weight=0`` is the paper. Adam
+replaces ADADELTA because the shipped runs see few samples.
 """
 
 from __future__ import annotations

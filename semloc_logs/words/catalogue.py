@@ -153,7 +153,7 @@ def segments(
 def update(work: Workspace) -> dict[str, dict[str, Any]]:
     """Bring the index of every variant up to date after checking all of its files.
 
-    For each variant what was ``changed``, a sentence, and its ``segments``: ``file``, ``words``,
+    For each variant the change ``changed``, a sentence, and its ``segments``: ``file``, ``words``,
     ``bytes``, ``sessions``. Raises WorkspaceError when no session was described.
     """
     described = [f for f in work.sessions() if f.words_json.exists()]

@@ -115,8 +115,8 @@ def _openness(
     first = order[np.unique(sector[order], return_index=True)[1]]
     nearest = np.full(_SECTORS, _FAR)
     nearest[sector[first]] = flat[stands[first]]
-    histograms["distance to what stands in a direction"] = _histogram(nearest, OPEN)
-    histograms["class of what stands in a direction"] = _classes(label[stands[first]])
+    histograms["distance to the nearest structure of a direction"] = _histogram(nearest, OPEN)
+    histograms["class of the nearest structure of a direction"] = _classes(label[stands[first]])
     return {
         f"first thing in a direction, {q} %: m": float(np.percentile(nearest, q))
         for q in (25, 50, 75)
@@ -250,7 +250,7 @@ def compare(simulated: Sequence[Portrait], real: Sequence[Portrait]) -> Figures:
     for name in (
         "classes of points within 50 m",
         "classes of voxels within 30 m",
-        "class of what stands in a direction",
+        "class of the nearest structure of a direction",
     ):
         ours = _pooled(simulated, name)
         theirs = _pooled(real, name)

@@ -24,8 +24,8 @@ class Species:
     """Ranges of the full-grown height in metres, of the clear stem and of the crown's radius as
     shares of it; the crown's shape.
 
-    ``cover`` is the leaves' area over that of the crown seen from the side; ``leaf`` their size in
-    metres; ``rise`` how steep limbs are.
+    ``cover`` is the leaves' area over the area of the crown seen from the side; ``leaf`` their size
+    in metres; ``rise`` how steep limbs are.
     """
 
     height: tuple[float, float]

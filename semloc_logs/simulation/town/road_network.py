@@ -80,7 +80,7 @@ class RoadNetwork:
 
 
 def drawn_road(rng: Rng, a: int, b: int, path: F64, narrow: float) -> Road:
-    """A road along a centre line (n, 2), its widths drawn; ``narrow`` multiplies that of the
+    """A road along a centre line (n, 2), its widths drawn; ``narrow`` multiplies the width of the
     carriageway.
     """
     parking = bool(rng.random() < 0.75)

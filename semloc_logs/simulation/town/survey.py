@@ -39,8 +39,8 @@ Rng = np.random.Generator
 def read_drive(path: Path) -> F64:
     """Positions (n, 3) in metres, z up, about every metre along the drive of a TUM or KITTI file.
 
-    KITTI poses are those of a camera (x right, y down, z ahead; KITTI odometry development kit),
-    TUM poses those of a frame with z up. LogError for files that cannot be read, drives that are
+    KITTI poses are of a camera (x right, y down, z ahead; KITTI odometry development kit),
+    TUM poses of a frame with z up. LogError for files that cannot be read, drives that are
     too short, leap, or spread over too large an area.
     """
     read = read_trajectory(TrajectoryFile(path))
@@ -211,7 +211,7 @@ def _node(nodes: list[F64], at: F64, merge: float = 12.0) -> int:
 
 
 def _agreeing_heights(drive: F64, pairs: NDArray[np.int64]) -> F64:
-    """Heights (n,) whose rises are those of the drive and that are equal where it passes twice:
+    """Heights (n,) with the rises of the drive, that are equal where it passes twice:
     least squares, a drift shared out.
     """
     n = len(drive)
