@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PHRASES = {
-    r"\b(is|are|was|were) no (?!longer|more\b|later|earlier|farther|further|other|surface|map\b|model)"
+    r"\b(is|are|was|were) no (?!longer|more\b|later|earlier|farther|further|other|surface|map\b)"
     r"[a-z]+": "is not a",
     r"\bthat of\b": "name the thing again, or use the possessive",
     r"\bthose of\b": "name the things again, or use the possessive",

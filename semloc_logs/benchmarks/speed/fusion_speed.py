@@ -171,7 +171,7 @@ def _content(blocks: BlockMap) -> tuple[int, int]:
 
 
 def _limits(case: Case, settings: Resolved, bandwidth: float, clock: float) -> Figures:
-    """What the middle scan needs at least, and its content beside the content by walking all rays."""
+    """What the middle scan needs at least, and its content beside the walk of all its rays."""
     scan = case.scans[len(case.scans) // 2]
     points = apply(scan.map_T_sensor, scan.points)
     steps, free, occupied = walk_all(

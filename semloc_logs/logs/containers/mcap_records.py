@@ -110,7 +110,7 @@ def chunk_head(record: bytes) -> ChunkHead:
 
 
 def chunk_records(record: bytes, head: ChunkHead) -> bytes:
-    """The records in a chunk; memory grows with the data, not with the size that the chunk claims."""
+    """The records in a chunk; memory grows with the data, not with the claimed size."""
     data = decompress(record[head.data], head.compression, head.unpacked_size)
     if head.crc and zlib.crc32(data) != head.crc:
         raise LogError("its checksum does not match its data")
