@@ -37,7 +37,7 @@ from semloc_logs.subvolumes.network import (
 )
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.completion_scores import completion_scores
-from semloc_logs.training.network_training import Progress, train
+from semloc_logs.training.network_training import Progress, TrainingRun, train
 from semloc_logs.training.pairs import read_shard
 
 HELD_OUT = 2
@@ -198,10 +198,8 @@ def run(
             variant,
             shards[:-HELD_OUT],
             training(20),
-            stem.with_suffix(".trial"),
+            TrainingRun(stem.with_suffix(".trial"), network=network, optimiser=_optimiser(row)),
             tick,
-            network=network,
-            optimiser_of=_optimiser(row),
         )
         pace.write_text(str(max(50, int(60 * minutes / np.mean(np.diff(clock[4:]))))))
     steps = int(pace.read_text())
@@ -209,9 +207,7 @@ def run(
         variant,
         shards[:-HELD_OUT],
         training(steps),
-        stem.with_suffix(".checkpoint"),
-        network=network,
-        optimiser_of=_optimiser(row),
+        TrainingRun(stem.with_suffix(".checkpoint"), network=network, optimiser=_optimiser(row)),
     )
     assert model is not None
     model.eval()

@@ -85,7 +85,7 @@ class Judged:
 
     @property
     def clear(self) -> Bools:
-        """Right, or wrong by three times the bounds (n,): the others teach neither side."""
+        """Right, or wrong by three times the bounds (n,): cases in between teach neither side."""
         return np.asarray(
             self.right | (self.error_m > 3 * CORRECT_M) | (self.error_deg > 3 * CORRECT_DEG)
         )
@@ -459,7 +459,7 @@ def _tempered(p: F64, before: Calibration, after: Calibration) -> F64:
     )
 
 
-# -- what is reported
+# -- reports
 
 
 def reliability(p: F64, right: Bools, edges: Sequence[float] = EDGES) -> list[dict[str, float]]:
@@ -485,13 +485,13 @@ def answers(judged: Judged, p: F64) -> NDArray[np.int64]:
     ascending.
     """
     best: dict[tuple[Any, ...], int] = {}
-    for k, key in enumerate(_asked(judged)):
+    for k, key in enumerate(_query_keys(judged)):
         if key not in best or p[k] > p[best[key]]:
             best[key] = k
     return np.array(sorted(best.values()), np.int64)
 
 
-def _asked(judged: Judged) -> Iterator[tuple[Any, ...]]:
+def _query_keys(judged: Judged) -> Iterator[tuple[Any, ...]]:
     placed = judged.placed
     return zip(
         judged.town, placed.query_session, placed.query.tolist(), placed.target_session, strict=True
@@ -505,7 +505,7 @@ def recall_at(
     have a right alignment with a target.
     """
     chosen = answers(judged, p)
-    able = len({key for key, right in zip(_asked(judged), judged.right, strict=True) if right})
+    able = len({key for key, right in zip(_query_keys(judged), judged.right, strict=True) if right})
     out = []
     for least in thresholds:
         accepted = chosen[p[chosen] >= least]

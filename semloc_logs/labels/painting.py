@@ -90,54 +90,59 @@ def nearest_depth(
     column, elevation, distance = viewpoint.columns(points[shown])
     order = np.lexsort((elevation, column))
     shown = shown[order]
-    column = column[order]
-    elevation = elevation[order]
     distance = distance[order]
     z = camera[shown, 2].astype(float)
     # off the axis a picture is stretched by the square of the ray's length over its depth
     stretch = np.linalg.norm(camera[shown], axis=1) / z
     half = np.maximum(projector.focal / cell * (COLUMN / 2) * distance / z * stretch, 0.5)
-    _draw(depth, (pixels[shown] + 0.5) / cell, z, distance, column, elevation, half)
+    cells = (pixels[shown] + 0.5) / cell
+    _draw(depth, _Rings(cells, z, distance, column[order], elevation[order], half))
     return depth, cell
 
 
+class _Rings(NamedTuple):
+    """Points in columns of equal azimuth, upwards, for compiled functions.
+
+    ``cell`` (n, 2) of the depth image, with fractions; depth ``z`` (n,); ``distance``, ``column``
+    and ``elevation`` (n,) as by :meth:`Viewpoint.columns`; ``half`` (n,) the width of a column in
+    cells, halved.
+    """
+
+    cell: F64
+    z: F64
+    distance: F32
+    column: NDArray[np.int32]
+    elevation: F32
+    half: F64
+
+
 @njit(cache=True, nogil=True)
-def _draw(
-    depth: NDArray[np.floating],
-    cells: F64,
-    z: F64,
-    distance: NDArray[np.floating],
-    column: NDArray[np.integer],
-    elevation: NDArray[np.floating],
-    half: F64,
-) -> None:
-    n = len(z)
-    for i in range(n):
-        _line(depth, 1, int(np.floor(cells[i, 1])), cells[i, 0], half[i], z[i])
-        above = _continues(distance, column, elevation, i, 1)
-        below = _continues(distance, column, elevation, i, -1)
+def _draw(depth: F32, rings: _Rings) -> None:
+    """Draw the points and the strips between them into ``depth`` (rows, columns)."""
+    cell, z, _, _, _, half = rings
+    for i in range(len(z)):
+        _line(depth, 1, int(np.floor(cell[i, 1])), cell[i, 0], half[i], z[i])
+        above = _continues(rings, i, 1)
+        below = _continues(rings, i, -1)
         if above >= 0:
-            _strip(depth, cells[i], cells[above], z[i], z[above], half[i], half[above])
+            _strip(depth, (cell[i], cell[above]), (z[i], z[above]), (half[i], half[above]))
         # a surface that ends before something far may reach as far as just before the next ring
         if above == _ENDS and below >= 0:
-            _strip(depth, cells[i], 2 * cells[i] - cells[below], z[i], z[i], half[i], half[i])
+            beyond = 2 * cell[i] - cell[below]
+            _strip(depth, (cell[i], beyond), (z[i], z[i]), (half[i], half[i]))
         if below == _ENDS and above >= 0:
-            _strip(depth, cells[i], 2 * cells[i] - cells[above], z[i], z[i], half[i], half[i])
+            beyond = 2 * cell[i] - cell[above]
+            _strip(depth, (cell[i], beyond), (z[i], z[i]), (half[i], half[i]))
 
 
 @njit(cache=True, nogil=True)
-def _continues(
-    distance: NDArray[np.floating],
-    column: NDArray[np.integer],
-    elevation: NDArray[np.floating],
-    i: int,
-    step: int,
-) -> int:
-    """The next point of another ring that is on the same surface as point ``i``.
+def _continues(rings: _Rings, i: int, step: int) -> int:
+    """The next point of another ring, upwards or downwards, on the same surface as point ``i``.
 
-    Upwards or downwards by ``step``; _ENDS where the next ring sees something much farther or
-    nothing, and _STEPS where it sees something else.
+    _ENDS where the next ring measured something much farther or nothing, _STEPS where it measured
+    something else.
     """
+    _, _, distance, column, elevation, _ = rings
     ends = _ENDS
     for k in range(1, _LOOK_AHEAD + 1):
         j = i + step * k
@@ -158,18 +163,14 @@ def _continues(
 
 @njit(cache=True, nogil=True)
 def _strip(
-    depth: NDArray[np.floating],
-    a: F64,
-    b: F64,
-    z_a: float,
-    z_b: float,
-    half_a: float,
-    half_b: float,
+    depth: F32, cells: tuple[F64, F64], z: tuple[float, float], half: tuple[float, float]
 ) -> None:
-    """Joins two points: in each row of cells the farthest depth that the line has there.
+    """Join two points by a strip; ``cells``, ``z`` and ``half`` of both as in :class:`_Rings`.
 
-    It is linear in 1 / z; where the line is flat, in each column instead.
+    In each row of cells (in each column where the line is flat) it has the farthest depth of the
+    line there, which is linear in 1 / z.
     """
+    a, b = cells
     main = 1 if abs(b[1] - a[1]) >= abs(b[0] - a[0]) else 0
     first = int(np.floor(min(a[main], b[main])))
     last = int(np.floor(max(a[main], b[main])))
@@ -180,9 +181,9 @@ def _strip(
         farthest = 0.0
         for edge in (float(line), line + 1.0):
             t = min(max((edge - a[main]) / (b[main] - a[main]), 0.0), 1.0)
-            farthest = max(farthest, 1.0 / ((1 - t) / z_a + t / z_b))
+            farthest = max(farthest, 1.0 / ((1 - t) / z[0] + t / z[1]))
         centre = a[1 - main] + middle * (b[1 - main] - a[1 - main])
-        _line(depth, main, line, centre, half_a + middle * (half_b - half_a), farthest)
+        _line(depth, main, line, centre, half[0] + middle * (half[1] - half[0]), farthest)
 
 
 @njit(cache=True, nogil=True)
@@ -241,40 +242,41 @@ def paint(
     out[seen] = labels[np.clip(v, 0, projector.height - 1), np.clip(u, 0, projector.width - 1)]
     known = seen[out[seen] != UNPAINTED]
     column, row = np.floor((pixels[known] + 0.5) / cell).astype(int).T
-    doubtful = _behind_its_own(
-        depth, cell, labels, out[known], row, column, camera[known, 2], projector.focal
-    )
+    labelled = _Labelled(out[known], row, column, camera[known, 2])
+    doubtful = _behind_its_own(labelled, depth, cell, labels, projector.focal)
     is_doubtful = np.zeros(len(wanted), bool)
     is_doubtful[known[doubtful]] = True
     return PaintedPoints(out, is_doubtful, inside)
 
 
-def _behind_its_own(
-    depth: F32,
-    cell: float,
-    labels: U32,
-    own: U32,
-    row: NDArray[np.intp],
-    column: NDArray[np.intp],
-    z: F32,
-    focal: float,
-) -> NDArray[np.bool_]:
-    """Which points (n,) have a much nearer surface of the same label beside them.
+class _Labelled(NamedTuple):
+    """Points with the labels ``own`` (n,) at cells (``row``, ``column``) and depth ``z`` (n,)."""
 
-    ``own``: their labels, at cells (``row``, ``column``).
+    own: U32
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+    z: F32
+
+
+def _behind_its_own(
+    points: _Labelled, depth: F32, cell: float, labels: U32, focal: float
+) -> NDArray[np.bool_]:
+    """Which ``points`` (n,) have a much nearer surface of the same label beside them.
+
+    ``depth`` has cells of ``cell`` pixels of the picture ``labels`` (h, w) with focal length
+    ``focal``.
     """
+    own, row, column, z = points
     out = np.zeros(len(own), bool)
+    rows, columns = depth.shape
     half = int(cell) // 2
     coarse = labels[half :: int(cell), half :: int(cell)]
-    coarse = np.pad(
-        coarse, [(0, max(0, n - m)) for n, m in zip(depth.shape, coarse.shape, strict=True)], "edge"
-    )
+    missing = [(0, max(0, n - m)) for n, m in zip(depth.shape, coarse.shape, strict=True)]
+    coarse = np.pad(coarse, missing, "edge")[:rows, :columns]
     values, counts = np.unique(own, return_counts=True)
     for label in values[np.argsort(-counts, kind="stable")][:_MOST_LABELS]:
-        of_label = np.flatnonzero(own == label)
-        surface = np.where(
-            coarse[: depth.shape[0], : depth.shape[1]] == label, depth, np.float32(np.inf)
-        )
+        members = np.flatnonzero(own == label)
+        surface = np.where(coarse == label, depth, np.float32(np.inf))
         for reach in _REACH:
             close = np.where(surface < _THING / np.tan(reach), surface, np.float32(_NOTHING))
             size = 2 * int(focal * reach / cell) + 1
@@ -284,8 +286,8 @@ def _behind_its_own(
                 borderType=cv2.BORDER_CONSTANT,
                 borderValue=_NOTHING,
             )
-            nearest = np.asarray(around)[row[of_label], column[of_label]]
-            out[of_label] |= nearest * _BEHIND_SHARE + _BEHIND < z[of_label]
+            nearest = np.asarray(around)[row[members], column[members]]
+            out[members] |= nearest * _BEHIND_SHARE + _BEHIND < z[members]
     return out
 
 

@@ -18,12 +18,13 @@ from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.selection import KeyframeSelector, thin
 from semloc_logs.mapping.up_direction import surface_normals
-from semloc_logs.numerics.prefetch import ahead
+from semloc_logs.numerics.prefetch import prefetched
 from semloc_logs.settings import ResolvedFusion
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-MOST_NORMALS = 20  # keyframes whose normals say where up is
+U32 = NDArray[np.uint32]
+MOST_NORMALS = 20  # keyframes whose normals show where up is
 
 
 @dataclass(slots=True, eq=False)
@@ -46,7 +47,7 @@ class Collected:
     def add(
         self, cloud: PosedCloud, kept: NDArray[np.int64], label: PointLabels | None = None
     ) -> None:
-        """Add a keyframe: the points ``kept`` (m,) of ``cloud``, their labels (m,) or None."""
+        """Add a keyframe: points ``kept`` (m,) of ``cloud``, their labels (m,) or None."""
         number = len(self)
         self._save(number, "points", cloud.points[kept])
         self._save(number, "label", label)
@@ -56,8 +57,7 @@ class Collected:
         self.origins.append(cloud.origin)
 
     def load(self, keyframe: int) -> tuple[F32, PointLabels | None, F32 | None]:
-        """Points (n, 3) in the base frame, their labels as recorded and the standard deviation of
-        their range, where there are any.
+        """Points (n, 3) in the base frame, labels as recorded, standard deviation of the ranges.
 
         The latter two are None where there are none. WorkspaceError when somebody removed the
         files, as a second ``fuse`` of the same session does.
@@ -109,7 +109,7 @@ def collect(
     # pictures come through the labeller in the same pass: they must not overtake the clouds that
     # they are painted on
     with closing(
-        ahead(clouds) if labeller.on_image is None else (cloud for cloud in clouds)
+        prefetched(clouds) if labeller.on_image is None else (cloud for cloud in clouds)
     ) as coming:
         for cloud in coming:
             if selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):

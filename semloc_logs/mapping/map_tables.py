@@ -22,7 +22,7 @@ from semloc_logs.mapping.ground import GroundMapper, ground_height, write_ground
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.selection import road_distance, submap_ranges
 from semloc_logs.mapping.submap_fusion import fuse_ranges
-from semloc_logs.numerics.prefetch import ahead
+from semloc_logs.numerics.prefetch import prefetched
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import STREET_VOXEL, ResolvedFusion
 from semloc_logs.tables import contracts
@@ -104,8 +104,10 @@ def write_map(session: LevelSession, folder: SessionFolder) -> dict[str, Any]:
         replacing_folder(folder.keyframes) as keyframes,
         replacing_folder(folder.blocks) as blocks,
         # whatever happens, the other threads end before their folders are renamed or removed
-        closing(ahead(keep_keyframes(keyframes, stamps_ns, labelled, metadata))) as kept,
-        closing(ahead(_kept_submaps(session, kept, ranges, facts, blocks), depth=1)) as submaps,
+        closing(prefetched(keep_keyframes(keyframes, stamps_ns, labelled, metadata))) as kept,
+        closing(
+            prefetched(_kept_submaps(session, kept, ranges, facts, blocks), depth=1)
+        ) as submaps,
     ):
         voxels = write_voxels(folder.voxels, submaps, metadata, fusion.clamp)
         if not ranges:

@@ -11,13 +11,17 @@ from typing import TypeVar
 
 T = TypeVar("T")
 _END = object()
+THREAD_NAME = "semloc-prefetch"
 _IN_CALLERS_THREAD = ContextVar("in_callers_thread", default=False)
+PUT_SECONDS = 0.1  # after which a waiting producer looks whether the consumer has left
+GET_SECONDS = 1.0  # after which a waiting consumer lets Ctrl-C through
 
 
 @contextmanager
 def in_callers_thread() -> Iterator[None]:
-    """Within it :func:`ahead` makes each item when the caller takes it, for profilers: these see one
-    thread.
+    """Within it :func:`prefetched` makes each item when the caller takes it.
+
+    For profilers, which see one thread.
     """
     token = _IN_CALLERS_THREAD.set(True)
     try:
@@ -26,7 +30,7 @@ def in_callers_thread() -> Iterator[None]:
         _IN_CALLERS_THREAD.reset(token)
 
 
-def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
+def prefetched(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
     """``items`` in their order, made in another thread; at most ``depth`` of them wait.
 
     Reading, decompressing and the compiled loops release the interpreter's lock, so two cores are
@@ -39,40 +43,16 @@ def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
     queue: Queue[object] = Queue(depth)
     left = Event()
     failure: list[BaseException] = []
-
-    def put(item: object) -> None:
-        while not left.is_set():
-            try:
-                queue.put(item, timeout=0.1)
-                return
-            except Full:
-                continue
-
-    def work() -> None:
-        try:
-            iterator = iter(items)
-            try:
-                for item in iterator:
-                    put(item)
-                    if left.is_set():
-                        return
-            finally:
-                close = getattr(iterator, "close", None)
-                if close is not None:
-                    close()
-        except BaseException as problem:  # whatever it is, the caller has to see it
-            failure.append(problem)
-        finally:
-            put(_END)
-
-    thread = Thread(target=work, name="semloc-ahead", daemon=True)
+    thread = Thread(
+        target=_produce, args=(items, queue, left, failure), name=THREAD_NAME, daemon=True
+    )
     thread.start()
     try:
         while True:
             try:
-                item = queue.get(timeout=1.0)
+                item = queue.get(timeout=GET_SECONDS)
             except Empty:
-                continue  # lets Ctrl-C through while the other thread is slow
+                continue
             if item is _END:
                 break
             yield item  # type: ignore[misc]
@@ -81,3 +61,34 @@ def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
         thread.join()
     if failure:
         raise failure[0]
+
+
+def _produce(
+    items: Iterable[T], queue: Queue[object], left: Event, failure: list[BaseException]
+) -> None:
+    """Put ``items`` into ``queue``, and its end, until they are all there or ``left`` is set."""
+    try:
+        iterator = iter(items)
+        try:
+            for item in iterator:
+                _put(item, queue, left)
+                if left.is_set():
+                    return
+        finally:
+            close = getattr(iterator, "close", None)
+            if close is not None:
+                close()
+    except BaseException as problem:  # whatever it is, the caller has to see it
+        failure.append(problem)
+    finally:
+        _put(_END, queue, left)
+
+
+def _put(item: object, queue: Queue[object], left: Event) -> None:
+    """Put ``item`` into ``queue``, unless the consumer has left."""
+    while not left.is_set():
+        try:
+            queue.put(item, timeout=PUT_SECONDS)
+            return
+        except Full:
+            continue

@@ -374,6 +374,7 @@ class Index:
     def __init__(self, vocabulary: Vocabulary, parts: Sequence[Part], budget: int = BUDGET) -> None:
         self.vocabulary = vocabulary
         self.budget = budget
+        self.shortlist = SHORTLIST
         self.parts = sorted((p for p in parts if len(p.segment)), key=lambda p: -len(p.segment))
         self._square = np.square(vocabulary.children).sum(2)
         self._live = np.zeros(WORDS, np.int64)
@@ -453,7 +454,7 @@ class Index:
         for number, p in enumerate(self.parts):
             s = p.segment
             lists = _Lists(s.starts, s.code, s.place, s.row, *allowed.of(p.group))
-            m = _scan(codes, ranges, lists, max(SHORTLIST, k), count, limit)
+            m = _scan(codes, ranges, lists, max(self.shortlist, k), count, limit)
             scanned.append(np.concatenate([m, np.full((1, m.shape[1]), number)]))
             candidates.append((s.code[m[1]], p.group[s.place[m[1]]] << 32 | s.row[m[1]]))
         if not scanned:

@@ -190,12 +190,12 @@ def test_a_failure_half_way_leaves_no_thread_and_no_file(
     def fails(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("semloc_logs.mapping.session_fusion.write_blocks", fails)
+    monkeypatch.setattr("semloc_logs.mapping.map_tables.write_blocks", fails)
     # which holds all that it passed through
     with pytest.raises(OSError, match="no space") as problem:
         fuse_session(FuseTask((drive(tmp_path / "a.mcap", GOOD),), folder, settings))
     assert problem.value
-    assert not [t for t in threading.enumerate() if t.name == "semloc-ahead"]
+    assert not [t for t in threading.enumerate() if t.name == "semloc-prefetch"]
     assert list(folder.path.iterdir()) == []
 
 

@@ -289,7 +289,7 @@ def test_centres_of_a_turned_map_are_those_of_the_map(yaw: float) -> None:
 
 
 def test_quarter_turns_of_the_query_meet_the_headings_of_the_map() -> None:
-    """A query at yaw a + 90 degrees has the map's descriptor at a, turned by one quarter."""
+    """A query at yaw a + 90 degrees has the descriptor of the map at a, turned by a quarter."""
     encoder = random_encoder("geometric", seed=2)
     state = world()
     turned = [turned_map(state, LOW, yaw) for yaw in (np.pi / 10, np.pi / 10 + np.pi / 2)]

@@ -308,7 +308,7 @@ def test_a_pose_takes_the_points_into_the_map() -> None:
 
 
 def test_rays_that_graze_the_ground_do_not_carve_it() -> None:
-    """A sensor 1.8 m above a road drives 20 m; its rays end on the road up to 40 m away."""
+    """A sensor 1.8 m above a road drives 20 m; rings of rays end on the road up to 40 m away."""
     f = fusion(voxel=0.3, reach=50.0)
     angle, ring = np.meshgrid(np.radians(np.arange(0, 360, 0.5)), np.geomspace(3, 40, 24))
 

@@ -300,8 +300,8 @@ def test_a_bounding_box_reads_few_row_groups(tmp_path: Path) -> None:
     assert max(g.row_groups[0].num_rows for g in every) <= 16384
     found = data.to_table(filter=box)
     query = (
-        f"SELECT * FROM '{tmp_path}/voxels/**/*.parquet' WHERE ix BETWEEN 100 AND 166 AND iy"
-        " BETWEEN 300 AND 366"
+        f"SELECT * FROM '{tmp_path}/voxels/**/*.parquet' "
+        "WHERE ix BETWEEN 100 AND 166 AND iy BETWEEN 300 AND 366"
     )
     rows = duckdb.connect().execute(query).fetchall()
     assert len(rows) == found.num_rows == 67 * 67

@@ -445,10 +445,14 @@ SCRIPT = """
 import sys, hashlib, numpy as np
 from semloc_logs.words.vocabulary import train_vocabulary, Vocabulary
 rng = np.random.default_rng(0)
-unit = lambda n: (lambda v: (v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32))(rng.standard_normal((n, 256)))
+def unit(n):
+    v = rng.standard_normal((n, 256))
+    return (v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32)
 grid = lambda a: (np.round(a * 2048) / 2048).astype(np.float32)
 thresholds = rng.uniform(-0.1, 0.1, (200, 64)).astype(np.float32)
-v = Vocabulary(grid(unit(200)), grid(unit(64)), thresholds, np.round(rng.uniform(-25, 25, (200, 5, 64))).astype(np.float32) / 256)
+cells, projection = grid(unit(200)), grid(unit(64))
+children = np.round(rng.uniform(-25, 25, (200, 5, 64))).astype(np.float32) / 256
+v = Vocabulary(cells, projection, thresholds, children)
 d = unit(3000)
 digest = hashlib.sha256()
 for a in (*v.words(d), v.nearest_cells(d, 8), (grid(d) @ v.cells.T)):

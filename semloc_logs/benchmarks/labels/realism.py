@@ -71,8 +71,8 @@ def portrait(scan: Scan, fusion: ResolvedFusion) -> Portrait:
     on_ground = (label == ROAD) | (label == SIDEWALK)
     if not (on_ground & (flat < 12)).any():
         raise LogError(
-            "a sweep has no point of a road or pavement within 12 m, so its heights cannot be"
-            " compared: give labelled sweeps"
+            "a sweep has no point of a road or pavement within 12 m, "
+            "so its heights cannot be compared: give labelled sweeps"
         )
     height = points[:, 2] - float(np.median(points[on_ground & (flat < 12), 2]))
     distance = np.linalg.norm(points, axis=1)
@@ -124,7 +124,7 @@ def _openness(
 
 
 def _street(points: F64, flat: F64, height: F64, label: U8) -> dict[str, float]:
-    """Widths of the street beside the sensor, x being ahead; heights of houses, trees and ground."""
+    """Widths of the street beside the sensor (x ahead); heights of houses, trees and ground."""
     beside = np.abs(points[:, 0]) < 12
     out = {}
     road = points[beside & (label == ROAD), 1]
@@ -168,7 +168,7 @@ def _voxels(
     histograms: dict[str, F64],
     numbers: dict[str, float],
 ) -> None:
-    """The map of the sweep alone: classes of its voxels, and what subvolumes near the sensor hold."""
+    """The map of the sweep alone: classes of its voxels, content of subvolumes near the sensor."""
     fuser = Fuser(fusion)
     fuser.add(scan.points, scan.label, np.zeros(3))
     blocks = fuser.finish()
@@ -221,8 +221,8 @@ def measure_realism(
         for scan in log_sweeps(log, 4, repeat=False):
             if (scan.label == UNLABELLED).all():
                 raise LogError(
-                    f"{log} has no labels, so its classes cannot be compared: give a log with a"
-                    " label field."
+                    f"{log} has no labels, so its classes cannot be compared: "
+                    "give a log with a label field."
                 )
             real.append(portrait(scan, fusion))
     simulated = [portrait(scan, fusion) for seed in seeds for scan in town_sweeps(seed, sweeps)]

@@ -81,10 +81,8 @@ def fusion_speed(
     ]
     for k, log in enumerate(logs):
         scans = log_sweeps(log)
-        what = (
-            f"a sweep of {np.mean([len(s.points) for s in scans]):.0f} points, 0.30 m, carved"
-            " to 50 m"
-        )
+        points = np.mean([len(s.points) for s in scans])
+        what = f"a sweep of {points:.0f} points, 0.30 m, carved to 50 m"
         cases.append(Case(f"log{k + 1}" if len(logs) > 1 else "log", scans, 0.30, 50.0, 5, what))
     bandwidth = memory_bandwidth()
     clock = clock_rate()
