@@ -18,7 +18,7 @@ import yaml
 from pydantic.fields import FieldInfo
 
 from semloc_logs.closures.closure import Reason
-from semloc_logs.logs.roles import ROLES
+from semloc_logs.logs.role_types import ROLES
 from semloc_logs.schemas import names, read_text
 from semloc_logs.settings import Settings
 

@@ -252,6 +252,16 @@ def test_rooms_of_the_architecture_are_the_rooms() -> None:
     assert named == found | {"schemas"}
 
 
+@pytest.mark.parametrize("name", ["ARCHITECTURE.md", "CONTRIBUTING.md", "README.md"])
+def test_paths_in_sentences_exist(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    folders = "semloc_logs|cli|schemas|tests|docs|benchmarks|examples"
+    paths = re.findall(rf"`((?:{folders})/[\w/.]*)`", text)
+    assert paths
+    real = [path for path in paths if "NAME" not in path and path != "docs/build/"]
+    assert not [path for path in real if not (ROOT / path).exists()]
+
+
 def test_readme_is_short_and_shows_the_first_commands() -> None:
     assert len(README.splitlines()) < 120
     assert {"make demo", "make test"} <= {" ".join(words[:2]) for _, words in LINES}
