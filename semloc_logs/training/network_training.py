@@ -23,7 +23,7 @@ from torch.nn import functional as F
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.cut import CLASSES, code_table
-from semloc_logs.subvolumes.network import Completion, descriptors, in_eights
+from semloc_logs.subvolumes.network import Completion, descriptors, space_to_depth
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.batches import Batch, OutOfTime, batches
 from semloc_logs.training.checkpoints import resume, save_checkpoint
@@ -92,7 +92,7 @@ def _losses(
 ) -> _Losses:
     classes = CLASSES[model.encoder.variant]
     device = noise.device.type
-    target, known = targets(in_eights(batch.complete).movedim(-1, 0), table, classes)
+    target, known = targets(space_to_depth(batch.complete).movedim(-1, 0), table, classes)
     with torch.autocast(device, dtype=torch.bfloat16):
         logits, mu, log_variance = model(table[batch.incomplete.long()], noise)
         # the complete view is the goal; a gradient through it too would cost a third more
