@@ -88,11 +88,11 @@ def command(
     else:
         for view in views:
             row = view.choice.row
-            said = "closure" if view.choice.accepted else f"rejected ({view.choice.reason})"
+            verdict = "closure" if view.choice.accepted else f"rejected ({view.choice.reason})"
             ends = (
                 f"{row[f'{end}_session']} at {row[f'{end}_stamp_ns'] / 1e9:.1f} s"
                 for end in ("query", "target")
             )
-            console.result(f"{' in '.join(ends)}: {said}, probability {row['probability']:.4f}")
+            console.result(f"{' in '.join(ends)}: {verdict}, probability {row['probability']:.4f}")
         console.result(f"Picture: {output}")
     return 0

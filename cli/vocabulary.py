@@ -107,9 +107,9 @@ def command(
     if as_json:
         console.result_json(made if variant == "both" else made[variant])
     else:
-        for said in made.values():
+        for report in made.values():
             console.result(
-                f"{said['vocabulary']}: from {said['descriptors']} descriptors of {said['shards']}"
-                " scenes"
+                f"{report['vocabulary']}: from {report['descriptors']} descriptors"
+                f" of {report['shards']} scenes"
             )
     return 0

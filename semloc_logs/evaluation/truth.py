@@ -1,5 +1,5 @@
 """Closures against the truth: which are right, how far off, and how many of the revisits were found
-(DESIGN: closures.parquet).
+(docs/reference/truth.md).
 """
 
 from __future__ import annotations

@@ -494,3 +494,13 @@ def test_all_logs_failing_is_1(tmp_path: Path) -> None:
     done = semloc("run", tmp_path / "no.mcap", "-w", tmp_path / "w")
     assert done.exit_code == 1
     assert "no.mcap" in done.stderr
+
+
+def test_every_point_format_of_the_library_is_offered() -> None:
+    from semloc_logs.cli import export
+    from semloc_logs.exports import FORMATS, POINT_FORMATS
+
+    form = next(p for p in export.command.params if p.name == "form")
+
+    assert export.POINTS == POINT_FORMATS
+    assert set(form.type.choices) == set(FORMATS)

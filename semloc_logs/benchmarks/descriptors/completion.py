@@ -43,7 +43,7 @@ def completion_figures(found: Completed) -> Figures:
     known = found.truth <= found.classes
     truth = found.truth[known]
     answers = {
-        "ours": found.said[known],
+        "ours": found.completed[known],
         "most_probable": found.probable[known],
         "all_free": np.full_like(truth, found.classes),
         "copy_input": found.given[known],
@@ -122,7 +122,10 @@ def completion_benchmark(
         draw_completions(
             picture,
             variant,
-            *(states_of(v[rows], found.classes) for v in (found.given, found.said, found.truth)),
+            *(
+                states_of(v[rows], found.classes)
+                for v in (found.given, found.completed, found.truth)
+            ),
         )
     return completion_figures(found)
 
