@@ -31,7 +31,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages.decode import Decoder
-from semloc_logs.logs.problems import Problems
+from semloc_logs.logs.problems import Problem, Problems
 
 # of processor time; a log's twenty definitions take one of them
 LIMIT_S = {"decoders": 2.0, "layouts": 2.0, "logs": 10.0}
@@ -59,9 +59,9 @@ def decode(message: Message, *, is_known: bool = False) -> None:
         decoder, problems = _decoders.setdefault(id(message.definition), (decoder, problems))
         problems.forget_skipped(None)
     decoder.frames(message)
-    sentences = problems.sentences()
-    if any("MemoryError" in sentence for sentence in sentences):
-        raise AssertionError(f"too much memory was requested: {sentences}")
+    texts = [problem.text for problem in problems]
+    if any("MemoryError" in text for text in texts):
+        raise AssertionError(f"too much memory was requested: {texts}")
 
 
 def read(files: dict[str, bytes]) -> None:
@@ -77,8 +77,8 @@ def read(files: dict[str, bytes]) -> None:
         try:
             for _ in log.frames():
                 pass
-            if not all(isinstance(sentence, str) for sentence in log.problems):
-                raise AssertionError("a problem is not a sentence")
+            if not all(isinstance(problem, Problem) and problem.text for problem in log.problems):
+                raise AssertionError("a problem has no text")
         except LogError:
             pass
         finally:

@@ -90,3 +90,5 @@ def show_evaluation(result: Evaluation) -> None:
             f"Recall {result.recall:.3f}: {result.answered} of {result.possible} queries with a"
             " revisit within 5 m"
         )
+    elif not result.possible:
+        console.result(f"None of {result.queries} queries has a revisit within 5 m: no recall")

@@ -117,5 +117,7 @@ def show_closures(work: Workspace) -> None:
         f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in"
         f" {work.rejected}"
     )
+    if not rows:
+        console.note(f"To see the best rejected hypothesis: semloc show -w {work.path} -o view.png")
     if work.picture.exists():
         console.result(f"Picture: {work.picture}")

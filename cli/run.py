@@ -53,8 +53,8 @@ def command(
 
     Each LOG is a session.
 
-    Can be interrupted and run again: finished work is kept. A log that cannot be read is named, the
-    others are done, and the exit code is 3.
+    Can be interrupted and run again: finished work is kept. A damaged log is named, the others
+    are done, and the exit code is 3. A path that does not exist stops the command at once.
 
     \b
     Example:  semloc run monday.mcap tuesday.bag -w work --annotate copy

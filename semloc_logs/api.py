@@ -23,7 +23,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.engines import Engine, make_engine
-from semloc_logs.errors import WorkspaceError
+from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.evaluation.truth import Evaluation, evaluate_closures
 from semloc_logs.exports.map_points import SessionPoints
 from semloc_logs.logs.annotation.annotate import AnnotateReport
@@ -105,8 +105,16 @@ class Closures(Sequence[Closure]):
         return self._table
 
     def to_pandas(self) -> Any:
-        """The table as a pandas DataFrame; pandas has to be installed."""
-        return self._table.to_pandas()
+        """The table as a pandas DataFrame. SettingsError where pandas is not installed."""
+        try:
+            return self._table.to_pandas()
+        except ModuleNotFoundError as error:
+            raise SettingsError(
+                "pandas is not installed: run 'pip install pandas', or use to_arrow()."
+            ) from error
+
+    def __repr__(self) -> str:
+        return f"Closures({len(self)})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +152,8 @@ class Session:
         return self._points("keyframes", frame)
 
     def _points(self, what: str, frame: str) -> pa.Table:
+        if frame not in ("session", "map"):
+            raise SettingsError(f"frame is 'session' or 'map', not {frame!r}.")
         batches = list(SessionPoints(SessionMap(self.folder), what, frame, None).batches())
         points = np.concatenate([np.zeros((0, 3)), *(xyz for xyz, _ in batches)])
         labels = np.concatenate([np.zeros(0, np.uint8), *(label for _, label in batches)])
@@ -177,6 +187,9 @@ class Workspace:
         self._engine = engine
         self._jobs = jobs
         self._progress = progress
+
+    def __repr__(self) -> str:
+        return f"Workspace({str(self.path)!r})"
 
     @property
     def path(self) -> Path:
