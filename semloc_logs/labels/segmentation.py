@@ -87,7 +87,9 @@ class Segmenter:
         model_path, spec_path = _named(settings)
         spec = read_spec(spec_path)
         if not model_path.is_file():
-            raise SettingsError(f"There is no model {model_path}: --seg-model takes an ONNX file.")
+            raise SettingsError(
+                f"The model {model_path} does not exist: --seg-model takes an ONNX file."
+            )
         net, runtime = _load(model_path, spec, settings.threads)
         return cls(net, runtime, spec, spec_path, model_path)
 

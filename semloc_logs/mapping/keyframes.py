@@ -47,7 +47,7 @@ class Collected:
     def add(
         self, cloud: PosedCloud, kept: NDArray[np.int64], label: PointLabels | None = None
     ) -> None:
-        """Add a keyframe: points ``kept`` (m,) of ``cloud``, labels (m,) from the labeller or None."""
+        """Add a keyframe: points ``kept`` (m,) of ``cloud``, labels (m,) of the labeller."""
         number = len(self)
         self._save(number, "points", cloud.points[kept])
         self._save(number, "label", label)

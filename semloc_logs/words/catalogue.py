@@ -113,9 +113,9 @@ class Change:
             (self.merged, "merged", "segment"),
             (self.dropped, "removed", "old file"),
         ]
-        said = [f"{n} {what}{'' if n == 1 else 's'} {done}" for n, done, what in parts if n]
+        sentences = [f"{n} {what}{'' if n == 1 else 's'} {done}" for n, done, what in parts if n]
         return ", ".join(
-            said
+            sentences
             + (
                 [f"kept in memory as it cannot be written ({self.unwritten})"]
                 if self.unwritten
@@ -153,7 +153,7 @@ def segments(
 def update(work: Workspace) -> dict[str, dict[str, Any]]:
     """Bring the index of every variant up to date after checking all of its files.
 
-    For each variant what was ``changed``, a sentence, and its ``segments``: ``file``, ``words``,
+    For each variant ``changed``, a sentence, and its ``segments``: ``file``, ``words``,
     ``bytes``, ``sessions``. Raises WorkspaceError when no session was described.
     """
     described = [f for f in work.sessions() if f.words_json.exists()]
@@ -347,8 +347,8 @@ def _plan(serving: Serving) -> list[list[Segment]]:
 
 def _path(folder: Path, sessions: Sequence[Held]) -> Path:
     """The file of a segment that holds ``sessions``, the same whichever process writes it."""
-    said = "\n".join(f"{h.name} {h.key} {h.submaps}" for h in sessions)
-    return folder / f"{hashlib.sha256(said.encode()).hexdigest()[:16]}{SUFFIX}"
+    held = "\n".join(f"{h.name} {h.key} {h.submaps}" for h in sessions)
+    return folder / f"{hashlib.sha256(held.encode()).hexdigest()[:16]}{SUFFIX}"
 
 
 def _written(folder: Path, variant: str, segment: Segment, change: Change) -> Segment:

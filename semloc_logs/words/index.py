@@ -39,7 +39,7 @@ Bools = NDArray[np.bool_]
 # of each query: where its ranges start (n + 1,); of each range: first word, last word + 1, probe
 Ranges = tuple[I64, I64, I64, I64]
 SHORTLIST = 32  # nearest codes in Hamming distance that are compared asymmetrically
-BUDGET = 32_768  # codes that a look-up compares, and those of one word more
+BUDGET = 32_768  # codes that a look-up compares, and the codes of one word more
 # distances of descriptors to words are multiples of 1 / UNIT: see
 # :mod:`semloc_logs.words.vocabulary`
 UNIT = 2.0**19
@@ -273,7 +273,7 @@ def _look(
 def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, count: I64, limit: I64) -> I64:
     """Queries, positions and probes (3, m) of the entries of a segment among the ``size`` nearest.
 
-    These may match and are the nearest so far. ``count`` (n, 66) and ``limit`` (n,) are those of
+    These may match and are the nearest so far. ``count`` (n, 66) and ``limit`` (n,) are as in
     :func:`_look` and continue from segment to segment.
     """
     offsets, firsts, lasts, _ = ranges
@@ -368,7 +368,7 @@ class Part:
 class Index:
     """Words of a database in segments.
 
-    A look-up compares at most ``budget`` codes and those of one word more.
+    A look-up compares at most ``budget`` codes and the codes of one word more.
     """
 
     def __init__(self, vocabulary: Vocabulary, parts: Sequence[Part], budget: int = BUDGET) -> None:
