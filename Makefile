@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help install demo test fuzz weights lint format wheel clean
+.PHONY: help install demo test docs reference fuzz weights lint format wheel clean
 
 help:
 	@echo "make install   a virtual environment in $(VENV) with semloc and the tools of development"
 	@echo "make demo      two simulated drives, their loop closures, and an annotated log, in demo/"
 	@echo "make test      all tests"
+	@echo "make docs      the documentation, in docs/build/; make reference writes its generated pages only"
 	@echo "make fuzz      damaged messages and logs for MINUTES (1) from SEED (0) on"
 	@echo "make weights   the descriptor of 16 million subvolumes, in weights/, in runs of MINUTES (9); goes on where it stopped"
 	@echo "make lint      ruff and mypy"
@@ -31,6 +32,16 @@ demo: install
 test: install
 	$(BIN)/python -m pytest
 
+$(VENV)/installed-docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+	@touch $@
+
+reference: install
+	$(BIN)/python -P docs/generate.py
+
+docs: reference $(VENV)/installed-docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/build
+
 fuzz: install
 	$(BIN)/python -P benchmarks/fuzz.py --minutes $(or $(MINUTES),1) --seed $(or $(SEED),0)
 
@@ -45,6 +56,7 @@ lint: install
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/python .ci/speech.py
 
 format: install
 	$(BIN)/ruff format
@@ -54,4 +66,4 @@ wheel: install
 	$(BIN)/python -m build --wheel
 
 clean:
-	rm -rf $(VENV) build dist demo *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist demo docs/build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

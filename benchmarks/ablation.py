@@ -30,14 +30,14 @@ from semloc_logs.subvolumes.network import (
     Completion,
     Decoder,
     Encoder,
-    Turning,
+    P4Convolution,
     channels_last,
-    halve,
     latent_mean,
+    max_pool,
 )
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.completion_scores import completion_scores
-from semloc_logs.training.network_training import Progress, train
+from semloc_logs.training.network_training import Progress, TrainingRun, train
 from semloc_logs.training.pairs import read_shard
 
 HELD_OUT = 2
@@ -104,7 +104,7 @@ class _Ablated(Encoder):
     """The encoder with parts of it put back to the paper's."""
 
     def __init__(self, variant: str, latent: int, row: Row) -> None:
-        layer = Turning if row.turning else _Fixed
+        layer = P4Convolution if row.turning else _Fixed
         super().__init__(variant, latent, layer)
         self.row = row
         if not row.patch:
@@ -122,7 +122,7 @@ class _Ablated(Encoder):
         )
         inputs = CLASSES[self.variant] + 3
         voxels = F.one_hot(codes.long(), inputs).to(reduced).permute(0, 4, 1, 2, 3)
-        return halve(
+        return max_pool(
             F.conv3d(
                 voxels, weight.reshape(-1, 3, 3, 3, inputs).permute(0, 4, 1, 2, 3), bias, padding=1
             )
@@ -146,7 +146,7 @@ class _Ablated(Encoder):
         first, *blocks, mean = self._layers()
         x = F.relu(self.norms[0](self.first_block(codes, *first)))
         for (weight, bias), norm in zip(blocks, list(self.norms)[1:], strict=True):
-            x = F.relu(norm(halve(F.conv3d(x, weight, bias, padding=1))))
+            x = F.relu(norm(max_pool(F.conv3d(x, weight, bias, padding=1))))
         return latent_mean(x[:, :, inner, inner], *mean)
 
 
@@ -198,10 +198,8 @@ def run(
             variant,
             shards[:-HELD_OUT],
             training(20),
-            stem.with_suffix(".trial"),
+            TrainingRun(stem.with_suffix(".trial"), network=network, optimiser=_optimiser(row)),
             tick,
-            network=network,
-            optimiser_of=_optimiser(row),
         )
         pace.write_text(str(max(50, int(60 * minutes / np.mean(np.diff(clock[4:]))))))
     steps = int(pace.read_text())
@@ -209,9 +207,7 @@ def run(
         variant,
         shards[:-HELD_OUT],
         training(steps),
-        stem.with_suffix(".checkpoint"),
-        network=network,
-        optimiser_of=_optimiser(row),
+        TrainingRun(stem.with_suffix(".checkpoint"), network=network, optimiser=_optimiser(row)),
     )
     assert model is not None
     model.eval()

@@ -1,12 +1,13 @@
 """Make semloc_logs/closures/acceptance/calibration.json again, from towns that no training has
 seen.
 
-    python benchmarks/calibrate.py collect DIR [--drives FOLDER] [--only TOWN]... [--jobs N]    simulate, ask, judge; resumes
-    python benchmarks/calibrate.py fit DIR [--install]                                          fit and report; seconds
+    python benchmarks/calibrate.py collect DIR [--drives FOLDER] [--only TOWN]... [--jobs N]
+    python benchmarks/calibrate.py fit DIR [--install]
 
-Collecting writes DIR/TOWN/judged.parquet, all alignments of a town with their features and errors;
-fitting reads these alone. It writes DIR/calibration.json and DIR/reliability.png; --install also
-replaces the calibration of the package.
+Collecting simulates, queries and judges, and resumes; fitting takes seconds. Collecting writes
+DIR/TOWN/judged.parquet, all alignments of a town with their features and errors; fitting reads
+these alone. It writes DIR/calibration.json and DIR/reliability.png; --install also replaces the
+calibration of the package.
 """
 
 from __future__ import annotations
@@ -67,8 +68,8 @@ TOWNS = (
 )
 
 
-def ask(args: argparse.Namespace) -> None:
-    """Simulate, fuse, describe, ask and judge the towns that have no table yet."""
+def collect_towns(args: argparse.Namespace) -> None:
+    """Simulate, fuse, describe, query and judge the towns that have no table yet."""
     single_threaded()
     collect(
         Place(args.dir, args.drives),
@@ -78,27 +79,27 @@ def ask(args: argparse.Namespace) -> None:
 
 
 def report(args: argparse.Namespace) -> None:
-    """Fit the models; what is printed and drawn is of towns that the models have not seen."""
+    """Fit the models; print and draw their results in towns that they have not seen."""
     judged = read_judged(sorted(args.dir.glob("*/judged.parquet")))
     fitted = fit(judged)
     content = json.dumps(calibration_json(judged, fitted), indent=1) + "\n"
     (args.dir / "calibration.json").write_text(content)
     print(content)
     ordinary = ~judged.copies
-    said = {
+    parts = {
         "alone, outside cities of copies": (judged.part(ordinary), fitted.alone[ordinary]),
         "with neighbours": (judged, fitted.probability),
     }
     curves = {}
-    for name, (part, p) in said.items():
+    for name, (part, p) in parts.items():
         curves[name] = reliability(p[part.clear], part.right[part.clear])
         print(f"{name}, of towns not seen:")
         for line in (*curves[name], *recall_at(part, p)):
             print("  " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
     draw_reliability(args.dir / "reliability.png", curves)
     if args.install:
-        folder = Path(semloc_logs.closures.acceptance.__path__[0])
-        (folder / "calibration.json").write_text(content)
+        package = Path(semloc_logs.closures.acceptance.__file__).parent
+        (package / "calibration.json").write_text(content)
 
 
 def main() -> None:
@@ -116,7 +117,7 @@ def main() -> None:
     )
     first.add_argument("--only", action="append", metavar="TOWN")
     first.add_argument("--jobs", type=int, default=1)
-    first.set_defaults(run=ask)
+    first.set_defaults(run=collect_towns)
     second = commands.add_parser("fit")
     second.add_argument("dir", type=Path)
     second.add_argument("--install", action="store_true")

@@ -1,15 +1,15 @@
-"""False closures at the defaults: thousands of queries in towns that look alike, and all pairs of
-recorded logs.
+"""False closures at the defaults: queries in ambiguous towns, and all pairs of recorded logs.
 
-    python benchmarks/false_closures.py towns DIR [--queries 5000] [--drives FOLDER] [--jobs N]     simulate, ask, judge; resumes
+    python benchmarks/false_closures.py towns DIR [--queries 5000] [--drives FOLDER] [--jobs N]
     python benchmarks/false_closures.py logs DIR LOGS [--small NAME]... [--jobs N]
 
-Two of three towns are cities whose blocks are copies of one another. Then come towns of cameras,
-most of them driven there and back along recorded drives, where these are in FOLDER. Their tables
-DIR/TOWN/judged.parquet hold features, so after a new calibration the same command counts again
-without asking again. LOGS is a folder of logs, with *_truth.json for those whose truth is known
-(those of one file are of one place; a closure between logs of different places is false). Each pair
-is asked with the labels of the log, with those from geometry and without any.
+``towns`` simulates, queries and judges, and resumes. Two of three towns are cities whose blocks are
+copies of one another. Then come towns of cameras, most of them driven there and back along recorded
+drives, where these are in FOLDER. Their tables DIR/TOWN/judged.parquet hold features, so after a
+new calibration the same command counts again without new queries. LOGS is a folder of logs, with
+*_truth.json for logs whose truth is known (the logs of one file are of one place; a closure between
+logs of different places is false). Each pair is searched with the labels of the log, with labels
+from geometry and without any.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ SOURCES = ("auto", "geometry", "uniform")  # auto: labels of the log, where it h
 SMALL = ("room_*", "euroc_*")
 
 
-def ask_towns(args: argparse.Namespace) -> None:
+def search_towns(args: argparse.Namespace) -> None:
     """Ask, then count under the calibration of the package."""
     place = Place(args.dir, args.drives)
     paths = collect(place, short_towns(FIRST, MOST), args.jobs, args.queries) + collect(
@@ -112,10 +112,10 @@ def ask_towns(args: argparse.Namespace) -> None:
             print(f"  {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
     accepted = (k for k in answers(judged, p) if p[k] >= SURE)
     for k in (k for k in accepted if not judged.right[k]):
-        ends = f"{judged.placed.query_session[k]} query {judged.placed.query[k]} in {judged.placed.target_session[k]}"
-        print(
-            f"  false: town {judged.town[k]}, {ends}, probability {p[k]:.4f}, {judged.error_m[k]:.1f} m, {judged.error_deg[k]:.0f} degrees"
-        )
+        placed = judged.placed
+        ends = f"{placed.query_session[k]} query {placed.query[k]} in {placed.target_session[k]}"
+        error = f"{judged.error_m[k]:.1f} m, {judged.error_deg[k]:.0f} degrees"
+        print(f"  false: town {judged.town[k]}, {ends}, probability {p[k]:.4f}, {error}")
 
 
 # -- recorded logs
@@ -130,7 +130,7 @@ def logs_of(folder: Path) -> list[Path]:
     )
 
 
-def ask_logs(args: argparse.Namespace) -> None:
+def search_logs(args: argparse.Namespace) -> None:
     """Every log against every other one, by label source: at 0.30 m voxels all of them, at 0.05 m
     the small ones.
     """
@@ -144,7 +144,7 @@ def ask_logs(args: argparse.Namespace) -> None:
         for voxel, logs in ((0.30, every), (0.05, small)):
             if len(logs) > 1:
                 work = Workspace(args.dir / f"{source}-{voxel:g}")
-                ask_pairs(
+                search_pairs(
                     work, logs, {"labels.source": source, "fusion.voxel_size": str(voxel)}, engine
                 )
                 wrong += count_pairs(work, args.logs, f"{source}, {voxel:g} m")
@@ -152,7 +152,7 @@ def ask_logs(args: argparse.Namespace) -> None:
     print(f"{wrong} false closures")
 
 
-def ask_pairs(
+def search_pairs(
     work: Workspace, logs: list[Path], assignments: dict[str, str], engine: Engine
 ) -> None:
     """Fuse, describe and close; a log that cannot be fused is named and left out."""
@@ -223,7 +223,7 @@ def main() -> None:
     first.add_argument(
         "--drives", type=Path, help="folder of kitti_00.txt and others: towns along these as well"
     )
-    first.set_defaults(run=ask_towns)
+    first.set_defaults(run=search_towns)
     second = commands.add_parser("logs")
     second.add_argument("dir", type=Path)
     second.add_argument("logs", type=Path)
@@ -231,9 +231,9 @@ def main() -> None:
         "--small",
         action="append",
         metavar="NAME",
-        help="logs also asked at 0.05 m voxels; default room_* and euroc_*",
+        help="logs that are searched at 0.05 m voxels, too; default room_* and euroc_*",
     )
-    second.set_defaults(run=ask_logs)
+    second.set_defaults(run=search_logs)
     for command in (first, second):
         command.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args()

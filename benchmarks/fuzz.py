@@ -31,11 +31,12 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages.decode import Decoder
-from semloc_logs.logs.problems import Problem, Problems, sentences
+from semloc_logs.logs.problems import Problems
 
 # of processor time; a log's twenty definitions take one of them
 LIMIT_S = {"decoders": 2.0, "layouts": 2.0, "logs": 10.0}
-MEMORY = 2 << 30
+MEMORY = 2 << 30  # bytes beyond those at the start
+SHOWN = 200  # characters of an error
 
 
 class TooSlowError(BaseException):
@@ -58,13 +59,13 @@ def decode(message: Message, *, is_known: bool = False) -> None:
         decoder, problems = _decoders.setdefault(id(message.definition), (decoder, problems))
         problems.forget_skipped(None)
     decoder.frames(message)
-    texts = sentences(problems)
-    if any("MemoryError" in text for text in texts):
-        raise AssertionError(f"too much memory was requested: {texts}")
+    sentences = problems.sentences()
+    if any("MemoryError" in sentence for sentence in sentences):
+        raise AssertionError(f"too much memory was requested: {sentences}")
 
 
 def read(files: dict[str, bytes]) -> None:
-    """The frames of one log, and what is said of it."""
+    """The frames of one log, and its problems."""
     with tempfile.TemporaryDirectory() as folder:
         for name, content in files.items():
             Path(folder, name).write_bytes(content)
@@ -76,8 +77,8 @@ def read(files: dict[str, bytes]) -> None:
         try:
             for _ in log.frames():
                 pass
-            if not all(isinstance(problem, Problem) for problem in log.problems):
-                raise AssertionError("a problem has another type")
+            if not all(isinstance(sentence, str) for sentence in log.problems):
+                raise AssertionError("a problem is not a sentence")
         except LogError:
             pass
         finally:
@@ -85,7 +86,7 @@ def read(files: dict[str, bytes]) -> None:
 
 
 def one(seed: int, only: str | None) -> tuple[str, float, Callable[[], None], Any]:
-    """What the input of ``seed`` is called, how many seconds it may take, what tries it, and the
+    """The name of the input of ``seed``, its limit in seconds, the function that tries it, and the
     input itself.
     """
     rng = random.Random(seed)
@@ -117,8 +118,56 @@ def one(seed: int, only: str | None) -> tuple[str, float, Callable[[], None], An
     return name, LIMIT_S[kind], lambda: read(files), files
 
 
+class Findings:
+    """What the inputs of a run showed: errors, the slowest input, the growth of memory."""
+
+    def __init__(self, keep: Path, only: str | None) -> None:
+        self.kinds: Counter[str] = Counter()
+        self.slowest = (0.0, "")  # s of processor time
+        self.largest = (0.0, "")  # MiB by which the peak grew
+        self.peak = _peak_mib()
+        self._keep = keep
+        self._only = only
+
+    def attempt(self, seed: int) -> None:
+        """Try the input of ``seed``."""
+        name, limit_s, attempt, content = one(seed, self._only)
+        signal.setitimer(signal.ITIMER_PROF, limit_s)
+        start = time.process_time()
+        try:
+            attempt()
+        except (Exception, TooSlowError) as error:
+            signal.setitimer(signal.ITIMER_PROF, 0)
+            self._add(seed, name, error, content)
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
+
+        grown = _peak_mib() - self.peak
+        if grown > 1:
+            self.peak += grown
+            self.largest = max(self.largest, (grown, f"{name} seed {seed}"))
+        self.slowest = max(self.slowest, (time.process_time() - start, f"{name} seed {seed}"))
+
+    def _add(self, seed: int, name: str, error: BaseException, content: Any) -> None:
+        """Count a finding; the first one of its kind is kept in a file."""
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        kind = f"{name}: {type(error).__name__} at {Path(place.filename).name}:{place.lineno}"
+        self.kinds[kind] += 1
+        if self.kinds[kind] > 1:
+            return
+        self._keep.mkdir(exist_ok=True)
+        trace = "".join(traceback.format_exception(error))
+        repeat = f"--seed {seed} --count 1 --only {self._only}"
+        (self._keep / f"{seed}.txt").write_text(f"{trace}\n{repeat}\n{content!r}\n")
+        print(f"seed {seed}: {kind}: {str(error)[:SHOWN]}", flush=True)
+
+
+def _peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 def main() -> int:
-    """Runs for the time asked for."""
+    """Run for some minutes, or with some inputs."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
         "--seed", type=int, default=0, help="the first input; each further one has the next number"
@@ -130,53 +179,30 @@ def main() -> int:
         "--keep", type=Path, default=Path("fuzz-findings"), help="folder for findings"
     )
     options = parser.parse_args()
+
     warnings.simplefilter("error")
-    messages(), logs()  # before memory is limited
+    messages()  # before memory is limited
+    logs()
     signal.signal(signal.SIGPROF, _alarm)
     held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
+
+    findings = Findings(options.keep, options.only)
     end = time.monotonic() + 60 * options.minutes
-    found: Counter[str] = Counter()
-    slowest = (0.0, "")
-    largest = (0.0, "")
-    seed = options.seed
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    while (
-        (seed < options.seed + options.count)
-        if options.count is not None
-        else (time.monotonic() < end)
-    ):
-        name, limit_s, attempt, content = one(seed, options.only)
-        signal.setitimer(signal.ITIMER_PROF, limit_s)
-        start = time.process_time()
-        try:
-            attempt()
-        except (Exception, TooSlowError) as error:
-            signal.setitimer(signal.ITIMER_PROF, 0)
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            key = f"{name}: {type(error).__name__} at {Path(place.filename).name}:{place.lineno}"
-            found[key] += 1
-            if found[key] == 1:
-                options.keep.mkdir(exist_ok=True)
-                text = (
-                    "".join(traceback.format_exception(error))
-                    + f"\n--seed {seed} --count 1 --only {options.only}\n{content!r}\n"
-                )
-                (options.keep / f"{seed}.txt").write_text(text)
-                print(f"seed {seed}: {key}: {str(error)[:200]}", flush=True)
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0)
-        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 - peak
-        if grown > 1:
-            peak += grown
-            largest = max(largest, (grown, f"{name} seed {seed}"))
-        slowest = max(slowest, (time.process_time() - start, f"{name} seed {seed}"))
-        seed += 1
-    print(f"{seed - options.seed} inputs, {sum(found.values())} findings of {len(found)} kinds")
+    done = 0
+    while done < options.count if options.count is not None else time.monotonic() < end:
+        findings.attempt(options.seed + done)
+        done += 1
+
+    kinds = findings.kinds
+    print(f"{done} inputs, {sum(kinds.values())} findings of {len(kinds)} kinds")
+    seconds, slowest = findings.slowest
+    grown, largest = findings.largest
     print(
-        f"slowest {slowest[0]:.2f} s of processor ({slowest[1]}); peak memory {peak:.0f} MiB, most by {largest[0]:.0f} MiB ({largest[1]})"
+        f"slowest {seconds:.2f} s of processor ({slowest}); "
+        f"peak memory {findings.peak:.0f} MiB, most by {grown:.0f} MiB ({largest})"
     )
-    return 1 if found else 0
+    return 1 if kinds else 0
 
 
 if __name__ == "__main__":

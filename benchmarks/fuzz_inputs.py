@@ -39,8 +39,21 @@ from semloc_logs.logs.messages.decode import CONVERTERS
 
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
-_LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
-_LIVOX = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+_LIVOX_POINT = """uint32 offset_time
+float32 x
+float32 y
+float32 z
+uint8 reflectivity
+uint8 tag
+uint8 line
+"""
+_LIVOX = """std_msgs/Header header
+uint64 timebase
+uint32 point_num
+uint8 lidar_id
+uint8[3] rsvd
+CustomPoint[] points
+"""
 for _store in (ROS2, ROS1):
     for _package in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces"):
         _store.register(get_types_from_msg(_LIVOX_POINT, f"{_package}/msg/CustomPoint"))

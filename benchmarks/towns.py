@@ -1,5 +1,5 @@
 """Simulated towns that no training has seen, as workspaces of a folder: simulated, fused, described
-and asked, each step once.
+and queried, each step once.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Place:
         return part
 
     def simulate(self, town: Town) -> dict[str, Path]:
-        """Logs by session name, with truth.json for all of them; what is there already is kept."""
+        """Logs by session name, with truth.json for all of them; existing ones are kept."""
         home = self.folder / town.name
         logs = {}
         truth = {}
@@ -136,7 +136,7 @@ class Place:
         (home / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
         return logs
 
-    def ask(self, town: Town) -> Workspace:
+    def query(self, town: Town) -> Workspace:
         """The town's workspace with the alignments of every session with every session; all are
         kept as rejected, with their features.
         """
@@ -154,7 +154,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class TownTask:
-    """One town to simulate, ask and judge; picklable."""
+    """One town to simulate, query and judge; picklable."""
 
     place: Place
     town: Town
@@ -165,7 +165,7 @@ def judged_table(task: TownTask) -> tuple[Path, float]:
     start = time.perf_counter()
     table = task.place.folder / task.town.name / "judged.parquet"
     if not table.exists():
-        work = task.place.ask(task.town)
+        work = task.place.query(task.town)
         judge_town(work, table.with_name("truth.json"), task.town.name, table)
     return table, time.perf_counter() - start
 
@@ -173,25 +173,26 @@ def judged_table(task: TownTask) -> tuple[Path, float]:
 def collect(
     place: Place, towns: Sequence[Town], jobs: int, queries: float = math.inf
 ) -> list[Path]:
-    """Tables of the towns that can be built, one town a process, until ``queries`` have been asked;
-    those there are kept.
+    """Tables of the towns that can be built, one town a process, until they have ``queries``.
+
+    Existing tables are kept.
     """
-    mine = [town for town in towns if place.has(town)]
+    possible = [town for town in towns if place.has(town)]
     tables = []
-    asked = 0
+    done = 0
     engine = make_engine("processes", jobs)
-    print(f"{len(mine)} towns at most, {jobs} at a time", flush=True)
+    print(f"{len(possible)} towns at most, {jobs} at a time", flush=True)
     for number, (table, seconds) in enumerate(
-        engine.map(judged_table, [TownTask(place, town) for town in mine]), 1
+        engine.map(judged_table, [TownTask(place, town) for town in possible]), 1
     ):
         judged = read_judged([table])
-        asked += int(read_metadata(table)["queries"])
+        done += int(read_metadata(table)["queries"])
         tables.append(table)
         figures = (
-            f"{len(judged)} alignments, {int(judged.right.sum())} right, {asked} queries so far"
+            f"{len(judged)} alignments, {int(judged.right.sum())} right, {done} queries so far"
         )
         print(f"{number}: {table.parent.name}: {figures}, {seconds:.0f} s", flush=True)
-        if asked >= queries:
+        if done >= queries:
             break
     engine.stop()
     return tables

@@ -96,16 +96,16 @@ def command(
 ) -> int:
     """Figures of speed and quality, measured here and now, beside what else does the same.
 
-    NAME is reading, fusion, encoder, search, verification or annotate (on simulated data; fusion
-    takes sweeps of LOGs too), memory (peak of fusing drives of several lengths), fuse (one session of the LOGs,
-    beside reading and integrating alone), pipeline (seconds, memory and profile of a run on the
-    LOGs), words (recall of word matches between two LOGs whose truth is known, trained weights
-    beside random ones), labels (classes from geometry against the labels recorded in the LOGs),
-    realism (simulated sweeps beside the labelled ones of the LOGs), retrieval (recall of
-    descriptors on held-out simulated streets and, with --truth, of the first LOG's in the second
-    one's), completion (of incomplete subvolumes of such streets), scaling (the look-up of words in
-    maps of 10, 100 and 1000 km), or localisation (whole queries in a simulated city beside other
-    systems). Close other programs first: times are wall-clock.
+    On simulated data: reading, fusion (also on sweeps of LOGs), encoder, search, verification,
+    annotate, memory (peak of fusing drives of several lengths), retrieval (recall of descriptors on
+    held-out streets and, with --truth, of the first LOG's in the second one's), completion (of
+    incomplete subvolumes of such streets), scaling (the look-up of words in maps of 10, 100 and
+    1000 km), localisation (whole queries in a simulated city beside other systems).
+
+    On LOGs: fuse (one session, beside reading and integrating alone), pipeline (seconds, memory and
+    profile of a run), words (recall of word matches between two LOGs whose truth is known, trained
+    weights beside random ones), labels (classes from geometry against recorded labels), realism
+    (simulated sweeps beside labelled ones). Close other programs first: times are wall-clock.
 
     \b
     Example:  semloc benchmark reading --json

@@ -34,7 +34,7 @@ class Console:
         self.verbosity = 0
         self.log_format = "text"
         self._bars: Bars | None = None
-        self._shown: dict[tuple[str, str], float] = {}
+        self._shown: dict[tuple[str, str, str], float] = {}
         self._begun = time.monotonic()
 
     # -- stdout
@@ -44,7 +44,7 @@ class Console:
         click.echo(text)
 
     def result_json(self, content: object) -> None:
-        """The answer as JSON; figures that are no numbers become null."""
+        """The answer as JSON; figures without a value become null."""
         click.echo(json.dumps(_finite(content), indent=1, default=str))
 
     def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
@@ -91,7 +91,7 @@ class Console:
             self._bars.show(event)
             return
         now = time.monotonic()
-        key = event.stage, event.session
+        key = event.stage, event.session, event.unit
         is_due = now - self._shown.get(key, self._begun) >= PLAIN_SECONDS
         if is_due or event.finished or self.verbosity > 0:
             self._shown[key] = now
@@ -172,7 +172,7 @@ class Bars:
         )
         from rich.progress import Progress as RichProgress
 
-        self._tasks: dict[tuple[str, str], TaskID] = {}
+        self._tasks: dict[tuple[str, str, str], TaskID] = {}
         self._bar = RichProgress(
             SpinnerColumn(),
             TextColumn("{task.description}", markup=False),
@@ -193,7 +193,7 @@ class Bars:
 
     def show(self, event: Progress) -> None:
         """Move the bar of the event's work; a finished one disappears."""
-        key = event.stage, event.session
+        key = event.stage, event.session, event.unit
         if event.finished:
             if key in self._tasks:
                 self._bar.remove_task(self._tasks.pop(key))

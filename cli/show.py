@@ -19,7 +19,7 @@ from .options import (
 
 @click.command(cls=Command)
 @work_option
-@click.option("--query", metavar="SESSION", help="Only what this session asked.")
+@click.option("--query", metavar="SESSION", help="Only queries of this session.")
 @click.option(
     "--at",
     type=float,
@@ -54,8 +54,8 @@ def command(
     as_json: bool,
 ) -> int:
     """A picture of closures: the query's voxels in the colours of their classes laid over the pale
-    map, before and after the alignment, what the map says of each voxel, and subvolumes whose words
-    matched, as seen and as the network completes them.
+    map, before and after the alignment, the verdict of the map on each voxel, and subvolumes whose
+    words matched, as seen and as the network completes them.
 
     Without --at or --closure: the best closures of different pairs of sessions, and the best
     hypothesis that was rejected.
@@ -88,11 +88,11 @@ def command(
     else:
         for view in views:
             row = view.choice.row
-            said = "closure" if view.choice.accepted else f"rejected ({view.choice.reason})"
+            verdict = "closure" if view.choice.accepted else f"rejected ({view.choice.reason})"
             ends = (
                 f"{row[f'{end}_session']} at {row[f'{end}_stamp_ns'] / 1e9:.1f} s"
                 for end in ("query", "target")
             )
-            console.result(f"{' in '.join(ends)}: {said}, probability {row['probability']:.4f}")
+            console.result(f"{' in '.join(ends)}: {verdict}, probability {row['probability']:.4f}")
         console.result(f"Picture: {output}")
     return 0

@@ -96,6 +96,7 @@ def command(
     """
     from semloc_logs.engines.processes import cores
     from semloc_logs.training.checkpoints import steps_done
+    from semloc_logs.training.network_training import TrainingRun
     from semloc_logs.training.runs import device_of, learn_descriptor, use_threads
     from semloc_logs.training.schedule import samples_after
 
@@ -112,17 +113,8 @@ def command(
                 folder, work, settings, opened, samples_after(steps_done(where), settings.training)
             )
             with closing(shards):
-                found = learn_descriptor(
-                    name,
-                    shards,
-                    settings,
-                    where,
-                    weights,
-                    console.note,
-                    device=chosen,
-                    deadline=deadline,
-                    snapshots=snapshots,
-                )
+                run = TrainingRun(where, device=chosen, deadline=deadline, snapshots=snapshots)
+                found = learn_descriptor(name, shards, settings, run, weights, console.note)
             if found is None:
                 opened.stop()  # scenes that are being made are made again
                 console.warn(

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 @path_option("--shards", help="Use the packed pairs (.parquet) of this folder instead.")
 @path_option(
     "--checkpoint",
-    help="Folder of packed pairs, such as that of 'semloc train'; default: beside the output.",
+    help="Folder of packed pairs, such as 'semloc train' leaves; default: beside the output.",
 )
 @click.option("--scenes", type=int, metavar="N", help="Simulated scenes; default: training.scenes.")
 @click.option(
@@ -80,9 +80,7 @@ def command(
     from semloc_logs.training.runs import given_shards, learn_vocabulary, use_threads
 
     if variant == "both" and settings.descriptor.weights is not None:
-        raise click.UsageError(
-            "descriptor.weights are those of one variant: name it with --variant."
-        )
+        raise click.UsageError("descriptor.weights belong to one variant: name it with --variant.")
     if shards is not None and work is not None:
         raise click.UsageError("--shards and --work are alternatives.")
     with console.progress():
@@ -109,9 +107,9 @@ def command(
     if as_json:
         console.result_json(made if variant == "both" else made[variant])
     else:
-        for said in made.values():
+        for report in made.values():
             console.result(
-                f"{said['vocabulary']}: from {said['descriptors']} descriptors of {said['shards']}"
-                " scenes"
+                f"{report['vocabulary']}: from {report['descriptors']} descriptors"
+                f" of {report['shards']} scenes"
             )
     return 0

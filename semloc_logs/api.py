@@ -159,7 +159,7 @@ class Workspace:
     ``jobs`` workers (default: the cores this process may use). ``progress`` is called with a
     :class:`semloc_logs.progress.Progress` now and then.
 
-    Every stage does only what is not up to date, unless ``overwrite``. Errors are of the type
+    Every stage skips work that is up to date, unless ``overwrite``. Errors are of the type
     :class:`semloc_logs.errors.SemlocError`, one sentence each.
     """
 
@@ -257,7 +257,7 @@ class Workspace:
         annotation = Annotation(AnnotationMode(mode), target, overwrite)
         return annotate(Path(log), self._folder, self._settings, annotation, session=session)
 
-    # -- what is there
+    # -- contents
 
     @property
     def sessions(self) -> list[str]:
@@ -312,7 +312,7 @@ def open_log(path: PathLike) -> AbstractContextManager[Log]:
     """An MCAP file, ROS 1 bag, ROS 2 bag folder or .db3 file, to read in a ``with`` block.
 
     ``log.frames()`` gives typed frames (:mod:`semloc_logs.frames`) in log-time order,
-    ``log.streams`` the topics. Raises LogError for what is no log.
+    ``log.streams`` the topics. Raises LogError for other files.
     """
     return closing(containers.open_log(path))
 

@@ -78,7 +78,7 @@ class Fusion(_Section):
     odometry: Literal["none", "lidar"] = Field(
         "none",
         description="lidar: poses from LIDAR odometry (KISS-ICP, the extra 'odometry') instead of"
-        " those of the log",
+        " the poses of the log",
     )
     clamp: tuple[float, float] = Field(
         (-2.0, 3.5), description="bounds of the log-odds (OctoMap), within +-6"
@@ -110,7 +110,7 @@ class Labels(_Section):
         None, description="ONNX model that labels the camera pictures, for source onnx"
     )
     spec: Path | None = Field(
-        None, description="YAML file that says what the model takes and gives"
+        None, description="YAML file that describes input and output of the model"
     )
     threads: int = Field(1, ge=1, le=64, description="threads of the model in each job")
     erode: int = Field(
@@ -182,7 +182,7 @@ class Query(_Section):
     radius: float | None = Field(
         None,
         gt=0,
-        description="a query map has what is this near to its keyframes (m); default 24 m at 0.30"
+        description="a query map holds points this near to its keyframes (m); default 24 m at 0.30"
         " m voxels",
     )
 
@@ -223,7 +223,7 @@ class Closures(_Section):
     exclude_seconds: float = Field(
         30.0,
         ge=0,
-        description="within a session, keyframes nearer in time than this are no revisit",
+        description="within a session, keyframes nearer in time than this are not a revisit",
     )
     exclude_distance: float | None = Field(
         None,
@@ -378,7 +378,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _from_yaml(text: str) -> Any:
-    """ValueError for what is no YAML; the values of tags and dates raise many other types."""
+    """ValueError for other text; the values of tags and dates raise many other types."""
     try:
         return yaml.load(text, Loader=_Loader)
     except (

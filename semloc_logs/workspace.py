@@ -1,4 +1,4 @@
-"""Every path of a workspace, and nothing else (DESIGN: contracts, workspace)."""
+"""Every path of a workspace, and nothing else (docs/reference/workspace.md)."""
 
 from __future__ import annotations
 

@@ -41,9 +41,17 @@ def register(database, query, yaw):
         R.CorrespondenceCheckerBasedOnDistance(near),
     ]
     found = R.registration_ransac_based_on_feature_matching(
-        query[1], database[1], query[2], database[2], True, near, R.TransformationEstimationPointToPoint(False), 3, checks,
+        query[1],
+        database[1],
+        query[2],
+        database[2],
+        True,
+        near,
+        R.TransformationEstimationPointToPoint(False),
+        3,
+        checks,
         R.RANSACConvergenceCriteria(20_000, 0.999),
-    )  # fmt: skip
+    )
     better = R.registration_icp(
         query[0],
         database[0],

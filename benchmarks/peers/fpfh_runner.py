@@ -2,7 +2,7 @@
 nearest to given centres.
 
 For every K with points_K.npy ((n, 3), metres), track_K.npy ((k, 3), where the sensor was) and
-centres_K.npy ((m, 3)) it writes features_K.npy ((m, 33) float32). Normals are those of all points
+centres_K.npy ((m, 3)) it writes features_K.npy ((m, 33) float32). Normals are of all points
 within a metre, seen from the sensor's nearest place; features come from the points thinned to cells
 of CELL metres (0: all of them) within RADIUS. Needs open3d and numpy only.
 """

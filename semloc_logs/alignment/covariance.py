@@ -40,7 +40,7 @@ def stiffness(fit: Fit) -> float:
 def covariance_of(
     fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: float, road: float = 0.0
 ) -> F64:
-    """Covariance (6, 6) of target_T_query in the target's axes (DESIGN: closures.parquet).
+    """Covariance (6, 6) of target_T_query in the target's axes (docs/reference/tables.md).
 
     What noisy normals alone would claim to know is taken off first. Where the points then hold
     nothing (along a corridor) the error is as large as the search lets it be: the bounds of the

@@ -14,7 +14,7 @@ from semloc_logs.numerics.transforms import inverse, yaw_transform
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 # two alignments of a query with one target are the same place to within so many voxels and degrees
-# (DESIGN: a right closure is within 1 m at voxels of 0.30 m, and 5 degrees)
+# (docs/reference/truth.md: a right closure is within 1 m at voxels of 0.30 m, and 5 degrees)
 SAME_PLACE_VOXELS = 3.3
 SAME_PLACE_DEGREES = 5.0
 # drift of odometry, in metres and in degrees for each metre of road: LIDAR odometry on KITTI has

@@ -12,6 +12,7 @@ from semloc_logs.alignment.surface import Arrays, Surface, look_at, nearest_poin
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+Pair = tuple[float, float]
 LEAST_POINTS = 12  # that an alignment needs
 KERNEL = 0.15  # of the robust weights, in units of the radius
 LOOSE = 0.1  # weight of points that are not on planes
@@ -107,7 +108,7 @@ def _align(
     surface: Arrays,
     start: F64,
     steps: tuple[F64, I64, I64],
-    weighting: tuple[float, float],
+    weighting: Pair,
 ) -> tuple[F64, F64, int, int, float, F64, F64]:
     """The transform, the points' centre, their numbers, squares, information and range bias.
 
@@ -228,12 +229,7 @@ def _moved(T: F64, centre: F64, move: F64) -> F64:
 
 @njit(cache=True, nogil=True)
 def _normal_equations(
-    moved: F64,
-    ray: F64,
-    index: I64,
-    surface: Arrays,
-    centre: F64,
-    variances: tuple[float, float],
+    moved: F64, ray: F64, index: I64, surface: Arrays, centre: F64, variances: Pair
 ) -> tuple[float, F64, F64, F64, F64]:
     """Squared distances, information (6, 6), range bias (2, 6); normal equations (6, 6), (6,).
 

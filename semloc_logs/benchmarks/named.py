@@ -38,7 +38,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """``figures`` by name, each with ``ours``, its unit and those of peers; of a profile also the
+    """``figures`` by name, each with ``ours``, the unit and the peers; of a profile also the
     ``busiest`` functions: seconds, calls, name.
     """
 

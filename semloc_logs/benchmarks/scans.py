@@ -33,7 +33,7 @@ def street_sweeps(count: int = 12, points: int = SWEEP_POINTS, seed: int = 8) ->
     """Sweeps 1.2 m apart of a simulated sensor of 64 beams along a street, ``points`` each (fewer
     if it cannot see so many).
 
-    Their mean range is about 10 m, as that of real sweeps, and 98 % or more of the points are
+    Their mean range is about 10 m, as in real sweeps, and 98 % or more of the points are
     within 50 m.
     """
     from semloc_logs.simulation.drives.trajectory import poses_along, smooth_line
@@ -156,7 +156,7 @@ def log_sweeps(log: Path, count: int = 12, *, repeat: bool = True) -> list[Scan]
     """The first ``count`` clouds of a log with their recorded labels, if any.
 
     With ``repeat`` a log of fewer clouds is seen again from poses each 1.2 m further on, so that no
-    scan meets a map of itself only. LogError when there is no cloud.
+    scan meets a map of itself only. LogError without any cloud.
     """
     from semloc_logs.labels.space import guess_space, to_cityscapes
     from semloc_logs.logs.session.session import SessionOptions, open_session

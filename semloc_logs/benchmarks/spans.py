@@ -1,6 +1,6 @@
 """Named spans of a run: the time within functions of the package, as a profiler measures it.
 
-Spans name the functions themselves, so that a renamed function is an error and not a missing figure.
+Spans hold the functions themselves, so that a renamed one is an error and not a missing figure.
 """
 
 from __future__ import annotations
@@ -67,13 +67,13 @@ class FunctionTimes:
         )
 
     def busiest(self, count: int) -> Rows:
-        """Own seconds, calls and place of the ``count`` functions that take most time themselves."""
+        """Own seconds, calls and place of the ``count`` functions with most own seconds."""
         rows = [(own, calls, _place(code)) for code, (_, calls, own, _, _) in self._stats.items()]
         return sorted(rows, reverse=True)[:count]
 
 
 def span_seconds(spans: Sequence[Span], times: FunctionTimes, whole: Function) -> dict[str, float]:
-    """Seconds of each of ``spans`` by name, and as ``rest`` what is left of the time of ``whole``."""
+    """Seconds of each of ``spans`` by name, and the ``rest`` of the time of ``whole``."""
     seconds = {span.name: span.seconds(times) for span in spans}
     return seconds | {"rest": max(0.0, times.within(whole) - sum(seconds.values()))}
 

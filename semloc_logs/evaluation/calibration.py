@@ -2,7 +2,7 @@
 many have never been visited.
 
 Every town is judged against its truth into a table of its own; the three logistic models of the
-acceptance are fitted on all of them. What is reported is said of each town by models that never saw
+acceptance are fitted on all of them. The report on each town is by models that never saw
 it.
 """
 
@@ -85,7 +85,7 @@ class Judged:
 
     @property
     def clear(self) -> Bools:
-        """Right, or wrong by three times the bounds (n,): what is in between teaches neither side."""
+        """Right, or wrong by three times the bounds (n,): cases in between teach neither side."""
         return np.asarray(
             self.right | (self.error_m > 3 * CORRECT_M) | (self.error_deg > 3 * CORRECT_DEG)
         )
@@ -115,7 +115,7 @@ def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
     """All alignments of a workspace whose closures were made with ``closures.min_probability=1``,
     judged, as the table ``output``.
 
-    Columns: those of rejected.parquet without the neighbours, and town, query, road, target_road,
+    Columns: as in rejected.parquet, without the neighbours, and town, query, road, target_road,
     own_* and at_* (the query in its own map by odometry, in the target's by alignment), error_m,
     error_deg, right.
     """
@@ -269,7 +269,7 @@ def fit_agreement(
     """The models of the ``agreement`` (n,), from the clear ones that have neighbours among ``rows``
     (n,), beside ``alone``.
 
-    Neighbours in the same copy of a block agree about any copy. So the models are those of streets
+    Neighbours in the same copy of a block agree about any copy. So the models are of streets
     that look like no others. How much like others is too much: the geometric mean of the right ones
     of the ordinary town that has the most of it and the wrong ones that would be accepted of the
     city of copies that has the least: as many times the one as the other is it.
@@ -352,8 +352,8 @@ def decided_by(model: Model, judged: Judged) -> F64:
 
 
 def where_right(judged: Judged, alone: F64) -> F64:
-    """Probability (n,) that of the poses in its place an alignment has the right one, by what each
-    says ``alone`` (n,).
+    """Probability (n,) that an alignment has the right pose of its place, by the probabilities
+    ``alone`` (n,) of the poses there.
     """
     share = np.ones(len(judged))
     for mine in (np.flatnonzero(judged.town == town) for town in sorted(set(judged.town))):
@@ -372,7 +372,7 @@ def possible(judged: Judged) -> Bools:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """The model of all towns; and what models that had not seen a town said of it: ``alone`` and
+    """The model of all towns; and the results of models that had not seen a town: ``alone`` and
     ``probability`` (n,).
     """
 
@@ -384,7 +384,7 @@ class Fitted:
 def fit(judged: Judged) -> Fitted:
     """Fit all models, and each of them without each town in turn.
 
-    Those of neighbours learn from what that of an alignment alone said of towns it had not seen.
+    The models of neighbours learn from results of the model alone on towns it had not seen.
     Where the held-out log-odds turn out too sure (Platt, Probabilistic outputs for support vector
     machines, 1999), the first and the last are tempered.
     """
@@ -459,7 +459,7 @@ def _tempered(p: F64, before: Calibration, after: Calibration) -> F64:
     )
 
 
-# -- what is reported
+# -- reports
 
 
 def reliability(p: F64, right: Bools, edges: Sequence[float] = EDGES) -> list[dict[str, float]]:
@@ -485,13 +485,13 @@ def answers(judged: Judged, p: F64) -> NDArray[np.int64]:
     ascending.
     """
     best: dict[tuple[Any, ...], int] = {}
-    for k, key in enumerate(_asked(judged)):
+    for k, key in enumerate(_query_keys(judged)):
         if key not in best or p[k] > p[best[key]]:
             best[key] = k
     return np.array(sorted(best.values()), np.int64)
 
 
-def _asked(judged: Judged) -> Iterator[tuple[Any, ...]]:
+def _query_keys(judged: Judged) -> Iterator[tuple[Any, ...]]:
     placed = judged.placed
     return zip(
         judged.town, placed.query_session, placed.query.tolist(), placed.target_session, strict=True
@@ -505,7 +505,7 @@ def recall_at(
     have a right alignment with a target.
     """
     chosen = answers(judged, p)
-    able = len({key for key, right in zip(_asked(judged), judged.right, strict=True) if right})
+    able = len({key for key, right in zip(_query_keys(judged), judged.right, strict=True) if right})
     out = []
     for least in thresholds:
         accepted = chosen[p[chosen] >= least]
@@ -525,7 +525,8 @@ def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
     high, and what they are made from.
     """
     return {
-        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature; 'near' where a query has neighbours, "
+        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature;"
+        " 'near' where a query has neighbours, "
         "'together' where it has far ones too; at most a half where lookalike exceeds most_alike",
         "alone": fitted.model.own_features.to_json(FEATURES),
         "least_support": round(fitted.model.min_support, 4),

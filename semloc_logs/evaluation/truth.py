@@ -1,5 +1,5 @@
 """Closures against the truth: which are right, how far off, and how many of the revisits were found
-(DESIGN: closures.parquet).
+(docs/reference/truth.md).
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def evaluate_closures(
 
 
 def _settings_of(work: Workspace, settings: Resolved) -> Resolved:
-    """``settings`` with the sections that closures.parquet was made with, where it says so."""
+    """``settings`` with the sections that closures.parquet was made with, where it has them."""
     recorded = read_metadata(work.closures).get("settings")
     if not isinstance(recorded, dict):
         return settings
@@ -160,7 +160,8 @@ def _settings_of(work: Workspace, settings: Resolved) -> Resolved:
         }
     except (KeyError, ValueError):
         raise WorkspaceError(
-            f"{work.closures} was made by another version: run 'semloc close -w {work.path} --overwrite'."
+            f"{work.closures} was made by another version: "
+            f"run 'semloc close -w {work.path} --overwrite'."
         ) from None
     return settings.model_copy(update=update)
 
@@ -203,7 +204,7 @@ def _count_queries(
     settings: Resolved,
     self_closures: bool,
 ) -> tuple[int, int, int]:
-    """Queries of known true pose, those of them that are possible, and those of the latter that are
+    """Queries of known true pose, how many of them are possible, and how many of the latter are
     answered.
     """
     positions: dict[str, F64] = {}
@@ -295,13 +296,15 @@ def read_truth(path: Path, sessions: Mapping[str, SessionMap]) -> dict[str, True
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:
         raise TruthError(
-            f"Truth file {path} cannot be read as JSON ({problem}): give a file that maps a log's name to its truth."
+            f"Truth file {path} cannot be read as JSON ({problem}): "
+            "give a file that maps a log's name to its truth."
         ) from None
     if not isinstance(content, dict) or not all(
         isinstance(entry, dict) for entry in content.values()
     ):
         raise TruthError(
-            f"Truth file {path} does not map each log's name to an object with 'T_common_session' or 'trajectory'."
+            f"Truth file {path} does not map each log's name to an object "
+            "with 'T_common_session' or 'trajectory'."
         )
     tracks = {}
     for file, entry in content.items():
@@ -310,7 +313,8 @@ def read_truth(path: Path, sessions: Mapping[str, SessionMap]) -> dict[str, True
             tracks[name] = _track(path, file, entry, sessions[name])
     if not tracks:
         raise TruthError(
-            f"Truth file {path} knows {', '.join(content) or 'no log'}, but the workspace has the sessions {', '.join(sessions) or 'none'}."
+            f"Truth file {path} knows {', '.join(content) or 'no log'}, "
+            f"but the workspace has the sessions {', '.join(sessions) or 'none'}."
         )
     return tracks
 
@@ -329,7 +333,8 @@ def _track(path: Path, file: str, entry: Mapping[str, Any], session: SessionMap)
             raise ValueError
     except (KeyError, ValueError, TypeError):
         raise TruthError(
-            f"Truth file {path}: {file} needs 'T_common_session', a rigid 4x4 matrix of numbers, or 'trajectory', a TUM file."
+            f"Truth file {path}: {file} needs 'T_common_session', a rigid 4x4 matrix of numbers, "
+            "or 'trajectory', a TUM file."
         ) from None
     table = read_table(session.folder.trajectory)
     return TrueTrack(np.asarray(table["stamp_ns"].to_numpy()), common_T_session @ poses_of(table))
@@ -362,7 +367,8 @@ def read_tum(path: Path) -> TrueTrack:
                 raise ValueError
         except (ValueError, OverflowError, InvalidOperation):
             raise TruthError(
-                f"Trajectory {path}, line {number}: there should be seconds, x y z (m) and a quaternion qx qy qz qw."
+                f"Trajectory {path}, line {number}: "
+                "give seconds, x y z (m) and a quaternion qx qy qz qw."
             ) from None
         rows[stamp_ns] = values
     if not rows:

@@ -1,4 +1,6 @@
-"""Sessions and closures in other programs' formats: poses, a pose graph, points."""
+"""Sessions and closures in other programs' formats: poses (TUM, KITTI), a pose graph (g2o), points
+(PLY, PCD, LAS, LAZ, XYZ).
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ FORMATS = ("tum", "kitti", "g2o", *POINT_FORMATS)
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which points to export, in which frame, and within which bounds of it (m), if any."""
+    """Which points: the ``voxels`` of the map or the points of the ``keyframes``, in which frame,
+    and within which bounds of it (m) if any.
+    """
 
     what: Literal["voxels", "keyframes"] = "voxels"
     frame: Literal["session", "map"] = "session"
@@ -44,12 +48,12 @@ def export(
     output: Path,
     selection: Selection | None = None,
 ) -> list[Path]:
-    """Write the sessions ``names`` (all if empty) to the folder ``output``; returns the files.
+    """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
 
     ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``:
     one pose graph of all; the point formats: ``selection``, by default the centres of all occupied
-    voxels in the session frame. Raises WorkspaceError when a session is missing or does not fit the
-    format, SemlocError when a library is missing.
+    voxels in the session frame. Raises WorkspaceError when a session is not there or does not fit
+    the format, SemlocError when a library is missing.
     """
     sessions = {folder.name: SessionMap(folder) for folder in work.chosen(names)}
     if form == "g2o":
@@ -76,7 +80,9 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def tum(session: SessionMap) -> bytes:
-    """Lines of the whole trajectory: seconds, position (m), quaternion xyzw, session frame."""
+    """Seconds, position (m), quaternion xyzw of the base frame in the session frame: the whole
+    trajectory.
+    """
     table = read_table(session.folder.trajectory)
     t, q = translation_quaternion(poses_of(table))
     lines = [
@@ -88,7 +94,9 @@ def tum(session: SessionMap) -> bytes:
 
 
 def kitti(session: SessionMap) -> bytes:
-    """Lines of the whole trajectory: the upper 3 x 4 of ``session_T_base``, row-major."""
+    """Twelve numbers a line: the upper 3 x 4 of ``session_T_base`` of each pose of the trajectory,
+    row-major.
+    """
     poses = poses_of(read_table(session.folder.trajectory))
     return "".join(
         " ".join(f"{x:.12g}" for x in pose[:3].ravel()) + "\n" for pose in poses

@@ -39,7 +39,7 @@ _MOST_COLOURS = 4096  # that are remembered of one topic, to guess the palette
 _HALF = 0xFFFF  # the lower half of an id is the class, the upper an instance (SemanticKITTI)
 
 
-class _LabelSource(Enum):
+class _Carrier(Enum):
     """Where the labels of a keyframe come from."""
 
     NONE = "none"
@@ -98,7 +98,7 @@ class Labeller:
         self._session = session
         self._topics: dict[str, _Topic] = {}
         # of each keyframe, with the topic of labels that come with the cloud
-        self._keyframes: list[tuple[_LabelSource, str]] = []
+        self._keyframes: list[tuple[_Carrier, str]] = []
         self._model: Segmenter | None = None
         self._pictures: Pictures | None = None
         if settings.space is not None:
@@ -149,19 +149,19 @@ class Labeller:
             ids: U32 = cloud.label[keep]
             topic = cloud.label_topic or cloud.header.topic
             self._topic(topic).see(ids, cloud.label_form is LabelForm.COLOURS)
-            self._keyframes.append((_LabelSource.CLOUD, topic))
+            self._keyframes.append((_Carrier.CLOUD, topic))
             return ids
 
         painted = None if self._pictures is None else self._pictures.labels(cloud, keep)
         if painted is None:
-            self._keyframes.append((_LabelSource.NONE, ""))
+            self._keyframes.append((_Carrier.NONE, ""))
             return None
         if self.source != "onnx":
             for number, name in enumerate(self.images):
                 topic_labels = self._topic(name)
                 own = painted["label"][_of_camera(painted, number)]
                 topic_labels.see(own, topic_labels.is_coloured)
-        self._keyframes.append((_LabelSource.CAMERAS, ""))
+        self._keyframes.append((_Carrier.CAMERAS, ""))
         return painted
 
     def conclude(self) -> None:
@@ -171,7 +171,7 @@ class Labeller:
             return
         if self.source not in ("auto", "log"):
             return
-        has_labels = any(source is not _LabelSource.NONE for source, _ in self._keyframes) and any(
+        has_labels = any(source is not _Carrier.NONE for source, _ in self._keyframes) and any(
             not topic.is_empty() for topic in self._topics.values()
         )
         if not has_labels and self.source == "log":
@@ -216,7 +216,7 @@ class Labeller:
         if self.source == "uniform" or labels is None:
             return np.full(len(points), UNLABELLED, np.uint8)
         source, topic = self._keyframes[keyframe]
-        if source is not _LabelSource.CAMERAS:
+        if source is not _Carrier.CAMERAS:
             return self._train_ids(topic, labels)
 
         out = self._classes_of_painted(labels)

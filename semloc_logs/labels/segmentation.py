@@ -87,9 +87,7 @@ class Segmenter:
         model_path, spec_path = _named(settings)
         spec = read_spec(spec_path)
         if not model_path.is_file():
-            raise SettingsError(
-                f"The model {model_path} does not exist: --seg-model takes an ONNX file."
-            )
+            raise SettingsError(f"Model {model_path} is missing: --seg-model takes an ONNX file.")
         net, runtime = _load(model_path, spec, settings.threads)
         return cls(net, runtime, spec, spec_path, model_path)
 

@@ -284,8 +284,8 @@ def guess_space(ids: NDArray[np.integer]) -> str:
     instances = bool((every > 0xFFFF).any())
     if not instances and max(low, default=0) <= 18:
         return "cityscapes"
-    # the full ids of Cityscapes end at 33, and most of them that occur on a street are not ids of
-    # SemanticKITTI
+    # the full ids of Cityscapes end at 33, and most of the ids that occur on a street are not ids
+    # of SemanticKITTI
     full = not instances and max(low) <= 33 and len(low - set(_shipped("semantickitti").names)) > 1
     return "cityscapes_ids" if full else "semantickitti"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs import progress
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.labels.camera_labels import PointLabels
@@ -47,7 +47,7 @@ class Collected:
     def add(
         self, cloud: PosedCloud, kept: NDArray[np.int64], label: PointLabels | None = None
     ) -> None:
-        """Add a keyframe: points ``kept`` (m,) of ``cloud``, labels (m,) of the labeller."""
+        """Add a keyframe: points ``kept`` (m,) of ``cloud``, their labels (m,) or None."""
         number = len(self)
         self._save(number, "points", cloud.points[kept])
         self._save(number, "label", label)
@@ -97,9 +97,12 @@ def collect(
     labeller: Labeller,
     fusion: ResolvedFusion,
     scratch: Path,
-    on_progress: Callable[[str], None],
+    name: str,
 ) -> Collected:
-    """Read the log once: the thinned points of its keyframes go to files of ``scratch``."""
+    """Read the log once: the thinned points of its keyframes go to files of ``scratch``.
+
+    Progress is reported under the ``name`` of the session.
+    """
     collected = Collected(scratch, fusion.keyframe_resolution)
     selector = KeyframeSelector(fusion)
     clouds = session.clouds(labeller.on_image, labeller.images)
@@ -113,5 +116,5 @@ def collect(
                 kept = thin(cloud.points, collected.cell)
                 collected.add(cloud, kept, labeller.take(cloud, kept))
                 if len(collected) % 50 == 0:
-                    on_progress(f"read {len(collected)} keyframes")
+                    progress.report("fuse", name, len(collected), None, "keyframes read")
     return collected

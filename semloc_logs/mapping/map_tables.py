@@ -5,7 +5,7 @@ A chain of iterators that holds a few keyframes and the submaps that are being d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs import progress
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.space import SKY
 from semloc_logs.labels.sweep_ground import ground_surface
@@ -39,7 +40,6 @@ from semloc_logs.voxels.store import (
 from semloc_logs.workspace import SessionFolder
 
 F64 = NDArray[np.float64]
-Progress = Callable[[str], None]
 
 VIEW = 24.0  # m at voxels of 0.30 m: as far as a query looks
 PROGRESS_EVERY = 50  # keyframes
@@ -47,11 +47,12 @@ PROGRESS_EVERY = 50  # keyframes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelSession:
-    """The keyframes of a session, with the pose of each in its map, ``map_T_base`` (n, 4, 4).
+    """The keyframes of session ``name``, with the pose of each in its map.
 
-    ``metadata`` goes into every table.
+    ``map_T_base`` is (n, 4, 4); ``metadata`` goes into every table.
     """
 
+    name: str
     collected: Collected
     labeller: Labeller
     map_T_base: F64
@@ -87,9 +88,7 @@ class MapFacts:
     submaps: list[dict[str, Any]] = field(default_factory=list)
 
 
-def write_map(
-    session: LevelSession, folder: SessionFolder, on_progress: Progress
-) -> dict[str, Any]:
+def write_map(session: LevelSession, folder: SessionFolder) -> dict[str, Any]:
     """Write every table but the trajectory; returns what session.json holds of them."""
     fusion = session.fusion
     metadata = session.metadata
@@ -100,14 +99,14 @@ def write_map(
     facts = MapFacts()
     ground = GroundMapper(session.scale)
     stamps_ns = [h.stamp_ns for h in session.collected.headers]
-    labelled = labelled_keyframes(session, ground, facts, on_progress)
+    labelled = labelled_keyframes(session, ground, facts)
     with (
         replacing_folder(folder.keyframes) as keyframes,
         replacing_folder(folder.blocks) as blocks,
         # whatever happens, the other threads end before their folders are renamed or removed
         closing(prefetched(keep_keyframes(keyframes, stamps_ns, labelled, metadata))) as kept,
         closing(
-            prefetched(_kept_submaps(session, kept, ranges, facts, blocks, on_progress), depth=1)
+            prefetched(_kept_submaps(session, kept, ranges, facts, blocks), depth=1)
         ) as submaps,
     ):
         voxels = write_voxels(folder.voxels, submaps, metadata, fusion.clamp)
@@ -125,7 +124,7 @@ def write_map(
 
 
 def labelled_keyframes(
-    session: LevelSession, ground: GroundMapper, facts: MapFacts, on_progress: Progress
+    session: LevelSession, ground: GroundMapper, facts: MapFacts
 ) -> Iterator[Keyframe]:
     """All keyframes with their classes, without sky; ``ground`` and ``facts`` are filled."""
     collected = session.collected
@@ -150,7 +149,7 @@ def labelled_keyframes(
         facts.points.append(int(keep.sum()))
         facts.views.append(_view(points[keep], collected.origins[i], VIEW * scale))
         if (i + 1) % PROGRESS_EVERY == 0 or i + 1 == count:
-            on_progress(f"labelled {i + 1} of {count} keyframes")
+            progress.report("fuse", session.name, i + 1, count, "keyframes labelled")
         yield Keyframe(points[keep], label[keep], None if sigma is None else sigma[keep])
 
 
@@ -166,7 +165,6 @@ def _kept_submaps(
     ranges: Sequence[tuple[int, int]],
     facts: MapFacts,
     folder: Path,
-    on_progress: Progress,
 ) -> Iterator[BlockMap]:
     """Every submap, once it is written to ``folder`` and entered in ``facts``."""
     origins = session.collected.origins
@@ -182,7 +180,7 @@ def _kept_submaps(
                 "blocks": len(blocks.keys),
             }
         )
-        on_progress(f"fused submap {i + 1} of {len(ranges)}")
+        progress.report("fuse", session.name, i + 1, len(ranges), "submaps")
         yield blocks
 
 

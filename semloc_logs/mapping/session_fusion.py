@@ -22,7 +22,7 @@ from semloc_logs.logs.sensors.depth import RangeNoise
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import check_reach, level
-from semloc_logs.mapping.map_tables import LevelSession, Progress, write_map
+from semloc_logs.mapping.map_tables import LevelSession, write_map
 from semloc_logs.settings import Resolved
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
@@ -55,7 +55,6 @@ class FusedSession:
 
 def fuse_session(
     task: FuseTask,
-    on_progress: Progress = lambda _: None,
     on_tables: Callable[[dict[str, Any]], None] = lambda _: None,
 ) -> FusedSession:
     """Write every table and, last, session.json.
@@ -65,7 +64,7 @@ def fuse_session(
     """
     with closing(_opened(task)) as session:
         labeller = Labeller(task.settings.labels, session)
-        metadata, content = _fused(task, session, labeller, on_progress)
+        metadata, content = _fused(task, session, labeller)
         _write_trajectory(task.folder, session, metadata)
         problems = [*session.problems, *labeller.problems]
         content = {
@@ -99,12 +98,12 @@ def _opened(task: FuseTask) -> Session:
 
 
 def _fused(
-    task: FuseTask, session: Session, labeller: Labeller, on_progress: Progress
+    task: FuseTask, session: Session, labeller: Labeller
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read the log and write the tables of the map: their metadata, and what they hold."""
     fusion = task.settings.fusion
     with _scratch(task.folder) as scratch:
-        collected = collect(session, labeller, fusion, scratch, on_progress)
+        collected = collect(session, labeller, fusion, scratch, task.folder.name)
         if not len(collected):
             reasons = "; ".join(sentences(session.problems)) or "its sensor streams are empty"
             raise LogError(f"{session.name} gave no usable points: {reasons}")
@@ -119,8 +118,8 @@ def _fused(
             "label_source": labeller.source,
             "version": semloc_logs.__version__,
         }
-        levelled = LevelSession(collected, labeller, map_T_base, fusion, metadata)
-        return metadata, write_map(levelled, task.folder, on_progress)
+        levelled = LevelSession(task.folder.name, collected, labeller, map_T_base, fusion, metadata)
+        return metadata, write_map(levelled, task.folder)
 
 
 @contextmanager

@@ -271,7 +271,7 @@ def _group(visible: Visibility, keyframe: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Aligned:
-    """A query aligned with submap ``group`` of the only target session, which is ``visible``.
+    """A query aligned with submap ``group`` of the only target session of ``visible``.
 
     ``ground`` is the height of the ground in the query's frame, metres.
     """
@@ -347,7 +347,7 @@ def _states(aligned: _Aligned, variant: str, laid: F64, centres: F64) -> tuple[U
         load_completion(variant, settings.descriptor.weights), (query, target, query)
     )
     inner = query[:, half:-half, half:-half]
-    return inner, states_of(completion.said, completion.classes), target
+    return inner, states_of(completion.completed, completion.classes), target
 
 
 def _turned(query: Query, yaw: float) -> tuple[U8, NDArray[np.int64]]:

@@ -32,15 +32,17 @@ class Condition:
     def __post_init__(self) -> None:
         if self.season not in SEASONS:
             raise SettingsError(
-                f"there is no simulated season {self.season!r}: choose one of {', '.join(SEASONS)}"
+                f"unknown simulated season {self.season!r}: choose one of {', '.join(SEASONS)}"
             )
         if self.daytime not in DAYTIMES:
             raise SettingsError(
-                f"there is no simulated time of day {self.daytime!r}: choose one of {', '.join(DAYTIMES)}"
+                f"unknown simulated time of day {self.daytime!r}: "
+                f"choose one of {', '.join(DAYTIMES)}"
             )
         if not (math.isfinite(self.roadworks) and 0 <= self.roadworks <= 50):
             raise SettingsError(
-                f"there cannot be {self.roadworks} simulated roadworks a kilometre: give between 0 and 50"
+                f"{self.roadworks} simulated roadworks a kilometre are impossible: "
+                "give between 0 and 50"
             )
         if not 0 <= self.rebuilt <= 1:
             raise SettingsError(

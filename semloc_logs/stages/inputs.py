@@ -16,7 +16,7 @@ from semloc_logs.tables.table import read_json
 @dataclass(frozen=True, slots=True)
 class SessionInput:
     """One session to fuse: its logs, recorded back to back; topics by role where the log leaves the
-    choice open; and a file of poses instead of those of the logs.
+    choice open; and a file of poses instead of the poses of the logs.
     """
 
     name: str

@@ -39,7 +39,7 @@ class Completed:
     """
 
     given: U8
-    said: U8
+    completed: U8
     probable: U8
     truth: U8
     classes: int

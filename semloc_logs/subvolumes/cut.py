@@ -2,8 +2,8 @@
 
 Whole maps are turned by a heading; training takes single subvolumes. A subvolume is 32^3 voxels.
 The encoder sees a margin of 8 voxels around it in x and y, which is its receptive field, so that
-the descriptors of a whole map can be computed at once and equal the ones of single subvolumes
-to rounding.
+the descriptors of a whole map can be computed at once and equal the descriptors of single
+subvolumes to rounding.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ class _LookUp(torch.autograd.Function):
         return None, torch.stack(columns, 1).to(grad.dtype)
 
 
-def halve(x: Tensor) -> Tensor:
+def max_pool(x: Tensor) -> Tensor:
     """2x2x2 max-pooling.
 
     Without gradients as three maxima, which take half the time of the library's kernel in bf16.
@@ -66,7 +66,7 @@ def halve(x: Tensor) -> Tensor:
     return torch.maximum(x[..., ::2], x[..., 1::2])
 
 
-def in_eights(volume: Tensor) -> Tensor:
+def space_to_depth(volume: Tensor) -> Tensor:
     """Space to depth: voxels (b, x, y, z) -> (b, x / 2, y / 2, z / 2, 8)."""
     b, x, y, z = volume.shape
     return (
@@ -74,8 +74,8 @@ def in_eights(volume: Tensor) -> Tensor:
     )
 
 
-def from_eights(cells: Tensor) -> Tensor:
-    """The reverse of :func:`in_eights`."""
+def depth_to_space(cells: Tensor) -> Tensor:
+    """The reverse of :func:`space_to_depth`."""
     b, x, y, z, _ = cells.shape
     return (
         cells.reshape(b, x, y, z, 2, 2, 2)
@@ -98,7 +98,7 @@ def _turned(base: Tensor, group_in: bool) -> Tensor:
     return torch.cat(turns)
 
 
-class Turning(nn.Module):
+class P4Convolution(nn.Module):
     """The parameters of one layer of the encoder, a convolution over quarter turns (P4).
 
     ``base`` filters for one heading and a ``bias`` that all headings share.
@@ -163,7 +163,7 @@ class Encoder(nn.Module):
     """
 
     def __init__(
-        self, variant: str, latent: int = LATENT, layer: Callable[..., Any] = Turning
+        self, variant: str, latent: int = LATENT, layer: Callable[..., Any] = P4Convolution
     ) -> None:
         super().__init__()
         self.variant, self.latent = variant, latent
@@ -215,7 +215,7 @@ class Encoder(nn.Module):
             if reduced
             else self.embedding.weight
         )
-        cells = in_eights(codes).int()
+        cells = space_to_depth(codes).int()
         if codes.is_cuda:
             looked_up: Tensor = F.embedding(cells, table)
         else:
@@ -250,7 +250,7 @@ class Encoder(nn.Module):
         )
         for weight, bias in blocks:
             # ReLU before pooling, as in the paper, would cost eight times as much
-            x = F.relu(halve(F.conv3d(x, weight, bias, padding=1)))
+            x = F.relu(max_pool(F.conv3d(x, weight, bias, padding=1)))
         return latent_mean(x[:, :, 1:-1, 1:-1], *mean)  # the pooled margin has served
 
 
@@ -263,8 +263,8 @@ def latent_mean(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 class Decoder(nn.Module):
     """Latent code (b, latent) -> logits (L + 2, 8, b, 16, 16, 16) of a subvolume.
 
-    The subvolume is :func:`in_eights`, the eight moved to the front. Upsampling by repetition and
-    convolution as in the paper, but the last step gives the 2x2x2 voxels of each cell at once.
+    The subvolume is :func:`space_to_depth`, the eight moved to the front. Upsampling by repetition
+    and convolution as in the paper, but the last step gives the 2x2x2 voxels of each cell at once.
     """
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
@@ -292,7 +292,7 @@ class Decoder(nn.Module):
 
 def as_volumes(logits: Tensor) -> Tensor:
     """The decoder's output -> (b, L + 2, 32, 32, 32)."""
-    return torch.stack([from_eights(of_class.movedim(0, -1)) for of_class in logits], 1)
+    return torch.stack([depth_to_space(of_class.movedim(0, -1)) for of_class in logits], 1)
 
 
 def channels_last(module: nn.Module) -> None:

@@ -33,7 +33,7 @@ def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
 def load_weights(
     build: Callable[[str, int], Network], part: str, variant: str, weights: Path | None = None
 ) -> Network:
-    """The network that ``build(variant, latent)`` makes, with shipped weights or a file's.
+    """The network that ``build(variant, latent)`` makes, with shipped weights or weights of a file.
 
     ``part`` is ``encoder.`` for the encoder alone, empty for all. SettingsError when the file does
     not hold them.

@@ -97,7 +97,8 @@ def batches(
             coming = begin(number + 1) if number + 1 < pools else []
             if not pool:
                 raise SettingsError(
-                    "There is nothing to train on: none of the scenes or stretches of road gave a pair of subvolumes."
+                    "There is nothing to train on: "
+                    "none of the scenes or stretches of road gave a pair of subvolumes."
                 )
             wanted = iter(range(max(first, number * per_pool), min(steps, (number + 1) * per_pool)))
             drawn = deque(

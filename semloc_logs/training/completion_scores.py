@@ -39,19 +39,19 @@ def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, 
         logits, mu, _ = model(codes, None)
         ours.append(descriptors(mu[:, :, 1:2, 1:2]))
         theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 1:2, 1:2]))
-        said = as_volumes(logits)[:, : classes + 1].argmax(1).numpy()
+        completed = as_volumes(logits)[:, : classes + 1].argmax(1).numpy()
         target, known = (
             t.numpy() for t in targets(torch.from_numpy(whole), torch.from_numpy(table), classes)
         )
         given = table[part[:, 16:-16, 16:-16]]
         seen += int(known.sum())
-        right += int((known & (said == target)).sum())
+        right += int((known & (completed == target)).sum())
         free += int((known & (target == classes)).sum())
         copied += int((known & (given == target)).sum())
         unseen = known & (given == classes + 1)
         hidden += int(unseen.sum())
-        hidden_right += int((unseen & (said == target)).sum())
-        np.add.at(confusion, (target[known], said[known]), 1)
+        hidden_right += int((unseen & (completed == target)).sum())
+        np.add.at(confusion, (target[known], completed[known]), 1)
     inter = np.diag(confusion)[:classes]
     union = confusion.sum(0)[:classes] + confusion.sum(1)[:classes] - inter
     occurs = confusion.sum(1)[:classes] > 0

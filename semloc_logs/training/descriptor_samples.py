@@ -24,8 +24,8 @@ def shard_descriptors(
     """Unit descriptors (n, N), nine of the complete view of each of the first pairs (of all without
     ``pairs_per_shard``).
 
-    One shard is in memory at a time; what is kept has half precision, which is finer than what a
-    vocabulary rounds to.
+    One shard is in memory at a time; descriptors have half precision, which is finer than the
+    rounding of a vocabulary.
     """
     table = code_table(encoder.variant)
     out = []

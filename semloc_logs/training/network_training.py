@@ -2,9 +2,9 @@
 GPU, resumable from a checkpoint.
 
 Beside the paper's completion loss a contrastive term (InfoNCE over the batch) pulls the descriptor
-of an incomplete subvolume towards that of the complete one seen a little shifted and turned, which
-is what the database holds; ``training.contrastive_weight=0`` is the paper. Adam replaces ADADELTA
-because the shipped runs see few samples.
+of an incomplete subvolume towards the descriptor of the complete one seen a little shifted and
+turned, which is what the database holds; ``training.contrastive_weight=0`` is the paper. Adam
+replaces ADADELTA because the shipped runs see few samples.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ from torch.nn import functional as F
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.cut import CLASSES, code_table
-from semloc_logs.subvolumes.network import Completion, descriptors, in_eights
+from semloc_logs.subvolumes.network import Completion, descriptors, space_to_depth
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.batches import Batch, OutOfTime, batches
 from semloc_logs.training.checkpoints import resume, save_checkpoint
+from semloc_logs.training.pairs import MIN_OCCUPIED
 from semloc_logs.training.schedule import learning_rate, plateau_end, samples_after, steps_of
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 RATE = 1.5e-3
 BATCH_OF_RATE = 12  # a larger batch steps farther, with the square root as Adam wants it
 TEMPERATURE = 0.1
-MIN_OCCUPIED = 40
+MAX_GRADIENT = 10.0  # norm, to which a larger one is cut
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +76,23 @@ class _Losses:
     contrastive: Tensor
     matched: float
 
+    def progress(self, samples: int) -> Progress:
+        """These losses as numbers, after so many samples."""
+        return Progress(
+            samples,
+            float(self.total.detach()),
+            float(self.reconstruction.detach()),
+            float(self.contrastive.detach()),
+            self.matched,
+        )
+
 
 def _losses(
     model: Completion, batch: Batch, noise: Tensor, table: Tensor, training: Training
 ) -> _Losses:
     classes = CLASSES[model.encoder.variant]
     device = noise.device.type
-    target, known = targets(in_eights(batch.complete).movedim(-1, 0), table, classes)
+    target, known = targets(space_to_depth(batch.complete).movedim(-1, 0), table, classes)
     with torch.autocast(device, dtype=torch.bfloat16):
         logits, mu, log_variance = model(table[batch.incomplete.long()], noise)
         # the complete view is the goal; a gradient through it too would cost a third more
@@ -119,87 +130,116 @@ def _adam(model: Completion) -> torch.optim.Optimizer:
     return torch.optim.Adam(model.parameters(), lr=RATE)
 
 
+@dataclass(frozen=True, slots=True)
+class TrainingRun:
+    """Where and for how long a network is trained.
+
+    ``checkpoint`` is renewed every ``save_every`` steps. Training stops when the clock
+    ``time.monotonic()`` passes ``deadline``. ``snapshots`` is a folder that gets the weights after
+    1/32, 1/16, ... 1/2 of the steps, for a learning curve. On the ``device`` cuda the network is
+    compiled. Another ``network`` and ``optimiser`` are for comparison.
+    """
+
+    checkpoint: Path
+    save_every: int = 100
+    device: str = "cpu"
+    deadline: float = math.inf
+    snapshots: Path | None = None
+    network: Callable[[str, int], Completion] = Completion
+    optimiser: Callable[[Completion], torch.optim.Optimizer] = _adam
+
+    @property
+    def plateau(self) -> Path:
+        """The checkpoint at which the rate begins to fall."""
+        return self.checkpoint.with_suffix(".plateau.safetensors")
+
+
 def train(
     variant: str,
     shards: Sequence[Path],
     training: Training,
-    checkpoint: Path,
+    run: TrainingRun,
     on_step: Callable[[Progress], None] = lambda _: None,
-    save_every: int = 100,
-    *,
-    device: str = "cpu",
-    deadline: float = math.inf,
-    snapshots: Path | None = None,
-    network: Callable[[str, int], Completion] = Completion,
-    optimiser_of: Callable[[Completion], torch.optim.Optimizer] = _adam,
 ) -> Completion | None:
-    """Train from scratch or from ``checkpoint``, which is renewed every ``save_every`` steps;
-    returns the finished network.
+    """Train from scratch or from the checkpoint of ``run``; returns the finished network.
 
-    None, with a checkpoint to go on from, when the clock ``time.monotonic()`` passes ``deadline``.
-    ``shards`` may wait in ``[i]`` for scenes that are still being made. The checkpoint at which
-    the rate begins to fall stays beside the others, as NAME.plateau.safetensors: put in their
-    place, it is where a training with more samples goes on. ``snapshots`` is a folder that gets
-    the weights after 1/32, 1/16, ... 1/2 of the steps, for a learning curve. On a GPU the network
-    is compiled. Other networks and optimisers are for comparison.
-    Raises SettingsError without shards and WorkspaceError when the checkpoint is of another run.
+    None, with a checkpoint from which the same call continues, when the time is over. ``shards``
+    may wait in ``[i]`` for scenes that are still being made. The checkpoint at which the rate
+    begins to fall stays as NAME.plateau.safetensors: as the checkpoint of a training with more
+    samples, it saves the steps until there. Raises SettingsError without shards and WorkspaceError
+    when the checkpoint is of another run.
     """
     if not len(shards):
         raise SettingsError(
             "There is nothing to train on: give sessions with keyframes, or scenes to simulate."
         )
     torch.manual_seed(training.seed)
-    model = network(variant, training.latent).to(device)
-    optimiser = optimiser_of(model)
+    model = run.network(variant, training.latent).to(run.device)
+    optimiser = run.optimiser(model)
     steps = steps_of(training)
-    done = resume(checkpoint, model, optimiser, training) if checkpoint.exists() else 0
-    if device == "cuda":
+    done = resume(run.checkpoint, model, optimiser, training) if run.checkpoint.exists() else 0
+    if run.device == "cuda":
         model.encoder.compile()
         model.decoder.compile()
-    table = torch.from_numpy(code_table(variant)).to(device)
+    table = torch.from_numpy(code_table(variant)).to(run.device)
     rate = optimiser.defaults["lr"] * math.sqrt(training.batch / BATCH_OF_RATE)
     model.train()
-    step = done
-    coming = batches(shards, training, done, steps, device, deadline=deadline)
-    while step < steps:
+    keeper = _Keeper(run, model, optimiser, training)
+    coming = batches(shards, training, done, steps, run.device, deadline=run.deadline)
+    for step in range(done, steps):
         try:
             batch = next(coming)
         except OutOfTime:
             if step > done:
-                save_checkpoint(checkpoint, model, optimiser, training, step)
+                keeper.save(step)
             return None
         for group in optimiser.param_groups:
             group["lr"] = rate * learning_rate(step, steps)
-        normal = np.random.default_rng((training.seed, 2, step)).standard_normal(
-            (training.batch, training.latent), np.float32
-        )
-        losses = _losses(model, batch, torch.from_numpy(normal).to(device), table, training)
+        noise = _noise(training, step).to(run.device)
+        losses = _losses(model, batch, noise, table, training)
         optimiser.zero_grad(set_to_none=True)
         losses.total.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
+        torch.nn.utils.clip_grad_norm_(model.parameters(), MAX_GRADIENT)
         optimiser.step()
-        late = time.monotonic() >= deadline
-        if (step + 1) % save_every == 0 or step + 1 == steps or late:
-            save_checkpoint(checkpoint, model, optimiser, training, step + 1)
-        if step + 1 == plateau_end(steps):
-            save_checkpoint(
-                checkpoint.with_suffix(".plateau.safetensors"), model, optimiser, training, step + 1
-            )
-        samples = samples_after(step + 1, training)
-        if snapshots and step + 1 in {steps >> k for k in range(1, 6)}:
-            save_weights(
-                snapshots / f"{variant}-{samples:09d}.safetensors", model, {"samples": str(samples)}
-            )
-        on_step(
-            Progress(
-                samples,
-                float(losses.total.detach()),
-                float(losses.reconstruction.detach()),
-                float(losses.contrastive.detach()),
-                losses.matched,
-            )
-        )
-        step += 1
-        if late and step < steps:
+
+        is_late = time.monotonic() >= run.deadline
+        keeper.keep(step + 1, is_late=is_late)
+        on_step(losses.progress(samples_after(step + 1, training)))
+        if is_late and step + 1 < steps:
             return None
     return model
+
+
+def _noise(training: Training, step: int) -> Tensor:
+    """Normal noise of the latent variables (batch, latent) in a step."""
+    rng = np.random.default_rng((training.seed, 2, step))
+    return torch.from_numpy(rng.standard_normal((training.batch, training.latent), np.float32))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Keeper:
+    """Writes the checkpoints and snapshots of a training."""
+
+    run: TrainingRun
+    model: Completion
+    optimiser: torch.optim.Optimizer
+    training: Training
+
+    def save(self, done: int) -> None:
+        """Renew the checkpoint, after ``done`` steps."""
+        self._save(self.run.checkpoint, done)
+
+    def keep(self, done: int, *, is_late: bool) -> None:
+        """Write the files that are due after ``done`` steps, or when the time is over."""
+        steps = steps_of(self.training)
+        if done % self.run.save_every == 0 or done == steps or is_late:
+            self.save(done)
+        if done == plateau_end(steps):
+            self._save(self.run.plateau, done)
+        if self.run.snapshots and done in {steps >> k for k in range(1, 6)}:
+            samples = samples_after(done, self.training)
+            name = f"{self.model.encoder.variant}-{samples:09d}.safetensors"
+            save_weights(self.run.snapshots / name, self.model, {"samples": str(samples)})
+
+    def _save(self, path: Path, done: int) -> None:
+        save_checkpoint(path, self.model, self.optimiser, self.training, done)

@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.numerics import transforms
-from semloc_logs.settings import ResolvedFusion, Training
+from semloc_logs.settings import STREET_VOXEL, ResolvedFusion, Training
 from semloc_logs.subvolumes.cut import SIZE, WIDE, turn
 from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap, Fuser
 
 U8 = NDArray[np.uint8]
 Pair = tuple[U8, U8, U8]
-PER_FRAME = 12
+PER_FRAME = 12  # pairs that are tried
+MIN_OCCUPIED = 40  # voxels of a subvolume that is worth describing
 # m at 0.30 m voxels: subvolumes are so near to their frame; a long stretch
 REACH, LONG = 30.0, 20.0
 ROW_GROUP = 32  # pairs that are read together
@@ -69,60 +70,72 @@ def cut_pairs(
     fusion: ResolvedFusion,
     training: Training,
     rng: np.random.Generator,
-    min_occupied: int = 40,
-    asked: Sequence[SceneFrame] | None = None,
+    queries: Sequence[SceneFrame] | None = None,
 ) -> list[Pair]:
-    """(incomplete (64, 64, 32), complete (32, 32, 32), complete seen a little shifted and turned
-    (64, 64, 32)) voxel states.
+    """Voxel states: incomplete (64, 64, 32), complete (32, 32, 32), and complete, a little shifted
+    and turned, (64, 64, 32).
 
     ``frames`` are fused to the complete map; the incomplete views are of single frames, five in a
-    row, or 20 m of the frames ``asked``, by default the same. The middle subvolume of an incomplete
-    view, at least, has ``min_occupied`` occupied voxels.
+    row, or 20 m of the frames ``queries``, by default the same. The middle subvolume of an
+    incomplete view, at least, has ``MIN_OCCUPIED`` occupied voxels.
     """
     v = fusion.voxel_size
-    scale = v / 0.30
+    scale = v / STREET_VOXEL
     whole, whole_low = _dense(fuse(frames, fusion))
     surface = np.argwhere(occupied(whole)) + whole_low
-    asked = frames if asked is None else asked
+    queries = frames if queries is None else queries
     out = []
-    for i in range(len(asked)):
-        part, part_low = _dense(fuse(_stretch(asked, i, scale, training.tilt, rng), fusion))
+    for i in range(len(queries)):
+        part, part_low = _dense(fuse(_stretch(queries, i, scale, training.tilt, rng), fusion))
         seen = np.argwhere(occupied(part)) + part_low
-        here = asked[i].map_T_base[:2, 3] / v
-        seen = seen[np.linalg.norm(seen[:, :2] - here, axis=1) < REACH * scale / v]
+        position = queries[i].map_T_base[:2, 3] / v
+        seen = seen[np.linalg.norm(seen[:, :2] - position, axis=1) < REACH * scale / v]
         if not len(seen):
             continue
         for _ in range(PER_FRAME):
-            xy = seen[rng.integers(len(seen)), :2] + rng.uniform(-12, 12, 2)
-            column = surface[(np.abs(surface[:, :2] - xy) < SIZE / 2).all(1), 2]
-            if len(column) < min_occupied:
+            centre = _centre(seen, surface, rng)
+            if centre is None:
                 continue
-            # the map's layers are 8 voxels apart: the lowest surface lies anywhere in the lowest
-            # eight voxels, or a little above
-            bottom = np.percentile(column, 5) - rng.uniform(0, 9)
-            centre = np.array([*xy, np.floor(bottom) + SIZE / 2])
             yaw = rng.uniform(0, 2 * np.pi)
-            incomplete, other, complete = (
-                np.empty(s, np.uint8)
-                for s in ((BROAD, BROAD, SIZE), (BROAD, BROAD, SIZE), (SIZE, SIZE, SIZE))
-            )
-            turn(part, part_low, yaw, centre, incomplete)
-            if occupied(incomplete[16:-16, 16:-16]).sum() < min_occupied:
+            incomplete = _cut(part, part_low, yaw, centre, BROAD)
+            if occupied(incomplete[16:-16, 16:-16]).sum() < MIN_OCCUPIED:
                 continue
-            turn(whole, whole_low, yaw, centre, complete)
+            complete = _cut(whole, whole_low, yaw, centre, SIZE)
             shift = (
-                training.shift / 0.30 * np.array([*rng.uniform(-1, 1, 2), rng.uniform(-0.8, 0.8)])
+                training.shift
+                / STREET_VOXEL
+                * np.array([*rng.uniform(-1, 1, 2), rng.uniform(-0.8, 0.8)])
             )
-            turn(
-                whole,
-                whole_low,
-                yaw + rng.uniform(-training.turn, training.turn),
-                centre + shift,
-                other,
-            )
-            if occupied(other).sum() >= min_occupied:
+            turned = yaw + rng.uniform(-training.turn, training.turn)
+            other = _cut(whole, whole_low, turned, centre + shift, BROAD)
+            if occupied(other).sum() >= MIN_OCCUPIED:
                 out.append((incomplete, complete, other))
     return out
+
+
+def _centre(
+    seen: NDArray[np.int64], surface: NDArray[np.int64], rng: np.random.Generator
+) -> NDArray[np.float64] | None:
+    """The centre of a subvolume near a random voxel that was ``seen``; None where the map has too
+    little ``surface``.
+    """
+    xy = seen[rng.integers(len(seen)), :2] + rng.uniform(-12, 12, 2)
+    column = surface[(np.abs(surface[:, :2] - xy) < SIZE / 2).all(1), 2]
+    if len(column) < MIN_OCCUPIED:
+        return None
+    # the map's layers are 8 voxels apart: the lowest surface lies anywhere in the lowest eight
+    # voxels, or a little above
+    bottom = np.percentile(column, 5) - rng.uniform(0, 9)
+    return np.array([*xy, np.floor(bottom) + SIZE / 2])
+
+
+def _cut(
+    state: U8, low: NDArray[np.int64], yaw: float, centre: NDArray[np.float64], width: int
+) -> U8:
+    """The box (width, width, 32) of a map about ``centre``, turned by ``yaw``."""
+    box = np.empty((width, width, SIZE), np.uint8)
+    turn(state, low, yaw, centre, box)
+    return box
 
 
 def _stretch(

@@ -5,7 +5,6 @@ vocabulary, all resumable.
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.completion_scores import completion_scores
 from semloc_logs.training.descriptor_samples import shard_descriptors
-from semloc_logs.training.network_training import Progress, train
+from semloc_logs.training.network_training import Progress, TrainingRun, train
 from semloc_logs.training.own_sessions import cut_stretch, stretch_tasks
 from semloc_logs.training.pairs import read_shard, rows_of
 from semloc_logs.training.scene_shards import make_shard, scene_tasks
@@ -43,10 +42,10 @@ REPORT_SECONDS = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Packed:
-    """Shards of pairs to train on, of which ``train[i]`` may wait until it is there, and those that
-    only measure.
+    """Shards of pairs to train on, and shards that only measure.
 
-    Shards that ``drop`` names as used, by number, are made again when they are needed again.
+    ``train[i]`` may wait until it is made. ``drop(n)`` removes the used ones before number n; they
+    are made again when they are needed again.
     """
 
     train: Sequence[Path]
@@ -68,12 +67,11 @@ class Packed:
 def simulated_shards(
     folder: Path, settings: Resolved, engine: Engine, note: Note, samples: int = 0
 ) -> Packed:
-    """Pairs from ``training.scenes`` simulated scenes, as a training that has seen ``samples``
-    samples goes on to need them.
+    """Pairs from ``training.scenes`` simulated scenes, for a training that has seen ``samples``.
 
     They are made in the order in which training uses them, a few ahead of it, while ``engine`` is
-    open; shards that are there for the same settings stay. Those that measure are made when they
-    are read.
+    open; existing shards for the same settings stay. Shards that measure are made when they are
+    read.
     """
     tasks = scene_tasks(
         _shard_folder(folder, "simulated", settings), settings.training.scenes, settings
@@ -99,13 +97,15 @@ def simulated_shards(
 def session_shards(
     folder: Path, sessions: Sequence[SessionFolder], settings: Resolved, engine: Engine, note: Note
 ) -> Packed:
-    """Pairs from fused sessions with poses, a shard for each stretch of road. Raises SettingsError
-    when there is none.
+    """Pairs from fused sessions with poses, a shard for each stretch of road.
+
+    Raises SettingsError when there is none.
     """
     tasks = stretch_tasks(_shard_folder(folder, "sessions", settings), sessions, settings)
     if not tasks:
         raise SettingsError(
-            "No session of the workspace has poses and enough keyframes to train on: fuse longer drives with 'semloc fuse'."
+            "No session of the workspace has poses and enough keyframes to train on: "
+            "fuse longer drives with 'semloc fuse'."
         )
     out = []
     for shard in engine.map(cut_stretch, tasks):
@@ -116,11 +116,12 @@ def session_shards(
 
 
 def given_shards(folder: Path) -> list[Path]:
-    """The shards (.parquet) of a folder of packed pairs. Raises SettingsError when there is none."""
+    """The shards (.parquet) of a folder of packed pairs; SettingsError without any."""
     shards = sorted(folder.glob("*.parquet"))
     if not shards:
         raise SettingsError(
-            f"{folder}: no shards of packed pairs (.parquet); 'semloc train' leaves them below its checkpoint folder."
+            f"{folder}: no shards of packed pairs (.parquet); "
+            "'semloc train' leaves them below its checkpoint folder."
         )
     return shards
 
@@ -134,57 +135,58 @@ def _shard_folder(folder: Path, kind: str, settings: Resolved) -> Path:
     return folder / f"{kind}-{relevant.fingerprint('fusion', 'training')}"
 
 
+class _Reporter:
+    """Notes of a training's progress, every few seconds and at its end."""
+
+    def __init__(self, variant: str, samples: int, note: Note) -> None:
+        self._variant = variant
+        self._samples = samples
+        self._note = note
+        self._started = time.monotonic()
+        self._last = 0.0
+        self._first_samples: int | None = None
+
+    def take(self, step: Progress) -> None:
+        """Report one step, if it is time."""
+        now = time.monotonic()
+        if self._first_samples is None:
+            self._first_samples = step.samples
+        if now - self._last < REPORT_SECONDS and step.samples < self._samples:
+            return
+        self._last = now
+        rate = (step.samples - self._first_samples) / max(now - self._started, 1e-9)
+        self._note(
+            f"{self._variant}: {min(step.samples, self._samples)} of {self._samples} samples, "
+            f"{rate:.0f} a second, reconstruction {step.reconstruction:.3f}, "
+            f"contrastive {step.contrastive:.3f}, matched {step.matched:.0%}"
+        )
+
+
 def learn_descriptor(
     variant: str,
     shards: Packed,
     settings: Resolved,
-    checkpoint: Path,
+    run: TrainingRun,
     output: Path,
     note: Note,
-    *,
-    device: str = "cpu",
-    deadline: float = math.inf,
-    snapshots: Path | None = None,
 ) -> dict[str, float] | None:
     """Train ``variant``, measure on the held-out shards, write the weights with a card; the scores.
 
-    Goes on from ``checkpoint`` if it is there. None, with a checkpoint, where ``time.monotonic()``
-    passed ``deadline`` before the end. Raises SettingsError when there are too few shards to hold
-    any out.
+    Continues from the checkpoint of ``run``, if any. None, with a checkpoint, when its deadline
+    passes before the end. Raises SettingsError when there are too few shards to hold any out.
     """
     if not len(shards.held_out):
         raise SettingsError(
-            f"Training needs at least {HELD_OUT + 1} scenes or stretches of road, not {len(shards.train)}: two of them only measure."
+            f"Training needs at least {HELD_OUT + 1} scenes or stretches of road, "
+            f"not {len(shards.train)}: two of them only measure."
         )
-    training = settings.training
-    started = time.monotonic()
-    spoke = 0.0
-    first = -1
+    reporter = _Reporter(variant, settings.training.samples, note)
 
-    def tell(step: Progress) -> None:
-        nonlocal spoke, first
-        now = time.monotonic()
-        if first < 0:
-            first = step.samples
+    def on_step(step: Progress) -> None:
         shards.drop(scene_window(step.samples, len(shards.train)).start - SCENES_KEPT)
-        if now - spoke >= REPORT_SECONDS or step.samples >= training.samples:
-            spoke = now
-            rate = (step.samples - first) / max(now - started, 1e-9)
-            losses = f"reconstruction {step.reconstruction:.3f}, contrastive {step.contrastive:.3f}, matched {step.matched:.0%}"
-            note(
-                f"{variant}: {min(step.samples, training.samples)} of {training.samples} samples, {rate:.0f} a second, {losses}"
-            )
+        reporter.take(step)
 
-    model = train(
-        variant,
-        shards.train,
-        training,
-        checkpoint,
-        tell,
-        device=device,
-        deadline=deadline,
-        snapshots=snapshots,
-    )
+    model = train(variant, shards.train, settings.training, run, on_step)
     if model is None:
         return None
     held_out = [tuple(part[:SCORED] for part in read_shard(shard)) for shard in shards.held_out]
@@ -227,30 +229,29 @@ def use_threads(count: int) -> None:
 
 
 def _card(settings: Resolved, shards: int, **facts: Any) -> dict[str, str]:
-    """What a model was made of, as strings for the file's metadata."""
+    """The origin of a model, as strings for the file's metadata."""
     training = settings.training
-    said = {
+    card = {
         "version": semloc_logs.__version__,
         "samples": training.samples,
         "shards": shards,
         "seed": training.seed,
     }
-    said |= {
+    card |= {
         "voxel_size": settings.fusion.voxel_size,
         "training": training.model_dump(mode="json"),
         **facts,
     }
-    return {k: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for k, v in said.items()}
+    return {k: v if isinstance(v, str) else json.dumps(v, sort_keys=True) for k, v in card.items()}
 
 
 def device_of(name: str) -> str:
-    """``cpu`` or ``cuda`` for ``auto``, ``cpu`` or ``cuda``. Raises SettingsError for a GPU that is
-    not there.
-    """
+    """``cpu`` or ``cuda`` for ``auto``, ``cpu`` or ``cuda``; SettingsError without such a GPU."""
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and not torch.cuda.is_available():
         raise SettingsError(
-            "There is no GPU that torch can use here: train with --device cpu, or install a torch build for this GPU."
+            "torch finds no GPU that it can use: "
+            "train with --device cpu, or install a torch build for this GPU."
         )
     return name

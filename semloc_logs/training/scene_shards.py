@@ -26,11 +26,13 @@ def make_shard(task: SceneTask) -> Path:
     if not task.shard.exists():
         scene = training_scene(task.seed)
         mapped = [scene_frame(f) for f in scene.mapped]
-        asked = mapped if scene.asked is scene.mapped else [scene_frame(f) for f in scene.asked]
+        queries = (
+            mapped if scene.queries is scene.mapped else [scene_frame(f) for f in scene.queries]
+        )
         rng = np.random.default_rng((task.settings.training.seed, 3, task.seed))
         write_shard(
             task.shard,
-            cut_pairs(mapped, task.settings.fusion, task.settings.training, rng, asked=asked),
+            cut_pairs(mapped, task.settings.fusion, task.settings.training, rng, queries),
         )
     return task.shard
 

@@ -39,7 +39,7 @@ from semloc_logs.simulation.town.street import build_street, street_ground
 RAYS = 60_000  # a sweep at most
 RANGE = 60.0  # m
 CAMERA_STEP = 3  # every third pixel and row of a camera is cast
-ASKED = 36  # frames of the second drive
+QUERY_FRAMES = 36  # frames of the second drive
 LABEL_NOISE = 0.02, 0.2  # share of wrong labels of a session, least and most
 KINDS = {5: "hall", 8: "forest", 11: "room"}  # by seed modulo 12; the others are streets
 ROOM_SCALE = 6.0  # a room in voxels of 0.05 m looks as one six times as large in voxels of 0.30 m
@@ -62,12 +62,10 @@ class TrainingFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingScene:
-    """Frames of the drive that maps a place, and of the drive that asks about it; these may be the
-    same frames.
-    """
+    """Frames of the drive that maps a place, and of the query drive; these may be the same."""
 
     mapped: list[TrainingFrame]
-    asked: list[TrainingFrame]
+    queries: list[TrainingFrame]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,19 +118,19 @@ def training_scene(seed: int, frames: int = 60) -> TrainingScene:
     rng = np.random.default_rng([seed, 77])
     kind = KINDS.get(seed % 12, "street")
     if kind == "hall":
-        mapping, asking = _hall(rng, seed, frames)
+        mapping, querying = _hall(rng, seed, frames)
     elif kind == "room":
-        mapping, asking = _room(rng, seed, frames)
+        mapping, querying = _room(rng, seed, frames)
     else:
-        mapping, asking = _street(rng, seed, frames, forest=kind == "forest")
+        mapping, querying = _street(rng, seed, frames, forest=kind == "forest")
     rig = _rig(rng, kind)
     scale = ROOM_SCALE if kind == "room" else 1.0
     mapped = [_enlarged(f, scale) for f in _frames(mapping, rng, rig, 2 * seed)]
-    if asking is None:
+    if querying is None:
         return TrainingScene(mapped, mapped)
     other = rig if rng.random() < 0.4 else _rig(rng, kind)
     return TrainingScene(
-        mapped, [_enlarged(f, scale) for f in _frames(asking, rng, other, 2 * seed + 1)]
+        mapped, [_enlarged(f, scale) for f in _frames(querying, rng, other, 2 * seed + 1)]
     )
 
 
@@ -239,7 +237,7 @@ def _street(
         poses = np.concatenate([poses, again(frames - once)])
     mapping = drive(poses, _condition(rng, 0))
     return mapping, drive(
-        again(min(ASKED, once)), _condition(rng, 1)
+        again(min(QUERY_FRAMES, once)), _condition(rng, 1)
     ) if rng.random() < 0.6 else None
 
 
@@ -258,7 +256,7 @@ def _hall(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
         return _Drive(world, poses, np.arange(count, dtype=np.float64), None)
 
     return drive(line, frames), drive(
-        line[::-1], min(ASKED, frames)
+        line[::-1], min(QUERY_FRAMES, frames)
     ) if rng.random() < 0.6 else None
 
 
@@ -281,5 +279,5 @@ def _room(rng: Rng, seed: int, frames: int) -> tuple[_Drive, _Drive | None]:
         poses[:, :3, :3] = poses[:, :3, :3] @ nod
         return _Drive(build_room(seed, condition), poses, np.arange(count, dtype=np.float64), None)
 
-    again = walk(line[::-1], min(ASKED, frames), 1) if rng.random() < 0.6 else None
+    again = walk(line[::-1], min(QUERY_FRAMES, frames), 1) if rng.random() < 0.6 else None
     return walk(line, frames, 0), again

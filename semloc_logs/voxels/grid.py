@@ -145,7 +145,7 @@ class Fuser:
         sigma: NDArray[np.floating] | None = None,
         map_T_points: NDArray[np.float64] | None = None,
     ) -> None:
-        """Integrate a frame, with the arguments of :meth:`Carver.marks`."""
+        """Integrate a frame; the arguments are as of :meth:`Carver.marks`."""
         self.take(self._carver.marks(points, label, origin, sigma, map_T_points))
 
     def take(self, marks: Marks) -> None:

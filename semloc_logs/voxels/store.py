@@ -1,4 +1,4 @@
-"""Keyframes, blocks and voxels as Parquet: what fusion keeps (DESIGN: contracts, workspace)."""
+"""Keyframes, blocks and voxels as Parquet: what fusion keeps (docs/reference/tables.md)."""
 
 from __future__ import annotations
 

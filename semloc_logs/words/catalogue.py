@@ -113,9 +113,9 @@ class Change:
             (self.merged, "merged", "segment"),
             (self.dropped, "removed", "old file"),
         ]
-        sentences = [f"{n} {what}{'' if n == 1 else 's'} {done}" for n, done, what in parts if n]
+        done = [f"{n} {what}{'' if n == 1 else 's'} {verb}" for n, verb, what in parts if n]
         return ", ".join(
-            sentences
+            done
             + (
                 [f"kept in memory as it cannot be written ({self.unwritten})"]
                 if self.unwritten
@@ -153,7 +153,7 @@ def segments(
 def update(work: Workspace) -> dict[str, dict[str, Any]]:
     """Bring the index of every variant up to date after checking all of its files.
 
-    For each variant ``changed``, a sentence, and its ``segments``: ``file``, ``words``,
+    For each variant the change ``changed``, a sentence, and its ``segments``: ``file``, ``words``,
     ``bytes``, ``sessions``. Raises WorkspaceError when no session was described.
     """
     described = [f for f in work.sessions() if f.words_json.exists()]

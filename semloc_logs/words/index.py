@@ -7,7 +7,7 @@ that are as near as the last, are found by counting bits. Of these the nearest a
 *asymmetric* distance (Gordo et al. 2014): a bit that differs counts as much as the query's
 projection lies off the cell's threshold, as bits of projections close to it mean little. That finds
 more true neighbours than the Hamming distance alone does, for a few microseconds a query; the
-distance to the centroid of an entry's word adds nothing to it (benchmarks/README.md, Words).
+distance to the centroid of an entry's word adds nothing to it (docs/benchmarks.md, Words).
 
 Matches do not depend on how words are spread over segments: the budget counts words of all of them,
 and of equally near entries the first by submap and row is nearer.
@@ -273,7 +273,7 @@ def _look(
 def _scan(codes: U64, ranges: Ranges, lists: _Lists, size: int, count: I64, limit: I64) -> I64:
     """Queries, positions and probes (3, m) of the entries of a segment among the ``size`` nearest.
 
-    These may match and are the nearest so far. ``count`` (n, 66) and ``limit`` (n,) are as in
+    These may match and are the nearest so far. ``count`` (n, 66) and ``limit`` (n,) are of
     :func:`_look` and continue from segment to segment.
     """
     offsets, firsts, lasts, _ = ranges
@@ -374,6 +374,7 @@ class Index:
     def __init__(self, vocabulary: Vocabulary, parts: Sequence[Part], budget: int = BUDGET) -> None:
         self.vocabulary = vocabulary
         self.budget = budget
+        self.shortlist = SHORTLIST
         self.parts = sorted((p for p in parts if len(p.segment)), key=lambda p: -len(p.segment))
         self._square = np.square(vocabulary.children).sum(2)
         self._live = np.zeros(WORDS, np.int64)
@@ -453,7 +454,7 @@ class Index:
         for number, p in enumerate(self.parts):
             s = p.segment
             lists = _Lists(s.starts, s.code, s.place, s.row, *allowed.of(p.group))
-            m = _scan(codes, ranges, lists, max(SHORTLIST, k), count, limit)
+            m = _scan(codes, ranges, lists, max(self.shortlist, k), count, limit)
             scanned.append(np.concatenate([m, np.full((1, m.shape[1]), number)]))
             candidates.append((s.code[m[1]], p.group[s.place[m[1]]] << 32 | s.row[m[1]]))
         if not scanned:

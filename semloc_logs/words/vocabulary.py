@@ -7,7 +7,7 @@ made of: 2^16 words in 4.3 MB, as the children are stored in steps of 2^-8, one 
 Thresholds of the code are the medians of each *cell*, so within a cell half of all bits are set.
 Jegou et al. have them for every word; here a word has a handful of descriptors to take a median of,
 and thresholds at the words' centroids find no more true neighbours than thresholds of cells do
-(benchmarks/README.md, Words), while every word of a cell would need codes of its own of the query.
+(docs/benchmarks.md, Words), while every word of a cell would need codes of its own of the query.
 
 Descriptors, directions and centroids are multiples of 2^-11 (children of 2^-8), so that words do
 not depend on the order in which a BLAS with so many threads adds: see

@@ -24,6 +24,7 @@ from semloc_logs.stages.close import Selection
 from semloc_logs.stages.report import Report
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
+from semloc_logs.training.network_training import TrainingRun
 from semloc_logs.training.runs import Packed
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
@@ -430,19 +431,15 @@ def test_train_holds_two_shards_out_and_prints_scores(
         variant: str,
         shards: Packed,
         settings: Any,
-        checkpoint: Path,
+        run: TrainingRun,
         output: Path,
         note: Any,
-        *,
-        device: str,
-        deadline: float,
-        snapshots: Any,
     ) -> dict[str, float] | None:
-        assert (device, snapshots) == ("cpu", None)
-        if deadline < time.monotonic() + 60:
+        assert (run.device, run.snapshots) == ("cpu", None)
+        if run.deadline < time.monotonic() + 60:
             return None
         trained.append((variant, len(shards.train), settings.training.samples))
-        assert checkpoint == tmp_path / "w/checkpoint" / f"{variant}.safetensors"
+        assert run.checkpoint == tmp_path / "w/checkpoint" / f"{variant}.safetensors"
         return {"accuracy": 0.875}
 
     monkeypatch.setattr(
@@ -497,3 +494,13 @@ def test_all_logs_failing_is_1(tmp_path: Path) -> None:
     done = semloc("run", tmp_path / "no.mcap", "-w", tmp_path / "w")
     assert done.exit_code == 1
     assert "no.mcap" in done.stderr
+
+
+def test_every_point_format_of_the_library_is_offered() -> None:
+    from semloc_logs.cli import export
+    from semloc_logs.exports import FORMATS, POINT_FORMATS
+
+    form = next(p for p in export.command.params if p.name == "form")
+
+    assert export.POINTS == POINT_FORMATS
+    assert set(form.type.choices) == set(FORMATS)

@@ -31,10 +31,9 @@ def drive_session(
     road: NDArray[np.float64],
     submaps: list[tuple[int, int]],
     words: list[NDArray[np.float64]],
-    seconds: float = 1.0,
     saw: tuple[tuple[float, float], ...] = ((0.0, 5.0),),
 ) -> SessionMap:
-    """A session along ``road`` (n, 2), a keyframe every ``seconds``, with words at ``words`` (m, 3)
+    """A session along ``road`` (n, 2), a keyframe every second, with words at ``words`` (m, 3)
     of each submap of keyframes.
 
     Each keyframe ``saw`` points ahead and to its left, metres, at the height of its number in
@@ -47,7 +46,7 @@ def drive_session(
     poses = np.array([yaw_transform(0.0, (x, y, 0.0)) for x, y in road])
     columns: dict[str, Any] = {
         "keyframe": np.arange(n),
-        "stamp_ns": (np.arange(n) * seconds * 1e9).astype(np.int64),
+        "stamp_ns": (np.arange(n) * 1e9).astype(np.int64),
         "log_time_ns": np.arange(n),
         "topic": ["/points"] * n,
         "posed": [True] * n,

@@ -224,7 +224,7 @@ def test_files_that_are_missing_or_no_model(tmp_path: Path) -> None:
         Segmenter.open(Labels(source="onnx"))
     opened(tmp_path)
     spec = tmp_path / "spec.yaml"
-    with pytest.raises(SettingsError, match="does not exist"):
+    with pytest.raises(SettingsError, match="is missing: --seg-model"):
         Segmenter.open(Labels(source="onnx", model=tmp_path / "none.onnx", spec=spec))
     (tmp_path / "model.onnx").write_bytes(b"not a model" * 100)
     with pytest.raises(SettingsError, match="cannot be read as ONNX"):

@@ -116,7 +116,7 @@ def test_two_drives_through_a_basement_agree_on_up(shared: Callable[[str], Path]
                     Labeller(settings.labels, session),
                     settings.fusion,
                     scratch,
-                    lambda _: None,
+                    name,
                 )
                 session_T_map, _ = level(session, collected)
             finally:

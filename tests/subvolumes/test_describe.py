@@ -25,9 +25,9 @@ from semloc_logs.subvolumes.network import (
     Completion,
     Decoder,
     Encoder,
+    depth_to_space,
     descriptors,
-    from_eights,
-    in_eights,
+    space_to_depth,
 )
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.pairs import occupied
@@ -191,10 +191,10 @@ def test_other_strides_are_refused() -> None:
 
 def test_eights_there_and_back() -> None:
     volume = torch.arange(2 * 4 * 6 * 8).reshape(2, 4, 6, 8)
-    cells = in_eights(volume)
+    cells = space_to_depth(volume)
     assert cells.shape == (2, 2, 3, 4, 8)
     assert sorted(cells[1, 1, 2, 3].tolist()) == sorted(volume[1, 2:4, 4:6, 6:8].flatten().tolist())
-    assert torch.equal(from_eights(cells), volume)
+    assert torch.equal(depth_to_space(cells), volume)
 
 
 def test_shapes_of_the_network() -> None:

@@ -19,7 +19,7 @@ from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.training import network_training
 from semloc_logs.training.batches import batches
 from semloc_logs.training.completion_scores import completion_scores
-from semloc_logs.training.network_training import Progress, _seen, targets, train
+from semloc_logs.training.network_training import Progress, TrainingRun, _seen, targets, train
 from semloc_logs.training.pairs import (
     BROAD,
     SceneFrame,
@@ -150,7 +150,9 @@ def test_the_loss_goes_down(
 ) -> None:
     monkeypatch.setattr(network_training, "RATE", 0.1)  # of a warm-up over fifty steps
     seen: list[Progress] = []
-    model = train("geometric", shards[:1], short(12), tmp_path / "checkpoint", seen.append)
+    model = train(
+        "geometric", shards[:1], short(12), TrainingRun(tmp_path / "checkpoint"), seen.append
+    )
     assert [p.samples for p in seen] == [18 * (i + 1) for i in range(12)]
     assert seen[-1].reconstruction < 0.8 * seen[0].reconstruction
     assert seen[-1].loss < seen[0].loss
@@ -178,7 +180,7 @@ def test_a_training_that_was_stopped_ends_where_an_unbroken_one_does(
     shards: list[Path], tmp_path: Path
 ) -> None:
     settings = short(4)
-    whole = train("geometric", shards, settings, tmp_path / "whole")
+    whole = train("geometric", shards, settings, TrainingRun(tmp_path / "whole"))
 
     def stop(progress: Progress) -> None:
         if progress.samples == 3 * 18:
@@ -186,9 +188,11 @@ def test_a_training_that_was_stopped_ends_where_an_unbroken_one_does(
 
     checkpoint = tmp_path / "broken"
     with pytest.raises(_Stop):
-        train("geometric", shards, settings, checkpoint, stop, save_every=2)
+        train("geometric", shards, settings, TrainingRun(checkpoint, save_every=2), stop)
     seen: list[Progress] = []
-    resumed = train("geometric", shards, settings, checkpoint, seen.append, save_every=2)
+    resumed = train(
+        "geometric", shards, settings, TrainingRun(checkpoint, save_every=2), seen.append
+    )
     assert [p.samples for p in seen] == [54, 72]  # from the checkpoint, not from the start
     assert whole is not None
     assert resumed is not None
@@ -196,12 +200,12 @@ def test_a_training_that_was_stopped_ends_where_an_unbroken_one_does(
         assert torch.equal(a, b), name
     for odd, message in ((short(4, seed=1), "settings"), (short(5), "settings")):
         with pytest.raises(WorkspaceError, match=message):
-            train("geometric", shards, odd, checkpoint)
+            train("geometric", shards, odd, TrainingRun(checkpoint))
     with pytest.raises(WorkspaceError, match="settings"):
-        train("semantic", shards, settings, checkpoint)
+        train("semantic", shards, settings, TrainingRun(checkpoint))
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     with pytest.raises(WorkspaceError, match="broken"):
-        train("geometric", shards, settings, checkpoint)
+        train("geometric", shards, settings, TrainingRun(checkpoint))
 
 
 def test_a_training_stops_in_time_and_leaves_snapshots(shards: list[Path], tmp_path: Path) -> None:
@@ -214,15 +218,14 @@ def test_a_training_stops_in_time_and_leaves_snapshots(shards: list[Path], tmp_p
                 "geometric",
                 shards,
                 settings,
-                checkpoint,
+                TrainingRun(checkpoint, deadline=0.0, snapshots=tmp_path),
                 seen.append,
-                deadline=0.0,
-                snapshots=tmp_path,
             )
             is None
         )
         assert [p.samples for p in seen] == [18 * (i + 1) for i in range(steps)]
-    assert train("geometric", shards, settings, checkpoint, seen.append, deadline=0.0) is not None
+    run = TrainingRun(checkpoint, deadline=0.0)
+    assert train("geometric", shards, settings, run, seen.append) is not None
     assert len(seen) == 4
     assert sorted(p.name for p in tmp_path.glob("geometric-*")) == [
         "geometric-000000018.safetensors",
@@ -291,7 +294,10 @@ def test_a_scene_that_comes_too_late_ends_the_training_in_time(
     try:
         assert (
             train(
-                "geometric", Scenes(), short(4), tmp_path / "checkpoint", deadline=time.monotonic()
+                "geometric",
+                Scenes(),
+                short(4),
+                TrainingRun(tmp_path / "checkpoint", deadline=time.monotonic()),
             )
             is None
         )
@@ -313,13 +319,13 @@ def test_the_rate_rises_stays_and_falls() -> None:
 def test_a_training_can_be_made_longer_from_its_plateau(shards: list[Path], tmp_path: Path) -> None:
     short_run = tmp_path / "short"
     long_run = tmp_path / "long"
-    train("geometric", shards, short(4), short_run)
-    whole = train("geometric", shards, short(8), long_run)
+    train("geometric", shards, short(4), TrainingRun(short_run))
+    whole = train("geometric", shards, short(8), TrainingRun(long_run))
     with pytest.raises(WorkspaceError, match="settings"):
-        train("geometric", shards, short(8), short_run)  # its rate has fallen already
+        train("geometric", shards, short(8), TrainingRun(short_run))  # its rate has fallen already
     plateau = tmp_path / "short.plateau.safetensors"
     seen: list[Progress] = []
-    longer = train("geometric", shards, short(8), plateau, seen.append)
+    longer = train("geometric", shards, short(8), TrainingRun(plateau), seen.append)
     assert [p.samples for p in seen] == [18 * (i + 1) for i in range(3, 8)]
     assert whole is not None
     assert longer is not None
@@ -330,7 +336,7 @@ def test_a_training_can_be_made_longer_from_its_plateau(shards: list[Path], tmp_
 def test_nothing_to_train_on(shards: list[Path], tmp_path: Path) -> None:
     for paths in ([], shards[2:]):
         with pytest.raises(SettingsError, match="nothing to train on"):
-            train("geometric", paths, short(4), tmp_path / "checkpoint")
+            train("geometric", paths, short(4), TrainingRun(tmp_path / "checkpoint"))
     assert pq.read_metadata(shards[2]).num_rows == 0
 
 
@@ -338,9 +344,8 @@ def test_a_batch_without_anything_to_describe_keeps_the_weights_finite(tmp_path:
     bare = np.full((BROAD, BROAD, SIZE), 254, np.uint8)
     bare[32, 32, :3] = 2
     write_shard(tmp_path / "shard", [(bare, bare[16:-16, 16:-16], bare)])
-    model = train(
-        "geometric", [tmp_path / "shard"], short(1), tmp_path / "checkpoint", save_every=1
-    )
+    run = TrainingRun(tmp_path / "checkpoint", save_every=1)
+    model = train("geometric", [tmp_path / "shard"], short(1), run)
     assert model is not None
     assert all(torch.isfinite(p).all() for p in model.parameters())
 

@@ -17,6 +17,7 @@ from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import Resolved, load
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
+from semloc_logs.training.network_training import TrainingRun
 from semloc_logs.training.own_sessions import session_frames, stretch_tasks
 from semloc_logs.training.pairs import read_shard, write_shard
 from semloc_logs.training.runs import (
@@ -66,7 +67,12 @@ def test_a_descriptor_is_learned_measured_and_described(shards: list[Path], tmp_
     output = tmp_path / "geometric.safetensors"
     checkpoint = tmp_path / "checkpoint.safetensors"
     scores = learn_descriptor(
-        "geometric", Packed(shards[:2], shards[2:]), settings, checkpoint, output, notes.append
+        "geometric",
+        Packed(shards[:2], shards[2:]),
+        settings,
+        TrainingRun(checkpoint),
+        output,
+        notes.append,
     )
     assert scores is not None
     assert {"accuracy", "recall5"} <= set(scores)
@@ -85,7 +91,12 @@ def test_a_descriptor_is_learned_measured_and_described(shards: list[Path], tmp_
     first = load_file(output)
     notes = []
     assert learn_descriptor(
-        "geometric", Packed(shards[:2], shards[2:]), settings, checkpoint, output, notes.append
+        "geometric",
+        Packed(shards[:2], shards[2:]),
+        settings,
+        TrainingRun(checkpoint),
+        output,
+        notes.append,
     ) == pytest.approx(scores)
     assert notes == []
     assert all(torch.equal(tensor, first[name]) for name, tensor in load_file(output).items())
@@ -97,7 +108,7 @@ def test_two_scenes_are_too_few(shards: list[Path], tmp_path: Path) -> None:
             "geometric",
             Packed(shards[:2], []),
             _settings(),
-            tmp_path / "c",
+            TrainingRun(tmp_path / "c"),
             tmp_path / "w",
             lambda _: None,
         )
@@ -111,7 +122,7 @@ def test_a_vocabulary_belongs_to_its_weights(shards: list[Path], tmp_path: Path)
         "geometric",
         Packed(shards[:2], shards[2:]),
         settings,
-        tmp_path / "c.safetensors",
+        TrainingRun(tmp_path / "c.safetensors"),
         weights,
         lambda _: None,
     )

@@ -1,5 +1,5 @@
 """What training gets: labelled clouds in the base frame with true poses, of one drive that maps and
-one that asks.
+a query drive.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from semloc_logs.training.training_scenes import _rig, training_scene
 def test_scenes_have_the_promised_form(seed: int) -> None:
     scene = training_scene(seed, frames=8)
     assert len(scene.mapped) == 8
-    assert scene.asked is scene.mapped or len(scene.asked) in (5, 8)
-    for frame in [*scene.mapped, *scene.asked]:
+    assert scene.queries is scene.mapped or len(scene.queries) in (5, 8)
+    for frame in [*scene.mapped, *scene.queries]:
         points = frame.points
         origin = frame.origin
         labels = frame.labels
@@ -82,7 +82,7 @@ def test_sensors_and_label_errors_vary() -> None:
 
 def test_the_same_seed_gives_the_same_frames() -> None:
     first, again, other = (training_scene(seed, frames=2) for seed in (3, 3, 5))
-    for a, b in zip(first.mapped + first.asked, again.mapped + again.asked, strict=True):
+    for a, b in zip(first.mapped + first.queries, again.mapped + again.queries, strict=True):
         assert all(
             np.array_equal(getattr(a, k), getattr(b, k))
             for k in ("points", "origin", "labels", "world_T_base")

@@ -23,7 +23,7 @@ U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
 Figures = dict[str, dict[str, float | str]]
 
-SEEDS = (9001, 9002, 9003, 9004)  # of held-out streets: those of training count from 0
+SEEDS = (9001, 9002, 9003, 9004)  # of held-out streets; seeds of training count from 0
 PAIRS = 150  # of a street at most
 PAPER = 0.87  # accuracy (4.3)
 SHOWN = 6  # subvolumes in the picture
@@ -33,8 +33,8 @@ def completion_figures(found: Completed) -> Figures:
     """Over the voxels that the complete map observed, as classes or free; ``all_free`` and
     ``copy_input`` are the two trivial answers.
 
-    ``ours`` weighs what is occupied three times, ``most_probable`` says the likeliest label of each
-    voxel, ``input_completed`` keeps what the input observed and is ours elsewhere.
+    ``ours`` weighs occupied voxels three times, ``most_probable`` is the likeliest label of each
+    voxel, ``input_completed`` keeps the observations of the input and is ours elsewhere.
 
     ``accuracy``: share of right labels (the paper's figure); ``unobserved_accuracy``: the same
     where the input observed nothing; ``mean_iou``: mean over the occupied classes that occur;
@@ -43,7 +43,7 @@ def completion_figures(found: Completed) -> Figures:
     known = found.truth <= found.classes
     truth = found.truth[known]
     answers = {
-        "ours": found.said[known],
+        "ours": found.completed[known],
         "most_probable": found.probable[known],
         "all_free": np.full_like(truth, found.classes),
         "copy_input": found.given[known],
@@ -51,13 +51,13 @@ def completion_figures(found: Completed) -> Figures:
     hidden = answers["copy_input"] == found.classes + 1
     answers["input_completed"] = np.where(hidden, answers["ours"], answers["copy_input"])
     figures: Figures = {}
-    for who, said in answers.items():
-        confusion = np.bincount(truth.astype(np.int64) * 32 + said, minlength=32 * 32).reshape(
+    for who, codes in answers.items():
+        confusion = np.bincount(truth.astype(np.int64) * 32 + codes, minlength=32 * 32).reshape(
             32, 32
         )
         scores = _scores(confusion, found.classes)
         scores["unobserved_accuracy"] = (
-            float((said == truth)[hidden].mean()) if hidden.any() else 0.0
+            float((codes == truth)[hidden].mean()) if hidden.any() else 0.0
         )
         for name, value in scores.items():
             figures.setdefault(name, {})[who] = value
@@ -122,7 +122,10 @@ def completion_benchmark(
         draw_completions(
             picture,
             variant,
-            *(states_of(v[rows], found.classes) for v in (found.given, found.said, found.truth)),
+            *(
+                states_of(v[rows], found.classes)
+                for v in (found.given, found.completed, found.truth)
+            ),
         )
     return completion_figures(found)
 

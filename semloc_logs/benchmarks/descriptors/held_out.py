@@ -1,12 +1,12 @@
 """Streets of simulated towns that no training has seen, mapped by a camera and by a LIDAR, with
 queries from other drives through them.
 
-What the retrieval benchmark asks. Databases are fused from a drive along each street in summer, by
+The retrieval benchmark uses them. Databases are fused from a drive along each street in summer, by
 a camera that looks ahead and by a LIDAR. Queries are fused from one or five frames of another
 drive: another line in the lane, other parked cars and traffic; with the camera turned by 0, 90 or
 180 degrees, or with the LIDAR in snow. Each query map is turned by the paper's heading that is
-nearest to the true one, of a frame of unknown heading, so that what is left is anything up to half
-a step. Streets are kept in a folder.
+nearest to the true one, of a frame of unknown heading, so that the rest is anything up to half a
+step. Streets are kept in a folder.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from semloc_logs.benchmarks.descriptors.places import (
     HEADINGS,
     Place,
     Street,
-    asked_place,
     map_place,
     read_street,
+    turned_place,
     write_street,
 )
 from semloc_logs.benchmarks.versions import simulation_version
@@ -52,10 +52,10 @@ U8 = NDArray[np.uint8]
 # points and sensor (base frame, m), labels, standard deviation of the range
 Cloud = tuple[F32, F32, U8, F32 | None]
 
-TOWNS = 9001  # seed of the first town: those of training count from 0
+TOWNS = 9001  # seed of the first town; seeds of training count from 0
 APART = 10_000.0  # m between the towns in the common frame
 SENSORS = ("camera", "lidar")
-# and the sensor that asks
+# and the sensor of the query
 SCENARIOS = {"0": "camera", "90": "camera", "180": "camera", "season": "lidar"}
 SPACING, QUERY_SPACING = 1.5, 1.0  # m between frames
 FRAMES = (1, 5)  # of queries
@@ -96,21 +96,31 @@ class Extent:
     queries: int = 3
 
 
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How many held-out streets are made: descriptors of the database, query words of each
+    scenario, and the towns.
+    """
+
+    database: int = 100_000
+    queries: int = 2000
+    extent: Extent = Extent()
+
+
 def held_out(
     folder: Path,
     settings: Resolved,
     count: Callable[[Place], int],
-    database: int = 100_000,
-    queries: int = 2000,
-    extent: Extent = Extent(),
+    size: Size = Size(),
     on_progress: Callable[[str], None] = lambda _: None,
 ) -> HeldOut:
-    """As many streets as give ``database`` descriptors of each sensor by ``count``, simulated where
-    ``folder`` lacks them.
+    """Streets with ``size.database`` descriptors of each sensor by ``count``.
 
-    Another version of the simulation has files of its own. SettingsError when so many cannot be
-    had.
+    They are simulated where ``folder`` lacks them. Another version of the simulation has files of
+    its own. SettingsError when the towns have fewer descriptors.
     """
+    database = size.database
+    extent = size.extent
     folder = folder / simulation_version()
     note = {
         "schema_version": 1,
@@ -134,14 +144,16 @@ def held_out(
                 counts[kind] += held
             paths.append(path)
             on_progress(
-                f"{min(min(counts.values()), database)} of {database} descriptors' streets are simulated"
+                f"streets with {min(min(counts.values()), database)} of {database} descriptors "
+                "are simulated"
             )
     _scene.cache_clear()  # a town takes hundreds of megabytes
     if min(counts.values()) < database:
         raise SettingsError(
-            f"{database} held-out descriptors cannot be had: {min(counts.values())} at most."
+            f"The held-out towns have {min(counts.values())} descriptors, not {database}: "
+            "give a smaller --database."
         )
-    return HeldOut(tuple(paths), settings, database, queries)
+    return HeldOut(tuple(paths), settings, database, size.queries)
 
 
 def _is_made(path: Path, note: dict[str, Any]) -> bool:
@@ -249,7 +261,7 @@ def simulate_street(town: int, road: int, settings: Resolved, extent: Extent = E
                     again.camera(p, yaw) if sensor == "camera" else again.lidar(p) for p in poses
                 ]
                 found.append(
-                    _asked(settings, clouds, poses, common, float(rng.uniform(0, 2 * np.pi)))
+                    _query(settings, clouds, poses, common, float(rng.uniform(0, 2 * np.pi)))
                 )
     return Street(database, queries)
 
@@ -272,10 +284,10 @@ def _mapped(settings: Resolved, clouds: list[Cloud], poses: F64, common_T_map: F
     return map_place(blocks, track, float(np.median(poses[:, 2, 3])), common_T_map)
 
 
-def _asked(
+def _query(
     settings: Resolved, clouds: list[Cloud], poses: F64, common_T_map: F64, heading: float
 ) -> Place:
     """A query in a frame of some ``heading`` in the map, its origin in the middle of the drive."""
     map_T_query = yaw_transform(heading, tuple(poses[len(poses) // 2][:3, 3]))
     blocks, track = _fuse(settings, clouds, inverse(map_T_query) @ poses, settings.query.radius)
-    return asked_place(blocks, track, 0.0, common_T_map @ map_T_query, settings)
+    return turned_place(blocks, track, 0.0, common_T_map @ map_T_query, settings)

@@ -1,4 +1,4 @@
-"""Places to describe: maps of streets and queries, as the benchmarks of the descriptor keep them."""
+"""Places to describe: maps of streets and queries, as the benchmarks keep them."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ def map_place(blocks: BlockMap, track: F64, ground_z: float, common_T_map: F64) 
     )
 
 
-def asked_place(
+def turned_place(
     blocks: BlockMap, track: F64, ground_z: float, common_T_query: F64, settings: Resolved
 ) -> Place:
-    """A query map about the origin of its level frame, turned by that heading of the paper that is
-    nearest to the true one.
+    """A query map about the origin of its level frame, turned by the paper's heading nearest to the
+    true one.
 
-    ``track`` (n, 3) and ``ground_z`` are in the query's frame, metres. ``settings`` are resolved.
+    ``track`` (n, 3) and ``ground_z`` are in the query's frame, metres.
     """
     step = 2 * np.pi / HEADINGS
     yaw = step * round(float(np.arctan2(common_T_query[1, 0], common_T_query[0, 0])) / step)
@@ -124,5 +124,6 @@ def read_street(path: Path) -> Street:
         return Street(database, queries)
     except (KeyError, ValueError, TypeError, OverflowError):
         raise WorkspaceError(
-            f"{path} is no street of the retrieval benchmark: remove it, and it is simulated again."
+            f"{path} is not a street of the retrieval benchmark: "
+            "remove it, and it is simulated again."
         ) from None

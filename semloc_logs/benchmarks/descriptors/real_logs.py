@@ -39,12 +39,10 @@ def word_recalls(logs: Sequence[Path], truth: Path, settings: Resolved) -> Figur
     with tempfile.TemporaryDirectory(prefix="semloc-words-") as folder:
         target, query = fused_maps(logs, Path(folder), settings)
         tracks = read_truth(truth, {m.folder.name: m for m in (target, query)})
-        pairs = true_queries(query, target, tracks, settings)
+        queries = true_queries(query, target, tracks, settings)
 
         def recalls(encoder: Encoder, vocabulary: Vocabulary | None) -> list[WordRecall]:
-            return [
-                word_recall(query, k, target, T, settings, encoder, vocabulary) for k, T in pairs
-            ]
+            return [word_recall(true, settings, encoder, vocabulary) for true in queries]
 
         figures: Figures = {}
         for variant in VARIANTS:

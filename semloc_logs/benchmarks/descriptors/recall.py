@@ -1,8 +1,8 @@
-"""Are descriptors found again? The share of query subvolumes whose true place is among the nearest
+"""Recall of descriptors: the share of query subvolumes whose true place is among the nearest
 descriptors of a database.
 
-What is asked: :mod:`semloc_logs.benchmarks.descriptors.held_out`. Whatever describes a place can be
-measured: the network, trained or not, or a descriptor of a peer.
+Databases and queries: :mod:`semloc_logs.benchmarks.descriptors.held_out`. They are described by the
+network, trained or not, or by a descriptor of a peer.
 """
 
 from __future__ import annotations
@@ -116,12 +116,11 @@ def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:
     The share of query words whose true place is among the 5 nearest (L2) of exactly
     ``world.database`` database words: one of those is within the larger of 1.5 m (at 0.30 m voxels)
     and half a cell's diagonal of it. Query words without any such database word do not count.
-    Scenarios other than the five have a database of their own name, filled up with that of the
-    LIDAR.
+    Scenarios other than the five have a database of their own name, filled up with the LIDAR's.
     """
     v = world.settings.fusion.voxel_size
     found: dict[str, list[Words]] = {}
-    asked: dict[str, list[Words]] = {}
+    queries: dict[str, list[Words]] = {}
     rng = np.random.default_rng(0)
     for street in world.streets():
         for kind, place in street.database:
@@ -130,13 +129,15 @@ def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:
             for place in places:
                 words = _words(place, describe(place, True), v)
                 most = WORDS if name in DATABASES else None  # real queries are few
-                asked.setdefault(name, []).append(words[rng.permutation(len(words.centre))[:most]])
-    if "0" in asked:  # the camera that looks ahead asks the LIDAR's map too
-        asked["sensor"] = asked["0"]
+                queries.setdefault(name, []).append(
+                    words[rng.permutation(len(words.centre))[:most]]
+                )
+    if "0" in queries:  # the queries of the camera that looks ahead, in the LIDAR's map too
+        queries["sensor"] = queries["0"]
     databases = {kind: _joined(parts) for kind, parts in found.items()}
     radius = true_radius(world.settings)
     out = {}
-    for name, parts in asked.items():
+    for name, parts in queries.items():
         kinds = DATABASES.get(name, (name, "lidar"))
         out[name] = _recall(
             _joined(parts),
@@ -170,39 +171,39 @@ def _joined(parts: list[Words]) -> Words:
     )
 
 
-def _recall(asked: Words, database: Words, world: HeldOut, radius: float) -> float:
+def _recall(queries: Words, database: Words, world: HeldOut, radius: float) -> float:
     """Of as many query words as are wanted, on as large a database as is wanted; drawn at random,
     always the same.
     """
     rng = np.random.default_rng(1)
     away = (
-        cKDTree(database.centre).query(asked.centre)[0]
-        if len(database.centre) and len(asked.centre)
+        cKDTree(database.centre).query(queries.centre)[0]
+        if len(database.centre) and len(queries.centre)
         else np.zeros(0)
     )
     possible = rng.permutation(np.flatnonzero(away < radius))[: world.queries]
-    asked = asked[np.sort(possible)]
-    if not len(asked.centre):
+    queries = queries[np.sort(possible)]
+    if not len(queries.centre):
         return 0.0
-    beside = cKDTree(asked.centre).query(database.centre)[0] < BESIDE * radius / RADIUS
+    beside = cKDTree(queries.centre).query(database.centre)[0] < BESIDE * radius / RADIUS
     others = rng.permutation(np.flatnonzero(~beside))[: max(0, world.database - int(beside.sum()))]
     database = database[np.sort(np.r_[np.flatnonzero(beside), others])]
-    return float(found_again(asked, database, radius).mean())
+    return float(found_again(queries, database, radius).mean())
 
 
 def found_again(
-    asked: Words, database: Words, radius: float, nearest: int = NEAREST
+    queries: Words, database: Words, radius: float, nearest: int = NEAREST
 ) -> NDArray[np.bool_]:
     """Which words (m,) have one of their ``nearest`` descriptors (L2) within ``radius`` metres of
     where they truly are.
     """
-    out = np.zeros(len(asked.centre), bool)
+    out = np.zeros(len(queries.centre), bool)
     length = np.einsum("nd,nd->n", database.descriptor, database.descriptor)
     k = min(nearest, len(length))
     for i in range(0, len(out), BLOCK):
         rows = slice(i, i + BLOCK)
-        distance = length - 2 * asked.descriptor[rows] @ database.descriptor.T
+        distance = length - 2 * queries.descriptor[rows] @ database.descriptor.T
         best = np.argpartition(distance, k - 1, axis=1)[:, :k]
-        away = np.linalg.norm(database.centre[best] - asked.centre[rows, None], axis=2)
+        away = np.linalg.norm(database.centre[best] - queries.centre[rows, None], axis=2)
         out[rows] = (away < radius).any(1)
     return out

@@ -1,6 +1,4 @@
-"""`semloc benchmark retrieval`: is the true place of a subvolume among its nearest descriptors,
-trained beside random and FPFH?
-"""
+"""`semloc benchmark retrieval`: recall of trained descriptors beside random ones and FPFH."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from semloc_logs.benchmarks.descriptors.fpfh import fpfh_describes
-from semloc_logs.benchmarks.descriptors.held_out import HeldOut, held_out
+from semloc_logs.benchmarks.descriptors.held_out import HeldOut, Size, held_out
 from semloc_logs.benchmarks.descriptors.places import Place, Street
 from semloc_logs.benchmarks.descriptors.recall import (
     NoEncoder,
@@ -35,9 +33,11 @@ REAL = {"real_log": "semantic", "real_geometry_labels": "semantic", "real_geomet
 
 @dataclass(frozen=True, slots=True)
 class RetrievalChoice:
-    """What is measured: ``variants`` of the network, ``weights`` instead of the shipped ones,
-    descriptors of the database and words that ask in each scenario, ``work``: a folder that keeps
-    the simulated streets.
+    """Options of the benchmark.
+
+    ``variants`` of the network, ``weights`` instead of the shipped ones, descriptors of the
+    ``database`` and query words of each scenario, ``work``: a folder that keeps the simulated
+    streets.
     """
 
     variants: tuple[str, ...] = ("semantic",)
@@ -54,19 +54,20 @@ def retrieval_benchmark(
     real: Mapping[str, Street] | None = None,
     note: Note = lambda _: None,
 ) -> Figures:
-    """Recall at 5 of each scenario: ``trained``, ``random`` (mean of three seeds) and ``fpfh``,
-    where ``peers`` says which Python has it.
+    """Recall at 5 of each scenario: ``trained``, ``random`` (mean of three seeds) and ``fpfh``.
 
-    ``real`` streets, by name of their scenario, are asked for among the simulated ones: those of
-    ``REAL``. SettingsError for another peer, or weights of one variant for both.
+    ``peers`` names the Python that has FPFH. ``real`` streets, by names of their scenarios in
+    ``REAL``, are searched among the simulated ones. SettingsError for another peer, or weights of
+    one variant for both.
     """
     if set(peers) - {"fpfh"}:
         raise SettingsError(
-            f"Descriptors of '{next(iter(set(peers) - {'fpfh'}))}' cannot be compared with: give --peer fpfh=PYTHON."
+            f"Unknown peer '{min(set(peers) - {'fpfh'})}' of retrieval: give --peer fpfh=PYTHON."
         )
     if choice.weights is not None and len(choice.variants) > 1:
         raise SettingsError(
-            "One file of weights is for one variant: give --variant semantic or --variant geometric."
+            "One file of weights is for one variant: "
+            "give --variant semantic or --variant geometric."
         )
     settings = densely(settings).resolved()
     with ExitStack() as stack:
@@ -77,9 +78,8 @@ def retrieval_benchmark(
             work / "streets",
             settings,
             count_subvolumes(settings),
-            choice.database,
-            choice.queries,
-            on_progress=note,
+            Size(choice.database, choice.queries),
+            note,
         )
         figures: Figures = {}
         fpfh: dict[str, float] = {}
@@ -127,7 +127,7 @@ def _fpfh(world: HeldOut, python: str, folder: Path) -> dict[str, float]:
     def places() -> Iterator[tuple[Place, bool]]:
         for street in world.streets():
             yield from ((place, False) for _, place in street.database)
-            yield from ((place, True) for asked in street.queries.values() for place in asked)
+            yield from ((place, True) for places in street.queries.values() for place in places)
 
     same = network_describes(NoEncoder().eval(), world.settings)
     return recalls(

@@ -1,6 +1,4 @@
-"""Does the descriptor earn its place? Recall of word matches between two maps whose true alignment
-is known.
-"""
+"""Recall of word matches between two maps whose true alignment is known."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.benchmarks.descriptors.places import Place, Street, asked_place, map_place
+from semloc_logs.benchmarks.descriptors.places import Place, Street, map_place, turned_place
 from semloc_logs.closures.query import build_query, query_keyframes, query_members
 from semloc_logs.evaluation.truth import TrueTrack
 from semloc_logs.mapping.session_map import SessionMap
@@ -25,83 +23,96 @@ from semloc_logs.words.vocabulary import Vocabulary, train_vocabulary
 
 F64 = NDArray[np.float64]
 NEAR = 10.0  # m from the target's road
-FAR = 1e6
+FAR = 1e6  # m from every simulated street
+RADIUS = 1.5  # m between a query word's true place and a database word that counts
+NEAREST = 5  # database words of a query word that count
 
 
 @dataclass(frozen=True, slots=True)
 class WordRecall:
-    """Share of query words with a true place among their 5 nearest database words: by descriptor
-    (``exact``) and by vocabulary and code (``coded``); of ``words`` query words that have a
-    database word within ``radius`` metres of their true place.
+    """Share of query words with a true place among their 5 nearest database words.
+
+    ``exact`` by descriptor, ``coded`` by vocabulary and code; of ``words`` query words that have
+    one of ``database`` words within 1.5 m of their true place.
     """
 
     exact: float
     coded: float
     words: int
     database: int
-    radius: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueQuery:
+    """The query at ``keyframe`` of a session and its true place in the target's map, (4, 4)."""
+
+    query: SessionMap
+    keyframe: int
+    target: SessionMap
+    targetmap_T_querymap: F64
 
 
 def word_recall(
-    query: SessionMap,
-    keyframe: int,
-    target: SessionMap,
-    targetmap_T_querymap: F64,
-    settings: Resolved,
-    encoder: Encoder,
-    vocabulary: Vocabulary | None,
-    radius: float = 1.5,
-    k: int = 5,
+    true: TrueQuery, settings: Resolved, encoder: Encoder, vocabulary: Vocabulary | None
 ) -> WordRecall:
-    """Recall at ``k`` of the words of the query at ``keyframe``, in the search's heading nearest to
-    the true one.
+    """Recall of the words of a query, in the search's heading nearest to the true one.
 
     Without a ``vocabulary`` one is trained on the database's own descriptors.
     """
     v = settings.fusion.voxel_size
-    parts = [
-        d
-        for s in target.submaps
-        for d in describe_submap(
-            target.folder, s["id"], s["ground_z"], target.road(s), encoder, settings
-        )
-    ]
-    centre = np.concatenate([p.centre for p in parts]) * v
-    descriptor = np.concatenate([p.descriptor for p in parts])
-    place = query_place(query, keyframe, targetmap_T_querymap, settings)
+    centre, descriptor = _database_words(true.target, settings, encoder)
+    place = query_place(true.query, true.keyframe, true.targetmap_T_querymap, settings)
     d = settings.descriptor
-    asked = describe_map(
+    words = describe_map(
         place.state, place.low, place.ground_z, v, encoder, d.query_stride, d.min_occupied
     )
-    true = apply(place.common_T_map, asked.centre.astype(np.float64) * v)
-    distance = np.linalg.norm(true[:, None, :] - centre[None], axis=2)
-    possible = distance.min(1) < radius
+    true_centre = apply(place.common_T_map, words.centre.astype(np.float64) * v)
+    distance = np.linalg.norm(true_centre[:, None, :] - centre[None], axis=2)
+    possible = distance.min(1) < RADIUS
     if not possible.any():
-        return WordRecall(0.0, 0.0, 0, len(centre), radius)
-    similarity = asked.descriptor @ descriptor.T
-    nearest = np.argsort(-similarity, axis=1, kind="stable")[:, :k]
-    exact = np.asarray((np.take_along_axis(distance, nearest, 1) < radius).any(1))
-    words = vocabulary or train_vocabulary(descriptor)
-    index = Index.of_words(words, *words.words(descriptor), np.zeros(len(centre), np.int64))
-    matches = index.search(asked.descriptor, k, settings.closures.probes, Allowed(np.ones(1, bool)))
-    coded = np.zeros(len(true), bool)
-    np.logical_or.at(coded, matches.query, distance[matches.query, matches.entry] < radius)
+        return WordRecall(0.0, 0.0, 0, len(centre))
+
+    similarity = words.descriptor @ descriptor.T
+    nearest = np.argsort(-similarity, axis=1, kind="stable")[:, :NEAREST]
+    exact = np.asarray((np.take_along_axis(distance, nearest, 1) < RADIUS).any(1))
+
+    vocabulary = vocabulary or train_vocabulary(descriptor)
+    index = Index.of_words(
+        vocabulary, *vocabulary.words(descriptor), np.zeros(len(centre), np.int64)
+    )
+    matches = index.search(
+        words.descriptor, NEAREST, settings.closures.probes, Allowed(np.ones(1, bool))
+    )
+    coded = np.zeros(len(true_centre), bool)
+    np.logical_or.at(coded, matches.query, distance[matches.query, matches.entry] < RADIUS)
     return WordRecall(
         float(exact[possible].mean()),
         float(coded[possible].mean()),
         int(possible.sum()),
         len(centre),
-        radius,
     )
+
+
+def _database_words(
+    target: SessionMap, settings: Resolved, encoder: Encoder
+) -> tuple[F64, NDArray[np.float32]]:
+    """Centres (n, 3) in metres and descriptors (n, d) of all submaps."""
+    parts = [
+        words
+        for s in target.submaps
+        for words in describe_submap(
+            target.folder, s["id"], s["ground_z"], target.road(s), encoder, settings
+        )
+    ]
+    centre = np.concatenate([part.centre for part in parts]) * settings.fusion.voxel_size
+    return centre, np.concatenate([part.descriptor for part in parts])
 
 
 def query_place(
     query: SessionMap, keyframe: int, targetmap_T_querymap: F64, settings: Resolved
 ) -> Place:
-    """The query at ``keyframe``, turned to the nearest heading of the search, and its place in the
-    target's map frame.
-    """
-    asked = build_query(query, keyframe, settings)[0].blocks
+    """The query at ``keyframe`` in the target's map, turned to the search's nearest heading."""
+    blocks = build_query(query, keyframe, settings)[0].blocks
     querymap_T_query = np.eye(4)
     querymap_T_query[:3, 3] = query.map_T_base[keyframe][:3, 3]
     ground = float(query.ground_z[keyframe] - query.map_T_base[keyframe][2, 3])
@@ -112,27 +123,29 @@ def query_place(
             for i in members
         ]
     )
-    return asked_place(asked, track, ground, targetmap_T_querymap @ querymap_T_query, settings)
+    return turned_place(blocks, track, ground, targetmap_T_querymap @ querymap_T_query, settings)
 
 
 def true_queries(
     query: SessionMap, target: SessionMap, tracks: Mapping[str, TrueTrack], settings: Resolved
-) -> list[tuple[int, F64]]:
-    """Keyframes of ``query`` that ask within 10 m of the target's road, each with the true
-    ``targetmap_T_querymap`` (4, 4) there.
+) -> list[TrueQuery]:
+    """The queries within 10 m of the target's road.
 
-    Maps drift: the transform is that of the target's keyframe that is nearest.
+    Maps drift: their place is relative to the target's nearest keyframe.
     """
-    common = [tracks[m.folder.name].at(m.stamps_ns)[0] for m in (query, target)]
-    out = []
+    common_T_query, common_T_target = (
+        tracks[m.folder.name].at(m.stamps_ns)[0] for m in (query, target)
+    )
+    queries = []
     for k in query_keyframes(query, settings):
-        here = common[0][k]
-        away = np.linalg.norm(common[1][:, :3, 3] - here[:3, 3], axis=1)
-        near = int(np.argmin(away))
-        if away[near] < NEAR:
-            targetmap_T_common = target.map_T_base[near] @ inverse(common[1][near])
-            out.append((k, targetmap_T_common @ here @ inverse(query.map_T_base[k])))
-    return out
+        common_T_base = common_T_query[k]
+        away = np.linalg.norm(common_T_target[:, :3, 3] - common_T_base[:3, 3], axis=1)
+        nearest = int(np.argmin(away))
+        if away[nearest] < NEAR:
+            targetmap_T_common = target.map_T_base[nearest] @ inverse(common_T_target[nearest])
+            targetmap_T_querymap = targetmap_T_common @ common_T_base @ inverse(query.map_T_base[k])
+            queries.append(TrueQuery(query, k, target, targetmap_T_querymap))
+    return queries
 
 
 def real_street(
@@ -142,8 +155,9 @@ def real_street(
     name: str,
     settings: Resolved,
 ) -> Street:
-    """The submaps of ``target`` as a database and the queries of ``query``, both called ``name``;
-    far away from every simulated street.
+    """The submaps of ``target`` as a database and the queries of ``query``, both called ``name``.
+
+    Their common frame is far away from every simulated street.
     """
     common_T_map = np.eye(4)
     common_T_map[1, 3] = -FAR
@@ -154,7 +168,7 @@ def real_street(
         track = np.stack([apply(target.map_T_base[i], target.origins[i][None])[0] for i in frames])
         database.append((name, map_place(blocks, track, submap["ground_z"], common_T_map)))
     places = [
-        query_place(query, k, common_T_map @ T, settings)
-        for k, T in true_queries(query, target, tracks, settings)
+        query_place(query, true.keyframe, common_T_map @ true.targetmap_T_querymap, settings)
+        for true in true_queries(query, target, tracks, settings)
     ]
     return Street(database, {name: places})

@@ -1,4 +1,4 @@
-"""How good are classes from geometry, against the labels of a log or of simulated sweeps?
+"""Quality of classes from geometry, against the labels of a log or of simulated sweeps.
 
 The truth is the log's own label in the coarse set: road, sidewalk and terrain (parking and lane
 marking too) are ground; building, wall and fence construction; vegetation and, as in Cityscapes,
@@ -98,7 +98,8 @@ def measure_labels(logs: Sequence[Path], settings: Resolved) -> Figures:
                 voxels += _measure_session(session, settings, points, taken, sizes)
             else:
                 raise LogError(
-                    f"{log} has no poses, so its labels cannot be fused: give a log with a pose stream."
+                    f"{log} has no poses, so its labels cannot be fused: "
+                    "give a log with a pose stream."
                 )
     figures: Figures = {}
     for what, counts in (("points", points), ("voxels", voxels)):

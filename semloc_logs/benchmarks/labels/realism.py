@@ -71,7 +71,8 @@ def portrait(scan: Scan, fusion: ResolvedFusion) -> Portrait:
     on_ground = (label == ROAD) | (label == SIDEWALK)
     if not (on_ground & (flat < 12)).any():
         raise LogError(
-            "a sweep has no point of a road or pavement within 12 m, so its heights cannot be compared: give labelled sweeps"
+            "a sweep has no point of a road or pavement within 12 m, "
+            "so its heights cannot be compared: give labelled sweeps"
         )
     height = points[:, 2] - float(np.median(points[on_ground & (flat < 12), 2]))
     distance = np.linalg.norm(points, axis=1)
@@ -114,8 +115,8 @@ def _openness(
     first = order[np.unique(sector[order], return_index=True)[1]]
     nearest = np.full(_SECTORS, _FAR)
     nearest[sector[first]] = flat[stands[first]]
-    histograms["distance to what stands in a direction"] = _histogram(nearest, OPEN)
-    histograms["class of what stands in a direction"] = _classes(label[stands[first]])
+    histograms["distance to the nearest structure of a direction"] = _histogram(nearest, OPEN)
+    histograms["class of the nearest structure of a direction"] = _classes(label[stands[first]])
     return {
         f"first thing in a direction, {q} %: m": float(np.percentile(nearest, q))
         for q in (25, 50, 75)
@@ -123,7 +124,7 @@ def _openness(
 
 
 def _street(points: F64, flat: F64, height: F64, label: U8) -> dict[str, float]:
-    """Widths of the street beside the sensor, x being ahead; heights of houses, trees and ground."""
+    """Widths of the street beside the sensor (x ahead); heights of houses, trees and ground."""
     beside = np.abs(points[:, 0]) < 12
     out = {}
     road = points[beside & (label == ROAD), 1]
@@ -167,7 +168,7 @@ def _voxels(
     histograms: dict[str, F64],
     numbers: dict[str, float],
 ) -> None:
-    """The map of the sweep alone: classes of its voxels, and what subvolumes near the sensor hold."""
+    """The map of the sweep alone: classes of its voxels, content of subvolumes near the sensor."""
     fuser = Fuser(fusion)
     fuser.add(scan.points, scan.label, np.zeros(3))
     blocks = fuser.finish()
@@ -220,7 +221,8 @@ def measure_realism(
         for scan in log_sweeps(log, 4, repeat=False):
             if (scan.label == UNLABELLED).all():
                 raise LogError(
-                    f"{log} has no labels, so its classes cannot be compared: give a log with a label field."
+                    f"{log} has no labels, so its classes cannot be compared: "
+                    "give a log with a label field."
                 )
             real.append(portrait(scan, fusion))
     simulated = [portrait(scan, fusion) for seed in seeds for scan in town_sweeps(seed, sweeps)]
@@ -248,7 +250,7 @@ def compare(simulated: Sequence[Portrait], real: Sequence[Portrait]) -> Figures:
     for name in (
         "classes of points within 50 m",
         "classes of voxels within 30 m",
-        "class of what stands in a direction",
+        "class of the nearest structure of a direction",
     ):
         ours = _pooled(simulated, name)
         theirs = _pooled(real, name)

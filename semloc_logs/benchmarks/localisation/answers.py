@@ -1,5 +1,5 @@
-"""Localisation, judged: which keyframes ask under a condition, how far off an answer is, and the
-figures of many of them.
+"""Localisation, judged: the query keyframes of a condition, the error of an answer, and the figures
+of many answers.
 
 Every system gives for each query the pose that it ranks first, in the database's map, and a score
 of its own. It is judged against the database keyframe nearest to that pose, so that the drift of
@@ -41,9 +41,10 @@ LIMITS = {"1 m": (1.0, 5.0), "5 m": (5.0, 20.0)}
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a system said to the query at ``keyframe``: errors of its first pose (None: it found
-    none), its score, seconds, and errors of the pose that it accepted after it had heard all
-    queries (None: it accepted none), if it ``decides`` at all.
+    """The answer of a system to the query at ``keyframe``.
+
+    Errors of its first pose (None: it found none), its score, seconds, and errors of the pose that
+    it accepted after all queries (None: it accepted none), if it ``decides`` at all.
     """
 
     keyframe: int
@@ -82,7 +83,7 @@ def _within(limit: str, error_m: float | None, error_deg: float | None) -> bool:
 
 @dataclass(eq=False)
 class World:
-    """A fused session that asks and the database, with their truth."""
+    """A fused query session and the database, with their truth."""
 
     work: Workspace
     drive: WorldDrive
@@ -97,7 +98,7 @@ class World:
 
     @cached_property
     def true_query(self) -> F64:
-        """True poses (n, 4, 4) of the keyframes that ask."""
+        """True poses (n, 4, 4) of the query session's keyframes."""
         return read_tum(self.drive.truth).at(self.query.stamps_ns)[0]
 
     @cached_property
@@ -107,16 +108,14 @@ class World:
         return read_tum(database.truth).at(self.database.stamps_ns)[0]
 
     def keyframes(self, settings: Resolved, most: int) -> list[int]:
-        """At most ``most`` keyframes that ask, evenly among those that are where the condition
-        says.
-        """
-        possible = [k for k in query_keyframes(self.query, settings) if self._asks(k)]
+        """At most ``most`` query keyframes, evenly among those that meet the condition."""
+        possible = [k for k in query_keyframes(self.query, settings) if self._meets_condition(k)]
         if len(possible) <= most:
             return possible
         return [possible[round(i)] for i in np.linspace(0, len(possible) - 1, most)]
 
     def nearest(self, keyframe: int, count: int) -> list[int]:
-        """The database's keyframes truly nearest to that of the query."""
+        """The database's keyframes truly nearest to the query's."""
         return [int(i) for i in np.argsort(self._away(keyframe), kind="stable")[:count]]
 
     def _away(self, keyframe: int) -> F64:
@@ -124,7 +123,7 @@ class World:
             np.linalg.norm(self.true_database[:, :3, 3] - self.true_query[keyframe, :3, 3], axis=1)
         )
 
-    def _asks(self, keyframe: int) -> bool:
+    def _meets_condition(self, keyframe: int) -> bool:
         condition = self.drive.condition
         if condition == UNSEEN:
             return True

@@ -1,5 +1,5 @@
-"""The simulated city of the localisation benchmark: one drive that maps it and drives of several
-conditions that ask.
+"""The simulated city of the localisation benchmark: one drive that maps it, and query drives under
+several conditions.
 
 A drive of its own makes the city: three winding streets one after the other, then across all of
 them three more. The first half is the database. Queries come from the same streets in the same and
@@ -61,12 +61,12 @@ class WorldDrive:
 
 def world_drives(folder: Path) -> list[WorldDrive]:
     """The database's drive, and one of each condition and sensor."""
-    asking = [
+    queries = [
         WorldDrive(folder, f"{condition}_{sensor}", sensor, condition)
         for condition in CONDITIONS
         for sensor in SENSORS
     ]
-    return [WorldDrive(folder, DATABASE, "lidar", DATABASE), *asking]
+    return [WorldDrive(folder, DATABASE, "lidar", DATABASE), *queries]
 
 
 def world_path(seed: int) -> tuple[F64, int]:
@@ -121,7 +121,7 @@ def _line(plan: F64, first: int, condition: str) -> F64:
 
 
 def simulate_drive_log(drive: WorldDrive) -> str:
-    """Write the log of ``drive`` and its true trajectory, unless they are there; returns its name."""
+    """Write the log of ``drive`` and its true trajectory, unless they exist; returns its name."""
     if drive.log.exists():
         return drive.name
     seed = SEED + (drive.condition == UNSEEN)

@@ -100,7 +100,7 @@ class Localisation:
         if unknown:
             known = ", ".join(sorted({p.runner for p in PEERS}))
             raise SettingsError(
-                f"There is no peer '{min(unknown)}' to localise with: there are {known}."
+                f"Unknown peer '{min(unknown)}' of localisation: give one of {known}."
             )
         for name in self.engine.map(simulate_drive_log, self.drives):
             self.note(f"{name} is simulated")

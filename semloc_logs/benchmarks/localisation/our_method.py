@@ -315,7 +315,7 @@ def write_random(work: Workspace, settings: Resolved) -> None:
 
 
 def link_workspace(source: Workspace, target: Workspace) -> None:
-    """Link the sessions of ``source`` without their words into ``target``, unless they exist."""
+    """Link the sessions of ``source`` without words into ``target``, unless they exist there."""
     for session in source.sessions():
         goal = target.session(session.name)
         if not goal.session_json.exists():

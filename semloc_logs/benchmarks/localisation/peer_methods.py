@@ -1,10 +1,10 @@
-"""Others' localisation in the benchmark: the same keyframes as clouds, asked of each peer in a
+"""The peers' localisation in the benchmark: the same keyframes as clouds, given to each peer in a
 Python environment of its own.
 
-A cloud is what the keyframes within some length of road saw, in the level frame of its middle one,
-x along the drive. The database has one every quarter of that length. Peers that register pairs get
-their candidates from Scan Context, with its heading, and once more, as "NAME, place told", the
-database's clouds that are truly nearest: what they could do with a perfect retrieval.
+A cloud holds the points of the keyframes within some length of road, in the level frame of its
+middle one, x along the drive. The database has one every quarter of that length. Peers that
+register pairs get their candidates from Scan Context, with its heading, and once more, as "NAME,
+place told", the database's clouds that are truly nearest: the limit of a perfect retrieval.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ F64 = NDArray[np.float64]
 SECONDS = 3600.0
 CELL = 0.2  # m: points of a cloud are thinned to it
 CANDIDATES, TOLD = 5, 3
+ANSWER_SHOWN = 200  # characters of a malformed answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ class PeerTask:
     settings: Resolved
 
     def answers(self) -> list[Answer]:
-        """One for each keyframe. SemlocError when the peer fails or says something else."""
+        """One for each keyframe. SemlocError when the peer fails or its answer is malformed."""
         world = read_world(self.work, self.drive)
         folder = self.folder / f"clouds-{self.system.length:g}"
         centres = database_keyframes(world.database, self.system.length / 4)
@@ -96,16 +97,17 @@ class PeerTask:
             / f"{self.system.runner}-{self.drive.name}{'-told' if self.system.told else ''}.json"
         )
         path.write_text(json.dumps(job))
-        said = run_peer(self.system.runner, self.python, [str(path)], SECONDS)
+        output = run_peer(self.system.runner, self.python, [str(path)], SECONDS)
         try:
-            found = json.loads(said.splitlines()[-1])["queries"]
+            found = json.loads(output.splitlines()[-1])["queries"]
             return [
                 self._answer(world, centres, k, f, s)
                 for k, f, s in zip(self.keyframes, found, seconds, strict=True)
             ]
         except (ValueError, KeyError, IndexError, TypeError) as problem:
             raise SemlocError(
-                f"Peer {self.system.runner} answered {said[-200:]!r} ({problem}): see benchmarks/README.md."
+                f"Peer {self.system.runner} answered {output[-ANSWER_SHOWN:]!r} ({problem}): "
+                "see benchmarks/README.md."
             ) from None
 
     def _candidates(
@@ -146,13 +148,13 @@ class PeerTask:
         world: World,
         centres: Sequence[int],
         keyframe: int,
-        said: dict[str, Any],
+        answer: dict[str, Any],
         extra: float,
     ) -> Answer:
-        seconds = float(said["seconds"]) + extra
-        if not said["found"]:
+        seconds = float(answer["seconds"]) + extra
+        if not answer["found"]:
             return Answer(keyframe, seconds)
-        number, score, pose = said["found"][0]
+        number, score, pose = answer["found"][0]
         map_T_cloud = cloud_frame(world.database, centres[number]) @ np.array(pose, float).reshape(
             4, 4
         )

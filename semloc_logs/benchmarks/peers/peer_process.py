@@ -1,5 +1,5 @@
-"""Mappers to compare with: each runs in a process of a Python environment of its own and is asked
-for one round after the other.
+"""Mappers to compare with: each runs in a process of a Python environment of its own, one round
+after the other.
 
 A peer NAME is the script ``benchmarks/peers/NAME_runner.py`` of the source checkout. It gets a
 folder with ``points_K.npy`` ((n, 3) float32, sensor frame), ``poses.npy`` ((m, 4, 4)), voxel size
@@ -30,8 +30,8 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """All scans in one new map: milliseconds (and of processor time) of each, of what is due at the
-    end; voxels of the map.
+    """All scans in one new map: wall-clock and processor milliseconds of each, milliseconds of the
+    work at the end; voxels of the map.
     """
 
     ms: list[float]
@@ -46,12 +46,12 @@ def runner(name: str) -> Path:
     folder = Path(semloc_logs.__file__).resolve().parents[1] / "benchmarks" / "peers"
     known = sorted(p.name.removesuffix("_runner.py") for p in folder.glob("*_runner.py"))
     if name not in known:
-        there = (
-            f"there are {', '.join(known)}"
+        advice = (
+            f"give one of {', '.join(known)}"
             if known
-            else "their scripts are in benchmarks/peers of the source checkout"
+            else "the scripts of peers are in benchmarks/peers of the source checkout"
         )
-        raise SettingsError(f"There is no peer '{name}' to compare with: {there}.")
+        raise SettingsError(f"Unknown peer '{name}': {advice}.")
     return folder / f"{name}_runner.py"
 
 
@@ -63,7 +63,7 @@ def environment(threads: int) -> dict[str, str]:
 
 
 def run_peer(name: str, python: str, arguments: Sequence[str], seconds: float) -> str:
-    """What the script of peer ``name`` prints within ``seconds``, in one thread.
+    """The output of the script of peer ``name``, which has ``seconds`` and one thread.
 
     SettingsError when ``python`` cannot be started, SemlocError when the script fails.
     """
@@ -82,11 +82,15 @@ def run_peer(name: str, python: str, arguments: Sequence[str], seconds: float) -
             f"Peer {name} cannot be had from {python} ({problem}): give --peer {name}=PYTHON."
         ) from None
     if done.returncode:
-        said = done.stderr.strip().splitlines()
-        raise SemlocError(
-            f"Peer {name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md."
-        )
+        raise _failure(name, done.stderr)
     return done.stdout
+
+
+def _failure(name: str, errors: str) -> SemlocError:
+    """The error of a peer that wrote ``errors`` to its stderr."""
+    lines = errors.strip().splitlines()
+    reason = lines[-1] if lines else "without a message"
+    return SemlocError(f"Peer {name} failed ({reason}): see benchmarks/README.md.")
 
 
 def write_scans(folder: Path, scans: Sequence[Scan]) -> None:
@@ -123,7 +127,8 @@ class Peer:
         except OSError as problem:
             self._errors.close()
             raise SettingsError(
-                f"Peer {name} cannot be started with {python} ({problem.strerror}): give --peer {name}=PYTHON."
+                f"Peer {name} cannot be started with {python} ({problem.strerror}): "
+                f"give --peer {name}=PYTHON."
             ) from None
 
     def __enter__(self) -> Peer:
@@ -153,10 +158,7 @@ class Peer:
         finally:
             watch.cancel()
         self._errors.seek(0)
-        said = self._errors.read().strip().splitlines()
-        raise SemlocError(
-            f"Peer {self.name} failed ({said[-1] if said else 'it said nothing'}): see benchmarks/README.md."
-        )
+        raise _failure(self.name, self._errors.read())
 
 
 def open_peers(

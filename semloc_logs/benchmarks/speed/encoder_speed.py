@@ -94,7 +94,8 @@ def encoder_speed(settings: Resolved) -> Figures:
         }
         if max(apart, *(float(row.get("difference", 0.0)) for row in figures.values())) > ROUNDING:
             raise SemlocError(
-                f"Descriptors of one map differ by {apart:.3f} between ways to encode it, more than bf16 rounds."
+                f"Descriptors of one map differ by {apart:.3f} between ways to encode it, "
+                "more than bf16 rounds."
             )
         figures |= layers(network, codes)
         return figures
@@ -191,7 +192,7 @@ def _on_cores(
     network: Encoder, codes: NDArray[np.uint8], expected: NDArray[np.float32], cores: int
 ) -> Figures:
     """The dense run on all cores by threads and by processes, and how far descriptors differ from
-    those of one thread.
+    the times of one thread.
     """
     torch.set_num_threads(cores)
     by_threads = _median(lambda: encode(network, codes), time.perf_counter) / len(expected)

@@ -12,7 +12,7 @@ The limit of the machine, two ways:
 * ``limit_ms``: bytes that must be touched over the memory's bandwidth (measured by a large copy,
 read and written bytes counted). Points are read once (16 bytes: x y z and a label) and each voxel
 that the scan touches is read and written (one byte of log-odds). No method that keeps these voxels
-can be faster; it says nothing about the work of finding them. * ``limit_walk_ms``: every ray walked
+can be faster; it leaves out the work of finding them. * ``limit_walk_ms``: every ray walked
 voxel by voxel at one clock cycle a step, on one core (the clock is measured by a chain of dependent
 operations, four cycles each). A method that walks each ray cannot be faster; one that walks a ray
 for each end voxel, as ours, can.
@@ -81,7 +81,8 @@ def fusion_speed(
     ]
     for k, log in enumerate(logs):
         scans = log_sweeps(log)
-        what = f"a sweep of {np.mean([len(s.points) for s in scans]):.0f} points, 0.30 m, carved to 50 m"
+        points = np.mean([len(s.points) for s in scans])
+        what = f"a sweep of {points:.0f} points, 0.30 m, carved to 50 m"
         cases.append(Case(f"log{k + 1}" if len(logs) > 1 else "log", scans, 0.30, 50.0, 5, what))
     bandwidth = memory_bandwidth()
     clock = clock_rate()
@@ -95,7 +96,7 @@ def fusion_speed(
 
 
 def measure(case: Case, settings: Resolved, peers: Mapping[str, str]) -> Figures:
-    """Rounds of all, in turn: times of a scan, of what is due at the end, and the content of the
+    """Rounds of all, in turn: times of a scan, of the work at the end, and the content of the
     map.
     """
     fusion = _fusion(settings, case)
@@ -170,7 +171,7 @@ def _content(blocks: BlockMap) -> tuple[int, int]:
 
 
 def _limits(case: Case, settings: Resolved, bandwidth: float, clock: float) -> Figures:
-    """What the middle scan needs at least, and its content beside that of all its rays walked."""
+    """What the middle scan needs at least, and its content beside the walk of all its rays."""
     scan = case.scans[len(case.scans) // 2]
     points = apply(scan.map_T_sensor, scan.points)
     steps, free, occupied = walk_all(

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.benchmarks.descriptors.held_out import HeldOut, held_out
+from semloc_logs.benchmarks.descriptors.held_out import HeldOut, Size, held_out
 from semloc_logs.benchmarks.descriptors.recall import (
     Describe,
     count_subvolumes,
@@ -59,7 +59,7 @@ QUERIES = 1600  # look-ups of one query
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Streets:
-    """Words of streets and words that ask: ``centre`` (n, 3) and ``asked_centre`` (m, 3), metres in
+    """Words of streets and query words: ``centre`` (n, 3) and ``query_centre`` (m, 3), metres in
     a common frame, descriptors (n, N) and (m, N), the number of each word's ``street`` (n,); a word
     within ``radius`` metres is the true one.
     """
@@ -67,22 +67,22 @@ class Streets:
     centre: F64
     descriptor: F32
     street: NDArray[np.integer]
-    asked_centre: F64
-    asked: F32
+    query_centre: F64
+    query: F32
     radius: float
 
     def queries(self) -> Streets:
         """These streets with those words alone that have a true one, at most :data:`QUERIES`."""
-        possible = np.flatnonzero(cKDTree(self.centre).query(self.asked_centre)[0] < self.radius)
+        possible = np.flatnonzero(cKDTree(self.centre).query(self.query_centre)[0] < self.radius)
         if not len(possible):
-            raise SettingsError("No word that asks has a true one among the streets' words.")
+            raise SettingsError("None of the query words has a true one among the streets' words.")
         mine = np.sort(np.random.default_rng(1).permutation(possible)[:QUERIES])
         return Streets(
             self.centre,
             self.descriptor,
             self.street,
-            self.asked_centre[mine],
-            self.asked[mine],
+            self.query_centre[mine],
+            self.query[mine],
             self.radius,
         )
 
@@ -156,11 +156,11 @@ class _World:
     def found(self, index: Index, probes: int) -> float:
         """Share of the words that ask whose place is among their five nearest."""
         s = self.streets
-        m = index.search(s.asked, 5, probes, Allowed(np.ones(len(self.names), bool)))
+        m = index.search(s.query, 5, probes, Allowed(np.ones(len(self.names), bool)))
         near = (m.group == 0) & (
-            np.linalg.norm(m.centre - s.asked_centre[m.query], axis=1) < s.radius
+            np.linalg.norm(m.centre - s.query_centre[m.query], axis=1) < s.radius
         )
-        return len(np.unique(m.query[near])) / len(s.asked)
+        return len(np.unique(m.query[near])) / len(s.query)
 
 
 def scaling_benchmark(
@@ -175,7 +175,7 @@ def scaling_benchmark(
         folder = work or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="semloc-")))
         streets = described(
             held_out(
-                folder / "streets", settings, count_subvolumes(settings), DATABASE, on_progress=note
+                folder / "streets", settings, count_subvolumes(settings), Size(DATABASE), note
             ),
             describe,
         )
@@ -187,7 +187,7 @@ def scaling_benchmark(
 def described(world: HeldOut, describe: Describe) -> Streets:
     """The words of the LIDAR's maps, and of its last query of each street in snow."""
     parts: dict[str, list[NDArray[Any]]] = {
-        name: [] for name in ("centre", "descriptor", "street", "asked_centre", "asked")
+        name: [] for name in ("centre", "descriptor", "street", "query_centre", "query")
     }
     for number, s in enumerate(world.streets()):
         places = [(place, False) for kind, place in s.database if kind == "lidar"] + [
@@ -199,8 +199,8 @@ def described(world: HeldOut, describe: Describe) -> Streets:
                 place.common_T_map,
                 words.centre.astype(np.float64) * world.settings.fusion.voxel_size,
             )
-            parts["asked_centre" if is_query else "centre"].append(at)
-            parts["asked" if is_query else "descriptor"].append(words.descriptor)
+            parts["query_centre" if is_query else "centre"].append(at)
+            parts["query" if is_query else "descriptor"].append(words.descriptor)
             parts["street"].append(np.full(0 if is_query else len(at), number))
     joined: dict[str, Any] = {name: np.concatenate(arrays) for name, arrays in parts.items()}
     return Streets(radius=true_radius(world.settings), **joined)

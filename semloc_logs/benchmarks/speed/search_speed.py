@@ -1,10 +1,9 @@
-"""Speed of the look-up of words and what it finds, beside FAISS on codes of as many bits.
+"""Speed and recall of the look-up of words, beside FAISS on codes of as many bits.
 
-Descriptors are drawn whose principal directions matter less and less, as those of trained networks
-do, without clusters. A query is one of the database moved by noise, and *found* is the share of
-queries whose origin is among the five nearest. Codes of the peers have one threshold for each bit,
-the median of all: they have no cells of ours. Processor time, the least of some runs and the
-median.
+Descriptors are drawn without clusters; their principal directions matter less and less, as in
+trained networks. A query is one of the database moved by noise, and *found* is the share of queries
+whose origin is among the five nearest. Codes of the peers have one threshold for each bit, the
+median of all: they have no cells. Processor time, the least of some runs and the median.
 """
 
 from __future__ import annotations
@@ -55,7 +54,8 @@ def search_speed(
     """
     if peers and (set(peers) != {"faiss"} or not RUNNER.exists()):
         raise SettingsError(
-            f"The only peer of search is faiss=PYTHON, run from a checkout (benchmarks/README.md), not {', '.join(peers)}."
+            "The only peer of search is faiss=PYTHON, run from a checkout (benchmarks/README.md), "
+            f"not {', '.join(peers)}."
         )
     # the second level takes no part in a look-up
     vocabulary = train_vocabulary(draw(1, 100_000), children=16)
@@ -142,10 +142,10 @@ def _faiss(
                 capture_output=True,
                 text=True,
             )
-            said: dict[str, list[float]] = json.loads(ran.stdout)
+            figures: dict[str, list[float]] = json.loads(ran.stdout)
         except (OSError, subprocess.CalledProcessError, ValueError) as problem:
             last = (getattr(problem, "stderr", None) or str(problem)).strip().splitlines()[-1]
             raise SettingsError(
                 f"{python}: FAISS did not run ({last}): install faiss-cpu and numpy there."
             ) from None
-        return said
+        return figures

@@ -33,7 +33,7 @@ RIVAL_RATIO = 0.7  # of the best score: what looks like a copy of the best place
 # of the best score, and a score: no right alignment has less
 MIN_RELATIVE_SCORE = 0.8
 MIN_SCORE = 0.3
-RIGHT_WITHIN = 1.0  # m, at voxels of 0.30 m: what a right closure is (DESIGN: closures.parquet)
+RIGHT_WITHIN = 1.0  # m, at voxels of 0.30 m (docs/reference/truth.md)
 # standard deviations that count as one: from 0.2 m on 99 % of errors in simulated towns are within
 # 2.2, of normal ones 2.6
 MARGIN = 1.2

@@ -233,7 +233,7 @@ def _file_fingerprint(path: Path) -> str:
 def _mcap_facts(end: LogEnd) -> LogFacts:
     """What our channels need to know of an MCAP log.
 
-    The encoding is that of most of its channels, unless its profile states it.
+    The encoding is the one of most channels, unless its profile states it.
     """
     encodings = Counter(c.message_encoding for c in end.channels)
     known = [e for e in sorted(encodings) if e in _ENCODINGS]

@@ -25,7 +25,7 @@ _SPHERE, _LINE_LIST, _TEXT = (
 
 
 class RosEncoder:
-    """Messages of ROS ``version`` 1 or 2, with ``old_markers`` those of ROS 2 before Humble."""
+    """Messages of ROS ``version`` 1 or 2, with ``old_markers`` as in ROS 2 before Humble."""
 
     def __init__(self, version: int, *, old_markers: bool = False) -> None:
         self.version = version
@@ -156,7 +156,9 @@ class RosEncoder:
         return bytes(write(message, name))
 
     def _definition(self, name: str) -> str:
-        """The definition of a message type with those of the types in it, as MCAP wants it."""
+        """The definition of a message type with the definitions of the types in it, as MCAP wants
+        it.
+        """
         text, _ = self.store.generate_msgdef(name, ros_version=self.version)
         if name != CLOSURE:
             return str(text)

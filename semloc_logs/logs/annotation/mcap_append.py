@@ -1,4 +1,4 @@
-"""Adding channels to an MCAP file without decoding what is there.
+"""Adding channels to an MCAP file without decoding its records.
 
 An MCAP file is magic, data section, DataEnd, summary, footer, magic. To add records, everything up
 to DataEnd is kept as it is, and the tail of the file, from DataEnd on, is written anew: our

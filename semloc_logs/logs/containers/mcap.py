@@ -159,7 +159,7 @@ class McapLog(BaseLog):
             for c in counts
         )
         if not known or sum(counts.values()) != statistics.message_count:
-            return None  # allowed, but then only a walk tells what is in the file
+            return None  # allowed, but then only a walk finds the contents of the file
         for i in indexes:
             if i.chunk_start_offset + i.chunk_length > self._size:
                 raise LogError(
@@ -279,7 +279,7 @@ class McapLog(BaseLog):
             return
         view = memoryview(data)
         found = self._walk(data, part.offset)
-        found.sort(key=lambda f: f[0])  # stable, and nearly free for what is in order already
+        found.sort(key=lambda f: f[0])  # stable, and nearly free for sorted input
         for log_time, channel, start, end in found:
             if channel not in self._channels:
                 self._problems.add(

@@ -1,6 +1,6 @@
 """The records of an MCAP file: one walk over them and one bounded decompressor.
 
-Every error is a ``LogError`` that states what is wrong; the caller adds the file and the offset.
+Every error is a ``LogError`` that states the fault; the caller adds the file and the offset.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def spans(data: bytes) -> Iterator[tuple[int, int, int]]:
             )
         yield opcode, start, position
     if position != size:
-        raise LogError(f"{size - position} bytes at its end are no record")
+        raise LogError(f"{size - position} bytes at its end are not a record")
 
 
 def walk(file: SizedFile, position: int, end: int) -> Iterator[tuple[int, int, int]]:
@@ -110,7 +110,7 @@ def chunk_head(record: bytes) -> ChunkHead:
 
 
 def chunk_records(record: bytes, head: ChunkHead) -> bytes:
-    """The records in a chunk; memory grows with what is there, not with what the chunk claims."""
+    """The records in a chunk; memory grows with the data, not with the claimed size."""
     data = decompress(record[head.data], head.compression, head.unpacked_size)
     if head.crc and zlib.crc32(data) != head.crc:
         raise LogError("its checksum does not match its data")

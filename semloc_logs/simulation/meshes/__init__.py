@@ -1,1 +1,1 @@
-"""Triangle meshes of what stands in a town."""
+"""Triangle meshes of the objects in a town."""

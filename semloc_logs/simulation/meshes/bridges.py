@@ -79,7 +79,8 @@ def _bank(sign: float, near: float, wide: float, top: float) -> Mesh:
     plan = np.array(
         [
             [-wide / 2, y0, top], [-wide / 2, y1, top], [wide / 2, y1, top], [wide / 2, y0, top],
-            [-foot, y0, -1.5], [-foot, y1, -1.5], [-wide / 2, y2, -1.5], [wide / 2, y2, -1.5], [foot, y1, -1.5], [foot, y0, -1.5],
+            [-foot, y0, -1.5], [-foot, y1, -1.5], [-wide / 2, y2, -1.5],
+            [wide / 2, y2, -1.5], [foot, y1, -1.5], [foot, y0, -1.5],
         ]
     )  # fmt: skip
     faces = [

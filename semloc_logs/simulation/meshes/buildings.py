@@ -226,11 +226,8 @@ def _hall(rng: Rng, width: float, depth: float, height: float) -> Parts:
         ]
     )
     opened = rng.random((2, len(gates))) < np.array([[0.5], [0.8]])
-    walls = [
-        facades.wall(
-            corners[0], corners[1], FOOT, height, gates, rows, opened, float(rng.uniform(0.2, 0.5))
-        )
-    ]
+    panes = facades.Panes(gates, rows, opened, float(rng.uniform(0.2, 0.5)))
+    walls = [facades.wall(corners[0], corners[1], FOOT, height, panes)]
     o = facades.openings(rng, "blank")
     walls += [
         facades.side_wall(rng, corners[k], corners[(k + 1) % 4], height, o, 0.15) for k in (1, 2, 3)

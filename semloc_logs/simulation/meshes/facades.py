@@ -51,25 +51,49 @@ def openings(rng: Rng, ground: str) -> Openings:
     )
 
 
-def wall(
-    start: F64,
-    end: F64,
-    low: float,
-    high: float,
-    columns: F64,
-    rows: F64,
-    opened: NDArray[np.bool_],
-    recess: float,
-) -> Mesh:
-    """A wall from ``low`` to ``high`` metres with panes at ``columns`` (k, 2) along it and ``rows``
-    (m, 2) up.
+@dataclass(frozen=True, slots=True, eq=False)
+class Panes:
+    """The panes of a wall at ``columns`` (k, 2) along it and ``rows`` (m, 2) up, in metres.
 
-    Panes lie ``recess`` metres deep where ``opened`` (m, k).
+    They lie ``recess`` metres deep where they are ``opened`` (m, k).
     """
+
+    columns: F64
+    rows: F64
+    opened: NDArray[np.bool_]
+    recess: float
+
+
+def wall(start: F64, end: F64, low: float, high: float, panes: Panes) -> Mesh:
+    """A wall from ``low`` to ``high`` metres with panes."""
     way = end - start
     length = float(np.hypot(*way))
     way = way / max(length, 1e-9)
     inward = np.array([-way[1], way[0]])
+    c = _wall_cells(length, low, high, panes)
+    s = c[:, [0, 1, 1, 0]]
+    z = c[:, [2, 2, 3, 3]]
+    faces = [np.stack([s, np.repeat(c[:, 4:], 4, axis=1), z], axis=-1)]
+
+    # the four sides of every recess
+    deep = np.flatnonzero(c[:, 4] > 0)
+    front = faces[0][deep] * [1, 0, 1]
+    faces += [
+        np.stack([front[:, a], front[:, b], faces[0][deep][:, b], faces[0][deep][:, a]], axis=1)
+        for a, b in ((1, 0), (2, 1), (3, 2), (0, 3))
+    ]
+
+    local = np.concatenate(faces)
+    corners = np.empty_like(local)
+    corners[..., :2] = start + local[..., :1] * way + local[..., 1:2] * inward
+    corners[..., 2] = local[..., 2]
+    return quads(corners)
+
+
+def _wall_cells(length: float, low: float, high: float, panes: Panes) -> F64:
+    """The rectangles (n, 5) that a wall is made of: from, to, bottom, top and depth, in metres."""
+    columns = panes.columns
+    rows = panes.rows
     left = np.concatenate([[0.0], columns[:, 1]])
     right = np.concatenate([columns[:, 0], [length]])
     below = np.concatenate([[low], rows[:, 1]])
@@ -83,29 +107,18 @@ def wall(
         k, m = grid(np.arange(len(columns) + 1), np.arange(len(rows)))
         cells.append(np.column_stack([left[k], right[k], rows[m, 0], rows[m, 1], np.zeros(len(k))]))
         k, m = grid(np.arange(len(columns)), np.arange(len(rows)))
-        cells.append(np.column_stack([columns[k], rows[m], np.where(opened[m, k], recess, 0.0)]))
+        depth = np.where(panes.opened[m, k], panes.recess, 0.0)
+        cells.append(np.column_stack([columns[k], rows[m], depth]))
     elif len(rows):
         cells.append(
             np.column_stack(
                 [np.zeros(len(rows)), np.full(len(rows), length), rows, np.zeros(len(rows))]
             )
         )
-    c = np.concatenate(cells)
-    c = c[(c[:, 1] - c[:, 0] > 1e-6) & (c[:, 3] - c[:, 2] > 1e-6)]
-    s = c[:, [0, 1, 1, 0]]
-    z = c[:, [2, 2, 3, 3]]
-    faces = [np.stack([s, np.repeat(c[:, 4:], 4, axis=1), z], axis=-1)]
-    deep = np.flatnonzero(c[:, 4] > 0)
-    front = faces[0][deep] * [1, 0, 1]
-    faces += [
-        np.stack([front[:, a], front[:, b], faces[0][deep][:, b], faces[0][deep][:, a]], axis=1)
-        for a, b in ((1, 0), (2, 1), (3, 2), (0, 3))
-    ]
-    local = np.concatenate(faces)
-    corners = np.empty_like(local)
-    corners[..., :2] = start + local[..., :1] * way + local[..., 1:2] * inward
-    corners[..., 2] = local[..., 2]
-    return quads(corners)
+    c: F64 = np.concatenate(cells)
+    wide = c[:, 1] - c[:, 0] > 1e-6
+    tall = c[:, 3] - c[:, 2] > 1e-6
+    return np.asarray(c[wide & tall])
 
 
 def columns_of(length: float, pitch: float, width: float, margin: float = 0.6) -> F64:
@@ -126,7 +139,7 @@ def side_wall(rng: Rng, start: F64, end: F64, height: float, o: Openings, share:
     rows = np.column_stack([floors + o.sill, np.minimum(floors + o.head, height - 0.2)])
     rows = rows[rows[:, 1] - rows[:, 0] > 0.3]
     opened = np.broadcast_to(rng.random(len(columns)) < share, (len(rows), len(columns)))
-    return wall(start, end, FOOT, height, columns, rows, opened, o.recess)
+    return wall(start, end, FOOT, height, Panes(columns, rows, opened, o.recess))
 
 
 def front_wall(rng: Rng, start: F64, end: F64, height: float, o: Openings) -> tuple[Mesh, F64, F64]:
@@ -141,18 +154,8 @@ def front_wall(rng: Rng, start: F64, end: F64, height: float, o: Openings) -> tu
     rows = rows[rows[:, 1] - rows[:, 0] > 0.3]
     meshes = []
     if height > top + 0.1:
-        meshes.append(
-            wall(
-                start,
-                end,
-                top,
-                height,
-                columns,
-                rows,
-                np.ones((len(rows), len(columns)), bool),
-                o.recess,
-            )
-        )
+        every = np.ones((len(rows), len(columns)), bool)
+        meshes.append(wall(start, end, top, height, Panes(columns, rows, every, o.recess)))
     ground = columns
     if o.ground == "shop":
         ground = columns_of(length, rng.uniform(2.2, 4.5), rng.uniform(1.6, 2.1), 0.4)
@@ -175,7 +178,7 @@ def front_wall(rng: Rng, start: F64, end: F64, height: float, o: Openings) -> tu
     if o.ground == "blank":
         opened[:] = False
     deep = max(o.recess, 0.25) if o.ground == "shop" else o.recess
-    meshes.append(wall(start, end, FOOT, top, ground, levels, opened, deep))
+    meshes.append(wall(start, end, FOOT, top, Panes(ground, levels, opened, deep)))
     return joined(*meshes), columns, floors[: len(rows)]
 
 
@@ -237,10 +240,12 @@ def bay(rng: Rng, x: float, y: float, width: float, deep: float, height: float) 
             b,
             FOOT,
             height,
-            columns_of(float(np.hypot(*(b - a))), 1.3, 0.9, 0.1),
-            np.array([[0.8, min(2.1, height - 0.3)]]),
-            np.ones((1, 9), bool),
-            0.08,
+            Panes(
+                columns_of(float(np.hypot(*(b - a))), 1.3, 0.9, 0.1),
+                np.array([[0.8, min(2.1, height - 0.3)]]),
+                np.ones((1, 9), bool),
+                0.08,
+            ),
         )
         for a, b in pairwise(plan)
     ]

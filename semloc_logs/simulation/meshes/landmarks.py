@@ -1,4 +1,4 @@
-"""What a town has few of: a church, a petrol station; and sheds, garages, greenhouses and kiosks."""
+"""Rare buildings: a church, a petrol station; and sheds, garages, greenhouses and kiosks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from semloc_logs.simulation.meshes.world import (
 
 
 def shed(rng: Rng, width: float, depth: float, height: float) -> Parts:
-    """A garden shed, a garage, a greenhouse or a kiosk on the plan of :func:`buildings.building`."""
+    """A shed, a garage, a greenhouse or a kiosk on the plan of :func:`buildings.building`."""
     where = (-width / 2, width / 2, 0.0, depth)
     corners = np.array([[-width / 2, 0], [width / 2, 0], [width / 2, depth], [-width / 2, depth]])
     o = facades.openings(rng, str(rng.choice(["windows", "garage", "blank"])))
@@ -35,7 +35,7 @@ def shed(rng: Rng, width: float, depth: float, height: float) -> Parts:
 
 
 def church(rng: Rng, width: float, depth: float) -> Parts:
-    """A nave with buttresses and high windows, a tower with a spire before it and a choir behind."""
+    """A nave with buttresses and high windows, a tower with a spire before it, a choir behind."""
     nave = min(width, 14.0) / 2
     height = float(rng.uniform(6.0, 10.0))
     storey = float(rng.uniform(3.0, 4.0))

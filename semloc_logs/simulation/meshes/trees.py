@@ -9,6 +9,7 @@ Trunks count as vegetation, as in Cityscapes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +24,8 @@ class Species:
     """Ranges of the full-grown height in metres, of the clear stem and of the crown's radius as
     shares of it; the crown's shape.
 
-    ``cover`` is the leaves' area over that of the crown seen from the side; ``leaf`` their size in
-    metres; ``rise`` how steep limbs are.
+    ``cover`` is the leaves' area over the area of the crown seen from the side; ``leaf`` their size
+    in metres; ``rise`` how steep limbs are.
     """
 
     height: tuple[float, float]
@@ -108,24 +109,18 @@ def tree(
         return [(_palm(own, height, 0.6 * radius + 0.8), VEGETATION)]
     if species.shape == "cone":
         return [(_conifer(own, height, clear, radius, species.leaf), VEGETATION)]
-    wood, ends = _wood(own, species, height, clear, radius)
-    seed = int(own.integers(2**62))
+    crown = _Crown(clear, height - clear, radius)
+    wood, ends = _wood(own, species, height, crown)
+    cover = np.random.default_rng(int(own.integers(2**62)))
+    hanging = name == "weeping"
     if bare and not species.evergreen:
-        crown = twigs(
-            np.random.default_rng(seed), ends, 0.3 + 0.06 * radius, hanging=name == "weeping"
-        )
-    else:
-        crown = _foliage(
-            np.random.default_rng(seed),
-            species,
-            ends,
-            height - clear,
-            radius,
-            hanging=name == "weeping",
-        )
-        if not species.evergreen and leafy < 1:
-            crown = Mesh(crown.vertices, crown.triangles[: int(leafy * len(crown.triangles))])
-    return [(joined(wood, crown), VEGETATION)]
+        return [
+            (joined(wood, twigs(cover, ends, 0.3 + 0.06 * radius, hanging=hanging)), VEGETATION)
+        ]
+    foliage = _foliage(cover, species, ends, crown, hanging=hanging)
+    if not species.evergreen and leafy < 1:
+        foliage = Mesh(foliage.vertices, foliage.triangles[: int(leafy * len(foliage.triangles))])
+    return [(joined(wood, foliage), VEGETATION)]
 
 
 def _envelope(shape: str, up: F64) -> F64:
@@ -141,22 +136,61 @@ def _envelope(shape: str, up: F64) -> F64:
     return np.sqrt(np.clip(1.02 - up**2, 0, 1))  # a dome
 
 
-def _wood(
-    rng: Rng, species: Species, height: float, clear: float, radius: float
-) -> tuple[Mesh, F64]:
+class _Crown(NamedTuple):
+    """The crown of a tree in metres: its foot over the ground, its height and radius."""
+
+    foot: float
+    height: float
+    radius: float
+
+
+def _wood(rng: Rng, species: Species, height: float, crown: _Crown) -> tuple[Mesh, F64]:
     """Trunks, limbs and branches, and the ends of the branches (n, 3)."""
-    crown = height - clear
     thick = (0.017 * height + 0.03) * rng.uniform(0.75, 1.3)
+    stems, meshes = _stems(rng, species, height, crown, thick)
+
+    limbs = int(np.clip(rng.integers(6, 11) + len(stems), 6, 14))
+    begin, tip = _limbs(rng, species, stems, limbs, crown)
+    bend = (
+        0.55 * begin
+        + 0.45 * tip
+        - np.array([0, 0, 1.0])
+        * (0.08 * np.linalg.norm(tip - begin, axis=1))[:, None]
+        * np.sign(species.rise - 0.8)
+    )
+    meshes.append(tubes(begin, bend, 0.42 * thick, 0.28 * thick, 5))
+    meshes.append(tubes(bend, tip, 0.28 * thick, 0.1 * thick, 4))
+
+    # branches from the nearest point of a limb or a stem to points all over the crown
+    t = np.linspace(0.35, 1.0, 5)[:, None, None]
+    along = np.concatenate([(bend + (tip - bend) * t).reshape(-1, 3), *(s[4:] for s in stems)])
+    number = int(np.clip(10 + 4.0 * crown.radius * np.sqrt(crown.height), 14, 50))
+    ends = _inside(rng, species.shape, number, crown) + 0.7 * stems[0][3] * [1, 1, 0]
+    gap = ends[:, None] - along[None]
+    cost = np.linalg.norm(gap, axis=2) + 0.8 * np.maximum(-gap[:, :, 2], 0)
+    meshes.append(tubes(along[cost.argmin(1)], ends, 0.1 * thick + 0.008, 0.012, 3))
+    return joined(*meshes), np.concatenate([ends, tip])
+
+
+def _stems(
+    rng: Rng, species: Species, height: float, crown: _Crown, thick: float
+) -> tuple[list[F64], list[Mesh]]:
+    """The lines (n, 3) of the stems, and their meshes."""
     starts = []
     meshes = []
     count = int(rng.integers(species.stems[0], species.stems[1] + 1))
     for k in range(count):
-        spread = 0.0 if count == 1 else 0.45 * radius
+        spread = 0.0 if count == 1 else 0.45 * crown.radius
         angle = 2 * np.pi * k / count + rng.uniform(-0.4, 0.4)
         top = np.array(
-            [spread * np.cos(angle), spread * np.sin(angle), clear + crown * rng.uniform(0.6, 0.8)]
+            [
+                spread * np.cos(angle),
+                spread * np.sin(angle),
+                crown.foot + crown.height * rng.uniform(0.6, 0.8),
+            ]
         )
-        levels = np.array([-0.4, 0.35, 0.55 * clear, clear, clear + 0.3 * crown, top[2]])
+        foot = crown.foot
+        levels = np.array([-0.4, 0.35, 0.55 * foot, foot, foot + 0.3 * crown.height, top[2]])
         share = np.clip(levels / top[2], 0, 1)
         wander = np.cumsum(rng.normal(size=(len(levels), 2)) * 0.011 * height, axis=0) * (
             share[:, None] > 0.1
@@ -170,44 +204,16 @@ def _wood(
         width = thick * (1.0 if count == 1 else 0.6) * np.array([1.5, 1.0, 0.9, 0.8, 0.5, 0.15])
         meshes.append(tubes(line[:-1], line[1:], width[:-1], width[1:], 7))
         starts.append(line)
-    limbs = int(np.clip(rng.integers(6, 11) + count, 6, 14))
-    begin, tip = _limbs(rng, species, starts, limbs, clear, crown, radius)
-    bend = (
-        0.55 * begin
-        + 0.45 * tip
-        - np.array([0, 0, 1.0])
-        * (0.08 * np.linalg.norm(tip - begin, axis=1))[:, None]
-        * np.sign(species.rise - 0.8)
-    )
-    meshes.append(tubes(begin, bend, 0.42 * thick, 0.28 * thick, 5))
-    meshes.append(tubes(bend, tip, 0.28 * thick, 0.1 * thick, 4))
-    t = np.linspace(0.35, 1.0, 5)[:, None, None]
-    along = np.concatenate([(bend + (tip - bend) * t).reshape(-1, 3), *(s[4:] for s in starts)])
-    number = int(np.clip(10 + 4.0 * radius * np.sqrt(crown), 14, 50))
-    ends = _inside(rng, species.shape, number, clear, crown, radius) + 0.7 * starts[0][3] * [
-        1,
-        1,
-        0,
-    ]
-    gap = ends[:, None] - along[None]
-    cost = np.linalg.norm(gap, axis=2) + 0.8 * np.maximum(-gap[:, :, 2], 0)
-    meshes.append(tubes(along[cost.argmin(1)], ends, 0.1 * thick + 0.008, 0.012, 3))
-    return joined(*meshes), np.concatenate([ends, tip])
+    return starts, meshes
 
 
 def _limbs(
-    rng: Rng,
-    species: Species,
-    lines: list[F64],
-    count: int,
-    clear: float,
-    crown: float,
-    radius: float,
+    rng: Rng, species: Species, lines: list[F64], count: int, crown: _Crown
 ) -> tuple[F64, F64]:
     """Both ends (n, 3) of the limbs."""
     up = np.sort(rng.uniform(0.0, 0.75, count) ** 1.3)
     stem = rng.integers(0, len(lines), count)
-    z = clear + up * crown * 0.8
+    z = crown.foot + up * crown.height * 0.8
     base = np.array(
         [
             [
@@ -220,13 +226,15 @@ def _limbs(
     )
     angle = 2.4 * np.arange(count) + rng.uniform(-0.5, 0.5, count) + rng.uniform(0, 6.3)
     high = np.clip(up * 0.8 + rng.uniform(0.12, 0.3, count) * species.rise, 0.1, 0.93)
-    out = radius * _envelope(species.shape, high) * rng.uniform(0.6, 0.85, count)
-    tip = np.column_stack([out * np.cos(angle), out * np.sin(angle), clear + high * crown])
+    out = crown.radius * _envelope(species.shape, high) * rng.uniform(0.6, 0.85, count)
+    tip = np.column_stack(
+        [out * np.cos(angle), out * np.sin(angle), crown.foot + high * crown.height]
+    )
     return base, tip
 
 
-def _inside(rng: Rng, shape: str, count: int, clear: float, crown: float, radius: float) -> F64:
-    """Points (n, 3) in the crown, more of them near its surface; the surface has lumps and dents."""
+def _inside(rng: Rng, shape: str, count: int, crown: _Crown) -> F64:
+    """Points (n, 3) in the crown, more of them near its surface, which has lumps and dents."""
     up = rng.uniform(0.03, 0.97, count)
     angle = rng.uniform(0, 2 * np.pi, count)
     phase = rng.uniform(0, 2 * np.pi, 4)
@@ -235,8 +243,9 @@ def _inside(rng: Rng, shape: str, count: int, clear: float, crown: float, radius
         + 0.16 * np.sin(2 * angle + phase[0]) * np.sin(4 * up + phase[1])
         + 0.12 * np.sin(3 * angle + 5 * up + phase[2])
     )
-    out = radius * _envelope(shape, up) * lumps * np.sqrt(rng.uniform(0.2, 1.0, count))
-    return np.column_stack([out * np.cos(angle), out * np.sin(angle), clear + up * crown])
+    out = crown.radius * _envelope(shape, up) * lumps * np.sqrt(rng.uniform(0.2, 1.0, count))
+    z = crown.foot + up * crown.height
+    return np.column_stack([out * np.cos(angle), out * np.sin(angle), z])
 
 
 def leaves(rng: Rng, centre: F64, size: float | F64) -> Mesh:
@@ -245,10 +254,10 @@ def leaves(rng: Rng, centre: F64, size: float | F64) -> Mesh:
     return triangles_of(centre[:, None] + rng.uniform(-0.8, 0.8, (len(centre), 3, 3)) * reach)
 
 
-def _foliage(
-    rng: Rng, species: Species, ends: F64, crown: float, radius: float, *, hanging: bool
-) -> Mesh:
-    area = np.pi / 4 * crown * 2 * radius
+def _foliage(rng: Rng, species: Species, ends: F64, crown: _Crown, *, hanging: bool) -> Mesh:
+    """Leaves about the ends (n, 3) of the branches."""
+    radius = crown.radius
+    area = np.pi / 4 * crown.height * 2 * radius
     count = int(
         np.clip(
             species.cover

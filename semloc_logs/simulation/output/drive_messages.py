@@ -240,7 +240,7 @@ class RosMessages:
             "sensor_msgs/msg/Imu",
             header=self._header(stamp_ns, "base_link"),
             orientation=self._quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
-            orientation_covariance=np.array([-1.0] + [0.0] * 8),  # -1: there is no orientation
+            orientation_covariance=np.array([-1.0] + [0.0] * 8),  # -1: without orientation
             angular_velocity=self._vector(rate),
             angular_velocity_covariance=np.zeros(9),
             linear_acceleration=self._vector(force),

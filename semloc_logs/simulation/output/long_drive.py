@@ -55,7 +55,7 @@ class Lap:
             turn = full_sweep(
                 scene, pose @ self.base_T_lidar, rng, MODELS["hdl32"], SweepOptions(columns)
             )
-            # all points at once: there is no motion to undo, whichever way the lap is driven
+            # all points at once: no motion has to be undone, whichever way the lap is driven
             self.sweeps.append(Sweep(turn.points, turn.labels, turn.ring, np.zeros_like(turn.turn)))
 
     def write(self, path: Path, laps: int, *, onwards: bool) -> int:
@@ -91,5 +91,5 @@ class Lap:
 
 
 def _ahead(path: F64) -> bool:
-    """Whether a road belongs to the driven line, which lies along x, and is no side street."""
+    """Whether a road belongs to the driven line, which lies along x, and not to a side street."""
     return bool(abs(path[-1, 0] - path[0, 0]) > abs(path[-1, 1] - path[0, 1]))

@@ -4,7 +4,7 @@ that such sensors have.
 Camera frames are optical: x right, y down, z ahead. A disparity d has an error that does not depend
 on depth, so that z = f b / d is wrong by z^2 sigma_d / (f b) (Gallup et al., Variable
 Baseline/Resolution Stereo, CVPR 2008, equation 2); it is alike over patches as large as the matched
-windows, surfaces in front bleed over what is behind them, and nothing is measured where the second
+windows, surfaces in front bleed over those behind them, and nothing is measured where the second
 view sees nothing, on panes, and for want of texture.
 """
 
@@ -186,7 +186,7 @@ def depth_frame(
     """What the depth camera at ``world_T_camera`` (4, 4, optical frame) measures, of every
     ``step``-th pixel and row.
 
-    ``traffic`` is a second scene, of what moves. The images are those of the pixels asked for,
+    ``traffic`` is a second scene, of what moves. The images have the chosen pixels only,
     (ceil(h / step), ceil(w / step)).
     """
     rays = pixel_rays(model, step)
@@ -203,7 +203,7 @@ def measure(
     model: CameraModel,
     step: int = 1,
 ) -> CameraFrame:
-    """The depth measured of what is seen (:func:`first_hits` of :func:`pixel_rays`)."""
+    """The measured depth of first hits (:func:`first_hits` of :func:`pixel_rays`)."""
     holes = _holes(hits, rays, world_T_camera, rng, model, step)
     depth, labels, holes = _bleed(hits.depth, hits.labels, holes, rng, model.bleed / step)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -314,7 +314,7 @@ def _cells(points: F32, size: float) -> I64:
 
 def _hidden(depth: F32, model: CameraModel, step: int) -> NDArray[np.bool_]:
     """Pixels (h, w) that the second camera, ``baseline`` to the right, does not see: out of its
-    picture or behind what is nearer.
+    picture or behind nearer surfaces.
     """
     height, width = depth.shape
     disparity = np.float32(model.focal * model.baseline / step) / depth
@@ -332,7 +332,7 @@ def _hidden(depth: F32, model: CameraModel, step: int) -> NDArray[np.bool_]:
 def _bleed(
     depth: F32, labels: U8, holes: NDArray[np.bool_], rng: np.random.Generator, pixels: float
 ) -> tuple[F32, U8, NDArray[np.bool_]]:
-    """Surfaces in front grown over what is behind by up to ``pixels``, by patches more or less."""
+    """Surfaces in front grown over those behind by up to ``pixels``, by patches more or less."""
     rounds = math.ceil(pixels)
     if rounds < 1:
         return depth, labels, holes

@@ -106,9 +106,9 @@ def mixed_ranges(rng: np.random.Generator, distance: F32, gap: float, divergence
     """Ranges (columns, beams) where beams that are cut by an edge report something between the near
     and the far surface.
 
-    ``gap`` is the angle between columns and ``divergence`` that of a beam (rad): their ratio is the
-    share of beams that an edge cuts. Surfaces further apart than the pulse is long give two echoes,
-    of which one is reported, so mixed ranges become rare with the step.
+    ``gap``: angle between columns; ``divergence``: angle of a beam (rad). Their ratio is
+    the share of beams that an edge cuts. Surfaces further apart than the pulse is long give two
+    echoes, of which one is reported, so mixed ranges become rare with the step.
     """
     out = distance.copy()
     cut = min(1.0, divergence / gap)

@@ -58,8 +58,8 @@ def corrupt_labels(
     Patches follow from ``points`` (n, 3) and ``seed``: points in a fixed frame and the same seed
     give the same errors in every sweep. With the number of a ``frame`` about half of them belong to
     that frame alone. ``beyond`` (n,) is the class across the nearest edge
-    (:func:`semloc_logs.simulation.sensors.echoes.beyond_edges`), which bleeds over as that of masks
-    that are laid over a scan does.
+    (:func:`semloc_logs.simulation.sensors.echoes.beyond_edges`), which bleeds over as the label of
+    masks that are laid over a scan does.
     """
     table = _table()
     out = labels.copy()

@@ -20,12 +20,12 @@ class LidarModel:
 
     ``pattern``: ``spin`` turns about z; ``raster`` scans lines at the elevations over
     ``width_deg``, the uppermost first; ``rosette`` leads a row of beams through two turning prisms
-    (Risley), which draws another flower of ``width_deg`` x ``rise_deg`` at every moment. ``noise``:
-    standard deviation of a range (m). ``beam_bias``: that of what each beam adds to all its ranges
-    (m). ``pointing_deg``: that of the angle at which a column is measured beside the one it
-    reports. ``divergence``: full angle of a beam (rad), inside which an edge mixes two ranges.
-    ``lift``: heights of the beams' origins over the sensor's (m). ``blocked``: (from, to, below)
-    degrees of azimuth, anticlockwise, and elevation where the vehicle itself is in the way.
+    (Risley), which draws another flower of ``width_deg`` x ``rise_deg`` at every moment. Standard
+    deviations: ``noise`` of a range (m); ``beam_bias`` of the constant that each beam adds to its
+    ranges (m); ``pointing_deg`` of the angle between the measured and the reported column.
+    ``divergence``: full angle of a beam (rad), inside which an edge mixes two ranges. ``lift``:
+    heights of the beams' origins over the sensor's (m). ``blocked``: (from, to, below) degrees of
+    azimuth, anticlockwise, and elevation where the vehicle itself is in the way.
     """
 
     name: str

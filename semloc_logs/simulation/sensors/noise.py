@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -20,20 +22,32 @@ def _number(a: int, b: int, c: int, seed: int) -> float:
     return float(h ^ (h >> 16)) / 4294967296.0
 
 
-@njit(cache=True, nogil=True)
-def octaves(
-    points: F32, footprint: F32, size: float, count: int, keep: float, stretch: float, seed: int
-) -> F32:
-    """Value noise (n,) at ``points`` (n, 3) of ``count`` octaves from lumps of ``size`` metres on
-    (Ebert et al., Texturing and Modeling, chapter 2).
+class Octaves(NamedTuple):
+    """``levels`` octaves of value noise, from lumps of ``size`` metres on.
 
-    An octave is ``keep`` as strong and 0.47 as large as the one before and fades where its lumps
-    are as small as ``footprint`` (n,), so that pictures do not flicker. ``stretch`` is a factor on
+    An octave is ``keep`` as strong and 0.47 as large as the one before; ``stretch`` is a factor on
     z.
     """
+
+    size: float
+    levels: int
+    keep: float
+    stretch: float = 1.0
+
+
+@njit(cache=True, nogil=True)
+def octaves(points: F32, footprint: F32, noise: Octaves, seed: int) -> F32:
+    """Value noise (n,) at ``points`` (n, 3).
+
+    An octave fades where its lumps are as small as ``footprint`` (n,), so that pictures do not
+    flicker. Source: Ebert et al., Texturing and Modeling, chapter 2.
+    """
+    size, count, keep, stretch = noise
     out = np.zeros(len(points), np.float32)
     for n in range(len(points)):
-        strength, lump, total = 1.0, size, 0.0
+        strength = 1.0
+        lump = size
+        total = 0.0
         for octave in range(count):
             visible = min(1.0, 0.6 * lump / footprint[n] - 0.5)
             if visible <= 0.0:
@@ -90,18 +104,26 @@ def within(
     )
 
 
+class Stone(NamedTuple):
+    """Length and height of a stone in a course, and width of the joints, in metres."""
+
+    length: float
+    height: float
+    joint: float
+
+
 def stones(
     u: NDArray[np.floating],
     v: NDArray[np.floating],
-    length: float,
-    height: float,
-    joint: float,
+    stone: Stone,
     footprint: F32,
     seed: I64 | int,
 ) -> tuple[F32, F32]:
-    """Courses of stones in the plane (u, v) in metres: how much joint (0 to 1) a pixel holds, and
-    the tone (-1 to 1) of the stone.
+    """Courses of stones in the plane (u, v) in metres.
+
+    The share of joint (0 to 1) in a pixel, and the tone (-1 to 1) of the stone.
     """
+    length, height, joint = stone
     row = cell(v, height)
     shifted = u + 0.5 * length * (row & 1)
     column = cell(shifted, length)
@@ -120,6 +142,6 @@ def stones(
 def letters(
     u: NDArray[np.floating], v: NDArray[np.floating], size: float, footprint: F32, seed: I64 | int
 ) -> F32:
-    """Blocks like those of letters and numbers: 1 where there is ink."""
+    """Blocks like letters and numbers: 1 on the ink."""
     ink = number(cell(u, size), cell(v, size), seed) < 0.45
     return np.where(footprint > 0.7 * size, np.float32(0.4), ink.astype(np.float32))

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.meshes.world import F64, ROAD, Scene
 from semloc_logs.simulation.sensors.camera import CameraModel, Hits, first_hits, pixel_rays
-from semloc_logs.simulation.sensors.noise import octaves
+from semloc_logs.simulation.sensors.noise import Octaves, octaves
 from semloc_logs.simulation.sensors.surface_colours import Surfaces, markings, road_plan, surfaces
-from semloc_logs.simulation.sensors.texture import colours, spots
+from semloc_logs.simulation.sensors.texture import Pixels, colours
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -120,28 +120,22 @@ class Painter:
         footprint: F32,
         traffic: Scene | None,
     ) -> tuple[F32, F32]:
+        """Reflectances (n, 3) of the numbered ``pixels`` and how much is mirrored (n,)."""
         labels = hits.labels.ravel()[pixels]
-        triangle = hits.triangle.ravel()[pixels]
         moving = hits.moving.ravel()[pixels]
         paint = np.zeros(len(pixels), np.float32)
         road = np.flatnonzero((labels == ROAD) & ~moving)
         if len(road):
             paint[road] = markings(self._plan, points[road], footprint[road])
+        triangle = hits.triangle.ravel()[pixels]
+        seen = Pixels(points, normals, triangle, labels, footprint, paint)
         colour = np.zeros((len(pixels), 3), np.float32)
         gloss = np.zeros(len(pixels), np.float32)
         groups: list[tuple[NDArray[np.bool_], Surfaces]] = [(~moving, self._surfaces)]
         if traffic is not None and moving.any():
             groups.append((moving, surfaces(traffic.world, moving=True)))
         for mask, known in groups:
-            at = spots(
-                known,
-                triangle[mask],
-                points[mask],
-                normals[mask],
-                labels[mask],
-                footprint[mask],
-                paint[mask],
-            )
+            at = seen.take(mask).spots(known)
             colour[mask], gloss[mask] = colours(at, self.condition.season)
         return colour, gloss
 
@@ -178,10 +172,7 @@ class Painter:
         wisps = octaves(
             flat,
             0.02 / np.maximum(d[:, 2], 0.04),
-            1.8,
-            5,
-            0.55,
-            1.0,
+            Octaves(1.8, 5, 0.55),
             211 + 31 * self.condition.number,
         )
         cover = white * np.clip(0.9 * wisps - 0.1, 0, 1)[:, None]

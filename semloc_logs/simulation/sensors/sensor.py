@@ -35,7 +35,7 @@ class Sensor:
     def __post_init__(self) -> None:
         if self.name not in (*MODELS, *CAMERAS):
             raise SettingsError(
-                f"there is no simulated sensor {self.name!r}: "
+                f"unknown simulated sensor {self.name!r}: "
                 f"choose one of {', '.join((*MODELS, *CAMERAS))}"
             )
         if not RATES_HZ[0] <= self.rate_hz <= RATES_HZ[1]:

@@ -23,7 +23,7 @@ _MOST_CELLS = 8_000_000
 class Surfaces:
     """Pieces of a world: ``piece`` (m,) of each triangle; ``seed`` (p,) int64 that is the same in
     every session, ``low`` and ``high`` (p, 3) its box in metres; ``bark`` (m,) are triangles of
-    plants that are no leaves; ``own`` (m,) int64 a number of each triangle.
+    plants without leaves; ``own`` (m,) int64 a number of each triangle.
     """
 
     piece: I32

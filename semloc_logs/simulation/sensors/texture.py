@@ -7,7 +7,7 @@ Colours are linear reflectances (n, 3).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,9 @@ from semloc_logs.simulation.meshes.world import (
     WALL,
 )
 from semloc_logs.simulation.sensors.noise import (
+    Octaves,
     Real,
+    Stone,
     cell,
     letters,
     number,
@@ -66,16 +68,14 @@ class Spots:
 
     def take(self, some: NDArray[np.intp]) -> Spots:
         """Some of the spots."""
-        return Spots(
-            self.points[some], self.normals[some], self.labels[some], self.seed[some], self.low[some], self.high[some], self.bark[some],
-            self.own[some], self.footprint[some], self.paint[some],
-        )  # fmt: skip
+        return Spots(*(getattr(self, field.name)[some] for field in fields(self)))
 
     def noise(
         self, size: float, count: int, keep: float, *, stretch: float = 1.0, seed: int = 0
     ) -> F32:
         """:func:`noise.octaves` at the spots."""
-        return np.asarray(octaves(self.points, self.footprint, size, count, keep, stretch, seed))
+        noise = Octaves(size, count, keep, stretch)
+        return np.asarray(octaves(self.points, self.footprint, noise, seed))
 
     def along(self) -> F32:
         """Metres along the level direction of the surface, whichever way the triangle is turned."""
@@ -87,31 +87,38 @@ class Spots:
         return np.asarray(np.einsum("ij,ij->i", level, self.points[:, :2]), np.float32)
 
 
-def spots(
-    surfaces: Surfaces,
-    triangle: I64,
-    points: F32,
-    normals: F32,
-    labels: U8,
-    footprint: F32,
-    paint: F32,
-) -> Spots:
-    """The spots at ``points`` on ``triangle`` (n,) of a world."""
-    piece = surfaces.piece[triangle]
-    low = surfaces.low[piece]
-    high = surfaces.high[piece]
-    return Spots(
-        points,
-        normals,
-        labels,
-        surfaces.seed[piece],
-        low,
-        high,
-        surfaces.bark[triangle],
-        surfaces.own[triangle],
-        footprint,
-        paint,
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class Pixels:
+    """What pixels see: points and unit normals of triangles (n, 3), numbers of these and labels
+    (n,), sizes (n,) of the pixels in metres, ``paint`` (n,) share of road marking.
+    """
+
+    points: F32
+    normals: F32
+    triangle: I64
+    labels: U8
+    footprint: F32
+    paint: F32
+
+    def take(self, mask: NDArray[np.bool_]) -> Pixels:
+        """Some of the pixels."""
+        return Pixels(*(getattr(self, field.name)[mask] for field in fields(self)))
+
+    def spots(self, surfaces: Surfaces) -> Spots:
+        """The spots on the surfaces of a world."""
+        piece = surfaces.piece[self.triangle]
+        return Spots(
+            self.points,
+            self.normals,
+            self.labels,
+            surfaces.seed[piece],
+            surfaces.low[piece],
+            surfaces.high[piece],
+            surfaces.bark[self.triangle],
+            surfaces.own[self.triangle],
+            self.footprint,
+            self.paint,
+        )
 
 
 def colours(at: Spots, season: str) -> tuple[F32, F32]:
@@ -147,13 +154,13 @@ def _painted(seed: I64, salt: I64 | int) -> F32:
 
 
 def _wall(at: Spots, u: F32, h: F32) -> F32:
-    """Brick, plaster or panels, with dirt and what was sprayed onto them."""
+    """Brick, plaster or panels, with dirt and graffiti."""
     seed = at.seed
     f = at.footprint
     rough = at.noise(1.7, 7, 0.85)
     style = number(seed, 1, 7)
     warm = number(seed, 2, 7)
-    joint, tone = stones(u, h, 0.24, 0.083, 0.014, f, seed)
+    joint, tone = stones(u, h, Stone(0.24, 0.083, 0.014), f, seed)
     brick = _tone(
         _mix(_rgb(0.30, 0.11, 0.07), _rgb(0.42, 0.30, 0.17), warm**2),
         1 + 0.38 * tone + 0.24 * rough,
@@ -163,7 +170,7 @@ def _wall(at: Spots, u: F32, h: F32) -> F32:
     plaster = _tone(
         _rgb(0.42 + 0.22 * r, 0.36 + 0.2 * r * g + 0.08 * b, 0.26 + 0.24 * b), 1 + 0.26 * rough
     )
-    joint, tone = stones(u, h, 1.8, 0.9, 0.03, f, seed)
+    joint, tone = stones(u, h, Stone(1.8, 0.9, 0.03), f, seed)
     panel = _mix(
         _tone(_rgb(0.34, 0.33, 0.31), 1 + 0.1 * tone + 0.28 * rough),
         _rgb(0.1, 0.1, 0.1),
@@ -235,9 +242,8 @@ def _roof(at: Spots) -> F32:
     rough = at.noise(1.5, 7, 0.85, seed=13)
     up = np.abs(at.normals[:, 2])
     slope = np.sqrt(np.maximum(1 - up**2, 0.05))
-    joint, tone = stones(
-        at.along(), at.points[:, 2] / slope, 0.22, 0.34, 0.03, at.footprint, at.seed
-    )
+    tiling = Stone(0.22, 0.34, 0.03)
+    joint, tone = stones(at.along(), at.points[:, 2] / slope, tiling, at.footprint, at.seed)
     kind = number(at.seed, 12, 7)[:, None]
     tile = np.where(
         kind < 0.5,
@@ -300,7 +306,7 @@ def _road(at: Spots, season: str) -> tuple[F32, F32]:
 def _sidewalk(at: Spots, season: str) -> tuple[F32, F32]:
     x = at.points[:, 0]
     y = at.points[:, 1]
-    joint, tone = stones(x + 0.13 * y, y - 0.13 * x, 0.6, 0.4, 0.015, at.footprint, 67)
+    joint, tone = stones(x + 0.13 * y, y - 0.13 * x, Stone(0.6, 0.4, 0.015), at.footprint, 67)
     colour = _tone(_rgb(0.3, 0.29, 0.27), 1 + 0.16 * tone + 0.22 * at.noise(0.9, 7, 0.85, seed=71))
     return _mix(colour, _rgb(0.1, 0.1, 0.09), 0.6 * joint), np.zeros(len(x), np.float32)
 
@@ -340,7 +346,7 @@ def _plant(at: Spots, season: str) -> tuple[F32, F32]:
 
 
 def _vehicle(at: Spots, season: str) -> tuple[F32, F32]:
-    """Paint, panes and tyres by height; nothing that would stay in place while the vehicle drives."""
+    """Paint, panes and tyres by height; nothing that stays in place while the vehicle drives."""
     size = at.high[:, 2] - at.low[:, 2]
     share = (at.points[:, 2] - at.low[:, 2]) / np.maximum(size, 0.1)
     up = np.abs(at.normals[:, 2])
@@ -354,7 +360,9 @@ def _vehicle(at: Spots, season: str) -> tuple[F32, F32]:
 
 
 def _masonry(at: Spots, season: str) -> tuple[F32, F32]:
-    joint, tone = stones(at.along(), at.points[:, 2], 0.37, 0.19, 0.02, at.footprint, at.seed)
+    joint, tone = stones(
+        at.along(), at.points[:, 2], Stone(0.37, 0.19, 0.02), at.footprint, at.seed
+    )
     stone = _mix(_rgb(0.33, 0.3, 0.25), _rgb(0.36, 0.2, 0.14), number(at.seed, 1, 57))
     colour = _tone(stone, 1 + 0.4 * tone + 0.22 * at.noise(0.8, 6, 0.85, seed=53))
     return _mix(colour, _rgb(0.3, 0.29, 0.27), 0.7 * joint), np.zeros(len(colour), np.float32)
@@ -419,7 +427,7 @@ def _thing(at: Spots, season: str) -> tuple[F32, F32]:
 
 
 def _snow(at: Spots, colour: F32, gloss: F32) -> None:
-    """White on what is not steep; roads are driven away and salted."""
+    """White on surfaces that are not steep; roads are driven away and salted."""
     up = np.abs(at.normals[:, 2])
     some = np.flatnonzero((up > 0.35) & ((at.labels < PERSON) | (at.labels > MOTORCYCLE)))
     lying = at.take(some)
@@ -437,7 +445,8 @@ def _snow(at: Spots, colour: F32, gloss: F32) -> None:
 
 
 _PAINTERS: dict[int, Callable[[Spots, str], tuple[F32, F32]]] = {
-    ROAD: _road, SIDEWALK: _sidewalk, BUILDING: _building, WALL: _masonry, FENCE: _fence, POLE: _pole, TRAFFIC_LIGHT: _lamp,
+    ROAD: _road, SIDEWALK: _sidewalk, BUILDING: _building, WALL: _masonry, FENCE: _fence,
+    POLE: _pole, TRAFFIC_LIGHT: _lamp,
     TRAFFIC_SIGN: _sign, VEGETATION: _plant, TERRAIN: _terrain, PERSON: _person, RIDER: _person,
     **dict.fromkeys(range(CAR, MOTORCYCLE), _vehicle),
 }  # fmt: skip

@@ -84,7 +84,7 @@ def railway(setting: Setting) -> None:
 
 
 def backlands(setting: Setting) -> None:
-    """Trees, sheds and houses in what is left behind the plots."""
+    """Trees, sheds and houses in the space behind the plots."""
     rng = setting.rng
     ground = setting.ground
     i, j = np.nonzero(ground.free & (ground.beside > 5))

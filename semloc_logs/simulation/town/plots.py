@@ -43,10 +43,21 @@ class _House:
         ]
 
 
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """The plots along one side of a road, which begin ``walk`` metres beside the carriageway."""
+
+    setting: Setting
+    side: Side
+    style: Style
+    walk: float
+
+
 def plots(setting: Setting, side: Side, style: Style) -> None:
     """Everything beyond the pavement along one side of a road."""
     edge = side.road.half_width + 5.0
     walk = side.road.sidewalk + (0.2 if side.road.sidewalk else 1.0)
+    row = _Row(setting, side, style, walk)
     model = _drawn_house(setting.rng, style, float(np.clip(style.plot, 5, 45)))
     apart = style.gap
     u = edge + setting.rng.uniform(0, 4)
@@ -60,9 +71,9 @@ def plots(setting: Setting, side: Side, style: Style) -> None:
             odd = style.copies == "mirror" and number % 2 == 1
             house = replace(model, mirrored=odd)
             gap = 0.0 if style.copies == "mirror" and not odd else apart
-        _plot(setting, side, style, u, gap, walk, house)
-        u = u + house.width + gap
-        number = number + 1
+        _plot(row, u, gap, house)
+        u += house.width + gap
+        number += 1
 
 
 def _drawn_house(rng: Rng, style: Style, width: float) -> _House:
@@ -71,22 +82,42 @@ def _drawn_house(rng: Rng, style: Style, width: float) -> _House:
     return _House(int(rng.integers(2**31)), width, depth, height, str(rng.choice(style.roofs)))
 
 
-def _plot(
-    setting: Setting, side: Side, style: Style, u: float, gap: float, walk: float, house: _House
-) -> None:
+def _plot(row: _Row, u: float, gap: float, house: _House) -> None:
     """A plot of land: a house perhaps, its garden, frontage and drive."""
+    setting = row.setting
+    style = row.style
     rng = setting.rng
     width = house.width
-    depth = house.depth
-    setback = walk + max(
+    setback, built = _build(row, u, house)
+    if style.kind == "car park":
+        _car_park(row, u, width + gap, setback)
+    elif style.kind == "square":
+        _square(row, u, width + gap, setback)
+    _pave(row, u - gap / 2, width + gap, setback)
+    if gap > 1.8:  # beside the house
+        setting.parked(
+            row.side, u + width + gap / 2, row.walk + rng.uniform(2.8, 7.0), 0.6, across=True
+        )
+    if style.setback > 1.2:
+        _frontage(row, u - gap / 2, u + width + gap / 2, built)
+    _garden(row, u - gap / 2, width + gap, setback + (house.depth if built else 0.0), built)
+
+
+def _build(row: _Row, u: float, house: _House) -> tuple[float, bool]:
+    """Build the house, or not; how far it is set back, and whether it is built."""
+    setting = row.setting
+    style = row.style
+    rng = setting.rng
+    width = house.width
+    setback = row.walk + max(
         0.3, style.setback * (rng.uniform(0.85, 1.15) if style.copies == "none" else 1.0)
     )
     gx, gy = np.meshgrid(
-        np.arange(-width / 2 + 0.2, width / 2, 0.5), np.arange(0.2, depth + 0.1, 0.5)
+        np.arange(-width / 2 + 0.2, width / 2, 0.5), np.arange(0.2, house.depth + 0.1, 0.5)
     )
     built = bool(rng.random() < style.built)
     for further in (0.0, 0.8, 2.0, 4.0):  # where the road bends a house has to stand further back
-        x, y, yaw = side.at(u + width / 2, setback + further)
+        x, y, yaw = row.side.at(u + width / 2, setback + further)
         c = np.cos(yaw)
         s = np.sin(yaw)
         # the house's +y looks away from the road, which lies to the left of the traffic on this
@@ -102,25 +133,7 @@ def _plot(
     if built:
         _put_house(setting, house, x, y, yaw + np.pi)
         setting.ground.take(cells)
-    if style.kind == "car park":
-        _car_park(setting, side, u, width + gap, walk, setback)
-    elif style.kind == "square":
-        _square(setting, side, u, width + gap, walk, setback)
-    _pave(setting, side, style, u - gap / 2, width + gap, walk, setback)
-    if gap > 1.8:  # beside the house
-        setting.parked(side, u + width + gap / 2, walk + rng.uniform(2.8, 7.0), 0.6, across=True)
-    if style.setback > 1.2:
-        _frontage(setting, side, style, u - gap / 2, u + width + gap / 2, walk, built)
-    _garden(
-        setting,
-        side,
-        style,
-        u - gap / 2,
-        width + gap,
-        walk,
-        setback + (depth if built else 0.0),
-        built,
-    )
+    return setback, built
 
 
 def _put_house(setting: Setting, house: _House, x: float, y: float, yaw: float) -> None:
@@ -152,10 +165,11 @@ def _put_house(setting: Setting, house: _House, x: float, y: float, yaw: float) 
         setting.put(scaffolding(house.width, house.depth, house.height), x, y, yaw, moving=True)
 
 
-def _car_park(
-    setting: Setting, side: Side, u: float, width: float, walk: float, depth: float
-) -> None:
+def _car_park(row: _Row, u: float, width: float, depth: float) -> None:
     """Rows of parked cars, and lamps between them."""
+    setting = row.setting
+    side = row.side
+    walk = row.walk
     share = float(setting.rng.uniform(0.2, 0.95))
     room = side.area(u, u + width, walk + 1.0, depth - 2.0)
     if not setting.ground.allowed(room):
@@ -163,16 +177,17 @@ def _car_park(
     setting.ground.take(room)
     for v in np.arange(walk + 3.5, depth - 3.0, 8.5):
         for along in np.arange(u + 2.0, u + width - 1.5, 2.7):
-            for row in (v, v + 5.2) if v + 8 < depth else (v,):
-                setting.parked(side, float(along), float(row), share, across=True)
+            for beside in (v, v + 5.2) if v + 8 < depth else (v,):
+                setting.parked(side, float(along), float(beside), share, across=True)
         x, y, yaw = side.at(u + width / 2, v + 2.6)
         setting.put(objects.pole(setting.rng, "double"), x, y, yaw, aside=True)
 
 
-def _square(
-    setting: Setting, side: Side, u: float, width: float, walk: float, depth: float
-) -> None:
+def _square(row: _Row, u: float, width: float, depth: float) -> None:
     """Trees in rows on stone, a few benches, perhaps something in the middle."""
+    setting = row.setting
+    side = row.side
+    walk = row.walk
     rng = setting.rng
     size = rng.uniform(0.5, 0.8)
     kind = str(rng.choice(["round", "column"]))
@@ -187,24 +202,26 @@ def _square(
     setting.ground.take(side.area(u, u + width, walk + 1.0, depth - 2.0))
 
 
-def _pave(
-    setting: Setting, side: Side, style: Style, u: float, width: float, walk: float, setback: float
-) -> None:
+def _pave(row: _Row, u: float, width: float, setback: float) -> None:
     """Stone between the pavement and the house: all of it, or a drive beside the house."""
+    setting = row.setting
     drive = setting.rng.uniform(2.4, 4.5)
-    whole = setting.rng.random() < style.paved
+    whole = setting.rng.random() < row.style.paved
     a, b, far = (
         (u, u + width, setback + 1.0)
         if whole
         else (u + width - drive, u + width, setback + setting.rng.uniform(2, 9))
     )
     if whole or setting.rng.random() < 0.6:
-        setting.ground.pave(side.area(a, b, walk - 0.5, far))
+        setting.ground.pave(row.side.area(a, b, row.walk - 0.5, far))
 
 
-def _frontage(
-    setting: Setting, side: Side, style: Style, u0: float, u1: float, walk: float, house: bool
-) -> None:
+def _frontage(row: _Row, u0: float, u1: float, house: bool) -> None:
+    """A hedge, a fence or a wall towards the road, with an opening, and perhaps one beside."""
+    setting = row.setting
+    side = row.side
+    style = row.style
+    walk = row.walk
     rng = setting.rng
     if style.frontage == "none" or rng.random() < (0.12 if house else 0.5):
         return
@@ -234,16 +251,12 @@ def _frontage(
             setting.put_line(objects.fence(rng, line) if rng.random() < 0.5 else hedge(rng, line))
 
 
-def _garden(
-    setting: Setting,
-    side: Side,
-    style: Style,
-    u: float,
-    width: float,
-    walk: float,
-    behind: float,
-    house: bool,
-) -> None:
+def _garden(row: _Row, u: float, width: float, behind: float, house: bool) -> None:
+    """Trees, bushes and tall grass before the house and behind it."""
+    setting = row.setting
+    side = row.side
+    style = row.style
+    walk = row.walk
     rng = setting.rng
     for _ in range(rng.poisson(style.garden * width / 4)):
         near = rng.random() < (0.5 if house else 0.7)

@@ -80,7 +80,7 @@ class RoadNetwork:
 
 
 def drawn_road(rng: Rng, a: int, b: int, path: F64, narrow: float) -> Road:
-    """A road along a centre line (n, 2), its widths drawn; ``narrow`` multiplies that of the
+    """A road along a centre line (n, 2), its widths drawn; ``narrow`` multiplies the width of the
     carriageway.
     """
     parking = bool(rng.random() < 0.75)
@@ -298,7 +298,7 @@ def lane_path(network: RoadNetwork, route: list[tuple[int, bool]]) -> F64:
 
 
 def _round(circle: Circle, start: F64, end: F64) -> F64:
-    """The line (n, 2) round an island, counter-clockwise from beside one point to beside another."""
+    """The line (n, 2) counter-clockwise round an island, from beside one point to another."""
     middle = np.array([circle.x, circle.y])
     first, last = (float(np.arctan2(*(p - middle)[::-1])) for p in (start, end))
     # in and out of the circle a quarter of a lane's width is enough to turn

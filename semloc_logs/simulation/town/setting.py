@@ -1,4 +1,4 @@
-"""What a street world is put together in: the ground, what stands on it for good, and what differs
+"""The parts of a street world: the ground, permanent things on it, and things that differ
 between sessions.
 """
 
@@ -19,8 +19,8 @@ Rng = np.random.Generator
 class Setting:
     """Puts things on the ground; ``moving`` collects what differs between sessions.
 
-    ``rng`` draws what is the same in all sessions, ``change`` what their number changes, ``works``
-    what is dug up, gone or new.
+    ``rng`` draws things common to all sessions, ``change`` things that their number changes,
+    ``works`` things dug up, gone or new.
     """
 
     def __init__(self, ground: Ground, seed: int, condition: Condition) -> None:

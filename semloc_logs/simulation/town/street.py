@@ -1,4 +1,4 @@
-"""A street world along a road network: what is static follows from the seed, what changes between
+"""A street world along a road network: static things follow from the seed, changes between
 sessions from the condition.
 """
 

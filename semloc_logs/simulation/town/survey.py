@@ -39,8 +39,8 @@ Rng = np.random.Generator
 def read_drive(path: Path) -> F64:
     """Positions (n, 3) in metres, z up, about every metre along the drive of a TUM or KITTI file.
 
-    KITTI poses are those of a camera (x right, y down, z ahead; KITTI odometry development kit),
-    TUM poses those of a frame with z up. LogError for files that cannot be read, drives that are
+    KITTI poses are of a camera (x right, y down, z ahead; KITTI odometry development kit),
+    TUM poses of a frame with z up. LogError for files that cannot be read, drives that are
     too short, leap, or spread over too large an area.
     """
     read = read_trajectory(TrajectoryFile(path))
@@ -51,10 +51,11 @@ def read_drive(path: Path) -> F64:
     extent = np.ptp(at[:, :2], axis=0) + 100.0
     if not (np.isfinite(extent).all() and extent.prod() * 4 < _MOST_CELLS):
         raise LogError(
-            f"The drive of {path} spreads over {extent[0]:.0f} m x {extent[1]:.0f} m, which is too much: give a part of it."
+            f"The drive of {path} spreads over {extent[0]:.0f} m x {extent[1]:.0f} m, "
+            "which is too much: give a part of it."
         )
     kept = [0]
-    for k in range(1, len(at)):  # what stands or trembles is no way
+    for k in range(1, len(at)):  # standing and trembling add nothing to the way
         if np.hypot(*(at[k, :2] - at[kept[-1], :2])) > 0.7:
             kept.append(k)
     if (
@@ -66,7 +67,8 @@ def read_drive(path: Path) -> F64:
     leaps = np.linalg.norm(np.diff(at[kept, :2], axis=0), axis=1)
     if leaps.max() > 60:
         raise LogError(
-            f"The drive of {path} leaps by {leaps.max():.0f} m after pose {kept[int(leaps.argmax())]}: give one without gaps."
+            f"The drive of {path} leaps by {leaps.max():.0f} m "
+            f"after pose {kept[int(leaps.argmax())]}: give one without gaps."
         )
     points = resample(at[kept], length / max(1, round(length)))
     return np.column_stack(
@@ -144,7 +146,7 @@ def _first_passes(plan: F64, tangent: F64) -> tuple[NDArray[np.bool_], NDArray[n
     for early, late in twins[order].tolist():
         again[late] |= not again[early]
     fresh = ~again
-    for value, least in ((True, 20), (False, 10)):  # short stretches belong to what is around them
+    for value, least in ((True, 20), (False, 10)):  # short stretches belong to their neighbours
         edges = np.flatnonzero(np.diff(np.concatenate([[-1], fresh.astype(np.int8), [-1]])))
         for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             if b - a < least and fresh[a] == value and a > 0 and b < len(fresh):
@@ -209,7 +211,7 @@ def _node(nodes: list[F64], at: F64, merge: float = 12.0) -> int:
 
 
 def _agreeing_heights(drive: F64, pairs: NDArray[np.int64]) -> F64:
-    """Heights (n,) whose rises are those of the drive and that are equal where it passes twice:
+    """Heights (n,) with the rises of the drive, that are equal where it passes twice:
     least squares, a drift shared out.
     """
     n = len(drive)

@@ -20,7 +20,7 @@ MARGIN = 48.0  # m of ground beside a road
 KERB = 0.12  # m
 STEEPEST = 0.08  # slope of a road without a survey
 _BANKS = (0.0, 0.0, 0.0, 0.06, 0.15, 0.28, -0.06, -0.2)  # slopes beside roads
-_DEPTH = 0.5  # m of what is dug up
+_DEPTH = 0.5  # m of the ditches
 CLEAR = 1.4  # m to either side of a driven line
 
 

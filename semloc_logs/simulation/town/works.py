@@ -1,4 +1,4 @@
-"""Roadworks and building sites: what stands around a street for some weeks."""
+"""Roadworks and building sites, which stay in a street for some weeks."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _barriers(length: float, depth: float) -> Mesh:
 
 
 def cone(rng: Rng) -> Mesh:
-    """A traffic cone; there is no class for it."""
+    """A traffic cone, which has no class."""
     height = rng.uniform(0.5, 0.75)
     return merge(box(0.38, 0.38, 0.04), cylinder(0.14, height, 8, 0.03))
 

@@ -68,7 +68,7 @@ def pairs(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_the_shipped_network_completes(variant: str) -> None:
     model = load_completion(variant)
     found = completed(model, pairs(1))
-    assert found.said.shape == (1, 32, 32, 32)
+    assert found.completed.shape == (1, 32, 32, 32)
     figures = completion_figures(found)
     assert float(figures["accuracy"]["ours"]) > float(figures["accuracy"]["copy_input"])
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from semloc_logs.benchmarks.descriptors import held_out as module
 from semloc_logs.benchmarks.descriptors import retrieval as benchmark
 from semloc_logs.benchmarks.descriptors.fpfh import fpfh_describes
-from semloc_logs.benchmarks.descriptors.held_out import SCENARIOS, Extent, HeldOut, held_out
+from semloc_logs.benchmarks.descriptors.held_out import SCENARIOS, Extent, HeldOut, Size, held_out
 from semloc_logs.benchmarks.descriptors.places import Place, Street, read_street, write_street
 from semloc_logs.benchmarks.descriptors.recall import (
     DATABASES,
@@ -181,7 +181,7 @@ def little_town(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_small_held_out_town(tmp_path: Path, little_town: None) -> None:
     extent = Extent(queries=1)
     count = count_subvolumes(SETTINGS)
-    world = held_out(tmp_path, SETTINGS, count, 300, 40, extent)
+    world = held_out(tmp_path, SETTINGS, count, Size(300, 40, extent))
     made = {p: p.stat().st_mtime_ns for p in world.paths}
     street = next(world.streets())
     assert set(street.queries) == set(SCENARIOS)
@@ -208,10 +208,10 @@ def test_a_small_held_out_town(tmp_path: Path, little_town: None) -> None:
     found = retrieval_recall(world, NoEncoder())
     assert set(found) == set(DATABASES)
     assert all(0 <= v <= 1 for v in found.values())
-    again = held_out(tmp_path, SETTINGS, count, 300, 40, extent)
+    again = held_out(tmp_path, SETTINGS, count, Size(300, 40, extent))
     assert {p: p.stat().st_mtime_ns for p in again.paths} == made  # not simulated twice
-    with pytest.raises(SettingsError, match="cannot be had"):
-        held_out(tmp_path, SETTINGS, count, 10**6, 40, extent)
+    with pytest.raises(SettingsError, match="The held-out towns have"):
+        held_out(tmp_path, SETTINGS, count, Size(10**6, 40, extent))
     _comes_back(street, tmp_path / "again.parquet")
 
 

@@ -52,10 +52,10 @@ def test_a_street_is_as_wide_as_it_is() -> None:
         9 / np.sin(np.radians(67.5)), abs=0.3
     )
     facing = np.degrees(2 * np.arctan(20 / 9)) / 180
-    assert 1 - seen.histograms["distance to what stands in a direction"][-1] == pytest.approx(
-        facing, abs=0.02
-    )
-    assert seen.histograms["class of what stands in a direction"][2] == 1.0
+    assert 1 - seen.histograms["distance to the nearest structure of a direction"][
+        -1
+    ] == pytest.approx(facing, abs=0.02)
+    assert seen.histograms["class of the nearest structure of a direction"][2] == 1.0
 
 
 def test_voxels_are_counted() -> None:

@@ -1,4 +1,4 @@
-"""The localisation benchmark: what it asks, how it judges, what it compares with."""
+"""The localisation benchmark: its queries, how it judges, what it compares with."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def straight(heading_deg: float, condition: str) -> World:
 
 
 @pytest.mark.parametrize(
-    ("heading", "condition", "asks"),
+    ("heading", "condition", "is_query"),
     [
         (10, "0", True),
         (50, "0", False),
@@ -90,10 +90,10 @@ def straight(heading_deg: float, condition: str) -> World:
         (0, CROSSING, False),
     ],
 )
-def test_a_query_asks_where_its_heading_is_that_of_the_condition(
-    heading: float, condition: str, asks: bool
+def test_queries_have_the_heading_of_their_condition(
+    heading: float, condition: str, is_query: bool
 ) -> None:
-    assert straight(heading, condition)._asks(0) is asks
+    assert straight(heading, condition)._meets_condition(0) is is_query
 
 
 def test_errors_are_those_against_the_nearest_keyframe_of_a_map_that_lies_elsewhere() -> None:
@@ -251,7 +251,7 @@ def called(search: object) -> tuple[object, dict[str, object]]:
     return search.func, search.keywords
 
 
-def test_systems_differ_only_in_what_they_say() -> None:
+def test_systems_differ_only_in_their_options() -> None:
     settings = load().resolved()
     by_name = {s.name: settings_of(s, settings, Path("random")) for s in OURS}
     assert by_name["ours"].query.length == 20

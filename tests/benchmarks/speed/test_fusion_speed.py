@@ -22,7 +22,8 @@ from pathlib import Path
 import numpy as np
 count = len(np.load(Path(sys.argv[1]) / "poses.npy"))
 for free, _ in enumerate(sys.stdin):
-    print(json.dumps({"ms": [5.0] * count, "cpu_ms": [4.0] * count, "finish_ms": 1.0, "free": free, "occupied": 7}), flush=True)
+    times = {"ms": [5.0] * count, "cpu_ms": [4.0] * count, "finish_ms": 1.0}
+    print(json.dumps({**times, "free": free, "occupied": 7}), flush=True)
 """
 
 
@@ -32,7 +33,7 @@ def scans() -> list[Scan]:
 
 
 def test_one_ray_is_walked_voxel_by_voxel() -> None:
-    """From the middle of voxel 0 to that of voxel 3 along x: three free, one occupied, four steps."""
+    """Between the middles of voxels 0 and 3 along x: three free, one occupied, four steps."""
     assert walk_all(np.array([[3.5, 0.5, 0.5]]), np.array([0.5, 0.5, 0.5]), 1.0, 50.0) == (4, 3, 1)
 
 
@@ -134,7 +135,7 @@ def test_peer_that_fails_is_named_with_what_it_said(
 def test_peer_without_python_or_script_is_wrong_usage(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    with pytest.raises(SettingsError, match="no peer 'nobody'"):
+    with pytest.raises(SettingsError, match="Unknown peer 'nobody'"):
         runner("nobody")
     monkeypatch.setattr(peer_process, "runner", lambda name: tmp_path / "x.py")
     with pytest.raises(SettingsError, match="cannot be started"):

@@ -152,7 +152,8 @@ def test_a_damaged_chunk_is_skipped_and_named(tmp_path: Path) -> None:
     lost = range(chunk.message_start_time, chunk.message_end_time + 1)
     assert [m.log_time_ns for m in log.messages()] == [k for k in range(100) if k not in lost]
     assert sentences(log.problems) == [
-        f"x.mcap: the chunk at byte {chunk.chunk_start_offset} was skipped: its checksum does not match its data."
+        f"x.mcap: the chunk at byte {chunk.chunk_start_offset} was skipped: its checksum does not"
+        " match its data."
     ]
 
 

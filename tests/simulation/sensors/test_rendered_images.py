@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.meshes.world import BUILDING, ROAD, MeshBuilder, Scene, World, box
 from semloc_logs.simulation.sensors.camera import CAMERAS, base_T_camera, first_hits, pixel_rays
-from semloc_logs.simulation.sensors.noise import octaves
+from semloc_logs.simulation.sensors.noise import Octaves, octaves
 from semloc_logs.simulation.sensors.rendered_images import Painter
 from semloc_logs.simulation.sensors.surface_colours import road_plan, surfaces
 from semloc_logs.simulation.town.street import build_street
@@ -119,7 +119,7 @@ def test_a_box_casts_a_shadow() -> None:
 def test_noise_fades_with_the_size_of_the_pixel() -> None:
     points = np.random.default_rng(0).uniform(-50, 50, (2000, 3)).astype(np.float32)
     near, far = (
-        octaves(points, np.full(2000, f, np.float32), 1.0, 4, 0.8, 1.0, 3) for f in (0.001, 3.0)
+        octaves(points, np.full(2000, f, np.float32), Octaves(1.0, 4, 0.8), 3) for f in (0.001, 3.0)
     )
     assert 0.2 < near.std() < 1.5
     assert abs(near.mean()) < 0.1
