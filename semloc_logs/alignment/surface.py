@@ -12,8 +12,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.mapping.selection import thin
-from semloc_logs.numerics.eigen import eigen
-from semloc_logs.numerics.local_shape import shapes_of
+from semloc_logs.numerics.cells import by_cell
+from semloc_logs.numerics.local_shape import (
+    LEAST_SPREAD,
+    MOMENTS,
+    add_point,
+    covariance,
+    principal_axes,
+    shapes_of,
+)
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -119,21 +126,13 @@ def _sorted(points: F64, cell: float) -> tuple[I64, F64, I64, I32]:
         low[:] = high[:] = 0.0
     for k in range(3):
         shape[k] += int(np.floor((high[k] - low[k]) / cell))
-    at = np.empty(len(points), np.int64)
-    start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int32)
+    number = np.empty(len(points), np.int64)
     for n in range(len(points)):
-        x = (points[n, 0] - low[0]) / cell
-        y = (points[n, 1] - low[1]) / cell
-        z = (points[n, 2] - low[2]) / cell
-        at[n] = (int(np.floor(x)) * shape[1] + int(np.floor(y))) * shape[2] + int(np.floor(z))
-        start[at[n] + 1] += 1
-    for c in range(1, len(start)):
-        start[c] += start[c - 1]
-    order = np.empty(len(points), np.int64)
-    free = start.copy()
-    for n in range(len(points)):
-        order[free[at[n]]] = n
-        free[at[n]] += 1
+        x = int(np.floor((points[n, 0] - low[0]) / cell))
+        y = int(np.floor((points[n, 1] - low[1]) / cell))
+        z = int(np.floor((points[n, 2] - low[2]) / cell))
+        number[n] = (x * shape[1] + y) * shape[2] + z
+    order, start = by_cell(number, shape[0] * shape[1] * shape[2])
     return order, low, shape, start
 
 
@@ -170,56 +169,39 @@ def _flattened(
     moved = points.copy()
     normals = np.zeros((len(points), 3))
     planar = np.zeros(len(points))
+    moments = np.empty(MOMENTS)
     mean = np.empty(3)
     a = np.empty((3, 3))
-    values = np.empty(3)
-    vectors = np.empty((3, 3))
+    extent = np.empty(3)
+    axes = np.empty((3, 3))
     for n in range(len(points)):
         p = (points[n, 0], points[n, 1], points[n, 2])
-        total, count = _moments(around, sigma, cells, p, noise, (mean, a))
-        if count < LEAST_FLAT:
+        if _sum_around(around, sigma, cells, p, noise, moments) < LEAST_FLAT:
             continue
-        mean /= total
-        a[1, 0] = a[0, 1]
-        a[2, 0] = a[0, 2]
-        a[2, 1] = a[1, 2]
+        covariance(moments, mean, a)
+        principal_axes(a, extent, axes)
+        longest = extent[2] + LEAST_SPREAD
+        off = mean[0] * axes[0, 0] + mean[1] * axes[1, 0] + mean[2] * axes[2, 0]
         for k in range(3):
-            for m in range(3):
-                a[k, m] = a[k, m] / total - mean[k] * mean[m]
-        eigen(a, values, vectors)
-        s0 = np.sqrt(max(values[0], 0.0))
-        s1 = np.sqrt(max(values[1], 0.0))
-        s2 = np.sqrt(max(values[2], 0.0)) + 1e-9
-        off = mean[0] * vectors[0, 0] + mean[1] * vectors[1, 0] + mean[2] * vectors[2, 0]
-        for k in range(3):
-            normals[n, k] = vectors[k, 0]
-            moved[n, k] += off * vectors[k, 0]
-        planar[n] = 1.0 if s0 / s2 < THICK and (s2 - s1) / s2 < LINEAR else 0.0
+            normals[n, k] = axes[k, 0]
+            moved[n, k] += off * axes[k, 0]
+        is_thin = extent[0] / longest < THICK
+        planar[n] = 1.0 if is_thin and (longest - extent[1]) / longest < LINEAR else 0.0
     return moved, normals, planar
 
 
 @njit(cache=True, nogil=True)
-def _moments(
-    around: F64,
-    sigma: F64,
-    cells: Cells,
-    p: Point,
-    noise: float,
-    moments: tuple[F64, F64],
-) -> tuple[float, int]:
-    """Weight and number of the points ``around`` within a cell's edge of ``p``.
+def _sum_around(around: F64, sigma: F64, cells: Cells, p: Point, noise: float, moments: F64) -> int:
+    """The number of points ``around`` within a cell's edge of ``p``.
 
-    ``moments``: the sums of weighted offsets (3,) and of their products, above the diagonal (3, 3).
+    ``moments`` (10,): gets those of their offsets from ``p``.
     """
     radius = cells[0]
-    mean, a = moments
     gx, gy, gz = _in_cells_of(cells, p)
     x = int(np.floor(gx))
     y = int(np.floor(gy))
     z = int(np.floor(gz))
-    mean[:] = 0.0
-    a[:] = 0.0
-    total = 0.0
+    moments[:] = 0.0
     count = 0
     for dx in range(-1, 2):
         for dy in range(-1, 2):
@@ -230,19 +212,9 @@ def _moments(
                 o2 = around[i, 2] - p[2]
                 if o0 * o0 + o1 * o1 + o2 * o2 > radius * radius:
                     continue
-                w = 1.0 / (noise * noise + sigma[i] * sigma[i])
-                total = total + w
-                count = count + 1
-                mean[0] += w * o0
-                mean[1] += w * o1
-                mean[2] += w * o2
-                a[0, 0] += w * o0 * o0
-                a[1, 1] += w * o1 * o1
-                a[2, 2] += w * o2 * o2
-                a[0, 1] += w * o0 * o1
-                a[0, 2] += w * o0 * o2
-                a[1, 2] += w * o1 * o2
-    return total, count
+                count += 1
+                add_point(moments, o0, o1, o2, 1.0 / (noise * noise + sigma[i] * sigma[i]))
+    return count
 
 
 @njit(cache=True, nogil=True)

@@ -80,7 +80,7 @@ def nearest_depth(
 ) -> tuple[F32, float]:
     """Depth of the nearest surface in each cell of the picture, and the edge of a cell in pixels.
 
-    Depth in m along the optical axis, infinite where there is no surface. ``camera`` and ``pixels``
+    Depth in m along the optical axis, infinite without a surface. ``camera`` and ``pixels``
     are the places of all ``points`` (n, 3) of a cloud in the camera's frame and in its picture.
     """
     cell = max(1.0, float(round(projector.focal * _CELL)))

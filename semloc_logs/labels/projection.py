@@ -13,6 +13,9 @@ _NEAREST = 0.1  # m along the optical axis: nearer points are not projected
 _STEEPEST = np.radians(85)
 # points so much further from the middle than the picture's corner still are projected
 _MARGIN = 1.25
+_MOST_STRETCH = 0.02  # by which a picture may be scaled differently along its axes
+FISHEYE_MODELS = ("equidistant", "kannala_brandt", "fisheye")
+POLYNOMIAL_MODELS = ("plumb_bob", "rational_polynomial", "thin_prism", "")
 
 
 class Projector:
@@ -24,58 +27,25 @@ class Projector:
     """
 
     def __init__(self, camera: Camera, height: int, width: int, *, rectified: bool = False) -> None:
-        where = f"CameraInfo {camera.header.topic}"
-        matrix, self._distortion, self._rotation = (
-            camera.K.copy(),
-            np.atleast_1d(np.asarray(camera.D, float)),
-            np.eye(3),
-        )
+        matrix = camera.K.copy()
+        self._distortion = np.atleast_1d(np.asarray(camera.D, float))
+        self._rotation = np.eye(3)
         if (rectified and camera.P[0, 0] > 0) or matrix[0, 0] <= 0:
             matrix = camera.P[:, :3].copy()
             self._distortion = np.zeros(0)
             self._rotation = camera.R
-        scale = np.array([width / (camera.width or width), height / (camera.height or height)])
-        if abs(scale[0] / scale[1] - 1) > 0.02:
-            raise LogError(
-                f"{where} is for {camera.width} x {camera.height} pixels but its picture has "
-                f"{width} x {height}: "
-                f"record the CameraInfo of the picture, or name it with --topic camera_info=TOPIC."
-            )
-        # pixel centres are whole numbers: the corner of the picture is at -0.5
-        matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
-        matrix[:2, :2] *= scale[:, None]
-        if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-            raise LogError(
-                f"{where} has no focal length: the camera is not calibrated; name another with "
-                "--topic camera_info=TOPIC."
-            )
-        self.height, self.width, self.focal, self._matrix = (
-            height,
-            width,
-            float(matrix[0, 0]),
-            matrix,
-        )
-        name = camera.model.lower()
-        count = len(self._distortion)
-        self._fisheye = name in ("equidistant", "kannala_brandt", "fisheye") and count == 4
-        is_polynomial = name in (
-            "plumb_bob",
-            "rational_polynomial",
-            "thin_prism",
-            "",
-        ) and count in (4, 5, 8, 12, 14)
-        if np.any(self._distortion) and not (self._fisheye or is_polynomial):
-            raise LogError(
-                f"{where} has the distortion model '{camera.model[:40]}' with {count} "
-                "coefficients, which is not supported: "
-                "record rectified pictures, or name another calibration with --topic "
-                "camera_info=TOPIC."
-            )
-        corners = (
-            np.array([[u, v] for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
-            - matrix[:2, 2]
-        )
-        corner = float(np.hypot(corners[:, 0] / matrix[0, 0], corners[:, 1] / matrix[1, 1]).max())
+        self._matrix = _scaled(matrix, camera, height, width)
+        self.height = height
+        self.width = width
+        self.focal = float(self._matrix[0, 0])
+        self._fisheye = _is_fisheye(camera, self._distortion)
+
+        # the corner of the picture that is farthest from the axis, at focal length 1
+        u = np.array([-0.5, width - 0.5]) - self._matrix[0, 2]
+        v = np.array([-0.5, height - 0.5]) - self._matrix[1, 2]
+        x = np.repeat(u, 2) / self._matrix[0, 0]
+        y = np.tile(v, 2) / self._matrix[1, 1]
+        corner = float(np.hypot(x, y).max())
         self._widest = _widest(self._distortion, self._fisheye, _MARGIN * corner)
 
     def pixels(self, points: NDArray[np.floating]) -> tuple[F64, NDArray[np.bool_]]:
@@ -127,6 +97,47 @@ class Projector:
             & (v >= -0.5 - y)
             & (v < self.height - 0.5 + y)
         )
+
+
+def _scaled(matrix: F64, camera: Camera, height: int, width: int) -> F64:
+    """The camera matrix (3, 3) for a picture of ``height`` x ``width`` pixels.
+
+    LogError when the picture was not scaled as a whole, or without a focal length.
+    """
+    scale = np.array([width / (camera.width or width), height / (camera.height or height)])
+    if abs(scale[0] / scale[1] - 1) > _MOST_STRETCH:
+        raise LogError(
+            f"CameraInfo {camera.header.topic} is for {camera.width} x {camera.height} pixels but "
+            f"its picture has {width} x {height}: record the CameraInfo of the picture, or name it "
+            "with --topic camera_info=TOPIC."
+        )
+    # pixel centres are whole numbers: the corner of the picture is at -0.5
+    matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
+    matrix[:2, :2] *= scale[:, None]
+    if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        raise LogError(
+            f"CameraInfo {camera.header.topic} has no focal length: the camera is not calibrated; "
+            "name another with --topic camera_info=TOPIC."
+        )
+    return matrix
+
+
+def _is_fisheye(camera: Camera, distortion: F64) -> bool:
+    """Whether ``distortion`` (n,) is of the equidistant model, and not of a polynomial one.
+
+    LogError for another model.
+    """
+    name = camera.model.lower()
+    count = len(distortion)
+    is_fisheye = name in FISHEYE_MODELS and count == 4
+    is_polynomial = name in POLYNOMIAL_MODELS and count in (4, 5, 8, 12, 14)
+    if np.any(distortion) and not (is_fisheye or is_polynomial):
+        raise LogError(
+            f"CameraInfo {camera.header.topic} has the distortion model '{camera.model[:40]}' with "
+            f"{count} coefficients, which is not supported: record rectified pictures, or name "
+            "another calibration with --topic camera_info=TOPIC."
+        )
+    return is_fisheye
 
 
 def _widest(distortion: F64, fisheye: bool, corner: float) -> float:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from semloc_logs.numerics.cells import by_cell
 
 F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
 CELL = 1.0  # of the grid, at street scale (m)
@@ -98,7 +99,7 @@ class _Cells(NamedTuple):
 
     z: F64
     order: I64
-    start: I64
+    start: I32
     nx: int
     ny: int
 

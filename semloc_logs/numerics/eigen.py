@@ -18,9 +18,9 @@ def eigen(a: F64, values: F64, vectors: F64) -> None:
     ``a`` (3, 3) is overwritten. Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations,
     8.5): as accurate for nearly equal eigenvalues as for others.
     """
+    vectors[:] = 0.0
     for i in range(3):
-        for j in range(3):
-            vectors[i, j] = 1.0 if i == j else 0.0
+        vectors[i, i] = 1.0
     for _ in range(SWEEPS):
         if abs(a[0, 1]) + abs(a[0, 2]) + abs(a[1, 2]) <= 1e-15 * (
             abs(a[0, 0]) + abs(a[1, 1]) + abs(a[2, 2])

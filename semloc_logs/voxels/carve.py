@@ -248,8 +248,7 @@ def mark_ends(grid: Grid, rays: Rays, votes: Votes) -> tuple[I64, F64]:
             uncertainty = float(sigma[i]) if len(sigma) else 0.0
             weight, carved = _weight_and_reach(length[i], dz, uncertainty, LEVEL[labels[i]])
         address = ax[int(start[0] + dx)] + ay[int(start[1] + dy)] + az[int(start[2] + dz)]
-        # one ray for a hit and one for a pass that end in the same voxel: they differ in what they
-        # carve
+        # a hit and a pass that end in the same voxel are carved both: they carve different parts
         key = address * 2 + is_hit
         if key != last:
             last = key
