@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Figures = dict[str, dict[str, float | str]]
 REPEATS = 5
+CLOSURES = 100  # in the annotated log
 
 
 def _seconds(action: Callable[[], Any], repeats: int = REPEATS) -> float:
@@ -125,68 +126,61 @@ def annotate(settings: Resolved) -> Figures:
     """A hundred closures into a simulated MCAP log in place, beside rewriting the log with
     mcap-python.
     """
-    from mcap.reader import make_reader
-    from mcap.writer import Writer
-
-    from semloc_logs.logs.annotation.annotate import ClosureRecord
-
     with tempfile.TemporaryDirectory(prefix="semloc-") as folder:
         log = _drive(Path(folder))
-        with log.open("rb") as file:
-            times = [m.log_time for _, _, m in make_reader(file).iter_messages()]
-        stamps = [times[i * (len(times) - 1) // 99] for i in range(100)]
-        covariance = tuple(np.eye(6).ravel().tolist())
-        records = [
-            ClosureRecord(
-                "session_0",
-                "other",
-                s,
-                s,
-                1.0,
-                0.0,
-                0.0,
-                0.0,
-                0.0,
-                0.0,
-                1.0,
-                covariance,
-                0.5,
-                0.999,
-                100,
-                10,
-            )
-            for s in stamps
-        ]
-
-        def rewrite() -> None:
-            with log.open("rb") as source, (Path(folder) / "copy.mcap").open("wb") as target:
-                writer = Writer(target)
-                writer.start()
-                channels: dict[int, int] = {}
-                for schema, channel, m in make_reader(source).iter_messages():
-                    if channel.id not in channels:
-                        known = (
-                            writer.register_schema(schema.name, schema.encoding, schema.data)
-                            if schema
-                            else 0
-                        )
-                        channels[channel.id] = writer.register_channel(
-                            channel.topic, channel.message_encoding, known, channel.metadata
-                        )
-                    writer.add_message(
-                        channels[channel.id], m.log_time, m.data, m.publish_time, m.sequence
-                    )
-                writer.finish()  # type: ignore[no-untyped-call]
-
+        records = _closure_records(log, CLOSURES)
         size = log.stat().st_size / 1e6
-        taken = [_annotated(log, records[: 100 - i]) for i in range(REPEATS)]
+        taken = [_annotated(log, records[: CLOSURES - i]) for i in range(REPEATS)]
+        rewritten = _seconds(lambda: _rewrite(log, Path(folder) / "copy.mcap"), 2)
         return {
             "in_place": {
                 "ours": float(np.median(taken)),
                 "unit": f"s for a log of {size:.0f} MB",
-                "mcap-python": _seconds(rewrite, 2),
+                "mcap-python": rewritten,
             }
         }
+
+
+def _closure_records(log: Path, count: int) -> list[ClosureRecord]:
+    """Closures with another session, evenly over the messages of ``log``."""
+    from mcap.reader import make_reader
+
+    from semloc_logs.logs.annotation.annotate import ClosureRecord
+
+    with log.open("rb") as file:
+        times = [m.log_time for _, _, m in make_reader(file).iter_messages()]
+    stamps = [times[i * (len(times) - 1) // (count - 1)] for i in range(count)]
+    ends = ("session_0", "other")
+    position = (1.0, 0.0, 0.0)
+    quaternion = (0.0, 0.0, 0.0, 1.0)
+    covariance = tuple(np.eye(6).ravel().tolist())
+    return [
+        ClosureRecord(*ends, s, s, *position, *quaternion, covariance, 0.5, 0.999, 100, 10)
+        for s in stamps
+    ]
+
+
+def _rewrite(log: Path, copy: Path) -> None:
+    """Copy ``log`` message by message with mcap-python."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    with log.open("rb") as source, copy.open("wb") as target:
+        writer = Writer(target)
+        writer.start()
+        channels: dict[int, int] = {}
+        for schema, channel, m in make_reader(source).iter_messages():
+            if channel.id not in channels:
+                known = (
+                    writer.register_schema(schema.name, schema.encoding, schema.data)
+                    if schema
+                    else 0
+                )
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, known, channel.metadata
+                )
+            writer.add_message(channels[channel.id], m.log_time, m.data, m.publish_time, m.sequence)
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 def _annotated(log: Path, records: Sequence[ClosureRecord]) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from semloc_logs.simulation.meshes.shapes import Parts, Rng, boxes, joined, tubes, wheels
 from semloc_logs.simulation.meshes.world import (
     BUILDING,
+    F64,
     FENCE,
     PERSON,
     POLE,
@@ -316,66 +317,97 @@ def street_clutter(rng: Rng, kind: str | None = None) -> Parts:
     drawn = str(rng.choice(CLUTTER))
     kind = kind or drawn
     size = rng.uniform(0.8, 1.25, 3)
-    if kind == "column":
-        tall = 3.2 * size[2]
-        return [
-            (
-                joined(
-                    cylinder(0.6, tall, 12),
-                    cylinder(0.72, 0.15, 12, z=tall),
-                    cylinder(0.6, 0.4, 12, 0.1, z=tall + 0.15),
-                ),
-                UNLABELLED,
-            )
-        ]
-    if kind == "hydrant":
-        return [
-            (
-                joined(
-                    cylinder(0.12, 0.6, 8),
-                    ellipsoid((0.13, 0.13, 0.12), 0.62, 4, 8),
-                    box(0.42, 0.14, 0.14, z=0.4),
-                ),
-                UNLABELLED,
-            )
-        ]
-    if kind == "basket":
-        return [
-            (cylinder(0.05, 1.2, 6), POLE),
-            (place(cylinder(0.19, 0.55, 8, 0.22, z=0.5), 0, 0.25), UNLABELLED),
-        ]
-    if kind == "meter":
-        return [(joined(cylinder(0.05, 1.1, 6), box(0.3, 0.25, 0.7, z=1.0)), POLE)]
-    if kind == "planter":
-        tub = boxes(np.array([[1.4 * size[0], 0.7 * size[1], 0.6 * size[2], 0, 0, 0]]))
-        angle = rng.uniform(0, 2 * np.pi, 60)
-        centre = np.column_stack(
-            [
-                0.5 * np.cos(angle) * size[0],
-                0.25 * np.sin(angle),
-                0.6 * size[2] + rng.uniform(0.0, 0.5, 60),
-            ]
-        )
-        corners = centre[:, None] + rng.uniform(-0.16, 0.16, (60, 3, 3))
-        return [
-            (tub, UNLABELLED),
-            (
-                Mesh(corners.reshape(-1, 3), np.arange(180, dtype=np.int64).reshape(-1, 3)),
-                VEGETATION,
+    makers = {
+        "column": _advertising_column,
+        "hydrant": _hydrant,
+        "basket": _basket,
+        "meter": _meter,
+        "planter": _planter,
+        "rack": _rack,
+    }
+    if kind in makers:
+        return makers[kind](rng, size)
+    return [(boxes(np.array(_box_clutter(rng, size)[kind])), UNLABELLED)]
+
+
+def _advertising_column(_: Rng, size: F64) -> Parts:
+    """A column for posters."""
+    tall = 3.2 * size[2]
+    return [
+        (
+            joined(
+                cylinder(0.6, tall, 12),
+                cylinder(0.72, 0.15, 12, z=tall),
+                cylinder(0.6, 0.4, 12, 0.1, z=tall + 0.15),
             ),
+            UNLABELLED,
+        )
+    ]
+
+
+def _hydrant(_: Rng, __: F64) -> Parts:
+    """A hydrant."""
+    return [
+        (
+            joined(
+                cylinder(0.12, 0.6, 8),
+                ellipsoid((0.13, 0.13, 0.12), 0.62, 4, 8),
+                box(0.42, 0.14, 0.14, z=0.4),
+            ),
+            UNLABELLED,
+        )
+    ]
+
+
+def _basket(_: Rng, __: F64) -> Parts:
+    """A waste basket on a pole."""
+    return [
+        (cylinder(0.05, 1.2, 6), POLE),
+        (place(cylinder(0.19, 0.55, 8, 0.22, z=0.5), 0, 0.25), UNLABELLED),
+    ]
+
+
+def _meter(_: Rng, __: F64) -> Parts:
+    """A parking meter."""
+    return [(joined(cylinder(0.05, 1.1, 6), box(0.3, 0.25, 0.7, z=1.0)), POLE)]
+
+
+def _planter(rng: Rng, size: F64) -> Parts:
+    """A tub with plants."""
+    tub = boxes(np.array([[1.4 * size[0], 0.7 * size[1], 0.6 * size[2], 0, 0, 0]]))
+    angle = rng.uniform(0, 2 * np.pi, 60)
+    centre = np.column_stack(
+        [
+            0.5 * np.cos(angle) * size[0],
+            0.25 * np.sin(angle),
+            0.6 * size[2] + rng.uniform(0.0, 0.5, 60),
         ]
-    if kind == "rack":
-        return [
-            (
-                boxes(
-                    np.array(
-                        [[0.05, 1.0, 0.8, 0.9 * k, 0, 0] for k in range(int(rng.integers(2, 6)))]
-                    )
-                ),
-                FENCE,
-            )
-        ]
-    rows = {
+    )
+    corners = centre[:, None] + rng.uniform(-0.16, 0.16, (60, 3, 3))
+    return [
+        (tub, UNLABELLED),
+        (
+            Mesh(corners.reshape(-1, 3), np.arange(180, dtype=np.int64).reshape(-1, 3)),
+            VEGETATION,
+        ),
+    ]
+
+
+def _rack(rng: Rng, __: F64) -> Parts:
+    """A row of stands for bicycles."""
+    return [
+        (
+            boxes(
+                np.array([[0.05, 1.0, 0.8, 0.9 * k, 0, 0] for k in range(int(rng.integers(2, 6)))])
+            ),
+            FENCE,
+        )
+    ]
+
+
+def _box_clutter(rng: Rng, size: F64) -> dict[str, list[list[float]]]:
+    """Boxes (length, width, height, x, y, z) of things that are made of these alone, by kind."""
+    return {
         "bin": [
             [0.55, 0.6, 1.0, 0, 0, 0.05],
             [0.6, 0.65, 0.08, 0, 0, 1.03],
@@ -402,5 +434,4 @@ def street_clutter(rng: Rng, kind: str | None = None) -> Parts:
             [0.15, 0.12, 0.6, 0.6, 0, 0],
         ],
         "phone": [[0.9, 0.9, 2.2, 0, 0, 0], [1.0, 1.0, 0.12, 0, 0, 2.2]],
-    }[kind]
-    return [(boxes(np.array(rows)), UNLABELLED)]
+    }
