@@ -194,7 +194,7 @@ def _flattened(
 def _sum_around(around: F64, sigma: F64, cells: Cells, p: Point, noise: float, moments: F64) -> int:
     """The number of points ``around`` within a cell's edge of ``p``.
 
-    ``moments`` (10,): gets those of their offsets from ``p``.
+    ``moments`` (10,): filled with the moments of their offsets from ``p``.
     """
     radius = cells[0]
     gx, gy, gz = _in_cells_of(cells, p)
