@@ -18,7 +18,7 @@ from semloc_logs.engines import Serial
 from semloc_logs.errors import LogError
 from semloc_logs.logs.annotation.annotate import Results, annotate_in_place
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
-from semloc_logs.mapping.session_fusion import FuseTask
+from semloc_logs.mapping.session_fusion import FusedSession, FuseTask
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Resolved
 from semloc_logs.simulation.output.drive_log import write_truth
@@ -209,7 +209,7 @@ def test_the_files_of_a_label_model_are_inputs(
 ) -> None:
     """The model itself is not run: a stand-in writes what tells that a session is done."""
 
-    def stand_in(task: FuseTask, **_: Any) -> dict[str, Any]:
+    def stand_in(task: FuseTask, **_: Any) -> FusedSession:
         content = {
             "fingerprint": task.fingerprint,
             "skipped": [],
@@ -219,7 +219,7 @@ def test_the_files_of_a_label_model_are_inputs(
             "voxels": 0,
         }
         task.folder.session_json.write_text(json.dumps(content))
-        return {**content, "label_source": "onnx"}
+        return FusedSession({**content, "label_source": "onnx"}, ())
 
     monkeypatch.setattr(fuse_stage, "fuse_session", stand_in)
     model = tmp_path / "model.onnx"
