@@ -195,7 +195,7 @@ def reasons_page() -> str:
     rows = [(f"`{reason.name}`", _FIGURE.sub("x", reason.value)) for reason in Reason]
     parts = [
         "# Reasons for rejection",
-        "The column `reason` of `rejected.parquet` has one of these sentences, with figures in"
+        "The column `reason` of `rejected.parquet` contains one of these sentences, with figures in"
         " place of x. [Acceptance](../explanation/acceptance.md) explains the gates.",
         _table(("reason", "sentence"), rows),
     ]
