@@ -27,7 +27,13 @@ from semloc_logs.labels.space import cityscapes
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse, turned_about_z
 from semloc_logs.settings import STREET_VOXEL, Resolved
-from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder, quarter_turns
+from semloc_logs.subvolumes.describe import (
+    Described,
+    Windows,
+    describe_map,
+    load_encoder,
+    quarter_turns,
+)
 from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.workspace import Workspace
 
@@ -188,10 +194,8 @@ def _described(query: Query, variant: str, ground_z: float, settings: Resolved) 
         query.blocks.dense(low, tuple((high - low).tolist())),
         low,
         ground_z,
-        settings.fusion.voxel_size,
         load_encoder(variant, descriptor.weights),
-        descriptor.query_stride,
-        descriptor.min_occupied,
+        Windows(settings.fusion.voxel_size, descriptor.query_stride, descriptor.min_occupied),
     )
 
 

@@ -40,6 +40,20 @@ class Described:
     descriptor: F32
 
 
+@dataclass(frozen=True, slots=True)
+class Windows:
+    """The subvolumes of a map that are described.
+
+    ``voxel_size`` in metres, ``stride`` 4 or 8 voxels, at least ``min_occupied`` voxels in each;
+    where there is a road, the centre lies within ``reach`` metres of it.
+    """
+
+    voxel_size: float
+    stride: int
+    min_occupied: int
+    reach: float = np.inf
+
+
 def quarter_turns(descriptor: F32, turns: int) -> F32:
     """Descriptors (n, latent) of a map turned by ``turns`` quarters about z, counter-clockwise.
 
@@ -137,19 +151,17 @@ def describe_map(
     state: U8,
     low: NDArray[np.integer],
     ground_z: float,
-    voxel_size: float,
     encoder: Encoder,
-    stride: int,
-    min_occupied: int,
+    windows: Windows,
     road: NDArray[np.floating] | None = None,
-    reach: float = np.inf,
 ) -> Described:
     """Describe the box ``state`` (x, y, z) of voxel states with its corner at voxel ``low`` (3,).
 
-    ``ground_z`` is in metres, ``stride`` 4 or 8 voxels. Positions are multiples of the stride in
-    the map's voxel grid only if ``low`` is. With a ``road`` (m, 2), metres, only subvolumes whose
-    centre lies within ``reach`` metres of it are described.
+    ``ground_z`` and the ``road`` (m, 2) are in metres. Positions are multiples of the stride in the
+    map's voxel grid only if ``low`` is.
     """
+    stride = windows.stride
+    voxel_size = windows.voxel_size
     if stride not in (4, 8):
         raise SettingsError(f"A stride of {stride} voxels is not possible: 4 or 8.")
     corner = np.asarray(low)
@@ -164,11 +176,12 @@ def describe_map(
     layer = _layers(inner, bottom, stride)
 
     # windows that are described: enough in them, and close to the road
-    described = _window_sums(_filled(inner, 0, height), stride) >= min_occupied
+    described = _window_sums(_filled(inner, 0, height), stride) >= windows.min_occupied
     if road is not None:
-        windows = np.moveaxis(np.indices(described.shape), 0, -1) * stride + first + corner[:2]
-        middle = (windows + SIZE / 2) * voxel_size
-        described &= cKDTree(road).query(middle, distance_upper_bound=reach)[0] < reach
+        corners = np.moveaxis(np.indices(described.shape), 0, -1) * stride + first + corner[:2]
+        middle = (corners + SIZE / 2) * voxel_size
+        distance, _ = cKDTree(road).query(middle, distance_upper_bound=windows.reach)
+        described &= distance < windows.reach
 
     table = code_table(encoder.variant)
     centres = []
@@ -178,7 +191,7 @@ def describe_map(
         z = bottom + LAYER * int(index)
         if z < 0 or z + SIZE > height:
             continue
-        enough = _window_sums(_filled(inner, z, z + SIZE), stride) >= min_occupied
+        enough = _window_sums(_filled(inner, z, z + SIZE), stride) >= windows.min_occupied
         # corners of the windows within the inner box
         wanted = np.argwhere(enough & described & (layer == index)) * stride
         if not len(wanted):

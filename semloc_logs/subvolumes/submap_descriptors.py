@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from semloc_logs.labels.space import KNOWS_CLASSES
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import turned_map
-from semloc_logs.subvolumes.describe import Described, describe_map
+from semloc_logs.subvolumes.describe import Described, Windows, describe_map
 from semloc_logs.subvolumes.network import Encoder
-from semloc_logs.voxels.store import blocks_path, read_blocks
+from semloc_logs.voxels.store import read_blocks
 from semloc_logs.workspace import SessionFolder
 
 
@@ -34,8 +34,7 @@ class DescribeTask:
 
 
 def describe_submap(
-    folder: SessionFolder,
-    submap: int,
+    blocks: Path,
     ground_z: float,
     road: NDArray[np.floating],
     encoder: Encoder,
@@ -44,29 +43,19 @@ def describe_submap(
 ) -> list[Described]:
     """Centres (voxels) and descriptors of the subvolumes of a submap, close to its ``road``.
 
-    ``road`` (m, 2) are the keyframes' positions, metres. One set for each of ``yaws``, as a query
-    at that heading sees the submap.
+    ``blocks`` is the submap's table, ``road`` (m, 2) are the keyframes' positions, metres. One set
+    for each of ``yaws``, as a query at that heading sees the submap.
     """
-    blocks = read_blocks(blocks_path(folder.blocks, submap), states_only=True)
-    low, high = blocks.bounds()
-    state = blocks.dense(low, tuple((high - low).tolist()))
-    d = settings.descriptor
+    held = read_blocks(blocks, states_only=True)
+    low, high = held.bounds()
+    state = held.dense(low, tuple((high - low).tolist()))
     v = settings.fusion.voxel_size
-    reach = d.reach
+    d = settings.descriptor
+    windows = Windows(v, d.stride, d.min_occupied, d.reach)
     out = []
     for turned in (turned_map(state, low, yaw) for yaw in yaws):
         positions = turned.from_map(road / v) * v
-        described = describe_map(
-            turned.state,
-            turned.low,
-            ground_z,
-            v,
-            encoder,
-            d.stride,
-            d.min_occupied,
-            positions,
-            reach,
-        )
+        described = describe_map(turned.state, turned.low, ground_z, encoder, windows, positions)
         out.append(Described(turned.to_map(described.centre), described.descriptor))
     return out
 

@@ -13,6 +13,7 @@ from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.submap_descriptors import DescribeTask, describe_submap, known_headings
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table
+from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words.vocabulary import load_vocabulary
 
 # variant, yaw, centres (n, 3), words, codes
@@ -27,7 +28,12 @@ def index_submap(task: DescribeTask) -> int:
         encoder = load_encoder(variant, task.settings.descriptor.weights)
         vocabulary = load_vocabulary(variant, task.settings.descriptor.vocabulary)
         headings = describe_submap(
-            task.folder, task.submap, task.ground_z, task.road, encoder, task.settings, yaws
+            blocks_path(task.folder.blocks, task.submap),
+            task.ground_z,
+            task.road,
+            encoder,
+            task.settings,
+            yaws,
         )
         for yaw, described in zip(yaws, headings, strict=True):
             parts.append(

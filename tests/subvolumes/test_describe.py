@@ -16,6 +16,7 @@ from semloc_logs.subvolumes import describe
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table, turned_map
 from semloc_logs.subvolumes.describe import (
     Described,
+    Windows,
     describe_map,
     load_encoder,
     quarter_turns,
@@ -87,13 +88,13 @@ def test_a_map_at_once_is_its_subvolumes_one_by_one(
     state = world()
     encoder = random_encoder(variant)
     with full_precision():
-        found = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
+        found = describe_map(state, LOW, (12 - 16) * V, encoder, Windows(V, 8, 40))
     assert len(found.descriptor) > 30
     np.testing.assert_allclose(np.linalg.norm(found.descriptor, axis=1), 1, atol=1e-5)
     some = np.arange(0, len(found.centre), len(found.centre) // 7)
     single = one_by_one(state, Described(found.centre[some], found.descriptor[some]), encoder)
     np.testing.assert_allclose(found.descriptor[some], single, atol=1e-5)
-    reduced = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
+    reduced = describe_map(state, LOW, (12 - 16) * V, encoder, Windows(V, 8, 40))
     np.testing.assert_array_equal(reduced.centre, found.centre)
     assert np.abs(reduced.descriptor - found.descriptor).max() < 1e-2
     # the step in the ground needs more than one layer
@@ -104,7 +105,7 @@ def test_a_finer_stride_contains_the_coarser_one() -> None:
     state = world()
     encoder = random_encoder("semantic")
     ground = (12 - 16) * V
-    coarse, fine = (describe_map(state, LOW, ground, V, encoder, s, 40) for s in (8, 4))
+    coarse, fine = (describe_map(state, LOW, ground, encoder, Windows(V, s, 40)) for s in (8, 4))
     row = {tuple(c): i for i, c in enumerate(fine.centre.tolist())}
     assert len(row) == len(fine.centre)  # no place twice
     same = [row[tuple(c)] for c in coarse.centre.tolist()]
@@ -116,7 +117,7 @@ def test_a_finer_stride_contains_the_coarser_one() -> None:
 def test_what_is_described_holds_enough_and_starts_at_its_lowest_surface() -> None:
     state = world()
     padded = np.pad(state, 64, constant_values=253)
-    found = describe_map(state, LOW, (12 - 16) * V, V, random_encoder("geometric"), 8, 400)
+    found = describe_map(state, LOW, (12 - 16) * V, random_encoder("geometric"), Windows(V, 8, 400))
     bottoms = []
     for centre in found.centre:
         x, y, z = (centre - SIZE / 2).astype(int) - LOW + 64
@@ -124,7 +125,9 @@ def test_what_is_described_holds_enough_and_starts_at_its_lowest_surface() -> No
         assert part.sum() >= 400
         bottoms.append(int(np.argmax(part.sum((0, 1)) > 20)))
     assert max(bottoms) <= 8  # the lowest surface lies in the lowest eight voxels
-    everywhere = describe_map(state, LOW, (12 - 16) * V, V, random_encoder("geometric"), 8, 1)
+    everywhere = describe_map(
+        state, LOW, (12 - 16) * V, random_encoder("geometric"), Windows(V, 8, 1)
+    )
     assert len(everywhere.centre) > len(found.centre)
 
 
@@ -134,8 +137,10 @@ def test_a_map_described_in_other_words_of_its_own_position() -> None:
     """
     state = world()
     encoder = random_encoder("geometric")
-    a = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
-    b = describe_map(state, LOW + np.array([800, -160, 24]), (12 - 16 + 24) * V, V, encoder, 8, 40)
+    a = describe_map(state, LOW, (12 - 16) * V, encoder, Windows(V, 8, 40))
+    b = describe_map(
+        state, LOW + np.array([800, -160, 24]), (12 - 16 + 24) * V, encoder, Windows(V, 8, 40)
+    )
     np.testing.assert_array_equal(a.descriptor, b.descriptor)
     np.testing.assert_array_equal(a.centre + np.array([800, -160, 24]), b.centre)
 
@@ -148,10 +153,10 @@ def test_the_grid_is_that_of_the_map_wherever_the_content_starts() -> None:
     encoder = random_encoder("geometric")
     state[:5], state[:, :3] = 253, 253
     ground = (12 - 16) * V
-    a = describe_map(state, LOW, ground, V, encoder, 8, 40)
+    a = describe_map(state, LOW, ground, encoder, Windows(V, 8, 40))
     assert set(np.unique((a.centre[:, :2] - SIZE / 2 - LOW[:2]) % 8)) == {0.0}
     more = np.pad(state, ((24, 16), (40, 8), (16, 0)), constant_values=253)
-    b = describe_map(more, LOW - np.array([24, 40, 16]), ground, V, encoder, 8, 40)
+    b = describe_map(more, LOW - np.array([24, 40, 16]), ground, encoder, Windows(V, 8, 40))
     order_a, order_b = (np.lexsort(d.centre.T) for d in (a, b))
     np.testing.assert_array_equal(a.centre[order_a], b.centre[order_b])
     assert np.abs(a.descriptor[order_a] - b.descriptor[order_b]).max() < 1e-2
@@ -166,7 +171,9 @@ def test_the_grid_is_that_of_the_map_wherever_the_content_starts() -> None:
     ],
 )
 def test_maps_with_nothing_occupied(state: U8) -> None:
-    found = describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 1)
+    found = describe_map(
+        state, np.zeros(3, int), 0.0, random_encoder("geometric"), Windows(V, 8, 1)
+    )
     assert found.centre.shape == (0, 3)
     assert found.descriptor.shape == (0, 256)
 
@@ -175,18 +182,24 @@ def test_a_single_voxel_and_a_small_map() -> None:
     state = np.full((16, 16, 16), 253, np.uint8)
     state[8, 8, 8] = 2
     assert (
-        len(describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 2).centre)
+        len(
+            describe_map(
+                state, np.zeros(3, int), 0.0, random_encoder("geometric"), Windows(V, 8, 2)
+            ).centre
+        )
         == 0
     )
     state[6:10, 6:10, 8:12] = 2
-    found = describe_map(state, np.zeros(3, int), 0.0, V, random_encoder("geometric"), 8, 20)
+    found = describe_map(
+        state, np.zeros(3, int), 0.0, random_encoder("geometric"), Windows(V, 8, 20)
+    )
     assert len(found.centre) > 0
     assert np.abs(found.centre[:, :2] - 8).max() <= SIZE
 
 
 def test_other_strides_are_refused() -> None:
     with pytest.raises(SettingsError, match="stride"):
-        describe_map(world(), LOW, 0.0, V, random_encoder("geometric"), 6, 40)
+        describe_map(world(), LOW, 0.0, random_encoder("geometric"), Windows(V, 6, 40))
 
 
 def test_eights_there_and_back() -> None:
@@ -238,8 +251,8 @@ def test_weights_come_back_and_other_files_are_refused(tmp_path: Path) -> None:
     save_weights(path, model, {"trained_on": "nothing"})
     encoder = load_encoder("geometric", path)
     state = world()
-    a = describe_map(state, LOW, (12 - 16) * V, V, encoder, 8, 40)
-    b = describe_map(state, LOW, (12 - 16) * V, V, model.encoder, 8, 40)
+    a = describe_map(state, LOW, (12 - 16) * V, encoder, Windows(V, 8, 40))
+    b = describe_map(state, LOW, (12 - 16) * V, model.encoder, Windows(V, 8, 40))
     assert (a.descriptor * b.descriptor).sum(1).min() > 0.999  # bf16 of the weights
     with pytest.raises(SettingsError, match="semantic"):
         load_encoder("semantic", path)  # of the other variant
@@ -278,7 +291,9 @@ def test_centres_of_a_turned_map_are_those_of_the_map(yaw: float) -> None:
     state = np.full((80, 96, 40), 254, np.uint8)
     state[60:64, 20:24, 12:16] = 2
     turned = turned_map(state, LOW, yaw)
-    found = describe_map(turned.state, turned.low, -4 * V, V, random_encoder("geometric"), 4, 40)
+    found = describe_map(
+        turned.state, turned.low, -4 * V, random_encoder("geometric"), Windows(V, 4, 40)
+    )
     away = turned.to_map(found.centre)[:, :2] - (LOW[:2] + np.array([62, 22]))
     assert len(away) >= 5
     assert np.abs(away).max() < 16 * np.sqrt(2) + 2
@@ -293,7 +308,9 @@ def test_quarter_turns_of_the_query_meet_the_headings_of_the_map() -> None:
     encoder = random_encoder("geometric", seed=2)
     state = world()
     turned = [turned_map(state, LOW, yaw) for yaw in (np.pi / 10, np.pi / 10 + np.pi / 2)]
-    found = [describe_map(t.state, t.low, (12 - 16) * V, V, encoder, 8, 40) for t in turned]
+    found = [
+        describe_map(t.state, t.low, (12 - 16) * V, encoder, Windows(V, 8, 40)) for t in turned
+    ]
     known, asked = (t.to_map(f.centre) for t, f in zip(turned, found, strict=True))
     i, j = np.nonzero(np.linalg.norm(known[:, None] - asked[None], axis=2) < 0.01)
     assert len(i) > 10

@@ -21,7 +21,7 @@ from semloc_logs.benchmarks.descriptors.places import Place
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import MARGIN, SIZE
-from semloc_logs.subvolumes.describe import Described, describe_map
+from semloc_logs.subvolumes.describe import Described, Windows, describe_map
 from semloc_logs.subvolumes.network import LATENT
 
 F32 = NDArray[np.float32]
@@ -84,12 +84,9 @@ def network_describes(encoder: nn.Module, settings: Resolved) -> Describe:
             place.state,
             place.low,
             place.ground_z,
-            v,
             encoder,  # type: ignore[arg-type]
-            stride,
-            d.min_occupied,
+            Windows(v, stride, d.min_occupied, np.inf if is_query else d.reach),
             road,
-            np.inf if is_query else d.reach,
         )
 
     return describe

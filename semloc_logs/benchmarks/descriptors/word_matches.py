@@ -14,7 +14,7 @@ from semloc_logs.evaluation.truth import TrueTrack
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse
 from semloc_logs.settings import Resolved
-from semloc_logs.subvolumes.describe import describe_map
+from semloc_logs.subvolumes.describe import Windows, describe_map
 from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.subvolumes.submap_descriptors import describe_submap
 from semloc_logs.voxels.store import blocks_path, read_blocks
@@ -64,7 +64,7 @@ def word_recall(
     place = query_place(true.query, true.keyframe, true.targetmap_T_querymap, settings)
     d = settings.descriptor
     words = describe_map(
-        place.state, place.low, place.ground_z, v, encoder, d.query_stride, d.min_occupied
+        place.state, place.low, place.ground_z, encoder, Windows(v, d.query_stride, d.min_occupied)
     )
     true_centre = apply(place.common_T_map, words.centre.astype(np.float64) * v)
     distance = np.linalg.norm(true_centre[:, None, :] - centre[None], axis=2)
@@ -101,7 +101,11 @@ def _database_words(
         words
         for s in target.submaps
         for words in describe_submap(
-            target.folder, s["id"], s["ground_z"], target.road(s), encoder, settings
+            blocks_path(target.folder.blocks, s["id"]),
+            s["ground_z"],
+            target.road(s),
+            encoder,
+            settings,
         )
     ]
     centre = np.concatenate([part.centre for part in parts]) * settings.fusion.voxel_size

@@ -35,10 +35,11 @@ from semloc_logs.closures.query import build_query, query_keyframes
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.subvolumes.cut import turned_map
-from semloc_logs.subvolumes.describe import Described, describe_map, load_encoder
+from semloc_logs.subvolumes.describe import Described, Windows, describe_map, load_encoder
 from semloc_logs.subvolumes.network import Completion
 from semloc_logs.subvolumes.submap_descriptors import describe_submap
 from semloc_logs.subvolumes.weight_files import save_weights
+from semloc_logs.voxels.store import blocks_path
 from semloc_logs.words.index import Allowed, Index, Matches
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import Workspace
@@ -219,10 +220,8 @@ def sweep_words(
             turned.state,
             turned.low,
             ground_z,
-            v,
             encoder,
-            descriptor.query_stride,
-            descriptor.min_occupied,
+            Windows(v, descriptor.query_stride, descriptor.min_occupied),
         )
         nearest = database.words(variant).search(
             words.descriptor, closures.neighbours, closures.probes, allowed
@@ -303,7 +302,11 @@ def write_random(work: Workspace, settings: Resolved) -> None:
     encoder = load_encoder("semantic", weights)
     parts = [
         describe_submap(
-            database.folder, s["id"], s["ground_z"], database.road(s), encoder, settings
+            blocks_path(database.folder.blocks, s["id"]),
+            s["ground_z"],
+            database.road(s),
+            encoder,
+            settings,
         )
         for s in database.submaps
     ]

@@ -42,7 +42,7 @@ from semloc_logs.errors import SemlocError, SettingsError
 from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import load
 from semloc_logs.subvolumes.cut import turned_map
-from semloc_logs.subvolumes.describe import describe_map, load_encoder
+from semloc_logs.subvolumes.describe import Windows, describe_map, load_encoder
 from semloc_logs.words.index import Allowed, Matches
 from semloc_logs.workspace import Workspace
 
@@ -197,10 +197,8 @@ def test_a_sweep_finds_a_map_that_was_described_at_another_heading() -> None:
         turned.state,
         turned.low,
         0.0,
-        0.3,
         encoder,
-        settings.descriptor.query_stride,
-        settings.descriptor.min_occupied,
+        Windows(0.3, settings.descriptor.query_stride, settings.descriptor.min_occupied),
     )
     centre = turned.to_map(known.centre) * 0.3
 
