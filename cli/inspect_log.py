@@ -50,7 +50,9 @@ def command(logs: tuple[Path, ...], topics: dict[str, str], as_json: bool) -> in
         console.warn(str(refused))
     for content in found:
         for sentence in content["skipped"]:
-            console.warn(f"{content['path']}: {sentence}")
+            path = content["path"]
+            named = sentence.startswith(Path(path).name)  # else it begins with the topic
+            console.warn(sentence if named else f"{path}: {sentence}")
     return 3 if failed or any(content["skipped"] for content in found) else 0
 
 
@@ -69,7 +71,7 @@ def _show(content: dict[str, Any]) -> None:
             f"Base frame {content['base_frame']!r}, poses in {content['session_frame']!r}"
         )
     for name, value in content["poses"].items():
-        if value not in (None, [], {}):
+        if name == "count" or value not in (None, [], {}, 0):
             console.result(f"  poses, {name}: {value}")
     for topic, sensor in content["sensors"].items():
         facts = ", ".join(f"{k} {v}" for k, v in sensor.items() if k != "base_T_sensor")
