@@ -9,7 +9,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -57,6 +59,24 @@ class Lettering:
     facts: Sequence[str] = ()
     legend: Legend = field(default_factory=list)
     metres: float | None = None
+
+
+class _Pixels(Artist):
+    """RGB ``picture`` (height, width, 3) as it is, from pixel (left, low) of the figure.
+
+    Images of matplotlib are resampled by floats even then, which takes 100 bytes for each pixel.
+    """
+
+    def __init__(self, picture: U8, left: int, low: int) -> None:
+        super().__init__()
+        self._picture = picture
+        self._corner = (left, low)
+        self.set_zorder(-1)  # below the axes
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw into ``renderer``, whose rows run upwards."""
+        rows = cv2.cvtColor(self._picture, cv2.COLOR_RGB2RGBA)[::-1]
+        renderer.draw_image(renderer.new_gc(), *self._corner, np.ascontiguousarray(rows))
 
 
 class Sheet:
@@ -215,11 +235,10 @@ class Sheet:
         left = self._px(PAD)
         for panel in row:
             height, width = panel.picture.shape[:2]
-            axes = self._area(left, bottom + row_height - height, width, height)
-            axes.imshow(
-                panel.picture, extent=(0, width, height, 0), interpolation="nearest", aspect="auto"
-            )
-            axes.autoscale(False)
+            low = bottom + row_height - height
+            self._figure.add_artist(_Pixels(panel.picture, left, low))
+            axes = self._area(left, low, width, height)
+            axes.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
             for number, line in enumerate(reversed(panel.caption.splitlines())):
                 y = bottom + row_height + number * self._line(SMALL)
                 self._write(line, left, y, SMALL, SOFT)
