@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.covariance import COMMON_BIAS, RANGE_BIAS, covariance_of
+from semloc_logs.alignment.covariance import COMMON_BIAS, RANGE_BIAS, covariance_of, stiffness
 from semloc_logs.alignment.hypotheses import SAME_PLACE_VOXELS
 from semloc_logs.alignment.icp import Fit, Step, Weighting, _add_point, align
 from semloc_logs.alignment.query_map import Query
@@ -238,6 +238,17 @@ def test_covariance_by_hand() -> None:
     angle = 1 / ((4800 - 4 * 4.3845) / (12 * 0.01) + 131.31) + 1e-6
     np.testing.assert_allclose([position, angle], [2.0036e-4, 2.600e-5], rtol=1e-3)
     np.testing.assert_allclose(C, np.diag([position] * 3 + [angle] * 3), rtol=1e-4, atol=1e-12)
+
+
+def test_stiffness_by_hand() -> None:
+    """A direction of 5 that shares 2 with a rotation of 2 holds 5 - 2 * 2 / 2 = 3 with it free."""
+    information = np.diag([5.0, 4.0, 9.0, 2.0, 7.0, 7.0])
+    assert stiffness(held(information)) == pytest.approx(4.0)
+    information[0, 3] = information[3, 0] = 2.0
+    assert stiffness(held(information)) == pytest.approx(3.0)
+    information[4, 4] = np.inf  # one number that is none makes the whole useless
+    assert stiffness(held(information)) == 0.0
+    assert stiffness(held(np.diag([5.0, 4.0, 0.0, 2.0, 7.0, 7.0]))) == 0.0
 
 
 def test_covariance_of_a_fit_that_knows_nothing_is_what_the_search_allows() -> None:
