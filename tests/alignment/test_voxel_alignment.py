@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix, same_place, yaw_between
-from semloc_logs.alignment.icp import Step, align
+from semloc_logs.alignment.icp import Step, Weighting, align
 from semloc_logs.alignment.mask_grid import (
     ANY_BIT,
     FREE_BIT,
@@ -20,7 +20,7 @@ from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit, measured
 from semloc_logs.alignment.scores import Scores, alignment_score, structure_scores
 from semloc_logs.alignment.search import Candidate, search, search_hypotheses
 from semloc_logs.alignment.surface import thin_points
-from semloc_logs.alignment.target_map import Target
+from semloc_logs.alignment.target_map import PLANE_NOISE, UNCERTAIN_RADII, Target
 from semloc_logs.alignment.tau import tau
 from semloc_logs.labels.space import UNLABELLED, cityscapes
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
@@ -449,7 +449,7 @@ def test_a_coarse_fit_leaves_a_place_that_looks_alike(degrees: int) -> None:
     truth = yaw_transform(np.radians(degrees), (3.0, -2.0, 0.5))
     target = Target(block_map(town()), V)
     query = Query(block_map(moved(town(), truth)), apply(inverse(truth), points_of(town())), V)
-    candidate = Candidate(0, truth, 1.0, 10)
+    candidate = Candidate(0, yaw_transform(0.02, (0.8 * V, -0.6 * V, 0.3 * V)) @ truth, 1.0, 10)
     right = coarse_fit(candidate, target, query)
     assert np.linalg.norm(right.target_T_query[:3, 3] - truth[:3, 3]) < 0.2 * V
     assert escaped(right, candidate, target, query, 20) is right
@@ -461,6 +461,23 @@ def test_a_coarse_fit_leaves_a_place_that_looks_alike(degrees: int) -> None:
     fine = fine_fit(right.target_T_query, target.surface, query)
     assert np.linalg.norm(fine.target_T_query[:3, 3] - truth[:3, 3]) < 0.1 * V
     assert fine.count == len(query.points)  # the last step takes all of them
+
+
+def test_an_alignment_of_uncertain_points_is_measured_by_their_radius() -> None:
+    """Every third point, out to two voxels, stands for three: also where ranges may all be off."""
+    target = Target(block_map(town()), V)
+    points = points_of(town())
+    spread = 0.8 * V * points / np.linalg.norm(points, axis=1, keepdims=True)
+    query = Query(block_map(town()), points, V, spread)
+    beside = yaw_transform(0.0, (0.0, 0.0, 1.5 * V))
+    found = measured(beside, target.surface, query)
+    step = Step(UNCERTAIN_RADII[1] * V, 0, 1)
+    whole = align(points, target.surface, beside, (step,), spread, Weighting(PLANE_NOISE * V))
+    assert found.inliers == pytest.approx(whole.inliers, abs=0.02)
+    assert np.abs(whole.range_bias).max() > 0
+    np.testing.assert_allclose(
+        found.range_bias, whole.range_bias, atol=0.1 * np.abs(whole.range_bias).max()
+    )
 
 
 def test_evidence_of_unlabelled_voxels_asks_for_anything_occupied() -> None:
