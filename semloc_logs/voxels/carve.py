@@ -20,7 +20,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.labels.space import GROUND
-from semloc_logs.numerics.hash_table import EMPTY, empty_table, place_of
+from semloc_logs.numerics.hash_table import (
+    EMPTY,
+    MULTIPLIER,
+    SHIFT,
+    place_of,
+    table_size,
+)
 from semloc_logs.settings import ResolvedFusion
 from semloc_logs.voxels.keys import BLOCK
 
@@ -222,6 +228,20 @@ def _weight_and_reach(length: float, dz: float, sigma: float, level: bool) -> tu
 
 
 @njit(cache=True, nogil=True)
+def _place_of_row(rows: NDArray[np.int32], keys: I64, key: int) -> int:
+    """Where the row of ``key`` is in ``rows``, or the empty place (-1) for it.
+
+    As :func:`place_of`, but the table holds rows of ``keys``: a third of the memory, where few of
+    many rays end in voxels of their own.
+    """
+    mask = len(rows) - 1
+    place = ((key * MULTIPLIER) >> SHIFT) & mask
+    while rows[place] >= 0 and keys[rows[place]] != key:
+        place = (place + 1) & mask
+    return int(place)
+
+
+@njit(cache=True, nogil=True)
 def mark_ends(grid: Grid, rays: Rays, votes: Votes) -> tuple[I64, F64]:
     """Mark the end voxels of all rays; those longer than the limit do not hit.
 
@@ -231,8 +251,7 @@ def mark_ends(grid: Grid, rays: Rays, votes: Votes) -> tuple[I64, F64]:
     marks, touched, ax, ay, az = grid
     start, offset, length, limit, labels, sigma = rays
     n = len(offset)
-    table = empty_table(n)
-    row_at = np.empty(len(table), np.int32)
+    rows = np.full(table_size(n), -1, np.int32)
     address_of = np.empty(n, np.int64)
     ends = np.empty((n, 3))
     count, last, row = 0, -1, -1
@@ -253,13 +272,11 @@ def mark_ends(grid: Grid, rays: Rays, votes: Votes) -> tuple[I64, F64]:
         if key != last:
             last = key
             touched[address >> BITS] = 1
-            place = place_of(table, key)
-            if table[place] != EMPTY:
-                row = row_at[place]
-            else:
+            place = _place_of_row(rows, address_of, key)
+            row = rows[place]
+            if row < 0:
                 row = count
-                table[place] = key
-                row_at[place] = row
+                rows[place] = row
                 address_of[row] = key
                 ends[row, 0] = start[0] + dx * carved
                 ends[row, 1] = start[1] + dy * carved
