@@ -102,7 +102,7 @@ def search_hypotheses(
 
 
 def _suppressed(searched: Sequence[_Searched], distance: float, most: int) -> list[_Searched]:
-    """The first ``most`` that are not beside an earlier one: hypotheses that have met are one."""
+    """The first ``most`` that are not beside an earlier one, with which they have become one."""
     groups = np.array([s.hypothesis.group for s in searched], np.int64)
     poses = np.array([s.pose for s in searched]).reshape(-1, 4)
     return [searched[i] for i in non_maximum_suppression(groups, poses, distance, most).tolist()]

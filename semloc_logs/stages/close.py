@@ -24,7 +24,6 @@ from semloc_logs.closures.query import query_keyframes
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
-from semloc_logs.pictures.closures_picture import draw_closures
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of, recorded_fingerprint
 from semloc_logs.stages.report import Report
@@ -70,6 +69,9 @@ def close(
     )
     if not overwrite and _is_up_to_date(work, fingerprint):
         return Report(kept=["closures"], closures=len(read_closures(work.closures)))
+
+    # matplotlib is loaded only where something is drawn
+    from semloc_logs.pictures.closures_picture import draw_closures
 
     _update_indexes(work, sorted(variants), [folder.name for folder in targets])
     tasks = _tasks(work, queries, targets, maps, settings, selection.self_closures)

@@ -15,7 +15,6 @@ from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import content_fingerprint, recover
 from semloc_logs.logs.problems import lost, sentences
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask, fuse_session
-from semloc_logs.pictures.map_picture import Caption, draw_map
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import SessionInput, fingerprint_of, recorded_fingerprint
 from semloc_logs.stages.report import Report
@@ -85,6 +84,9 @@ def _fuse_one(task: FuseTask) -> FusedSession | SemlocError:
     """An expected error is a result: one bad log does not end the night's work."""
 
     def draw(content: dict[str, Any]) -> None:
+        # matplotlib is loaded only where something is drawn
+        from semloc_logs.pictures.map_picture import Caption, draw_map
+
         poses = poses_of(read_table(task.folder.frames))
         positions = poses[:, :3, 3] if content["posed"] else np.zeros((0, 3))
         caption = Caption(task.folder.name, content["label_source"], content["voxel_size"])

@@ -286,8 +286,8 @@ def test_covariance_of_position_and_angles_turns_with_the_target(yaw: float) -> 
     "arm", [(10.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, 10.0), (3.0, -4.0, 5.0)]
 )
 def test_an_error_of_angle_moves_the_base_across_its_arm(arm: tuple[float, float, float]) -> None:
-    """The base lies ``arm`` from what was aligned: position and angle of the base by the Jacobian
-    of turned points, by differences.
+    """The base is ``arm`` away from the aligned points: its covariance is that of the points,
+    moved by a Jacobian of finite differences.
     """
     half = np.random.default_rng(4).normal(size=(6, 6)) * 30
     found = held(half @ half.T)
@@ -318,8 +318,8 @@ def test_covariance_lies_in_the_axes_of_the_target() -> None:
 
 
 def test_covariance_grows_with_the_lever_arm() -> None:
-    """A base frame far from what was aligned is less certain across the arm by angle times
-    distance.
+    """Across the arm, the position of a base far from the aligned points is less certain: by the
+    angle times the distance.
     """
     rng = np.random.default_rng(6)
     found = align(room(rng, 700), surface_of(room(rng, 1500), CELL), np.eye(4), STEPS)
@@ -393,7 +393,7 @@ def test_a_certain_point_weighs_as_many_uncertain_ones_as_it_is_more_certain() -
     on = np.c_[np.zeros(40), rng.uniform(-1.5, 1.5, 40), rng.uniform(0.2, 1.8, 40)]
     query = np.r_[on, on + np.array([0.1, 0.0, 0.0])]
     spread = np.r_[np.zeros((40, 3)), np.tile([0.2, 0.0, 0.0], (40, 1))]
-    # so wide a kernel takes all as they are; the last step measures what was found
+    # a kernel this wide weighs all points alike; the last step measures the result
     wide = (Step(100.0, 15), Step(100.0, 0))
     found = align(query, surface_of(grid, CELL), np.eye(4), wide, spread, Weighting(0.1))
     assert found.target_T_query[0, 3] == pytest.approx(-0.1 * 0.2 / 1.2, rel=0.02)

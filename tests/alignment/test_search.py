@@ -1,4 +1,4 @@
-"""Hypotheses that have met are one; those of opposite headings have not met."""
+"""Hypotheses at the same pose are merged; those of opposite headings stay apart."""
 
 from __future__ import annotations
 

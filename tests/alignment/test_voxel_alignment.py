@@ -257,7 +257,7 @@ def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
     assert [c.score for c in candidates] == sorted((c.score for c in candidates), reverse=True)
     assert len(candidates) <= 24
     twice = search_hypotheses([near, near], {0: target}, query, 18, 24)
-    assert len(twice) == 1  # hypotheses that have met are one
+    assert len(twice) == 1  # hypotheses at the same pose are merged
 
 
 def evidence_of(cells: dict[Cell, int], structure: int) -> Evidence:
@@ -359,7 +359,7 @@ def test_structure_scores_by_hand() -> None:
         (4, 0, 0): 5,  # in free space
         (8, 0, 0): 2,  # on another class
         (12, 0, 0): 2,  # where nothing was observed
-        (0, 1, 0): 0,  # ground and cars are no structure
+        (0, 1, 0): 0,  # ground and cars do not count as structure
         (0, 0, 1): 13,
     }
     query = Query(block_map(query_cells), points_of(query_cells), V)

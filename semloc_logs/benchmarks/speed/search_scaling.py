@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -234,7 +235,7 @@ def search_scaling(
             world.describe()
             adding, index = _timed(world.index)
             opening, index = _timed(world.index)
-            least, median = timed(lambda index=index: world.found(index, settings.closures.probes))  # type: ignore[misc]
+            least, median = timed(partial(world.found, index, settings.closures.probes))
             share = world.found(index, settings.closures.probes)
             taken.append(least)
             rows = {

@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,7 @@ def _one_size(
     )
     figures: Figures = {}
     for probes in sorted({1, 4, 8, 16, settings.closures.probes}):
-        least, median = timed(lambda probes=probes: index.search(queries, 5, probes, allowed))  # type: ignore[misc]
+        least, median = timed(partial(index.search, queries, 5, probes, allowed))
         m = index.search(queries, 5, probes, allowed)
         share = float(len(np.unique(m.query[truth[m.query] == m.entry])) / QUERIES)
         figures[f"{size} words, {probes} probes"] = {"ours": least, **_shown(median, share)}
