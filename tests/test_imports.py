@@ -3,6 +3,8 @@ story.
 """
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -225,3 +227,8 @@ def test_cli_imports_its_siblings_relatively_and_nothing_heavy(path: Path) -> No
                 "numpy",
                 "rich",
             }
+
+
+def test_stages_load_no_matplotlib_before_something_is_drawn() -> None:
+    script = "import sys, semloc_logs.stages.run; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
