@@ -29,6 +29,32 @@ class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+class Logs(_Section):
+    """How logs are read; everything here overrules what the log itself says."""
+
+    stamps: Literal["auto", "header", "log"] = Field(
+        "auto",
+        description="times of messages: header: their own stamps; log: when they were recorded;"
+        " auto: their own, unless all stamps of a topic are 0",
+    )
+    time_offset: dict[str, float] = Field(
+        default_factory=dict,
+        description="seconds added to the stamps of a topic, by topic",
+    )
+    depth_unit: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="metres of one step of a depth image of whole numbers; default 0.001, as the"
+        " message's definition asks for",
+    )
+    memory: int = Field(
+        2 << 30,
+        ge=64 << 20,
+        description="bytes of a log that may be in memory at once, decompressed",
+    )
+
+
 class Fusion(_Section):
     """Keyframes, submaps and the voxel map (paper 3.1)."""
 
@@ -302,6 +328,7 @@ class ResolvedClosures(Closures):
 class Settings(_Section):
     """The whole configuration as given; see each section."""
 
+    logs: Logs = Logs()
     fusion: Fusion = Fusion()
     labels: Labels = Labels()
     descriptor: Descriptor = Descriptor()

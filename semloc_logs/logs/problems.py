@@ -25,13 +25,20 @@ class ProblemKind(Enum):
 class Problem:
     """One problem: ``text`` is a sentence for the user, ``topic`` is "" for the whole log.
 
-    ``lost``: input was lost. A command that met such a problem ends with exit code 3.
+    ``lost``: input was lost; ``assumed``: the result rests on an assumption that the log does not
+    settle. A command that met either ends with exit code 3.
     """
 
     topic: str
     kind: ProblemKind
     text: str
     lost: bool
+    assumed: bool = False
+
+    @property
+    def is_reported(self) -> bool:
+        """Whether the command that met the problem ends with exit code 3."""
+        return self.lost or self.assumed
 
     def of_log(self, name: str) -> Problem:
         """The same with the log's ``name`` in front, unless the text names its file itself."""
@@ -50,17 +57,22 @@ def lost(problems: Iterable[Problem]) -> list[Problem]:
     return [problem for problem in problems if problem.lost]
 
 
+def to_report(problems: Iterable[Problem]) -> list[Problem]:
+    """The problems for which a command ends with exit code 3."""
+    return [problem for problem in problems if problem.is_reported]
+
+
 def sorted_problems(problems: Iterable[Problem]) -> list[Problem]:
-    """Each text once: lost input first, then assumptions, otherwise in the given order."""
+    """Each text once: reported problems first, then the others, otherwise in the given order."""
     first_of_text: dict[str, Problem] = {}
-    for problem in sorted(problems, key=lambda p: not p.lost):
+    for problem in sorted(problems, key=lambda p: not p.is_reported):
         first_of_text.setdefault(problem.text, problem)
     return list(first_of_text.values())
 
 
 def without_loss_of(unused: Collection[str], problems: Iterable[Problem]) -> list[Problem]:
-    """The problems; those about the topics ``unused`` lose nothing."""
-    return [replace(p, lost=p.lost and p.topic not in unused) for p in problems]
+    """The problems; those about the topics ``unused`` lose nothing and assume nothing."""
+    return [replace(p, lost=False, assumed=False) if p.topic in unused else p for p in problems]
 
 
 class NoCloud(Enum):

@@ -17,7 +17,7 @@ import semloc_logs
 from semloc_logs.errors import LogError
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
-from semloc_logs.logs.problems import Problem, lost, sentences
+from semloc_logs.logs.problems import Problem, sentences, to_report
 from semloc_logs.logs.sensors.depth import RangeNoise
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.mapping.keyframes import collect
@@ -73,10 +73,10 @@ def fuse_session(
             "labels": labeller.to_json(),
             "name": task.folder.name,
             "fingerprint": task.fingerprint,
-            "settings": task.settings.model_dump(mode="json", include={"fusion", "labels"}),
+            "settings": task.settings.model_dump(mode="json", include={"logs", "fusion", "labels"}),
             **metadata,
             **content,
-            "skipped": sentences(lost(problems)),
+            "skipped": sentences(to_report(problems)),
         }
     on_tables(content)
     write_json(task.folder.session_json, content)
@@ -93,6 +93,7 @@ def _opened(task: FuseTask) -> Session:
         noise=RangeNoise(fusion.depth_noise, fusion.disparity_noise),
         poses=task.poses,
         odometry=fusion.odometry,
+        logs=task.settings.logs,
     )
     return open_session([*task.logs], options)
 

@@ -13,7 +13,7 @@ from semloc_logs.engines import Engine
 from semloc_logs.errors import LogError, SemlocError
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import content_fingerprint, recover
-from semloc_logs.logs.problems import lost, sentences
+from semloc_logs.logs.problems import sentences, to_report
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask, fuse_session
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import SessionInput, fingerprint_of, recorded_fingerprint
@@ -54,7 +54,7 @@ def fuse(
                 LOGGER.info("%s: %s", task.folder.name, outcome)
         else:
             report.done.append(task.folder.name)
-            report.skipped += sentences(lost(outcome.problems))
+            report.skipped += sentences(to_report(outcome.problems))
             _log_outcome(task.folder.name, outcome)
     if report.failed and not report.done and not report.kept:
         raise LogError(" ".join(report.failed))
@@ -70,7 +70,7 @@ def _task(session: SessionInput, folder: SessionFolder, settings: Resolved) -> F
         inputs.append(f"poses {session.poses.fingerprint()}")
     fingerprint = fingerprint_of(
         (
-            settings.fingerprint("fusion", "labels"),
+            settings.fingerprint("logs", "fusion", "labels"),
             label_fingerprint(settings.labels),
             repr(sorted(session.topics.items())),
             *inputs,
@@ -110,5 +110,5 @@ def _log_outcome(name: str, fused: FusedSession) -> None:
         content["label_source"],
     )
     for problem in fused.problems:
-        if not problem.lost:
+        if not problem.is_reported:
             LOGGER.info("%s: %s", name, problem.text)

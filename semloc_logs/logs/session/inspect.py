@@ -34,9 +34,9 @@ from semloc_logs.logs.problems import (
     Problem,
     ProblemKind,
     Problems,
-    lost,
     sentences,
     sorted_problems,
+    to_report,
     without_loss_of,
 )
 from semloc_logs.logs.role_types import no_sensor
@@ -154,7 +154,7 @@ class _Inspection:
                 for s in log.streams
             ],
             "problems": sentences(problems),
-            "skipped": sentences(lost(problems)),
+            "skipped": sentences(to_report(problems)),
             "base_frame": base.name if base else "",
             "session_frame": self._poses.session_frame,
             "poses": self._poses.track.to_json(),

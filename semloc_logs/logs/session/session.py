@@ -34,6 +34,7 @@ from semloc_logs.logs.session.image_relay import ImageRelay
 from semloc_logs.logs.session.merge import merged_frames
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.summary import conclude
+from semloc_logs.settings import Logs
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,7 @@ class SessionOptions:
     pictures n-fold; None: 2 above 200,000 pixels, stereo pictures stay as they are up to half a
     million. ``noise``: how uncertain their ranges are. ``poses`` is a file of poses, and
     ``odometry`` "lidar" makes poses from the sweeps: either replaces the poses of the log.
+    ``logs``: the settings of reading.
     """
 
     topics: Mapping[str, str] = field(default_factory=dict)
@@ -54,6 +56,7 @@ class SessionOptions:
     noise: RangeNoise = USUAL_NOISE
     poses: TrajectoryFile | None = None
     odometry: Literal["none", "lidar"] = "none"
+    logs: Logs = field(default_factory=Logs)
 
 
 def open_session(paths: Sequence[Path], options: SessionOptions | None = None) -> Session:
