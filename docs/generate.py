@@ -71,7 +71,7 @@ def settings_page() -> str:
         rows = [
             (
                 f"`{section}.{key}`",
-                f"`{json.dumps(_plain(value.default))}`",
+                f"`{json.dumps(_plain(value.get_default(call_default_factory=True)))}`",
                 _type_of(value),
                 _cell(value.description or ""),
             )
