@@ -241,6 +241,8 @@ def _kind(annotation: Any) -> str:
         return " or ".join([*kinds, "`null`"])
     if origin is tuple:
         return f"{len(get_args(annotation))} numbers"
+    if origin is dict:
+        return " -> ".join(_kind(part) for part in get_args(annotation))
     return {float: "number", int: "whole number", str: "text", Path: "path"}[annotation]
 
 
