@@ -54,6 +54,9 @@ class Logs(_Section):
         description="bytes of a log that may be in memory at once, decompressed",
     )
 
+    def __hash__(self) -> int:
+        return hash(self.model_dump_json())  # a mapping has no hash of its own
+
 
 class Fusion(_Section):
     """Keyframes, submaps and the voxel map (paper 3.1)."""
