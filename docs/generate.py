@@ -243,7 +243,8 @@ def _kind(annotation: Any) -> str:
         return f"{len(get_args(annotation))} numbers"
     if origin is dict:
         return " -> ".join(_kind(part) for part in get_args(annotation))
-    return {float: "number", int: "whole number", str: "text", Path: "path"}[annotation]
+    kinds = {bool: "`true` or `false`", float: "number", int: "whole number", str: "text"}
+    return {**kinds, Path: "path"}[annotation]
 
 
 def main() -> None:

@@ -259,6 +259,10 @@ class Closures(_Section):
         ge=0,
         description="nor nearer along the road than this (m); default 50 m at 0.30 m voxels",
     )
+    misfits: bool = Field(
+        False,
+        description="whether sessions whose poses do not fit their range data get closures, too",
+    )
     rejected_per_query: int = Field(
         3, ge=0, description="best rejected hypotheses of a query that are reported"
     )

@@ -18,6 +18,7 @@ class ProblemKind(Enum):
     LABEL = "label"
     TRANSFORM = "transform"
     POSE = "pose"
+    FIT = "fit"  # poses and range data contradict each other, or the poses themselves
     ROLE = "role"  # which topic plays which role
 
 

@@ -17,9 +17,10 @@ import semloc_logs
 from semloc_logs.errors import LogError
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
-from semloc_logs.logs.problems import Problem, sentences, to_report
+from semloc_logs.logs.problems import Problem, sentences, sorted_problems, to_report
 from semloc_logs.logs.sensors.depth import RangeNoise
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
+from semloc_logs.mapping.fit.check import SessionFit, check_session
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import check_reach, level
 from semloc_logs.mapping.map_tables import LevelSession, write_map
@@ -64,9 +65,9 @@ def fuse_session(
     """
     with closing(_opened(task)) as session:
         labeller = Labeller(task.settings.labels, session)
-        metadata, content = _fused(task, session, labeller)
+        metadata, content, check = _fused(task, session, labeller)
         _write_trajectory(task.folder, session, metadata)
-        problems = [*session.problems, *labeller.problems]
+        problems = sorted_problems([*session.problems, *check.problems, *labeller.problems])
         content = {
             **session.to_json(),
             "problems": sentences(problems),
@@ -74,6 +75,7 @@ def fuse_session(
             "name": task.folder.name,
             "fingerprint": task.fingerprint,
             "settings": task.settings.model_dump(mode="json", include={"logs", "fusion", "labels"}),
+            "fit": check.to_json(),
             **metadata,
             **content,
             "skipped": sentences(to_report(problems)),
@@ -100,8 +102,8 @@ def _opened(task: FuseTask) -> Session:
 
 def _fused(
     task: FuseTask, session: Session, labeller: Labeller
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read the log and write the tables of the map: their metadata, and what they hold."""
+) -> tuple[dict[str, Any], dict[str, Any], SessionFit]:
+    """Read the log and write the tables of the map: their metadata, what they hold, the check."""
     fusion = task.settings.fusion
     with _scratch(task.folder) as scratch:
         collected = collect(session, labeller, fusion, scratch, task.folder.name)
@@ -109,6 +111,7 @@ def _fused(
             reasons = "; ".join(sentences(session.problems)) or "its sensor streams are empty"
             raise LogError(f"{session.name} gave no usable points: {reasons}")
         check_reach(session, collected, fusion.voxel_size)
+        check = check_session(session, collected, fusion.voxel_size)
         labeller.conclude()
         session_T_map, map_T_base = level(session, collected)
         metadata = {
@@ -120,7 +123,7 @@ def _fused(
             "version": semloc_logs.__version__,
         }
         levelled = LevelSession(task.folder.name, collected, labeller, map_T_base, fusion, metadata)
-        return metadata, write_map(levelled, task.folder)
+        return metadata, write_map(levelled, task.folder), check
 
 
 @contextmanager

@@ -101,6 +101,16 @@ class SessionMap:
         return lru_cache(maxsize=KEPT)(partial(read_keyframe, self.folder.keyframes))
 
     @property
+    def misfits(self) -> list[str]:
+        """Why its poses cannot be right, a sentence each; empty where nothing is known."""
+        fit = self.json.get("fit") or {"track": None, "streams": []}
+        texts = [] if fit["track"] is None else [fit["track"]]
+        for stream in fit["streams"]:
+            wrong = (f["text"] for f in stream["findings"] if f["severity"] == "wrong")
+            texts += [f"{stream['topic']}: {text}" for text in wrong]
+        return texts
+
+    @property
     def posed(self) -> bool:
         """Whether the log has poses."""
         return bool(self.json["posed"])

@@ -61,6 +61,9 @@ def close(
     queries = work.chosen(selection.queries)
     targets = work.chosen(selection.targets)
     maps = {folder.name: SessionMap(folder) for folder in (*queries, *targets)}
+    skipped = _misfits(maps, settings)
+    queries = [folder for folder in queries if folder.name not in skipped]
+    targets = [folder for folder in targets if folder.name not in skipped]
     variants = _checked_variants(work, maps, settings)
     inputs = [f"{f.name} {recorded_fingerprint(f.words_json)}" for f in (*queries, *targets)]
     settings_fingerprint = settings.fingerprint(*SECTIONS)
@@ -68,7 +71,8 @@ def close(
         (settings_fingerprint, str(selection.self_closures), repr(len(queries)), *inputs)
     )
     if not overwrite and _is_up_to_date(work, fingerprint):
-        return Report(kept=["closures"], closures=len(read_closures(work.closures)))
+        count = len(read_closures(work.closures))
+        return Report(kept=["closures"], closures=count, skipped=list(skipped.values()))
 
     # matplotlib is loaded only where something is drawn
     from semloc_logs.pictures.closures_picture import draw_closures
@@ -87,7 +91,19 @@ def close(
     write_rejected(work.rejected, rejected, metadata)
     draw_closures(work, closures, maps)
     write_closures(work.closures, closures, metadata)
-    return Report(done=["closures"], closures=len(closures))
+    return Report(done=["closures"], closures=len(closures), skipped=list(skipped.values()))
+
+
+def _misfits(maps: Mapping[str, SessionMap], settings: Resolved) -> dict[str, str]:
+    """Sessions that get no closures, since these would be false, and the sentences that say so."""
+    if settings.closures.misfits:
+        return {}
+    return {
+        name: f"Session {name} gets no closures: its poses do not fit ({'; '.join(misfits)});"
+        " --set closures.misfits=true searches it all the same."
+        for name, session_map in maps.items()
+        if (misfits := session_map.misfits)
+    }
 
 
 def _checked_variants(

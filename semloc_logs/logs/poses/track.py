@@ -125,7 +125,7 @@ class PoseTrack:
     @property
     def poses(self) -> F64:
         """Poses (n, 4, 4)."""
-        return self._matrices(0, self._n)
+        return self._matrices(slice(0, self._n))
 
     @property
     def start_ns(self) -> int | None:
@@ -176,11 +176,9 @@ class PoseTrack:
         known = (wanted >= stamps[0] - EDGE_NS) & (wanted <= stamps[-1] + EDGE_NS)
         known &= stamps[right] - stamps[left] <= self.gap_limit_ns()
         if known.any():
-            first = int(left[known].min())
-            last = int(right[known].max()) + 1
-            poses[known] = transforms.interpolate(
-                stamps[first:last], self._matrices(first, last), wanted[known]
-            )
+            # only the poses on both sides: a drive may have a million
+            rows = np.unique(np.concatenate([left[known], right[known]]))
+            poses[known] = transforms.interpolate(stamps[rows], self._matrices(rows), wanted[known])
         return poses, known
 
     def gaps(self) -> list[tuple[int, int]]:
@@ -211,8 +209,9 @@ class PoseTrack:
             "ahead": self.ahead,
         }
 
-    def _matrices(self, first: int, last: int) -> F64:
-        out = np.zeros((last - first, 4, 4))
-        out[:, :3] = self._rows[first:last]
+    def _matrices(self, rows: NDArray[np.int64] | slice) -> F64:
+        part = self._rows[rows]
+        out = np.zeros((len(part), 4, 4))
+        out[:, :3] = part
         out[:, 3, 3] = 1.0
         return out

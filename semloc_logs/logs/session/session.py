@@ -22,6 +22,7 @@ from semloc_logs.logs.poses.base_frame import BasePoses, PoseSource
 from semloc_logs.logs.poses.imu_gravity import up_in_base, up_in_session
 from semloc_logs.logs.poses.lidar_odometry import LidarOdometry
 from semloc_logs.logs.poses.navsat import navsat_poses
+from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.poses.trajectory_file import FilePoses, TrajectoryFile
 from semloc_logs.logs.problems import Problem, sentences, sorted_problems, without_loss_of
 from semloc_logs.logs.role_types import no_sensor
@@ -171,6 +172,17 @@ class Session:
             if source in self._pass.meanings
         }
 
+    @property
+    def track(self) -> PoseTrack:
+        """The poses of the base frame; complete after the pass."""
+        return self._pass.poses.track
+
+    @property
+    def pose_name(self) -> str:
+        """The topic of the poses, TF, or the source that replaces them."""
+        source = self._pass.poses.source
+        return source.name if source else self.roles.pose or "TF"
+
     def trajectory(self) -> tuple[NDArray[np.int64], F64]:
         """Stamps (n,) and ``session_T_base`` (n, 4, 4) of all poses; complete after the pass."""
         track = self._pass.poses.track
@@ -278,7 +290,7 @@ class Session:
         self._pass = self._new_pass(relay)
         self._conclusion = []
         yield from self._pass.clouds(merged_frames(self.logs, self._pass.topics))
-        self._conclusion = conclude(self._pass, self.roles.pose)
+        self._conclusion = conclude(self._pass, self.pose_name)
 
     def _new_pass(self, relay: ImageRelay) -> CloudPass:
         roles = self.roles

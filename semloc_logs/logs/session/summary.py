@@ -13,12 +13,11 @@ from semloc_logs.logs.session.pose_problems import (
 )
 
 
-def conclude(done: CloudPass, pose_topic: str | None) -> list[Problem]:
-    """The problems of a pass that is over; ``pose_topic`` is the topic of its poses."""
+def conclude(done: CloudPass, name: str) -> list[Problem]:
+    """The problems of a pass that is over; ``name`` is the topic or source of its poses."""
     poses = done.poses
     track = poses.track
     builder = done.builder
-    name = poses.source.name if poses.source else pose_topic or "TF"
 
     problems = done.tally.problems((track.start_ns, track.end_ns))
     if builder.duplicates is not None:

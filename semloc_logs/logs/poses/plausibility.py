@@ -1,0 +1,135 @@
+"""Whether a track is one that a vehicle, a robot or a hand can have made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.frames import F64
+from semloc_logs.logs.messages.stamps import utc
+from semloc_logs.logs.poses.track import PoseTrack
+
+# acceleration (m/s^2) and turn rate (rad/s) that nothing exceeds which carries the sensor; a step
+# beyond them by more than the slack (m, rad) is a jump. Braking is below 12 m/s^2, a hand turns
+# with up to 10 rad/s. The slack is above what a correction of SLAM or a fix of RTK adds.
+ACCELERATION = 15.0
+TURN_RATE = 12.0
+SLACK = 1.0
+TURN_SLACK = 0.5
+FASTEST = 120.0  # m/s; trains are slower
+NEIGHBOURS = 5  # steps on either side that tell the speed around a step
+# two sources in turn: so large a share of the poses is left at once
+INTERLEAVED = 0.1
+# a track that begins again: its pose is the identity but for this (m, rad), far from where it was
+AT_IDENTITY, TURNED_AT_IDENTITY = 0.1, 0.02
+FAR = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Jump:
+    """Steps of a track that nothing can make: their ``stamps_ns``, and the sentence's end."""
+
+    stamps_ns: tuple[int, ...]
+    text: str
+
+
+def implausible(track: PoseTrack) -> Jump | None:
+    """What is impossible about a track; None where nothing is."""
+    stamps_ns = track.stamps_ns
+    if len(stamps_ns) < 3:
+        return None
+    poses = track.poses
+    seconds = np.diff(stamps_ns) * 1e-9
+    way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turn = _turns(poses)
+
+    speed = way / seconds
+    around = _around(speed)
+    excess = way - around * seconds - ACCELERATION * seconds**2
+    turned = turn - _around(turn / seconds) * seconds - TURN_RATE * seconds
+    jumps = (excess > SLACK) | (turned > TURN_SLACK)
+    jumps &= seconds * 1e9 <= track.gap_limit_ns()
+    restarts = _restarts(poses, jumps | (seconds * 1e9 > track.gap_limit_ns()))
+
+    to_and_fro = _to_and_fro(poses, way, seconds)
+    if to_and_fro.sum() >= max(3, INTERLEAVED * len(jumps)):
+        return _in_turn(stamps_ns, to_and_fro, way)
+    if restarts.any():
+        step = int(np.flatnonzero(restarts)[0])
+        text = (
+            f"the poses start again at the identity at {utc(int(stamps_ns[step + 1]))},"
+            f" {np.linalg.norm(poses[step, :3, 3]):.1f} m from where they were: the odometry was"
+            " reset; cut the log there into two sessions"
+        )
+        return Jump(tuple(stamps_ns[1:][restarts].tolist()), text)
+    if jumps.any():
+        return _jumped(stamps_ns, jumps, way, turn)
+    usual = float(np.median(speed[way > 0])) if (way > 0).any() else 0.0
+    if usual > FASTEST:
+        text = (
+            f"the poses move at {usual:.0f} m/s: they are not in metres, or their stamps are wrong"
+        )
+        return Jump((int(stamps_ns[0]),), text)
+    return None
+
+
+def _turns(poses: F64) -> F64:
+    """Angle (n - 1,) of each step, radians."""
+    steps = np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]
+    cosine = 0.5 * (np.trace(steps, axis1=1, axis2=2) - 1.0)
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _around(values: F64) -> F64:
+    """For each value the larger of the medians of the values before and after it."""
+    n = len(values)
+    padded = np.full(n + 2 * NEIGHBOURS, np.nan)
+    padded[NEIGHBOURS : NEIGHBOURS + n] = values
+    windows = np.lib.stride_tricks.sliding_window_view(padded, NEIGHBOURS)
+    medians = np.full(len(windows), np.nan)
+    is_known = np.isfinite(windows).any(1)
+    medians[is_known] = np.nanmedian(windows[is_known], axis=1)
+    return np.asarray(np.fmax(medians[:n], medians[NEIGHBOURS + 1 : NEIGHBOURS + 1 + n]))
+
+
+def _restarts(poses: F64, breaks: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Steps (n - 1,) after which the pose is the identity, from farther away."""
+    offsets = np.linalg.norm(poses[:, :3, 3], axis=1)
+    cosine = 0.5 * (np.trace(poses[:, :3, :3], axis1=1, axis2=2) - 1.0)
+    angles = np.arccos(np.clip(cosine, -1.0, 1.0))
+    at_identity = (offsets < AT_IDENTITY) & (angles < TURNED_AT_IDENTITY)
+    return np.asarray(breaks & at_identity[1:] & (offsets[:-1] > FAR))
+
+
+def _to_and_fro(poses: F64, way: F64, seconds: F64) -> NDArray[np.bool_]:
+    """Poses (n - 2,), without the first and the last, that are reached and left again at once."""
+    chord = np.linalg.norm(poses[2:, :3, 3] - poses[:-2, :3, 3], axis=1)
+    detour = way[:-1] + way[1:] - chord
+    return np.asarray(detour > SLACK + ACCELERATION * (seconds[:-1] + seconds[1:]) ** 2)
+
+
+def _in_turn(stamps_ns: NDArray[np.int64], to_and_fro: NDArray[np.bool_], way: F64) -> Jump:
+    distance = float(np.median(way[:-1][to_and_fro]))
+    count = int(to_and_fro.sum())
+    text = (
+        f"{count} of its {len(stamps_ns)} poses jump to and fro, by {distance:.1f} m in the median:"
+        " two publishers are mixed in one topic; record them on topics of their own"
+    )
+    return Jump(tuple(stamps_ns[1:-1][to_and_fro].tolist()), text)
+
+
+def _jumped(stamps_ns: NDArray[np.int64], jumps: NDArray[np.bool_], way: F64, turn: F64) -> Jump:
+    rows = np.flatnonzero(jumps)
+    worst = int(rows[np.argmax(way[rows])])
+    seconds = (stamps_ns[worst + 1] - stamps_ns[worst]) * 1e-9
+    count = "once" if len(rows) == 1 else f"{len(rows)} times"
+    degrees = np.degrees(turn[worst])
+    when = utc(int(stamps_ns[worst + 1]))
+    text = (
+        f"the poses jump {count}, by {way[worst]:.1f} m and {degrees:.0f} degrees in"
+        f" {seconds:.2f} s at {when}: no vehicle can move like this; cut the log there, or give"
+        " poses with --poses FILE"
+    )
+    return Jump(tuple(stamps_ns[1:][jumps].tolist()), text)

@@ -1,0 +1,485 @@
+"""Whether poses and range data fit each other, stream by stream.
+
+Keyframes that follow each other are registered. Where the motion that the range data show differs
+from the one that the poses give, the hypotheses of :mod:`semloc_logs.mapping.fit.model` are tried;
+each that explains much is named with its estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from semloc_logs.logs.messages.stamps import time_range
+from semloc_logs.logs.poses.plausibility import Jump, implausible
+from semloc_logs.logs.problems import Problem, ProblemKind
+from semloc_logs.logs.session.session import Session
+from semloc_logs.mapping.fit.model import (
+    CLOCK,
+    LEVER,
+    LONGEST_OFFSET,
+    MEDIAN_OF_6,
+    PARAMETERS,
+    ROTATION,
+    SCALE,
+    Estimate,
+    Fault,
+    Pairs,
+    PosesAt,
+    difference,
+    fit,
+    pose_motion,
+    starts,
+)
+from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, choose, motion, registered
+from semloc_logs.mapping.keyframes import Collected
+from semloc_logs.numerics.transforms import inverse
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+MOST_PAIRS = 60  # of a stream; a pair costs about 10 ms
+LEAST_PAIRS = 4
+# a hypothesis explains much: it lowers half of chi squared by so much, and its parameter differs
+# from zero by so many standard deviations
+LEAST_GAIN = 12.0
+LEAST_SIGMAS = 5.0
+# squared distances in the median beyond which other readings of the poses are tried
+FAR_OFF = 40.0
+MUCH_NEARER = 0.05  # such a reading explains the pairs when it lowers the median to this share
+TRIED = 4  # pairs that show whether another start is better
+BETTER_START = 1.15  # another start is better when so many times the points lie on planes
+# a pair contradicts its poses when registration brings so many times the points onto planes
+CONTRADICTS = 1.15
+CONTRADICTION = 50.0  # and its squared distance is larger
+LEAST_CONTRADICTIONS = 2
+
+# what a closure would suffer, in voxels: noted above the first, wrong above the second
+NOTED, WRONG = 0.5, 1.0
+# parameters by position, and what a wrong one is called
+NAMES = {
+    "clock_s": "an offset of its clock",
+    "rotation_x_rad": "a mounting turned about x",
+    "rotation_y_rad": "a mounting turned about y",
+    "rotation_z_rad": "a mounting turned about z",
+    "lever_x_m": "a mounting shifted along x",
+    "lever_y_m": "a mounting shifted along y",
+    "lever_z_m": "a mounting shifted along z",
+    "scale_log": "a wrong scale",
+}
+HIDDEN = 10.0  # a fault that the drive does not show before it has this effect is hidden
+WRONG_TURN = 0.05  # rad, within a pair
+NEAR_VOXELS = 33.0  # a rotation moves points at this distance (10 m at 0.30 m voxels)
+# of the scale, which moves the far end of a submap: odometry of wheels is off by 1 to 2 %
+SCALE_NOTED, SCALE_WRONG = 0.03, 0.06
+
+
+Start = Callable[[F64], F64]  # a motion (4, 4) by the poses -> the start of a registration
+
+
+class Severity(Enum):
+    """How much a finding matters."""
+
+    NOTED = "noted"
+    WRONG = "wrong"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong with a stream: the sentence's end, after the topics."""
+
+    severity: Severity
+    text: str
+
+
+@dataclass(slots=True)
+class StreamFit:
+    """The check of one stream.
+
+    ``pairs`` were registered; poses and clouds differ by ``translation_m`` and ``rotation_rad`` in
+    the median. ``parameters`` are (estimate, standard deviation) by name; ``hidden`` are the faults
+    that the drive would not show: a straight one hides a lever arm, a steady one a clock offset.
+    """
+
+    topic: str
+    pairs: int = 0
+    translation_m: float = 0.0
+    rotation_rad: float = 0.0
+    parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+    hidden: list[str] = field(default_factory=list)
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether closures of this stream would be false."""
+        return any(f.severity is Severity.WRONG for f in self.findings)
+
+    def untold(self) -> str:
+        """The sentence that says what could not be checked; empty where all could."""
+        if self.pairs < LEAST_PAIRS:
+            return (
+                f"{self.topic}: whether the poses fit its clouds cannot be told: only {self.pairs}"
+                " pairs of its keyframes could be compared."
+            )
+        if not self.hidden or self.findings:
+            return ""
+        faults = " or ".join(NAMES[name] for name in self.hidden)
+        return (
+            f"{self.topic}: the drive would not show {faults}: it is too short, too straight or too"
+            " steady, or the scene too plain."
+        )
+
+    def to_json(self) -> dict[str, object]:
+        """For session.json."""
+        return {
+            "topic": self.topic,
+            "pairs": self.pairs,
+            "translation_m": round(self.translation_m, 4),
+            "rotation_rad": round(self.rotation_rad, 5),
+            "parameters": {
+                name: {"estimate": round(value, 5), "sigma": round(sigma, 5)}
+                for name, (value, sigma) in self.parameters.items()
+            },
+            "hidden": self.hidden,
+            "findings": [{"severity": f.severity.value, "text": f.text} for f in self.findings],
+        }
+
+
+@dataclass(slots=True)
+class SessionFit:
+    """The check of a session: of the track of its ``pose`` stream, and of each range stream."""
+
+    pose: str
+    jump: Jump | None = None
+    streams: list[StreamFit] = field(default_factory=list)
+
+    @property
+    def fits(self) -> bool:
+        """Whether nothing is known that would make closures false."""
+        return self.jump is None and not any(stream.is_wrong for stream in self.streams)
+
+    @property
+    def problems(self) -> list[Problem]:
+        """A sentence for each finding."""
+        problems = []
+        if self.jump is not None:
+            text = f"{self.pose}: {self.jump.text}."
+            problems.append(Problem(self.pose, ProblemKind.FIT, text, lost=False, assumed=True))
+        for stream in self.streams:
+            for finding in stream.findings:
+                is_wrong = finding.severity is Severity.WRONG
+                verb = "do not fit each other" if is_wrong else "hardly fit each other"
+                text = f"{stream.topic} and the poses of {self.pose} {verb}: {finding.text}."
+                problem = Problem(stream.topic, ProblemKind.FIT, text, lost=False, assumed=is_wrong)
+                problems.append(problem)
+            if note := stream.untold():
+                problems.append(Problem(stream.topic, ProblemKind.FIT, note, lost=False))
+        return problems
+
+    def to_json(self) -> dict[str, object]:
+        """For session.json."""
+        return {
+            "fits": self.fits,
+            "track": None if self.jump is None else self.jump.text,
+            "streams": [stream.to_json() for stream in self.streams],
+        }
+
+
+def check_session(session: Session, collected: Collected, voxel: float) -> SessionFit:
+    """Checks the poses of a session that was read, and its keyframes against them."""
+    track = session.track
+    check = SessionFit(session.pose_name, implausible(track))
+    if not len(track) or check.jump is not None:
+        return check
+    for topic in session.roles.ranging:
+        rows = [i for i, h in enumerate(collected.headers) if h.topic == topic]
+        clouds = Clouds(collected, np.array(rows, np.int64), voxel)
+        check.streams.append(check_stream(topic, clouds, track.at_many))
+    return check
+
+
+def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
+    """Checks the keyframes of one stream against the poses."""
+    numbers = choose(clouds, MOST_PAIRS)
+    given = registered(clouds, numbers)
+    if len(given.pairs) < LEAST_PAIRS:
+        return StreamFit(topic, len(given.pairs))
+    none = fit(given.pairs, poses_at, np.zeros(0, np.int64), np.zeros(PARAMETERS))
+    if (start := _better_start(clouds, given, none.squares)) is not None:
+        stream = _judged(topic, clouds, poses_at, registered(clouds, numbers, start))
+        if stream.findings:
+            return stream
+    stream = _judged(topic, clouds, poses_at, given)
+    if not stream.findings:
+        _contradictions(stream, given, poses_at, clouds.voxel)
+    return stream
+
+
+def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) -> StreamFit:
+    """The faults that explain registered pairs."""
+    pairs = found.pairs
+    zero = np.zeros(PARAMETERS)
+    none = fit(pairs, poses_at, np.zeros(0, np.int64), zero)
+    off = difference(pairs.measured, pose_motion(pairs, poses_at, zero))
+    stream = StreamFit(
+        topic,
+        len(pairs),
+        float(np.nanmedian(np.linalg.norm(off[:, :3], axis=1))),
+        float(np.nanmedian(np.linalg.norm(off[:, 3:], axis=1))),
+    )
+    if reading := _other_reading(pairs, poses_at, none):
+        stream.findings.append(reading)
+        return stream
+    estimate, faults = _explained(pairs, poses_at, none)
+    if float(np.nanmedian(estimate.squares)) < FAR_OFF:
+        _describe(stream, estimate, faults, clouds)
+        joint = fit(pairs, poses_at, np.arange(PARAMETERS), estimate.parameters)
+        _enter(stream, joint, clouds)
+    return stream
+
+
+def _better_start(clouds: Clouds, found: Registered, squares: F64) -> Start | None:
+    """The motion that brings far more points onto planes than registration does.
+
+    It is tried on the few pairs that contradict the poses most, by ``squares`` (n,), and on as many
+    evenly spread.
+
+    A fault such as another convention of axes makes it from the given one exactly, so it need not
+    be registered; registration from the given motion may have ended anywhere.
+    """
+    worst = np.argsort(-squares, kind="stable")[:TRIED]
+    evenly = np.linspace(0, len(squares) - 1, TRIED).round().astype(np.int64)
+    rows = np.union1d(worst, evenly)
+    starts = _other_starts()
+    registrar = Registrar(clouds)
+    shares = np.zeros(len(starts))
+    for target, source in found.numbers[rows].tolist():
+        given = motion(clouds, target, source)
+        shares += registrar.shares(target, source, [start(given) for start in starts])
+    best = int(np.argmax(shares))
+    needed = BETTER_START * max(float(found.share[rows].sum()), 1e-9)
+    return starts[best] if shares[best] > needed else None
+
+
+def _other_starts() -> list[Start]:
+    """Motions that faults make of a given motion: none, other units, its inverse, other axes."""
+
+    def scaled(factor: float) -> Start:
+        def start(motion: F64) -> F64:
+            out = motion.copy()
+            out[:3, 3] *= factor
+            return out
+
+        return start
+
+    def turned(rotation: F64) -> Start:
+        mounting = np.eye(4)
+        mounting[:3, :3] = rotation
+        return lambda motion: inverse(mounting) @ motion @ mounting
+
+    axes = Rotation.create_group("O").as_matrix()
+    return [
+        lambda _: np.eye(4),
+        inverse,
+        *(scaled(factor) for factor in (0.1, 0.5, 2.0, 10.0)),
+        *(turned(rotation) for rotation in axes if np.trace(rotation) < 2.9),
+    ]
+
+
+def _other_reading(pairs: Pairs, poses_at: PosesAt, given: Estimate) -> Finding | None:
+    """Clouds in the fixed frame, or inverted poses, where one of them explains the pairs."""
+    far = float(np.nanmedian(given.squares))
+    if far < FAR_OFF:
+        return None
+    poses, known = poses_at(pairs.stamps_ns.ravel())
+    poses = poses.reshape(-1, 2, 4, 4)
+    known = np.asarray(known.reshape(-1, 2).all(1))
+    fixed = np.tile(np.eye(4), (len(pairs), 1, 1))
+    inverted = poses[:, 0] @ inverse(poses[:, 1])
+    for predicted, text in (
+        (
+            fixed,
+            "its clouds do not move although the vehicle does: they are in the fixed frame already,"
+            " and the motion of the vehicle is applied twice; use the clouds as the sensor measures"
+            " them",
+        ),
+        (
+            inverted,
+            "the poses fit when they are inverted: they are of the fixed frame in the frame of the"
+            " vehicle; record or give the poses of the vehicle",
+        ),
+    ):
+        predicted = predicted.copy()
+        predicted[~known] = np.nan
+        near = float(np.nanmedian(pairs.squares(predicted)))
+        if near < FAR_OFF and near < MUCH_NEARER * far:
+            return Finding(Severity.WRONG, text)
+    return None
+
+
+def _explained(pairs: Pairs, poses_at: PosesAt, none: Estimate) -> tuple[Estimate, list[Fault]]:
+    """The estimate with every fault that explains much, the one that explains most first."""
+    estimate = none
+    faults: list[Fault] = []
+    while len(faults) < len(Fault):
+        tries = {
+            fault: _with(pairs, poses_at, estimate, fault) for fault in Fault if fault not in faults
+        }
+        fault, better = min(tries.items(), key=lambda item: item[1].cost)
+        excess = max(1.0, float(np.nanmedian(better.squares)) / MEDIAN_OF_6)
+        if (estimate.cost - better.cost) / excess < LEAST_GAIN + len(fault.columns):
+            break
+        estimate = better
+        faults.append(fault)
+    return estimate, faults
+
+
+def _with(pairs: Pairs, poses_at: PosesAt, estimate: Estimate, fault: Fault) -> Estimate:
+    """The estimate with one more fault free."""
+    free = np.union1d(estimate.free, fault.columns)
+    fits = [
+        fit(pairs, poses_at, free, start)
+        for start in starts(pairs, poses_at, fault, estimate.parameters)
+    ]
+    return min(fits, key=lambda e: e.cost)
+
+
+def _describe(stream: StreamFit, estimate: Estimate, faults: list[Fault], clouds: Clouds) -> None:
+    """Enters a finding for each fault that matters."""
+    texts = {
+        Fault.CLOCK: _clock_text,
+        Fault.ROTATION: _rotation_text,
+        Fault.LEVER: _lever_text,
+        Fault.SCALE: _scale_text,
+    }
+    for fault in faults:
+        known = _significant(estimate, fault)
+        effect = _effect(known, fault, clouds)
+        if effect >= NOTED:
+            severity = Severity.WRONG if effect >= WRONG else Severity.NOTED
+            text = texts[fault](stream.topic, known, estimate.sigma)
+            stream.findings.append(Finding(severity, text))
+
+
+def _enter(stream: StreamFit, joint: Estimate, clouds: Clouds) -> None:
+    """Enters the parameters, all estimated together, and the faults that the drive would hide."""
+    for column, name in enumerate(NAMES):
+        stream.parameters[name] = float(joint.parameters[column]), joint.sigma(column)
+    for fault in Fault:
+        for column in fault.columns.tolist():
+            # nothing that drives on the level shows a height, which moves the whole map alike
+            if column == LEVER.stop - 1:
+                continue
+            least = np.zeros(PARAMETERS)
+            least[column] = LEAST_SIGMAS * joint.sigma(column)  # smaller ones are not sure
+            if _effect(least, fault, clouds) > HIDDEN:
+                stream.hidden.append(list(NAMES)[column])
+
+
+def _significant(estimate: Estimate, fault: Fault) -> F64:
+    """The parameters (8,) of a fault that differ from zero for sure; 0 for all others."""
+    known = np.zeros(PARAMETERS)
+    for column in fault.columns:
+        if abs(estimate.parameters[column]) >= LEAST_SIGMAS * estimate.sigma(column):
+            known[column] = estimate.parameters[column]
+    if abs(known[CLOCK]) > 0.98 * LONGEST_OFFSET:  # not found within the range of the search
+        known[CLOCK] = 0.0
+    return known
+
+
+def _effect(parameters: F64, fault: Fault, clouds: Clouds) -> float:
+    """What a fault does to a closure, in voxels (:data:`NOTED`, :data:`WRONG`)."""
+    if fault is Fault.CLOCK:
+        speed, turn_rate = clouds.rates()
+        shift = max(speed / clouds.voxel, turn_rate * NEAR_VOXELS)
+        return abs(float(parameters[CLOCK])) * shift
+    if fault is Fault.ROTATION:
+        return float(np.linalg.norm(parameters[ROTATION])) * NEAR_VOXELS
+    if fault is Fault.LEVER:
+        return float(np.linalg.norm(parameters[LEVER])) / clouds.voxel
+    change = abs(float(np.expm1(parameters[SCALE])))
+    return WRONG * change / SCALE_WRONG if change >= SCALE_NOTED else 0.0
+
+
+def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> str:
+    offset = float(parameters[CLOCK])
+    side = "behind" if offset > 0 else "ahead of"
+    return (
+        f"its stamps are {abs(offset):.2f} \u00b1 {sigma(CLOCK):.2f} s {side} the clock of the"
+        f" poses; give --set logs.time_offset.{topic}={offset:+.2f}"
+    )
+
+
+def _rotation_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> str:
+    rotation = Rotation.from_rotvec(parameters[ROTATION])
+    turns = []
+    for column, axis in zip(Fault.ROTATION.columns.tolist(), "xyz", strict=True):
+        if parameters[column]:
+            angle = np.degrees(parameters[column])
+            spread = np.degrees(sigma(column))
+            turns.append(f"{angle:.1f} \u00b1 {spread:.1f} degrees about {axis}")
+    convention = ""
+    if rotation.magnitude() > np.radians(45) and _is_axis_rotation(rotation):
+        convention = ", as where the axes of an optical frame are taken for those of a body frame"
+    return (
+        f"its mounting is turned by {', '.join(turns)} of the base frame{convention}; correct its"
+        " transform"
+    )
+
+
+def _is_axis_rotation(rotation: Rotation) -> bool:
+    """Whether a rotation takes axes to axes, within 10 degrees."""
+    group = Rotation.create_group("O")
+    return bool((group.inv() * rotation).magnitude().min() < np.radians(10.0))
+
+
+def _lever_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> str:
+    shifts = [
+        f"{parameters[column]:.2f} \u00b1 {sigma(column):.2f} m along {axis}"
+        for column, axis in zip(Fault.LEVER.columns.tolist(), "xyz", strict=True)
+        if parameters[column]
+    ]
+    return f"its mounting is off by {', '.join(shifts)} of the base frame; correct its transform"
+
+
+def _scale_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> str:
+    factor = float(np.exp(parameters[SCALE]))
+    return (
+        f"its clouds move {factor:.3f} \u00b1 {factor * sigma(SCALE):.3f} times as far as the"
+        " poses: one of both is not in metres, or the odometry is badly scaled"
+    )
+
+
+def _contradictions(stream: StreamFit, found: Registered, poses_at: PosesAt, voxel: float) -> None:
+    """Names the time where clouds move otherwise than the poses, and nothing else explains it."""
+    predicted = pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS))
+    squares = found.pairs.squares(predicted)
+    off = difference(found.pairs.measured, predicted)
+    meters = np.linalg.norm(off[:, :3], axis=1)
+    radians = np.linalg.norm(off[:, 3:], axis=1)
+    excess = max(1.0, float(np.nanmedian(squares)) / MEDIAN_OF_6)
+    with np.errstate(invalid="ignore"):
+        rows = np.flatnonzero(
+            (found.share > CONTRADICTS * found.given_share)
+            & (squares > CONTRADICTION * excess)
+            & ((meters > WRONG * voxel) | (radians > WRONG_TURN))
+        )
+    if len(rows) < LEAST_CONTRADICTIONS:
+        return
+    first = int(found.pairs.stamps_ns[rows].min())
+    last = int(found.pairs.stamps_ns[rows].max())
+    farthest = float(meters[rows].max())
+    most_turned = float(np.degrees(radians[rows].max()))
+    stream.findings.append(
+        Finding(
+            Severity.WRONG,
+            f"{len(rows)} of {len(found.pairs)} pairs of its clouds move otherwise than the poses,"
+            f" by up to {farthest:.1f} m and {most_turned:.0f} degrees ({time_range(first, last)}):"
+            " the poses are wrong there; cut the log, or give others with --poses FILE",
+        )
+    )

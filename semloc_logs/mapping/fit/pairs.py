@@ -1,0 +1,241 @@
+"""Pairs of keyframes that are registered with each other, evenly spread over a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from semloc_logs.mapping.fit.model import Pairs
+from semloc_logs.mapping.fit.plane_cells import Fit, PlaneCells, register, share_at
+from semloc_logs.mapping.keyframes import Collected
+from semloc_logs.mapping.selection import thin
+from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+# the second keyframe of a pair has moved so far (voxels), or turned so far (rad)
+APART = 6.0
+TURNED = 0.17
+LONGEST_NS = (
+    3_000_000_000  # between both; later ones have drifted apart, or something stood between
+)
+MOST_POINTS = 1500  # of a source
+COARSE, FINE = 4.0, 2.0  # edge of the cells (voxels)
+LITTLE = 0.9  # of the usual share of points on planes: something is wrong with the start
+# a registration is better than another when so many times the points lie on planes
+BETTER = 1.1
+# standard deviations beside the registration's own: of an edge of a voxel, of the way between both
+# (odometry drifts), and of the rotation (rad)
+NOISE_VOXELS = 0.05
+NOISE_WAY = 0.01
+NOISE_ROTATION = 0.003
+LEAST_RMS = 0.02  # voxels; distances to planes are not smaller
+UNTOLD = 1e-4  # information along a direction that no plane fixes (1/m^2): 100 m, or any angle
+LEAST_SHARE = 0.02  # of the points on planes, for a registration
+CORRELATED = 12.0  # points of one surface share their error: as many count as one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clouds:
+    """The keyframes of one stream: ``rows`` of ``collected``, ``voxel`` is the voxel size (m)."""
+
+    collected: Collected
+    rows: I64
+    voxel: float
+
+    def stamps_ns(self) -> I64:
+        """Their stamps (n,)."""
+        return np.array([self.collected.headers[r].stamp_ns for r in self.rows], np.int64)
+
+    def points(self, number: int) -> F64:
+        """Points (n, 3) of a keyframe in the base frame."""
+        return self.collected.load(int(self.rows[number]))[0].astype(float)
+
+    def some_points(self, number: int) -> F64:
+        """As :meth:`points`, thinned to what a registration moves."""
+        points = self.points(number)
+        points = points[thin(points, self.voxel)]
+        return points[:: max(1, len(points) // MOST_POINTS)]
+
+    def rates(self) -> tuple[float, float]:
+        """Speed (m/s) and turn rate (rad/s) that the drive reaches in a tenth of its steps."""
+        stamps_ns = self.stamps_ns()
+        speeds = []
+        turn_rates = []
+        for number in range(len(self.rows) - 1):
+            seconds = (stamps_ns[number + 1] - stamps_ns[number]) * 1e-9
+            if self.pose(number) is None or self.pose(number + 1) is None or seconds <= 0:
+                continue
+            moved = motion(self, number, number + 1)
+            speeds.append(float(np.linalg.norm(moved[:3, 3])) / seconds)
+            turn_rates.append(rotation_angle(moved[:3, :3]) / seconds)
+        if not speeds:
+            return 0.0, 0.0
+        return float(np.quantile(speeds, 0.9)), float(np.quantile(turn_rates, 0.9))
+
+    def pose(self, number: int) -> F64 | None:
+        """``session_T_base`` (4, 4) as the poses of the log give it."""
+        return self.collected.poses[int(self.rows[number])]
+
+
+def choose(clouds: Clouds, most: int) -> list[tuple[int, int]]:
+    """Numbers of the target and the source of at most so many pairs, evenly spread.
+
+    The source is the first keyframe after the target that has moved or turned far enough.
+    """
+    stamps_ns = clouds.stamps_ns()
+    chosen = []
+    for target in range(len(clouds.rows) - 1):
+        source = _partner(clouds, stamps_ns, target)
+        if source is not None:
+            chosen.append((target, source))
+    if len(chosen) <= most:
+        return chosen
+    evenly = np.unique(np.linspace(0, len(chosen) - 1, most).round().astype(np.int64))
+    return [chosen[i] for i in evenly]
+
+
+def _partner(clouds: Clouds, stamps_ns: I64, target: int) -> int | None:
+    from_pose = clouds.pose(target)
+    if from_pose is None:
+        return None
+    last = None
+    for source in range(target + 1, len(stamps_ns)):
+        pose = clouds.pose(source)
+        if pose is None or stamps_ns[source] - stamps_ns[target] > LONGEST_NS:
+            break
+        last = source
+        moved = inverse(from_pose) @ pose
+        is_apart = float(np.linalg.norm(moved[:3, 3])) >= APART * clouds.voxel
+        if is_apart or rotation_angle(moved[:3, :3]) >= TURNED:
+            break
+    return last
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registered:
+    """Registered ``pairs`` of the keyframes ``numbers`` (n, 2).
+
+    ``share`` (n,) of the points lies on planes, ``given_share`` by the poses of the log.
+    """
+
+    pairs: Pairs
+    numbers: I64
+    share: F64
+    given_share: F64
+
+
+class Registrar:
+    """Registers pairs of one stream; planes of the last target are kept."""
+
+    def __init__(self, clouds: Clouds) -> None:
+        self._clouds = clouds
+        self._target = -1
+        self._coarse: PlaneCells | None = None
+        self._fine: PlaneCells | None = None
+
+    def fit(self, target: int, source: int, starts: list[F64]) -> Fit:
+        """The best fit of the source from ``starts`` (4, 4); an earlier one where equal."""
+        coarse, fine = self._planes(target)
+        points = self._clouds.some_points(source)
+        best: Fit | None = None
+        for start in starts:
+            moved = register(fine, points, register(coarse, points, start).target_T_source)
+            if best is None or moved.share > BETTER * best.share:
+                best = moved
+        assert best is not None, "a registration needs a start"
+        return best
+
+    def shares(self, target: int, source: int, poses: Sequence[F64]) -> F64:
+        """The share of the source's points that lies on planes at each of ``poses`` (4, 4)."""
+        planes = self._planes(target)[1]
+        points = self._clouds.some_points(source)
+        return np.array([share_at(planes, points, pose) for pose in poses])
+
+    def _planes(self, target: int) -> tuple[PlaneCells, PlaneCells]:
+        if self._coarse is None or self._fine is None or self._target != target:
+            points = self._clouds.points(target)
+            self._target = target
+            self._coarse = PlaneCells.of(points, COARSE * self._clouds.voxel)
+            self._fine = PlaneCells.of(points, FINE * self._clouds.voxel)
+        return self._coarse, self._fine
+
+
+def covariance_of(fit: Fit, voxel: float) -> F64:
+    """Covariance (6, 6) of a registration and of the odometry that it is compared with."""
+    sigma = max(fit.rms, LEAST_RMS * voxel)
+    information = fit.information / (CORRELATED * sigma**2)
+    way = float(np.linalg.norm(fit.target_T_source[:3, 3]))
+    noise = NOISE_VOXELS * voxel + NOISE_WAY * way
+    spread = np.diag([noise**2] * 3 + [NOISE_ROTATION**2] * 3)
+    # where the scene does not tell, the pair counts nothing
+    covariance = np.linalg.inv(information + UNTOLD * np.eye(6)) + spread
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def registered(
+    clouds: Clouds, numbers: Sequence[tuple[int, int]], start: Callable[[F64], F64] | None = None
+) -> Registered:
+    """The pairs ``numbers`` registered from the motion that the poses give.
+
+    ``start`` makes a further start (4, 4) of it. Where few points lie on planes then, the speed of
+    the last pair that fitted is tried, too.
+    """
+    registrar = Registrar(clouds)
+    stamps_ns = clouds.stamps_ns()
+    fits = []
+    for target, source in numbers:
+        given = motion(clouds, target, source)
+        starts = [given] if start is None else [given, start(given)]
+        fits.append(registrar.fit(target, source, starts))
+    usual = float(np.median([fit.share for fit in fits])) if fits else 0.0
+    last: F64 | None = None
+    for i, (target, source) in enumerate(numbers):
+        seconds = (stamps_ns[source] - stamps_ns[target]) * 1e-9
+        if last is not None and fits[i].share < LITTLE * usual:
+            again = registrar.fit(target, source, [_moved(last, seconds)])
+            if again.share > BETTER * fits[i].share:
+                fits[i] = again
+        if fits[i].share >= LITTLE * usual:
+            last = _rate(fits[i].target_T_source, seconds)
+    return _kept(clouds, registrar, numbers, fits)
+
+
+def _kept(
+    clouds: Clouds, registrar: Registrar, numbers: Sequence[tuple[int, int]], fits: Sequence[Fit]
+) -> Registered:
+    """The pairs of which enough points lie on planes."""
+    rows = [i for i, fit in enumerate(fits) if fit.share >= LEAST_SHARE]
+    kept = np.array([numbers[i] for i in rows], np.int64).reshape(-1, 2)
+    pairs = Pairs(
+        clouds.stamps_ns()[kept],
+        np.array([fits[i].target_T_source for i in rows]).reshape(-1, 4, 4),
+        np.array([covariance_of(fits[i], clouds.voxel) for i in rows]).reshape(-1, 6, 6),
+    )
+    given = [float(registrar.shares(a, b, [motion(clouds, a, b)])[0]) for a, b in kept.tolist()]
+    return Registered(pairs, kept, np.array([fits[i].share for i in rows]), np.array(given))
+
+
+def _rate(motion: F64, seconds: float) -> F64:
+    """Translation (m/s) and rotation vector (rad/s) of a motion, (6,)."""
+    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    return np.asarray(np.concatenate([motion[:3, 3], turn]) / max(seconds, 1e-3))
+
+
+def _moved(rate: F64, seconds: float) -> F64:
+    """The motion (4, 4) at a steady ``rate`` (6,)."""
+    return exp_se3(rate[:3] * seconds, rate[3:] * seconds)
+
+
+def motion(clouds: Clouds, target: int, source: int) -> F64:
+    """``target_T_source`` (4, 4) by the poses of the log."""
+    from_pose = clouds.pose(target)
+    to_pose = clouds.pose(source)
+    assert from_pose is not None, "a chosen pair has poses"
+    assert to_pose is not None, "a chosen pair has poses"
+    return inverse(from_pose) @ to_pose

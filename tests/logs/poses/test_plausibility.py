@@ -1,0 +1,128 @@
+"""Tracks that no vehicle can have made are recognised; drives that it can have made are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from semloc_logs.logs.poses.plausibility import implausible
+from semloc_logs.logs.poses.track import PoseTrack
+from semloc_logs.numerics.transforms import inverse, yaw_transform
+
+F64 = NDArray[np.float64]
+STEP_NS = 50_000_000
+
+
+def _drive(count: int = 200, speed: float = 8.0, turn: float = 0.02) -> F64:
+    """Poses (count, 4, 4) every 0.05 s along a bend, from the origin on."""
+    poses = [np.eye(4)]
+    for _ in range(count - 1):
+        poses.append(poses[-1] @ yaw_transform(turn, (speed * 0.05, 0.0, 0.0)))
+    return np.array(poses)
+
+
+def _track(poses: F64, step_ns: int = STEP_NS) -> PoseTrack:
+    track = PoseTrack()
+    for i, pose in enumerate(poses):
+        track.append((i + 1) * step_ns, pose)
+    return track
+
+
+@given(
+    speed=st.floats(0, 60),
+    turn=st.floats(-0.2, 0.2),
+    noise=st.floats(0, 0.1),
+    seed=st.integers(0, 100),
+)
+def test_a_drive_at_any_speed_and_with_noise_is_possible(
+    speed: float, turn: float, noise: float, seed: int
+) -> None:
+    poses = _drive(60, speed, turn)
+    poses[:, :3, 3] += np.random.default_rng(seed).normal(0, noise, (60, 3))
+    assert implausible(_track(poses)) is None
+
+
+def test_hard_braking_is_possible() -> None:
+    way = np.r_[np.arange(0, 20, 1.0), 20 + np.cumsum(np.linspace(1.0, 0.0, 40))]
+    poses = np.array([yaw_transform(0.0, (x, 0.0, 0.0)) for x in way])
+    assert implausible(_track(poses)) is None
+
+
+def test_two_publishers_in_turn_are_recognised() -> None:
+    poses = _drive()
+    poses[1::2] = yaw_transform(0.35, (3.0, -2.0, 0.0)) @ poses[1::2]
+    jump = implausible(_track(poses))
+    assert jump is not None
+    assert "two publishers" in jump.text
+    assert len(jump.stamps_ns) > 150
+
+
+def test_a_slow_publisher_among_the_poses_of_a_fast_one_is_recognised() -> None:
+    poses = _drive()
+    poses[2::5] = yaw_transform(0.0, (0.0, 4.0, 0.0)) @ poses[2::5]
+    jump = implausible(_track(poses))
+    assert jump is not None
+    assert "two publishers" in jump.text
+
+
+@pytest.mark.parametrize("silent", [0, 100])
+def test_a_restart_at_the_identity_is_recognised_with_and_without_a_silence(silent: int) -> None:
+    poses = _drive()
+    poses[120:] = inverse(poses[120]) @ poses[120:]
+    track = PoseTrack()
+    for i, pose in enumerate(poses):
+        track.append((i + 1 + (silent if i >= 120 else 0)) * STEP_NS, pose)
+    jump = implausible(track)
+    assert jump is not None
+    assert "start again at the identity" in jump.text
+    assert jump.stamps_ns == ((121 + silent) * STEP_NS,)
+
+
+def test_a_return_to_the_start_is_possible() -> None:
+    poses = _drive(315, 8.0, 2 * np.pi / 314)  # once around a circle
+    assert np.linalg.norm(poses[-1][:3, 3]) < 0.1
+    assert implausible(_track(poses)) is None
+
+
+@pytest.mark.parametrize(("metres", "is_found"), [(0.8, False), (1.6, True)])
+def test_a_jump_counts_beyond_the_slack(metres: float, is_found: bool) -> None:
+    poses = _drive()
+    poses[100:] = yaw_transform(0.0, (0.0, metres, 0.0)) @ poses[100:]
+    jump = implausible(_track(poses))
+    assert (jump is not None) == is_found
+    if jump is not None:
+        assert "jump once" in jump.text
+        assert jump.stamps_ns == (101 * STEP_NS,)
+
+
+def test_a_sudden_turn_is_a_jump() -> None:
+    poses = _drive()
+    poses[100:] = poses[100:] @ yaw_transform(2.0)  # beside 0.02 rad of the bend
+    jump = implausible(_track(poses))
+    assert jump is not None
+    assert "116 degrees" in jump.text
+
+
+def test_a_vehicle_that_moved_in_a_gap_is_possible() -> None:
+    poses = _drive()
+    track = PoseTrack()
+    for i, pose in enumerate(poses):
+        if not 80 <= i < 160:  # 4 s without poses
+            track.append((i + 1) * STEP_NS, pose)
+    assert implausible(track) is None
+
+
+def test_millimetres_are_not_metres() -> None:
+    poses = _drive(200, 8.0)
+    poses[:, :3, 3] *= 1000
+    jump = implausible(_track(poses))
+    assert jump is not None
+    assert "not in metres" in jump.text
+
+
+def test_a_few_poses_tell_nothing() -> None:
+    assert implausible(_track(_drive(2))) is None
+    assert implausible(PoseTrack()) is None

@@ -1,0 +1,94 @@
+"""A street of boxes and a ground, seen without occlusion along a drive of our own making."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.frames import Header, PosedCloud
+from semloc_logs.logs.poses.track import PoseTrack
+from semloc_logs.mapping.fit.pairs import Clouds
+from semloc_logs.mapping.keyframes import Collected
+from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
+
+F64 = NDArray[np.float64]
+VOXEL = 0.3
+TOPIC = "/points"
+SECOND = 1_000_000_000
+
+
+def street(length: float = 60.0) -> F64:
+    """Points (n, 3) on the ground and on boxes of several sizes beside the way, 0.25 m apart."""
+    rng = np.random.default_rng(4)
+    step = 0.25
+    x, y = np.meshgrid(np.arange(-20, length + 20, step), np.arange(-15, 15, step))
+    parts = [np.c_[x.ravel(), y.ravel(), np.zeros(x.size)]]
+    for left in np.arange(-18.0, length + 15.0, 7.0):
+        for side in (-1.0, 1.0):
+            wide, deep, high = rng.uniform([2, 2, 2], [5, 5, 5])
+            near = side * rng.uniform(5, 8)
+            u, z = np.meshgrid(np.arange(0, wide, step), np.arange(0, high, step))
+            parts.append(np.c_[left + u.ravel(), np.full(u.size, near), z.ravel()])
+            v, z = np.meshgrid(np.arange(0, deep, step), np.arange(0, high, step))
+            depth = near + side * v.ravel()
+            parts += [np.c_[np.full(v.size, x), depth, z.ravel()] for x in (left, left + wide)]
+    points = np.concatenate(parts)
+    return points + rng.normal(0, 0.01, points.shape)
+
+
+def winding(seconds: F64) -> F64:
+    """Poses (n, 4, 4) of a vehicle that speeds up, slows down and turns to and fro."""
+    way = 3.0 * seconds + 1.5 * np.sin(0.9 * seconds)
+    side = 2.0 * np.sin(way / 6.0)
+    yaw = np.arctan(np.cos(way / 6.0) / 3.0)
+    return np.array([yaw_transform(a, (x, y, 1.5)) for a, x, y in zip(yaw, way, side, strict=True)])
+
+
+def straight(seconds: F64) -> F64:
+    """Poses (n, 4, 4) at a steady 3 m/s along x."""
+    return np.array([yaw_transform(0.0, (3.0 * s, 0.0, 1.5)) for s in seconds])
+
+
+def drive(
+    folder: Path,
+    poses_of: Callable[[F64], F64] = winding,
+    *,
+    seconds: float = 18.0,
+    clock: float = 0.0,
+    base_T_assumed: F64 | None = None,
+    scale: float = 1.0,
+    is_fixed: bool = False,
+) -> tuple[Clouds, PoseTrack]:
+    """Keyframes three times a second, and the poses twenty times a second.
+
+    The clouds are stamped ``clock`` seconds late; their mounting is wrong by ``base_T_assumed``
+    (true base frame from the one of the clouds); ``scale`` times as large; or in the session frame.
+    """
+    world = street()
+    times = np.arange(0.0, seconds, 0.05)
+    track = PoseTrack()
+    for time, pose in zip(times, poses_of(times), strict=True):
+        track.append(SECOND + round(time * 1e9), pose)
+    collected = Collected(folder, VOXEL / 3)
+    taken = np.arange(1.5, seconds - 1.5, 1 / 3)
+    for time, pose in zip(taken, poses_of(taken), strict=True):
+        points = apply(inverse(pose), world)
+        points = points[np.linalg.norm(points, axis=1) < 18.0]
+        if is_fixed:
+            points = apply(pose, points)
+        if base_T_assumed is not None:
+            points = apply(inverse(base_T_assumed), points)
+        stamp_ns = SECOND + round((time + clock) * 1e9)
+        header = Header(TOPIC, stamp_ns, stamp_ns, "lidar")
+        cloud = PosedCloud(
+            header,
+            (scale * points).astype(np.float32),
+            np.zeros(3, np.float32),
+            track.at(stamp_ns),
+            None,
+        )
+        collected.add(cloud, np.arange(len(points)))
+    return Clouds(collected, np.arange(len(collected)), VOXEL), track
