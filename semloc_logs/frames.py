@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,8 @@ class LidarFrame:
     """One sweep: ``points`` (n, 3) in the sensor frame.
 
     Rows with NaN, infinity or exactly zero are already gone. ``lost`` counts the points that were
-    not finite although their cloud calls itself dense.
+    not finite although their cloud calls itself dense. ``origin`` (3,) is the sensor's centre in
+    its frame; None: the frame's own origin.
     """
 
     header: Header
@@ -48,6 +50,7 @@ class LidarFrame:
     ring: NDArray[np.uint16] | None = None
     lost: int = 0
     remark: PointTimeRemark | None = None
+    origin: F32 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,17 +64,35 @@ class ImageFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthFrame:
-    """Depth along the optical axis in metres (h, w) float32; 0 where nothing was measured."""
+    """Depth along the optical axis in metres (h, w) float32; 0 where nothing was measured.
+
+    ``step`` (m) of one step of the recorded values, by the definition of their encoding.
+    """
 
     header: Header
     depth: F32
+    step: float = 0.001
+
+
+class Region(NamedTuple):
+    """A part of a picture (px): ``width`` or ``height`` 0 stand for all of it."""
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
+WHOLE_PICTURE = Region()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A CameraInfo or CameraCalibration.
+    """A CameraInfo or CameraCalibration, as recorded.
 
-    ``K`` (3, 3), ``P`` (3, 4), ``R`` (3, 3), distortion coefficients ``D`` of ``model``.
+    ``K`` (3, 3), ``P`` (3, 4), ``R`` (3, 3), distortion coefficients ``D`` of ``model``. All are of
+    the full picture of the sensor: the recorded picture is its part ``roi``, and ``binning`` (x, y)
+    pixels of the sensor make one of it.
     """
 
     header: Header
@@ -82,6 +103,8 @@ class Camera:
     R: F64
     P: F64
     model: str
+    binning: tuple[int, int] = (1, 1)
+    roi: Region = WHOLE_PICTURE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +134,7 @@ class ImuSample:
     """Specific force in m/s^2 and angular rate in rad/s, in the IMU frame.
 
     ``orientation`` is the quaternion xyzw of the IMU frame in east, north, up (REP 103, 105); None
-    when the IMU does not report one.
+    when the IMU does not report one. A force or rate that it does not report is NaN.
     """
 
     header: Header
@@ -122,9 +145,10 @@ class ImuSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NavSatSample:
-    """WGS 84 latitude and longitude in degrees, ellipsoid height in metres.
+    """WGS 84 latitude and longitude in degrees, ellipsoid height in metres (NaN: not measured).
 
-    ``covariance`` (3, 3) of east, north, up in m^2; None when the receiver does not know it.
+    ``covariance`` (3, 3) of east, north, up in m^2; None when the receiver does not know it, and
+    NaN for up where it knows the others. ``has_fix``: False where the receiver reports no fix.
     """
 
     header: Header
@@ -132,6 +156,7 @@ class NavSatSample:
     longitude_deg: float
     altitude: float
     covariance: F64 | None = None
+    has_fix: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

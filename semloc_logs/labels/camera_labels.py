@@ -192,6 +192,8 @@ class Pictures:
         projector = None
         try:
             projector = Projector(calibration, shape[0], shape[1], rectified="rect" in topic)
+            for text in projector.assumptions:
+                self.problems.assume(text, topic=topic, kind=ProblemKind.CALIBRATION)
         except LogError as error:
             self._cannot_use(topic, ProblemKind.CALIBRATION, str(error))
         camera.known = calibration, shape, projector

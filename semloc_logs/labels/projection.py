@@ -1,4 +1,4 @@
-"""Points in front of a camera -> pixels, by the distortion models of logs/depth.py."""
+"""Points in front of a camera -> pixels, by the lenses of logs/sensors/calibration.py."""
 
 from __future__ import annotations
 
@@ -8,37 +8,45 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Camera
+from semloc_logs.logs.sensors.calibration import Lens, camera_R_rect, fitted_camera, lens_of
 
 _NEAREST = 0.1  # m along the optical axis: nearer points are not projected
 _STEEPEST = np.radians(85)
 # points so much further from the middle than the picture's corner still are projected
 _MARGIN = 1.25
-_MOST_STRETCH = 0.02  # by which a picture may be scaled differently along its axes
-FISHEYE_MODELS = ("equidistant", "kannala_brandt", "fisheye")
-POLYNOMIAL_MODELS = ("plumb_bob", "rational_polynomial", "thin_prism", "")
 
 
 class Projector:
     """Projects points of a camera's optical frame into its pictures, ``height`` x ``width`` pixels.
 
     The optical frame has x right, y down, z forward. ``rectified``: the picture is undistorted, so
-    R and P hold, not K and D. A picture that was scaled as a whole is allowed for. LogError when
-    the calibration cannot be used.
+    R and P hold, not K and D. A picture that was scaled as a whole is allowed for.
+    ``assumptions``: sentences about what the calibration does not settle. LogError when it cannot
+    be used.
     """
 
     def __init__(self, camera: Camera, height: int, width: int, *, rectified: bool = False) -> None:
-        matrix = camera.K.copy()
-        self._distortion = np.atleast_1d(np.asarray(camera.D, float))
+        camera, assumption = fitted_camera(camera, height, width, scaled=True)
+        matrix = camera.K
+        lens = Lens(is_fisheye=False, coefficients=np.zeros(0))
         self._rotation = np.eye(3)
         if (rectified and camera.P[0, 0] > 0) or matrix[0, 0] <= 0:
-            matrix = camera.P[:, :3].copy()
-            self._distortion = np.zeros(0)
-            self._rotation = camera.R
-        self._matrix = _scaled(matrix, camera, height, width)
+            matrix = camera.P[:, :3]
+            self._rotation = camera_R_rect(camera).T
+        else:
+            lens = lens_of(camera)
+        if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+            raise LogError(
+                f"CameraInfo {camera.header.topic} has no focal length: the camera is not "
+                f"calibrated; name another with --topic camera_info=TOPIC."
+            )
+        self.assumptions = [text for text in (assumption, lens.assumption) if text]
+        self._matrix = matrix
+        self._distortion = lens.coefficients
+        self._fisheye = lens.is_fisheye
         self.height = height
         self.width = width
-        self.focal = float(self._matrix[0, 0])
-        self._fisheye = _is_fisheye(camera, self._distortion)
+        self.focal = float(matrix[0, 0])
 
         # the corner of the picture that is farthest from the axis, at focal length 1
         u = np.array([-0.5, width - 0.5]) - self._matrix[0, 2]
@@ -97,47 +105,6 @@ class Projector:
             & (v >= -0.5 - y)
             & (v < self.height - 0.5 + y)
         )
-
-
-def _scaled(matrix: F64, camera: Camera, height: int, width: int) -> F64:
-    """The camera matrix (3, 3) for a picture of ``height`` x ``width`` pixels.
-
-    LogError when the picture was not scaled as a whole, or without a focal length.
-    """
-    scale = np.array([width / (camera.width or width), height / (camera.height or height)])
-    if abs(scale[0] / scale[1] - 1) > _MOST_STRETCH:
-        raise LogError(
-            f"CameraInfo {camera.header.topic} is for {camera.width} x {camera.height} pixels but "
-            f"its picture has {width} x {height}: record the CameraInfo of the picture, or name it "
-            "with --topic camera_info=TOPIC."
-        )
-    # pixel centres are whole numbers: the corner of the picture is at -0.5
-    matrix[:2, 2] = (matrix[:2, 2] + 0.5) * scale - 0.5
-    matrix[:2, :2] *= scale[:, None]
-    if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-        raise LogError(
-            f"CameraInfo {camera.header.topic} has no focal length: the camera is not calibrated; "
-            "name another with --topic camera_info=TOPIC."
-        )
-    return matrix
-
-
-def _is_fisheye(camera: Camera, distortion: F64) -> bool:
-    """Whether ``distortion`` (n,) is of the equidistant model, and not of a polynomial one.
-
-    LogError for another model.
-    """
-    name = camera.model.lower()
-    count = len(distortion)
-    is_fisheye = name in FISHEYE_MODELS and count == 4
-    is_polynomial = name in POLYNOMIAL_MODELS and count in (4, 5, 8, 12, 14)
-    if np.any(distortion) and not (is_fisheye or is_polynomial):
-        raise LogError(
-            f"CameraInfo {camera.header.topic} has the distortion model '{camera.model[:40]}' with "
-            f"{count} coefficients, which is not supported: record rectified pictures, or name "
-            "another calibration with --topic camera_info=TOPIC."
-        )
-    return is_fisheye
 
 
 def _widest(distortion: F64, fisheye: bool, corner: float) -> float:

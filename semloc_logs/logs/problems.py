@@ -155,6 +155,10 @@ class Problems:
         """Adds a problem unless it is known."""
         self._added.setdefault(Problem(topic, kind, text, lost))
 
+    def assume(self, text: str, *, topic: str, kind: ProblemKind) -> None:
+        """Adds an assumption that the log does not settle, unless it is known."""
+        self._added.setdefault(Problem(topic, kind, text, lost=False, assumed=True))
+
     def skip(self, topic: str, reason: str, *, file: str = "") -> None:
         """Counts one skipped message of ``topic``; the first ``reason`` is the one in the text.
 

@@ -78,7 +78,7 @@ def test_scaled_and_rectified_pictures() -> None:
 
 
 def test_unusable_calibrations_are_named() -> None:
-    with pytest.raises(LogError, match="640 x 480 pixels but its picture has 640 x 640"):
+    with pytest.raises(LogError, match="640 x 480 pixels but the picture has 640 x 640"):
         Projector(camera(), 640, 640)
     with pytest.raises(LogError, match="'double_sphere'"):
         Projector(camera((0.1, 0.2), "double_sphere"), 480, 640)

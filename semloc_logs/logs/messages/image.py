@@ -7,7 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from semloc_logs.frames import F64, Camera, DepthFrame, Frame, Header, ImageFrame
+from semloc_logs.frames import (
+    F64,
+    WHOLE_PICTURE,
+    Camera,
+    DepthFrame,
+    Frame,
+    Header,
+    ImageFrame,
+    Region,
+)
 from semloc_logs.logs.messages import image_codecs
 from semloc_logs.logs.messages.definitions import UndecodableError, binary
 from semloc_logs.logs.messages.headers import Convert, foxglove, ros
@@ -15,7 +24,8 @@ from semloc_logs.logs.messages.headers import Convert, foxglove, ros
 
 def _picture(header: Header, pixels: Any, encoding: str, depth: bool) -> Iterator[Frame]:
     if depth:
-        yield DepthFrame(header, image_codecs.depth_metres(pixels))
+        step = image_codecs.depth_step(pixels)
+        yield DepthFrame(header, image_codecs.depth_metres(pixels), step)
     else:
         yield ImageFrame(header, pixels, encoding)
 
@@ -38,7 +48,7 @@ def _compressed(header: Header, m: Any) -> Iterator[Frame]:
     format_ = str(m.format or "")
     data = binary(m.data)
     if "compresseddepth" in format_.lower() or header.topic.endswith("/compressedDepth"):
-        yield DepthFrame(header, image_codecs.decode_compressed_depth(data, format_))
+        yield DepthFrame(header, *image_codecs.decode_compressed_depth(data, format_))
         return
     pixels = image_codecs.decode_compressed(data)
     depth = pixels.ndim == 2 and pixels.dtype == np.uint16
@@ -72,8 +82,24 @@ def _camera(header: Header, m: Any) -> Iterator[Frame]:
     if not P.any():
         P = np.hstack([K, np.zeros((3, 1))])
     yield Camera(
-        header, int(m.width or 0), int(m.height or 0), K, D, R, P, str(m.distortion_model or "")
+        header,
+        int(m.width or 0),
+        int(m.height or 0),
+        K,
+        D,
+        R,
+        P,
+        str(m.distortion_model or ""),
+        # foxglove.CameraCalibration has neither
+        (int(getattr(m, "binning_x", 0) or 1), int(getattr(m, "binning_y", 0) or 1)),
+        _region(getattr(m, "roi", None)),
     )
+
+
+def _region(roi: Any) -> Region:
+    if roi is None:
+        return WHOLE_PICTURE
+    return Region(int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height))
 
 
 CONVERTERS: dict[str, Convert] = {

@@ -51,6 +51,7 @@ _MAX_BYTES = 1 << 28
 _DEFLATE_MOST = 1100  # deflate shrinks at most 1032-fold
 _JPEG_MOST = 512  # pixels a byte: a block of 64 takes a bit at least
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by colour type; a palette becomes colour
+_PNG = b"\x89PNG\r\n\x1a\n"  # the first bytes
 _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
 
 
@@ -108,24 +109,35 @@ def decode_compressed(data: bytes | memoryview) -> Image:
     )
 
 
-def decode_compressed_depth(data: bytes | memoryview, format_: str) -> F32:
-    """Metres (h, w) of ROS's compressedDepth.
+def decode_compressed_depth(data: bytes | memoryview, format_: str) -> tuple[F32, float]:
+    """Metres (h, w) of ROS's compressedDepth, and the metres of one step of what it encodes.
 
-    12 bytes of quantisation parameters, then a PNG or RVL picture of 16 bits.
+    12 bytes of quantisation parameters, then a PNG or RVL picture of 16 bits. ``format_`` begins
+    with the encoding of the picture before compression; the bytes tell PNG from RVL.
     """
     if len(data) < _COMPRESSED_DEPTH_HEAD.size:
         raise UndecodableError("its depth image is cut off")
-    _, quant_a, quant_b = _COMPRESSED_DEPTH_HEAD.unpack_from(data)
-    body = data[_COMPRESSED_DEPTH_HEAD.size :]
-    raw = decode_rvl(body) if "rvl" in format_.lower() else decode_compressed(body)
+    # some publishers leave the parameters out
+    has_head = bytes(data[: len(_PNG)]) != _PNG
+    _, quant_a, quant_b = _COMPRESSED_DEPTH_HEAD.unpack_from(data) if has_head else (0, 0.0, 0.0)
+    body = data[_COMPRESSED_DEPTH_HEAD.size :] if has_head else data
+    is_rvl = "rvl" in format_.lower() and bytes(body[: len(_PNG)]) != _PNG
+    raw = decode_rvl(body) if is_rvl else decode_compressed(body)
     if raw.ndim != 2 or raw.dtype != np.uint16:
         raise UndecodableError("its depth image is not a picture of 16 bits")
     if format_.strip().lower().startswith("32fc1"):  # stored as inverse depth
+        if not has_head:
+            raise UndecodableError("its depth image lacks the parameters of its inverse depths")
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             metres = np.float32(quant_a) / (raw.astype(np.float32) - np.float32(quant_b))
         metres[raw == 0] = 0
-        return depth_metres(metres)
-    return depth_metres(raw)
+        return depth_metres(metres), depth_step(metres)
+    return depth_metres(raw), depth_step(raw)
+
+
+def depth_step(raw: Image | F32) -> float:
+    """Metres of one step of a depth image: whole numbers are millimetres, others metres."""
+    return 0.001 if raw.dtype == np.uint16 else 1.0
 
 
 def depth_metres(raw: Image | F32) -> F32:
@@ -158,7 +170,7 @@ def _check_claim(data: bytes) -> None:
 
     Before anything is allocated for it.
     """
-    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+    if data.startswith(_PNG):
         if len(data) < 33 or data[12:16] != b"IHDR" or data[25] not in _PNG_CHANNELS:
             raise UndecodableError("its PNG picture is damaged")
         _check_chunks(data)

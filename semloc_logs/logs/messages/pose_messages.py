@@ -29,6 +29,10 @@ from semloc_logs.logs.messages.headers import (
     vector,
 )
 
+# sensor_msgs/NavSatStatus: not yet set; -1: no fix
+_STATUS_UNKNOWN = -2
+_HIGHEST = 1e6  # m; what is farther from the ellipsoid is not driven to
+
 # -- poses and transforms
 
 
@@ -90,10 +94,23 @@ def _each(convert: Convert) -> Convert:
 
 def _imu(header: Header, m: Any) -> Iterator[Frame]:
     acceleration = vector(m.linear_acceleration)
-    rate = vector(m.angular_velocity)
-    if not (np.isfinite(acceleration).all() and np.isfinite(rate).all()):
+    if _is_unknown(m, "linear_acceleration_covariance"):
+        acceleration = np.full(3, np.nan)
+    elif not np.isfinite(acceleration).all():
         raise UndecodableError("its measurements are not finite")
+    rate = vector(m.angular_velocity)
+    if _is_unknown(m, "angular_velocity_covariance") or not np.isfinite(rate).all():
+        rate = np.full(3, np.nan)
     yield ImuSample(header, acceleration, rate, _imu_orientation(m))
+
+
+def _is_unknown(m: Any, name: str) -> bool:
+    """Whether a covariance of sensor_msgs/Imu marks its measurement as missing: it starts with -1.
+
+    A definition in the log may leave the covariance out.
+    """
+    covariance = getattr(m, name, None)
+    return covariance is not None and len(covariance) > 0 and float(covariance[0]) == -1.0
 
 
 def _imu_orientation(m: Any) -> F64 | None:
@@ -102,36 +119,54 @@ def _imu_orientation(m: Any) -> F64 | None:
     Without one the first element of its covariance is -1, or its length is not 1.
     """
     q = getattr(m, "orientation", None)
-    covariance = getattr(m, "orientation_covariance", None)
-    if q is None or (covariance is not None and len(covariance) and float(covariance[0]) == -1.0):
+    if q is None or _is_unknown(m, "orientation_covariance"):
         return None
     orientation = quaternion(q)
     return orientation if abs(math.hypot(*orientation) - 1.0) < 0.1 else None
 
 
-def _nav_sat(header: Header, m: Any) -> Iterator[Frame]:
-    latitude = float(m.latitude or 0.0)
-    longitude = float(m.longitude or 0.0)
-    altitude = float(m.altitude or 0.0)
-    if not (abs(latitude) <= 90 and abs(longitude) <= 360 and math.isfinite(altitude)):
-        raise UndecodableError("its latitude, longitude or altitude is not on Earth")
+def _nav_sat(header: Header, m: Any, *, has_fix: bool = True) -> Iterator[Frame]:
+    latitude = _number(m.latitude)
+    longitude = _number(m.longitude)
+    if not has_fix:
+        yield NavSatSample(header, latitude, longitude, math.nan, has_fix=False)
+        return
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
+        raise UndecodableError("its latitude or longitude is not on Earth")
+    altitude = _number(m.altitude)
+    if not abs(altitude) <= _HIGHEST:
+        altitude = math.nan
     yield NavSatSample(header, latitude, longitude, altitude, _fix_covariance(m))
 
 
+def _number(value: Any) -> float:
+    """A number; NaN where the message leaves it out."""
+    return math.nan if value is None else float(value)
+
+
 def _fix_covariance(m: Any) -> F64 | None:
-    """``position_covariance`` where its type is not "unknown" and it can be one."""
+    """``position_covariance`` where its type is not "unknown" and it can be one.
+
+    NaN for up where only the height is uncertain without bounds.
+    """
     recorded = getattr(m, "position_covariance", None)
     if not getattr(m, "position_covariance_type", 0) or recorded is None or len(recorded) != 9:
         return None
     covariance = np.array(recorded, float).reshape(3, 3)
-    return (
-        covariance if np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all() else None
-    )
+    is_known = np.isfinite(covariance[:2, :2]).all() and (np.diag(covariance)[:2] >= 0).all()
+    if not is_known:
+        return None
+    if not (np.isfinite(covariance).all() and covariance[2, 2] >= 0):
+        covariance[2] = covariance[:, 2] = np.nan
+    return covariance
 
 
 def _nav_sat_fix(header: Header, m: Any) -> Iterator[Frame]:
-    if m.status.status >= 0:  # below: the receiver itself reports that it has no fix
-        yield from _nav_sat(header, m)
+    status = int(m.status.status)
+    is_placed = bool(m.latitude) or bool(m.longitude)
+    # a driver that never sets its status leaves STATUS_UNKNOWN with a position
+    has_fix = status >= 0 or (status == _STATUS_UNKNOWN and is_placed)
+    yield from _nav_sat(header, m, has_fix=has_fix)
 
 
 CONVERTERS: dict[str, Convert] = {

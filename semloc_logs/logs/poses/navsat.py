@@ -11,6 +11,7 @@ better.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
@@ -36,6 +37,7 @@ _REVERSE = np.radians(120.0)
 _OFF_HEADING = np.radians(20.0)
 _GRAVITY = np.array([0.0, 0.0, 9.80665])
 _LEAST_FORCE = 0.5 * _GRAVITY[2]  # m/s^2; a smaller mean force is not gravity
+_LONGEST_WAIT_NS = 5_000_000_000  # for a fix with an altitude; frames wait for their poses
 _MOST_WAITING = 100_000  # fixes; beyond, the oldest are forgotten
 _SEMI_MAJOR = 6378137.0
 _FLATTENING = 1.0 / 298.257223563
@@ -93,6 +95,62 @@ class _Motion(NamedTuple):
     acceleration: F64
 
 
+class _Heights:
+    """Heights (m) of fixes, interpolated in time where the receiver did not measure them.
+
+    A fix waits for the next height, but no longer than 5 s: the one before serves.
+    Where none was known so far, heights are counted from the first one to come.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: deque[NavSatSample] = deque(maxlen=_MOST_WAITING)
+        self._known: tuple[int, float] | None = None  # stamp and height of the last that was known
+        self._start: float | None = None  # the height that counts as 0
+        self._given = 0
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether heights were given although none is known."""
+        return self._given > 0 and self._known is None
+
+    def add(self, fix: NavSatSample) -> None:
+        """The next fix, with or without altitude."""
+        self._waiting.append(fix)
+
+    def take(self, *, is_over: bool) -> Iterator[tuple[NavSatSample, float]]:
+        """The fixes whose height will not change any more; ``is_over``: no more will come."""
+        newest = self._waiting[-1] if self._waiting else None
+        if newest is None:
+            return
+        is_known = math.isfinite(newest.altitude)
+        waited_ns = newest.header.stamp_ns - self._waiting[0].header.stamp_ns
+        if not (is_known or is_over or waited_ns > _LONGEST_WAIT_NS):
+            return
+        if is_known and self._start is None:
+            # where fixes were given without any height, they were given at 0
+            self._start = newest.altitude if self._given else 0.0
+        before = self._known
+        after = None
+        if is_known:
+            after = (newest.header.stamp_ns, newest.altitude - (self._start or 0.0))
+            self._known = after
+        while self._waiting:
+            fix = self._waiting.popleft()
+            self._given += 1
+            yield fix, _height_between(before, after, fix.header.stamp_ns)
+
+
+def _height_between(
+    before: tuple[int, float] | None, after: tuple[int, float] | None, stamp_ns: int
+) -> float:
+    """The height at a time between two stamps with known heights; 0 where none is known."""
+    if before is None or after is None:
+        known = before or after
+        return 0.0 if known is None else known[1]
+    share = (stamp_ns - before[0]) / (after[0] - before[0])
+    return before[1] + share * (after[1] - before[1])
+
+
 class NavSatPoses:
     """Poses of the base frame in the local frame, from fixes and the samples of an IMU.
 
@@ -109,8 +167,10 @@ class NavSatPoses:
         self.local: LocalFrame | None = None
         self._count = count
         self._seen = 0
+        self._without_fix = 0
         self._refused = 0
         self._used = 0
+        self._heights = _Heights()
         # stamp, antenna, its frame
         self._fixes: deque[tuple[int, F64, str]] = deque(maxlen=_MOST_WAITING)
         # fixes within the window behind the next one to give
@@ -134,23 +194,33 @@ class NavSatPoses:
 
     def _take_fix(self, fix: NavSatSample) -> None:
         self._seen += 1
+        if not fix.has_fix:
+            self._without_fix += 1
+            return
         stamp_ns = fix.header.stamp_ns
         sigma = 0.0 if fix.covariance is None else float(np.sqrt(np.diag(fix.covariance)[:2].max()))
         is_late = self._newest is not None and stamp_ns <= self._newest
         if sigma > MAX_SIGMA or is_late or not is_time(stamp_ns):
             self._refused += 1
             return
-        if self.local is None:
-            self.local = LocalFrame(fix.latitude_deg, fix.longitude_deg, fix.altitude)
-        position = self.local.position(fix.latitude_deg, fix.longitude_deg, fix.altitude)
-        self._fixes.append((stamp_ns, position, fix.header.frame_id))
         self._newest = stamp_ns
+        self._heights.add(fix)
+        self._place_fixes()
+
+    def _place_fixes(self) -> None:
+        """Turns the fixes whose heights are known into positions."""
+        for fix, height in self._heights.take(is_over=self.is_over):
+            if self.local is None:
+                self.local = LocalFrame(fix.latitude_deg, fix.longitude_deg, height)
+            position = self.local.position(fix.latitude_deg, fix.longitude_deg, height)
+            self._fixes.append((fix.header.stamp_ns, position, fix.header.frame_id))
 
     def _take_imu(self, sample: ImuSample) -> None:
         stamp_ns = sample.header.stamp_ns
         if self._imu_frame is None:
             self._imu_frame = sample.header.frame_id
-        self._forces.append((stamp_ns, sample.acceleration))
+        if np.isfinite(sample.acceleration).all():
+            self._forces.append((stamp_ns, sample.acceleration))
         if sample.orientation is not None:
             self._has_orientation = True
             self._imu.append(stamp_ns, transform(np.zeros(3), sample.orientation))
@@ -180,14 +250,14 @@ class NavSatPoses:
     def finish(self) -> None:
         """All frames of the log have been seen."""
         self.is_over = True
+        self._place_fixes()
 
     @property
     def problems(self) -> list[Problem]:
         """Fixes that give no pose (lost), and assumptions about mounting and heading."""
         problems = Problems()
-        without_fix = max(self._count - self._seen, 0) if self.is_over else 0
         for count, reason in (
-            (without_fix, "report a missing fix"),
+            (self._without_fix, "report a missing fix"),
             (self._refused, f"are less certain than {MAX_SIGMA:g} m or out of order"),
         ):
             if count:
@@ -201,6 +271,13 @@ class NavSatPoses:
                 f"{self.name} never moves faster than {MIN_SPEED:g} m/s, and no IMU with a known "
                 f"mounting gives the heading: its {len(self._held)} fixes give no pose; "
                 f"use --odometry lidar, or give poses with --poses FILE.",
+            )
+        if self._heights.is_constant:
+            problems.assume(
+                f"No fix of {self.name} has an altitude: its heights are taken as constant; "
+                f"give poses with --poses FILE where the ground is not level.",
+                topic=self.name,
+                kind=ProblemKind.POSE,
             )
         errors = np.array(self._heading_errors)
         mean_error = float(np.angle(np.mean(np.exp(1j * errors)))) if len(errors) else 0.0

@@ -14,12 +14,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import F32, F64, Camera, DepthFrame, ImageFrame
 from semloc_logs.logs.problems import NoCloud, ProblemKind, Problems
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.sensors.rectification import (
-    FISHEYE,
-    FISHEYE_COEFFICIENTS,
-    PINHOLE,
-    PINHOLE_COEFFICIENTS,
-)
+from semloc_logs.logs.sensors.calibration import Lens, camera_R_rect, fitted_camera, lens_of
 from semloc_logs.logs.sensors.stereo import DISPARITY_NOISE
 
 DENSE_PIXELS = 200_000  # a larger depth image is thinned to every second pixel of every second row
@@ -71,8 +66,8 @@ class Unprojector:
     """Viewing rays of a depth camera, computed once for all images of that height and width.
 
     ``rectified``: the picture is undistorted, so the projection matrix P holds, not K and D.
-    ``stride`` None thins images of more than 200,000 pixels. LogError when the calibration cannot
-    be used.
+    ``stride`` None thins images of more than 200,000 pixels. ``assumptions``: sentences about what
+    the calibration does not settle. LogError when it cannot be used.
     """
 
     def __init__(
@@ -84,30 +79,29 @@ class Unprojector:
         rectified: bool = False,
         stride: int | None = None,
     ) -> None:
-        name = f"CameraInfo {camera.header.topic}"
-        if camera.width and camera.height and (camera.width, camera.height) != (width, height):
-            raise LogError(
-                f"{name} is for {camera.width} x {camera.height} pixels but the depth image has "
-                f"{width} x {height}: record the CameraInfo of the depth image, or name it with "
-                f"--topic camera_info=TOPIC."
-            )
+        camera, assumption = fitted_camera(camera, height, width, what="depth image")
         matrix = camera.K
-        distortion = np.atleast_1d(np.asarray(camera.D, float))
+        lens = Lens(is_fisheye=False, coefficients=np.zeros(0))
+        camera_R_picture = np.eye(3)
         if (rectified and camera.P[0, 0] > 0) or camera.K[0, 0] <= 0:
             matrix = camera.P[:, :3]
-            distortion = np.zeros(0)
+            camera_R_picture = camera_R_rect(camera)
+        else:
+            lens = lens_of(camera)
         if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
             raise LogError(
-                f"{name} has no focal length: the camera is not calibrated; "
-                f"name another with --topic camera_info=TOPIC."
+                f"CameraInfo {camera.header.topic} has no focal length: the camera is not "
+                f"calibrated; name another with --topic camera_info=TOPIC."
             )
 
+        self.assumptions = [text for text in (assumption, lens.assumption) if text]
         self._width = width
         self.step = stride or (2 if height * width > DENSE_PIXELS else 1)
         rows, columns = np.mgrid[0 : height : self.step, 0 : width : self.step]
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-        rays = _normalised(pixels, matrix, distortion, camera.model, name)
-        self._rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1).astype(np.float32)
+        flat = _normalised(pixels, matrix, lens, camera.header.topic)
+        rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+        self._rays = (rays @ camera_R_picture.T).astype(np.float32)
         self._lengths = np.linalg.norm(self._rays, axis=1)
 
     def points(
@@ -126,27 +120,22 @@ class Unprojector:
         return self._rays[kept] * z[kept, None], pixels
 
 
-def _normalised(pixels: F64, matrix: F64, distortion: F64, model: str, calibration: str) -> F64:
+def _normalised(pixels: F64, matrix: F64, lens: Lens, calibration: str) -> F64:
     """Pixels (n, 2) -> normalised image coordinates (n, 2)."""
-    if not np.any(distortion):
+    if not lens.is_fisheye and not len(lens.coefficients):
         y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
         return np.stack(
             [(pixels[:, 0] - matrix[0, 2] - matrix[0, 1] * y) / matrix[0, 0], y], axis=1
         )
-    name = model.lower()
-    rays = None
+    undo = cv2.fisheye.undistortPoints if lens.is_fisheye else cv2.undistortPoints
     try:
-        if name in PINHOLE and len(distortion) in PINHOLE_COEFFICIENTS:
-            rays = cv2.undistortPoints(pixels[:, None], matrix, distortion)
-        elif name in FISHEYE and len(distortion) == FISHEYE_COEFFICIENTS:
-            rays = cv2.fisheye.undistortPoints(pixels[:, None], matrix, distortion)
+        rays = undo(pixels[:, None], matrix, lens.coefficients)
     except cv2.error:
         rays = None
     if rays is None or not np.isfinite(rays).all():
         raise LogError(
-            f"{calibration} has the distortion model '{model[:40]}' with {len(distortion)} "
-            f"coefficients, which is not supported: record rectified depth, or name another "
-            f"calibration with --topic camera_info=TOPIC."
+            f"The distortion of CameraInfo {calibration} cannot be undone: record rectified depth, "
+            f"or name another calibration with --topic camera_info=TOPIC."
         )
     return np.asarray(rays, float).reshape(-1, 2)
 
@@ -286,6 +275,8 @@ class DepthClouds:
             unprojector = Unprojector(
                 camera, shape[0], shape[1], rectified=is_rectified, stride=self._stride
             )
+            for text in unprojector.assumptions:
+                self.problems.assume(text, topic=topic, kind=ProblemKind.CALIBRATION)
         except LogError as error:
             self.problems.add(str(error), topic=topic, kind=ProblemKind.CALIBRATION)
         self._unprojectors[topic] = (camera, shape, unprojector)
@@ -295,6 +286,7 @@ class DepthClouds:
 def same_calibration(a: Camera, b: Camera) -> bool:
     """Whether two calibrations are equal, apart from their headers."""
     return a is b or (
-        (a.width, a.height, a.model) == (b.width, b.height, b.model)
+        (a.width, a.height, a.model, a.binning, a.roi)
+        == (b.width, b.height, b.model, b.binning, b.roi)
         and all(np.array_equal(x, y) for x, y in ((a.K, b.K), (a.D, b.D), (a.R, b.R), (a.P, b.P)))
     )

@@ -9,7 +9,7 @@ OpenCV can undo.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,13 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F32, F64, Camera
+from semloc_logs.logs.sensors.calibration import camera_R_rect, fitted_camera, lens_of
 from semloc_logs.numerics.transforms import rotation_angle, rotation_between
 
-# distortion models that OpenCV can undo, and the numbers of their coefficients
-PINHOLE = ("plumb_bob", "rational_polynomial", "thin_prism", "")
-PINHOLE_COEFFICIENTS = (4, 5, 8, 12, 14)
-FISHEYE = ("equidistant", "kannala_brandt", "fisheye")
-FISHEYE_COEFFICIENTS = 4
 _SHORTEST_BASELINE = 1e-3  # m; below, the two frames are one
 SMALLEST = 32  # px, sides of a picture
 _LARGEST_NUMBER = 1e6  # in K (px), D and P
@@ -48,7 +44,7 @@ class Rectification:
     ``left_R_rect`` (3, 3) from the rectified to the left optical frame. ``maps`` are for cv2.remap,
     None where the pictures come rectified. ``valid`` (h, w) of left and right: pixels that
     lie on the recorded picture. ``pixels`` (h, w): flat index of the nearest pixel of the recorded
-    left picture.
+    left picture. ``assumptions``: sentences about what the calibrations do not settle.
     """
 
     focal: float
@@ -59,6 +55,7 @@ class Rectification:
     maps: tuple[Maps, Maps] | None
     valid: tuple[NDArray[np.bool_], NDArray[np.bool_]]
     pixels: NDArray[np.intp]
+    assumptions: tuple[str, ...] = ()
 
 
 def rectification(
@@ -74,9 +71,22 @@ def rectification(
     ``right_T_left`` (4, 4) between the optical frames, None where it is unknown. LogError where
     the calibrations do not allow it.
     """
-    pair = _Pair(left, right, shape)
-    _check_sizes(pair)
+    _check_size(_Pair(left, right, shape))
+    cameras = (left, right)
+    fitted = [fitted_camera(camera, *shape) for camera in cameras]
+    sentences = [fit.assumption for fit in fitted]
+    if not rectified:
+        sentences += [lens_of(camera).assumption for camera in cameras]
+    pair = _Pair(fitted[0].camera, fitted[1].camera, shape)
     _check_numbers(pair)
+    how = _rectification(pair, right_T_left, rectified=rectified)
+    return replace(how, assumptions=tuple(s for s in sentences if s))
+
+
+def _rectification(pair: _Pair, right_T_left: F64 | None, *, rectified: bool) -> Rectification:
+    """As :func:`rectification`, for calibrations of exactly these pictures."""
+    left = pair.left
+    right = pair.right
     if right_T_left is not None and np.linalg.norm(right_T_left[:3, 3]) < _SHORTEST_BASELINE:
         # the frame ids of both pictures are the same, as stereo_image_proc wants them
         right_T_left = None
@@ -114,19 +124,12 @@ class _Pair:
         return f"{self.left.header.topic}, {self.right.header.topic}"
 
 
-def _check_sizes(pair: _Pair) -> None:
+def _check_size(pair: _Pair) -> None:
     height, width = pair.shape
     if min(pair.shape) < SMALLEST:
         raise LogError(
             f"The pictures of {pair.names} have {width} x {height} pixels: too few to be matched."
         )
-    for camera in (pair.left, pair.right):
-        if camera.width and camera.height and (camera.height, camera.width) != pair.shape:
-            raise LogError(
-                f"CameraInfo {camera.header.topic} is for {camera.width} x {camera.height} pixels "
-                f"but the picture has {width} x {height}: record the CameraInfo of the picture, or "
-                f"name it with --topic camera_info=TOPIC."
-            )
 
 
 def bouguet_rotations(right_T_left: F64) -> tuple[F64, F64]:
@@ -214,7 +217,7 @@ def _as_recorded(pair: _Pair, right_T_left: F64 | None) -> Rectification:
         baseline=baseline,
         centre=centre,
         offset=centre[0] - float(right.P[0, 2]),
-        left_R_rect=np.eye(3),
+        left_R_rect=camera_R_rect(left),
         maps=None,
         valid=(valid, valid),
         pixels=np.arange(valid.size, dtype=np.intp).reshape(pair.shape),
@@ -271,24 +274,10 @@ def _common_matrix(pair: _Pair, rotations: tuple[F64, F64]) -> F64:
 
 def _undistorted(camera: Camera, pixels: F64) -> F64:
     """Pixels (n, 2) -> normalised image coordinates (n, 2)."""
-    undo = cv2.fisheye.undistortPoints if camera.model.lower() in FISHEYE else cv2.undistortPoints
-    return np.asarray(undo(pixels[:, None], camera.K, _coefficients(camera)), float).reshape(-1, 2)
-
-
-def _coefficients(camera: Camera) -> F64:
-    """D as OpenCV takes it; LogError for a model that OpenCV does not have."""
-    D = np.atleast_1d(np.asarray(camera.D, float))
-    model = camera.model.lower()
-    if not D.any():
-        return np.zeros(4)
-    is_pinhole = model in PINHOLE and len(D) in PINHOLE_COEFFICIENTS
-    if is_pinhole or (model in FISHEYE and len(D) == FISHEYE_COEFFICIENTS):
-        return D
-    raise LogError(
-        f"CameraInfo {camera.header.topic} has the distortion model '{camera.model[:40]}' with "
-        f"{len(D)} coefficients, which is not supported: record rectified pictures, or name "
-        f"another calibration with --topic camera_info=TOPIC."
-    )
+    lens = lens_of(camera)
+    undo = cv2.fisheye.undistortPoints if lens.is_fisheye else cv2.undistortPoints
+    coefficients = lens.coefficients if len(lens.coefficients) else np.zeros(4)
+    return np.asarray(undo(pixels[:, None], camera.K, coefficients), float).reshape(-1, 2)
 
 
 def _of_maps(
@@ -324,10 +313,10 @@ def _lookup(
 
     For cv2.remap, whether it lies on the picture at all, and as flat index.
     """
-    D = _coefficients(camera)
+    lens = lens_of(camera)
+    D = lens.coefficients if len(lens.coefficients) else np.zeros(4)
     size = (shape[1], shape[0])
-    is_fisheye = camera.model.lower() in FISHEYE
-    make = cv2.fisheye.initUndistortRectifyMap if is_fisheye else cv2.initUndistortRectifyMap
+    make = cv2.fisheye.initUndistortRectifyMap if lens.is_fisheye else cv2.initUndistortRectifyMap
     x, y = (
         np.asarray(m, np.float32) for m in make(camera.K, D, rotation, matrix, size, cv2.CV_32FC1)
     )

@@ -141,6 +141,7 @@ class StereoClouds:
             return self._matcher
         self._matched = pair
         self._matcher = None
+        topic = self._roles.stereo_left or ""
         try:
             how = rectification(
                 pair.left,
@@ -149,6 +150,8 @@ class StereoClouds:
                 pair.right_T_left,
                 rectified=is_rectified(self._roles),
             )
+            for text in how.assumptions:
+                self.problems.assume(text, topic=topic, kind=ProblemKind.CALIBRATION)
             self._matcher = StereoMatcher(
                 how,
                 min_range=min_range,
@@ -157,7 +160,6 @@ class StereoClouds:
                 noise=self._noise.disparity,
             )
         except LogError as error:
-            topic = self._roles.stereo_left or ""
             self.problems.add(str(error), topic=topic, kind=ProblemKind.CALIBRATION)
         return self._matcher
 

@@ -223,7 +223,11 @@ class _Inspection:
             yield _obstacle(topic, ProblemKind.CALIBRATION, text)
         elif isinstance(frame, DepthFrame):
             try:
-                Unprojector(self._cameras[info], *frame.depth.shape, rectified="rect" in topic)
+                unprojector = Unprojector(
+                    self._cameras[info], *frame.depth.shape, rectified="rect" in topic
+                )
+                for text in unprojector.assumptions:
+                    yield _assumption(topic, text)
             except LogError as error:
                 yield _obstacle(topic, ProblemKind.CALIBRATION, str(error))
 
@@ -261,13 +265,14 @@ class _Inspection:
             right.header.frame_id, left.header.frame_id, left.header.stamp_ns
         )
         try:
-            rectification(
+            how = rectification(
                 left_camera,
                 right_camera,
                 left.image.shape[:2],
                 right_T_left,
                 rectified=is_rectified(roles),
             )
+            obstacles += [_assumption(pair[0], text) for text in how.assumptions]
         except LogError as error:
             obstacles.append(_obstacle(pair[0], ProblemKind.CALIBRATION, str(error)))
         return obstacles
@@ -334,6 +339,10 @@ class _Inspection:
 
 def _obstacle(topic: str, kind: ProblemKind, text: str) -> Problem:
     return Problem(topic, kind, text, lost=False)
+
+
+def _assumption(topic: str, text: str) -> Problem:
+    return Problem(topic, ProblemKind.CALIBRATION, text, lost=False, assumed=True)
 
 
 def _duration_s(log: Log) -> float:

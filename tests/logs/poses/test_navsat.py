@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -204,9 +206,12 @@ def test_uncertain_and_missing_fixes_are_left_out() -> None:
     frames = fixes()
     frames[10] = fix(2.0, antenna_at(2.0) + np.array([30.0, 0, 0]), sigma=8.0)
     frames[11] = fix(2.2, antenna_at(2.2), sigma=None)
-    # three messages reported that there was no fix, so they gave no sample
+    missing = [
+        NavSatSample(header("/fix", 3.01 + k, "gps"), np.nan, np.nan, np.nan, has_fix=False)
+        for k in range(3)
+    ]
     source = NavSatPoses("/fix", 103)
-    found = drive(source, [*frames, *samples(with_orientation=True)])
+    found = drive(source, [*frames, *missing, *samples(with_orientation=True)])
     assert len(found) == 99
     assert 2.0 not in found
     check(found, position=0.01, angle=0.1)
@@ -260,3 +265,71 @@ def test_the_fixes_of_a_husky_agree_with_its_odometry(shared: Callable[[str], Pa
     assert named["session_frame"] == "enu"
     fallback = inspect_log(log, {"pose": "none"})["poses"]
     assert fallback == fixed
+
+
+# -- altitudes that are not measured
+
+
+def without_altitude(frame: Frame) -> Frame:
+    assert isinstance(frame, NavSatSample)
+    return replace(frame, altitude=np.nan)
+
+
+def climb(until: float) -> list[Frame]:
+    """East at 5 m/s, up at 0.5 m/s."""
+    return [fix(t, np.array([5.0 * t, 0.0, 0.5 * t])) for t in np.arange(0, until, 0.2)]
+
+
+def test_heights_between_known_ones_are_interpolated() -> None:
+    frames = climb(20.0)
+    known = drive(NavSatPoses("/fix", 100), climb(20.0), knows=("gps",))
+    # the first fixes too, and the last one
+    for k in (0, 1, 7, 8, 9, 50, 99):
+        frames[k] = without_altitude(frames[k])
+    source = NavSatPoses("/fix", 100)
+    found = drive(source, frames, knows=("gps",))
+    assert len(found) == 100
+    assert sentences(source.problems) == []
+    # heights count from the first one known, which is 0.2 m above the start: 0.5 m/s after 0.4 s
+    heights = {t: pose[2, 3] - known[t][2, 3] + 0.2 for t, pose in found.items()}
+    assert abs(heights[1.6]) < 1e-3
+    assert abs(heights[10.0]) < 1e-3
+    # before the first and after the last the nearest height serves
+    assert heights[0.0] == pytest.approx(0.2, abs=1e-3)
+    assert heights[19.8] == pytest.approx(-0.1, abs=1e-3)
+
+
+def test_positions_without_any_altitude_are_used_and_it_is_told() -> None:
+    source = NavSatPoses("/fix", 100)
+    found = drive(source, [without_altitude(f) for f in climb(20.0)], knows=("gps",))
+    assert len(found) == 100
+    assert found[19.0][0, 3] - found[0.0][0, 3] == pytest.approx(95.0, abs=0.1)
+    [problem] = source.problems
+    assert problem.assumed
+    assert "/fix has an altitude: its heights are taken as constant" in problem.text
+
+
+def test_a_first_height_that_comes_late_is_the_datum() -> None:
+    """Poses are not held back for it, and do not jump by the height above the ellipsoid."""
+    frames = climb(20.0)
+    for k in range(50):
+        frames[k] = without_altitude(frames[k])
+    source = NavSatPoses("/fix", 100)
+    for frame in frames[:40]:
+        source.take(frame)
+    assert list(source.poses(lambda _, __: np.eye(4)))
+    found = drive(source, frames[40:], knows=("gps",))
+    assert found[10.2][2, 3] - found[9.8][2, 3] == pytest.approx(0.1, abs=0.01)
+    assert sentences(source.problems) == []
+
+
+def test_an_unknown_variance_of_the_height_leaves_the_other_two() -> None:
+    frames = fixes()
+    for k in range(100):
+        wide = np.diag([64.0 if k == 10 else 0.01, 0.01, np.nan])
+        frame = frames[k]
+        assert isinstance(frame, NavSatSample)
+        frames[k] = replace(frame, covariance=wide)
+    source = NavSatPoses("/fix", 100)
+    assert len(drive(source, frames, knows=("gps",))) == 99
+    assert "1 of 100 messages are less certain than 5 m" in sentences(source.problems)[0]
