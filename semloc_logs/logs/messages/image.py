@@ -24,7 +24,7 @@ from semloc_logs.logs.messages.headers import Convert, foxglove, ros
 
 def _picture(header: Header, pixels: Any, encoding: str, depth: bool) -> Iterator[Frame]:
     if depth:
-        step = image_codecs.depth_step(pixels)
+        step = image_codecs.METRE if pixels.dtype.kind == "f" else image_codecs.MILLIMETRE
         yield DepthFrame(header, image_codecs.depth_metres(pixels), step)
     else:
         yield ImageFrame(header, pixels, encoding)
@@ -48,7 +48,10 @@ def _compressed(header: Header, m: Any) -> Iterator[Frame]:
     format_ = str(m.format or "")
     data = binary(m.data)
     if "compresseddepth" in format_.lower() or header.topic.endswith("/compressedDepth"):
-        yield DepthFrame(header, *image_codecs.decode_compressed_depth(data, format_))
+        metres = image_codecs.decode_compressed_depth(data, format_)
+        is_float = image_codecs.is_inverse_depth(format_)
+        step = image_codecs.METRE if is_float else image_codecs.MILLIMETRE
+        yield DepthFrame(header, metres, step)
         return
     pixels = image_codecs.decode_compressed(data)
     depth = pixels.ndim == 2 and pixels.dtype == np.uint16

@@ -45,6 +45,9 @@ for _pattern, _code in (
     _RAW[f"bayer_{_pattern}8"] = ("u1", 1, _code)
     _RAW[f"bayer_{_pattern}16"] = ("u2", 1, _code)
 
+# one step of a depth image, m: of whole numbers, and of floats
+MILLIMETRE = 0.001
+METRE = 1.0
 _LABEL_WORDS = ("label", "segment", "semantic", "mask", "class")
 _MAX_PIXELS = 1 << 26  # twice 8K
 _MAX_BYTES = 1 << 28
@@ -109,8 +112,8 @@ def decode_compressed(data: bytes | memoryview) -> Image:
     )
 
 
-def decode_compressed_depth(data: bytes | memoryview, format_: str) -> tuple[F32, float]:
-    """Metres (h, w) of ROS's compressedDepth, and the metres of one step of what it encodes.
+def decode_compressed_depth(data: bytes | memoryview, format_: str) -> F32:
+    """Metres (h, w) of ROS's compressedDepth.
 
     12 bytes of quantisation parameters, then a PNG or RVL picture of 16 bits. ``format_`` begins
     with the encoding of the picture before compression; the bytes tell PNG from RVL.
@@ -125,19 +128,19 @@ def decode_compressed_depth(data: bytes | memoryview, format_: str) -> tuple[F32
     raw = decode_rvl(body) if is_rvl else decode_compressed(body)
     if raw.ndim != 2 or raw.dtype != np.uint16:
         raise UndecodableError("its depth image is not a picture of 16 bits")
-    if format_.strip().lower().startswith("32fc1"):  # stored as inverse depth
+    if is_inverse_depth(format_):
         if not has_head:
             raise UndecodableError("its depth image lacks the parameters of its inverse depths")
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             metres = np.float32(quant_a) / (raw.astype(np.float32) - np.float32(quant_b))
         metres[raw == 0] = 0
-        return depth_metres(metres), depth_step(metres)
-    return depth_metres(raw), depth_step(raw)
+        return depth_metres(metres)
+    return depth_metres(raw)
 
 
-def depth_step(raw: Image | F32) -> float:
-    """Metres of one step of a depth image: whole numbers are millimetres, others metres."""
-    return 0.001 if raw.dtype == np.uint16 else 1.0
+def is_inverse_depth(format_: str) -> bool:
+    """Whether a compressedDepth of this format holds inverse depths, of a float picture."""
+    return format_.strip().lower().startswith("32fc1")
 
 
 def depth_metres(raw: Image | F32) -> F32:
