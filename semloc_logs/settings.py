@@ -45,8 +45,8 @@ class Logs(_Section):
         None,
         gt=0,
         le=1,
-        description="metres of one step of a depth image of whole numbers; default 0.001, as the"
-        " message's definition asks for",
+        description="metres of one step of a depth image; default 0.001 of whole numbers and 1 of"
+        " 32FC1, as their encodings are defined",
     )
     memory: int = Field(
         2 << 30,

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from semloc_logs.frames import Frame, Header, LidarFrame
+from semloc_logs.frames import F64, Frame, Header, LidarFrame
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages import livox
-from semloc_logs.logs.messages.definitions import binary
-from semloc_logs.logs.messages.headers import Convert, check_time, foxglove, ros, transform
-from semloc_logs.logs.messages.point_fields import Field, Layout, decode_points
+from semloc_logs.logs.messages.definitions import UndecodableError, binary
+from semloc_logs.logs.messages.headers import Convert, check_time, foxglove, ros, transform, vector
+from semloc_logs.logs.messages.point_fields import Field, Layout, decode_points, is_noise
 from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.numerics import transforms
 
@@ -23,11 +24,7 @@ _FOXGLOVE_KINDS = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4"
 
 
 def _point_cloud2(header: Header, m: Any) -> Iterator[Frame]:
-    fields = [
-        Field(f.name, f.offset, _POINT_KINDS[f.datatype])
-        for f in m.fields
-        if f.datatype in _POINT_KINDS
-    ]
+    fields = _fields(((f.name, f.offset, f.datatype) for f in m.fields), _POINT_KINDS)
     layout = Layout(m.width, m.height, m.point_step, m.row_step, bool(m.is_bigendian))
     p = decode_points(binary(m.data), layout, fields, header.stamp_ns)
     yield LidarFrame(
@@ -44,22 +41,45 @@ def _point_cloud2(header: Header, m: Any) -> Iterator[Frame]:
 def _foxglove_cloud(header: Header, m: Any) -> Iterator[Frame]:
     step = int(m.point_stride or 0)
     data = binary(m.data)
-    fields = [
-        Field(str(f.name), int(f.offset or 0), _FOXGLOVE_KINDS[f.type])
-        for f in m.fields or ()
-        if f.type in _FOXGLOVE_KINDS
-    ]
+    fields = _fields(
+        ((str(f.name), int(f.offset or 0), f.type) for f in m.fields or ()), _FOXGLOVE_KINDS
+    )
     count = len(data) // step if step > 0 else 0
     p = decode_points(data, Layout(count, 1, step, 0), fields, header.stamp_ns)
     points = p.points
-    if m.pose is not None and m.pose.orientation is not None and m.pose.position is not None:
-        rotation = m.pose.orientation
-        # left out by writers that mean the identity
-        if any((rotation.x, rotation.y, rotation.z, rotation.w)):
-            frame_T_cloud = transform(m.pose.position, rotation)
-            if not np.array_equal(frame_T_cloud, np.eye(4)):
-                points = transforms.apply(frame_T_cloud, points).astype(np.float32)
-    yield LidarFrame(header, points, p.label, p.offset_ns, p.ring, remark=p.remark)
+    origin = None
+    frame_T_cloud = _cloud_pose(m.pose)
+    if not np.array_equal(frame_T_cloud, np.eye(4)):
+        points = transforms.apply(frame_T_cloud, points).astype(np.float32)
+        origin = frame_T_cloud[:3, 3].astype(np.float32)
+    yield LidarFrame(header, points, p.label, p.offset_ns, p.ring, remark=p.remark, origin=origin)
+
+
+def _fields(recorded: Iterable[tuple[str, int, Any]], kinds: Mapping[int, str]) -> list[Field]:
+    """The fields of a point from (name, offset, type). UndecodableError for an axis of no type."""
+    fields = []
+    for name, offset, type_ in recorded:
+        if type_ in kinds:
+            fields.append(Field(name, offset, kinds[type_]))
+        elif name.lower() in ("x", "y", "z"):
+            raise UndecodableError(f"its field {name} has the unknown type {type_}")
+    return fields
+
+
+def _cloud_pose(pose: Any) -> F64:
+    """``frame_T_cloud`` (4, 4); what a writer leaves out is 0, and no rotation."""
+    out = np.eye(4)
+    if pose is None:
+        return out
+    rotation = pose.orientation
+    if rotation is not None and any((rotation.x, rotation.y, rotation.z, rotation.w)):
+        zero = SimpleNamespace(x=0.0, y=0.0, z=0.0)
+        return transform(zero if pose.position is None else pose.position, rotation)
+    if pose.position is not None:
+        out[:3, 3] = vector(pose.position)
+    if not np.isfinite(out).all():
+        raise UndecodableError("its pose has values that are not finite")
+    return out
 
 
 def _livox(m: Any, message: Message) -> Iterator[Frame]:
@@ -77,6 +97,7 @@ def _livox(m: Any, message: Message) -> Iterator[Frame]:
     xyz = np.stack([m.points[axis] for axis in "xyz"], axis=1).astype(np.float32)
     finite = np.isfinite(xyz).all(axis=1)
     kept = finite & ((xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0))
+    kept &= ~is_noise(m.points["tag"])
     yield LidarFrame(
         header,
         xyz[kept],

@@ -18,7 +18,8 @@ TIMES = (
     "t", "time", "timestamp", "time_stamp", "offset_time", "time_offset", "time_offset_ns",
     "timestamp_offset", "point_time_offset", "relative_timestamp",
 )  # fmt: skip
-_USED = {"x", "y", "z", *LABELS, *RINGS, *TIMES}
+TAG = "tag"  # of Livox, whose drivers record it beside "line"
+_USED = {"x", "y", "z", TAG, *LABELS, *RINGS, *TIMES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,7 @@ class Layout:
 def decode_points(
     data: bytes | memoryview, layout: Layout, fields: Sequence[Field], stamp_ns: int
 ) -> Points:
-    """Points whose position is finite and not exactly zero.
+    """Points whose position is finite and not exactly zero, and that are not tagged as noise.
 
     UndecodableError when the layout does not fit the data.
     """
@@ -85,6 +86,8 @@ def decode_points(
     valid = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
     finite = int(np.count_nonzero(valid))
     valid &= (xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0)
+    if {TAG, "line"} <= columns.keys() and rows.dtype[columns[TAG]] == np.uint8:
+        valid &= ~is_noise(rows[columns[TAG]].reshape(-1))
     everything = bool(valid.all())
 
     def column(names: Sequence[str], kinds: str) -> NDArray[np.generic] | None:
@@ -106,6 +109,20 @@ def decode_points(
         not_finite=len(xyz) - finite,
         remark=remark,
     )
+
+
+def is_noise(tag: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Which points (n,) a Livox tags as noise.
+
+    Bits 0 and 1 judge a point by its neighbours, bits 2 and 3 by its intensity: 0 is a normal
+    point, 1 and 2 are noise of high and moderate confidence (Livox SDK communication protocol;
+    moderate and low confidence of the point itself in the second generation). Bits 4 and 5 are the
+    number of the return: all returns are surfaces.
+    """
+    bits = tag.astype(np.uint8)
+    by_place = bits & 3
+    by_intensity = (bits >> 2) & 3
+    return np.asarray((by_place - 1 < 2) | (by_intensity - 1 < 2))
 
 
 def _offsets(

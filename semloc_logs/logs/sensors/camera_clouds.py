@@ -19,7 +19,7 @@ class CameraClouds:
     """Depth images and stereo pairs -> points with labels.
 
     ``calibrations``: the newest one by CameraInfo topic; ``labels``: the label images;
-    ``right_T_left`` as in StereoClouds.
+    ``right_T_left`` as in StereoClouds; ``depth_unit`` as in DepthUnits.
     """
 
     def __init__(
@@ -29,9 +29,10 @@ class CameraClouds:
         *,
         stride: int | None = None,
         noise: RangeNoise = USUAL_NOISE,
+        depth_unit: float | None = None,
     ) -> None:
         self._roles = roles
-        self._depth = DepthClouds(roles, stride, noise)
+        self._depth = DepthClouds(roles, stride, noise, depth_unit)
         self.labels: LabelImages = self._depth.labels
         self.calibrations: dict[str, Camera] = self._depth.calibrations
         self._stereo = StereoClouds(
@@ -40,8 +41,13 @@ class CameraClouds:
 
     @property
     def problems(self) -> list[Problem]:
-        """Calibrations (lost) and label images that cannot be used."""
-        return [*self._depth.problems, *self._stereo.problems, *self.labels.problems]
+        """Depth units, and calibrations (lost) and label images that cannot be used."""
+        return [
+            *self._depth.units.problems,
+            *self._depth.problems,
+            *self._stereo.problems,
+            *self.labels.problems,
+        ]
 
     def take(self, frame: DepthFrame | ImageFrame) -> None:
         """Remembers a label image or a picture of a stereo pair; any other is ignored."""

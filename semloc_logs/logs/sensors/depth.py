@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F32, F64, Camera, DepthFrame, ImageFrame
+from semloc_logs.logs.messages.image_codecs import METRE, MILLIMETRE, depth_metres
 from semloc_logs.logs.problems import NoCloud, ProblemKind, Problems
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.calibration import Lens, camera_R_rect, fitted_camera, lens_of
@@ -26,6 +27,11 @@ LABEL_TOLERANCE_NS = 15_000_000
 DEPTH_NOISE = 0.0019  # 1/m, the coefficient of the square
 _LEAST_DEPTH_NOISE = 0.0012  # m
 _NOISE_FREE_DEPTH = 0.4  # m
+# m; a room or a street is nearer, and further away than a hand: medians of depth images beyond
+# either are of another unit
+_FARTHEST_MEDIAN = 200.0
+_NEAREST_MEDIAN = 0.05
+_LEAST_MEASURED = 100  # one pixel in so many has a depth in an image that shows the unit
 _LABELS_KEPT = 80  # more than the depth images that may wait for their pose
 
 
@@ -159,13 +165,62 @@ def is_coloured(frame: DepthFrame | ImageFrame) -> bool:
     return isinstance(frame, ImageFrame) and frame.image.ndim == 3
 
 
-def _metres(frame: DepthFrame | ImageFrame) -> F32 | None:
-    """Depth (h, w) in m; a 16-bit picture that the user named as depth is in millimetres."""
-    if isinstance(frame, DepthFrame):
-        return frame.depth
-    if frame.image.ndim == 2 and frame.image.dtype == np.uint16:
-        return np.where(frame.image == 65535, 0, frame.image).astype(np.float32) * np.float32(1e-3)
-    return None
+class DepthUnits:
+    """Depth images in metres; ``problems`` name the topics whose values cannot be what they claim.
+
+    ``unit`` (m) of one step of all of them; None: as their encodings are defined, millimetres of
+    whole numbers and metres of floats, unless the floats cannot be metres.
+    """
+
+    def __init__(self, unit: float | None = None) -> None:
+        self.problems = Problems()
+        self._unit = unit
+        self._unit_of: dict[str, float] = {}
+
+    def metres(self, frame: DepthFrame | ImageFrame) -> F32 | None:
+        """Depth (h, w) in m; None where a picture that the user named as depth has no depth."""
+        if isinstance(frame, DepthFrame):
+            recorded = frame.depth
+            step = frame.step
+        elif frame.image.ndim == 2 and frame.image.dtype == np.uint16:
+            recorded = depth_metres(frame.image)
+            step = MILLIMETRE
+        else:
+            return None
+        unit = self._unit or self._unit_of.get(frame.header.topic)
+        if unit is None:
+            unit = self._judge(frame.header.topic, recorded, step)
+        return recorded if unit == step else recorded * np.float32(unit / step)
+
+    def _judge(self, topic: str, recorded: F32, step: float) -> float:
+        """The unit (m) of a topic, by its first image that shows enough."""
+        measured = recorded[recorded > 0]
+        # simulators give the sky one large value
+        below = measured[measured < measured.max()] if len(measured) else measured
+        some = below if len(below) else measured
+        if len(some) < max(1, recorded.size // _LEAST_MEASURED):
+            return step
+        median = float(np.median(some))
+        unit = step
+        if step == METRE and median > _FARTHEST_MEDIAN:
+            unit = MILLIMETRE
+            self.problems.assume(
+                f"{topic}: half of its depths are beyond {median:.0f}, which would be metres by "
+                f"their encoding 32FC1: they are taken as millimetres; "
+                f"--set logs.depth_unit=1 takes them as metres.",
+                topic=topic,
+                kind=ProblemKind.FRAME,
+            )
+        elif step == MILLIMETRE and median < _NEAREST_MEDIAN:
+            self.problems.assume(
+                f"{topic}: half of its depths are below {median * 1e3:.0f} mm if their steps are "
+                f"millimetres, as their encoding has it; --set logs.depth_unit=METRES gives the "
+                f"metres of one step.",
+                topic=topic,
+                kind=ProblemKind.FRAME,
+            )
+        self._unit_of[topic] = unit
+        return unit
 
 
 class LabelImages:
@@ -223,11 +278,17 @@ class DepthClouds:
     """Depth images -> points with labels, by the recorded calibrations and ``labels``.
 
     ``calibrations``: the newest one by CameraInfo topic; ``problems`` name the unusable ones.
+    ``units``: what the values of the images are in, ``unit`` (m) where the user says it.
     """
 
     def __init__(
-        self, roles: Roles, stride: int | None = None, noise: RangeNoise = USUAL_NOISE
+        self,
+        roles: Roles,
+        stride: int | None = None,
+        noise: RangeNoise = USUAL_NOISE,
+        unit: float | None = None,
     ) -> None:
+        self.units = DepthUnits(unit)
         self.calibrations: dict[str, Camera] = {}
         self.labels = LabelImages(roles)
         self.problems = Problems()
@@ -246,7 +307,7 @@ class DepthClouds:
     ) -> RangePoints | NoCloud:
         """Points in the optical frame, or the reason for none."""
         topic = frame.header.topic
-        depth = _metres(frame)
+        depth = self.units.metres(frame)
         if depth is None:
             return NoCloud.NO_DEPTH
         camera = self.calibrations.get(self._roles.info_of.get(topic, ""))

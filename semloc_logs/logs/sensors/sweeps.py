@@ -32,7 +32,8 @@ def sweep_in_base(
     than ``min_range`` or beyond ``max_range`` (m, from the sensor) are dropped.
     """
     with np.errstate(over="ignore"):  # damaged floats may be 1e38
-        squared = np.einsum("ni,ni->n", frame.points, frame.points)
+        rays = frame.points if frame.origin is None else frame.points - frame.origin
+        squared = np.einsum("ni,ni->n", rays, rays)
     kept = (squared >= min_range**2) & (squared <= max_range**2)
     points = frame.points[kept]
     label = None if frame.label is None else frame.label[kept]

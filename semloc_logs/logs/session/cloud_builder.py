@@ -120,7 +120,8 @@ class CloudBuilder:
             max_range=self._limits.farthest,
         )
         self.deskewed += is_deskewed
-        return PosedCloud(header, points, _origin(place), place.session_T_base, label)
+        origin = _origin(place, sweep.origin)
+        return PosedCloud(header, points, origin, place.session_T_base, label)
 
     def _picture(self, frame: DepthFrame | ImageFrame, place: _Place) -> PosedCloud | NoCloud:
         seen = self._cameras.points(frame, self._limits.nearest, self._limits.farthest)
@@ -144,5 +145,8 @@ class CloudBuilder:
         )
 
 
-def _origin(place: _Place) -> F32:
+def _origin(place: _Place, in_sensor: F32 | None = None) -> F32:
+    """The sensor's centre (3,) in the base frame, where ``in_sensor`` (3,) is it in its frame."""
+    if in_sensor is not None:
+        return in_base(place.base_T_sensor, in_sensor[None])[0]
     return place.base_T_sensor[:3, 3].astype(np.float32)

@@ -41,7 +41,7 @@ from semloc_logs.logs.problems import (
 )
 from semloc_logs.logs.role_types import no_sensor
 from semloc_logs.logs.roles import guess_roles
-from semloc_logs.logs.sensors.depth import Unprojector
+from semloc_logs.logs.sensors.depth import DepthUnits, Unprojector
 from semloc_logs.logs.sensors.rectification import rectification
 from semloc_logs.logs.sensors.stereo_pairs import is_rectified
 from semloc_logs.logs.session.frame_queue import RangeFrame
@@ -215,6 +215,10 @@ class _Inspection:
     def _depth_obstacles(self, topic: str) -> Iterator[Problem]:
         info = self._roles.info_of.get(topic)
         frame = self._first.get(topic)
+        if isinstance(frame, DepthFrame):
+            units = DepthUnits()
+            units.metres(frame)
+            yield from units.problems
         if info is None or info not in self._cameras:
             text = (
                 f"{topic} has no CameraInfo: it cannot become points; record it, or name it with "

@@ -300,7 +300,13 @@ class Session:
         # fixes that are named as the pose topic are not only a fallback
         named = navsat if roles.pose is not None else None
         poses = BasePoses(roles, static_count, self._pose_source() or named, navsat)
-        cameras = CameraClouds(roles, poses.tree.lookup, stride=options.stride, noise=options.noise)
+        cameras = CameraClouds(
+            roles,
+            poses.tree.lookup,
+            stride=options.stride,
+            noise=options.noise,
+            depth_unit=options.logs.depth_unit,
+        )
         # a user who names several LIDARs wants them all
         may_repeat = len(roles.lidar) > 1 and "lidar" not in options.topics
         duplicates = DuplicateTopics() if may_repeat else None

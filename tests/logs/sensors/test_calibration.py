@@ -27,7 +27,7 @@ def camera(
     """A sensor of 640 x 480 pixels: fx, fy, cx, cy are ``K``."""
     fx, fy, cx, cy = K
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    P = np.hstack([matrix, [[-fx * baseline], [0], [0]]])
+    P = np.hstack([matrix, np.array([[-fx * baseline], [0], [0]])])
     header = Header("/info", 0, 0, "optical")
     D = np.zeros(5)
     return Camera(header, width, height, matrix, D, np.eye(3), P, "plumb_bob", binning, roi)
@@ -155,7 +155,8 @@ def test_stereo_pairs_with_binning() -> None:
     assert how.assumptions == ()
     half = replace(right, K=right.K * [[0.5], [0.5], [1]], P=right.P * [[0.5], [0.5], [1]])
     how = rectification(left, half, (240, 320), None, rectified=True)
-    assert (how.focal, how.baseline) == (250, pytest.approx(0.1))
+    assert how.focal == 250
+    assert how.baseline == pytest.approx(0.1)
     assert "K fits the reduced picture" in how.assumptions[0]
 
 
