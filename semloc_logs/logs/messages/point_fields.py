@@ -19,6 +19,7 @@ TIMES = (
     "timestamp_offset", "point_time_offset", "relative_timestamp",
 )  # fmt: skip
 TAG = "tag"  # of Livox, whose drivers record it beside "line"
+_NOISE = (1, 2)  # of the two bits of a judgement
 _USED = {"x", "y", "z", TAG, *LABELS, *RINGS, *TIMES}
 
 
@@ -122,7 +123,7 @@ def is_noise(tag: NDArray[np.generic]) -> NDArray[np.bool_]:
     bits = tag.astype(np.uint8)
     by_place = bits & 3
     by_intensity = (bits >> 2) & 3
-    return np.asarray((by_place - 1 < 2) | (by_intensity - 1 < 2))
+    return np.isin(by_place, _NOISE) | np.isin(by_intensity, _NOISE)
 
 
 def _offsets(

@@ -26,6 +26,7 @@ from semloc_logs.frames import (
     LidarFrame,
     NavSatSample,
     PoseSample,
+    Region,
     TransformSample,
 )
 from semloc_logs.logs.log import Definition, Message
@@ -279,8 +280,15 @@ def test_camera_info(ros: Ros) -> None:
     assert frame.D.tolist() == [0.1, 0.2]
     assert frame.R.tolist() == np.eye(3).tolist()
     assert frame.P.tolist() == [[100, 0, 2, 0], [0, 100, 3, 0], [0, 0, 1, 0]]
+    assert (frame.binning, frame.roi) == ((1, 1), Region(0, 0, 0, 0))
     assert ros.frames(camera_info(ros, 0.0)) == []
     assert "not calibrated" in sentences(ros.problems)[0]
+    binned = camera_info(ros, 100.0)
+    binned.binning_x, binned.binning_y = 2, 3
+    binned.roi.x_offset, binned.roi.y_offset, binned.roi.width, binned.roi.height = 4, 5, 6, 7
+    [frame] = ros.frames(binned)
+    assert isinstance(frame, Camera)
+    assert (frame.binning, frame.roi) == ((2, 3), Region(4, 5, 6, 7))
 
 
 def test_imu_and_nav_sat(ros: Ros) -> None:
@@ -312,6 +320,23 @@ def test_imu_and_nav_sat(ros: Ros) -> None:
     )
     assert isinstance(frame, ImuSample)
     assert frame.orientation is None
+
+    # the same for the others, whose values then mean nothing
+    force.x = math.nan
+    covariances["linear_acceleration_covariance"] = np.r_[-1.0, np.zeros(8)]
+    [frame] = ros.frames(
+        ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances)
+    )
+    assert isinstance(frame, ImuSample)
+    assert np.isnan(frame.acceleration).all()
+    assert frame.angular_velocity.tolist() == [0.5, 2, 3]
+    covariances["linear_acceleration_covariance"] = np.zeros(9)
+    assert (
+        ros.frames(ros.make("sensor_msgs/msg/Imu", header=ros.header(), **parts, **covariances))
+        == []
+    )
+    assert "not finite" in sentences(ros.problems)[0]
+    ros.problems.forget_skipped(None)
 
     def fix(status: int, latitude: float, kind: int = 0, variance: float = 0.0) -> list[Any]:
         s = ros.make("sensor_msgs/msg/NavSatStatus", status=status, service=1)
@@ -345,8 +370,34 @@ def test_imu_and_nav_sat(ros: Ros) -> None:
     [frame] = fix(-1, math.nan)
     assert not frame.has_fix
     assert sentences(ros.problems) == []  # a receiver without a fix is not a problem of the log
+    # a driver that never sets the status has a fix where it has a position
+    [frame] = fix(-2, 47.25)
+    assert frame.has_fix
     assert fix(0, math.nan) == []
     assert len(sentences(ros.problems)) == 1
+
+
+@pytest.mark.parametrize("altitude", [math.nan, math.inf, -1e7])
+def test_a_fix_without_an_altitude_is_a_position(ros: Ros, altitude: float) -> None:
+    covariance = np.diag([4.0, 9.0, math.nan]).ravel()
+    covariance[2] = covariance[6] = math.nan
+    [frame] = ros.frames(
+        ros.make(
+            "sensor_msgs/msg/NavSatFix",
+            header=ros.header(),
+            status=ros.make("sensor_msgs/msg/NavSatStatus", status=0, service=1),
+            latitude=47.25,
+            longitude=8.5,
+            altitude=altitude,
+            position_covariance=covariance,
+            position_covariance_type=2,
+        )
+    )
+    assert isinstance(frame, NavSatSample)
+    assert math.isnan(frame.altitude)
+    assert frame.covariance is not None
+    assert np.diag(frame.covariance)[:2].tolist() == [4, 9]
+    assert sentences(ros.problems) == []
 
 
 IMU_LIKE = (
@@ -482,9 +533,25 @@ def test_protobuf_point_cloud_with_its_pose() -> None:
     assert frame.label is not None
     assert frame.label.tolist() == [7]
     assert (frame.header.stamp_ns, frame.header.frame_id) == (5_000_000_007, "lidar")
+    assert frame.origin is not None
+    assert frame.origin.tolist() == [1, 2, 3]
+    # a position without a rotation
+    m.pose.ClearField("orientation")
+    [frame], _ = protobuf_frames(m)
+    assert frame.points.tolist() == [[2, 2, 3]]
+    assert frame.origin.tolist() == [1, 2, 3]
+    m.pose.position.x = math.nan
+    frames, problems = protobuf_frames(m)
+    assert frames == []
+    assert "not finite" in sentences(problems)[0]
     m.ClearField("pose")
     [frame], _ = protobuf_frames(m)
     assert frame.points.tolist() == [[1, 0, 0]]
+    assert frame.origin is None
+    m.fields[1].type = 0
+    frames, problems = protobuf_frames(m)
+    assert frames == []
+    assert "its field y has the unknown type 0" in sentences(problems)[0]
 
 
 def test_protobuf_transforms_and_images() -> None:
@@ -527,6 +594,14 @@ def test_json_messages() -> None:
     [frame], _ = json_frames("foxglove.LocationFix", fix)
     assert isinstance(frame, NavSatSample)
     assert frame.latitude_deg == 47.25
+    del fix["altitude"]
+    [frame], _ = json_frames("foxglove.LocationFix", fix)
+    assert isinstance(frame, NavSatSample)
+    assert math.isnan(frame.altitude)
+    del fix["latitude"]
+    frames, problems = json_frames("foxglove.LocationFix", fix)
+    assert frames == []
+    assert "latitude or longitude is not on Earth" in sentences(problems)[0]
     calibration = {
         "timestamp": time,
         "width": 4,

@@ -173,6 +173,17 @@ def test_rvl_round_trip(width: int, height: int, data: st.DataObject) -> None:
     assert decode_rvl(rvl(pixels, width, height)).reshape(-1).tolist() == pixels
 
 
+def test_compressed_depth_without_its_head() -> None:
+    raw = np.array([[0, 1000, 2500]], np.uint16)
+    for format_ in ("16UC1; compressedDepth", "16UC1; compressedDepth rvl"):
+        np.testing.assert_allclose(decode_compressed_depth(png(raw), format_), [[0, 1.0, 2.5]])
+    # PNG behind the head, although the format has it otherwise
+    found = decode_compressed_depth(bytes(12) + png(raw), "16UC1; compressedDepth rvl")
+    np.testing.assert_allclose(found, [[0, 1.0, 2.5]])
+    with pytest.raises(UndecodableError, match="lacks the parameters"):
+        decode_compressed_depth(png(raw), "32FC1; compressedDepth")
+
+
 def test_rvl_inside_compressed_depth() -> None:
     data = struct.pack("<iff", 1, 0, 0) + rvl([0, 0, 1200, 1300, 0, 7], 3, 2)
     np.testing.assert_allclose(

@@ -205,7 +205,11 @@ PACKAGES = ["livox_ros_driver", "livox_ros_driver2", "livox_interfaces"]
 
 
 def livox_message(
-    package: str, encoding: str, frame_id: str = "livox", count: int = 5
+    package: str,
+    encoding: str,
+    frame_id: str = "livox",
+    count: int = 5,
+    tags: tuple[int, ...] = (16,) * 5,
 ) -> tuple[bytes, Definition]:
     store = get_typestore(Stores.ROS2_HUMBLE if encoding == "cdr" else Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(CUSTOM["point"], f"{package}/msg/CustomPoint"))
@@ -217,7 +221,7 @@ def livox_message(
     )
     points = [
         t[f"{package}/msg/CustomPoint"](
-            offset_time=k * 20_000_000, x=1.0 + k, y=2.0, z=-k, reflectivity=7, tag=16, line=k
+            offset_time=k * 20_000_000, x=1.0 + k, y=2.0, z=-k, reflectivity=7, tag=tags[k], line=k
         )
         for k in range(count)
     ]
@@ -257,6 +261,22 @@ def test_livox_with_and_without_its_definition(package: str, encoding: str, fram
         assert frame.offset_ns.tolist() == [1000 + k * 20_000_000 for k in range(5)]
         assert frame.ring is not None
         assert frame.ring.tolist() == list(range(5))
+
+
+# (tag, is it noise): bits 0 and 1 by place, 2 and 3 by intensity, 4 and 5 the return
+TAGS = [(0b00, 0), (0b01, 1), (0b10, 1), (0b11, 0), (0b0100, 1), (0b1000, 1), (0b1100, 0)]
+TAGS += [(0b010000, 0), (0b100000, 0), (0b100001, 1)]
+
+
+@pytest.mark.parametrize(("tag", "noise"), TAGS)
+def test_points_that_a_livox_tags_as_noise(tag: int, noise: int) -> None:
+    data, definition = livox_message(PACKAGES[1], "cdr", tags=(0, tag, 0, 0, 0))
+    problems = Problems()
+    type_ = f"{PACKAGES[1]}/msg/CustomMsg"
+    [frame] = Decoder(problems).frames(Message("/l", type_, "cdr", 1, data, definition))
+    assert isinstance(frame, LidarFrame)
+    assert frame.points[:, 0].tolist() == [1, 3, 4, 5] if noise else [1, 2, 3, 4, 5]
+    assert (frame.lost, sentences(problems)) == (0, [])
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])

@@ -55,6 +55,19 @@ def test_rows_with_padding_and_points_that_are_none() -> None:
     assert len(decode_points(infinite, Layout(1, 1, 12, 12), XYZ, STAMP).points) == 0
 
 
+def test_tags_of_a_livox() -> None:
+    """Its drivers record them beside the line; a tag of another sensor means something else."""
+    tag = Field("tag", 12, "u1")
+    data = b"".join(struct.pack("<fffBB", k, 0, 0, k, 7) for k in (1, 2, 3, 4, 16))
+    livox = [*XYZ, tag, Field("line", 13, "u1")]
+    p = decode_points(data, Layout(5, 1, 14, 70), livox, STAMP)
+    assert p.points[:, 0].tolist() == [3, 16]
+    assert p.ring is not None
+    assert p.ring.tolist() == [7, 7]
+    assert p.not_finite == 0
+    assert len(decode_points(data, Layout(5, 1, 14, 70), [*XYZ, tag], STAMP).points) == 5
+
+
 def test_columns_follow_the_points_that_are_kept() -> None:
     fields = [*XYZ, Field("label", 12, "u1")]
     data = b"".join(

@@ -12,6 +12,7 @@ from semloc_logs.logs.problems import NoCloud, sentences
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.depth import (
     DepthClouds,
+    DepthUnits,
     RangePoints,
     Unprojector,
     depth_sigma,
@@ -141,6 +142,80 @@ ROLES = Roles(
     info_of={"/d/depth": "/d/camera_info"},
     label_of={"/d/depth": "/d/label"},
 )
+
+
+# -- units
+
+
+def pictured(metres: float, step: float) -> DepthFrame:
+    """A slanted wall around so many metres, as the definition of its encoding has them."""
+    depth = np.linspace(0.9 * metres, 1.1 * metres, 48, dtype=np.float32).reshape(6, 8)
+    depth[0, 0] = 0.0
+    return DepthFrame(Header("/d/depth", 0, 0, "optical"), depth, step)
+
+
+def test_depth_is_in_the_unit_of_its_encoding() -> None:
+    units = DepthUnits()
+    for frame in (pictured(2.0, 0.001), pictured(2.0, 1.0), pictured(60.0, 1.0)):
+        metres = DepthUnits().metres(frame)
+        assert metres is not None
+        assert metres.tolist() == frame.depth.tolist()
+        units.metres(frame)
+    assert sentences(units.problems) == []
+
+
+def test_floats_that_are_millimetres() -> None:
+    units = DepthUnits()
+    metres = units.metres(pictured(2000.0, 1.0))
+    assert metres is not None
+    np.testing.assert_allclose(np.median(metres[metres > 0]), 2.0, atol=0.01)
+    [problem] = units.problems
+    assert problem.assumed
+    assert "/d/depth: half of its depths are beyond 20" in problem.text
+    assert "--set logs.depth_unit=1 " in problem.text
+    # once judged, a topic keeps its unit: something held before the camera
+    metres = units.metres(pictured(100.0, 1.0))
+    assert metres is not None
+    assert metres.max() == pytest.approx(0.11)
+
+    # the sky of a simulator is far, the street is not
+    street = pictured(8.0, 1.0)
+    street.depth[:4] = 1000.0
+    units = DepthUnits()
+    metres = units.metres(street)
+    assert metres is not None
+    assert metres.max() == 1000.0
+    assert sentences(units.problems) == []
+
+
+def test_whole_numbers_that_are_no_millimetres() -> None:
+    units = DepthUnits()
+    units.metres(pictured(0.004, 0.001))
+    [problem] = units.problems
+    assert problem.assumed
+    assert "/d/depth: half of its depths are below 4 mm" in problem.text
+
+
+def test_the_unit_that_the_user_gives() -> None:
+    # 5000 steps a metre; floats in millimetres; floats in metres that look like millimetres
+    for unit, frame, expected in (
+        (0.0002, pictured(10.0, 0.001), 2.0),
+        (0.001, pictured(2000.0, 1.0), 2.0),
+        (1.0, pictured(300.0, 1.0), 300.0),
+    ):
+        units = DepthUnits(unit)
+        metres = units.metres(frame)
+        assert metres is not None
+        assert metres[0, 0] == 0
+        np.testing.assert_allclose(np.median(metres[metres > 0]), expected, rtol=0.01)
+        assert sentences(units.problems) == []
+    # a 16-bit picture that was named as depth
+    picture = ImageFrame(
+        Header("/d/depth", 0, 0, "optical"), np.array([[10_000, 65535]], np.uint16), "mono16"
+    )
+    metres = DepthUnits(0.0002).metres(picture)
+    assert metres is not None
+    np.testing.assert_allclose(metres, [[2.0, 0.0]])
 
 
 def depth_frame(stamp_ns: int = 0, shape: tuple[int, int] = (6, 8)) -> DepthFrame:

@@ -95,3 +95,14 @@ def test_range_limits_and_labels_go_together() -> None:
     assert found[:, 0].tolist() == [1, 50]
     assert labels is not None
     assert labels.tolist() == [2, 3]
+
+
+def test_ranges_are_from_the_sensor_where_it_is_not_at_the_origin_of_its_frame() -> None:
+    points = np.array([[10, 0, 0], [13, 0, 0], [0.1, 0, 0]], np.float32)
+    header = Header("/l", STAMP, STAMP, "lidar")
+    limits = {"min_range": 0.5, "max_range": 4.0}
+    frame = LidarFrame(header, points, origin=np.array([9.8, 0, 0], np.float32))
+    kept, _, _ = sweep_in_base(frame, np.eye(4), None, **limits)
+    assert kept.tolist() == [[13, 0, 0]]
+    kept, _, _ = sweep_in_base(LidarFrame(header, points), np.eye(4), None, **limits)
+    assert len(kept) == 0
