@@ -26,7 +26,7 @@ class Projector:
     """
 
     def __init__(self, camera: Camera, height: int, width: int, *, rectified: bool = False) -> None:
-        camera, assumption = fitted_camera(camera, height, width, scaled=True)
+        camera, assumption = fitted_camera(camera, height, width, rectified=rectified, scaled=True)
         matrix = camera.K
         lens = Lens(is_fisheye=False, coefficients=np.zeros(0))
         self._rotation = np.eye(3)

@@ -21,6 +21,8 @@ _RAW: dict[str, tuple[str, int, int | None]] = {
     "8uc1": ("u1", 1, None),
     "mono16": ("u2", 1, None),
     "16uc1": ("u2", 1, None),
+    "16sc1": ("i2", 1, None),
+    "32sc1": ("i4", 1, None),
     "32fc1": ("f4", 1, None),
     "rgb8": ("u1", 3, None),
     "bgr8": ("u1", 3, cv2.COLOR_BGR2RGB),
@@ -30,6 +32,8 @@ _RAW: dict[str, tuple[str, int, int | None]] = {
     "8uc4": ("u1", 4, cv2.COLOR_BGRA2RGB),
     "rgb16": ("u2", 3, None),
     "bgr16": ("u2", 3, cv2.COLOR_BGR2RGB),
+    "rgba16": ("u2", 4, cv2.COLOR_RGBA2RGB),
+    "bgra16": ("u2", 4, cv2.COLOR_BGRA2RGB),
     "yuv422": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
     "uyvy": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
@@ -82,6 +86,8 @@ def decode_raw(
     pixels: Any = np.ascontiguousarray(strided, value.newbyteorder("="))
     if channels == 1:
         pixels = pixels[:, :, 0]
+    if value.kind == "i":
+        pixels = _without_sign(pixels)
     if conversion is None:
         return cast("Image | F32", pixels)
     try:
@@ -90,6 +96,13 @@ def decode_raw(
         raise UndecodableError(
             f"{width} x {height} pixels of {encoding} cannot be converted"
         ) from error
+
+
+def _without_sign(pixels: Any) -> NDArray[np.uint16]:
+    """Signed values as 16 bits: below 0 is nothing. UndecodableError where they do not fit."""
+    if int(pixels.max()) > np.iinfo(np.uint16).max:
+        raise UndecodableError(f"its value {int(pixels.max())} does not fit 16 bits")
+    return np.asarray(np.maximum(pixels, 0), np.uint16)
 
 
 def decode_compressed(data: bytes | memoryview) -> Image:
@@ -163,7 +176,7 @@ def is_depth(topic: str, encoding: str) -> bool:
     encoding = encoding.strip().lower()
     if encoding == "32fc1":
         return True
-    if encoding == "16uc1":
+    if encoding in ("16uc1", "16sc1"):
         return "depth" in name or not any(word in name for word in _LABEL_WORDS)
     return encoding == "mono16" and "depth" in name
 

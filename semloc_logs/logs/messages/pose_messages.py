@@ -150,7 +150,10 @@ def _fix_covariance(m: Any) -> F64 | None:
     NaN for up where only the height is uncertain without bounds.
     """
     recorded = getattr(m, "position_covariance", None)
-    if not getattr(m, "position_covariance_type", 0) or recorded is None or len(recorded) != 9:
+    kind = getattr(m, "position_covariance_type", 0)
+    # some write the names of enumerations in JSON
+    is_unknown = not kind or str(kind) == "UNKNOWN"
+    if is_unknown or recorded is None or len(recorded) != 9:
         return None
     covariance = np.array(recorded, float).reshape(3, 3)
     is_known = np.isfinite(covariance[:2, :2]).all() and (np.diag(covariance)[:2] >= 0).all()

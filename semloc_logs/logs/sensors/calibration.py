@@ -130,12 +130,18 @@ class _Reading(NamedTuple):
 
 
 def fitted_camera(
-    camera: Camera, height: int, width: int, *, what: str = "picture", scaled: bool = False
+    camera: Camera,
+    height: int,
+    width: int,
+    *,
+    rectified: bool = False,
+    what: str = "picture",
+    scaled: bool = False,
 ) -> FittedCamera:
     """The calibration of a picture of ``height`` x ``width`` pixels.
 
-    ``what`` the picture is called; ``scaled``: it may have been scaled as a whole. LogError where
-    the calibration is of another size.
+    ``rectified``: P holds for it, not K; ``what`` it is called; ``scaled``: it may have been scaled
+    as a whole. LogError where the calibration is of another size.
     """
     size = np.array([width, height], float)
     full = _full_size(camera, size)
@@ -145,7 +151,8 @@ def fitted_camera(
     if is_whole and by_definition.is_of(size):
         fitted = FittedCamera(camera)
     elif not is_whole:
-        fitted = _with_region(camera, full, size)
+        matrix = "P" if rectified else "K"
+        fitted = _with_region(_Claim(camera, matrix, full, by_definition), size)
     if fitted is not None:
         return FittedCamera(_of_size(fitted.camera, height, width), fitted.assumption)
 
@@ -201,27 +208,54 @@ def _by_definition(camera: Camera, full: F64) -> _Reading:
     return _Reading(size / binning, region.offset, binning)
 
 
-def _with_region(camera: Camera, full: F64, size: F64) -> FittedCamera | None:
+class _Claim(NamedTuple):
+    """A calibration with binning or region.
+
+    ``matrix``: which of K and P holds for the picture; ``full`` size (x, y) of the sensor's picture;
+    ``by_definition``: what the message asks for.
+    """
+
+    camera: Camera
+    matrix: str
+    full: F64
+    by_definition: _Reading
+
+    @property
+    def name(self) -> str:
+        """Of the CameraInfo, for sentences."""
+        return f"CameraInfo {self.camera.header.topic}"
+
+    @property
+    def told(self) -> str:
+        """What it has of region and binning, for sentences."""
+        return _region_and_binning(self.camera)
+
+    @property
+    def point(self) -> F64:
+        """The principal point (x, y)."""
+        return np.asarray(getattr(self.camera, self.matrix)[:2, 2])
+
+
+def _with_region(claim: _Claim, size: F64) -> FittedCamera | None:
     """The one reading of region and binning that gives a picture of ``size``; None: none does."""
-    by_definition = _by_definition(camera, full)
+    camera, matrix, full, by_definition = claim
     if by_definition.is_of(size):
-        return _by_principal_point(camera, full, by_definition)
+        return _by_principal_point(claim)
 
     binning = by_definition.binning
     one = np.ones(2)
-    name = f"CameraInfo {camera.header.topic}"
-    told = _region_and_binning(camera)
     if _Reading(full, np.zeros(2), one).is_of(size):
         # the driver writes the size of the picture
-        middle = full / 2
-        point = camera.K[:2, 2]
-        if _off(point, middle, full) <= _OFF_MIDDLE:
-            return FittedCamera(camera)
-        if _off(by_definition.of_picture(point), middle, full) <= _OFF_MIDDLE:
+        reduced = by_definition.of_picture(claim.point)
+        if (
+            _off(claim.point, full / 2, full) > _OFF_MIDDLE
+            and _off(reduced, full / 2, full) <= _OFF_MIDDLE
+        ):
             return FittedCamera(
                 _reduced(camera, by_definition),
-                f"{name} is for {_pixels(full)} pixels, but its K is for a larger picture: K is "
-                f"reduced as its {told} has it; {_REMEDY} if that is wrong.",
+                f"{claim.name} is for {_pixels(full)} pixels, but its {matrix} is for a larger "
+                f"picture: {matrix} is reduced as its {claim.told} has it; {_REMEDY} if that is "
+                f"wrong.",
             )
         return FittedCamera(camera)
     for part, reading in (
@@ -231,36 +265,36 @@ def _with_region(camera: Camera, full: F64, size: F64) -> FittedCamera | None:
         if reading.is_of(size):
             return FittedCamera(
                 _reduced(camera, reading),
-                f"{name} has {told}, but its pictures have {_pixels(size)} pixels: only the {part} "
-                f"is applied; {_REMEDY} if that is wrong.",
+                f"{claim.name} has {claim.told}, but its pictures have {_pixels(size)} pixels: "
+                f"only the {part} is applied; {_REMEDY} if that is wrong.",
             )
     return None
 
 
-def _by_principal_point(camera: Camera, full: F64, reading: _Reading) -> FittedCamera:
+def _by_principal_point(claim: _Claim) -> FittedCamera:
     """K of the full picture, as defined, unless it can only be the K of the recorded picture."""
-    point = camera.K[:2, 2]
-    middle = reading.of_picture(full / 2)
-    off_full = _off(point, full / 2, full)
-    off_picture = _off(point, middle, reading.size)
-    name = f"CameraInfo {camera.header.topic}"
-    told = _region_and_binning(camera)
-    reduced = _reduced(camera, reading)
+    camera, matrix, full, reading = claim
+    off_full = _off(claim.point, full / 2, full)
+    off_picture = _off(claim.point, reading.of_picture(full / 2), reading.size)
+    told = f"{claim.name} has {claim.told} of {_pixels(full)} pixels"
     if off_full > _OFF_MIDDLE and off_picture < off_full:
         return FittedCamera(
             camera,
-            f"{name} has {told} of {_pixels(full)} pixels, but its K fits the reduced picture: it "
-            f"is taken as it is; {_REMEDY} if that is wrong.",
+            f"{told}, but its {matrix} fits the reduced picture: it is taken as it is; {_REMEDY} "
+            f"if that is wrong.",
         )
-    differs = _off(reduced.K[:2, 2], point, reading.size) > _NO_MATTER
-    if differs and max(off_full, off_picture) < _NEAR_MIDDLE and off_picture < off_full:
-        return FittedCamera(
-            reduced,
-            f"{name} has {told} of {_pixels(full)} pixels; whether its K is of the full picture "
-            f"cannot be told, so it is taken to be, as the message is defined; {_REMEDY} if that "
-            f"is wrong.",
+    reduced = reading.of_picture(claim.point)
+    is_doubtful = (
+        off_picture < off_full < _NEAR_MIDDLE
+        and _off(reduced, claim.point, reading.size) > _NO_MATTER
+    )
+    assumption = ""
+    if is_doubtful:
+        assumption = (
+            f"{told}; whether its {matrix} is of the full picture cannot be told, so it is taken "
+            f"to be, as the message is defined; {_REMEDY} if that is wrong."
         )
-    return FittedCamera(reduced)
+    return FittedCamera(_reduced(camera, reading), assumption)
 
 
 def _off(point: F64, middle: F64, size: F64) -> float:

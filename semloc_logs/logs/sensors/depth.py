@@ -85,7 +85,9 @@ class Unprojector:
         rectified: bool = False,
         stride: int | None = None,
     ) -> None:
-        camera, assumption = fitted_camera(camera, height, width, what="depth image")
+        camera, assumption = fitted_camera(
+            camera, height, width, rectified=rectified, what="depth image"
+        )
         matrix = camera.K
         lens = Lens(is_fisheye=False, coefficients=np.zeros(0))
         camera_R_picture = np.eye(3)

@@ -73,7 +73,7 @@ def rectification(
     """
     _check_size(_Pair(left, right, shape))
     cameras = (left, right)
-    fitted = [fitted_camera(camera, *shape) for camera in cameras]
+    fitted = [fitted_camera(camera, *shape, rectified=rectified) for camera in cameras]
     sentences = [fit.assumption for fit in fitted]
     if not rectified:
         sentences += [lens_of(camera).assumption for camera in cameras]

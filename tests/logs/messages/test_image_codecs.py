@@ -50,6 +50,16 @@ def test_row_padding_and_byte_order() -> None:
     assert decode_raw(data, 2, 2, 6, "16UC1", True).tolist() == [[1, 2], [3, 4]]
 
 
+def test_signed_values() -> None:
+    """32SC1 carries labels, 16SC1 depth; below 0 is nothing."""
+    pixels = decode_raw(struct.pack("<hh", -1, 1500), 2, 1, 4, "16SC1", big_endian=False)
+    assert pixels.tolist() == [[0, 1500]]
+    pixels = decode_raw(struct.pack(">ii", 7, 40_000), 2, 1, 8, "32SC1", big_endian=True)
+    assert (pixels.dtype, pixels.tolist()) == (np.uint16, [[7, 40_000]])
+    with pytest.raises(UndecodableError, match="70000 does not fit 16 bits"):
+        decode_raw(struct.pack("<i", 70_000), 1, 1, 4, "32SC1", big_endian=False)
+
+
 @pytest.mark.parametrize(
     ("pattern", "site"), [("rggb", (0, 0)), ("bggr", (1, 1)), ("gbrg", (1, 0)), ("grbg", (0, 1))]
 )

@@ -157,7 +157,10 @@ def test_stereo_pairs_with_binning() -> None:
     how = rectification(left, half, (240, 320), None, rectified=True)
     assert how.focal == 250
     assert how.baseline == pytest.approx(0.1)
-    assert "K fits the reduced picture" in how.assumptions[0]
+    assert "P fits the reduced picture" in how.assumptions[0]
+    # K does not matter to rectified pictures
+    how = rectification(left, replace(right, K=half.K), (240, 320), None, rectified=True)
+    assert how.assumptions == ()
 
 
 def test_rectified_pictures_are_turned_back_into_the_frame_of_the_camera() -> None:
