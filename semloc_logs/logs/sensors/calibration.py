@@ -126,7 +126,7 @@ class _Reading(NamedTuple):
 
     def of_picture(self, point: F64) -> F64:
         """A place (x, y) on the full picture in pixels of the recorded one."""
-        return (point - self.offset) / self.binning
+        return np.asarray((point - self.offset) / self.binning)
 
 
 def fitted_camera(
@@ -211,8 +211,8 @@ def _by_definition(camera: Camera, full: F64) -> _Reading:
 class _Claim(NamedTuple):
     """A calibration with binning or region.
 
-    ``matrix``: which of K and P holds for the picture; ``full`` size (x, y) of the sensor's picture;
-    ``by_definition``: what the message asks for.
+    ``matrix``: which of K and P holds for the picture; ``full`` (x, y): size of the picture of the
+    whole sensor; ``by_definition``: how the message is defined.
     """
 
     camera: Camera

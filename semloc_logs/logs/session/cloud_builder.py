@@ -148,5 +148,5 @@ class CloudBuilder:
 def _origin(place: _Place, in_sensor: F32 | None = None) -> F32:
     """The sensor's centre (3,) in the base frame, where ``in_sensor`` (3,) is it in its frame."""
     if in_sensor is not None:
-        return in_base(place.base_T_sensor, in_sensor[None])[0]
+        return in_base(place.base_T_sensor, in_sensor[None]).reshape(3)
     return place.base_T_sensor[:3, 3].astype(np.float32)

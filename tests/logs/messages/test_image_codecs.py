@@ -55,7 +55,8 @@ def test_signed_values() -> None:
     pixels = decode_raw(struct.pack("<hh", -1, 1500), 2, 1, 4, "16SC1", big_endian=False)
     assert pixels.tolist() == [[0, 1500]]
     pixels = decode_raw(struct.pack(">ii", 7, 40_000), 2, 1, 8, "32SC1", big_endian=True)
-    assert (pixels.dtype, pixels.tolist()) == (np.uint16, [[7, 40_000]])
+    assert pixels.dtype == np.dtype(np.uint16)
+    assert pixels.tolist() == [[7, 40_000]]
     with pytest.raises(UndecodableError, match="70000 does not fit 16 bits"):
         decode_raw(struct.pack("<i", 70_000), 1, 1, 4, "32SC1", big_endian=False)
 
