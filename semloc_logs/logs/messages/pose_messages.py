@@ -31,7 +31,7 @@ from semloc_logs.logs.messages.headers import (
 
 # sensor_msgs/NavSatStatus: not yet set; -1: no fix
 _STATUS_UNKNOWN = -2
-_HIGHEST = 1e6  # m; what is farther from the ellipsoid is not driven to
+_HIGHEST = 1e6  # m above the ellipsoid: nothing that drives is higher
 
 # -- poses and transforms
 
@@ -61,6 +61,11 @@ def _foxglove_transform(header: Header, m: Any) -> Iterator[Frame]:
         transform(m.translation, m.rotation),
         _is_static(header),
     )
+
+
+def _foxglove_odometry(header: Header, m: Any) -> Iterator[Frame]:
+    child = str(m.body_frame_id or "")
+    yield PoseSample(header, child, transform(m.pose.position, m.pose.orientation))
 
 
 def _is_static(header: Header) -> bool:
@@ -182,6 +187,7 @@ CONVERTERS: dict[str, Convert] = {
     "tf2_msgs/msg/TFMessage": _each(ros(_transform)),
     "tf/msg/tfMessage": _each(ros(_transform)),
     "foxglove.PoseInFrame": foxglove(_pose),
+    "foxglove.Odometry": foxglove(_foxglove_odometry),
     "foxglove.FrameTransform": foxglove(_foxglove_transform, "parent_frame_id"),
     "foxglove.FrameTransforms": _each(foxglove(_foxglove_transform, "parent_frame_id")),
     "foxglove.LocationFix": foxglove(_nav_sat),

@@ -280,7 +280,7 @@ class DepthClouds:
     """Depth images -> points with labels, by the recorded calibrations and ``labels``.
 
     ``calibrations``: the newest one by CameraInfo topic; ``problems`` name the unusable ones.
-    ``units``: what the values of the images are in, ``unit`` (m) where the user says it.
+    ``units``: what the values of the images are in, ``unit`` (m) where the user gives it.
     """
 
     def __init__(

@@ -585,6 +585,11 @@ def test_json_messages() -> None:
     assert isinstance(frame, PoseSample)
     assert (frame.header.stamp_ns, frame.header.frame_id) == (5_000_000_007, "odom")
     np.testing.assert_allclose(frame.frame_T_child, TURNED, atol=1e-12)
+    odometry = {"timestamp": time, "frame_id": "odom", "body_frame_id": "base", "pose": pose}
+    [frame], _ = json_frames("foxglove.Odometry", odometry)
+    assert isinstance(frame, PoseSample)
+    assert (frame.header.frame_id, frame.child_frame_id) == ("odom", "base")
+    np.testing.assert_allclose(frame.frame_T_child, TURNED, atol=1e-12)
     fields = [{"name": n, "offset": 4 * k, "type": 7} for k, n in enumerate("xyz")]
     data = base64.b64encode(struct.pack("<fff", 1, 2, 3)).decode()
     cloud = {"timestamp": time, "frame_id": "l", "point_stride": 12, "fields": fields, "data": data}
