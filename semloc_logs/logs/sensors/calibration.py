@@ -126,7 +126,8 @@ class _Reading(NamedTuple):
 
     def of_picture(self, point: F64) -> F64:
         """A place (x, y) on the full picture in pixels of the recorded one."""
-        return np.asarray((point - self.offset) / self.binning)
+        place: F64 = (point - self.offset) / self.binning
+        return place
 
 
 def fitted_camera(
