@@ -199,7 +199,8 @@ def _region(camera: Camera) -> _RegionPixels:
 
 def _binning(camera: Camera) -> F64:
     """Pixels of the sensor in one of the picture (x, y); 0 stands for 1."""
-    return np.maximum(np.array(camera.binning, float), 1.0)
+    binning: F64 = np.maximum(np.array(camera.binning, float), 1.0)
+    return binning
 
 
 def _by_definition(camera: Camera, full: F64) -> _Reading:
