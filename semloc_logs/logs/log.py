@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -50,6 +50,20 @@ class Message(NamedTuple):
     definition: Definition
 
 
+class Section(NamedTuple):
+    """A part of a log that can be read without the rest: a chunk, a stretch of time of a database.
+
+    ``topics`` that may have messages in it, empty when unknown; ``nbytes`` of the file that it
+    takes, roughly. ``messages`` reads the messages of some topics (None: of all) in log-time order.
+    """
+
+    start_ns: int
+    end_ns: int
+    nbytes: int
+    topics: frozenset[str]
+    messages: Callable[[Collection[str] | None], Iterator[Message]]
+
+
 class Log(Protocol):
     """An open log. Iterating twice reads the file twice; every pass needs bounded memory."""
 
@@ -86,6 +100,9 @@ class Log(Protocol):
 
         Damage ends the iteration early and is named in ``problems``; it raises nothing.
         """
+
+    def sections(self) -> list[Section]:
+        """The parts of the log by their first log time, from the index: nothing is read for it."""
 
     def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
         """The frames of ``topics`` in log-time order; a message may yield several, or none.

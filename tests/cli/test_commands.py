@@ -336,14 +336,17 @@ def _log(path: Path, messages: int = 3) -> Path:
     return path
 
 
-def test_inspect_prints_an_object_or_an_array(tmp_path: Path) -> None:
+def test_inspect_prints_an_array(tmp_path: Path) -> None:
     a = _log(tmp_path / "a.mcap")
     b = _log(tmp_path / "b.mcap", 5)
-    one = json.loads(semloc("inspect", a, "--json").stdout)
+    (one,) = json.loads(semloc("inspect", a, "--json").stdout)
     assert one["path"] == str(a)
     assert one["format"] == "mcap"
-    assert one["streams"] == [{"topic": "/note", "type": "Note", "role": None, "count": 3}]
+    assert one["streams"] == [
+        {"topic": "/note", "type": "Note", "role": None, "count": 3, "rate_hz": 1.0}
+    ]
     assert one["problems"]
+    assert one["verdict"].startswith("not ready: ")
     both = json.loads(semloc("inspect", a, b, "--json").stdout)
     assert [log["streams"][0]["count"] for log in both] == [3, 5]
 
@@ -351,23 +354,36 @@ def test_inspect_prints_an_object_or_an_array(tmp_path: Path) -> None:
 def test_inspect_for_people(tmp_path: Path) -> None:
     done = semloc("inspect", _log(tmp_path / "a.mcap"))
     assert done.exit_code == 0
-    assert "/note" in done.stdout
+    assert "/note (Note, 3)" in done.stdout
+    assert "1970-01-01 00:00:00 UTC, 2.0 s" in done.stdout
+    assert "not ready: there is neither a LIDAR" in done.stdout
     assert done.stderr == ""
 
 
 def test_inspect_of_what_is_no_log_is_1(tmp_path: Path) -> None:
     (tmp_path / "empty.bag").touch()
+    done = semloc("inspect", tmp_path / "empty.bag")
+    assert (done.exit_code, done.stdout) == (1, "")
+    assert "is empty" in done.stderr
     done = semloc("inspect", tmp_path / "empty.bag", "--json")
     assert done.exit_code == 1
     assert "is empty" in done.stderr
-    assert done.stdout == ""
+    (refused,) = json.loads(done.stdout)
+    assert refused["streams"] == []
+    assert "is empty" in refused["problems"][0]
+    assert refused["verdict"].startswith("not ready: ")
 
 
 def test_inspect_goes_on_after_a_bad_log(tmp_path: Path) -> None:
     (tmp_path / "empty.bag").touch()
     done = semloc("inspect", tmp_path / "empty.bag", _log(tmp_path / "a.mcap"), "--json")
     assert done.exit_code == 3
-    assert [log["path"] for log in json.loads(done.stdout)] == [str(tmp_path / "a.mcap")]
+    logs = json.loads(done.stdout)
+    assert [log["path"] for log in logs] == [
+        str(tmp_path / "empty.bag"),
+        str(tmp_path / "a.mcap"),
+    ]
+    assert [bool(log["streams"]) for log in logs] == [False, True]
     assert "is empty" in done.stderr
 
 
@@ -378,10 +394,26 @@ def test_inspect_says_3_when_data_are_lost(tmp_path: Path, monkeypatch: pytest.M
         "problems": [],
         "streams": [],
     }
-    monkeypatch.setattr("semloc_logs.logs.session.inspect.inspect_log", lambda *_: lost)
+    monkeypatch.setattr("semloc_logs.logs.session.inspect.inspect_log", lambda *_, **__: lost)
     done = semloc("inspect", "a.mcap", "--json")
     assert done.exit_code == 3
     assert done.stderr == "Warning: a.mcap: /points: 3 messages cannot be read.\n"
+
+
+def test_inspect_of_metadata_is_of_its_folder(tmp_path: Path) -> None:
+    _log(tmp_path / "a.mcap")
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    done = semloc("inspect", tmp_path / "metadata.yaml", "--json")
+    assert done.exit_code == 0, done.stderr
+    assert [log["path"] for log in json.loads(done.stdout)] == [str(tmp_path)]
+
+
+def test_inspect_full_reads_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("semloc_logs.logs.session.excerpt.WHOLE_BYTES", 0)
+    log = _log(tmp_path / "a.mcap")
+    quick = semloc("inspect", log)
+    assert "--full reads all messages" in quick.stdout
+    assert "--full" not in semloc("inspect", log, "--full").stdout
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Frame
-from semloc_logs.logs.log import Log, Message, Stream
+from semloc_logs.logs.log import Log, Message, Section, Stream
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.problems import Problem, Problems
 
@@ -47,6 +47,10 @@ class BaseLog(ABC):
     @abstractmethod
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` in log-time order."""
+
+    @abstractmethod
+    def sections(self) -> list[Section]:
+        """The parts of the log that can be read one by one, by their first log time."""
 
     def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
         """The decoded messages of ``topics`` in log-time order."""

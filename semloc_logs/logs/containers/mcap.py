@@ -36,7 +36,7 @@ from semloc_logs.logs.containers.mcap_records import (
     spans,
     walk,
 )
-from semloc_logs.logs.log import Definition, Message, Stream
+from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
 from semloc_logs.logs.problems import Problems
 
@@ -82,6 +82,19 @@ class McapLog(BaseLog):
             if wanted is None or not p.channels or any(self._topic(c) in wanted for c in p.channels)
         )
         return in_log_time_order((p.start_ns, partial(self._load, p, wanted)) for p in parts)
+
+    def sections(self) -> list[Section]:
+        """The chunks and runs of messages outside chunks, by their first log time."""
+        topics_of: dict[frozenset[int], frozenset[str]] = {}
+        sections = []
+        for part in sorted(self._parts, key=lambda p: (p.start_ns, p.offset)):
+            topics = topics_of.get(part.channels)
+            if topics is None:
+                topics = frozenset(self._topic(channel) for channel in part.channels)
+                topics_of[part.channels] = topics
+            messages = partial(self._load_topics, part)
+            sections.append(Section(part.start_ns, part.end_ns, part.size, topics, messages))
+        return sections
 
     def close(self) -> None:
         """Releases the file."""
@@ -264,6 +277,9 @@ class McapLog(BaseLog):
             loose.append(Part(offset, size, log_time, log_time, frozenset((channel,)), False))
 
     # -- reading
+
+    def _load_topics(self, part: Part, topics: Collection[str] | None) -> Iterator[Message]:
+        return self._load(part, None if topics is None else frozenset(topics))
 
     def _load(self, part: Part, wanted: frozenset[str] | None) -> Iterator[Message]:
         """The messages of one part in log-time order; its bytes live as long as this iterator."""

@@ -9,6 +9,7 @@ import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from semloc_logs.logs.containers.base import (
     open_file,
     read_exactly,
 )
-from semloc_logs.logs.log import Definition, Message, Stream
+from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -60,13 +61,31 @@ class Rosbag1Log(BaseLog):
 
         A damaged chunk is skipped and named in ``problems``.
         """
-        wanted = None if topics is None else frozenset(topics)
-        ids = {
-            c for c, (topic, _, _) in self._connections.items() if wanted is None or topic in wanted
-        }
+        ids = self._ids(topics)
         return in_log_time_order(
             (p.start_ns, partial(self._load, p, ids)) for p in self._parts if p.connections & ids
         )
+
+    def sections(self) -> list[Section]:
+        """The chunks by their first log time; a chunk ends where the next one starts."""
+        offsets = sorted({self._size, *(p.offset for p in self._parts)})
+        end_of = dict(pairwise(offsets))
+        return [
+            Section(
+                part.start_ns,
+                part.end_ns,
+                end_of[part.offset] - part.offset,
+                frozenset(self._connections[c][0] for c in part.connections),
+                partial(self._load_topics, part),
+            )
+            for part in sorted(self._parts, key=lambda p: (p.start_ns, p.offset))
+        ]
+
+    def _ids(self, topics: Collection[str] | None) -> set[int]:
+        """The connections of ``topics`` (None: all)."""
+        return {
+            c for c, (topic, _, _) in self._connections.items() if topics is None or topic in topics
+        }
 
     def close(self) -> None:
         """Releases the file."""
@@ -195,6 +214,9 @@ class Rosbag1Log(BaseLog):
             self._parts.append(Part(offset, min(times), max(times), connections))
 
     # -- reading
+
+    def _load_topics(self, part: Part, topics: Collection[str] | None) -> Iterator[Message]:
+        return self._load(part, self._ids(topics))
 
     def _load(self, part: Part, wanted: set[int]) -> Iterator[Message]:
         try:

@@ -25,7 +25,7 @@ from semloc_logs.logs.containers.base import (
 )
 from semloc_logs.logs.containers.mcap import McapLog
 from semloc_logs.logs.containers.sqlite import SqliteLog
-from semloc_logs.logs.log import Log, Message
+from semloc_logs.logs.log import Log, Message, Section
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".db3", ".mcap")
@@ -53,6 +53,11 @@ class Rosbag2Log(BaseLog):
             if f.start_ns is not None
         ]
         return in_log_time_order(parts)
+
+    def sections(self) -> list[Section]:
+        """The sections of all files, by their first log time."""
+        sections = [section for file in self._files for section in file.sections()]
+        return sorted(sections, key=lambda section: section.start_ns)
 
     def close(self) -> None:
         """Releases the files."""

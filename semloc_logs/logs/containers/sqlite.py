@@ -9,6 +9,7 @@ import contextlib
 import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -17,12 +18,14 @@ import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import MAX_CHUNK, BaseLog, decompress
-from semloc_logs.logs.log import Definition, Message, Stream
+from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.definitions import is_standard
 from semloc_logs.logs.messages.type_names import ros2_type
 from semloc_logs.logs.problems import ProblemKind, Problems
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message starts like this
+_SECTION_BYTES = 4 << 20  # about as much as a chunk of other containers holds
+_MOST_SECTIONS = 4096
 # the text of an error quotes the file, so that it may itself not be UTF-8
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError)
 
@@ -51,13 +54,41 @@ class SqliteLog(BaseLog):
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` (None: of all) in log-time order, up to any damage."""
+        return self._load(None, topics)
+
+    def sections(self) -> list[Section]:
+        """Equal stretches of time; a single one where the file is damaged."""
+        start_ns = self.start_ns
+        end_ns = self.end_ns
+        if start_ns is None or end_ns is None:
+            return []
+        nbytes = self._path_size()
+        count = 1 if self._damaged else min(max(nbytes // _SECTION_BYTES, 1), _MOST_SECTIONS)
+        step_ns = (end_ns - start_ns) // count + 1
+        sections = []
+        for first_ns in range(start_ns, end_ns + 1, step_ns):
+            last_ns = min(first_ns + step_ns - 1, end_ns)
+            messages = partial(self._load, None if count == 1 else (first_ns, last_ns))
+            sections.append(Section(first_ns, last_ns, nbytes // count, frozenset(), messages))
+        return sections
+
+    def _path_size(self) -> int:
+        try:
+            return self.path.stat().st_size
+        except OSError:
+            return 0
+
+    def _load(
+        self, between: tuple[int, int] | None, topics: Collection[str] | None
+    ) -> Iterator[Message]:
+        """The messages of ``topics`` with log times ``between`` two, both included."""
         wanted = [i for i, (topic, *_) in self._topics.items() if topics is None or topic in topics]
         if not wanted:
             return
         self._problems.forget_skipped(topics, file=self._name)
         read = 0
         try:
-            for topic_id, log_time, data in self._rows(wanted):
+            for topic_id, log_time, data in self._rows(wanted, between):
                 topic, type_, encoding, definition = self._topics[topic_id]
                 read += 1
                 if not isinstance(data, bytes) or not isinstance(log_time, int):
@@ -78,14 +109,18 @@ class SqliteLog(BaseLog):
                 f"({error})."
             )
 
-    def _rows(self, topic_ids: list[int]) -> Iterator[tuple[int, Any, Any]]:
+    def _rows(
+        self, topic_ids: list[int], between: tuple[int, int] | None
+    ) -> Iterator[tuple[int, Any, Any]]:
         """(topic id, log time, data) in log-time order; the order of recording breaks ties."""
         marks = ",".join("?" * len(topic_ids))
         columns = "SELECT topic_id, timestamp, data FROM messages"
         where = f"WHERE topic_id IN ({marks})"
         if not self._damaged:
+            if between is not None:
+                where += " AND timestamp BETWEEN ? AND ?"
             yield from self._database.execute(
-                f"{columns} {where} ORDER BY timestamp, id", topic_ids
+                f"{columns} {where} ORDER BY timestamp, id", (*topic_ids, *(between or ()))
             )
             return
         # an index may be damaged: without it, and only as far as the table can be read
