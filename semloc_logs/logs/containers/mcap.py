@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
+from mcap.records import Channel, Header, Schema, Statistics
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import (
@@ -30,8 +30,10 @@ from semloc_logs.logs.containers.mcap_records import (
     MAGIC,
     MESSAGE,
     MESSAGE_BODY,
+    IndexedChunk,
     chunk_head,
     chunk_records,
+    indexed_chunk,
     parse,
     spans,
     walk,
@@ -173,38 +175,28 @@ class McapLog(BaseLog):
         )
         if not known or sum(counts.values()) != statistics.message_count:
             return None  # allowed, but then only a walk finds the contents of the file
-        for i in indexes:
-            if i.chunk_start_offset + i.chunk_length > self._size:
+        for chunk in indexes:
+            if chunk.offset + chunk.size > self._size:
                 raise LogError(
-                    f"a chunk is claimed at byte {i.chunk_start_offset}, "
+                    f"a chunk is claimed at byte {chunk.offset}, "
                     f"but the file ends at byte {self._size}"
                 )
-            channels = frozenset(i.message_index_offsets)
-            self._parts.append(
-                Part(
-                    i.chunk_start_offset,
-                    i.chunk_length,
-                    i.message_start_time,
-                    i.message_end_time,
-                    channels,
-                    True,
-                )
-            )
+            self._parts.append(Part(*chunk, chunk=True))
         if statistics.message_count:
             self.start_ns = statistics.message_start_time
             self.end_ns = statistics.message_end_time
         return counts
 
-    def _summary_records(self, summary: bytes) -> tuple[Statistics | None, list[ChunkIndex]]:
+    def _summary_records(self, summary: bytes) -> tuple[Statistics | None, list[IndexedChunk]]:
         """Statistics and chunk indexes; learns of schemas and channels on the way."""
         statistics: Statistics | None = None
-        indexes: list[ChunkIndex] = []
+        indexes: list[IndexedChunk] = []
         for opcode, start, end in spans(summary):
             body = summary[start:end]
             if opcode == Opcode.STATISTICS:
                 statistics = parse(Statistics.read, body)
             elif opcode == Opcode.CHUNK_INDEX:
-                indexes.append(parse(ChunkIndex.read, body))
+                indexes.append(indexed_chunk(body))
             else:
                 self._define(opcode, body)
         return statistics, indexes

@@ -25,8 +25,20 @@ MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish
 MESSAGE_BODY = MESSAGE.size - HEAD.size  # bytes of a message's body before its data
 _CHUNK = struct.Struct("<BQQQQII")  # head, times, size and CRC unpacked, length of the compression
 _DATA_LENGTH = struct.Struct("<Q")
+_CHUNK_INDEX = struct.Struct("<QQQQI")  # times, offset, size, bytes of the message indexes' offsets
+_INDEX_OFFSET = struct.Struct("<HQ")  # channel, offset of its message index
 
 Record = TypeVar("Record")
+
+
+class IndexedChunk(NamedTuple):
+    """What the index claims of a chunk: place, times and channels (none: unknown)."""
+
+    offset: int
+    size: int
+    start_ns: int
+    end_ns: int
+    channels: frozenset[int]
 
 
 class ChunkHead(NamedTuple):
@@ -90,6 +102,19 @@ def walk(file: SizedFile, position: int, end: int) -> Iterator[tuple[int, int, i
             return
         yield opcode, position, size
         position += size
+
+
+def indexed_chunk(body: bytes) -> IndexedChunk:
+    """A chunk index from its body; a large log has a hundred thousand of them."""
+    try:
+        start_ns, end_ns, offset, size, nbytes = _CHUNK_INDEX.unpack_from(body)
+    except struct.error as error:
+        raise LogError(f"a chunk index cannot be parsed ({error})") from error
+    listed = body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + nbytes]
+    if len(listed) != nbytes or nbytes % _INDEX_OFFSET.size:
+        raise LogError("a chunk index cannot be parsed (its message indexes do not fit)")
+    channels = frozenset(channel for channel, _ in _INDEX_OFFSET.iter_unpack(listed))
+    return IndexedChunk(offset, size, start_ns, end_ns, channels)
 
 
 def chunk_head(record: bytes) -> ChunkHead:

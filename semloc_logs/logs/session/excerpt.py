@@ -47,9 +47,11 @@ class Excerpt:
             return
         spent: Counter[str] = Counter()
         for number, section in enumerate(self._sections):
-            searched = {t for t in self._missing if _may_hold(section, t)}
-            searched = {t for t in searched if spent[t] < _SEARCH_BYTES}
             sampled = self._sampled if number in self._chosen else frozenset()
+            if not sampled and not self._missing:
+                continue
+            searched = self._missing & section.topics if section.topics else set(self._missing)
+            searched = {topic for topic in searched if spent[topic] < _SEARCH_BYTES}
             if searched or sampled:
                 yield from section.messages(searched | sampled)
             for topic in searched:
@@ -60,7 +62,7 @@ class Excerpt:
         candidates = [
             number
             for number, section in enumerate(self._sections)
-            if any(_may_hold(section, topic) for topic in self._sampled)
+            if not section.topics or not section.topics.isdisjoint(self._sampled)
         ]
         if not candidates:
             return frozenset()
@@ -68,8 +70,3 @@ class Excerpt:
         most = int(min(MOST_SAMPLES, max(_SAMPLE_BYTES / max(mean, 1.0), 2)))
         chosen = np.linspace(0, len(candidates) - 1, most).round().astype(int)
         return frozenset(candidates[i] for i in chosen)
-
-
-def _may_hold(section: Section, topic: str) -> bool:
-    """Whether a section may have messages of a topic."""
-    return not section.topics or topic in section.topics
