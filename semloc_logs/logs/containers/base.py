@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heappop, heappush, heapreplace
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, Protocol, TypeVar
 
 import lz4.frame
 import zstandard
@@ -164,11 +164,15 @@ def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> byt
     return data
 
 
-def decompress(data: bytes, compression: str, size: int) -> bytes:
-    """The ``size`` bytes that ``data`` holds.
+Bytes = TypeVar("Bytes", bytes, memoryview)
+
+
+def decompress(data: Bytes, compression: str, size: int) -> Bytes | bytes:
+    """The ``size`` bytes that ``data`` holds; ``data`` itself where it is not compressed.
 
     LogError for another size, a claim beyond reason or damaged data.
     """
+    unpacked: Bytes | bytes
     if compression in ("", "none"):
         unpacked = data
     elif compression not in ("zstd", "lz4", "bz2"):
@@ -192,7 +196,7 @@ def decompress(data: bytes, compression: str, size: int) -> bytes:
     return unpacked
 
 
-def _unpack(data: bytes, compression: str, size: int) -> bytes:
+def _unpack(data: bytes | memoryview, compression: str, size: int) -> bytes:
     """Decompresses plausible sizes at once, and claims to grow by more than that in steps."""
     plausible = size <= max(_PLAUSIBLE_GROWTH * len(data), _STEP)
     if compression == "zstd":
@@ -211,12 +215,12 @@ class _Engine(Protocol):
     @property
     def eof(self) -> bool: ...
 
-    def decompress(self, data: bytes, max_length: int = -1) -> bytes: ...
+    def decompress(self, data: bytes | memoryview, max_length: int = -1) -> bytes: ...
 
 
-def _feed(engine: _Engine, data: bytes) -> Callable[[int], bytes]:
+def _feed(engine: _Engine, data: bytes | memoryview) -> Callable[[int], bytes]:
     """A function that reads at most so many decompressed bytes of ``data``."""
-    rest = [data]
+    rest: list[bytes | memoryview] = [data]
 
     def read(size: int) -> bytes:
         if engine.eof:

@@ -276,6 +276,7 @@ class McapLog(BaseLog):
     def _load(self, part: Part, wanted: frozenset[str] | None) -> Iterator[Message]:
         """The messages of one part in log-time order; its bytes live as long as this iterator."""
         try:
+            data: bytes | memoryview
             if part.chunk:
                 data = self._unpack_chunk(part.offset, part.size)
             else:
@@ -299,11 +300,11 @@ class McapLog(BaseLog):
             if wanted is None or topic in wanted:
                 yield Message(topic, type_, encoding, log_time, view[start:end], definition)
 
-    def _unpack_chunk(self, offset: int, size: int) -> bytes:
+    def _unpack_chunk(self, offset: int, size: int) -> bytes | memoryview:
         record = read_exactly(self._file, offset, size, self._size)
         return chunk_records(record, chunk_head(record))
 
-    def _walk(self, data: bytes, offset: int) -> list[tuple[int, int, int, int]]:
+    def _walk(self, data: bytes | memoryview, offset: int) -> list[tuple[int, int, int, int]]:
         """(log time, channel, start, end) of the messages in ``data``.
 
         Learns of schemas and channels on the way.
@@ -328,7 +329,7 @@ class McapLog(BaseLog):
             )
         return found
 
-    def _define(self, opcode: int, body: bytes) -> None:
+    def _define(self, opcode: int, body: bytes | memoryview) -> None:
         if opcode == Opcode.SCHEMA:
             schema = parse(Schema.read, body)
             self._schemas.setdefault(schema.id, schema)

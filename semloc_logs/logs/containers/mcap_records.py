@@ -59,7 +59,7 @@ def raw(record: McapRecord) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def parse(read: Callable[[ReadDataStream], Record], body: bytes) -> Record:
+def parse(read: Callable[[ReadDataStream], Record], body: bytes | memoryview) -> Record:
     """A record from its body; ``LogError`` when the bytes make no sense."""
     try:
         return read(ReadDataStream(BytesIO(body)))
@@ -68,7 +68,7 @@ def parse(read: Callable[[ReadDataStream], Record], body: bytes) -> Record:
         raise LogError(f"a record cannot be parsed ({reason})") from error
 
 
-def spans(data: bytes) -> Iterator[tuple[int, int, int]]:
+def spans(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
     """(opcode, start of the body, end of the body) of the records in ``data``, in their order.
 
     ``LogError`` where they stop to fit.
@@ -134,9 +134,12 @@ def chunk_head(record: bytes) -> ChunkHead:
     return ChunkHead(start_ns, end_ns, size, crc, compression, data)
 
 
-def chunk_records(record: bytes, head: ChunkHead) -> bytes:
-    """The records in a chunk; memory grows with the data, not with the claimed size."""
-    data = decompress(record[head.data], head.compression, head.unpacked_size)
+def chunk_records(record: bytes, head: ChunkHead) -> bytes | memoryview:
+    """The records in a chunk; memory grows with the data, not with the claimed size.
+
+    An uncompressed chunk is not copied: the result is a view of ``record``.
+    """
+    data = decompress(memoryview(record)[head.data], head.compression, head.unpacked_size)
     if head.crc and zlib.crc32(data) != head.crc:
         raise LogError("its checksum does not match its data")
     return data

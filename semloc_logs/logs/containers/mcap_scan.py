@@ -61,7 +61,7 @@ class _Found:
         kept = self.schemas if opcode == Opcode.SCHEMA else self.channels
         kept.setdefault(struct.unpack_from("<H", raw, 9)[0], raw)
 
-    def message(self, head: bytes) -> None:
+    def message(self, head: bytes | memoryview) -> None:
         """Count a message by the first 22 bytes of its record's content."""
         channel, _, log_time, _ = struct.unpack("<HIQQ", head)
         self.counts[channel] = self.counts.get(channel, 0) + 1
@@ -137,7 +137,7 @@ def _visit_chunk(found: _Found, record: bytes, offset: int) -> None:
     data = chunk_records(record, head)
     for opcode, start, stop in spans(data):
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            found.definition(opcode, data[start - HEAD.size : stop])
+            found.definition(opcode, bytes(data[start - HEAD.size : stop]))
         elif opcode == Opcode.MESSAGE:
             found.message(data[start : min(stop, start + MESSAGE_BODY)])
     found.chunks.append(
