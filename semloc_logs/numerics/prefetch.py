@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from queue import Empty, Full, Queue
 from threading import Event, Thread
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 T = TypeVar("T")
 _END = object()
@@ -92,3 +93,39 @@ def _put(item: object, queue: Queue[object], left: Event) -> None:
             return
         except Full:
             continue
+
+
+class Lookahead(Generic[T]):
+    """``make(0)``, ``make(1)``, ... by threads, up to ``depth`` of them before they are taken.
+
+    For work that releases the interpreter's lock. Exceptions of ``make`` are raised by
+    :meth:`take`. Within :func:`in_callers_thread` each result is made when it is taken.
+    """
+
+    def __init__(self, make: Callable[[int], T], count: int, depth: int = 2) -> None:
+        self._make = make
+        self._count = count
+        self._depth = depth
+        self._next = 0  # the first that no thread has begun
+        self._begun: dict[int, Future[T]] = {}
+        self._pool: ThreadPoolExecutor | None = None
+        if not _IN_CALLERS_THREAD.get():
+            self._pool = ThreadPoolExecutor(depth, thread_name_prefix=THREAD_NAME)
+
+    def __enter__(self) -> Lookahead[T]:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Waits for the threads; what no one has begun is not made any more."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def take(self, number: int) -> T:
+        """``make(number)``, for numbers that only grow."""
+        if self._pool is None:
+            return self._make(number)
+        last = min(number + self._depth, self._count - 1)
+        for following in range(max(self._next, number), last + 1):
+            self._begun[following] = self._pool.submit(self._make, following)
+        self._next = max(self._next, last + 1)
+        return self._begun.pop(number).result()

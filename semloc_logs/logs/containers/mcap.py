@@ -5,10 +5,11 @@ Memory holds overlapping chunks only.
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -41,8 +42,10 @@ from semloc_logs.logs.containers.mcap_records import (
 from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
 from semloc_logs.logs.problems import Problems
+from semloc_logs.numerics.prefetch import Lookahead
 
 _FOOTER = struct.Struct("<BQQQI")
+_AHEAD_BYTES = 16 << 20  # larger chunks are not unpacked ahead of their turn
 _LOOSE = 1 << 22  # messages outside chunks are read in runs of about this many bytes
 
 
@@ -78,12 +81,23 @@ class McapLog(BaseLog):
         A damaged chunk is skipped and named in ``problems``.
         """
         wanted = None if topics is None else frozenset(topics)
-        parts = (
-            p
-            for p in self._parts
-            if wanted is None or not p.channels or any(self._topic(c) in wanted for c in p.channels)
+        # in the order in which they are opened
+        parts = sorted(
+            (
+                p
+                for p in self._parts
+                if wanted is None
+                or not p.channels
+                or any(self._topic(c) in wanted for c in p.channels)
+            ),
+            key=lambda p: p.start_ns,
         )
-        return in_log_time_order((p.start_ns, partial(self._load, p, wanted)) for p in parts)
+        descriptor = self._file.fileno()
+        with Lookahead(lambda k: _unpacked_ahead(descriptor, parts[k]), len(parts)) as ahead:
+            yield from in_log_time_order(
+                (p.start_ns, partial(self._load, p, wanted, partial(ahead.take, k)))
+                for k, p in enumerate(parts)
+            )
 
     def sections(self) -> list[Section]:
         """The chunks and runs of messages outside chunks, by their first log time."""
@@ -273,11 +287,22 @@ class McapLog(BaseLog):
     def _load_topics(self, part: Part, topics: Collection[str] | None) -> Iterator[Message]:
         return self._load(part, None if topics is None else frozenset(topics))
 
-    def _load(self, part: Part, wanted: frozenset[str] | None) -> Iterator[Message]:
-        """The messages of one part in log-time order; its bytes live as long as this iterator."""
+    def _load(
+        self,
+        part: Part,
+        wanted: frozenset[str] | None,
+        take: Callable[[], bytes | memoryview | None] = lambda: None,
+    ) -> Iterator[Message]:
+        """The messages of one part in log-time order; its bytes live as long as this iterator.
+
+        ``take`` gives the unpacked part where a thread has made it, else None.
+        """
         try:
+            ready = take()
             data: bytes | memoryview
-            if part.chunk:
+            if ready is not None:
+                data = ready
+            elif part.chunk:
                 data = self._unpack_chunk(part.offset, part.size)
             else:
                 data = read_exactly(self._file, part.offset, part.size, self._size)
@@ -359,3 +384,20 @@ class McapLog(BaseLog):
                 return c.topic, type_, c.message_encoding, definition  # its schema may still come
             self._kinds[channel] = (c.topic, type_, c.message_encoding, definition)
         return self._kinds[channel]
+
+
+def _unpacked_ahead(descriptor: int, part: Part) -> bytes | memoryview | None:
+    """The records of a chunk of usual size; None for all others, and where anything is wrong.
+
+    Then the chunk is read again when its turn has come, and the fault is named. Positioned reads
+    leave the position of the file alone, and a file that is cut off while it is read gives an
+    error, where a memory map would end the program.
+    """
+    if not part.chunk or not 0 < part.size <= _AHEAD_BYTES:
+        return None
+    try:
+        record = os.pread(descriptor, part.size, part.offset)
+        head = chunk_head(record)
+        return chunk_records(record, head) if head.unpacked_size <= _AHEAD_BYTES else None
+    except (LogError, OSError, OverflowError):
+        return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import json
+import struct
 import zlib
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -21,9 +22,11 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import PoseSample
 from semloc_logs.logs.containers.base import decompress, in_log_time_order
 from semloc_logs.logs.containers.mcap import McapLog
+from semloc_logs.logs.containers.mcap_records import indexed_chunk
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.problems import sentences
+from semloc_logs.numerics.prefetch import in_callers_thread
 
 ENTRIES = [
     ("/a", 10),
@@ -183,6 +186,45 @@ def test_an_index_that_points_behind_the_file_is_not_used(tmp_path: Path) -> Non
     log = open_log(path)
     assert len(list(log.messages())) == len(ENTRIES)
     assert "is damaged" in sentences(log.problems)[0]
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD])
+def test_chunks_that_are_unpacked_ahead_read_the_same(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    entries = [(topic, 100 * k + time) for k in range(50) for topic, time in ENTRIES]
+    path = write(tmp_path / "a.mcap", entries, compression)
+    log = McapLog(path)
+    ahead = [(m.topic, m.log_time_ns, bytes(m.data)) for m in log.messages()]
+    with in_callers_thread():
+        alone = [(m.topic, m.log_time_ns, bytes(m.data)) for m in log.messages()]
+    log.close()
+    assert len(ahead) == len(entries)
+    assert ahead == alone
+
+
+def test_a_log_that_is_cut_off_while_it_is_read(tmp_path: Path) -> None:
+    entries = [(topic, 100 * k + time) for k in range(2000) for topic, time in ENTRIES]
+    path = write(tmp_path / "a.mcap", entries)
+    log = McapLog(path)
+    messages = log.messages()
+    read = [next(messages)]
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size // 2)
+    read += messages
+    log.close()
+    assert 1 < len(read) < len(entries)
+    assert any("bytes could be read at byte" in text for text in sentences(log.problems))
+
+
+def test_a_chunk_index_that_does_not_fit_is_refused() -> None:
+    body = struct.pack("<QQQQI", 1, 2, 300, 400, 20) + struct.pack("<HQHQ", 7, 500, 9, 600)
+    rest = struct.pack("<QI", 30, 4) + b"zstd" + struct.pack("<QQ", 100, 200)
+    chunk = indexed_chunk(body + rest)
+    assert chunk == (300, 400, 1, 2, frozenset({7, 9}))
+    for damaged in (body[:30], body[:-1], body.replace(b"\x14\0\0\0", b"\x15\0\0\0") + rest):
+        with pytest.raises(LogError, match="a chunk index cannot be parsed"):
+            indexed_chunk(damaged)
 
 
 def test_several_encodings_in_one_file(tmp_path: Path) -> None:
