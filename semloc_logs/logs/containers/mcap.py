@@ -9,7 +9,7 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +26,7 @@ from semloc_logs.logs.containers.base import (
     open_file,
     read_exactly,
 )
+from semloc_logs.logs.containers.buffers import Buffers
 from semloc_logs.logs.containers.mcap_records import (
     HEAD,
     MAGIC,
@@ -37,6 +38,7 @@ from semloc_logs.logs.containers.mcap_records import (
     indexed_chunk,
     parse,
     spans,
+    unpack_chunk_into,
     walk,
 )
 from semloc_logs.logs.log import Definition, Message, Section, Stream
@@ -92,11 +94,18 @@ class McapLog(BaseLog):
             ),
             key=lambda p: p.start_ns,
         )
-        descriptor = self._file.fileno()
-        with Lookahead(lambda k: _unpacked_ahead(descriptor, parts[k]), len(parts)) as ahead:
+        buffers = Buffers()
+        unpack = partial(_unpacked_ahead, self._file.fileno(), buffers)
+
+        def load(ahead: Lookahead[_Unpacked | None], number: int, part: Part) -> Iterator[Message]:
+            unpacked = ahead.take(number)
+            yield from self._load(part, wanted, unpacked and unpacked.data)
+            if unpacked is not None:
+                buffers.give(unpacked.buffer)
+
+        with Lookahead(lambda k: unpack(parts[k]), len(parts)) as ahead:
             yield from in_log_time_order(
-                (p.start_ns, partial(self._load, p, wanted, partial(ahead.take, k)))
-                for k, p in enumerate(parts)
+                (part.start_ns, partial(load, ahead, k, part)) for k, part in enumerate(parts)
             )
 
     def sections(self) -> list[Section]:
@@ -288,20 +297,16 @@ class McapLog(BaseLog):
         return self._load(part, None if topics is None else frozenset(topics))
 
     def _load(
-        self,
-        part: Part,
-        wanted: frozenset[str] | None,
-        take: Callable[[], bytes | memoryview | None] = lambda: None,
+        self, part: Part, wanted: frozenset[str] | None, unpacked: memoryview | None = None
     ) -> Iterator[Message]:
         """The messages of one part in log-time order; its bytes live as long as this iterator.
 
-        ``take`` gives the unpacked part where a thread has made it, else None.
+        ``unpacked``: the records of the part, where a thread has made them.
         """
         try:
-            ready = take()
             data: bytes | memoryview
-            if ready is not None:
-                data = ready
+            if unpacked is not None:
+                data = unpacked
             elif part.chunk:
                 data = self._unpack_chunk(part.offset, part.size)
             else:
@@ -386,7 +391,14 @@ class McapLog(BaseLog):
         return self._kinds[channel]
 
 
-def _unpacked_ahead(descriptor: int, part: Part) -> bytes | memoryview | None:
+class _Unpacked(NamedTuple):
+    """The records of a chunk, and the memory that they lie in."""
+
+    data: memoryview
+    buffer: bytearray
+
+
+def _unpacked_ahead(descriptor: int, buffers: Buffers, part: Part) -> _Unpacked | None:
     """The records of a chunk of usual size; None for all others, and where anything is wrong.
 
     Then the chunk is read again when its turn has come, and the fault is named. Positioned reads
@@ -395,9 +407,19 @@ def _unpacked_ahead(descriptor: int, part: Part) -> bytes | memoryview | None:
     """
     if not part.chunk or not 0 < part.size <= _AHEAD_BYTES:
         return None
+    packed = buffers.take(part.size)
+    record = memoryview(packed)[: part.size]
     try:
-        record = os.pread(descriptor, part.size, part.offset)
+        if os.preadv(descriptor, [record], part.offset) != part.size:
+            return None
         head = chunk_head(record)
-        return chunk_records(record, head) if head.unpacked_size <= _AHEAD_BYTES else None
+        if head.compression != "zstd" or head.unpacked_size > _AHEAD_BYTES:
+            return None
+        buffer = buffers.take(head.unpacked_size)
+        data = memoryview(buffer)[: head.unpacked_size]
+        if not unpack_chunk_into(data, record, head):
+            return None
     except (LogError, OSError, OverflowError):
         return None
+    buffers.give(packed)
+    return _Unpacked(data.toreadonly(), buffer)

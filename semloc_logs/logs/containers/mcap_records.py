@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from io import BytesIO
 from typing import NamedTuple, TypeVar
 
+import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -117,11 +118,11 @@ def indexed_chunk(body: bytes) -> IndexedChunk:
     return IndexedChunk(offset, size, start_ns, end_ns, channels)
 
 
-def chunk_head(record: bytes) -> ChunkHead:
+def chunk_head(record: bytes | memoryview) -> ChunkHead:
     """The claims of a whole chunk record; ``LogError`` when they do not fit the record."""
     try:
         opcode, length, start_ns, end_ns, size, crc, name_length = _CHUNK.unpack_from(record)
-        compression = record[_CHUNK.size : _CHUNK.size + name_length].decode()
+        compression = str(record[_CHUNK.size : _CHUNK.size + name_length], "utf-8")
         (data_length,) = _DATA_LENGTH.unpack_from(record, _CHUNK.size + name_length)
     except (struct.error, UnicodeDecodeError) as error:
         raise LogError(f"its head is damaged ({error})") from error
@@ -143,3 +144,16 @@ def chunk_records(record: bytes, head: ChunkHead) -> bytes | memoryview:
     if head.crc and zlib.crc32(data) != head.crc:
         raise LogError("its checksum does not match its data")
     return data
+
+
+def unpack_chunk_into(out: memoryview, record: memoryview, head: ChunkHead) -> bool:
+    """Fills ``out`` with the records of a zstd chunk; False where they are not as claimed."""
+    reader = zstandard.ZstdDecompressor().stream_reader(record[head.data], read_across_frames=True)
+    filled = 0
+    try:
+        while filled < len(out) and (count := reader.readinto(out[filled:])):
+            filled += count
+        is_whole = filled == len(out) and not reader.read(1)
+    except (zstandard.ZstdError, MemoryError):
+        return False
+    return is_whole and (not head.crc or zlib.crc32(out) == head.crc)

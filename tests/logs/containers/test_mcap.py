@@ -203,6 +203,17 @@ def test_chunks_that_are_unpacked_ahead_read_the_same(
     assert ahead == alone
 
 
+def test_kept_messages_stay_as_they_are(tmp_path: Path) -> None:
+    entries = [(topic, 100 * k + time) for k in range(200) for topic, time in ENTRIES]
+    log = McapLog(write(tmp_path / "a.mcap", entries))
+    kept = list(log.messages())
+    # memory of chunks is used again, but not while a message of it is alive
+    copies = [bytes(m.data) for m in log.messages()]
+    assert [bytes(m.data) for m in kept] == copies
+    assert copies == [pose(m.log_time_ns) for m in kept]
+    log.close()
+
+
 def test_a_log_that_is_cut_off_while_it_is_read(tmp_path: Path) -> None:
     entries = [(topic, 100 * k + time) for k in range(2000) for topic, time in ENTRIES]
     path = write(tmp_path / "a.mcap", entries)
