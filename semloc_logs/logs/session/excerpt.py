@@ -41,7 +41,7 @@ class Excerpt:
         self.section_count = len(self._sections)
 
     def messages(self) -> Iterator[Message]:
-        """All messages, or those of the sample."""
+        """All messages, or the messages of the sample."""
         if self.is_complete:
             yield from self._log.messages()
             return

@@ -172,7 +172,7 @@ def _tree(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _findings(content: Mapping[str, Any]) -> Iterator[list[str]]:
-    """Problems, what is not known, and the verdict."""
+    """Problems, unknown properties, and the verdict."""
     name = "Problems"
     for sentence in content["problems"]:
         yield _wrapped(sentence, f"{name:<{_NAMES - 2}}- ")
