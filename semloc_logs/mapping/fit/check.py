@@ -43,7 +43,9 @@ from semloc_logs.numerics.transforms import inverse
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-MOST_PAIRS = 60  # of a stream; a pair costs about 10 ms
+# pairs of a stream: one for so many keyframes, within these bounds; a pair costs about 15 ms
+KEYFRAMES_A_PAIR = 4
+FEWEST_PAIRS, MOST_PAIRS = 24, 60
 LEAST_PAIRS = 4
 # a hypothesis explains much: it lowers half of chi squared by so much, and its parameter differs
 # from zero by so many standard deviations
@@ -205,7 +207,8 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
 
 def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
     """Checks the keyframes of one stream against the poses."""
-    numbers = choose(clouds, MOST_PAIRS)
+    count = len(clouds.rows) // KEYFRAMES_A_PAIR
+    numbers = choose(clouds, min(max(count, FEWEST_PAIRS), MOST_PAIRS))
     given = registered(clouds, numbers)
     if len(given.pairs) < LEAST_PAIRS:
         return StreamFit(topic, len(given.pairs))

@@ -58,9 +58,9 @@ class Clouds:
 
     def some_points(self, number: int) -> F64:
         """As :meth:`points`, thinned to what a registration moves."""
-        points = self.points(number)
+        points = self.collected.load(int(self.rows[number]))[0]
         points = points[thin(points, self.voxel)]
-        return points[:: max(1, len(points) // MOST_POINTS)]
+        return points[:: max(1, len(points) // MOST_POINTS)].astype(float)
 
     def rates(self) -> tuple[float, float]:
         """Speed (m/s) and turn rate (rad/s) that the drive reaches in a tenth of its steps."""
@@ -131,18 +131,20 @@ class Registered:
 
 
 class Registrar:
-    """Registers pairs of one stream; planes of the last target are kept."""
+    """Registers pairs of one stream; the last target and the last source are kept."""
 
     def __init__(self, clouds: Clouds) -> None:
         self._clouds = clouds
         self._target = -1
         self._coarse: PlaneCells | None = None
         self._fine: PlaneCells | None = None
+        self._source = -1
+        self._points = np.zeros((0, 3))
 
     def fit(self, target: int, source: int, starts: list[F64]) -> Fit:
         """The best fit of the source from ``starts`` (4, 4); an earlier one where equal."""
         coarse, fine = self._planes(target)
-        points = self._clouds.some_points(source)
+        points = self._some_points(source)
         best: Fit | None = None
         for start in starts:
             moved = register(fine, points, register(coarse, points, start).target_T_source)
@@ -154,8 +156,14 @@ class Registrar:
     def shares(self, target: int, source: int, poses: Sequence[F64]) -> F64:
         """The share of the source's points that lies on planes at each of ``poses`` (4, 4)."""
         planes = self._planes(target)[1]
-        points = self._clouds.some_points(source)
+        points = self._some_points(source)
         return np.array([share_at(planes, points, pose) for pose in poses])
+
+    def _some_points(self, source: int) -> F64:
+        if self._source != source:
+            self._source = source
+            self._points = self._clouds.some_points(source)
+        return self._points
 
     def _planes(self, target: int) -> tuple[PlaneCells, PlaneCells]:
         if self._coarse is None or self._fine is None or self._target != target:
@@ -189,10 +197,12 @@ def registered(
     registrar = Registrar(clouds)
     stamps_ns = clouds.stamps_ns()
     fits = []
+    given_shares = []
     for target, source in numbers:
         given = motion(clouds, target, source)
         starts = [given] if start is None else [given, start(given)]
         fits.append(registrar.fit(target, source, starts))
+        given_shares.append(float(registrar.shares(target, source, [given])[0]))
     usual = float(np.median([fit.share for fit in fits])) if fits else 0.0
     last: F64 | None = None
     for i, (target, source) in enumerate(numbers):
@@ -203,11 +213,11 @@ def registered(
                 fits[i] = again
         if fits[i].share >= LITTLE * usual:
             last = _rate(fits[i].target_T_source, seconds)
-    return _kept(clouds, registrar, numbers, fits)
+    return _kept(clouds, numbers, fits, np.array(given_shares))
 
 
 def _kept(
-    clouds: Clouds, registrar: Registrar, numbers: Sequence[tuple[int, int]], fits: Sequence[Fit]
+    clouds: Clouds, numbers: Sequence[tuple[int, int]], fits: Sequence[Fit], given_shares: F64
 ) -> Registered:
     """The pairs of which enough points lie on planes."""
     rows = [i for i, fit in enumerate(fits) if fit.share >= LEAST_SHARE]
@@ -217,8 +227,7 @@ def _kept(
         np.array([fits[i].target_T_source for i in rows]).reshape(-1, 4, 4),
         np.array([covariance_of(fits[i], clouds.voxel) for i in rows]).reshape(-1, 6, 6),
     )
-    given = [float(registrar.shares(a, b, [motion(clouds, a, b)])[0]) for a, b in kept.tolist()]
-    return Registered(pairs, kept, np.array([fits[i].share for i in rows]), np.array(given))
+    return Registered(pairs, kept, np.array([fits[i].share for i in rows]), given_shares[rows])
 
 
 def _rate(motion: F64, seconds: float) -> F64:
