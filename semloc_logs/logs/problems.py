@@ -19,6 +19,7 @@ class ProblemKind(Enum):
     TRANSFORM = "transform"
     POSE = "pose"
     ROLE = "role"  # which topic plays which role
+    STAMP = "stamp"  # times of messages: missing, or of another clock
 
 
 @dataclass(frozen=True, slots=True)

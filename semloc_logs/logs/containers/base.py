@@ -16,8 +16,9 @@ import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Frame
-from semloc_logs.logs.log import Log, Message, Stream
+from semloc_logs.logs.log import Log, Message, Reading, Stream
 from semloc_logs.logs.messages.decode import Decoder
+from semloc_logs.logs.messages.topic_clocks import TopicClocks
 from semloc_logs.logs.problems import Problem, Problems
 
 # no recorder writes chunks of 2 GiB; a larger claim is damage or a decompression bomb
@@ -48,11 +49,16 @@ class BaseLog(ABC):
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         """The messages of ``topics`` in log-time order."""
 
-    def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
+    def frames(
+        self, topics: Collection[str] | None = None, reading: Reading | None = None
+    ) -> Iterator[Frame]:
         """The decoded messages of ``topics`` in log-time order."""
         self._problems.forget_skipped(topics)
+        reading = reading or Reading()
+        clocks = TopicClocks(reading)
         for message in self.messages(topics):
-            yield from self._decoder.frames(message)
+            if reading.accepts(message):
+                yield from clocks.frames(self._decoder, message)
 
     @abstractmethod
     def close(self) -> None:

@@ -11,7 +11,14 @@ from semloc_logs.frames import Frame, Header, LidarFrame
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages import livox
 from semloc_logs.logs.messages.definitions import binary
-from semloc_logs.logs.messages.headers import Convert, check_time, foxglove, ros, transform
+from semloc_logs.logs.messages.headers import (
+    Convert,
+    check_time,
+    foxglove,
+    header_at,
+    ros,
+    transform,
+)
 from semloc_logs.logs.messages.point_fields import Field, Layout, decode_points
 from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.numerics import transforms
@@ -63,12 +70,7 @@ def _foxglove_cloud(header: Header, m: Any) -> Iterator[Frame]:
 
 
 def _livox(m: Any, message: Message) -> Iterator[Frame]:
-    header = Header(
-        message.topic,
-        check_time(m.sec * 1_000_000_000 + m.nanosec),
-        message.log_time_ns,
-        m.frame_id,
-    )
+    header = header_at(check_time(m.sec * 1_000_000_000 + m.nanosec), m.frame_id, message)
     offset = m.points["offset_time"].astype(np.int64)
     # the base of the times is the stamp unless the sensor has a clock of its own
     start = m.timebase_ns - header.stamp_ns

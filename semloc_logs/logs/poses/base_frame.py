@@ -156,6 +156,11 @@ class BasePoses:
         self._static_count = static_count
         self._static_times: set[tuple[str, int]] = set()
 
+    @property
+    def edge(self) -> Edge | None:
+        """The edge of TF that gives the poses; None where another source does."""
+        return self._edge
+
     def take(self, sample: PoseSample | TransformSample) -> None:
         """A sample of the pose topic or of TF."""
         header = sample.header

@@ -22,8 +22,9 @@ from semloc_logs.logs.problems import NoCloud
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.camera_clouds import CameraClouds
 from semloc_logs.logs.session.cloud_builder import CloudBuilder
-from semloc_logs.logs.session.frame_queue import FrameQueue, RangeFrame
+from semloc_logs.logs.session.frame_queue import MOST_WAITING_BYTES, FrameQueue, RangeFrame
 from semloc_logs.logs.session.image_relay import ImageRelay
+from semloc_logs.logs.session.stamp_offsets import StampOffsets
 from semloc_logs.logs.session.tally import Tally
 
 _TF_PATIENCE = 16  # frames to wait for a better pose edge in TF than one that is not called odom
@@ -32,7 +33,8 @@ _TF_PATIENCE = 16  # frames to wait for a better pose edge in TF than one that i
 class CloudPass:
     """The state of a pass: ``poses``, ``tally`` of frames, ``meanings`` of labels by topic.
 
-    ``builder`` makes the clouds, ``relay`` hands pictures on.
+    ``builder`` makes the clouds, ``relay`` hands pictures on; ``stamp_offsets``: header stamps
+    beside log times. Frames that wait for their poses take ``most_bytes`` at most.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class CloudPass:
         cameras: CameraClouds,
         builder: CloudBuilder,
         relay: ImageRelay,
+        most_bytes: int = MOST_WAITING_BYTES,
     ) -> None:
         self.poses = poses
         self.cameras = cameras
@@ -49,7 +52,8 @@ class CloudPass:
         self.accelerometer = Accelerometer()
         self.tally = Tally()
         self.meanings: dict[str, LabelNames] = {}
-        self.waiting = FrameQueue()
+        self.stamp_offsets = StampOffsets()
+        self.waiting = FrameQueue(most_bytes)
         self._roles = roles
         self._relay = relay
 
@@ -74,6 +78,18 @@ class CloudPass:
             *self._relay.topics,
         }
 
+    @property
+    def posed_topics(self) -> list[str]:
+        """The topics whose frames need a pose at their time, the main sensor first."""
+        roles = self._roles
+        labels = roles.label_of.values()
+        return [*roles.ranging, *roles.topics("stereo_right"), *labels, *self._relay.topics]
+
+    @property
+    def other_topics(self) -> list[str]:
+        """Topics whose times matter less."""
+        return [*self._roles.topics("imu"), *self._roles.topics("gnss")]
+
     def clouds(self, frames: Iterable[Frame]) -> Iterator[PosedCloud]:
         """The clouds of all ``frames``, given in the order of recording."""
         for frame in frames:
@@ -84,6 +100,10 @@ class CloudPass:
 
     def _take(self, frame: Frame) -> None:
         topic = frame.header.topic
+        if isinstance(frame, TransformSample):
+            self.stamp_offsets.add_transform(frame)
+        else:
+            self.stamp_offsets.add(frame.header)
         if isinstance(frame, TransformSample | PoseSample):
             self.poses.take(frame)
         elif isinstance(frame, Camera):

@@ -11,6 +11,18 @@ from semloc_logs.logs.session.pose_problems import (
     refused_poses,
     smeared,
 )
+from semloc_logs.logs.session.stamp_offsets import edge_topic, stamp_problems
+
+
+def _stamp_problems(done: CloudPass, pose_topic: str | None) -> list[Problem]:
+    """Stamps that are missing, or that come from different clocks."""
+    poses = done.poses
+    if poses.source is not None:
+        pose_topic = poses.source.name
+    elif poses.edge is not None:
+        end = edge_topic("", poses.edge)
+        pose_topic = next((t for t in done.stamp_offsets.topics if t.endswith(end)), None)
+    return stamp_problems(done.stamp_offsets, pose_topic, done.posed_topics, done.other_topics)
 
 
 def conclude(done: CloudPass, pose_topic: str | None) -> list[Problem]:
@@ -20,7 +32,8 @@ def conclude(done: CloudPass, pose_topic: str | None) -> list[Problem]:
     builder = done.builder
     name = poses.source.name if poses.source else pose_topic or "TF"
 
-    problems = done.tally.problems((track.start_ns, track.end_ns))
+    problems = _stamp_problems(done, pose_topic)
+    problems += done.tally.problems((track.start_ns, track.end_ns))
     if builder.duplicates is not None:
         problems += builder.duplicates.problems()
     problems += invalid_poses(name, track)

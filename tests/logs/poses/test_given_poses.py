@@ -22,7 +22,7 @@ from semloc_logs.frames import (
     PoseSample,
     TransformSample,
 )
-from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.log import Message, Reading, Stream
 from semloc_logs.logs.poses import lidar_odometry
 from semloc_logs.logs.poses.lidar_odometry import LidarOdometry
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
@@ -62,7 +62,9 @@ class FakeLog:
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         return iter(())
 
-    def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
+    def frames(
+        self, topics: Collection[str] | None = None, reading: Reading | None = None
+    ) -> Iterator[Frame]:
         return (f for f in self._frames if topics is None or f.header.topic in topics)
 
     def close(self) -> None:
