@@ -54,11 +54,9 @@ class BaseLog(ABC):
     ) -> Iterator[Frame]:
         """The decoded messages of ``topics`` in log-time order."""
         self._problems.forget_skipped(topics)
-        reading = reading or Reading()
-        clocks = TopicClocks(reading)
+        clocks = TopicClocks(reading or Reading())
         for message in self.messages(topics):
-            if reading.accepts(message):
-                yield from clocks.frames(self._decoder, message)
+            yield from clocks.frames(self._decoder, message)
 
     @abstractmethod
     def close(self) -> None:
@@ -101,12 +99,25 @@ def encoding_of(streams: Iterable[Stream]) -> str:
 
 
 def merged_streams(logs: Sequence[Log]) -> list[Stream]:
-    """The streams of all logs sorted by topic; counts of the same topic and type add up."""
+    """The streams of all logs sorted by topic; counts of the same topic and type add up.
+
+    So do encodings, such as in a bag of ROS 1 and an MCAP of ROS 2, unless one log has several.
+    """
     counts: Counter[tuple[str, str, str]] = Counter()
+    mixed: set[tuple[str, str]] = set()
     for log in logs:
+        kinds = Counter((s.topic, s.type) for s in log.streams)
+        mixed |= {kind for kind, encodings in kinds.items() if encodings > 1}
         for s in log.streams:
             counts[s.topic, s.type, s.encoding] += s.count
-    return [Stream(*key, count) for key, count in sorted(counts.items())]
+    usual: dict[tuple[str, str], str] = {}
+    for (topic, type_, encoding), _ in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
+        usual.setdefault((topic, type_), encoding)
+    added: Counter[tuple[str, str, str]] = Counter()
+    for (topic, type_, encoding), count in counts.items():
+        is_one = (topic, type_) not in mixed
+        added[topic, type_, usual[topic, type_] if is_one else encoding] += count
+    return [Stream(*key, count) for key, count in sorted(added.items())]
 
 
 def in_log_time_order(

@@ -16,12 +16,15 @@ class TopicClocks:
     """
 
     def __init__(self, reading: Reading) -> None:
+        self._reading = reading
         self._clock = reading.clock
         self._offset_ns = reading.offset_ns
         self._stamped: set[str] = set()  # topics that had a stamp other than 0
 
     def frames(self, decoder: Decoder, message: Message) -> list[Frame]:
-        """The frames in ``message``."""
+        """The frames in ``message``; none if its stream is not read."""
+        if not self._reading.accepts(message):
+            return []
         topic = message.topic
         is_open = self._clock is Clock.AUTO and topic not in self._stamped
         if is_open or self._clock is Clock.LOG:

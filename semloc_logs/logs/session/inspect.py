@@ -148,7 +148,7 @@ class _Inspection:
                 {
                     "topic": s.topic,
                     "type": s.type,
-                    "role": self._roles.role_of(s.topic),
+                    "role": self._roles.role_of_stream(s),
                     "count": self._counts[s.topic, s.type, s.encoding],
                 }
                 for s in log.streams

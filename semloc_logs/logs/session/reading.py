@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.log import Clock, Reading, Stream
+from semloc_logs.logs.roles import Roles
 from semloc_logs.settings import Logs
 
 
-def reading_of(settings: Logs, streams: Sequence[Stream], name: str) -> Reading:
-    """The clock and the offset of each topic.
+def reading_of(settings: Logs, roles: Roles, streams: Sequence[Stream], name: str) -> Reading:
+    """The clock and the offset of each topic, and the streams that no role uses.
 
     LogError for the offset of a topic that the session ``name`` does not have.
     """
@@ -25,4 +26,4 @@ def reading_of(settings: Logs, streams: Sequence[Stream], name: str) -> Reading:
                 f"are {', '.join(topics)}."
             )
         offset_ns[topic] = round(seconds * 1e9)
-    return Reading(Clock(settings.stamps), offset_ns)
+    return Reading(Clock(settings.stamps), offset_ns, roles.left_out)

@@ -99,7 +99,7 @@ class Session:
             raise RoleError(f"{self.name}: {error}") from error
         if not self.roles.ranging:
             raise RoleError(f"{self.name}: {no_sensor(self.streams)}")
-        self._reading = reading_of(self._options.logs, self.streams, self.name)
+        self._reading = reading_of(self._options.logs, self.roles, self.streams, self.name)
         self._pass = self._new_pass(ImageRelay())
         self._conclusion: list[Problem] = []
 
@@ -239,7 +239,7 @@ class Session:
                 {
                     "topic": s.topic,
                     "type": s.type,
-                    "role": self.roles.role_of(s.topic),
+                    "role": self.roles.role_of_stream(s),
                     "count": s.count,
                 }
                 for s in self.streams
