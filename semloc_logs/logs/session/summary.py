@@ -36,6 +36,7 @@ def conclude(done: CloudPass, pose_topic: str | None) -> list[Problem]:
     problems += done.tally.problems((track.start_ns, track.end_ns))
     if builder.duplicates is not None:
         problems += builder.duplicates.problems()
+    problems += poses.problems
     problems += invalid_poses(name, track)
     if poses.source is not None:
         problems += poses.source.problems
