@@ -25,9 +25,10 @@ from semloc_logs.frames import (
     TransformSample,
 )
 from semloc_logs.logs.containers.open import open_log
-from semloc_logs.logs.log import Log, Message
+from semloc_logs.logs.log import Log, Message, Reading
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.messages.stamps import time_range, utc
+from semloc_logs.logs.messages.topic_clocks import TopicClocks
 from semloc_logs.logs.poses.base_frame import BasePoses
 from semloc_logs.logs.poses.navsat import navsat_poses
 from semloc_logs.logs.problems import (
@@ -46,6 +47,7 @@ from semloc_logs.logs.sensors.rectification import rectification
 from semloc_logs.logs.sensors.stereo_pairs import is_rectified
 from semloc_logs.logs.session.frame_queue import RangeFrame
 from semloc_logs.logs.session.pose_problems import never_moves, no_poses
+from semloc_logs.logs.session.stamp_offsets import StampOffsets, stamp_problems
 
 _TRIES = 5  # messages of a range sensor that are decoded in search of a good one
 # a sensor that starts so far outside of the poses has another clock
@@ -58,8 +60,8 @@ def inspect_log(path: str | Path, topics: Mapping[str, str] | None = None) -> di
     Keys: ``path``, ``format``, ``encoding``, ``start_ns``, ``end_ns``, ``duration_s``, ``streams``
     (topic, type, role, count of readable messages), ``problems`` (sentences), ``skipped`` (the ones
     about lost data), ``base_frame``, ``session_frame``, ``poses``, ``cameras``, ``sensors``,
-    ``frames`` (of the TF tree). LogError for a file that is not a log, RoleError when an override
-    is impossible.
+    ``stamps`` (as in session.json), ``frames`` (of the TF tree). LogError for a file that is not a
+    log, RoleError when an override is impossible.
     """
     log = open_log(path)
     try:
@@ -84,6 +86,8 @@ class _Inspection:
         self._tries: Counter[str] = Counter()
         self._undecodable = Problems()
         self._decoder = Decoder(self._undecodable)
+        self._clocks = TopicClocks(Reading(left_out=self._roles.left_out))
+        self._stamp_offsets = StampOffsets()
         self._read()
 
         # the right camera of a pair does not decide the base frame
@@ -115,7 +119,8 @@ class _Inspection:
             self._tries[message.topic] += 1
             if self._tries[message.topic] > _TRIES:
                 return
-        for frame in self._decoder.frames(message):
+        for frame in self._clocks.frames(self._decoder, message):
+            self._stamp_offsets.take(frame)
             self._take(frame)
 
     def _take(self, frame: Frame) -> None:
@@ -157,6 +162,7 @@ class _Inspection:
             "skipped": sentences(to_report(problems)),
             "base_frame": base.name if base else "",
             "session_frame": self._poses.session_frame,
+            "stamps": self._stamp_offsets.to_json(),
             "poses": self._poses.track.to_json(),
             "cameras": {topic: _camera(camera) for topic, camera in sorted(self._cameras.items())},
             "sensors": {topic: self._sensor(frame) for topic, frame in sorted(self._first.items())},
@@ -175,6 +181,8 @@ class _Inspection:
                 *self._undecodable,
                 *self._unreadable(),
                 *self._roles.notes,
+                *self._poses.problems,
+                *stamp_problems(self._stamp_offsets, self._roles, self._poses),
                 *(base.problems if base else ()),
             ]
         )

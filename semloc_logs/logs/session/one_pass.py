@@ -54,8 +54,8 @@ class CloudPass:
         self.meanings: dict[str, LabelNames] = {}
         self.stamp_offsets = StampOffsets()
         self.waiting = FrameQueue(most_bytes)
+        self.relay = relay
         self._roles = roles
-        self._relay = relay
 
     @property
     def topics(self) -> set[str]:
@@ -75,20 +75,8 @@ class CloudPass:
             *roles.topics("imu"),
             *roles.topics("gnss"),
             *roles.label_info,
-            *self._relay.topics,
+            *self.relay.topics,
         }
-
-    @property
-    def posed_topics(self) -> list[str]:
-        """The topics whose frames need a pose at their time, the main sensor first."""
-        roles = self._roles
-        labels = roles.label_of.values()
-        return [*roles.ranging, *roles.topics("stereo_right"), *labels, *self._relay.topics]
-
-    @property
-    def other_topics(self) -> list[str]:
-        """Topics whose times matter less."""
-        return [*self._roles.topics("imu"), *self._roles.topics("gnss")]
 
     def clouds(self, frames: Iterable[Frame]) -> Iterator[PosedCloud]:
         """The clouds of all ``frames``, given in the order of recording."""
@@ -100,10 +88,7 @@ class CloudPass:
 
     def _take(self, frame: Frame) -> None:
         topic = frame.header.topic
-        if isinstance(frame, TransformSample):
-            self.stamp_offsets.add_transform(frame)
-        else:
-            self.stamp_offsets.add(frame.header)
+        self.stamp_offsets.take(frame)
         if isinstance(frame, TransformSample | PoseSample):
             self.poses.take(frame)
         elif isinstance(frame, Camera):
@@ -120,7 +105,7 @@ class CloudPass:
                 self._take_range(frame)
             if not isinstance(frame, LidarFrame):
                 self.cameras.take(frame)
-                self._relay.take(frame)
+                self.relay.take(frame)
 
     def _take_range(self, frame: RangeFrame) -> None:
         topic = frame.header.topic
@@ -160,11 +145,11 @@ class CloudPass:
     def _has_all(self, frame: RangeFrame) -> bool:
         """Whether everything that the cloud of ``frame`` needs has come."""
         stamp_ns = frame.header.stamp_ns
-        infos = [self._roles.info_of.get(topic) for topic in self._relay.topics]
+        infos = [self._roles.info_of.get(topic) for topic in self.relay.topics]
         if any(info not in {None, *self.cameras.calibrations} for info in infos):
             return False
         # poses have to reach the first picture that is not earlier
-        for picture_ns in self._relay.following(stamp_ns):
+        for picture_ns in self.relay.following(stamp_ns):
             if picture_ns is None or not self.poses.poses_have_passed(picture_ns):
                 return False
         if not isinstance(frame, LidarFrame) and not self.cameras.has_all(frame):

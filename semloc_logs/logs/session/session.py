@@ -289,7 +289,7 @@ class Session:
         self._pass = self._new_pass(relay)
         self._conclusion = []
         yield from self._pass.clouds(merged_frames(self.logs, self._pass.topics, self._reading))
-        self._conclusion = conclude(self._pass, self.roles.pose)
+        self._conclusion = conclude(self._pass, self.roles)
 
     def _new_pass(self, relay: ImageRelay) -> CloudPass:
         roles = self.roles

@@ -7,9 +7,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from semloc_logs.frames import F64, Header, TransformSample
+from semloc_logs.frames import F64, Frame, Header, TransformSample
+from semloc_logs.logs.poses.base_frame import BasePoses
 from semloc_logs.logs.poses.tf_tree import Edge, frame_name
 from semloc_logs.logs.problems import Problem, ProblemKind
+from semloc_logs.logs.roles import Roles
 
 _MOST_SAMPLES = 2048  # of a topic; beyond, every second one is forgotten
 _MOST_TOPICS = 1000  # a broken log may have a new TF edge in each message
@@ -48,21 +50,18 @@ class StampOffsets:
     def __init__(self) -> None:
         self._topics: dict[str, _Samples] = {}
 
-    def add(self, header: Header) -> None:
-        """The next message of a topic."""
-        self._add(header.topic, header)
-
-    def add_transform(self, sample: TransformSample) -> None:
-        """The next transform of an edge; a static one holds at any time."""
-        if not sample.static:
-            edge = (frame_name(sample.header.frame_id), frame_name(sample.child_frame_id))
-            self._add(edge_topic(sample.header.topic, edge), sample.header)
-
-    def _add(self, topic: str, header: Header) -> None:
+    def take(self, frame: Frame) -> None:
+        """The next frame of a topic; a static transform holds at any time."""
+        topic = frame.header.topic
+        if isinstance(frame, TransformSample):
+            if frame.static:
+                return
+            edge = (frame_name(frame.header.frame_id), frame_name(frame.child_frame_id))
+            topic = edge_topic(topic, edge)
         if topic not in self._topics and len(self._topics) < _MOST_TOPICS:
             self._topics[topic] = _Samples()
         if topic in self._topics:
-            self._topics[topic].add(header)
+            self._topics[topic].add(frame.header)
 
     @property
     def topics(self) -> list[str]:
@@ -135,12 +134,34 @@ class _Samples:
 
 
 def stamp_problems(
-    offsets: StampOffsets, poses: str | None, sensors: Sequence[str], others: Sequence[str] = ()
+    offsets: StampOffsets, roles: Roles, poses: BasePoses, pictures: Sequence[str] = ()
 ) -> list[Problem]:
     """Stamps that are missing, or that come from different clocks.
 
-    ``poses``: the topic of the poses, if there is one; ``sensors``: the topics that need poses, the
-    most important first; ``others`` are named too, but the map does not depend on their times.
+    ``pictures``: topics of pictures that label points.
+    """
+    labels = roles.label_of.values()
+    sensors = [*roles.ranging, *roles.topics("stereo_right"), *labels, *pictures]
+    others = [*roles.topics("imu"), *roles.topics("gnss")]
+    return _problems(offsets, _pose_topic(offsets, roles, poses), sensors, others)
+
+
+def _pose_topic(offsets: StampOffsets, roles: Roles, poses: BasePoses) -> str | None:
+    """The topic that the poses come from; None where they are no topic."""
+    if poses.source is not None:
+        return poses.source.name
+    if poses.edge is None:
+        return roles.pose
+    end = edge_topic("", poses.edge)
+    return next((topic for topic in offsets.topics if topic.endswith(end)), None)
+
+
+def _problems(
+    offsets: StampOffsets, poses: str | None, sensors: Sequence[str], others: Sequence[str]
+) -> list[Problem]:
+    """As :func:`stamp_problems`: ``sensors`` need the poses of the topic ``poses``.
+
+    The most important first. ``others`` are named too, but the map does not depend on their times.
     """
     named = dict.fromkeys([*([poses] if poses is not None else []), *sensors, *others])
     known = {topic: offset for topic in named if (offset := offsets.of(topic)) is not None}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from semloc_logs.logs.problems import Problem
+from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.pose_problems import (
     invalid_poses,
@@ -11,28 +12,17 @@ from semloc_logs.logs.session.pose_problems import (
     refused_poses,
     smeared,
 )
-from semloc_logs.logs.session.stamp_offsets import edge_topic, stamp_problems
+from semloc_logs.logs.session.stamp_offsets import stamp_problems
 
 
-def _stamp_problems(done: CloudPass, pose_topic: str | None) -> list[Problem]:
-    """Stamps that are missing, or that come from different clocks."""
-    poses = done.poses
-    if poses.source is not None:
-        pose_topic = poses.source.name
-    elif poses.edge is not None:
-        end = edge_topic("", poses.edge)
-        pose_topic = next((t for t in done.stamp_offsets.topics if t.endswith(end)), None)
-    return stamp_problems(done.stamp_offsets, pose_topic, done.posed_topics, done.other_topics)
-
-
-def conclude(done: CloudPass, pose_topic: str | None) -> list[Problem]:
-    """The problems of a pass that is over; ``pose_topic`` is the topic of its poses."""
+def conclude(done: CloudPass, roles: Roles) -> list[Problem]:
+    """The problems of a pass that is over."""
     poses = done.poses
     track = poses.track
     builder = done.builder
-    name = poses.source.name if poses.source else pose_topic or "TF"
+    name = poses.source.name if poses.source else roles.pose or "TF"
 
-    problems = _stamp_problems(done, pose_topic)
+    problems = stamp_problems(done.stamp_offsets, roles, poses, done.relay.topics)
     problems += done.tally.problems((track.start_ns, track.end_ns))
     if builder.duplicates is not None:
         problems += builder.duplicates.problems()
