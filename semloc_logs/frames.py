@@ -20,15 +20,15 @@ F64 = NDArray[np.float64]
 class Header:
     """Topic, times and coordinate frame of a message.
 
-    ``is_log_time``: the message has no stamp, or its stamp is not used: ``stamp_ns`` comes from the
-    log time. ``publisher`` tells publishers of one topic apart, "" where the log does not.
+    ``lacks_stamp``: the message has no stamp, or 0, and takes the log time instead. ``publisher``
+    tells publishers of one topic apart, "" where the log does not.
     """
 
     topic: str
     stamp_ns: int
     log_time_ns: int
     frame_id: str
-    is_log_time: bool = False
+    lacks_stamp: bool = False
     publisher: str = ""
 
 

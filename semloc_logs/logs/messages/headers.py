@@ -64,11 +64,10 @@ def header_at(recorded_ns: int | None, frame_id: str, message: Message) -> Heade
     """A header with the recorded stamp, or with the log time where the message's clock wants it."""
     clock = message.clock
     log_time_ns = message.log_time_ns
-    is_log_time = (
-        recorded_ns is None or clock is Clock.LOG or (recorded_ns == 0 and clock is Clock.AUTO)
-    )
-    time_ns = log_time_ns if is_log_time or recorded_ns is None else recorded_ns
-    return Header(message.topic, time_ns, log_time_ns, frame_id, is_log_time, message.publisher)
+    lacks_stamp = recorded_ns is None or (recorded_ns == 0 and clock is Clock.AUTO)
+    if recorded_ns is None or lacks_stamp or clock is Clock.LOG:
+        recorded_ns = log_time_ns
+    return Header(message.topic, recorded_ns, log_time_ns, frame_id, lacks_stamp, message.publisher)
 
 
 def ros_header(m: Any, message: Message) -> Header:

@@ -30,7 +30,7 @@ class TopicClocks:
         if is_open or self._clock is Clock.LOG:
             message = message._replace(clock=self._clock)
         frames = decoder.frames(message)
-        if is_open and any(not frame.header.is_log_time for frame in frames):
+        if is_open and any(not frame.header.lacks_stamp for frame in frames):
             self._stamped.add(topic)
         offset_ns = self._offset_ns.get(topic, 0)
         return [_shifted(frame, offset_ns) for frame in frames] if offset_ns else frames

@@ -111,7 +111,7 @@ class _Samples:
 
     def add(self, header: Header) -> None:
         offset = (header.log_time_ns - header.stamp_ns) * 1e-9
-        self._without_stamp += header.is_log_time
+        self._without_stamp += header.lacks_stamp
         self._least = min(self._least, offset)
         self._greatest = max(self._greatest, offset)
         if self._seen % self._every == 0:
