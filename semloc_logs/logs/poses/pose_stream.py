@@ -11,7 +11,7 @@ from semloc_logs.logs.poses.publishers import OnePublisher, publisher_of
 from semloc_logs.logs.poses.tf_tree import frame_name
 from semloc_logs.logs.problems import Problem, ProblemKind
 
-FEWEST = 8  # poses after which all kinds of them have been seen, if they come in turns
+FEWEST = 20  # poses after which the most frequent kind of them is known well enough
 
 
 class PoseKind(NamedTuple):
