@@ -10,7 +10,7 @@ from semloc_logs.logs.messages.decode import Decoder
 
 
 class TopicClocks:
-    """Decodes messages with the stamps that a ``reading`` asks for, during one pass over a log.
+    """Decodes messages with the stamps of a ``reading``, during one pass over a log.
 
     This is the only place that changes stamps: all that follows sees the result.
     """

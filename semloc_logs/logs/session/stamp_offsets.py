@@ -24,6 +24,7 @@ _FEWEST = 8  # messages in which a change of the clock can be seen
 _USUAL = ((37.0, "TAI beside UTC"), (18.0, "GPS time beside UTC"), (19.0, "TAI beside GPS time"))
 _TIME_ZONE = 1800.0  # s; time zones differ by multiples of it, but for a few
 _NEARLY = 0.5  # s
+_AT_ONCE = 0.005  # s
 _YEAR = 365.25 * 86400.0
 
 
@@ -147,7 +148,7 @@ def stamp_problems(
 
 
 def _pose_topic(offsets: StampOffsets, roles: Roles, poses: BasePoses) -> str | None:
-    """The topic that the poses come from; None where they are no topic."""
+    """The topic that the poses come from; None where another source has no messages."""
     if poses.source is not None:
         return poses.source.name
     if poses.edge is None:
@@ -229,24 +230,24 @@ class _Difference:
     def problem(self) -> Problem:
         shift, cause = _usual_shift(self.shift)
         topic = self.topic.partition(" ")[0]
+        size = f"{_duration(shift)} ({cause})" if cause else f"about {_duration(shift)}"
         text = (
             f"{self.topic}: its header stamps are {_beside_log_time(self.offset.median)}, the ones "
-            f"of {self.other} {_beside_log_time(self.its.median)}: their clocks differ by "
-            f"{_duration(shift)}{cause}; give --set logs.time_offset.{topic}={shift:.2f}, or "
-            f"--stamps log."
+            f"of {self.other} {_beside_log_time(self.its.median)}: their clocks differ by {size}; "
+            f"give --set logs.time_offset.{topic}={shift:.2f}, or --stamps log."
         )
         return Problem(topic, ProblemKind.STAMP, text, lost=False, assumed=self.is_used)
 
 
 def _usual_shift(shift: float) -> tuple[float, str]:
-    """A shift near a usual one is taken to be that, less a latency; and its cause in brackets."""
+    """A shift near a usual one is taken to be that, less a latency; and its cause."""
     sign = float(np.sign(shift))
     for usual, cause in _USUAL:
         if abs(abs(shift) - usual) < _NEARLY:
-            return sign * usual, f" ({cause})"
+            return sign * usual, cause
     zones = round(abs(shift) / _TIME_ZONE)
     if 0 < zones <= 48 and abs(abs(shift) - zones * _TIME_ZONE) < _NEARLY:
-        return sign * zones * _TIME_ZONE, " (a time zone)"
+        return sign * zones * _TIME_ZONE, "a time zone"
     return shift, ""
 
 
@@ -278,6 +279,8 @@ def _all_alike(topic: str, offset: StampOffset) -> Problem:
 
 def _beside_log_time(offset: float) -> str:
     """Where stamps lie beside log times: 37.00 s later than their recording."""
+    if abs(offset) < _AT_ONCE:
+        return "at the time of their recording"
     return f"{_duration(offset)} {'earlier' if offset >= 0 else 'later'} than their recording"
 
 
