@@ -355,7 +355,8 @@ def test_a_later_log_is_not_touched_before_its_time() -> None:
     assert second.given == 0
 
 
-def test_depth_camera_with_labels_and_its_own_pose() -> None:
+def depth_camera(count: int, period: float, late: float = 0.0) -> list[Frame]:
+    """Depth images with labels 0, 1, 2 ..., and poses that are recorded so late (s)."""
     info = Camera(
         header("/camera/depth/camera_info", 0.02, "optical"),
         4,
@@ -367,20 +368,31 @@ def test_depth_camera_with_labels_and_its_own_pose() -> None:
         "plumb_bob",
     )
     frames: list[Frame] = [info]
-    for k in range(4):
-        frames.append(
-            DepthFrame(
-                header("/camera/depth/image", 0.1 * k, "optical"), np.full((4, 4), 2.0, np.float32)
-            )
-        )
+    for k in range(count):
+        seconds = period * k
+        depth = np.full((4, 4), 2.0, np.float32)
+        frames.append(DepthFrame(header("/camera/depth/image", seconds, "optical"), depth))
         frames.append(
             ImageFrame(
-                header("/camera/label", 0.1 * k, "optical", late=0.05),
+                header("/camera/label", seconds, "optical", late=0.05),
                 np.full((4, 4), k, np.uint8),
                 "mono8",
             )
         )
-        frames.append(odometry(0.1 * k, "", topic="/camera/pose"))
+        frames.append(odometry(seconds, "", late, topic="/camera/pose"))
+    return frames
+
+
+def test_labels_wait_for_late_poses_with_their_depth_images() -> None:
+    """Poses are recorded 5 s late, after 150 more pictures of 30 Hz."""
+    frames = depth_camera(240, 1 / 30, late=5.0)
+    session = Session([FakeLog(frames, pose_type="geometry_msgs/msg/PoseStamped")])
+    clouds = list(session.clouds())
+    assert [int(cloud.label[0]) for cloud in clouds if cloud.label is not None] == [*range(240)]
+
+
+def test_depth_camera_with_labels_and_its_own_pose() -> None:
+    frames = depth_camera(4, 0.1)
     session = Session([FakeLog(frames, pose_type="geometry_msgs/msg/PoseStamped")])
     clouds = list(session.clouds())
     assert [int(cloud.label[0]) for cloud in clouds if cloud.label is not None] == [0, 1, 2, 3]
