@@ -18,6 +18,8 @@ _MOST_TOPICS = 1000  # a broken log may have a new TF edge in each message
 # s; a message is recorded after its measurement: a later stamp is of another clock, and computers
 # in one network agree to some milliseconds
 _LATEST = 0.02
+# s; up to this it is a note: with simulated time, log times are as coarse as the clock topic
+_CLEARLY_LATER = 0.1
 _EARLIEST = 5.0  # s; poses that are computed slowly are recorded within a second or two
 _FEWEST = 8  # messages in which a change of the clock can be seen
 # s, with their usual causes: a difference so near to one of them is taken to be just that
@@ -178,9 +180,11 @@ def _problems(
     for topic, offset in stamped.items():
         relative = offsets.relative(topic, reference)
         shift = float(np.median(relative))
+        is_clear = min(offset.median, usual.median) < -_CLEARLY_LATER or abs(shift) > _EARLIEST
         is_used = topic not in others
         if _is_other_clock(offset, usual, shift):
-            different.append(_Difference(topic, offset, reference, usual, shift, is_used))
+            is_assumed = is_used and is_clear
+            different.append(_Difference(topic, offset, reference, usual, shift, is_assumed))
         elif abs(step := _step(relative)) > _EARLIEST:
             problems.append(_changed(topic, reference, step, assumed=is_used))
     if not different:
@@ -214,18 +218,23 @@ def _step(relative: F64) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Difference:
-    """``topic`` is stamped by another clock than ``other``: ``shift`` (s) is between them."""
+    """``topic`` is stamped by another clock than ``other``: ``shift`` (s) is between them.
+
+    ``is_assumed``: the map rests on these stamps, and they are clearly wrong.
+    """
 
     topic: str
     offset: StampOffset
     other: str
     its: StampOffset
     shift: float
-    is_used: bool
+    is_assumed: bool
 
     def swapped(self) -> _Difference:
         """The same difference, named at the other topic."""
-        return _Difference(self.other, self.its, self.topic, self.offset, -self.shift, True)
+        return _Difference(
+            self.other, self.its, self.topic, self.offset, -self.shift, self.is_assumed
+        )
 
     def problem(self) -> Problem:
         shift, cause = _usual_shift(self.shift)
@@ -236,7 +245,7 @@ class _Difference:
             f"of {self.other} {_beside_log_time(self.its.median)}: their clocks differ by {size}; "
             f"give --set logs.time_offset.{topic}={shift:.2f}, or --stamps log."
         )
-        return Problem(topic, ProblemKind.STAMP, text, lost=False, assumed=self.is_used)
+        return Problem(topic, ProblemKind.STAMP, text, lost=False, assumed=self.is_assumed)
 
 
 def _usual_shift(shift: float) -> tuple[float, str]:

@@ -117,6 +117,17 @@ def test_sweeps_of_another_clock_are_named_with_the_shift(
     assert problem.text in inspect_log(path)["skipped"]  # type: ignore[operator]
 
 
+@pytest.mark.parametrize(("ahead", "is_assumed"), [(0.01, None), (0.05, False), (0.2, True)])
+def test_stamps_that_are_a_little_later_than_their_recording(
+    recorder: Recorder, ahead: float, is_assumed: bool | None
+) -> None:
+    """10 ms are the latency of a network, 50 ms a note, 0.2 s another clock."""
+    session, _ = fused(drive(recorder, poses=ahead))
+    assert [p.assumed for p in stamp_problems(session)] == (
+        [] if is_assumed is None else [is_assumed]
+    )
+
+
 def test_poses_of_another_clock_are_named_and_not_the_sweeps(recorder: Recorder) -> None:
     session, _ = fused(drive(recorder, poses=37.0))
     [problem] = stamp_problems(session)
