@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Function = Callable[..., Any]
 
 FLAGS = {  # options that are short for a setting
+    "stamps": "logs.stamps",
     "odometry": "fusion.odometry",
     "seg_model": "labels.model",
     "seg_spec": "labels.spec",
@@ -327,9 +328,17 @@ def pose_options(function: Function) -> Function:
     return with_poses
 
 
+stamps_option = click.option(
+    "--stamps",
+    type=click.Choice(["auto", "header", "log"]),
+    help="Times of messages: their header stamps, or when they were recorded; auto: header stamps"
+    " unless all of a topic are 0.  [default: auto]",
+)
+
+
 def reading_options(function: Function) -> Function:
-    """What is read of the logs, and how: topics, poses and labels."""
-    return topic_option(pose_options(label_options(function)))
+    """What is read of the logs, and how: topics, stamps, poses and labels."""
+    return topic_option(stamps_option(pose_options(label_options(function))))
 
 
 @dataclass(frozen=True, slots=True)

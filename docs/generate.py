@@ -168,6 +168,10 @@ def roles_page() -> str:
         "`semloc inspect LOG` shows which topic plays which role. `--topic ROLE=TOPIC` chooses"
         " another one, `--topic ROLE=none` leaves a role out. Several topics of one role are"
         " separated by commas.",
+        "A topic may hold messages of several types or encodings. One of them is used, and"
+        " `--topic ROLE=TOPIC:TYPE` or `--topic ROLE=TOPIC:ENCODING` chooses another. Where a pose"
+        " topic has poses of several frames, or by several publishers, `--topic pose=TOPIC:FRAME`"
+        " or `--topic pose=TOPIC:PUBLISHER` chooses.",
         _table(("role", "use"), [(f"`{role}`", ROLE_USES[role]) for role in ROLES]),
     ]
     return _page(parts)

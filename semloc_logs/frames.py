@@ -19,12 +19,18 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Header:
-    """Topic, times and coordinate frame of a message."""
+    """Topic, times and coordinate frame of a message.
+
+    ``lacks_stamp``: the message has no stamp, or 0, and takes the log time instead. ``publisher``
+    tells publishers of one topic apart, "" where the log does not.
+    """
 
     topic: str
     stamp_ns: int
     log_time_ns: int
     frame_id: str
+    lacks_stamp: bool = False
+    publisher: str = ""
 
 
 class PointTimeRemark(Enum):

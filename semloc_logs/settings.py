@@ -15,13 +15,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from semloc_logs.errors import SettingsError
 
 STREET_VOXEL = 0.30
 MOST_VOXELS = 1000
 _MOST_BYTES = 1 << 20  # of a YAML file
+_LARGEST_OFFSET = 2e9  # s, of stamps: more than from 1970 to now
+_BY_TOPIC = "logs.time_offset."  # the rest of such a key is a topic, which may have dots
 LabelSource = Literal["auto", "log", "onnx", "geometry", "uniform"]
 
 
@@ -53,6 +55,14 @@ class Logs(_Section):
         ge=64 << 20,
         description="bytes of a log that may be in memory at once, decompressed",
     )
+
+    @field_validator("time_offset")
+    @classmethod
+    def _check_offsets(cls, offsets: dict[str, float]) -> dict[str, float]:
+        """Offsets keep every stamp within 64 bits of nanoseconds."""
+        if any(abs(seconds) > _LARGEST_OFFSET for seconds in offsets.values()):
+            raise ValueError(f"an offset is at most {_LARGEST_OFFSET:g} s")
+        return offsets
 
     def __hash__(self) -> int:
         return hash(self.model_dump_json())  # a mapping has no hash of its own
@@ -479,7 +489,10 @@ def load(
 
 
 def _assign(tree: dict[str, Any], key: str, value: str) -> None:
-    *parents, last = key.split(".")
+    if key.startswith(_BY_TOPIC):
+        *parents, last = (*_BY_TOPIC.strip(".").split("."), key.removeprefix(_BY_TOPIC))
+    else:
+        *parents, last = key.split(".")
     for part in parents:
         child = tree.setdefault(part, {})
         if not isinstance(child, dict):

@@ -208,3 +208,15 @@ def test_resolved_settings_hold_every_length_and_stay_as_they_are() -> None:
 def test_the_environment_is_read_by_load_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SEMLOC_FUSION__VOXEL_SIZE", "0.7")
     assert Settings().fusion.voxel_size == 0.3
+
+
+def test_offsets_of_topics_may_have_dots_in_their_names() -> None:
+    key = "logs.time_offset./front.left/points"
+    settings = load(None, {key: "-0.4", "logs.time_offset./imu": "37"})
+    assert settings.logs.time_offset == {"/front.left/points": -0.4, "/imu": 37.0}
+
+
+@pytest.mark.parametrize("value", ["1e10", ".nan", ".inf", "late"])
+def test_impossible_offsets_are_refused_by_name(value: str) -> None:
+    with pytest.raises(SettingsError, match="time_offset"):
+        load(None, {"logs.time_offset./imu": value})

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -39,8 +40,20 @@ class Definition:
     text: bytes
 
 
+class Clock(Enum):
+    """Where the time of a message is taken from."""
+
+    HEADER = "header"  # its own stamp
+    LOG = "log"  # the time of its recording
+    AUTO = "auto"  # its own stamp; the time of its recording while all stamps of its topic are 0
+
+
 class Message(NamedTuple):
-    """A message as recorded; ``type`` and ``encoding`` as in its :class:`Stream`."""
+    """A message as recorded; ``type`` and ``encoding`` as in its :class:`Stream`.
+
+    ``publisher`` names the node or the channel where the log has several for one topic. ``clock``
+    decides the stamp of its frames.
+    """
 
     topic: str
     type: str
@@ -48,6 +61,29 @@ class Message(NamedTuple):
     log_time_ns: int
     data: bytes | memoryview
     definition: Definition
+    publisher: str = ""
+    clock: Clock = Clock.HEADER
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """How messages become frames.
+
+    ``offset_ns`` is added to the stamps of a topic. ``left_out``: streams that are not read, as
+    topic, type and encoding ("": every encoding).
+    """
+
+    clock: Clock = Clock.AUTO
+    offset_ns: Mapping[str, int] = field(default_factory=dict)
+    left_out: frozenset[tuple[str, str, str]] = frozenset()
+
+    def accepts(self, message: Message) -> bool:
+        """Whether the stream of a message is read."""
+        if not self.left_out:
+            return True
+        topic, type_, encoding = message[:3]
+        left_out = self.left_out
+        return (topic, type_, encoding) not in left_out and (topic, type_, "") not in left_out
 
 
 class Section(NamedTuple):
@@ -104,11 +140,13 @@ class Log(Protocol):
     def sections(self) -> list[Section]:
         """The parts of the log by their first log time, from the index: nothing is read for it."""
 
-    def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
+    def frames(
+        self, topics: Collection[str] | None = None, reading: Reading | None = None
+    ) -> Iterator[Frame]:
         """The frames of ``topics`` in log-time order; a message may yield several, or none.
 
-        A message that cannot be decoded is skipped, counted, and named once per topic in
-        ``problems``.
+        ``reading``: which of their streams, and by which clock. A message that cannot be decoded is
+        skipped, counted, and named once per topic in ``problems``.
         """
 
     def close(self) -> None:

@@ -20,6 +20,7 @@ class ProblemKind(Enum):
     POSE = "pose"
     FIT = "fit"  # poses and range data contradict each other, or the poses themselves
     ROLE = "role"  # which topic plays which role
+    STAMP = "stamp"  # times of messages: missing, or of another clock
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 from semloc_logs.errors import RoleError
 from semloc_logs.logs.log import Stream
@@ -50,6 +51,8 @@ _TYPES_OF_ROLE: dict[str, set[str]] = {
     "imu": {"imu"},
     "gnss": FIXES,
 }
+_USED_KINDS = frozenset().union(*_TYPES_OF_ROLE.values())
+_FEW = 10  # a stream with so many times fewer messages than another of its topic is not preferred
 
 
 def no_sensor(streams: Sequence[Stream]) -> str:
@@ -89,33 +92,140 @@ def kind_of(message_type: str) -> str:
     return "livox" if last == "custommsg" and message_type.startswith("livox") else last
 
 
-def chosen_topics(
-    streams: Sequence[Stream], overrides: Mapping[str, str]
-) -> dict[str, tuple[str, ...]]:
-    """The topics of the roles that the user chose; none for a role that is left out."""
-    return {role: _override(streams, role, value) for role, value in overrides.items()}
+@dataclass(frozen=True)
+class Choice:
+    """What the user chose: ``topics`` by role, none for a role that is left out.
+
+    ``streams``: the stream of each of them; ``decided``: topics with one stream that fits
+    the choice. ``pose_frame``: a frame that the poses of the pose topic must name.
+    """
+
+    topics: dict[str, tuple[str, ...]]
+    streams: dict[str, Stream]
+    decided: frozenset[str]
+    pose_frame: str = ""
 
 
-def _override(streams: Sequence[Stream], role: str, value: str) -> tuple[str, ...]:
-    flag = f"--topic {role}={value}"
-    if role not in ROLES:
-        raise RoleError(f"{flag}: the role '{role}' is unknown; the roles are {', '.join(ROLES)}.")
-    if value.strip().lower() in ("", "none"):
-        return ()
-    stream_of = {s.topic: s for s in streams}
-    names = {topic.lstrip("/"): topic for topic in stream_of}
-    listed = _listed(stream_of[topic] for topic in sorted(stream_of))
-    topics = []
-    for wanted in (part.strip() for part in value.split(",")):
-        topic = wanted if wanted in stream_of else names.get(wanted.lstrip("/"))
-        if topic is None:
-            raise RoleError(f"{flag}: the log has no topic '{wanted}'; its topics are {listed}.")
-        type_ = stream_of[topic].type
-        if type_ and kind_of(type_) not in _TYPES_OF_ROLE[role]:
+def read_choice(streams: Sequence[Stream], overrides: Mapping[str, str]) -> Choice:
+    """The choice by ``overrides``: role -> TOPIC, TOPIC:TYPE, TOPIC:ENCODING, or several of them.
+
+    For poses also TOPIC:FRAME.
+    """
+    topics: dict[str, tuple[str, ...]] = {}
+    chosen: dict[str, Stream] = {}
+    decided: set[str] = set()
+    pose_frame = ""
+    for role, value in overrides.items():
+        flag = f"--topic {role}={value}"
+        if role not in ROLES:
             raise RoleError(
-                f"{flag}: messages of type {type_} cannot be the {role}; the topics are {listed}."
+                f"{flag}: the role '{role}' is unknown; the roles are {', '.join(ROLES)}."
             )
-        topics.append(topic)
-    if role in SINGLE and len(topics) > 1:
-        raise RoleError(f"{flag}: the role '{role}' takes one topic, not {len(topics)}.")
-    return tuple(dict.fromkeys(topics))
+        found = []
+        for wanted in _parts(value):
+            topic, rest = _split(streams, wanted, flag)
+            candidates = _that_can(role, streams, topic, flag)
+            narrowed = [s for s in candidates if rest in ("", s.type, s.encoding)]
+            if not narrowed and role == "pose":
+                pose_frame = rest
+            elif not narrowed:
+                raise RoleError(f"{flag}: {topic} has no such messages, but {_kinds(candidates)}.")
+            chosen.setdefault(topic, best_stream(narrowed or candidates))
+            if len(narrowed) == 1:
+                decided.add(topic)
+            found.append(topic)
+        if role in SINGLE and len(found) > 1:
+            raise RoleError(f"{flag}: the role '{role}' takes one topic, not {len(found)}.")
+        topics[role] = tuple(dict.fromkeys(found))
+    return Choice(topics, chosen, frozenset(decided), pose_frame)
+
+
+def _parts(value: str) -> list[str]:
+    """The topics that a value names."""
+    parts = [part.strip() for part in value.split(",")]
+    return [] if parts == [""] or value.strip().lower() == "none" else parts
+
+
+def _split(streams: Sequence[Stream], wanted: str, flag: str) -> tuple[str, str]:
+    """The topic that the log has, and what follows it after a colon."""
+    topics = sorted({s.topic for s in streams}, key=len, reverse=True)
+    # as it is spelled, or with and without a slash in front
+    for name, spelled in ((wanted, str), (wanted.lstrip("/"), _without_slash)):
+        for topic in topics:
+            if name == spelled(topic):
+                return topic, ""
+            if name.startswith(f"{spelled(topic)}:"):
+                return topic, name[len(spelled(topic)) + 1 :]
+    listed = _listed(sorted(streams, key=lambda s: s.topic))
+    raise RoleError(f"{flag}: the log has no topic '{wanted}'; its topics are {listed}.")
+
+
+def _without_slash(topic: str) -> str:
+    return topic.lstrip("/")
+
+
+def _that_can(role: str, streams: Sequence[Stream], topic: str, flag: str) -> list[Stream]:
+    """The streams of a topic that can play a role, also the ones of unknown type."""
+    of_topic = [s for s in streams if s.topic == topic]
+    able = [s for s in of_topic if not s.type or kind_of(s.type) in _TYPES_OF_ROLE[role]]
+    if not able:
+        types = " or ".join(sorted({s.type for s in of_topic}))
+        listed = _listed(sorted(streams, key=lambda s: s.topic))
+        raise RoleError(
+            f"{flag}: messages of type {types} cannot be the {role}; the topics are {listed}."
+        )
+    return able
+
+
+def best_stream(streams: Sequence[Stream]) -> Stream:
+    """The stream of a topic that is used: of a type that plays a role, the best of them.
+
+    The better type of poses, unless it has very few of the messages; else the most messages.
+    """
+    usable = [s for s in streams if kind_of(s.type) in _USED_KINDS] or streams
+    most = max(s.count for s in usable)
+
+    def rank(s: Stream) -> tuple[bool, int, int, str, str]:
+        has_few = s.count * _FEW < most
+        return has_few, POSES.get(kind_of(s.type), 0), -s.count, s.type, s.encoding
+
+    return min(usable, key=rank)
+
+
+def left_out_streams(
+    streams: Sequence[Stream], used: Mapping[str, Stream], decided: Collection[str]
+) -> tuple[frozenset[tuple[str, str, str]], list[Problem]]:
+    """The streams of topics that have several and that are not ``used``; the problems name them.
+
+    Topics whose stream the user has ``decided`` need no naming.
+    """
+    left_out = set()
+    problems = []
+    for topic, kept in used.items():
+        others = [s for s in streams if s.topic == topic and s != kept and s.count]
+        for other in others:
+            encoding = other.encoding if other.type == kept.type else ""
+            left_out.add((topic, other.type, encoding))
+        if others and topic not in decided:
+            problems.append(_several(kept, others))
+    return frozenset(left_out), problems
+
+
+def _several(kept: Stream, others: Sequence[Stream]) -> Problem:
+    """The problem of a topic with messages of several types or encodings."""
+    text = (
+        f"{kept.topic} has messages of {len(others) + 1} kinds: {_kinds([kept])} are used, "
+        f"{_kinds(others)} are not"
+    )
+    # a type that plays no role is not missed
+    usable = [s for s in others if kind_of(s.type) in _USED_KINDS]
+    if usable:
+        kind = kind_of(usable[0].type)
+        role = next(r for r, kinds in _TYPES_OF_ROLE.items() if kind in kinds)
+        end = usable[0].encoding if usable[0].type == kept.type else usable[0].type
+        text += f"; --topic {role}={kept.topic}:{end} chooses them"
+    return Problem(kept.topic, ProblemKind.ROLE, f"{text}.", lost=False, assumed=bool(usable))
+
+
+def _kinds(streams: Sequence[Stream]) -> str:
+    return ", ".join(f"{s.count} of {s.type or 'unknown type'} ({s.encoding})" for s in streams)

@@ -17,9 +17,12 @@ from semloc_logs.logs.role_types import (
     POSES,
     ROLES,
     TRANSFORMS,
-    chosen_topics,
+    Choice,
+    best_stream,
     kind_of,
+    left_out_streams,
     packets,
+    read_choice,
 )
 from semloc_logs.logs.topic_pairs import (
     calibrations,
@@ -71,6 +74,8 @@ class Roles:
     ``info_of`` names the CameraInfo topic of a picture's topic, ``label_of`` the label image of a
     depth topic, ``names_of`` the topic with the meaning of the labels of a label image or a LIDAR.
     ``problems`` are choices that only the user can make; ``notes`` are choices that were made.
+    ``left_out``: streams of these topics that are not read, as in Reading. ``pose_frame``: a frame
+    that the poses must name, "" for any.
     """
 
     lidar: tuple[str, ...] = ()
@@ -91,6 +96,8 @@ class Roles:
     names_of: dict[str, str] = field(default_factory=dict)
     problems: tuple[Problem, ...] = ()
     notes: tuple[Problem, ...] = ()
+    left_out: frozenset[tuple[str, str, str]] = frozenset()
+    pose_frame: str = ""
 
     @property
     def ranging(self) -> tuple[str, ...]:
@@ -112,6 +119,12 @@ class Roles:
         """
         order = ("stereo_left", "stereo_right", *ROLES)
         return next((role for role in order if topic in self.topics(role)), None)
+
+    def role_of_stream(self, stream: Stream) -> str | None:
+        """As :meth:`role_of`; None for a stream that is not read, whatever its topic is."""
+        key = (stream.topic, stream.type)
+        is_left_out = (*key, stream.encoding) in self.left_out or (*key, "") in self.left_out
+        return None if is_left_out else self.role_of(stream.topic)
 
     def to_json(self) -> dict[str, object]:
         """Role -> list of topics, without roles that no topic plays."""
@@ -136,7 +149,7 @@ def guess_roles(streams: Sequence[Stream], overrides: Mapping[str, str] | None =
     or ``none`` to leave a role out. RoleError for an unknown role or topic and for a topic whose
     type cannot play the role.
     """
-    guess = _Guess(streams, chosen_topics(streams, overrides or {}))
+    guess = _Guess(streams, read_choice(streams, overrides or {}))
     for role, rule in _RULES:
         guess.assign(role, rule)
     return guess.roles()
@@ -148,13 +161,18 @@ class _Guess:
     ``chosen``: topics by role as the user gave them.
     """
 
-    def __init__(self, streams: Sequence[Stream], chosen: Mapping[str, tuple[str, ...]]) -> None:
-        self.chosen = chosen
-        self.kinds = {
-            s.topic: kind_of(s.type)
-            for s in streams
-            if s.count > 0 and not s.topic.startswith(OWN_PREFIX)
+    def __init__(self, streams: Sequence[Stream], choice: Choice) -> None:
+        self.chosen = choice.topics
+        self._choice = choice
+        of_topic: dict[str, list[Stream]] = {}
+        for s in streams:
+            if s.count > 0 and not s.topic.startswith(OWN_PREFIX):
+                of_topic.setdefault(s.topic, []).append(s)
+        self._used = {
+            topic: choice.streams.get(topic, best_stream(several))
+            for topic, several in of_topic.items()
         }
+        self.kinds = {topic: kind_of(s.type) for topic, s in self._used.items()}
         self.pictures = one_transport(self.of_kind(IMAGES))
         self.problems: list[Problem] = []
         self.notes: list[Problem] = []
@@ -208,6 +226,7 @@ class _Guess:
         pose = topics["pose"]
         has_pose_of_fixes = any(self.kinds.get(topic) in FIXES for topic in pose)
         gnss = pose if has_pose_of_fixes else topics["gnss"]
+        left_out, several = left_out_streams(self._streams, self._used, self._choice.decided)
         return Roles(
             lidar=topics["lidar"],
             depth=topics["depth"],
@@ -240,7 +259,9 @@ class _Guess:
                 forced="label_info" in self.chosen,
             ),
             problems=(*self._pair_problems(), *self.problems),
-            notes=(*self.notes, *packets(self._streams)),
+            notes=(*several, *self.notes, *packets(self._streams)),
+            left_out=left_out,
+            pose_frame=self._choice.pose_frame,
         )
 
     def _pair_problems(self) -> list[Problem]:

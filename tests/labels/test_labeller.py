@@ -25,7 +25,7 @@ from semloc_logs.frames import (
     TransformSample,
 )
 from semloc_logs.labels.labeller import Labeller
-from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.log import Message, Reading, Section, Stream
 from semloc_logs.logs.problems import Problem, sentences
 from semloc_logs.logs.session.session import Session
 from semloc_logs.numerics.transforms import yaw_transform
@@ -63,10 +63,15 @@ class FakeLog:
             Stream(t, kind, "cdr", topics.count(t)) for t, kind in sorted(kinds.items())
         ]
 
+    def sections(self) -> list[Section]:
+        return []
+
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         return iter(())
 
-    def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
+    def frames(
+        self, topics: Collection[str] | None = None, reading: Reading | None = None
+    ) -> Iterator[Frame]:
         return iter([f for f in self._frames if topics is None or f.header.topic in topics])
 
     def close(self) -> None:

@@ -174,11 +174,17 @@ class Recorder:
         self.add(topic, STORES["ros2"].types["tf2_msgs/msg/TFMessage"](transforms=[edge]), stamp_ns)
 
     def pose(
-        self, stamp_ns: int, pose: Array, *, late_ns: int = 0, log_time_ns: int | None = None
+        self,
+        stamp_ns: int,
+        pose: Array,
+        *,
+        late_ns: int = 0,
+        log_time_ns: int | None = None,
+        frames: tuple[str, str] = ("odom", "base_link"),
     ) -> None:
-        """``odom_T_base_link`` (4, 4): Odometry, in protobuf a transform."""
+        """``odom_T_base_link`` (4, 4), or of other frames: Odometry, in protobuf a transform."""
         if self.kind == "protobuf":
-            self.transform("odom", "base_link", pose, stamp_ns, "/tf")
+            self.transform(*frames, pose, stamp_ns, "/tf")
             return
         t, q = translation_quaternion(pose)
         point = self.make(
@@ -192,8 +198,8 @@ class Recorder:
         twist = self.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
         message = self.make(
             "nav_msgs/msg/Odometry",
-            header=self.header(stamp_ns, "odom"),
-            child_frame_id="base_link",
+            header=self.header(stamp_ns, frames[0]),
+            child_frame_id=frames[1],
             pose=self.make(
                 "geometry_msgs/msg/PoseWithCovariance", pose=where, covariance=np.zeros(36)
             ),
@@ -213,22 +219,24 @@ class Recorder:
         return self.path
 
     def _write_mcap(self) -> None:
-        channels: dict[str, int] = {}
+        channels: dict[tuple[str, str], int] = {}
         with self.path.open("wb") as file:
             writer = Writer(file)
             writer.start("ros2" if self.kind == "ros2" else "")
             for log_time, topic, m in self.events:
-                if topic not in channels:
+                name = m.DESCRIPTOR.full_name if self.kind == "protobuf" else m.__msgtype__
+                key = (topic, name)
+                if key not in channels:
                     if self.kind == "protobuf":
                         schema = writer.register_schema(
-                            m.DESCRIPTOR.full_name,
+                            name,
                             "protobuf",
                             build_file_descriptor_set(m).SerializeToString(),
                         )
-                        channels[topic] = writer.register_channel(topic, "protobuf", schema)
+                        channels[key] = writer.register_channel(topic, "protobuf", schema)
                     else:
                         text = self.store.generate_msgdef(m.__msgtype__, ros_version=2)[0].encode()
-                        channels[topic] = writer.register_channel(
+                        channels[key] = writer.register_channel(
                             topic, "cdr", writer.register_schema(m.__msgtype__, "ros2msg", text)
                         )
                 data = (
@@ -237,7 +245,7 @@ class Recorder:
                     else bytes(self.store.serialize_cdr(m, m.__msgtype__))
                 )
                 writer.add_message(
-                    channels[topic], log_time=log_time, publish_time=log_time, data=data
+                    channels[key], log_time=log_time, publish_time=log_time, data=data
                 )
             writer.finish()  # type: ignore[no-untyped-call]
 

@@ -16,8 +16,9 @@ import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Frame
-from semloc_logs.logs.log import Log, Message, Section, Stream
+from semloc_logs.logs.log import Log, Message, Reading, Section, Stream
 from semloc_logs.logs.messages.decode import Decoder
+from semloc_logs.logs.messages.topic_clocks import TopicClocks
 from semloc_logs.logs.problems import Problem, Problems
 
 # no recorder writes chunks of 2 GiB; a larger claim is damage or a decompression bomb
@@ -52,11 +53,14 @@ class BaseLog(ABC):
     def sections(self) -> list[Section]:
         """The parts of the log that can be read one by one, by their first log time."""
 
-    def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
+    def frames(
+        self, topics: Collection[str] | None = None, reading: Reading | None = None
+    ) -> Iterator[Frame]:
         """The decoded messages of ``topics`` in log-time order."""
         self._problems.forget_skipped(topics)
+        clocks = TopicClocks(reading or Reading())
         for message in self.messages(topics):
-            yield from self._decoder.frames(message)
+            yield from clocks.frames(self._decoder, message)
 
     @abstractmethod
     def close(self) -> None:
@@ -99,12 +103,25 @@ def encoding_of(streams: Iterable[Stream]) -> str:
 
 
 def merged_streams(logs: Sequence[Log]) -> list[Stream]:
-    """The streams of all logs sorted by topic; counts of the same topic and type add up."""
+    """The streams of all logs sorted by topic; counts of the same topic and type add up.
+
+    So do encodings, such as in a bag of ROS 1 and an MCAP of ROS 2, unless one log has several.
+    """
     counts: Counter[tuple[str, str, str]] = Counter()
+    mixed: set[tuple[str, str]] = set()
     for log in logs:
+        kinds = Counter((s.topic, s.type) for s in log.streams)
+        mixed |= {kind for kind, encodings in kinds.items() if encodings > 1}
         for s in log.streams:
             counts[s.topic, s.type, s.encoding] += s.count
-    return [Stream(*key, count) for key, count in sorted(counts.items())]
+    usual: dict[tuple[str, str], str] = {}
+    for (topic, type_, encoding), _ in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
+        usual.setdefault((topic, type_), encoding)
+    added: Counter[tuple[str, str, str]] = Counter()
+    for (topic, type_, encoding), count in counts.items():
+        is_one = (topic, type_) not in mixed
+        added[topic, type_, usual[topic, type_] if is_one else encoding] += count
+    return [Stream(*key, count) for key, count in sorted(added.items())]
 
 
 def in_log_time_order(

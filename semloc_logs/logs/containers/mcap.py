@@ -71,6 +71,7 @@ class McapLog(BaseLog):
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._kinds: dict[int, tuple[str, str, str, Definition]] = {}
+        self._publishers: dict[int, str] = {}  # of channels that share their topic
         self._parts: list[Part] = []
         self._file = open_file(path)
         with closed_on_error(self._file, path):
@@ -141,6 +142,7 @@ class McapLog(BaseLog):
             Stream(topic, type_, encoding, count)
             for (topic, type_, encoding), count in sorted(grouped.items())
         ]
+        self._publishers = self._shared_channels()
         self.encoding = profile if profile in ("ros1", "ros2") else encoding_of(self.streams)
 
     def _profile(self) -> str:
@@ -317,6 +319,7 @@ class McapLog(BaseLog):
             )
             return
         view = memoryview(data)
+        publishers = self._publishers
         found = self._walk(data, part.offset)
         found.sort(key=lambda f: f[0])  # stable, and nearly free for sorted input
         for log_time, channel, start, end in found:
@@ -328,7 +331,10 @@ class McapLog(BaseLog):
                 continue
             topic, type_, encoding, definition = self._kind(channel)
             if wanted is None or topic in wanted:
-                yield Message(topic, type_, encoding, log_time, view[start:end], definition)
+                publisher = publishers.get(channel, "")
+                yield Message(
+                    topic, type_, encoding, log_time, view[start:end], definition, publisher
+                )
 
     def _unpack_chunk(self, offset: int, size: int) -> bytes | memoryview:
         record = read_exactly(self._file, offset, size, self._size)
@@ -366,6 +372,18 @@ class McapLog(BaseLog):
         elif opcode == Opcode.CHANNEL:
             channel = parse(Channel.read, body)
             self._channels.setdefault(channel.id, channel)
+
+    def _shared_channels(self) -> dict[int, str]:
+        """The node, or else the number, of each channel whose stream has several."""
+        channels: dict[tuple[str, str, str], list[int]] = {}
+        for channel in self._channels:
+            channels.setdefault(self._kind(channel)[:3], []).append(channel)
+        return {
+            channel: self._channels[channel].metadata.get("callerid") or f"channel {channel}"
+            for several in channels.values()
+            if len(several) > 1
+            for channel in several
+        }
 
     def _topic(self, channel: int) -> str:
         return self._kind(channel)[0] if channel in self._channels else ""

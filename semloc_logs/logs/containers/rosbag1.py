@@ -43,13 +43,23 @@ class Part(NamedTuple):
     connections: frozenset[int]
 
 
+class Connection(NamedTuple):
+    """What one publisher sends; ``node`` is its name, "" where the bag does not have it."""
+
+    topic: str
+    type: str
+    definition: Definition
+    node: str
+
+
 class Rosbag1Log(BaseLog):
     """A ROS 1 bag. LogError unless it is one of format 2.0 without encryption."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "rosbag1")
         self.encoding = "ros1"
-        self._connections: dict[int, tuple[str, str, Definition]] = {}
+        self._connections: dict[int, Connection] = {}
+        self._publishers: dict[int, str] = {}  # of connections that share their topic
         self._parts: list[Part] = []
         self._file = open_file(path)
         with closed_on_error(self._file, path):
@@ -75,7 +85,7 @@ class Rosbag1Log(BaseLog):
                 part.start_ns,
                 part.end_ns,
                 end_of[part.offset] - part.offset,
-                frozenset(self._connections[c][0] for c in part.connections),
+                frozenset(self._connections[c].topic for c in part.connections),
                 partial(self._load_topics, part),
             )
             for part in sorted(self._parts, key=lambda p: (p.start_ns, p.offset))
@@ -84,7 +94,7 @@ class Rosbag1Log(BaseLog):
     def _ids(self, topics: Collection[str] | None) -> set[int]:
         """The connections of ``topics`` (None: all)."""
         return {
-            c for c, (topic, _, _) in self._connections.items() if topics is None or topic in topics
+            c for c, known in self._connections.items() if topics is None or known.topic in topics
         }
 
     def close(self) -> None:
@@ -117,14 +127,27 @@ class Rosbag1Log(BaseLog):
             counts = self._scan()
 
         grouped: Counter[tuple[str, str]] = Counter()
-        for connection, (topic, type_, _) in self._connections.items():
+        for connection, (topic, type_, *_) in self._connections.items():
             grouped[topic, type_] += counts.get(connection, 0)
+        self._publishers = self._shared_connections()
         self.streams = [
             Stream(topic, type_, "ros1", count) for (topic, type_), count in sorted(grouped.items())
         ]
         if self._parts:
             self.start_ns = min(p.start_ns for p in self._parts)
             self.end_ns = max(p.end_ns for p in self._parts)
+
+    def _shared_connections(self) -> dict[int, str]:
+        """The node, or else the number, of each connection whose stream has several."""
+        connections: dict[tuple[str, str], list[int]] = {}
+        for number, known in self._connections.items():
+            connections.setdefault(known[:2], []).append(number)
+        return {
+            number: self._connections[number].node or f"connection {number}"
+            for several in connections.values()
+            if len(several) > 1
+            for number in several
+        }
 
     def _read_index(self, head: Fields) -> Counter[int] | None:
         """Message counts by connection; None when the bag was not closed."""
@@ -227,12 +250,16 @@ class Rosbag1Log(BaseLog):
             )
             return
         view = memoryview(data)
+        publishers = self._publishers
         messages = self._walk(data, part.offset)
         messages.sort(key=lambda m: m[0])  # stable, and nearly free where they are in order already
         for log_time, connection, start, end in messages:
             if connection in wanted:
-                topic, type_, definition = self._connections[connection]
-                yield Message(topic, type_, "ros1", log_time, view[start:end], definition)
+                topic, type_, definition, _ = self._connections[connection]
+                publisher = publishers.get(connection, "")
+                yield Message(
+                    topic, type_, "ros1", log_time, view[start:end], definition, publisher
+                )
 
     def _unpack_chunk(self, offset: int) -> bytes:
         fields, start, end = self._record(offset)
@@ -338,10 +365,13 @@ def _time(fields: Fields, name: bytes) -> int:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-def _connection(fields: Fields, data: bytes) -> tuple[str, str, Definition]:
-    """Topic, type and definition; the record's data repeat the header layout."""
+def _connection(fields: Fields, data: bytes) -> Connection:
+    """The connection of a record, whose data repeat the header layout."""
     inner = _fields(data)
     topic = fields.get(b"topic", inner.get(b"topic", b"")).decode(errors="replace")
     type_ = ros2_type(inner.get(b"type", b"").decode(errors="replace"))
     text = inner.get(b"message_definition", b"")
-    return topic, type_, Definition(type_, "ros1msg" if text.strip() else "", text)
+    definition = Definition(type_, "ros1msg" if text.strip() else "", text)
+    return Connection(
+        topic, type_, definition, inner.get(b"callerid", b"").decode(errors="replace")
+    )

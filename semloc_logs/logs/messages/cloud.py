@@ -12,7 +12,15 @@ from semloc_logs.frames import F64, Frame, Header, LidarFrame
 from semloc_logs.logs.log import Message
 from semloc_logs.logs.messages import livox
 from semloc_logs.logs.messages.definitions import UndecodableError, binary
-from semloc_logs.logs.messages.headers import Convert, check_time, foxglove, ros, transform, vector
+from semloc_logs.logs.messages.headers import (
+    Convert,
+    check_time,
+    foxglove,
+    header_at,
+    ros,
+    transform,
+    vector,
+)
 from semloc_logs.logs.messages.point_fields import Field, Layout, decode_points, is_noise
 from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.numerics import transforms
@@ -83,12 +91,7 @@ def _cloud_pose(pose: Any) -> F64:
 
 
 def _livox(m: Any, message: Message) -> Iterator[Frame]:
-    header = Header(
-        message.topic,
-        check_time(m.sec * 1_000_000_000 + m.nanosec),
-        message.log_time_ns,
-        m.frame_id,
-    )
+    header = header_at(check_time(m.sec * 1_000_000_000 + m.nanosec), m.frame_id, message)
     offset = m.points["offset_time"].astype(np.int64)
     # the base of the times is the stamp unless the sensor has a clock of its own
     start = m.timebase_ns - header.stamp_ns

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from semloc_logs.frames import F64, Frame, Header
-from semloc_logs.logs.log import Message
+from semloc_logs.logs.log import Clock, Message
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.numerics import transforms
 
@@ -48,10 +48,10 @@ def check_time(time_ns: int) -> int:
     return time_ns
 
 
-def stamp_ns(time: Any, message: Message) -> int:
-    """Nanoseconds of a ROS time, protobuf timestamp or JSON {sec, nsec}; without one, log time."""
+def stamp_ns(time: Any) -> int | None:
+    """Nanoseconds of a ROS time, protobuf timestamp or JSON {sec, nsec}; None without one."""
     if time is None:
-        return message.log_time_ns
+        return None
     for seconds, nanoseconds in (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec")):
         s = getattr(time, seconds, None)
         n = getattr(time, nanoseconds, None)
@@ -60,18 +60,26 @@ def stamp_ns(time: Any, message: Message) -> int:
     raise UndecodableError("its time stamp has neither seconds nor nanoseconds")
 
 
+def header_at(recorded_ns: int | None, frame_id: str, message: Message) -> Header:
+    """A header with the recorded stamp, or with the log time where the message's clock wants it."""
+    clock = message.clock
+    log_time_ns = message.log_time_ns
+    lacks_stamp = recorded_ns is None or (recorded_ns == 0 and clock is Clock.AUTO)
+    if recorded_ns is None or lacks_stamp or clock is Clock.LOG:
+        recorded_ns = log_time_ns
+    return Header(message.topic, recorded_ns, log_time_ns, frame_id, lacks_stamp, message.publisher)
+
+
 def ros_header(m: Any, message: Message) -> Header:
     """The header of a message with a std_msgs/Header."""
-    return Header(
-        message.topic, stamp_ns(m.header.stamp, message), message.log_time_ns, m.header.frame_id
-    )
+    return header_at(stamp_ns(m.header.stamp), m.header.frame_id, message)
 
 
 def foxglove_header(m: Any, message: Message, frame_id: Any) -> Header:
     """The header of a message with a ``timestamp``; ``frame_id`` is "" unless it is a string."""
     if not isinstance(frame_id, str):
         frame_id = ""
-    return Header(message.topic, stamp_ns(m.timestamp, message), message.log_time_ns, frame_id)
+    return header_at(stamp_ns(m.timestamp), frame_id, message)
 
 
 def vector(v: Any) -> F64:

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Frame, PoseSample, TransformSample
+from semloc_logs.logs.poses.pose_stream import FEWEST, PoseStream
+from semloc_logs.logs.poses.publishers import EdgePublishers
 from semloc_logs.logs.poses.tf_tree import Edge, TransformTree, frame_name
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import Problem, ProblemKind
@@ -150,25 +153,31 @@ class BasePoses:
             and roles.pose is not None
             and roles.pose not in (*roles.tf, *roles.tf_static)
         )
-        self._child: str | None = None
+        self._stream = PoseStream(roles.pose or "", roles.pose_frame)
+        self._publishers = EdgePublishers()
         self._edge: Edge | None = None
         self._raw: deque[tuple[int, F64]] = deque()
         self._static_count = static_count
         self._static_times: set[tuple[str, int]] = set()
 
+    @property
+    def edge(self) -> Edge | None:
+        """The edge of TF that gives the poses; None where another source does."""
+        return self._edge
+
     def take(self, sample: PoseSample | TransformSample) -> None:
         """A sample of the pose topic or of TF."""
         header = sample.header
         if self._has_topic and header.topic == self._roles.pose:
-            if self._child is None:
-                self._child = frame_name(sample.child_frame_id)
-                self.session_frame = frame_name(header.frame_id)
-            self._raw.append((header.stamp_ns, sample.frame_T_child))
-            self._move()
+            if self._stream.take(sample):
+                self._raw.append((header.stamp_ns, sample.frame_T_child))
+                self._move()
         elif isinstance(sample, TransformSample):
             if header.topic in self._roles.tf_static:
                 sample = replace(sample, static=True)
                 self._static_times.add((header.topic, header.log_time_ns))
+            if not self._publishers.accepts(sample):
+                return
             self.tree.add(sample)
             if (
                 self._edge == (frame_name(header.frame_id), frame_name(sample.child_frame_id))
@@ -185,10 +194,14 @@ class BasePoses:
         even if it must: its frame is unknown.
         """
         edge = None
+        kind = None
         has_pose_stream = self.source is not None or self._has_topic
         if has_pose_stream:
-            child = self._child if self.source is None else self.source.child
-            if child is None:
+            kind = self._stream.best(partial(self._is_connected, sensors))
+            child = (kind and kind.child) if self.source is None else self.source.child
+            # poses of several frames or publishers may come in turns
+            may_be_mixed = self.source is None and self._stream.count < FEWEST
+            if child is None or (may_be_mixed and is_patient and not must):
                 return False
         else:
             edge = self._pose_edge(sensors)
@@ -205,9 +218,21 @@ class BasePoses:
         self.base = self._choose(sensors, child)
         if edge is not None:
             self._follow(edge)
+        elif kind is not None and self.source is None:
+            self.session_frame = kind.parent
+            self._raw.extend(self._stream.choose(kind, partial(self._is_connected, sensors)))
         self._pull()
         self._move()
         return True
+
+    def _is_connected(self, sensors: Sequence[str], frame: str) -> bool:
+        """Whether transforms connect a frame with a sensor."""
+        return any(self.tree.connected(frame, sensor) for sensor in sensors)
+
+    @property
+    def problems(self) -> list[Problem]:
+        """Poses and transforms that are left out, because others of the same name are used."""
+        return [*self._stream.problems(), *self._publishers.problems(self._edge)]
 
     def _child_of(self, edge: Edge | None) -> str | None:
         """The frame that the poses of a TF edge, or without one of the fallback, belong to."""

@@ -32,7 +32,8 @@ _NOISE_FREE_DEPTH = 0.4  # m
 _FARTHEST_MEDIAN = 200.0
 _NEAREST_MEDIAN = 0.05
 _LEAST_MEASURED = 100  # one pixel in so many has a depth in an image that shows the unit
-_LABELS_KEPT = 80  # more than the depth images that may wait for their pose
+_LABEL_BYTES = 256 << 20  # of a topic, for the pictures that wait for their pose
+_OLD_LABEL_NS = 1_000_000_000  # pictures of several topics come in order, give or take this
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +242,11 @@ class LabelImages:
         """Remembers a frame of a label topic."""
         if is_coloured(frame):
             self.coloured.add(frame.header.topic)
-        self._frames.setdefault(frame.header.topic, deque(maxlen=_LABELS_KEPT)).append(frame)
+        kept = self._frames.setdefault(frame.header.topic, deque())
+        kept.append(frame)
+        # all pictures of a topic have about the same size
+        while len(kept) > 1 and len(kept) * _picture_bytes(frame) > _LABEL_BYTES:
+            kept.popleft()
 
     def has(self, frame: DepthFrame | ImageFrame) -> bool:
         """Whether the label image of a picture has come, if the log promises one."""
@@ -259,6 +264,10 @@ class LabelImages:
         if not candidates:
             return None
         nearest = min(candidates, key=lambda c: abs(c.header.stamp_ns - frame.header.stamp_ns))
+        while candidates[0].header.stamp_ns < frame.header.stamp_ns - _OLD_LABEL_NS:
+            if len(candidates) == 1:
+                break
+            candidates.popleft()
         if abs(nearest.header.stamp_ns - frame.header.stamp_ns) > LABEL_TOLERANCE_NS:
             return None
         ids = label_ids(nearest)
@@ -274,6 +283,10 @@ class LabelImages:
                 lost=False,
             )
         return None
+
+
+def _picture_bytes(frame: DepthFrame | ImageFrame) -> int:
+    return frame.depth.nbytes if isinstance(frame, DepthFrame) else frame.image.nbytes
 
 
 class DepthClouds:

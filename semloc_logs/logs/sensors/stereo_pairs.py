@@ -24,8 +24,7 @@ from semloc_logs.logs.sensors.depth import (
 from semloc_logs.logs.sensors.rectification import rectification
 from semloc_logs.logs.sensors.stereo import StereoMatcher
 
-MOST_KEPT = 80  # right pictures, more than the left ones that may wait for their pose
-MOST_KEPT_BYTES = 256 << 20
+MOST_KEPT_BYTES = 512 << 20  # of right pictures, as of the left ones that wait for their pose
 # between partners: half a period at 10 Hz, until the period is known, and later still
 _LARGEST_GAP_NS = 50_000_000
 
@@ -71,7 +70,7 @@ class StereoClouds:
         """Remembers a right picture until its partner has come."""
         self._rights.append(frame)
         self._bytes += frame.image.nbytes
-        while len(self._rights) > MOST_KEPT or self._bytes > MOST_KEPT_BYTES:
+        while self._bytes > MOST_KEPT_BYTES:
             self._forget()
 
     def _forget(self) -> None:

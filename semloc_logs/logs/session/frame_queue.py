@@ -7,17 +7,23 @@ from collections import deque
 from semloc_logs.frames import DepthFrame, ImageFrame, LidarFrame
 from semloc_logs.logs.messages.stamps import StampOrder
 
-MAX_WAITING = 64  # frames that wait for their pose and transforms
-MAX_WAITING_BYTES = 512 << 20
+MOST_WAITING_BYTES = 512 << 20  # of frames that wait for their pose and transforms
+# between the log times of the first and the newest frame that wait: odometry that is computed
+# slowly is recorded within seconds
+LONGEST_WAIT_NS = 10_000_000_000
 
 RangeFrame = LidarFrame | DepthFrame | ImageFrame
 
 
 class FrameQueue:
-    """Frames in the order of recording; ``nbytes`` is their size in memory."""
+    """Frames in the order of recording; ``nbytes`` is their size in memory.
 
-    def __init__(self) -> None:
+    It should stay below ``most_bytes``.
+    """
+
+    def __init__(self, most_bytes: int = MOST_WAITING_BYTES) -> None:
         self.nbytes = 0
+        self._most_bytes = most_bytes
         self._frames: deque[tuple[RangeFrame, bool]] = deque()
         self._order: dict[str, StampOrder] = {}
 
@@ -27,7 +33,10 @@ class FrameQueue:
     @property
     def is_full(self) -> bool:
         """Whether the first of them cannot wait any longer."""
-        return len(self._frames) > MAX_WAITING or self.nbytes > MAX_WAITING_BYTES
+        if len(self._frames) < 2:
+            return False
+        waited_ns = self._frames[-1][0].header.log_time_ns - self.first.header.log_time_ns
+        return self.nbytes > self._most_bytes or waited_ns > LONGEST_WAIT_NS
 
     @property
     def first(self) -> RangeFrame:

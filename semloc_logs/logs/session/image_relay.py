@@ -9,10 +9,9 @@ import numpy as np
 
 from semloc_logs.frames import DepthFrame, ImageFrame
 from semloc_logs.logs.sensors.depth import label_ids
-from semloc_logs.logs.session.frame_queue import MAX_WAITING
 
 OnImage = Callable[[ImageFrame], None]
-_MOST_STAMPS = 4 * MAX_WAITING  # of a topic: pictures may come more often than clouds
+_MOST_STAMPS = 4096  # of a topic: the pictures that come while a cloud waits
 _LARGEST_ID = 0xFFFF  # of labels in 16 bits
 
 

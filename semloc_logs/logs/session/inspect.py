@@ -27,10 +27,11 @@ from semloc_logs.frames import (
     TransformSample,
 )
 from semloc_logs.logs.containers.open import open_log
-from semloc_logs.logs.log import Log, Message, Stream
+from semloc_logs.logs.log import Log, Message, Reading, Stream
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.messages.definitions import UndecodableError, parser
 from semloc_logs.logs.messages.stamps import time_range, utc
+from semloc_logs.logs.messages.topic_clocks import TopicClocks
 from semloc_logs.logs.poses.base_frame import BasePoses
 from semloc_logs.logs.poses.navsat import navsat_poses
 from semloc_logs.logs.problems import (
@@ -52,6 +53,7 @@ from semloc_logs.logs.sensors.stereo_pairs import is_rectified
 from semloc_logs.logs.session.excerpt import Excerpt
 from semloc_logs.logs.session.frame_queue import RangeFrame
 from semloc_logs.logs.session.pose_problems import never_moves, no_poses
+from semloc_logs.logs.session.stamp_offsets import StampOffsets, stamp_problems
 from semloc_logs.logs.session.verdict import (
     SCAN_REMEDY,
     Command,
@@ -83,9 +85,9 @@ def inspect_log(
     ``problems`` (sentences), ``skipped`` (the ones about lost data and assumptions),
     ``base_frame``, ``session_frame``, ``poses``, ``cameras``, ``sensors``, ``pictures``,
     ``frames`` (of the TF tree), ``transforms`` (its edges), ``labels``, ``complete`` (all messages
-    were read: a small log, or ``full``), ``unknown`` (what only ``full`` tells), ``verdict`` and
-    the command ``suggested``. LogError for a file that is not a log, RoleError when an override is
-    impossible.
+    were read: a small log, or ``full``), ``unknown`` (what only ``full`` tells), ``stamps`` (as in
+    session.json), ``verdict`` and the command ``suggested``. LogError for a file that is not a log,
+    RoleError when an override is impossible.
     """
     log = open_log(path)
     try:
@@ -125,6 +127,8 @@ class _Inspection:
         self._tries: Counter[str] = Counter()
         self._undecodable = Problems()
         self._decoder = Decoder(self._undecodable)
+        self._clocks = TopicClocks(Reading(left_out=self._roles.left_out))
+        self._stamp_offsets = StampOffsets()
         self._facts: dict[str, dict[str, object]] = {}
         self._ranging = {*self._roles.ranging, *self._roles.topics("stereo_right")}
         self._pictures = {
@@ -224,8 +228,9 @@ class _Inspection:
             self._poses.settle(sensors, is_patient=not must, must=must)
 
     def _decode(self, message: Message) -> list[Frame]:
-        frames = self._decoder.frames(message)
+        frames = list(self._clocks.frames(self._decoder, message))
         for frame in frames:
+            self._stamp_offsets.take(frame)
             self._take(frame)
         return frames
 
@@ -260,7 +265,7 @@ class _Inspection:
                 {
                     "topic": s.topic,
                     "type": s.type,
-                    "role": self._roles.role_of(s.topic),
+                    "role": self._roles.role_of_stream(s),
                     "count": self._count(s),
                     "rate_hz": self._rate(s),
                 }
@@ -270,6 +275,7 @@ class _Inspection:
             "skipped": sentences(to_report(problems)),
             "base_frame": base.name if base else "",
             "session_frame": self._poses.session_frame,
+            "stamps": self._stamp_offsets.to_json(),
             "poses": self._track(),
             "cameras": {topic: _camera(camera) for topic, camera in sorted(self._cameras.items())},
             "sensors": {topic: self._sensor(frame) for topic, frame in sorted(self._first.items())},
@@ -380,6 +386,8 @@ class _Inspection:
                 *self._undecodable,
                 *self._unreadable(),
                 *self._roles.notes,
+                *self._poses.problems,
+                *stamp_problems(self._stamp_offsets, self._roles, self._poses),
                 *(base.problems if base else ()),
             ]
         )

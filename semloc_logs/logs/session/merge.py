@@ -6,10 +6,12 @@ from collections.abc import Collection, Iterator, Sequence
 from heapq import heappop, heappush
 
 from semloc_logs.frames import Frame
-from semloc_logs.logs.log import Log
+from semloc_logs.logs.log import Log, Reading
 
 
-def merged_frames(logs: Sequence[Log], topics: Collection[str]) -> Iterator[Frame]:
+def merged_frames(
+    logs: Sequence[Log], topics: Collection[str], reading: Reading | None = None
+) -> Iterator[Frame]:
     """The frames of ``topics`` in log-time order over all logs, which may overlap.
 
     A log is read only once its time has come.
@@ -29,7 +31,7 @@ def merged_frames(logs: Sequence[Log], topics: Collection[str]) -> Iterator[Fram
     while heads or waiting:
         while waiting and (not heads or (logs[waiting[-1]].start_ns or 0) <= heads[0][0]):
             index = waiting.pop()
-            readers[index] = iter(logs[index].frames(topics))
+            readers[index] = iter(logs[index].frames(topics, reading))
             advance(index)
         if heads:
             index = heappop(heads)[1]

@@ -22,8 +22,9 @@ from semloc_logs.logs.problems import NoCloud
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.camera_clouds import CameraClouds
 from semloc_logs.logs.session.cloud_builder import CloudBuilder
-from semloc_logs.logs.session.frame_queue import FrameQueue, RangeFrame
+from semloc_logs.logs.session.frame_queue import MOST_WAITING_BYTES, FrameQueue, RangeFrame
 from semloc_logs.logs.session.image_relay import ImageRelay
+from semloc_logs.logs.session.stamp_offsets import StampOffsets
 from semloc_logs.logs.session.tally import Tally
 
 _TF_PATIENCE = 16  # frames to wait for a better pose edge in TF than one that is not called odom
@@ -32,7 +33,8 @@ _TF_PATIENCE = 16  # frames to wait for a better pose edge in TF than one that i
 class CloudPass:
     """The state of a pass: ``poses``, ``tally`` of frames, ``meanings`` of labels by topic.
 
-    ``builder`` makes the clouds, ``relay`` hands pictures on.
+    ``builder`` makes the clouds, ``relay`` hands pictures on; ``stamp_offsets``: header stamps
+    beside log times. Frames that wait for their poses take ``most_bytes`` at most.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class CloudPass:
         cameras: CameraClouds,
         builder: CloudBuilder,
         relay: ImageRelay,
+        most_bytes: int = MOST_WAITING_BYTES,
     ) -> None:
         self.poses = poses
         self.cameras = cameras
@@ -49,9 +52,10 @@ class CloudPass:
         self.accelerometer = Accelerometer()
         self.tally = Tally()
         self.meanings: dict[str, LabelNames] = {}
-        self.waiting = FrameQueue()
+        self.stamp_offsets = StampOffsets()
+        self.waiting = FrameQueue(most_bytes)
+        self.relay = relay
         self._roles = roles
-        self._relay = relay
 
     @property
     def topics(self) -> set[str]:
@@ -71,7 +75,7 @@ class CloudPass:
             *roles.topics("imu"),
             *roles.topics("gnss"),
             *roles.label_info,
-            *self._relay.topics,
+            *self.relay.topics,
         }
 
     def clouds(self, frames: Iterable[Frame]) -> Iterator[PosedCloud]:
@@ -84,6 +88,7 @@ class CloudPass:
 
     def _take(self, frame: Frame) -> None:
         topic = frame.header.topic
+        self.stamp_offsets.take(frame)
         if isinstance(frame, TransformSample | PoseSample):
             self.poses.take(frame)
         elif isinstance(frame, Camera):
@@ -100,7 +105,7 @@ class CloudPass:
                 self._take_range(frame)
             if not isinstance(frame, LidarFrame):
                 self.cameras.take(frame)
-                self._relay.take(frame)
+                self.relay.take(frame)
 
     def _take_range(self, frame: RangeFrame) -> None:
         topic = frame.header.topic
@@ -140,11 +145,11 @@ class CloudPass:
     def _has_all(self, frame: RangeFrame) -> bool:
         """Whether everything that the cloud of ``frame`` needs has come."""
         stamp_ns = frame.header.stamp_ns
-        infos = [self._roles.info_of.get(topic) for topic in self._relay.topics]
+        infos = [self._roles.info_of.get(topic) for topic in self.relay.topics]
         if any(info not in {None, *self.cameras.calibrations} for info in infos):
             return False
         # poses have to reach the first picture that is not earlier
-        for picture_ns in self._relay.following(stamp_ns):
+        for picture_ns in self.relay.following(stamp_ns):
             if picture_ns is None or not self.poses.poses_have_passed(picture_ns):
                 return False
         if not isinstance(frame, LidarFrame) and not self.cameras.has_all(frame):

@@ -34,8 +34,12 @@ from semloc_logs.logs.session.duplicate_topics import DuplicateTopics
 from semloc_logs.logs.session.image_relay import ImageRelay
 from semloc_logs.logs.session.merge import merged_frames
 from semloc_logs.logs.session.one_pass import CloudPass
+from semloc_logs.logs.session.reading import reading_of
+from semloc_logs.logs.session.stamp_offsets import StampOffsets
 from semloc_logs.logs.session.summary import conclude
 from semloc_logs.settings import Logs
+
+_SHARE_OF_WAITING = 4  # frames that wait take at most this part of the memory of a log
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +100,7 @@ class Session:
             raise RoleError(f"{self.name}: {error}") from error
         if not self.roles.ranging:
             raise RoleError(f"{self.name}: {no_sensor(self.streams)}")
+        self._reading = reading_of(self._options.logs, self.roles, self.streams, self.name)
         self._pass = self._new_pass(ImageRelay())
         self._conclusion: list[Problem] = []
 
@@ -136,6 +141,11 @@ class Session:
     def session_frame(self) -> str:
         """Name of the frame that the poses are in; "" until it is known, and without poses."""
         return self._pass.poses.session_frame
+
+    @property
+    def stamp_offsets(self) -> StampOffsets:
+        """Log times less header stamps of the topics that the pass has read."""
+        return self._pass.stamp_offsets
 
     @property
     def problems(self) -> list[Problem]:
@@ -241,7 +251,7 @@ class Session:
                 {
                     "topic": s.topic,
                     "type": s.type,
-                    "role": self.roles.role_of(s.topic),
+                    "role": self.roles.role_of_stream(s),
                     "count": s.count,
                 }
                 for s in self.streams
@@ -260,6 +270,7 @@ class Session:
                 }
                 for topic in self.roles.ranging
             },
+            "stamps": self.stamp_offsets.to_json(),
             "sweeps_deskewed": self._pass.builder.deskewed,
             "poses": poses.track.to_json(),
             "pose_source": poses.source.to_json() if poses.source else {"kind": "log"},
@@ -280,17 +291,17 @@ class Session:
     ) -> Iterator[PosedCloud]:
         """All clouds in the order of their recording, points in the base frame.
 
-        A frame waits until poses and transforms have passed its time, at most 64 at once; one that
-        then has no pose is counted and left out, unless the log has no pose stream at all: then
-        ``session_T_base`` is None. Colour pictures are decoded only for ``on_image``, which gets
-        each of them before the clouds up to its time: pictures of the topics ``images`` (pictures
-        or label images), by default of all picture topics.
+        A frame waits until poses and transforms have passed its time, within limits of time and
+        memory; one that then has no pose is counted and left out, unless the log has no pose
+        stream at all: then ``session_T_base`` is None. Colour pictures are decoded only for
+        ``on_image``, which gets each of them before the clouds up to its time: pictures of the
+        topics ``images`` (pictures or label images), by default of all picture topics.
         """
         relay = ImageRelay(on_image, self.roles.image if images is None else images)
         self._pass = self._new_pass(relay)
         self._conclusion = []
-        yield from self._pass.clouds(merged_frames(self.logs, self._pass.topics))
-        self._conclusion = conclude(self._pass, self.pose_name)
+        yield from self._pass.clouds(merged_frames(self.logs, self._pass.topics, self._reading))
+        self._conclusion = conclude(self._pass, self.roles)
 
     def _new_pass(self, relay: ImageRelay) -> CloudPass:
         roles = self.roles
@@ -312,4 +323,5 @@ class Session:
         duplicates = DuplicateTopics() if may_repeat else None
         limits = RangeLimits(options.min_range, options.max_range)
         builder = CloudBuilder(roles, poses, cameras, duplicates, limits)
-        return CloudPass(roles, poses, cameras, builder, relay)
+        most_bytes = self._options.logs.memory // _SHARE_OF_WAITING
+        return CloudPass(roles, poses, cameras, builder, relay, most_bytes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from semloc_logs.logs.problems import Problem
+from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.pose_problems import (
     invalid_poses,
@@ -11,17 +12,21 @@ from semloc_logs.logs.session.pose_problems import (
     refused_poses,
     smeared,
 )
+from semloc_logs.logs.session.stamp_offsets import stamp_problems
 
 
-def conclude(done: CloudPass, name: str) -> list[Problem]:
-    """The problems of a pass that is over; ``name`` is the topic or source of its poses."""
+def conclude(done: CloudPass, roles: Roles) -> list[Problem]:
+    """The problems of a pass that is over."""
     poses = done.poses
     track = poses.track
     builder = done.builder
+    name = poses.source.name if poses.source else roles.pose or "TF"
 
-    problems = done.tally.problems((track.start_ns, track.end_ns))
+    problems = stamp_problems(done.stamp_offsets, roles, poses, done.relay.topics)
+    problems += done.tally.problems((track.start_ns, track.end_ns))
     if builder.duplicates is not None:
         problems += builder.duplicates.problems()
+    problems += poses.problems
     problems += invalid_poses(name, track)
     if poses.source is not None:
         problems += poses.source.problems

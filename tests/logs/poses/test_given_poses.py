@@ -22,7 +22,7 @@ from semloc_logs.frames import (
     PoseSample,
     TransformSample,
 )
-from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.log import Message, Reading, Section, Stream
 from semloc_logs.logs.poses import lidar_odometry
 from semloc_logs.logs.poses.lidar_odometry import LidarOdometry
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
@@ -59,10 +59,15 @@ class FakeLog:
             Stream(topic, kind, "cdr", topics.count(topic)) for topic, kind in sorted(kinds.items())
         ]
 
+    def sections(self) -> list[Section]:
+        return []
+
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         return iter(())
 
-    def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
+    def frames(
+        self, topics: Collection[str] | None = None, reading: Reading | None = None
+    ) -> Iterator[Frame]:
         return (f for f in self._frames if topics is None or f.header.topic in topics)
 
     def close(self) -> None:

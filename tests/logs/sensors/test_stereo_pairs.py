@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from semloc_logs.frames import F64, Camera, Header, ImageFrame, PosedCloud
 from semloc_logs.logs.problems import NoCloud, lost, sentences
 from semloc_logs.logs.roles import Roles
+from semloc_logs.logs.sensors import stereo_pairs
 from semloc_logs.logs.sensors.depth import LabelImages, RangePoints
 from semloc_logs.logs.sensors.rectification import Rectification, rectification
 from semloc_logs.logs.sensors.stereo_pairs import StereoClouds, _grey
@@ -108,11 +109,13 @@ def test_labels_belong_to_the_left_pixels() -> None:
     np.testing.assert_allclose(found.label % 160, column, atol=1e-3)
 
 
-def test_memory_is_bounded_when_no_left_picture_comes() -> None:
+def test_memory_is_bounded_when_no_left_picture_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of 160 x 120 bytes; 80 of them may be kept."""
+    monkeypatch.setattr(stereo_pairs, "MOST_KEPT_BYTES", 80 * 160 * 120)
     stereo = clouds()
     for k in range(500):
         stereo.take_right(picture(RIGHT, k * MS))
-    assert len(stereo._rights) <= 80
+    assert len(stereo._rights) == 80
     assert stereo._bytes == sum(r.image.nbytes for r in stereo._rights)
 
 

@@ -21,11 +21,11 @@ from semloc_logs.frames import (
     PoseSample,
     TransformSample,
 )
-from semloc_logs.logs.log import Message, Stream
+from semloc_logs.logs.log import Message, Reading, Section, Stream
 from semloc_logs.logs.problems import Problem, ProblemKind, lost, sentences
-from semloc_logs.logs.session.frame_queue import MAX_WAITING
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.numerics.transforms import Array, rotation_angle, yaw_transform
+from semloc_logs.settings import Logs
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
@@ -63,10 +63,15 @@ class FakeLog:
             Stream(topic, kind, "cdr", topics.count(topic)) for topic, kind in sorted(kinds.items())
         ]
 
+    def sections(self) -> list[Section]:
+        return []
+
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Message]:
         return iter(())
 
-    def frames(self, topics: Collection[str] | None = None) -> Iterator[Frame]:
+    def frames(
+        self, topics: Collection[str] | None = None, reading: Reading | None = None
+    ) -> Iterator[Frame]:
         for frame in self._frames:
             if topics is None or frame.header.topic in topics:
                 self.given += 1
@@ -353,7 +358,8 @@ def test_a_later_log_is_not_touched_before_its_time() -> None:
     assert second.given == 0
 
 
-def test_depth_camera_with_labels_and_its_own_pose() -> None:
+def depth_camera(count: int, period: float, late: float = 0.0) -> list[Frame]:
+    """Depth images with labels 0, 1, 2 ..., and poses that are recorded so late (s)."""
     info = Camera(
         header("/camera/depth/camera_info", 0.02, "optical"),
         4,
@@ -365,20 +371,31 @@ def test_depth_camera_with_labels_and_its_own_pose() -> None:
         "plumb_bob",
     )
     frames: list[Frame] = [info]
-    for k in range(4):
-        frames.append(
-            DepthFrame(
-                header("/camera/depth/image", 0.1 * k, "optical"), np.full((4, 4), 2.0, np.float32)
-            )
-        )
+    for k in range(count):
+        seconds = period * k
+        depth = np.full((4, 4), 2.0, np.float32)
+        frames.append(DepthFrame(header("/camera/depth/image", seconds, "optical"), depth))
         frames.append(
             ImageFrame(
-                header("/camera/label", 0.1 * k, "optical", late=0.05),
+                header("/camera/label", seconds, "optical", late=0.05),
                 np.full((4, 4), k, np.uint8),
                 "mono8",
             )
         )
-        frames.append(odometry(0.1 * k, "", topic="/camera/pose"))
+        frames.append(odometry(seconds, "", late, topic="/camera/pose"))
+    return frames
+
+
+def test_labels_wait_for_late_poses_with_their_depth_images() -> None:
+    """Poses are recorded 5 s late, after 150 more pictures of 30 Hz."""
+    frames = depth_camera(240, 1 / 30, late=5.0)
+    session = Session([FakeLog(frames, pose_type="geometry_msgs/msg/PoseStamped")])
+    clouds = list(session.clouds())
+    assert [int(cloud.label[0]) for cloud in clouds if cloud.label is not None] == [*range(240)]
+
+
+def test_depth_camera_with_labels_and_its_own_pose() -> None:
+    frames = depth_camera(4, 0.1)
     session = Session([FakeLog(frames, pose_type="geometry_msgs/msg/PoseStamped")])
     clouds = list(session.clouds())
     assert [int(cloud.label[0]) for cloud in clouds if cloud.label is not None] == [0, 1, 2, 3]
@@ -465,16 +482,59 @@ def test_repeated_and_backward_poses_are_counted() -> None:
     )
 
 
-def test_the_buffer_is_bounded_when_nothing_ever_comes() -> None:
-    frames: list[Frame] = [*[sweep(0.1 * k) for k in range(500)], odometry(1000.0)]
-    session = Session([FakeLog(frames)])
-    most = 0
-    for frame in session.clouds():
-        raise AssertionError(frame)
+class WatchedLog(FakeLog):
+    """Calls ``watch`` whenever a frame has been taken."""
+
+    def watch(self) -> None:
+        pass
+
+    def frames(
+        self, topics: Collection[str] | None = None, reading: Reading | None = None
+    ) -> Iterator[Frame]:
+        for frame in super().frames(topics, reading):
+            yield frame
+            self.watch()
+
+
+def test_sweeps_without_a_pose_wait_for_seconds_only() -> None:
+    """500 sweeps in 50 s: the ones of the last 10 s wait, 0.1 s apart."""
+    log = WatchedLog([*[sweep(0.1 * k) for k in range(500)], odometry(1000.0)])
+    session = Session([log])
+    waiting: list[int] = []
+    log.watch = lambda: waiting.append(len(session._pass.waiting))  # type: ignore[method-assign]
+    assert list(session.clouds()) == []
     assert session.to_json()["frames"] == {
         "/points": {"seen": 500, "used": 0, "left_out": {"no pose": 500}}
     }
-    assert most <= MAX_WAITING
+    assert max(waiting) == 101
+
+
+def test_sweeps_that_wait_take_a_part_of_the_memory_only() -> None:
+    """A quarter of 64 MiB; 60 sweeps of 1 MiB come within a second."""
+    points = np.ones(((1 << 20) // 12, 3), np.float32)
+    sweeps = [LidarFrame(header("/points", k / 60, "lidar"), points) for k in range(60)]
+    log = WatchedLog([static("base_link", "lidar", MOUNT), *sweeps, odometry(1000.0)])
+    session = Session([log], SessionOptions(logs=Logs(memory=64 << 20)))
+    nbytes: list[int] = []
+    log.watch = lambda: nbytes.append(session._pass.waiting.nbytes)  # type: ignore[method-assign]
+    assert list(session.clouds()) == []
+    assert 15 << 20 < max(nbytes) <= 16 << 20
+
+
+def test_four_lidars_wait_for_poses_that_are_recorded_a_second_late() -> None:
+    """72 sweeps wait at once, each for its own pose."""
+    topics = [f"/lidar_{k}/points" for k in range(4)]
+    frames: list[Frame] = [static("base_link", "lidar", MOUNT)]
+    frames += [sweep(k / 18, topic) for k in range(90) for topic in topics]
+    frames += [odometry(0.05 * k, late=1.0) for k in range(101)]
+    session = Session([FakeLog(frames)], SessionOptions(topics={"lidar": ",".join(topics)}))
+    clouds = list(session.clouds())
+    assert len(clouds) == 360
+    for cloud in clouds:
+        assert cloud.session_T_base is not None
+        seconds = (cloud.header.stamp_ns - EPOCH) / S
+        assert cloud.session_T_base[0, 3] == pytest.approx(seconds, abs=1e-6)
+    assert lost(session.problems) == []
 
 
 class TestRecordedLogs:
