@@ -12,17 +12,29 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from semloc_logs.errors import SettingsError
 
 STREET_VOXEL = 0.30
 MOST_VOXELS = 1000
+_UNIT = 1e-2  # of a quaternion's squared length, off 1: people write few digits
 _MOST_BYTES = 1 << 20  # of a YAML file
 LabelSource = Literal["auto", "log", "onnx", "geometry", "uniform"]
+
+
+def _unit_quaternion(pose: tuple[float, ...]) -> tuple[float, ...]:
+    if abs(sum(v * v for v in pose[3:]) - 1.0) > _UNIT:
+        raise ValueError("its last four numbers have to be a unit quaternion qx, qy, qz, qw")
+    return pose
+
+
+Pose = Annotated[
+    tuple[float, float, float, float, float, float, float], AfterValidator(_unit_quaternion)
+]
 
 
 class _Section(BaseModel):
@@ -47,6 +59,11 @@ class Logs(_Section):
         le=1,
         description="metres of one step of a depth image of whole numbers; default 0.001, as the"
         " message's definition asks for",
+    )
+    mountings: dict[str, Pose] = Field(
+        default_factory=dict,
+        description="pose of a frame in the base frame, by frame name: [x, y, z, qx, qy, qz, qw]"
+        " in metres, instead of the transforms of the log",
     )
     memory: int = Field(
         2 << 30,

@@ -35,17 +35,23 @@ class RangeLimits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """Poses at the time of a frame: ``base_T_sensor`` (4, 4) and ``session_T_base`` or None."""
+    """Poses at the time of a frame: ``base_T_sensor`` (4, 4) and ``session_T_base`` or None.
+
+    ``is_fixed``: the frame of the points is fixed in the world, not a sensor's; the poses have
+    been applied to them already.
+    """
 
     base_T_sensor: F64
     session_T_base: F64 | None
+    is_fixed: bool = False
 
 
 class CloudBuilder:
     """Makes clouds of the points within ``limits``; ``duplicates`` finds topics that repeat others.
 
     ``sensors``: the last ``base_T_sensor`` (4, 4) of each frame id that gave a cloud; ``deskewed``:
-    sweeps freed of the vehicle's motion.
+    sweeps freed of the vehicle's motion; ``fixed``: frame by topic of clouds whose frame is fixed
+    in the world.
     """
 
     def __init__(
@@ -58,6 +64,7 @@ class CloudBuilder:
     ) -> None:
         self.sensors: dict[str, F64] = {}
         self.deskewed = 0
+        self.fixed: dict[str, str] = {}
         self.standstill = Standstill()
         self.duplicates = duplicates
         self._roles = roles
@@ -81,7 +88,10 @@ class CloudBuilder:
         if not len(cloud.points):
             return NoCloud.NO_POINTS
 
-        self.sensors[header.frame_id] = place.base_T_sensor
+        if place.is_fixed:
+            self.fixed[header.topic] = header.frame_id
+        else:
+            self.sensors[header.frame_id] = place.base_T_sensor
         pose = place.session_T_base
         is_main = header.topic == self._roles.ranging[0]
         if pose is not None and is_main and not self._poses.track.moves:
@@ -94,17 +104,23 @@ class CloudBuilder:
         base = self._poses.base
         if base is None:
             return NoCloud.NO_POSE
+        is_fixed = self._poses.is_fixed(header.frame_id)
         base_T_sensor = self._poses.base_T(header.frame_id, header.stamp_ns)
-        if base_T_sensor is None:
-            return NoCloud.NO_TRANSFORM
-        if base.pose_frame is None:
+        if base_T_sensor is None and not is_fixed:
+            is_connected = self._poses.tree.connected(base.name, header.frame_id)
+            return NoCloud.TRANSFORM_GAP if is_connected else NoCloud.NO_TRANSFORM
+        if base.pose_frame is None and base_T_sensor is not None:
             return _Place(base_T_sensor, None)
 
         # before the poses have come so far, it is unknown whether the frame lies in a gap: the
         # nearest pose serves at the end only
         is_known = is_end or self._poses.poses_have_passed(header.stamp_ns)
         pose = self._poses.track.at(header.stamp_ns) if is_known else None
-        return NoCloud.NO_POSE if pose is None else _Place(base_T_sensor, pose)
+        if pose is None:
+            return NoCloud.NO_POSE
+        if base_T_sensor is None:
+            return NoCloud.TRANSFORM_GAP
+        return _Place(base_T_sensor, pose, is_fixed)
 
     def _sweep(self, sweep: LidarFrame, place: _Place) -> PosedCloud | NoCloud:
         header = sweep.header
@@ -112,10 +128,12 @@ class CloudBuilder:
             header.topic, header.stamp_ns, in_base(place.base_T_sensor, sweep.points)
         ):
             return NoCloud.DUPLICATE
+        has_motion = place.session_T_base is not None and not place.is_fixed
         points, label, is_deskewed = sweep_in_base(
             sweep,
             place.base_T_sensor,
-            None if place.session_T_base is None else self._poses.track.at_many,
+            self._poses.track.at_many if has_motion else None,
+            centre=_origin(place) if place.is_fixed else None,
             min_range=self._limits.nearest,
             max_range=self._limits.farthest,
         )
@@ -145,4 +163,7 @@ class CloudBuilder:
 
 
 def _origin(place: _Place) -> F32:
+    """The sensor's centre; the base where the points do not come in the frame of their sensor."""
+    if place.is_fixed:
+        return np.zeros(3, np.float32)
     return place.base_T_sensor[:3, 3].astype(np.float32)

@@ -298,6 +298,7 @@ class _Inspection:
             base is not None
             and not self._poses.tree.connected(base.name, frame_id)
             and base.assumed != frame_id.lstrip("/")
+            and not self._poses.is_fixed(frame_id)
         ):
             text = (
                 f"No transform leads from '{frame_id}', the frame of {topic}, to the base frame "

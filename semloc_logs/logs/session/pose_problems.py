@@ -19,6 +19,15 @@ def no_poses() -> Problem:
     return Problem("", ProblemKind.POSE, text, lost=False)
 
 
+def clouds_in_fixed_frame(topic: str, frame: str, pose_topic: str) -> Problem:
+    """Clouds that the poses were applied to before they were recorded; nothing is lost by that."""
+    text = (
+        f"{topic} is in '{frame}', the frame that the poses of {pose_topic} are in: its points are "
+        f"moved back by the pose of their stamp, and seen from the origin of the base frame."
+    )
+    return Problem(topic, ProblemKind.TRANSFORM, text, lost=False)
+
+
 def refused_poses(topic: str, track: PoseTrack, *, lost: bool) -> list[Problem]:
     """Poses whose stamps make no sense; empty when all is well."""
     kinds = (

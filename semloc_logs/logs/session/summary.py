@@ -5,6 +5,7 @@ from __future__ import annotations
 from semloc_logs.logs.problems import Problem
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.pose_problems import (
+    clouds_in_fixed_frame,
     invalid_poses,
     never_moves,
     no_poses,
@@ -20,7 +21,11 @@ def conclude(done: CloudPass, pose_topic: str | None) -> list[Problem]:
     builder = done.builder
     name = poses.source.name if poses.source else pose_topic or "TF"
 
-    problems = done.tally.problems((track.start_ns, track.end_ns))
+    done.tally.explain(track)
+    problems = done.tally.problems(track, poses.base.name if poses.base else "")
+    problems += [
+        clouds_in_fixed_frame(topic, frame, name) for topic, frame in sorted(builder.fixed.items())
+    ]
     if builder.duplicates is not None:
         problems += builder.duplicates.problems()
     problems += invalid_poses(name, track)
