@@ -172,9 +172,10 @@ class Problems:
         topic: str = "",
         kind: ProblemKind = ProblemKind.FILE,
         lost: bool = True,
+        assumed: bool = False,
     ) -> None:
-        """Adds a problem unless it is known."""
-        self._added.setdefault(Problem(topic, kind, text, lost))
+        """Adds a problem unless it is known; one that is assumed loses nothing."""
+        self._added.setdefault(Problem(topic, kind, text, lost and not assumed, assumed))
 
     def skip(self, topic: str, reason: str, *, file: str = "") -> None:
         """Counts one skipped message of ``topic``; the first ``reason`` is the one in the text.

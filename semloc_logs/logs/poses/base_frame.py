@@ -195,9 +195,9 @@ class BasePoses:
         self._static_count = static_count
         self._static_times: set[tuple[str, int]] = set()
         self._given = mountings.given_poses
-        for known in mountings.known:
-            header = Header("", 0, 0, known.parent)
-            self.tree.add(TransformSample(header, known.child, matrix(known.pose), static=True))
+        for edge in (*mountings.own, *mountings.lent):
+            header = Header("", 0, 0, edge.parent)
+            self.tree.add(TransformSample(header, edge.child, matrix(edge.pose), static=True))
 
     def take(self, sample: PoseSample | TransformSample) -> None:
         """A sample of the pose topic or of TF."""

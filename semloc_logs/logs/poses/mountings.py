@@ -27,12 +27,13 @@ class Mountings:
     """Mountings of sensors beside the messages of a session.
 
     ``given`` by the user: the pose of a frame in the base frame, by frame name; they overrule the
-    log. ``known``: static transforms that hold until the session has its own. ``problems`` say
-    where they are from.
+    log. ``own`` static transforms of the session, and the ``lent`` ones of other logs, hold from
+    its start. ``problems`` tell where the lent ones are from.
     """
 
     given: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    known: tuple[StaticTransform, ...] = ()
+    own: tuple[StaticTransform, ...] = ()
+    lent: tuple[StaticTransform, ...] = ()
     problems: tuple[Problem, ...] = ()
 
     @property

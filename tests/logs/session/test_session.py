@@ -301,9 +301,10 @@ def test_a_given_mounting_overrules_the_log() -> None:
     logs = Logs(mountings={"lidar": (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)})
     clouds = list(Session([FakeLog(frames)], SessionOptions(logs=logs)).clouds())
     np.testing.assert_allclose(clouds[1].points, [[5, 0, 1], [0, 7, 1]], atol=1e-6)
+    base = Logs(mountings={"base_link": logs.mountings["lidar"]})
+    refused = Session([FakeLog(frames)], SessionOptions(logs=base))
     with pytest.raises(LogError, match="names 'base_link', but this is the base frame"):
-        base = Logs(mountings={"base_link": logs.mountings["lidar"]})
-        list(Session([FakeLog(frames)], SessionOptions(logs=base)).clouds())
+        list(refused.clouds())
 
 
 def test_transforms_of_another_log_hold_until_the_log_has_its_own() -> None:
@@ -311,7 +312,7 @@ def test_transforms_of_another_log_hold_until_the_log_has_its_own() -> None:
     frames += [odometry(0.1 * k) for k in range(4)]
     note = Problem("", ProblemKind.TRANSFORM, "from part_0.mcap", lost=False)
     lent = StaticTransform("base_link", "lidar", (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
-    options = SessionOptions(mountings=Mountings(known=(lent,), problems=(note,)))
+    options = SessionOptions(mountings=Mountings(lent=(lent,), problems=(note,)))
     session = Session([FakeLog(frames)], options)
     clouds = list(session.clouds())
     np.testing.assert_allclose(clouds[0].points, [[5, 0, 1], [0, 7, 1]], atol=1e-6)
