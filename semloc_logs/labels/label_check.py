@@ -17,9 +17,9 @@ I64 = NDArray[np.int64]
 
 # share of the points whose ids a space has: every shipped space describes all ids of its data set
 LEAST_KNOWN = 0.9
-# agreement of two sweeps beyond chance (Cohen's kappa): classes that a network gives reach 0.6,
-# numbers that are given anew in each sweep 0
-LEAST_AGREEMENT = 0.3
+# agreement of two sweeps beyond chance (Cohen's kappa): simulated drives with 15 to 30 % of wrong
+# labels have 0.37 to 0.63, numbers that are given anew in each sweep 0
+LEAST_AGREEMENT = 0.15
 # share of the ground that is labelled as ground, and of a ground class that lies near the ground
 LEAST_GROUND = 0.3
 LEAST_ON_ITS_GROUND = 0.2

@@ -23,6 +23,8 @@ _PACKETS = re.compile(
     r"velodynescan|velodynepacket|packetmsg|pandarscan|udppacket|udpframe|rslidarscan|rslidarpacket"
     r"|nebulapackets?|compressedpointcloud2?$"
 )
+SCANS = {"laserscan", "multiecholaserscan"}  # in one plane
+_MOST_NAMED = 4  # topics in a sentence
 IMAGES = {"image", "compressedimage", "rawimage"}
 CAMERAS = {"camerainfo", "cameracalibration"}
 TRANSFORMS = {"tfmessage", "frametransform", "frametransforms"}
@@ -56,11 +58,22 @@ def no_sensor(streams: Sequence[Stream]) -> str:
     """Why a log without LIDAR, depth and stereo pair cannot be fused, and which topic to name."""
     if undecoded := packets(streams):
         return " ".join(sentences(undecoded))
-    listed = _listed(s for s in streams if s.count)
+    recorded = [s for s in streams if s.count]
+    clouds = [s.topic for s in recorded if kind_of(s.type) in CLOUDS]
+    pictures = [s.topic for s in recorded if kind_of(s.type) in IMAGES]
+    ways = [f"--topic lidar={topic}" for topic in clouds[:_MOST_NAMED]]
+    if pictures:
+        ways.append(
+            "--topic depth=TOPIC, or --topic stereo_left=TOPIC --topic stereo_right=TOPIC, with "
+            f"the topics of pictures ({', '.join(pictures[:_MOST_NAMED])})"
+        )
+    scans = [s for s in recorded if kind_of(s.type) in SCANS]
+    remedy = f"name one with {', or '.join(ways)}" if ways else "record clouds or depth images"
+    if scans:
+        return f"{_listed(scans)} is a 2-D scan, and a 2-D scan cannot be mapped: {remedy}."
     return (
-        f"There is no LIDAR and no depth stream, nor a stereo pair; its topics are {listed}; "
-        f"name one with --topic lidar=TOPIC, --topic depth=TOPIC, or --topic stereo_left=TOPIC "
-        f"--topic stereo_right=TOPIC."
+        f"No topic is a LIDAR, depth images or a stereo pair; its topics are {_listed(recorded)}; "
+        f"{remedy}."
     )
 
 
@@ -111,6 +124,8 @@ def _override(streams: Sequence[Stream], role: str, value: str) -> tuple[str, ..
         if topic is None:
             raise RoleError(f"{flag}: the log has no topic '{wanted}'; its topics are {listed}.")
         type_ = stream_of[topic].type
+        if kind_of(type_) in SCANS and role in ("lidar", "depth"):
+            raise RoleError(f"{flag}: {topic} is a {type_}, and a 2-D scan cannot be mapped.")
         if type_ and kind_of(type_) not in _TYPES_OF_ROLE[role]:
             raise RoleError(
                 f"{flag}: messages of type {type_} cannot be the {role}; the topics are {listed}."

@@ -7,6 +7,7 @@ read: the first of every sensor, and static transforms until the frames of the s
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -136,14 +137,12 @@ class _Lent:
 
     def take(self, path: Path) -> None:
         """Reads the static transforms of a log."""
-        log = open_log(path)
         try:
-            topics = guess_roles(log.streams).tf_static
-            edges = [f for f in log.frames(topics) if isinstance(f, TransformSample)]
+            with closing(open_log(path)) as log:
+                topics = guess_roles(log.streams).tf_static
+                edges = [f for f in log.frames(topics) if isinstance(f, TransformSample)]
         except LogError:
             return  # its own session names the fault
-        finally:
-            log.close()
         tree = TransformTree()
         for sample in edges:
             tree.add(sample)

@@ -43,10 +43,13 @@ def refused_poses(topic: str, track: PoseTrack, *, lost: bool) -> list[Problem]:
 
 
 def invalid_poses(topic: str, track: PoseTrack) -> list[Problem]:
-    """Poses that are not rigid transforms; empty when all is well."""
+    """Poses that cannot be calculated with; empty when all is well."""
     if not track.invalid:
         return []
-    text = f"{track.invalid} poses are not rigid transforms and were left out."
+    text = (
+        f"{topic}: {track.invalid} poses were left out: they are not rigid transforms within "
+        f"100,000 km, or their stamps lie outside of the years 1933 to 2116."
+    )
     return [Problem(topic, ProblemKind.POSE, text, lost=True)]
 
 

@@ -583,7 +583,7 @@ def test_up_from_a_tilted_imu_on_a_turning_base() -> None:
 def test_logs_that_cannot_be_a_session() -> None:
     with pytest.raises(LogError, match="none was named"):
         open_session([])
-    with pytest.raises(RoleError, match="no LIDAR and no depth"):
+    with pytest.raises(RoleError, match="No topic is a LIDAR, depth images or a stereo pair"):
         Session([FakeLog([odometry(0.0)])])
     with pytest.raises(RoleError, match=r"drive.mcap: .*--topic pose=/a"):
         Session([FakeLog([sweep(0.0), odometry(0.0, topic="/a"), odometry(0.0, topic="/b")])])
