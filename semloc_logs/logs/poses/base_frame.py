@@ -195,6 +195,7 @@ class BasePoses:
         self._static_count = static_count
         self._static_times: set[tuple[str, int]] = set()
         self._given = mountings.given_poses
+        self._base_T_base_axes = np.eye(4)
         for edge in (*mountings.own, *mountings.lent):
             header = Header("", 0, 0, edge.parent)
             self.tree.add(TransformSample(header, edge.child, matrix(edge.pose), static=True))
@@ -298,11 +299,9 @@ class BasePoses:
         else:
             parent = first
         for frame, pose in self._given.items():
-            if frame == parent:
-                raise LogError(
-                    f"Setting 'logs.mountings' names '{frame}', but this is the base frame: name "
-                    f"the frames of the sensors."
-                )
+            if frame == parent:  # measurements in it have axes of their own
+                self._base_T_base_axes = pose
+                continue
             self.tree.fix(parent, frame, pose)
         return choose_base_frame(self.tree, sensors, stream, self._given)
 
@@ -312,6 +311,10 @@ class BasePoses:
         if not session_frame or session_frame == self._child:
             return set()
         return {session_frame, *self.tree.ancestors(session_frame)} - {self._child or BASE_LINK}
+
+    def is_given(self, frame_id: str) -> bool:
+        """Whether the user gave the mounting of a frame."""
+        return frame_name(frame_id) in self._given
 
     def is_fixed(self, frame_id: str) -> bool:
         """Whether the frame of a cloud is fixed in the world.
@@ -361,6 +364,8 @@ class BasePoses:
             return np.eye(4)
         if self.is_fixed(frame_id):
             return self._base_T_fixed(frame_id, stamp_ns)
+        if frame_name(frame_id) == self.base.name:
+            return self._base_T_base_axes
         return self.tree.lookup(self.base.name, frame_id, stamp_ns)
 
     def poses_have_passed(self, stamp_ns: int) -> bool:

@@ -10,19 +10,23 @@ from semloc_logs.frames import (
     F32,
     F64,
     DepthFrame,
+    Header,
     ImageFrame,
     LabelForm,
     LidarFrame,
     PosedCloud,
 )
-from semloc_logs.logs.poses.base_frame import BasePoses
+from semloc_logs.logs.poses.base_frame import BASE_LINK, BasePoses
 from semloc_logs.logs.poses.standstill import Standstill
+from semloc_logs.logs.poses.tf_tree import frame_name
 from semloc_logs.logs.problems import NoCloud
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.camera_clouds import CameraClouds
 from semloc_logs.logs.sensors.sweeps import in_base, sweep_in_base
 from semloc_logs.logs.session.duplicate_topics import DuplicateTopics
 from semloc_logs.logs.session.frame_queue import RangeFrame
+
+_LOOKS_UP = 0.7  # height of a unit vector: no vehicle's camera looks up by more than 45 degrees
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,8 @@ class CloudBuilder:
 
     ``sensors``: the last ``base_T_sensor`` (4, 4) of each frame id that gave a cloud; ``deskewed``:
     sweeps freed of the vehicle's motion; ``fixed``: frame by topic of clouds whose frame is fixed
-    in the world.
+    in the world; ``looks_up``: frame by topic of pictures that look up by their transform;
+    ``is_base``: of pictures in the base frame that is not called optical.
     """
 
     def __init__(
@@ -65,6 +70,8 @@ class CloudBuilder:
         self.sensors: dict[str, F64] = {}
         self.deskewed = 0
         self.fixed: dict[str, str] = {}
+        self.looks_up: dict[str, str] = {}
+        self.is_base: dict[str, str] = {}
         self.standstill = Standstill()
         self.duplicates = duplicates
         self._roles = roles
@@ -87,6 +94,8 @@ class CloudBuilder:
             return cloud
         if not len(cloud.points):
             return NoCloud.NO_POINTS
+        if not isinstance(frame, LidarFrame):
+            self._see_axes(header, place.base_T_sensor)
 
         if place.is_fixed:
             self.fixed[header.topic] = header.frame_id
@@ -121,6 +130,18 @@ class CloudBuilder:
         if base_T_sensor is None:
             return NoCloud.TRANSFORM_GAP
         return _Place(base_T_sensor, pose, is_fixed)
+
+    def _see_axes(self, header: Header, base_T_sensor: F64) -> None:
+        """Notices pictures whose frame may have the axes of a body (REP 103: x forward)."""
+        base = self._poses.base
+        frame = frame_name(header.frame_id)
+        if base is None or "optical" in frame or self._poses.is_given(frame):
+            return
+        if frame in (base.name, base.assumed):
+            if base.pose_frame is not None:
+                self.is_base[header.topic] = frame
+        elif base.name == BASE_LINK and base_T_sensor[2, 2] > _LOOKS_UP:
+            self.looks_up[header.topic] = frame
 
     def _sweep(self, sweep: LidarFrame, place: _Place) -> PosedCloud | NoCloud:
         header = sweep.header

@@ -28,6 +28,26 @@ def clouds_in_fixed_frame(topic: str, frame: str, pose_topic: str) -> Problem:
     return Problem(topic, ProblemKind.TRANSFORM, text, lost=False)
 
 
+def looks_up(topic: str, frame: str) -> Problem:
+    """Pictures whose axes may be wrong: by TF they look up, as if their frame were a body's."""
+    text = (
+        f"The z axis of '{frame}', along which the pictures of {topic} look, points up in "
+        f"'base_link': this is taken as it is; where '{frame}' is not the optical frame, give the "
+        f"pose of the optical frame with --set logs.mountings.{frame}=[x,y,z,qx,qy,qz,qw]."
+    )
+    return Problem(topic, ProblemKind.TRANSFORM, text, lost=False, assumed=True)
+
+
+def optical_base(topic: str, frame: str) -> Problem:
+    """Pictures in the frame of the poses, whose axes the log does not tell."""
+    text = (
+        f"The poses are taken as poses of the optical frame (z forward) of {topic}, because its "
+        f"frame is '{frame}', too; where '{frame}' has other axes, give the pose of the optical "
+        f"frame in it with --set logs.mountings.{frame}=[x,y,z,qx,qy,qz,qw]."
+    )
+    return Problem(topic, ProblemKind.TRANSFORM, text, lost=False, assumed=True)
+
+
 def refused_poses(topic: str, track: PoseTrack, *, lost: bool) -> list[Problem]:
     """Poses whose stamps make no sense; empty when all is well."""
     kinds = (

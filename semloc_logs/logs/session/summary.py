@@ -7,8 +7,10 @@ from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.pose_problems import (
     clouds_in_fixed_frame,
     invalid_poses,
+    looks_up,
     never_moves,
     no_poses,
+    optical_base,
     refused_poses,
     smeared,
 )
@@ -28,6 +30,8 @@ def conclude(done: CloudPass, pose_topic: str | None) -> list[Problem]:
     ]
     if builder.duplicates is not None:
         problems += builder.duplicates.problems()
+    problems += [looks_up(*item) for item in sorted(builder.looks_up.items())]
+    problems += [optical_base(*item) for item in sorted(builder.is_base.items())]
     problems += invalid_poses(name, track)
     if poses.source is not None:
         problems += poses.source.problems

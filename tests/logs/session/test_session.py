@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -301,10 +301,61 @@ def test_a_given_mounting_overrules_the_log() -> None:
     logs = Logs(mountings={"lidar": (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)})
     clouds = list(Session([FakeLog(frames)], SessionOptions(logs=logs)).clouds())
     np.testing.assert_allclose(clouds[1].points, [[5, 0, 1], [0, 7, 1]], atol=1e-6)
-    base = Logs(mountings={"base_link": logs.mountings["lidar"]})
-    refused = Session([FakeLog(frames)], SessionOptions(logs=base))
-    with pytest.raises(LogError, match="names 'base_link', but this is the base frame"):
-        list(refused.clouds())
+
+
+def depth_frames(frame_id: str) -> list[Frame]:
+    """A wall 2 m in front of a camera of 4 x 4 pixels, and poses of base_link."""
+    K = np.array([[4.0, 0, 1.5], [0, 4, 1.5], [0, 0, 1]])
+    camera = Camera(
+        header("/camera/camera_info", 0.0, frame_id),
+        4,
+        4,
+        K,
+        np.zeros(5),
+        np.eye(3),
+        np.zeros((3, 4)),
+        "plumb_bob",
+    )
+    frames: list[Frame] = [camera]
+    for k in range(3):
+        depth = np.full((4, 4), 2.0, np.float32)
+        frames.append(DepthFrame(header("/camera/depth/image", 0.1 * k, frame_id), depth))
+        frames.append(odometry(0.1 * k))
+    return frames
+
+
+def axes_problems(frames: Sequence[Frame], **mountings: tuple[float, ...]) -> list[Problem]:
+    session = Session([FakeLog(frames)], SessionOptions(logs=Logs(mountings=mountings)))
+    assert len(list(session.clouds())) == 3
+    return session.problems
+
+
+OPTICAL = np.array([[0.0, 0, 1, 0.5], [-1, 0, 0, 0], [0, -1, 0, 1], [0, 0, 0, 1]])
+OPTICAL_POSE = (0.5, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5)
+
+
+def test_a_depth_image_in_a_body_frame_is_an_assumption() -> None:
+    right = static("base_link", "camera_link", OPTICAL)
+    assert axes_problems([right, *depth_frames("camera_link")]) == []
+    body = static("base_link", "camera_link", yaw_transform(0.0, (0.5, 0.0, 1.0)))
+    [problem] = axes_problems([body, *depth_frames("camera_link")])
+    assert problem.assumed
+    assert "The z axis of 'camera_link', along which the pictures of" in problem.text
+    assert axes_problems([body, *depth_frames("camera_link")], camera_link=OPTICAL_POSE) == []
+
+
+def test_a_depth_image_in_the_base_frame_is_an_assumption_unless_it_is_called_optical() -> None:
+    [problem] = axes_problems(depth_frames("base_link"))
+    assert problem.assumed
+    assert "taken as poses of the optical frame (z forward) of /camera/depth/image" in problem.text
+    assert axes_problems(depth_frames("base_link"), base_link=OPTICAL_POSE) == []
+    session = Session(
+        [FakeLog(depth_frames("base_link"))],
+        SessionOptions(logs=Logs(mountings={"base_link": OPTICAL_POSE})),
+    )
+    # 2 m in front of the camera, which looks along x from (0.5, 0, 1)
+    points = next(session.clouds()).points
+    np.testing.assert_allclose(points[:, 0], 2.5, atol=1e-6)
 
 
 def test_transforms_of_another_log_hold_until_the_log_has_its_own() -> None:
