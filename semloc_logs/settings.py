@@ -12,10 +12,10 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from semloc_logs.errors import SettingsError
 
@@ -26,15 +26,7 @@ _MOST_BYTES = 1 << 20  # of a YAML file
 LabelSource = Literal["auto", "log", "onnx", "geometry", "uniform"]
 
 
-def _unit_quaternion(pose: tuple[float, ...]) -> tuple[float, ...]:
-    if abs(sum(v * v for v in pose[3:]) - 1.0) > _UNIT:
-        raise ValueError("its last four numbers have to be a unit quaternion qx, qy, qz, qw")
-    return pose
-
-
-Pose = Annotated[
-    tuple[float, float, float, float, float, float, float], AfterValidator(_unit_quaternion)
-]
+Pose = tuple[float, float, float, float, float, float, float]  # x, y, z, qx, qy, qz, qw
 
 
 class _Section(BaseModel):
@@ -73,6 +65,16 @@ class Logs(_Section):
 
     def __hash__(self) -> int:
         return hash(self.model_dump_json())  # a mapping has no hash of its own
+
+    @model_validator(mode="after")
+    def _check(self) -> Logs:
+        for frame, pose in self.mountings.items():
+            if abs(sum(v * v for v in pose[3:]) - 1.0) > _UNIT:
+                raise ValueError(
+                    f"the last four numbers of mountings.{frame} have to be a unit quaternion "
+                    f"qx, qy, qz, qw"
+                )
+        return self
 
 
 class Fusion(_Section):

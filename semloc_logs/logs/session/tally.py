@@ -39,7 +39,7 @@ class _LeftOut:
         self.last_ns = max(self.last_ns, stamp_ns)
 
     def sentence(self, topic: str, reason: NoCloud, track: PoseTrack, base: str) -> str:
-        """The end of a sentence, with what is known about these frames."""
+        """The end of a sentence, with the facts about these frames."""
         start_ns = self.first_ns if track.start_ns is None else track.start_ns
         end_ns = self.last_ns if track.end_ns is None else track.end_ns
         return reason.because.format(
