@@ -213,7 +213,7 @@ def test_the_environment_is_read_by_load_alone(monkeypatch: pytest.MonkeyPatch) 
 def test_a_mounting_is_a_position_and_a_unit_quaternion() -> None:
     given = {"logs.mountings.lidar": "[0.8, 0, 1.7, 0, 0, 0.707, 0.707]"}
     assert load(None, given).logs.mountings["lidar"][:3] == (0.8, 0.0, 1.7)
-    with pytest.raises(SettingsError, match="mountings.lidar have to be a unit quaternion"):
+    with pytest.raises(SettingsError, match=r"mountings\.lidar have to be a unit quaternion"):
         load(None, {"logs.mountings.lidar": "[0, 0, 1.7, 0, 0, 0, 2]"})
-    with pytest.raises(SettingsError, match="'logs.mountings.lidar"):
+    with pytest.raises(SettingsError, match=r"logs\.mountings\.lidar"):
         load(None, {"logs.mountings.lidar": "[0, 0, 1.7]"})
