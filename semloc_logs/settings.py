@@ -21,10 +21,14 @@ from semloc_logs.errors import SettingsError
 
 STREET_VOXEL = 0.30
 MOST_VOXELS = 1000
+_UNIT = 1e-2  # of a quaternion's squared length, off 1: people write few digits
 _MOST_BYTES = 1 << 20  # of a YAML file
 _LARGEST_OFFSET = 2e9  # s, of stamps: more than from 1970 to now
 _BY_TOPIC = "logs.time_offset."  # the rest of such a key is a topic, which may have dots
 LabelSource = Literal["auto", "log", "onnx", "geometry", "uniform"]
+
+
+Pose = tuple[float, float, float, float, float, float, float]  # x, y, z, qx, qy, qz, qw
 
 
 class _Section(BaseModel):
@@ -50,6 +54,11 @@ class Logs(_Section):
         description="metres of one step of a depth image; default 0.001 of whole numbers and 1 of"
         " 32FC1, as their encodings are defined",
     )
+    mountings: dict[str, Pose] = Field(
+        default_factory=dict,
+        description="pose of a frame in the base frame, by frame name: [x, y, z, qx, qy, qz, qw]"
+        " in metres, instead of the transforms of the log",
+    )
     memory: int = Field(
         2 << 30,
         ge=64 << 20,
@@ -66,6 +75,16 @@ class Logs(_Section):
 
     def __hash__(self) -> int:
         return hash(self.model_dump_json())  # a mapping has no hash of its own
+
+    @model_validator(mode="after")
+    def _check(self) -> Logs:
+        for frame, pose in self.mountings.items():
+            if abs(sum(v * v for v in pose[3:]) - 1.0) > _UNIT:
+                raise ValueError(
+                    f"the last four numbers of mountings.{frame} have to be a unit quaternion "
+                    f"qx, qy, qz, qw"
+                )
+        return self
 
 
 class Fusion(_Section):

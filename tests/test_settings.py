@@ -220,3 +220,12 @@ def test_offsets_of_topics_may_have_dots_in_their_names() -> None:
 def test_impossible_offsets_are_refused_by_name(value: str) -> None:
     with pytest.raises(SettingsError, match="time_offset"):
         load(None, {"logs.time_offset./imu": value})
+
+
+def test_a_mounting_is_a_position_and_a_unit_quaternion() -> None:
+    given = {"logs.mountings.lidar": "[0.8, 0, 1.7, 0, 0, 0.707, 0.707]"}
+    assert load(None, given).logs.mountings["lidar"][:3] == (0.8, 0.0, 1.7)
+    with pytest.raises(SettingsError, match=r"mountings\.lidar have to be a unit quaternion"):
+        load(None, {"logs.mountings.lidar": "[0, 0, 1.7, 0, 0, 0, 2]"})
+    with pytest.raises(SettingsError, match=r"logs\.mountings\.lidar"):
+        load(None, {"logs.mountings.lidar": "[0, 0, 1.7]"})

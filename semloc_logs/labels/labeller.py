@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import ImageFrame, LabelForm, PosedCloud
 from semloc_logs.labels.camera_labels import Painted, Pictures, PointLabels
 from semloc_logs.labels.from_geometry import classify
+from semloc_logs.labels.label_check import LEAST_KNOWN, LabelCheck
 from semloc_logs.labels.segmentation import Segmenter
 from semloc_logs.labels.space import (
     SKY,
@@ -35,6 +36,7 @@ from semloc_logs.logs.sensors.depth import label_ids
 from semloc_logs.logs.session.session import Session
 from semloc_logs.settings import Labels
 
+_MOST_PAIRS = 8  # pairs of keyframes that show whether ids are classes
 _MOST_COLOURS = 4096  # that are remembered of one topic, to guess the palette
 _HALF = 0xFFFF  # the lower half of an id is the class, the upper an instance (SemanticKITTI)
 
@@ -60,13 +62,14 @@ class _DecidedBy(Enum):
 class _Topic:
     """The labels of one topic as far as seen, and their meaning in the end."""
 
-    low: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(_HALF + 1, bool))
+    low: NDArray[np.int64] = field(default_factory=lambda: np.zeros(_HALF + 1, np.int64))
     has_instances: bool = False
     colours: dict[int, int] = field(default_factory=dict)
     is_coloured: bool = False
     space: LabelSpace | None = None
     decided_by: _DecidedBy = _DecidedBy.NOBODY
     strange: dict[int, int] = field(default_factory=dict)
+    doubt: str = ""  # why its ids are not classes
 
     def see(self, ids: U32, is_coloured: bool) -> None:
         values, counts = np.unique(ids[ids != UNPAINTED], return_counts=True)
@@ -76,12 +79,32 @@ class _Topic:
                 if colour in self.colours or len(self.colours) < _MOST_COLOURS:
                     self.colours[colour] = self.colours.get(colour, 0) + count
         else:
-            self.low[values & _HALF] = True
+            np.add.at(self.low, values & _HALF, counts)
             self.has_instances |= bool((values > _HALF).any())
 
     def is_empty(self) -> bool:
         """Whether nothing but zeros was ever recorded."""
         return not self.low[1:].any() and not self.has_instances and not any(self.colours)
+
+    def known_share(self, space: LabelSpace) -> float:
+        """Share of the labelled points whose ids the ``space`` has."""
+        ids = np.flatnonzero(self.low)
+        ids = ids[(ids != 0) & (ids != UNLABELLED)]
+        known = np.isin(ids, np.array([*space.names], np.int64))
+        total = int(self.low[ids].sum())
+        return float(self.low[ids[known]].sum() / total) if total else 1.0
+
+
+class KeyframeView(NamedTuple):
+    """A keyframe: level ``points`` (n, 3) in the map, seen from ``origin`` (3,).
+
+    ``labels`` as from :meth:`Labeller.take`; ``is_posed``: whether its pose is known.
+    """
+
+    points: NDArray[np.floating]
+    origin: NDArray[np.floating]
+    labels: PointLabels | None
+    is_posed: bool
 
 
 class Labeller:
@@ -134,6 +157,9 @@ class Labeller:
         """Pictures that cannot be used, guessed meanings, and labels without a class."""
         problems = Problems()
         for name, topic in sorted(self._topics.items()):
+            if topic.doubt:
+                problems.add(_unused(name, topic), topic=name, kind=ProblemKind.LABEL, assumed=True)
+                continue
             if topic.space is None or self.source != "log":
                 continue
             for text in _doubts(name, topic, topic.space):
@@ -164,8 +190,12 @@ class Labeller:
         self._keyframes.append((_Carrier.CAMERAS, ""))
         return painted
 
-    def conclude(self) -> None:
-        """Settles the source and the meaning of the labels, after the last keyframe."""
+    def conclude(self, view: Callable[[int], KeyframeView], scale: float) -> None:
+        """Settles the source and the meaning of the labels, after the last keyframe.
+
+        ``view`` gives a keyframe by its number, ``scale`` is the voxel size over 0.30 m: labels
+        that are not classes are found by a few of them.
+        """
         if self.source == "onnx":
             self._check_painted()
             return
@@ -179,9 +209,70 @@ class Labeller:
                 f"{self._session.name} has no labels (a 'label' field of the points or a label "
                 f"image): use --set labels.source=geometry."
             )
-        self.source = "log" if has_labels else "geometry"
         for name, topic in self._topics.items():
             topic.space, topic.decided_by = self._space(name, topic)
+        if self.source == "auto" and self._settings.space is None:
+            self._doubt_labels(view, scale)
+        are_doubted = all(t.doubt or t.is_empty() for t in self._topics.values())
+        self.source = "log" if has_labels and not are_doubted else "geometry"
+
+    def _doubt_labels(self, view: Callable[[int], KeyframeView], scale: float) -> None:
+        """Finds the topics whose ids are not classes."""
+        checks = {
+            name: LabelCheck(scale)
+            for name, topic in self._topics.items()
+            if not topic.is_empty() and not topic.is_coloured
+        }
+        for first, second in self._some_pairs():
+            for keyframe in (first, second):
+                seen = view(keyframe)
+                for name, is_own, ids in self._ids(keyframe, seen.labels):
+                    if name in checks:
+                        checks[name].add(
+                            seen.points[is_own],
+                            seen.origin,
+                            ids,
+                            self._train_ids(name, ids),
+                            follows=keyframe == second and seen.is_posed,
+                        )
+        for name, check in checks.items():
+            topic = self._topics[name]
+            share = 1.0 if topic.space is None else topic.known_share(topic.space)
+            if topic.decided_by is _DecidedBy.GUESS and topic.space and share < LEAST_KNOWN:
+                topic.doubt = (
+                    f"{1 - share:.0%} of their points have ids that {topic.space.name}, the most "
+                    f"similar label space, does not have"
+                )
+            else:
+                topic.doubt = check.doubt()
+
+    def _some_pairs(self) -> list[tuple[int, int]]:
+        """Keyframes with labels and the next ones of the same topic, evenly spread."""
+        last: dict[tuple[_Carrier, str], int] = {}
+        pairs = []
+        for number, of_keyframe in enumerate(self._keyframes):
+            if of_keyframe[0] is not _Carrier.NONE:
+                if of_keyframe in last:
+                    pairs.append((last[of_keyframe], number))
+                last[of_keyframe] = number
+        if not pairs:  # single keyframes
+            pairs = [(number, number) for number in last.values()]
+        chosen = np.linspace(0, len(pairs) - 1, min(_MOST_PAIRS, len(pairs))).round()
+        return [pairs[int(k)] for k in chosen]
+
+    def _ids(
+        self, keyframe: int, labels: PointLabels | None
+    ) -> Iterator[tuple[str, NDArray[np.bool_], U32]]:
+        """Topic, points (n,) and ids (m,) of the labels of a keyframe."""
+        carrier, topic = self._keyframes[keyframe]
+        if labels is None or carrier is _Carrier.NONE:
+            return
+        if carrier is _Carrier.CLOUD:
+            yield topic, np.ones(len(labels), bool), labels
+            return
+        for number, name in enumerate(self.images):
+            own = _of_camera(labels, number)
+            yield name, own, labels["label"][own]
 
     def _check_painted(self) -> None:
         """LogError when the model labelled no point."""
@@ -250,7 +341,7 @@ class Labeller:
                 "colours": topic.is_coloured,
             }
             for name, topic in sorted(self._topics.items())
-            if topic.space is not None and self.source == "log"
+            if topic.space is not None and self.source == "log" and not topic.doubt
         }
         content: dict[str, Any] = {"source": self.source, "spaces": spaces}
         if self._model is not None:
@@ -289,6 +380,8 @@ class Labeller:
     def _train_ids(self, name: str, ids: U32) -> U8:
         topic = self._topics[name]
         assert topic.space is not None
+        if topic.doubt:
+            return np.full(len(ids), UNLABELLED, np.uint8)
         if not topic.is_coloured:
             return topic.space.train_ids(ids)
         out, strange = topic.space.train_ids_of_colours(ids)
@@ -300,6 +393,14 @@ class Labeller:
 def _of_camera(painted: Painted, number: int) -> NDArray[np.bool_]:
     """Which points (n,) have their label from a camera."""
     return np.asarray((painted["camera"] == number) & (painted["label"] != UNPAINTED))
+
+
+def _unused(name: str, topic: _Topic) -> str:
+    return (
+        f"The labels of {name} are not used: {topic.doubt}; "
+        f"--set labels.source=log takes them as classes, --set labels.space=NAME tells of which "
+        f"label space."
+    )
 
 
 def _doubts(name: str, topic: _Topic, space: LabelSpace) -> Iterator[str]:

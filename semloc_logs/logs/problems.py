@@ -80,15 +80,37 @@ def without_loss_of(unused: Collection[str], problems: Iterable[Problem]) -> lis
 class NoCloud(Enum):
     """Reason why a frame gives no cloud: its ``key`` in session.json, and the end of a sentence."""
 
-    NO_POSE = (
-        "no pose",
-        "no pose is known at their time (frames {frames}, poses {poses}): the pose stream has a "
-        "gap there, or its clock differs from the clock of the sensor",
+    # a pose is missing; once the pass is over, one of the following tells why
+    NO_POSE = ("no pose", "no pose is known at their stamps ({frames})")
+    NO_POSES = ("no poses", "the pose stream gave no usable pose")
+    BEFORE_POSES = (
+        "before the poses",
+        "their stamps ({frames}) begin {before} before the first pose ({start}); where their clock "
+        "is another, give --set logs.time_offset.{topic}=SECONDS",
+    )
+    AFTER_POSES = (
+        "after the poses",
+        "their stamps ({frames}) end {after} after the last pose ({end}); where their clock is "
+        "another, give --set logs.time_offset.{topic}=SECONDS",
+    )
+    POSE_GAP = (
+        "pose gap",
+        "the poses have {gaps} between their stamps ({frames})",
+    )
+    LATE_POSE = (
+        "late pose",
+        "the poses of their stamps ({frames}) were recorded later than frames can wait",
     )
     NO_TRANSFORM = (
         "no transform",
-        "no transform leads from their frame to the base frame: record /tf_static, or leave the "
-        "topic out with --topic",
+        "no transform leads from their frame '{frame}' to the base frame '{base}': record "
+        "/tf_static, give the mounting with --set logs.mountings.{frame}=[x,y,z,qx,qy,qz,qw], or "
+        "leave the topic out with --topic",
+    )
+    TRANSFORM_GAP = (
+        "transform gap",
+        "the transforms between their frame '{frame}' and the base frame '{base}' have a gap at "
+        "their stamps ({frames})",
     )
     NO_CALIBRATION = (
         "no calibration",
@@ -123,8 +145,8 @@ class NoCloud(Enum):
     NO_POINTS = ("no points", "they have no points within the range limits")
     BACK_IN_TIME = (
         "back in time",
-        "their stamps fall back behind the stamps of earlier frames: the clock was set back; "
-        "cut the log there",
+        "their stamps ({frames}) lie more than a second before the stamp of an earlier frame; "
+        "cut the log there, or use the times of recording with --set logs.stamps=log",
     )
     EMPTY = ("empty", "they hold no points, or none whose position is a number")
     # frames of a topic that repeats another topic: nothing is lost, so it has no sentence
@@ -152,9 +174,10 @@ class Problems:
         topic: str = "",
         kind: ProblemKind = ProblemKind.FILE,
         lost: bool = True,
+        assumed: bool = False,
     ) -> None:
-        """Adds a problem unless it is known."""
-        self._added.setdefault(Problem(topic, kind, text, lost))
+        """Adds a problem unless it is known; one that is assumed loses nothing."""
+        self._added.setdefault(Problem(topic, kind, text, lost and not assumed, assumed))
 
     def assume(self, text: str, *, topic: str, kind: ProblemKind) -> None:
         """Adds an assumption that the log does not settle, unless it is known."""

@@ -24,6 +24,8 @@ _PACKETS = re.compile(
     r"velodynescan|velodynepacket|packetmsg|pandarscan|udppacket|udpframe|rslidarscan|rslidarpacket"
     r"|nebulapackets?|compressedpointcloud2?$"
 )
+SCANS = {"laserscan", "multiecholaserscan"}  # in one plane
+_MOST_NAMED = 4  # topics in a sentence
 IMAGES = {"image", "compressedimage", "rawimage"}
 CAMERAS = {"camerainfo", "cameracalibration"}
 TRANSFORMS = {"tfmessage", "frametransform", "frametransforms"}
@@ -59,11 +61,22 @@ def no_sensor(streams: Sequence[Stream]) -> str:
     """Why a log without LIDAR, depth and stereo pair cannot be fused, and which topic to name."""
     if undecoded := packets(streams):
         return " ".join(sentences(undecoded))
-    listed = _listed(s for s in streams if s.count)
+    recorded = [s for s in streams if s.count]
+    clouds = [s.topic for s in recorded if kind_of(s.type) in CLOUDS]
+    pictures = [s.topic for s in recorded if kind_of(s.type) in IMAGES]
+    ways = [f"--topic lidar={topic}" for topic in clouds[:_MOST_NAMED]]
+    if pictures:
+        ways.append(
+            "--topic depth=TOPIC, or --topic stereo_left=TOPIC --topic stereo_right=TOPIC, with "
+            f"the topics of pictures ({', '.join(pictures[:_MOST_NAMED])})"
+        )
+    scans = [s for s in recorded if kind_of(s.type) in SCANS]
+    remedy = f"name one with {', or '.join(ways)}" if ways else "record clouds or depth images"
+    if scans:
+        return f"{_listed(scans)} is a 2-D scan, and a 2-D scan cannot be mapped: {remedy}."
     return (
-        f"There is no LIDAR and no depth stream, nor a stereo pair; its topics are {listed}; "
-        f"name one with --topic lidar=TOPIC, --topic depth=TOPIC, or --topic stereo_left=TOPIC "
-        f"--topic stereo_right=TOPIC."
+        f"No topic is a LIDAR, depth images or a stereo pair; its topics are {_listed(recorded)}; "
+        f"{remedy}."
     )
 
 
@@ -169,6 +182,11 @@ def _that_can(role: str, streams: Sequence[Stream], topic: str, flag: str) -> li
     of_topic = [s for s in streams if s.topic == topic]
     able = [s for s in of_topic if not s.type or kind_of(s.type) in _TYPES_OF_ROLE[role]]
     if not able:
+        scans = [s for s in of_topic if kind_of(s.type) in SCANS]
+        if scans and role in ("lidar", "depth"):
+            raise RoleError(
+                f"{flag}: {topic} is a {scans[0].type}, and a 2-D scan cannot be mapped."
+            )
         types = " or ".join(sorted({s.type for s in of_topic}))
         listed = _listed(sorted(streams, key=lambda s: s.topic))
         raise RoleError(

@@ -15,7 +15,8 @@ from typing import Any
 
 import semloc_logs
 from semloc_logs.errors import LogError
-from semloc_logs.labels.labeller import Labeller
+from semloc_logs.labels.labeller import KeyframeView, Labeller
+from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.logs.problems import Problem, sentences, sorted_problems, to_report
 from semloc_logs.logs.sensors.depth import RangeNoise
@@ -24,7 +25,8 @@ from semloc_logs.mapping.fit.check import SessionFit, check_session
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import check_reach, level
 from semloc_logs.mapping.map_tables import LevelSession, write_map
-from semloc_logs.settings import Resolved
+from semloc_logs.numerics.transforms import apply
+from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.store import pose_columns
@@ -44,6 +46,7 @@ class FuseTask:
     topics: dict[str, str] = field(default_factory=dict)
     fingerprint: str = ""
     poses: TrajectoryFile | None = None
+    mountings: Mountings = NO_MOUNTINGS
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +99,7 @@ def _opened(task: FuseTask) -> Session:
         poses=task.poses,
         odometry=fusion.odometry,
         logs=task.settings.logs,
+        mountings=task.mountings,
     )
     return open_session([*task.logs], options)
 
@@ -112,8 +116,16 @@ def _fused(
             raise LogError(f"{session.name} gave no usable points: {reasons}")
         check_reach(session, collected, fusion.voxel_size)
         check = check_session(session, collected, fusion.voxel_size)
-        labeller.conclude()
         session_T_map, map_T_base = level(session, collected)
+
+        def view(keyframe: int) -> KeyframeView:
+            points, labels, _ = collected.load(keyframe)
+            map_T = map_T_base[keyframe]
+            origin = apply(map_T, collected.origins[keyframe][None])[0]
+            is_posed = collected.poses[keyframe] is not None
+            return KeyframeView(apply(map_T, points), origin, labels, is_posed)
+
+        labeller.conclude(view, fusion.voxel_size / STREET_VOXEL)
         metadata = {
             "schema_version": 1,
             "voxel_size": fusion.voxel_size,

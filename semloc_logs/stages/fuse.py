@@ -13,7 +13,10 @@ from semloc_logs.engines import Engine
 from semloc_logs.errors import LogError, SemlocError
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import content_fingerprint, recover
+from semloc_logs.logs.poses.base_frame import BASE_LINK
+from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings
 from semloc_logs.logs.problems import sentences, to_report
+from semloc_logs.logs.session.lent_transforms import lent_transforms
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask, fuse_session
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import SessionInput, fingerprint_of, recorded_fingerprint
@@ -39,8 +42,10 @@ def fuse(
     """
     report = Report()
     tasks: list[FuseTask] = []
+    logs = [log for session in sessions for log in session.logs]
     for session in sessions:
-        task = _task(session, work.session(session.name), settings)
+        others = [log for log in logs if log not in session.logs]
+        task = _task(session, work.session(session.name), settings, others)
         if not overwrite and recorded_fingerprint(task.folder.session_json) == task.fingerprint:
             report.kept.append(session.name)
             report.skipped += read_json(task.folder.session_json)["skipped"]
@@ -61,13 +66,20 @@ def fuse(
     return report
 
 
-def _task(session: SessionInput, folder: SessionFolder, settings: Resolved) -> FuseTask:
-    """The task of a session, with the fingerprint of all that its tables depend on."""
+def _task(
+    session: SessionInput, folder: SessionFolder, settings: Resolved, others: Sequence[Path]
+) -> FuseTask:
+    """The task of a session, with the fingerprint of all that its tables depend on.
+
+    ``others``: the logs of the other sessions, which may have transforms that this one lacks.
+    """
     for log in session.logs:
         recover(log)
     inputs = [content_fingerprint(log) for log in session.logs]
     if session.poses is not None:
         inputs.append(f"poses {session.poses.fingerprint()}")
+    mountings = _mountings(session, settings, others)
+    inputs += [repr(transform) for transform in mountings.lent]
     fingerprint = fingerprint_of(
         (
             settings.fingerprint("logs", "fusion", "labels"),
@@ -77,7 +89,21 @@ def _task(session: SessionInput, folder: SessionFolder, settings: Resolved) -> F
         )
     )
     logs = tuple(Path(log).absolute() for log in session.logs)
-    return FuseTask(logs, folder, settings, dict(session.topics), fingerprint, session.poses)
+    return FuseTask(
+        logs, folder, settings, dict(session.topics), fingerprint, session.poses, mountings
+    )
+
+
+def _mountings(session: SessionInput, settings: Resolved, others: Sequence[Path]) -> Mountings:
+    child = None
+    if session.poses is not None:
+        child = session.poses.frame or BASE_LINK
+    elif settings.fusion.odometry == "lidar":
+        child = BASE_LINK
+    try:
+        return lent_transforms(session.logs, others, session.topics, child)
+    except SemlocError:
+        return NO_MOUNTINGS  # the task meets the same error, and names it
 
 
 def _fuse_one(task: FuseTask) -> FusedSession | SemlocError:

@@ -24,7 +24,7 @@ from semloc_logs.frames import (
     PoseSample,
     TransformSample,
 )
-from semloc_logs.labels.labeller import Labeller
+from semloc_logs.labels.labeller import KeyframeView, Labeller
 from semloc_logs.logs.log import Message, Reading, Section, Stream
 from semloc_logs.logs.problems import Problem, sentences
 from semloc_logs.logs.session.session import Session
@@ -127,7 +127,7 @@ def classes(frames: Sequence[Frame], **settings: Any) -> tuple[list[list[int]], 
         (labeller.take(c, np.arange(len(c.points))), c.points)
         for c in session.clouds(labeller.on_image, labeller.images)
     ]
-    labeller.conclude()
+    labeller.conclude(lambda i: KeyframeView(taken[i][1], ORIGIN, taken[i][0], False), 1.0)
     json.dumps(labeller.to_json())
     return [
         labeller.labels(i, points, ORIGIN, ids, 1.0).tolist()
@@ -188,6 +188,26 @@ def test_labels_that_are_all_zero_are_none() -> None:
         classes([sweep(10, [0, 0, 0])], source="log")
     with pytest.raises(LogError, match="has no labels"):
         classes([sweep(10)], source="log")
+
+
+def test_ids_that_no_label_space_has_are_not_classes() -> None:
+    numbers = [sweep(10 * k, [101 + k, 230 - k, 77]) for k in range(1, 5)]
+    found, labeller = classes(numbers)
+    assert labeller.source == "geometry"
+    assert labeller.to_json()["spaces"] == {}
+    [problem] = labeller.problems
+    assert problem.assumed
+    assert problem.topic == "/lidar/points"
+    assert problem.text.startswith(
+        "The labels of /lidar/points are not used: 100% of their points have ids that "
+        "semantickitti, the most similar label space, does not have;"
+    )
+    # the user knows better
+    for given in ({"source": "log"}, {"space": "semantickitti"}):
+        found, labeller = classes(numbers, **given)
+        assert labeller.source == "log"
+        assert found == [[255, 255, 255]] * 4
+        assert not any(p.assumed for p in labeller.problems)
 
 
 def test_label_images_are_painted_onto_the_lidar() -> None:
@@ -373,7 +393,7 @@ def test_a_real_drive_without_poses(shared: Callable[[str], Path], tmp_path: Pat
         ids = labeller.take(cloud, np.arange(len(cloud.points)))
     finally:
         session.close()
-    labeller.conclude()
+    labeller.conclude(lambda _: KeyframeView(cloud.points, ORIGIN, ids, False), 1.0)
     found = labeller.labels(0, cloud.points, ORIGIN, ids, 1.0)
     behind = cloud.points[:, 0] < 0
     assert (found[behind] == 255).all()

@@ -7,6 +7,7 @@ import pytest
 from semloc_logs.errors import RoleError
 from semloc_logs.logs.log import Stream
 from semloc_logs.logs.problems import sentences
+from semloc_logs.logs.role_types import no_sensor
 from semloc_logs.logs.roles import Roles, find_roles, guess_roles
 
 CLOUD, IMAGE, JPEG, INFO = (
@@ -289,3 +290,22 @@ def test_foxglove_types() -> None:
         "gnss": ["/gps"],
     }
     assert found.info_of == {"/cam": "/cam_calibration"}
+
+
+def test_a_log_without_range_sensor_is_told_what_it_has() -> None:
+    scan, other = "sensor_msgs/msg/LaserScan", {"/odom": ODOM}
+    assert no_sensor(log({**other, "/scan": scan})) == (
+        "/scan (sensor_msgs/msg/LaserScan) is a 2-D scan, and a 2-D scan cannot be mapped: "
+        "record clouds or depth images."
+    )
+    with pytest.raises(RoleError, match="/scan is a sensor_msgs/msg/LaserScan, and a 2-D scan"):
+        roles({**other, "/scan": scan}, lidar="/scan")
+    # flags are named where a topic of their type is there, and these are accepted
+    assert no_sensor(log(other)).endswith("record clouds or depth images.")
+    mapped = no_sensor(log({**other, "/map_cloud": CLOUD}))
+    assert "--topic lidar=/map_cloud" in mapped
+    assert roles({**other, "/map_cloud": CLOUD}, lidar="/map_cloud").lidar == ("/map_cloud",)
+    pictures = no_sensor(log({**other, "/front/image": IMAGE}))
+    assert "--topic depth=TOPIC" in pictures
+    assert "lidar=" not in pictures
+    assert roles({**other, "/front/image": IMAGE}, depth="/front/image").depth == ("/front/image",)

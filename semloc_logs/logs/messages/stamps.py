@@ -46,6 +46,15 @@ def time_range(start_ns: int | None, end_ns: int | None) -> str:
     return f"{utc(start_ns)} to {utc(end_ns)}"
 
 
+def duration(span_ns: int) -> str:
+    """A span of time for people, in the largest unit that it fills."""
+    seconds = span_ns * 1e-9
+    for unit, length in (("years", 31_557_600), ("days", 86_400), ("hours", 3600), ("min", 60)):
+        if abs(seconds) >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.2f} s"
+
+
 def utc(stamp_ns: int) -> str:
     """A time for people: UTC to the millisecond, or nanoseconds where no calendar has it."""
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
@@ -11,15 +11,20 @@ from typing import Protocol
 import numpy as np
 
 from semloc_logs.errors import LogError
-from semloc_logs.frames import F64, Frame, PoseSample, TransformSample
+from semloc_logs.frames import F64, Frame, Header, PoseSample, TransformSample
+from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings, matrix
 from semloc_logs.logs.poses.pose_stream import FEWEST, PoseStream
 from semloc_logs.logs.poses.publishers import EdgePublishers
 from semloc_logs.logs.poses.tf_tree import Edge, TransformTree, frame_name
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.logs.roles import Roles
+from semloc_logs.logs.topic_pairs import shared
+from semloc_logs.numerics.transforms import inverse
 
 BASE_LINK = "base_link"
+# frames of REP 105, and of LIDAR-inertial odometry, in which the world stands still
+_FIXED_FRAMES = {"map", "odom", "world", "earth", "camera_init"}
 _LATE_TF_NS = 1_000_000_000  # a pose waits so long for the transform that leads to the base frame
 
 
@@ -37,33 +42,54 @@ class BaseFrame:
     problems: tuple[Problem, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class PoseTopic:
+    """The stream that the poses come from, as far as the base frame depends on it.
+
+    ``child``: the frame that it gives the pose of, "" where it names none, None without poses.
+    ``topic``: its name in sentences. ``is_of_sensor``: it stands in the namespace of a range
+    sensor, as the output of the sensor's own SLAM does.
+    """
+
+    child: str | None
+    topic: str
+    is_of_sensor: bool = False
+
+
 def choose_base_frame(
-    tree: TransformTree, sensors: Sequence[str], pose_child: str | None, pose_topic: str | None
+    tree: TransformTree,
+    sensors: Sequence[str],
+    stream: PoseTopic,
+    given: Collection[str] = (),
 ) -> BaseFrame:
     """The base frame: ``base_link`` where TF connects it with a sensor and the pose.
 
-    Else the frame that the pose belongs to; the sensor's own frame where the pose names none
-    (``pose_child`` ""), or without a pose (None). ``sensors``: frame ids of the range
-    sensors, the most important first.
+    Else the frame that the pose belongs to; the sensor's own frame where the pose names none, or
+    without a pose. ``sensors``: frame ids of the range sensors, the most important first.
+    ``given``: frames whose mounting in the base frame the user gave; it is in the tree already.
     """
     sensors = [frame_name(s) for s in sensors]
     reachable = _has_base_link(tree, sensors)
     first = sensors[0] if sensors else (BASE_LINK if reachable else "")
-    if pose_child is None:
+    if stream.child is None:
         return BaseFrame(BASE_LINK if reachable else first, None)
 
-    child = frame_name(pose_child)
+    child = frame_name(stream.child)
     if not child:
-        is_doubtful = reachable and first != BASE_LINK
+        if first in given or not sensors:
+            return BaseFrame(BASE_LINK, BASE_LINK)
+        is_settled = stream.is_of_sensor and not (reachable and first != BASE_LINK)
         return BaseFrame(
-            first, first, problems=(_unnamed_child(pose_topic, first),) if is_doubtful else ()
+            first, first, problems=() if is_settled else (_unnamed_child(first, stream),)
         )
 
     name = BASE_LINK if reachable and tree.connected(BASE_LINK, child) else child
     if not sensors or any(tree.connected(name, s) for s in sensors):
         return BaseFrame(name, child)
+    if first in _FIXED_FRAMES:  # nothing that moves has such a name
+        return BaseFrame(name, child)
     return BaseFrame(
-        child, child, assumed=first, problems=(_unconnected_sensor(first, child, pose_topic),)
+        child, child, assumed=first, problems=(_unconnected_sensor(first, child, stream.topic),)
     )
 
 
@@ -74,20 +100,32 @@ def _has_base_link(tree: TransformTree, sensors: Sequence[str]) -> bool:
     return any(tree.connected(BASE_LINK, sensor) for sensor in sensors)
 
 
-def _unnamed_child(pose_topic: str | None, sensor: str) -> Problem:
+def _unnamed_child(sensor: str, stream: PoseTopic) -> Problem:
+    """The frame of a pose is assumed.
+
+    It cannot be another where the sensor's own SLAM publishes the pose.
+    """
     text = (
-        f"{pose_topic} does not name its child frame: it is taken as the pose of the sensor frame "
-        f"'{sensor}'; record nav_msgs/Odometry with child_frame_id if it is another."
+        f"{stream.topic} does not name the frame whose pose it is: it is taken as the pose of the "
+        f"sensor frame '{sensor}'; where it is another, {_give_mounting(sensor)}."
     )
-    return Problem(pose_topic or "", ProblemKind.POSE, text, lost=False)
+    topic = stream.topic
+    return Problem(topic, ProblemKind.POSE, text, lost=False, assumed=not stream.is_of_sensor)
 
 
-def _unconnected_sensor(sensor: str, child: str, pose_topic: str | None) -> Problem:
+def _unconnected_sensor(sensor: str, child: str, pose_topic: str) -> Problem:
     text = (
         f"No transform connects the sensor frame '{sensor}' with '{child}', the frame of "
-        f"{pose_topic}: they are taken as one; record /tf_static if the sensor sits elsewhere."
+        f"{pose_topic}: they are taken as one; record /tf_static, or {_give_mounting(sensor)}."
     )
-    return Problem("", ProblemKind.TRANSFORM, text, lost=False)
+    return Problem("", ProblemKind.TRANSFORM, text, lost=False, assumed=True)
+
+
+def _give_mounting(sensor: str) -> str:
+    return (
+        f"give the pose of '{sensor}' in the frame of the poses with "
+        f"--set logs.mountings.{sensor}=[x,y,z,qx,qy,qz,qw]"
+    )
 
 
 class PoseSource(Protocol):
@@ -131,7 +169,7 @@ class BasePoses:
     Poses stay raw until :meth:`settle` has chosen the base frame. ``static_count``: static TF
     messages that are still to come, from the log's own statistics; once all have come, no frame
     has to wait for more. ``source`` gives the poses instead of the log's pose topic and TF,
-    ``fallback`` gives them when neither has any.
+    ``fallback`` gives them when neither has any. ``mountings`` are known from the start.
     """
 
     def __init__(
@@ -140,6 +178,7 @@ class BasePoses:
         static_count: int = 0,
         source: PoseSource | None = None,
         fallback: PoseSource | None = None,
+        mountings: Mountings = NO_MOUNTINGS,
     ) -> None:
         self.tree = TransformTree()
         self.track = PoseTrack()
@@ -154,11 +193,17 @@ class BasePoses:
             and roles.pose not in (*roles.tf, *roles.tf_static)
         )
         self._stream = PoseStream(roles.pose or "", roles.pose_frame)
+        self._child: str | None = None  # of the poses of a topic, once the base frame is chosen
         self._publishers = EdgePublishers()
         self._edge: Edge | None = None
         self._raw: deque[tuple[int, F64]] = deque()
         self._static_count = static_count
         self._static_times: set[tuple[str, int]] = set()
+        self._given = mountings.given_poses
+        self._base_T_base_axes = np.eye(4)
+        for edge in (*mountings.own, *mountings.lent):
+            header = Header("", 0, 0, edge.parent)
+            self.tree.add(TransformSample(header, edge.child, matrix(edge.pose), static=True))
 
     @property
     def edge(self) -> Edge | None:
@@ -210,6 +255,13 @@ class BasePoses:
                 return False
             child = self._child_of(edge)
 
+        if edge is not None:
+            fixed = self._fixed_above(edge[0], None)
+        elif kind is not None and self.source is None:
+            fixed = self._fixed_above(kind.parent, kind.child)
+        else:
+            fixed = self._fixed_above(self.session_frame, None)
+        sensors = [s for s in sensors if frame_name(s) not in fixed]
         if not must and not self._is_settled(sensors, child):
             return False
         if not has_pose_stream and edge is None:
@@ -220,6 +272,7 @@ class BasePoses:
             self._follow(edge)
         elif kind is not None and self.source is None:
             self.session_frame = kind.parent
+            self._child = kind.child
             self._raw.extend(self._stream.choose(kind, partial(self._is_connected, sensors)))
         self._pull()
         self._move()
@@ -251,10 +304,13 @@ class BasePoses:
     def _choose(self, sensors: Sequence[str], child: str | None) -> BaseFrame:
         source = self.source
         if source is None:
-            return choose_base_frame(self.tree, sensors, child, self._roles.pose or "TF")
+            topic = self._roles.pose or "TF"
+            is_of_sensor = any(shared(topic, t) for t in self._roles.ranging)
+            stream = PoseTopic(child, topic, is_of_sensor)
+            return self._choose_with_given(sensors, stream)
         self.session_frame = source.session_frame
         if not child:
-            base = choose_base_frame(self.tree, sensors, None, source.name)
+            base = self._choose_with_given(sensors, PoseTopic(None, source.name))
             return replace(base, pose_frame=base.name)
         known = {*self.tree.frames, *map(frame_name, sensors)}
         if frame_name(child) not in known:
@@ -262,7 +318,53 @@ class BasePoses:
                 f"{source.name} gives the poses of '{child}', but the log has no such frame: "
                 f"name one of {', '.join(sorted(known))}."
             )
-        return choose_base_frame(self.tree, sensors, child, source.name)
+        return self._choose_with_given(sensors, PoseTopic(child, source.name))
+
+    def _choose_with_given(self, sensors: Sequence[str], stream: PoseTopic) -> BaseFrame:
+        """The base frame, once the mountings that the user gave are in the tree."""
+        if not self._given:
+            return choose_base_frame(self.tree, sensors, stream)
+        first = frame_name(sensors[0]) if sensors else BASE_LINK
+        if stream.child and not self.tree.connected(BASE_LINK, stream.child):
+            parent = frame_name(stream.child)
+        elif stream.child or first in self._given or stream.child is None:
+            parent = BASE_LINK
+        else:
+            parent = first
+        for frame, pose in self._given.items():
+            if frame == parent:  # measurements in it have axes of their own
+                self._base_T_base_axes = pose
+                continue
+            self.tree.fix(parent, frame, pose)
+        return choose_base_frame(self.tree, sensors, stream, self._given)
+
+    def _fixed_above(self, session_frame: str, child: str | None) -> set[str]:
+        """The frame that the poses of ``child`` are in, and the frames above it."""
+        if not session_frame or session_frame == child:
+            return set()
+        return {session_frame, *self.tree.ancestors(session_frame)} - {child or BASE_LINK}
+
+    def is_given(self, frame_id: str) -> bool:
+        """Whether the user gave the mounting of a frame."""
+        return frame_name(frame_id) in self._given
+
+    def is_fixed(self, frame_id: str) -> bool:
+        """Whether the frame of a cloud is fixed in the world.
+
+        Its points were moved by the poses before they were recorded.
+        """
+        base = self.base
+        frame = frame_name(frame_id)
+        if base is None or base.pose_frame is None or frame in (base.name, base.pose_frame):
+            return False
+        return frame in self._fixed_above(self.session_frame, self._child)
+
+    def _base_T_fixed(self, frame_id: str, stamp_ns: int) -> F64 | None:
+        session_T_base = self.track.at(stamp_ns)
+        session_T_frame = self.tree.lookup(self.session_frame, frame_id, stamp_ns)
+        if session_T_base is None or session_T_frame is None:
+            return None
+        return np.asarray(inverse(session_T_base) @ session_T_frame)
 
     def take_measurement(self, frame: Frame) -> None:
         """A frame of the log that a source may make poses from."""
@@ -292,6 +394,10 @@ class BasePoses:
             return None
         if self.base.assumed is not None and frame_name(frame_id) == self.base.assumed:
             return np.eye(4)
+        if self.is_fixed(frame_id):
+            return self._base_T_fixed(frame_id, stamp_ns)
+        if frame_name(frame_id) == self.base.name:
+            return self._base_T_base_axes
         return self.tree.lookup(self.base.name, frame_id, stamp_ns)
 
     def poses_have_passed(self, stamp_ns: int) -> bool:
@@ -306,12 +412,18 @@ class BasePoses:
         """Whether :meth:`base_T` has its final answer."""
         if self.base is None:
             return False
+        if self.is_fixed(frame_id):
+            return self.poses_have_passed(stamp_ns)
         return frame_name(frame_id) == self.base.assumed or self.tree.has_passed(
             self.base.name, frame_id, stamp_ns
         )
 
     def _pose_edge(self, sensors: Sequence[str]) -> Edge | None:
         frames = [*sensors, BASE_LINK, "base_footprint"]
+        edge = self.tree.pose_edge(BASE_LINK)
+        if edge is not None:  # clouds in a frame above it were moved by the poses already
+            fixed = {edge[0], *self.tree.ancestors(edge[0])}
+            frames = [frame for frame in frames if frame_name(frame) not in fixed]
         return next(
             (edge for frame in frames if (edge := self.tree.pose_edge(frame)) is not None), None
         )

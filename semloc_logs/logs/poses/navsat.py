@@ -242,7 +242,8 @@ class NavSatPoses:
             if self._imu_frame is not None and mounting is None:
                 self._assume(
                     f"No transform leads from '{self._imu_frame}', the IMU's frame, to the base "
-                    f"frame: headings are courses over ground."
+                    f"frame: headings are courses over ground.",
+                    is_harmless=True,
                 )
             force = None if mounting is None else self._force(stamp_ns, mounting)
             yield from self._along_course(stamp_ns, antenna, lever, motion, force)
@@ -285,8 +286,8 @@ class NavSatPoses:
             self._lose(
                 problems,
                 f"The IMU's heading is off the course over ground by "
-                f"{np.degrees(mean_error):.0f} degrees: it is not relative to east (REP 103), or "
-                f"TF turns the IMU; take headings from the course with --topic imu=none.",
+                f"{np.degrees(mean_error):.0f} degrees on average, while REP 103 wants it from "
+                f"east: take headings from the course with --topic imu=none.",
             )
         return [*problems, *self._assumptions]
 
@@ -304,8 +305,14 @@ class NavSatPoses:
     def _lose(self, problems: Problems, text: str) -> None:
         problems.add(text, topic=self.name, kind=ProblemKind.POSE)
 
-    def _assume(self, text: str) -> None:
-        self._assumptions.add(text, topic=self.name, kind=ProblemKind.TRANSFORM, lost=False)
+    def _assume(self, text: str, *, is_harmless: bool = False) -> None:
+        self._assumptions.add(
+            text,
+            topic=self.name,
+            kind=ProblemKind.TRANSFORM,
+            lost=False,
+            assumed=not is_harmless,
+        )
 
     def _lever(self, base_T_antenna: F64 | None, frame_id: str) -> F64:
         """Position (3,) of the antenna in the base frame."""
@@ -313,7 +320,8 @@ class NavSatPoses:
             return base_T_antenna[:3, 3]
         self._assume(
             f"No transform leads from '{frame_id}', the antenna of {self.name}, to the base frame: "
-            f"it is taken to sit there."
+            f"it is taken to sit there; where it sits elsewhere, give its place with "
+            f"--set logs.mountings.{frame_id}=[x,y,z,0,0,0,1]."
         )
         return np.zeros(3)
 

@@ -38,12 +38,24 @@ class TransformTree:
         self._neighbours: dict[str, list[str]] = {}
         self._parents: dict[str, list[str]] = {}
         self._paths: dict[Edge, list[str] | None] = {}
+        self._fixed: set[Edge] = set()
+
+    def fix(self, parent: str, child: str, pose: F64) -> None:
+        """Sets ``parent_T_child`` (4, 4) for good: samples of this edge are ignored from now on."""
+        edge = (frame_name(parent), frame_name(child))
+        self._moving.pop(edge, None)
+        if edge not in self._static:
+            self._connect(*edge)
+        self._static[edge] = pose
+        self._fixed.add(edge)
 
     def add(self, sample: TransformSample) -> None:
         """Takes one edge; dynamic samples of an edge overrule static ones."""
         parent = frame_name(sample.header.frame_id)
         child = frame_name(sample.child_frame_id)
         edge = (parent, child)
+        if edge in self._fixed:
+            return
         is_new = edge not in self._static and edge not in self._moving
         usable = parent and child and parent != child and np.isfinite(sample.frame_T_child).all()
         if not usable or (is_new and len(self._static) + len(self._moving) >= MAX_EDGES):
@@ -55,10 +67,13 @@ class TransformTree:
             self._moving.setdefault(edge, PoseTrack(keep_seconds=HISTORY_SECONDS)).add(sample)
             self._static.pop(edge, None)
         if is_new:
-            self._neighbours.setdefault(parent, []).append(child)
-            self._neighbours.setdefault(child, []).append(parent)
-            self._parents.setdefault(child, []).append(parent)
-            self._paths.clear()
+            self._connect(parent, child)
+
+    def _connect(self, parent: str, child: str) -> None:
+        self._neighbours.setdefault(parent, []).append(child)
+        self._neighbours.setdefault(child, []).append(parent)
+        self._parents.setdefault(child, []).append(parent)
+        self._paths.clear()
 
     @property
     def frames(self) -> list[str]:
@@ -71,6 +86,21 @@ class TransformTree:
         return sorted(
             [(*edge, True) for edge in self._static] + [(*edge, False) for edge in self._moving]
         )
+
+    @property
+    def static_poses(self) -> dict[Edge, F64]:
+        """``parent_T_child`` (4, 4) of the static edges."""
+        return dict(self._static)
+
+    def ancestors(self, frame: str) -> set[str]:
+        """The frames above a frame, along all of its parents."""
+        above: set[str] = set()
+        coming = [frame_name(frame)]
+        while coming:
+            parents = [p for p in self._parents.get(coming.pop(), []) if p not in above]
+            above.update(parents)
+            coming += parents
+        return above
 
     def connected(self, target: str, source: str) -> bool:
         """Whether edges lead from one frame to the other; a frame is connected with itself."""
@@ -137,8 +167,11 @@ class TransformTree:
                 return pose if is_forward else transforms.inverse(pose)
         return None
 
+    def path(self, target: str, source: str) -> list[str] | None:
+        """Frame names from target to source along the fewest edges; None when unconnected."""
+        return self._path(frame_name(target), frame_name(source))
+
     def _path(self, target: str, source: str) -> list[str] | None:
-        """Frame names from target to source along the fewest edges."""
         if target == source:
             return [target]
         if target not in self._neighbours or source not in self._neighbours:

@@ -24,15 +24,20 @@ def sweep_in_base(
     *,
     min_range: float,
     max_range: float,
+    centre: F32 | None = None,
 ) -> tuple[F32, NDArray[np.uint32] | None, bool]:
     """Points (n, 3) of a sweep in the base frame at its stamp, labels, and whether deskewed.
 
     ``poses_at`` gives ``session_T_base`` (m, 4, 4) at stamps (m,) and which of them are known;
     without all of them, or without point times, the sweep stays as it was measured. Points nearer
-    than ``min_range`` or beyond ``max_range`` (m, from the sensor) are dropped.
+    than ``min_range`` or beyond ``max_range`` (m, from the sensor) are dropped. ``centre`` (3,):
+    the sensor in the base frame where it is not the origin of the points.
     """
     with np.errstate(over="ignore"):  # damaged floats may be 1e38
-        rays = frame.points if frame.origin is None else frame.points - frame.origin
+        if centre is not None:
+            rays = in_base(base_T_sensor, frame.points) - centre
+        else:
+            rays = frame.points if frame.origin is None else frame.points - frame.origin
         squared = np.einsum("ni,ni->n", rays, rays)
     kept = (squared >= min_range**2) & (squared <= max_range**2)
     points = frame.points[kept]

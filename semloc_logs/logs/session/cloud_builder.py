@@ -10,19 +10,23 @@ from semloc_logs.frames import (
     F32,
     F64,
     DepthFrame,
+    Header,
     ImageFrame,
     LabelForm,
     LidarFrame,
     PosedCloud,
 )
-from semloc_logs.logs.poses.base_frame import BasePoses
+from semloc_logs.logs.poses.base_frame import BASE_LINK, BasePoses
 from semloc_logs.logs.poses.standstill import Standstill
+from semloc_logs.logs.poses.tf_tree import frame_name
 from semloc_logs.logs.problems import NoCloud
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors.camera_clouds import CameraClouds
 from semloc_logs.logs.sensors.sweeps import in_base, sweep_in_base
 from semloc_logs.logs.session.duplicate_topics import DuplicateTopics
 from semloc_logs.logs.session.frame_queue import RangeFrame
+
+_LOOKS_UP = 0.7  # height of a unit vector: no vehicle's camera looks up by more than 45 degrees
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +39,24 @@ class RangeLimits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """Poses at the time of a frame: ``base_T_sensor`` (4, 4) and ``session_T_base`` or None."""
+    """Poses at the time of a frame: ``base_T_sensor`` (4, 4) and ``session_T_base`` or None.
+
+    ``is_fixed``: the frame of the points is fixed in the world, not a sensor's; the poses have
+    been applied to them already.
+    """
 
     base_T_sensor: F64
     session_T_base: F64 | None
+    is_fixed: bool = False
 
 
 class CloudBuilder:
     """Makes clouds of the points within ``limits``; ``duplicates`` finds topics that repeat others.
 
     ``sensors``: the last ``base_T_sensor`` (4, 4) of each frame id that gave a cloud; ``deskewed``:
-    sweeps freed of the vehicle's motion.
+    sweeps freed of the vehicle's motion; ``fixed``: frame by topic of clouds whose frame is fixed
+    in the world; ``looks_up``: frame by topic of pictures that look up by their transform;
+    ``is_base``: of pictures in the base frame that is not called optical.
     """
 
     def __init__(
@@ -58,6 +69,9 @@ class CloudBuilder:
     ) -> None:
         self.sensors: dict[str, F64] = {}
         self.deskewed = 0
+        self.fixed: dict[str, str] = {}
+        self.looks_up: dict[str, str] = {}
+        self.is_base: dict[str, str] = {}
         self.standstill = Standstill()
         self.duplicates = duplicates
         self._roles = roles
@@ -80,8 +94,13 @@ class CloudBuilder:
             return cloud
         if not len(cloud.points):
             return NoCloud.NO_POINTS
+        if not isinstance(frame, LidarFrame):
+            self._see_axes(header, place.base_T_sensor)
 
-        self.sensors[header.frame_id] = place.base_T_sensor
+        if place.is_fixed:
+            self.fixed[header.topic] = header.frame_id
+        else:
+            self.sensors[header.frame_id] = place.base_T_sensor
         pose = place.session_T_base
         is_main = header.topic == self._roles.ranging[0]
         if pose is not None and is_main and not self._poses.track.moves:
@@ -94,17 +113,35 @@ class CloudBuilder:
         base = self._poses.base
         if base is None:
             return NoCloud.NO_POSE
+        is_fixed = self._poses.is_fixed(header.frame_id)
         base_T_sensor = self._poses.base_T(header.frame_id, header.stamp_ns)
-        if base_T_sensor is None:
-            return NoCloud.NO_TRANSFORM
-        if base.pose_frame is None:
+        if base_T_sensor is None and not is_fixed:
+            is_connected = self._poses.tree.connected(base.name, header.frame_id)
+            return NoCloud.TRANSFORM_GAP if is_connected else NoCloud.NO_TRANSFORM
+        if base.pose_frame is None and base_T_sensor is not None:
             return _Place(base_T_sensor, None)
 
         # before the poses have come so far, it is unknown whether the frame lies in a gap: the
         # nearest pose serves at the end only
         is_known = is_end or self._poses.poses_have_passed(header.stamp_ns)
         pose = self._poses.track.at(header.stamp_ns) if is_known else None
-        return NoCloud.NO_POSE if pose is None else _Place(base_T_sensor, pose)
+        if pose is None:
+            return NoCloud.NO_POSE
+        if base_T_sensor is None:
+            return NoCloud.TRANSFORM_GAP
+        return _Place(base_T_sensor, pose, is_fixed)
+
+    def _see_axes(self, header: Header, base_T_sensor: F64) -> None:
+        """Notices pictures whose frame may have the axes of a body (REP 103: x forward)."""
+        base = self._poses.base
+        frame = frame_name(header.frame_id)
+        if base is None or "optical" in frame or self._poses.is_given(frame):
+            return
+        if frame in (base.name, base.assumed):
+            if base.pose_frame is not None:
+                self.is_base[header.topic] = frame
+        elif base.name == BASE_LINK and base_T_sensor[2, 2] > _LOOKS_UP:
+            self.looks_up[header.topic] = frame
 
     def _sweep(self, sweep: LidarFrame, place: _Place) -> PosedCloud | NoCloud:
         header = sweep.header
@@ -112,10 +149,12 @@ class CloudBuilder:
             header.topic, header.stamp_ns, in_base(place.base_T_sensor, sweep.points)
         ):
             return NoCloud.DUPLICATE
+        has_motion = place.session_T_base is not None and not place.is_fixed
         points, label, is_deskewed = sweep_in_base(
             sweep,
             place.base_T_sensor,
-            None if place.session_T_base is None else self._poses.track.at_many,
+            self._poses.track.at_many if has_motion else None,
+            centre=_origin(place) if place.is_fixed else None,
             min_range=self._limits.nearest,
             max_range=self._limits.farthest,
         )
@@ -146,7 +185,12 @@ class CloudBuilder:
 
 
 def _origin(place: _Place, in_sensor: F32 | None = None) -> F32:
-    """The sensor's centre (3,) in the base frame, where ``in_sensor`` (3,) is it in its frame."""
+    """The sensor's centre (3,) in the base frame, where ``in_sensor`` (3,) is it in its frame.
+
+    The base where the points do not come in the frame of their sensor.
+    """
+    if place.is_fixed:
+        return np.zeros(3, np.float32)
     if in_sensor is not None:
         return in_base(place.base_T_sensor, in_sensor[None]).reshape(3)
     return place.base_T_sensor[:3, 3].astype(np.float32)

@@ -413,8 +413,12 @@ class _Inspection:
         obstacles = list(roles.problems)
         if not roles.ranging:
             obstacles.append(_obstacle("", ProblemKind.ROLE, no_sensor(self._log.streams)))
-        if not len(self._poses.track) and not roles.problems:
+        base = self._poses.base
+        if base is not None and base.pose_frame is None and not roles.problems:
             obstacles.append(no_poses())
+        elif not len(self._poses.track) and not roles.problems:
+            text = f"{roles.pose or 'TF'} gave no usable pose."
+            obstacles.append(_obstacle(roles.pose or "", ProblemKind.POSE, text))
         for topic, count in sorted(self._empty.items()):
             clouds = f"{count} cloud{'s' if count > 1 else ''}"
             text = f"{topic}: no point with a position in the first {clouds}."
@@ -530,6 +534,7 @@ class _Inspection:
             base is not None
             and not self._poses.tree.connected(base.name, frame_id)
             and base.assumed != frame_id.lstrip("/")
+            and not self._poses.is_fixed(frame_id)
         ):
             text = (
                 f"No transform leads from '{frame_id}', the frame of {topic}, to the base frame "
@@ -543,8 +548,8 @@ class _Inspection:
         if not start_ns - _OTHER_CLOCK_NS < stamp_ns < end_ns + _OTHER_CLOCK_NS:
             text = (
                 f"{topic} starts at {utc(stamp_ns)} but the poses cover "
-                f"{time_range(start_ns, end_ns)}: their header stamps come from different clocks; "
-                f"record both with the same."
+                f"{time_range(start_ns, end_ns)}: frames without a pose are left out; where the "
+                f"clocks differ, give --set logs.time_offset.{topic}=SECONDS."
             )
             yield _obstacle(topic, ProblemKind.POSE, text)
 

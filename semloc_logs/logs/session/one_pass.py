@@ -109,12 +109,12 @@ class CloudPass:
 
     def _take_range(self, frame: RangeFrame) -> None:
         topic = frame.header.topic
-        self.tally.saw(topic, frame.header.stamp_ns)
+        self.tally.saw(topic)
         self.poses.take_measurement(frame)
         if isinstance(frame, LidarFrame):
             self.tally.measured(frame)
             if not len(frame.points):
-                self.tally.leave_out(topic, NoCloud.EMPTY)
+                self.tally.leave_out(frame.header, NoCloud.EMPTY)
                 return
         self.waiting.add(frame)
 
@@ -132,7 +132,7 @@ class CloudPass:
             frame, is_set_back = self.waiting.pop()
             cloud = self.builder.cloud(frame, is_end=is_end, is_set_back=is_set_back)
             if isinstance(cloud, NoCloud):
-                self.tally.leave_out(frame.header.topic, cloud)
+                self.tally.leave_out(frame.header, cloud)
             else:
                 self.tally.used[frame.header.topic] += 1
                 yield cloud

@@ -19,6 +19,35 @@ def no_poses() -> Problem:
     return Problem("", ProblemKind.POSE, text, lost=False)
 
 
+def clouds_in_fixed_frame(topic: str, frame: str, pose_topic: str) -> Problem:
+    """Clouds that the poses were applied to before they were recorded; nothing is lost by that."""
+    text = (
+        f"{topic} is in '{frame}', the frame that the poses of {pose_topic} are in: its points are "
+        f"moved back by the pose of their stamp, and seen from the origin of the base frame."
+    )
+    return Problem(topic, ProblemKind.TRANSFORM, text, lost=False)
+
+
+def looks_up(topic: str, frame: str) -> Problem:
+    """Pictures whose axes may be wrong: by TF they look up, as if their frame were a body's."""
+    text = (
+        f"The z axis of '{frame}', along which the pictures of {topic} look, points up in "
+        f"'base_link': this is taken as it is; where '{frame}' is not the optical frame, give the "
+        f"pose of the optical frame with --set logs.mountings.{frame}=[x,y,z,qx,qy,qz,qw]."
+    )
+    return Problem(topic, ProblemKind.TRANSFORM, text, lost=False, assumed=True)
+
+
+def optical_base(topic: str, frame: str) -> Problem:
+    """Pictures in the frame of the poses, whose axes the log does not tell."""
+    text = (
+        f"The poses are taken as poses of the optical frame (z forward) of {topic}, because its "
+        f"frame is '{frame}', too; where '{frame}' has other axes, give the pose of the optical "
+        f"frame in it with --set logs.mountings.{frame}=[x,y,z,qx,qy,qz,qw]."
+    )
+    return Problem(topic, ProblemKind.TRANSFORM, text, lost=False, assumed=True)
+
+
 def refused_poses(topic: str, track: PoseTrack, *, lost: bool) -> list[Problem]:
     """Poses whose stamps make no sense; empty when all is well."""
     kinds = (
@@ -34,10 +63,13 @@ def refused_poses(topic: str, track: PoseTrack, *, lost: bool) -> list[Problem]:
 
 
 def invalid_poses(topic: str, track: PoseTrack) -> list[Problem]:
-    """Poses that are not rigid transforms; empty when all is well."""
+    """Poses that cannot be calculated with; empty when all is well."""
     if not track.invalid:
         return []
-    text = f"{track.invalid} poses are not rigid transforms and were left out."
+    text = (
+        f"{topic}: {track.invalid} poses were left out: they are not rigid transforms within "
+        f"100,000 km, or their stamps lie outside of the years 1933 to 2116."
+    )
     return [Problem(topic, ProblemKind.POSE, text, lost=True)]
 
 

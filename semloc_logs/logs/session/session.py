@@ -6,7 +6,7 @@ Memory is bounded, whatever the length of the logs.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +21,7 @@ from semloc_logs.logs.log import Log, Stream
 from semloc_logs.logs.poses.base_frame import BasePoses, PoseSource
 from semloc_logs.logs.poses.imu_gravity import up_in_base, up_in_session
 from semloc_logs.logs.poses.lidar_odometry import LidarOdometry
+from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings
 from semloc_logs.logs.poses.navsat import navsat_poses
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.poses.trajectory_file import FilePoses, TrajectoryFile
@@ -51,7 +52,7 @@ class SessionOptions:
     pictures n-fold; None: 2 above 200,000 pixels, stereo pictures stay as they are up to half a
     million. ``noise``: how uncertain their ranges are. ``poses`` is a file of poses, and
     ``odometry`` "lidar" makes poses from the sweeps: either replaces the poses of the log.
-    ``logs``: the settings of reading.
+    ``logs``: the settings of reading; ``mountings``: static transforms from elsewhere.
     """
 
     topics: Mapping[str, str] = field(default_factory=dict)
@@ -62,6 +63,7 @@ class SessionOptions:
     poses: TrajectoryFile | None = None
     odometry: Literal["none", "lidar"] = "none"
     logs: Logs = field(default_factory=Logs)
+    mountings: Mountings = NO_MOUNTINGS
 
 
 def open_session(paths: Sequence[Path], options: SessionOptions | None = None) -> Session:
@@ -157,6 +159,7 @@ class Session:
                 *without_loss_of(unused, self._log_problems()),
                 *self._pass.cameras.problems,
                 *(base.problems if base else ()),
+                *self._options.mountings.problems,
                 *self.roles.notes,
                 *self._conclusion,
             ]
@@ -310,7 +313,8 @@ class Session:
         navsat = navsat_poses(roles, self.streams)
         # fixes that are named as the pose topic are not only a fallback
         named = navsat if roles.pose is not None else None
-        poses = BasePoses(roles, static_count, self._pose_source() or named, navsat)
+        mountings = replace(options.mountings, given=options.logs.mountings)
+        poses = BasePoses(roles, static_count, self._pose_source() or named, navsat, mountings)
         cameras = CameraClouds(
             roles,
             poses.tree.lookup,

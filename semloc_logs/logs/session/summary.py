@@ -6,9 +6,12 @@ from semloc_logs.logs.problems import Problem
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.pose_problems import (
+    clouds_in_fixed_frame,
     invalid_poses,
+    looks_up,
     never_moves,
     no_poses,
+    optical_base,
     refused_poses,
     smeared,
 )
@@ -22,10 +25,16 @@ def conclude(done: CloudPass, roles: Roles) -> list[Problem]:
     builder = done.builder
     name = poses.source.name if poses.source else roles.pose or "TF"
 
+    done.tally.explain(track)
     problems = stamp_problems(done.stamp_offsets, roles, poses, done.relay.topics)
-    problems += done.tally.problems((track.start_ns, track.end_ns))
+    problems += done.tally.problems(track, poses.base.name if poses.base else "")
+    problems += [
+        clouds_in_fixed_frame(topic, frame, name) for topic, frame in sorted(builder.fixed.items())
+    ]
     if builder.duplicates is not None:
         problems += builder.duplicates.problems()
+    problems += [looks_up(*item) for item in sorted(builder.looks_up.items())]
+    problems += [optical_base(*item) for item in sorted(builder.is_base.items())]
     problems += poses.problems
     problems += invalid_poses(name, track)
     if poses.source is not None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 
-from semloc_logs.frames import LidarFrame, PointTimeRemark
-from semloc_logs.logs.messages.stamps import time_range
+from semloc_logs.frames import Header, LidarFrame, PointTimeRemark
+from semloc_logs.logs.messages.stamps import duration, time_range, utc
+from semloc_logs.logs.poses.tf_tree import frame_name
+from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import NoCloud, Problem, ProblemKind
 
 _REMARKS = {
@@ -20,27 +23,93 @@ _REMARKS = {
 }
 
 
+@dataclass(slots=True)
+class _LeftOut:
+    """Frames of a topic that one reason leaves out: frame id of the first, range of stamps."""
+
+    frame_id: str
+    first_ns: int
+    last_ns: int
+    count: int = 0
+
+    def add(self, stamp_ns: int) -> None:
+        """Counts one more."""
+        self.count += 1
+        self.first_ns = min(self.first_ns, stamp_ns)
+        self.last_ns = max(self.last_ns, stamp_ns)
+
+    def sentence(self, topic: str, reason: NoCloud, track: PoseTrack, base: str) -> str:
+        """The end of a sentence, with the facts about these frames."""
+        start_ns = self.first_ns if track.start_ns is None else track.start_ns
+        end_ns = self.last_ns if track.end_ns is None else track.end_ns
+        return reason.because.format(
+            topic=topic,
+            frame=frame_name(self.frame_id),
+            base=base,
+            frames=time_range(self.first_ns, self.last_ns),
+            start=utc(start_ns),
+            end=utc(end_ns),
+            before=duration(start_ns - self.first_ns),
+            after=duration(self.last_ns - end_ns),
+            gaps=self._gaps(track),
+        )
+
+    def _gaps(self, track: PoseTrack) -> str:
+        """The gaps of the poses between the first and the last of these frames."""
+        gaps = [
+            end_ns - start_ns
+            for start_ns, end_ns in track.gaps()
+            if start_ns <= self.last_ns and self.first_ns <= end_ns
+        ]
+        longest = duration(max(gaps, default=0))
+        return f"a gap of {longest}" if len(gaps) == 1 else f"{len(gaps)} gaps of up to {longest}"
+
+
+def _why_no_pose(stamp_ns: int, track: PoseTrack) -> NoCloud:
+    """Why no pose was known at a time; ``track`` is complete by now."""
+    if track.start_ns is None or track.end_ns is None:
+        return NoCloud.NO_POSES
+    if track.at(stamp_ns) is not None:
+        return NoCloud.LATE_POSE
+    if stamp_ns < track.start_ns:
+        return NoCloud.BEFORE_POSES
+    return NoCloud.AFTER_POSES if stamp_ns > track.end_ns else NoCloud.POSE_GAP
+
+
 class Tally:
     """Frames seen, used and left out by topic and reason."""
 
     def __init__(self) -> None:
         self.seen: Counter[str] = Counter()
         self.used: Counter[str] = Counter()
-        self._left_out: Counter[tuple[str, NoCloud]] = Counter()
-        self._spans: dict[str, tuple[int, int]] = {}
+        self._left_out: dict[tuple[str, NoCloud], _LeftOut] = {}
+        self._without_pose: list[Header] = []
         self._points: Counter[str] = Counter()
         self._lost_points: Counter[str] = Counter()
         self._remarks: Counter[tuple[str, PointTimeRemark]] = Counter()
 
-    def saw(self, topic: str, stamp_ns: int) -> None:
+    def saw(self, topic: str) -> None:
         """Counts a frame."""
         self.seen[topic] += 1
-        first, last = self._spans.get(topic, (stamp_ns, stamp_ns))
-        self._spans[topic] = (min(first, stamp_ns), max(last, stamp_ns))
 
-    def leave_out(self, topic: str, reason: NoCloud) -> None:
+    def leave_out(self, header: Header, reason: NoCloud) -> None:
         """Counts a frame that gives no cloud."""
-        self._left_out[topic, reason] += 1
+        left_out = self._left_out.setdefault(
+            (header.topic, reason), _LeftOut(header.frame_id, header.stamp_ns, header.stamp_ns)
+        )
+        left_out.add(header.stamp_ns)
+        if reason is NoCloud.NO_POSE:
+            self._without_pose.append(header)
+
+    def explain(self, track: PoseTrack) -> None:
+        """Tells why poses are missing, once all poses of the ``track`` have come."""
+        for topic, reason in list(self._left_out):
+            if reason is NoCloud.NO_POSE:
+                del self._left_out[topic, reason]
+        waiting = self._without_pose
+        self._without_pose = []
+        for header in waiting:
+            self.leave_out(header, _why_no_pose(header.stamp_ns, track))
 
     def measured(self, frame: LidarFrame) -> None:
         """Counts the points of a sweep, and the remark on it."""
@@ -52,27 +121,31 @@ class Tally:
 
     def left_out(self, topic: str) -> dict[str, int]:
         """Key of each reason -> frames of ``topic``."""
-        counts = {reason.key: n for (other, reason), n in self._left_out.items() if other == topic}
+        counts = {
+            reason.key: left_out.count
+            for (other, reason), left_out in self._left_out.items()
+            if other == topic
+        }
         return dict(sorted(counts.items()))
 
-    def problems(self, poses: tuple[int | None, int | None]) -> list[Problem]:
+    def problems(self, track: PoseTrack, base: str) -> list[Problem]:
         """One problem for each topic and reason: lost frames, lost points, unusual point times.
 
-        ``poses``: the first and last stamp of the pose stream.
+        ``track``: the poses; ``base``: name of the base frame.
         """
-        return [*self._lost_frames(poses), *self._not_finite(), *self._unusual_times()]
+        return [*self._lost_frames(track, base), *self._not_finite(), *self._unusual_times()]
 
-    def _lost_frames(self, poses: tuple[int | None, int | None]) -> list[Problem]:
+    def _lost_frames(self, track: PoseTrack, base: str) -> list[Problem]:
         problems = []
-        for (topic, reason), count in sorted(
+        for (topic, reason), left_out in sorted(
             self._left_out.items(), key=lambda item: (item[0][0], item[0][1].key)
         ):
             if reason is NoCloud.DUPLICATE:
                 continue
-            because = reason.because.format(
-                frames=time_range(*self._spans[topic]), poses=time_range(*poses)
+            because = left_out.sentence(topic, reason, track, base)
+            text = (
+                f"{topic}: {left_out.count} of {self.seen[topic]} frames are left out: {because}."
             )
-            text = f"{topic}: {count} of {self.seen[topic]} frames are left out: {because}."
             problems.append(Problem(topic, ProblemKind.FRAME, text, lost=True))
         return problems
 

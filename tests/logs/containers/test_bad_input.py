@@ -279,10 +279,11 @@ def test_sweeps_with_impossible_times_are_counted(recorder: Any) -> None:
         log.cloud("/points", stamp, "lidar", rows(), late_ns=EPOCH + k * S // 5 - stamp)
     clouds, session = all_of(log)
     assert len(clouds) == 5
-    [sentence] = sentences(lost(session.problems))
-    assert sentence.startswith(
-        "/points: 3 of 8 frames are left out: no pose is known at their time"
-    )
+    after, before = sentences(lost(session.problems))
+    assert after.startswith("/points: 1 of 8 frames are left out: their stamps (2036-07-18")
+    assert "after the last pose (2023-11-14" in after
+    assert before.startswith("/points: 2 of 8 frames are left out: their stamps (1970-01-01")
+    assert "begin 53.9 years before the first pose (2023-11-14" in before
 
 
 def test_a_clock_that_is_set_back(recorder: Any) -> None:
@@ -308,9 +309,9 @@ def test_poses_that_stop(recorder: Any) -> None:
     clouds, session = all_of(log)
     assert 10 <= len(clouds) <= 12
     assert sentences(lost(session.problems))[0].startswith(
-        f"/points: {40 - len(clouds)} of 40 frames are left out: no pose is known "
-        f"at their time (frames 2023"
+        f"/points: {40 - len(clouds)} of 40 frames are left out: their stamps (2023"
     )
+    assert "after the last pose (2023-11-14T22:13:20.950Z)" in sentences(lost(session.problems))[0]
 
 
 def test_one_bad_transform_does_not_cost_its_message(recorder: Any) -> None:

@@ -118,7 +118,7 @@ def test_a_missing_extrinsic_costs_one_lidar_and_one_sentence(recorder: Any) -> 
     [sentence] = sentences(lost(session.problems))
     assert sentence.startswith(
         "/rear/points: 8 of 8 frames are left out: no transform leads from their "
-        "frame to the base frame"
+        "frame 'rear' to the base frame 'base_link'"
     )
 
 

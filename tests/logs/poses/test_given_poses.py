@@ -148,10 +148,11 @@ def test_a_file_that_covers_part_of_the_log(tmp_path: Path) -> None:
     stamps = [c.header.stamp_ns - EPOCH for c in clouds]
     # the nearest pose serves a tenth of a second
     assert (min(stamps), max(stamps)) == (19 * S // 10, 41 * S // 10)
-    assert any(
-        "77 of 100 frames are left out: no pose is known" in problem
-        for problem in sentences(lost(session.problems))
-    )
+    after, before = sentences(lost(session.problems))
+    assert after.startswith("/points: 58 of 100 frames are left out: their stamps")
+    assert "after the last pose" in after
+    assert before.startswith("/points: 19 of 100 frames are left out: their stamps")
+    assert "begin 2.00 s before the first pose" in before
 
 
 def test_the_logs_own_poses_are_not_used_beside_a_file(tmp_path: Path) -> None:
@@ -260,7 +261,7 @@ def test_a_jump_ends_the_poses_and_is_named(engine: Any) -> None:
         for problem in sentences(lost(session.problems))
     )
     assert any(
-        "13 of 20 frames are left out: no pose" in problem
+        "13 of 20 frames are left out: their stamps" in problem and "after the last pose" in problem
         for problem in sentences(lost(session.problems))
     )
 

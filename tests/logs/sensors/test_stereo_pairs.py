@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F64, Camera, Header, ImageFrame, PosedCloud
+from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import NoCloud, lost, sentences
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.sensors import stereo_pairs
@@ -139,9 +140,9 @@ def test_why_a_pair_gives_nothing(
     assert stereo.points(picture(LEFT, 0), 0.3, 20.0) == reason
     assert len(sentences(stereo.problems)) == (reason is NoCloud.UNUSABLE_PAIR)
     tally = Tally()
-    tally.saw(LEFT, 0)
-    tally.leave_out(LEFT, reason)
-    [sentence] = sentences(tally.problems((None, None)))
+    tally.saw(LEFT)
+    tally.leave_out(picture(LEFT, 0).header, reason)
+    [sentence] = sentences(tally.problems(PoseTrack(), "base_link"))
     assert sentence.startswith(f"{LEFT}: 1 of 1 frames are left out: ")
 
 

@@ -100,9 +100,9 @@ def test_range_limits_and_labels_go_together() -> None:
 def test_ranges_are_from_the_sensor_where_it_is_not_at_the_origin_of_its_frame() -> None:
     points = np.array([[10, 0, 0], [13, 0, 0], [0.1, 0, 0]], np.float32)
     header = Header("/l", STAMP, STAMP, "lidar")
-    limits = {"min_range": 0.5, "max_range": 4.0}
     frame = LidarFrame(header, points, origin=np.array([9.8, 0, 0], np.float32))
-    kept, _, _ = sweep_in_base(frame, np.eye(4), None, **limits)
+    kept, _, _ = sweep_in_base(frame, np.eye(4), None, min_range=0.5, max_range=4.0)
     assert kept.tolist() == [[13, 0, 0]]
-    kept, _, _ = sweep_in_base(LidarFrame(header, points), np.eye(4), None, **limits)
+    frame = LidarFrame(header, points)
+    kept, _, _ = sweep_in_base(frame, np.eye(4), None, min_range=0.5, max_range=4.0)
     assert len(kept) == 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from semloc_logs.frames import (
     TransformSample,
 )
 from semloc_logs.logs.log import Message, Reading, Section, Stream
+from semloc_logs.logs.poses.mountings import Mountings, StaticTransform
 from semloc_logs.logs.problems import Problem, ProblemKind, lost, sentences
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.numerics.transforms import Array, rotation_angle, yaw_transform
@@ -184,8 +185,38 @@ def test_a_gap_in_the_poses_costs_its_frames_and_a_sentence() -> None:
     clouds = list(session.clouds())
     assert len(clouds) == 201  # the frames at both edges of the gap have a pose of their own
     assert session._pass.waiting.nbytes == 0
-    assert len(sentences(lost(session.problems))) == 1
-    assert "/points: 99 of 300 frames are left out: no pose" in sentences(lost(session.problems))[0]
+    assert sentences(lost(session.problems)) == [
+        "/points: 99 of 300 frames are left out: the poses have a gap of 10.00 s between their "
+        "stamps (2023-11-14T22:13:30.100Z to 2023-11-14T22:13:39.900Z)."
+    ]
+
+
+def test_why_a_pose_is_missing_is_told_by_the_whole_stream() -> None:
+    mount = static("base_link", "lidar", MOUNT)
+    sweeps = [sweep(0.1 * k) for k in range(100)]
+
+    def reason(poses: Iterable[Frame]) -> str:
+        session = Session([FakeLog([mount, *sweeps, *poses])])
+        list(session.clouds())
+        [problem] = [p for p in sentences(session.problems) if p.startswith("/points")]
+        return problem.partition("left out: ")[2]
+
+    begins = reason(odometry(4.0 + 0.1 * k) for k in range(70))
+    assert begins.startswith("their stamps (2023-11-14T22:13:20.000Z to 2023-11-14T22:13:23.800Z)")
+    assert "begin 4.00 s before the first pose (2023-11-14T22:13:24.000Z)" in begins
+    ends = reason(odometry(0.1 * k) for k in range(41))
+    assert "end 5.90 s after the last pose (2023-11-14T22:13:24.000Z)" in ends
+    gaps = reason(odometry(0.1 * k) for k in range(101) if k % 50 < 30)
+    assert gaps.startswith("the poses have 2 gaps of up to 2.10 s between their stamps")
+    # a clock that starts at 0, recorded at the same time
+    other = reason(
+        PoseSample(header("/odom", -1.7e9 + 0.1 * k, "odom", 1.7e9), "base_link", np.eye(4))
+        for k in range(100)
+    )
+    assert "end 53.9 years after the last pose (1970-01-01T00:00:09.900Z)" in other
+    # recorded when 64 frames are waiting: not a gap, and not before the poses
+    late = reason(odometry(0.1 * k, late=8.0) for k in range(100))
+    assert "were recorded later than frames can wait" in late
 
 
 def test_poses_that_start_late_and_a_clock_of_its_own() -> None:
@@ -246,8 +277,145 @@ def test_an_unconnected_sensor_is_taken_as_the_base_with_a_problem() -> None:
     clouds = list(session.clouds())
     assert len(clouds) == 3
     np.testing.assert_allclose(clouds[0].points, sweep(0).points)
-    assert any("'lidar' with 'base_link'" in problem for problem in sentences(session.problems))
-    assert lost(session.problems) == []
+    [problem] = session.problems
+    assert "'lidar' with 'base_link'" in problem.text
+    assert problem.assumed
+    assert not problem.lost
+
+
+def test_the_user_gives_a_missing_mounting() -> None:
+    frames: list[Frame] = [
+        *[sweep(0.1 * k) for k in range(3)],
+        *[sweep(0.1 * k, "/rear", "/rear") for k in range(3)],
+        *[odometry(0.1 * k) for k in range(4)],
+    ]
+    turned = (1.0, 0.0, 2.0, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+    logs = Logs(mountings={"lidar": turned, "rear": (-1.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0)})
+    session = Session([FakeLog(frames)], SessionOptions(logs=logs))
+    clouds = {cloud.header.topic: cloud for cloud in session.clouds()}
+    np.testing.assert_allclose(clouds["/points"].points, [[1, 5, 2], [-6, 0, 2]], atol=1e-6)
+    np.testing.assert_allclose(clouds["/rear"].points, [[4, 0, 2], [-1, 7, 2]], atol=1e-6)
+    assert session.base_frame == "base_link"
+    assert session.problems == []
+
+
+def test_a_given_mounting_overrules_the_log() -> None:
+    frames: list[Frame] = [static("base_link", "lidar", MOUNT), sweep(0.0), sweep(0.1)]
+    frames += [odometry(0.1 * k) for k in range(4)]
+    logs = Logs(mountings={"lidar": (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)})
+    clouds = list(Session([FakeLog(frames)], SessionOptions(logs=logs)).clouds())
+    np.testing.assert_allclose(clouds[1].points, [[5, 0, 1], [0, 7, 1]], atol=1e-6)
+
+
+def depth_frames(frame_id: str) -> list[Frame]:
+    """A wall 2 m in front of a camera of 4 x 4 pixels, and poses of base_link."""
+    K = np.array([[4.0, 0, 1.5], [0, 4, 1.5], [0, 0, 1]])
+    camera = Camera(
+        header("/camera/camera_info", 0.0, frame_id),
+        4,
+        4,
+        K,
+        np.zeros(5),
+        np.eye(3),
+        np.zeros((3, 4)),
+        "plumb_bob",
+    )
+    frames: list[Frame] = [camera]
+    for k in range(3):
+        depth = np.full((4, 4), 2.0, np.float32)
+        frames.append(DepthFrame(header("/camera/depth/image", 0.1 * k, frame_id), depth))
+        frames.append(odometry(0.1 * k))
+    return frames
+
+
+def axes_problems(frames: Sequence[Frame], **mountings: tuple[float, ...]) -> list[Problem]:
+    session = Session([FakeLog(frames)], SessionOptions(logs=Logs(mountings=mountings)))
+    assert len(list(session.clouds())) == 3
+    return session.problems
+
+
+OPTICAL = np.array([[0.0, 0, 1, 0.5], [-1, 0, 0, 0], [0, -1, 0, 1], [0, 0, 0, 1]])
+OPTICAL_POSE = (0.5, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5)
+
+
+def test_a_depth_image_in_a_body_frame_is_an_assumption() -> None:
+    right = static("base_link", "camera_link", OPTICAL)
+    assert axes_problems([right, *depth_frames("camera_link")]) == []
+    body = static("base_link", "camera_link", yaw_transform(0.0, (0.5, 0.0, 1.0)))
+    [problem] = axes_problems([body, *depth_frames("camera_link")])
+    assert problem.assumed
+    assert "The z axis of 'camera_link', along which the pictures of" in problem.text
+    assert axes_problems([body, *depth_frames("camera_link")], camera_link=OPTICAL_POSE) == []
+
+
+def test_a_depth_image_in_the_base_frame_is_an_assumption_unless_it_is_called_optical() -> None:
+    [problem] = axes_problems(depth_frames("base_link"))
+    assert problem.assumed
+    assert "taken as poses of the optical frame (z forward) of /camera/depth/image" in problem.text
+    assert axes_problems(depth_frames("base_link"), base_link=OPTICAL_POSE) == []
+    session = Session(
+        [FakeLog(depth_frames("base_link"))],
+        SessionOptions(logs=Logs(mountings={"base_link": OPTICAL_POSE})),
+    )
+    # 2 m in front of the camera, which looks along x from (0.5, 0, 1)
+    points = next(session.clouds()).points
+    np.testing.assert_allclose(points[:, 0], 2.5, atol=1e-6)
+
+
+def test_transforms_of_another_log_hold_until_the_log_has_its_own() -> None:
+    frames: list[Frame] = [*[sweep(0.1 * k) for k in range(3)]]
+    frames += [odometry(0.1 * k) for k in range(4)]
+    note = Problem("", ProblemKind.TRANSFORM, "from part_0.mcap", lost=False)
+    lent = StaticTransform("base_link", "lidar", (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+    options = SessionOptions(mountings=Mountings(lent=(lent,), problems=(note,)))
+    session = Session([FakeLog(frames)], options)
+    clouds = list(session.clouds())
+    np.testing.assert_allclose(clouds[0].points, [[5, 0, 1], [0, 7, 1]], atol=1e-6)
+    assert session.problems == [note]
+    own = Session([FakeLog([static("base_link", "lidar", MOUNT), *frames])], options)
+    np.testing.assert_allclose(next(own.clouds()).points, [[1, 5, 2], [-6, 0, 2]], atol=1e-6)
+
+
+def fixed_sweep(seconds: float, frame_id: str) -> LidarFrame:
+    """Two walls that stand still in the odometry's frame; the last point is out of range."""
+    points = np.array([[30.0, 0.0, 0.0], [0.0, 7.0, 0.0], [200.0, 0.0, 0.0]], np.float32)
+    offset_ns = np.array([0, 50_000_000, 99_000_000], np.int64)
+    return LidarFrame(header("/cloud", seconds, frame_id), points, offset_ns=offset_ns)
+
+
+@pytest.mark.parametrize("through", ["the topic", "TF", "TF, above the odometry's frame"])
+def test_clouds_in_the_fixed_frame_are_moved_back_once(through: str) -> None:
+    frame_id = "map" if "above" in through else "odom"
+    frames: list[Frame] = [fixed_sweep(2.0 * k, frame_id) for k in range(5)]
+    if through == "the topic":
+        frames += [odometry(0.1 * k, child="body") for k in range(101)]
+    else:
+        pose = [yaw_transform(0.0, (0.1 * k, 0.0, 0.0)) for k in range(101)]
+        frames += [moving("odom", "base_link", 0.1 * k, pose[k]) for k in range(101)]
+        frames.append(static("map", "odom", np.eye(4), -0.5))
+    session = Session([FakeLog(frames)])
+    clouds = list(session.clouds())
+    assert len(clouds) == 5
+    for k, cloud in enumerate(clouds):
+        assert cloud.session_T_base is not None
+        # the vehicle drives along x at 1 m/s, and its points are in the base frame at the stamp
+        assert cloud.session_T_base[0, 3] == pytest.approx(2.0 * k)
+        np.testing.assert_allclose(cloud.points, [[30 - 2 * k, 0, 0], [-2 * k, 7, 0]], atol=1e-5)
+        np.testing.assert_array_equal(cloud.origin, 0)
+    assert session.to_json()["sweeps_deskewed"] == 0
+    assert [problem.is_reported for problem in session.problems] == [False]
+    assert f"/cloud is in '{frame_id}', the frame that the poses" in session.problems[0].text
+
+
+def test_a_fixed_frame_that_nothing_connects_is_not_taken_as_the_sensor() -> None:
+    frames: list[Frame] = [fixed_sweep(0.1 * k, "map") for k in range(5)]
+    frames += [odometry(0.1 * k) for k in range(6)]
+    session = Session([FakeLog(frames)])
+    assert list(session.clouds()) == []
+    assert (
+        "no transform leads from their frame 'map' to the base frame 'base_link'"
+        in (sentences(lost(session.problems))[0])
+    )
 
 
 def test_a_second_unconnected_sensor_is_not_guessed() -> None:
@@ -272,6 +440,28 @@ def test_a_pose_without_child_frame_is_that_of_the_sensor() -> None:
     session = Session([FakeLog(frames, pose_type="geometry_msgs/msg/PoseStamped")])
     assert len(list(session.clouds())) == 3
     assert session.base_frame == "lidar"
+    [problem] = session.problems
+    assert "/pose does not name the frame whose pose it is" in problem.text
+    assert problem.assumed
+
+
+def test_the_pose_of_a_sensors_own_slam_needs_no_child_frame() -> None:
+    frames: list[Frame] = [
+        *[sweep(0.1 * k, "/camera/points") for k in range(3)],
+        *[odometry(0.1 * k, "", topic="/camera/pose") for k in range(4)],
+    ]
+    session = Session([FakeLog(frames, pose_type="geometry_msgs/msg/PoseStamped")])
+    assert len(list(session.clouds())) == 3
+    assert session.problems == []
+
+
+def test_the_user_says_where_the_frame_of_an_unnamed_pose_is() -> None:
+    frames: list[Frame] = [sweep(0.1), *[odometry(0.1 * k, "", topic="/pose") for k in range(4)]]
+    logs = Logs(mountings={"lidar": (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)})
+    log = FakeLog(frames, pose_type="geometry_msgs/msg/PoseStamped")
+    session = Session([log], SessionOptions(logs=logs))
+    [cloud] = session.clouds()
+    np.testing.assert_allclose(cloud.points, [[5, 0, 1], [0, 7, 1]], atol=1e-6)
     assert session.problems == []
 
 
@@ -460,7 +650,7 @@ def test_up_from_a_tilted_imu_on_a_turning_base() -> None:
 def test_logs_that_cannot_be_a_session() -> None:
     with pytest.raises(LogError, match="none was named"):
         open_session([])
-    with pytest.raises(RoleError, match="no LIDAR and no depth"):
+    with pytest.raises(RoleError, match="No topic is a LIDAR, depth images or a stereo pair"):
         Session([FakeLog([odometry(0.0)])])
     with pytest.raises(RoleError, match=r"drive.mcap: .*--topic pose=/a"):
         Session([FakeLog([sweep(0.0), odometry(0.0, topic="/a"), odometry(0.0, topic="/b")])])
@@ -504,7 +694,7 @@ def test_sweeps_without_a_pose_wait_for_seconds_only() -> None:
     log.watch = lambda: waiting.append(len(session._pass.waiting))  # type: ignore[method-assign]
     assert list(session.clouds()) == []
     assert session.to_json()["frames"] == {
-        "/points": {"seen": 500, "used": 0, "left_out": {"no pose": 500}}
+        "/points": {"seen": 500, "used": 0, "left_out": {"before the poses": 500}}
     }
     assert max(waiting) == 101
 
