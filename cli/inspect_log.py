@@ -20,9 +20,17 @@ from .options import Command, console_options, json_option, logs_argument, topic
     help="Read all messages. Without it a log of more than 64 MB is read by its index, with a"
     " sample of its poses.",
 )
+@click.option(
+    "--check",
+    is_flag=True,
+    help="Read the keyframes and check whether the poses fit them: clock offsets, mountings, scale,"
+    " jumps. Takes about as long as half of 'semloc fuse'.",
+)
 @json_option
 @console_options
-def command(logs: tuple[Path, ...], topics: dict[str, str], full: bool, as_json: bool) -> int:
+def command(
+    logs: tuple[Path, ...], topics: dict[str, str], full: bool, check: bool, as_json: bool
+) -> int:
     """What a log holds, whether it can be used, and with which command.
 
     Streams with their roles and rates, sensors, poses, frames, problems and their remedies, and a
@@ -45,7 +53,8 @@ def command(logs: tuple[Path, ...], topics: dict[str, str], full: bool, as_json:
         try:
             if recover(log):
                 console.note(f"{log}: an interrupted 'semloc annotate --in-place' was repaired")
-            inspected.append(inspect_log(log, topics, full=full))
+            content: dict[str, Any] = inspect_log(log, topics, full=full)
+            inspected.append(_checked(log, content, topics) if check else content)
             contents.append(inspected[-1])
         except SemlocError as problem:
             failed.append(problem)
@@ -66,3 +75,15 @@ def command(logs: tuple[Path, ...], topics: dict[str, str], full: bool, as_json:
             named = sentence.startswith(Path(path).name)  # else it begins with the topic
             console.warn(sentence if named else f"{path}: {sentence}")
     return 3 if failed or any(content["skipped"] for content in inspected) else 0
+
+
+def _checked(log: Path, content: dict[str, Any], topics: dict[str, str]) -> dict[str, Any]:
+    """The content with the check of poses against range data, where the log can be mapped."""
+    from semloc_logs.settings import load
+    from semloc_logs.stages.check import check_log, with_fit
+
+    voxel_size = content["voxel_size"]
+    if voxel_size is None or not content["poses"]["count"]:
+        return content
+    settings = load(assignments={"fusion.voxel_size": str(voxel_size)})
+    return with_fit(content, check_log(log, settings, topics))

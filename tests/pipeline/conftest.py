@@ -263,6 +263,7 @@ def tools() -> SimpleNamespace:
         renames=renames,
         inputs=inputs_of,
         whole=whole,
+        crossing=crossing,
     )
 
 

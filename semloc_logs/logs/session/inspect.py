@@ -86,8 +86,8 @@ def inspect_log(
     ``base_frame``, ``session_frame``, ``poses``, ``cameras``, ``sensors``, ``pictures``,
     ``frames`` (of the TF tree), ``transforms`` (its edges), ``labels``, ``complete`` (all messages
     were read: a small log, or ``full``), ``unknown`` (what only ``full`` tells), ``stamps`` (as in
-    session.json), ``verdict`` and the command ``suggested``. LogError for a file that is not a log,
-    RoleError when an override is impossible.
+    session.json), ``verdict``, the command ``suggested`` and the ``voxel_size`` (m) that suits the
+    log. LogError for a file that is not a log, RoleError when an override is impossible.
     """
     log = open_log(path)
     try:
@@ -294,6 +294,7 @@ class _Inspection:
             "unknown": self._unknown(),
             "verdict": verdict.text,
             "suggested": verdict.suggested,
+            "voxel_size": verdict.voxel_size,
         }
 
     def _count(self, stream: Stream) -> int:

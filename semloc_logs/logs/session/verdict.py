@@ -51,10 +51,14 @@ _FEWEST = 20  # points that tell a plane
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """``text`` for people, with the command ``suggested`` at its end; "" where none helps."""
+    """``text`` for people, with the command ``suggested`` at its end; "" where none helps.
+
+    ``voxel_size`` (m) suits the log; None where it cannot be mapped.
+    """
 
     text: str
     suggested: str = ""
+    voxel_size: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +123,7 @@ def verdict_of(look: Look, problems: Sequence[Problem], *, is_reported: bool) ->
     elif look.is_complete:
         sentences += _no_closure_within(look.track, size)
     suggested = look.command.text(*options)
-    return Verdict(f"{state}: {'; '.join(sentences)}; suggested: {suggested}", suggested)
+    return Verdict(f"{state}: {'; '.join(sentences)}; suggested: {suggested}", suggested, size)
 
 
 def _usable(look: Look, problems: Sequence[Problem]) -> tuple[str, ...]:

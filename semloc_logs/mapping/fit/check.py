@@ -57,7 +57,7 @@ MUCH_NEARER = 0.05  # such a reading explains the pairs when it lowers the media
 TRIED = 4  # pairs that show whether another start is better
 BETTER_START = 1.15  # another start is better when so many times the points lie on planes
 # a pair contradicts its poses when registration brings so many times the points onto planes
-CONTRADICTS = 1.15
+CONTRADICTS = 1.1
 CONTRADICTION = 50.0  # and its squared distance is larger
 LEAST_CONTRADICTIONS = 2
 

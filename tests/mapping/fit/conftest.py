@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.frames import Header, PosedCloud
@@ -92,3 +94,9 @@ def drive(
         )
         collected.add(cloud, np.arange(len(points)))
     return Clouds(collected, np.arange(len(collected)), VOXEL), track
+
+
+@pytest.fixture(scope="session")
+def streets() -> SimpleNamespace:
+    """The functions of this file, for tests that cannot import it."""
+    return SimpleNamespace(street=street, drive=drive, winding=winding, straight=straight)

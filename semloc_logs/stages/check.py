@@ -1,0 +1,49 @@
+"""A log alone: whether its poses and its range data fit each other, without a workspace."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from semloc_logs.labels.labeller import Labeller
+from semloc_logs.logs.problems import sentences, to_report
+from semloc_logs.logs.session.session import SessionOptions, open_session
+from semloc_logs.mapping.fit.check import SessionFit, check_session
+from semloc_logs.mapping.keyframes import collect
+from semloc_logs.settings import Labels, Settings
+
+READ_RANGE = 2.0  # of the largest range that is fused, as fusing reads it
+
+
+def check_log(log: Path, settings: Settings, topics: Mapping[str, str]) -> SessionFit:
+    """Reads the keyframes of a log and checks them. LogError and RoleError as in fusing."""
+    fusion = settings.resolved().fusion
+    options = SessionOptions(
+        topics=topics,
+        min_range=fusion.min_range,
+        max_range=READ_RANGE * fusion.max_range,
+        logs=settings.logs,
+    )
+    with closing(open_session([log], options)) as session, tempfile.TemporaryDirectory() as folder:
+        labeller = Labeller(Labels(source="uniform"), session)
+        collected = collect(session, labeller, fusion, Path(folder), log.name)
+        return check_session(session, collected, fusion.voxel_size)
+
+
+def with_fit(content: Mapping[str, Any], fit: SessionFit) -> dict[str, Any]:
+    """The object of ``inspect --json`` with the check under ``fit``; its findings are problems."""
+    reported = sentences(to_report(fit.problems))
+    verdict = content["verdict"]
+    if not fit.fits:
+        verdict = f"not to be trusted: {reported[0]}"
+    return {
+        **content,
+        "problems": [*content["problems"], *sentences(fit.problems)],
+        "skipped": [*content["skipped"], *reported],
+        "fit": fit.to_json(),
+        "verdict": verdict,
+        "suggested": content["suggested"] if fit.fits else "",
+    }
