@@ -44,8 +44,8 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 # pairs of a stream: one for so many keyframes, within these bounds; a pair costs about 15 ms
-KEYFRAMES_A_PAIR = 4
-FEWEST_PAIRS, MOST_PAIRS = 24, 60
+KEYFRAMES_A_PAIR = 8
+FEWEST_PAIRS, MOST_PAIRS = 24, 400
 LEAST_PAIRS = 4
 # a hypothesis explains much: it lowers half of chi squared by so much, and its parameter differs
 # from zero by so many standard deviations
@@ -57,9 +57,10 @@ MUCH_NEARER = 0.05  # such a reading explains the pairs when it lowers the media
 TRIED = 4  # pairs that show whether another start is better
 BETTER_START = 1.15  # another start is better when so many times the points lie on planes
 # a pair contradicts its poses when registration brings so many times the points onto planes
-CONTRADICTS = 1.1
+CONTRADICTS = 1.15
+TELLING = 0.2  # registrations with a smaller share of points on planes may have ended anywhere
 CONTRADICTION = 50.0  # and its squared distance is larger
-LEAST_CONTRADICTIONS = 2
+LEAST_CONTRADICTIONS = 2  # one after the other
 
 # what a closure would suffer, in voxels: noted above the first, wrong above the second
 NOTED, WRONG = 0.5, 1.0
@@ -469,10 +470,14 @@ def _contradictions(stream: StreamFit, found: Registered, poses_at: PosesAt, vox
     with np.errstate(invalid="ignore"):
         rows = np.flatnonzero(
             (found.share > CONTRADICTS * found.given_share)
+            & (found.share > TELLING)
             & (squares > CONTRADICTION * excess)
             & ((meters > WRONG * voxel) | (radians > WRONG_TURN))
         )
-    if len(rows) < LEAST_CONTRADICTIONS:
+    # single ones are registrations that went wrong
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    rows = np.concatenate([run for run in runs if len(run) >= LEAST_CONTRADICTIONS] or [rows[:0]])
+    if not len(rows):
         return
     first = int(found.pairs.stamps_ns[rows].min())
     last = int(found.pairs.stamps_ns[rows].max())

@@ -26,6 +26,7 @@ LONGEST_NS = (
 )
 MOST_POINTS = 1500  # of a source
 COARSE, FINE = 4.0, 2.0  # edge of the cells (voxels)
+SPEEDS = (1.0, 0.6, 1.4)  # shares of the last speed
 LITTLE = 0.9  # of the usual share of points on planes: something is wrong with the start
 # a registration is better than another when so many times the points lie on planes
 BETTER = 1.1
@@ -191,8 +192,8 @@ def registered(
 ) -> Registered:
     """The pairs ``numbers`` registered from the motion that the poses give.
 
-    ``start`` makes a further start (4, 4) of it. Where few points lie on planes then, the speed of
-    the last pair that fitted is tried, too.
+    ``start`` makes a further start (4, 4) of it. Where few points lie on planes then, speeds about
+    the one of the last pair that fitted are tried, too.
     """
     registrar = Registrar(clouds)
     stamps_ns = clouds.stamps_ns()
@@ -208,7 +209,8 @@ def registered(
     for i, (target, source) in enumerate(numbers):
         seconds = (stamps_ns[source] - stamps_ns[target]) * 1e-9
         if last is not None and fits[i].share < LITTLE * usual:
-            again = registrar.fit(target, source, [_moved(last, seconds)])
+            speeds = [_moved(factor * last, seconds) for factor in SPEEDS]
+            again = registrar.fit(target, source, speeds)
             if again.share > BETTER * fits[i].share:
                 fits[i] = again
         if fits[i].share >= LITTLE * usual:
