@@ -18,6 +18,7 @@ class ProblemKind(Enum):
     LABEL = "label"
     TRANSFORM = "transform"
     POSE = "pose"
+    GRAVITY = "gravity"  # which way is up
     ROLE = "role"  # which topic plays which role
 
 

@@ -20,6 +20,7 @@ from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.logs.problems import Problem, sentences, to_report
 from semloc_logs.logs.sensors.depth import RangeNoise
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
+from semloc_logs.mapping.gravity import Gravity
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import check_reach, level
 from semloc_logs.mapping.map_tables import LevelSession, write_map
@@ -64,12 +65,13 @@ def fuse_session(
     """
     with closing(_opened(task)) as session:
         labeller = Labeller(task.settings.labels, session)
-        metadata, content = _fused(task, session, labeller)
+        metadata, content, gravity = _fused(task, session, labeller)
         _write_trajectory(task.folder, session, metadata)
-        problems = [*session.problems, *labeller.problems]
+        problems = [*session.problems, *gravity.problems, *labeller.problems]
         content = {
             **session.to_json(),
             "problems": sentences(problems),
+            "gravity": gravity.to_json(),
             "labels": labeller.to_json(),
             "name": task.folder.name,
             "fingerprint": task.fingerprint,
@@ -100,8 +102,8 @@ def _opened(task: FuseTask) -> Session:
 
 def _fused(
     task: FuseTask, session: Session, labeller: Labeller
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read the log and write the tables of the map: their metadata, and what they hold."""
+) -> tuple[dict[str, Any], dict[str, Any], Gravity]:
+    """Read the log and write the tables of the map: their metadata, what they hold, and up."""
     fusion = task.settings.fusion
     with _scratch(task.folder) as scratch:
         collected = collect(session, labeller, fusion, scratch, task.folder.name)
@@ -110,17 +112,19 @@ def _fused(
             raise LogError(f"{session.name} gave no usable points: {reasons}")
         check_reach(session, collected, fusion.voxel_size)
         labeller.conclude()
-        session_T_map, map_T_base = level(session, collected)
+        levelled = level(session, collected, fusion)
         metadata = {
             "schema_version": 1,
             "voxel_size": fusion.voxel_size,
-            "session_T_map": session_T_map.tolist(),
+            "session_T_map": levelled.session_T_map.tolist(),
             "label_space": "cityscapes",
             "label_source": labeller.source,
             "version": semloc_logs.__version__,
         }
-        levelled = LevelSession(task.folder.name, collected, labeller, map_T_base, fusion, metadata)
-        return metadata, write_map(levelled, task.folder)
+        keyframes = LevelSession(
+            task.folder.name, collected, labeller, levelled.map_T_base, fusion, metadata
+        )
+        return metadata, write_map(keyframes, task.folder), levelled.gravity
 
 
 @contextmanager

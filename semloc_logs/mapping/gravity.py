@@ -1,0 +1,206 @@
+"""The decision which way is up, how sure it is, and what to say where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.logs.problems import Problem, ProblemKind
+from semloc_logs.mapping.up_direction import find_up
+from semloc_logs.mapping.up_evidence import UpEvidence
+
+F64 = NDArray[np.float64]
+
+
+class UpSource(Enum):
+    """What settled which way is up."""
+
+    SETTING = "setting"
+    IMU = "imu"
+    MAP = "map"  # its ground and walls, and the motion
+    CONVENTION = "convention"  # of frames, because the map does not settle it
+
+
+# by how much the score of another direction must exceed the score of the expected one, to be
+# believed instead; down instead of up needs more, because a ceiling looks like a floor
+LIMIT = {UpSource.CONVENTION: 0.1, UpSource.IMU: 0.25}
+OPPOSITE = 0.1  # more
+IS_OPPOSITE = np.cos(np.radians(150.0))
+DOUBT = {UpSource.CONVENTION: 0.05, UpSource.IMU: 0.15}  # is said, but the expected one stays
+CLEAR = 0.1  # lead over every other direction without which a finding is unsure
+GIVEN_WITHIN = 0.35  # rad, of a direction that was given; it is refined
+NOTABLE = 40.0  # degrees off the convention
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """The frame ``name`` of log ``log``, in which up is looked for.
+
+    ``convention`` (3,) is up by convention, ``imu`` (3,) by the IMU on ``imu_topic``, if any.
+    """
+
+    log: str
+    name: str
+    convention: F64
+    imu: F64 | None = None
+    imu_topic: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gravity:
+    """``up`` (3,) in the session frame, or in the base frame of a log without poses.
+
+    ``prior`` (3,) is the direction near which it was refined. ``margin`` is its score less the
+    score of the best other direction; None where nothing was compared.
+    """
+
+    up: F64
+    prior: F64
+    source: UpSource
+    margin: float | None = None
+    off_convention: float | None = None  # degrees
+    off_imu: float | None = None  # degrees
+    problems: tuple[Problem, ...] = ()
+
+    @property
+    def is_assumed(self) -> bool:
+        """Whether the log does not settle which way is up."""
+        return any(p.assumed for p in self.problems)
+
+    def to_json(self) -> dict[str, Any]:
+        """For session.json."""
+
+        def rounded(value: float | None, digits: int) -> float | None:
+            return None if value is None else round(value, digits)
+
+        return {
+            "source": self.source.value,
+            "up": [round(float(x), 6) for x in self.up],
+            "margin": rounded(self.margin, 3),
+            "assumed": self.is_assumed,
+            "off_convention_deg": rounded(self.off_convention, 1),
+            "off_imu_deg": rounded(self.off_imu, 1),
+        }
+
+
+def given_gravity(direction: F64, normals: F64, weights: F64) -> Gravity:
+    """Up near a ``direction`` (3,) that the user gave, refined by the surfaces of the map."""
+    prior = direction / np.linalg.norm(direction)
+    return Gravity(find_up(normals, weights, prior, GIVEN_WITHIN), prior, UpSource.SETTING)
+
+
+def find_gravity(frame: Frame, normals: F64, weights: F64, evidence: UpEvidence) -> Gravity:
+    """Up as the IMU or the convention expects it, unless the map clearly shows another direction.
+
+    ``normals`` (n, 3) and ``weights`` (n,) are of all flat places of the map.
+    """
+    expected_by = UpSource.CONVENTION if frame.imu is None else UpSource.IMU
+    prior = frame.convention if frame.imu is None else frame.imu
+    up = find_up(normals, weights, prior)
+    if not evidence.is_enough:
+        problems = (_no_evidence(frame),) if frame.imu is None else ()
+        return _gravity(frame, up, prior, expected_by, None, problems)
+
+    others = evidence.others(up)
+    scores = evidence.scores(np.concatenate([up[None], others]))
+    best = int(np.argmax(scores[1:]))
+    lead = float(scores[0] - scores[1 + best])
+    other = others[best]
+    limit = LIMIT[expected_by] + (OPPOSITE if float(other @ up) < IS_OPPOSITE else 0.0)
+
+    if -lead <= limit:
+        doubtful = -lead > DOUBT[expected_by]
+        source = expected_by
+        if source is UpSource.CONVENTION and lead >= CLEAR:
+            source = UpSource.MAP
+        problems = (_doubt(frame, up, other),) if doubtful else ()
+        return _gravity(frame, up, prior, source, lead, problems)
+
+    # the map decides
+    margin = float(scores[1 + best] - np.delete(scores, 1 + best).max())
+    up = find_up(normals, weights, other)
+    if frame.imu is not None:
+        problems = (_contradiction(frame, up),)
+    else:
+        problems = (_found(frame, up, is_sure=margin >= CLEAR),)
+    return _gravity(frame, up, other, UpSource.MAP, margin, problems)
+
+
+def _gravity(
+    frame: Frame,
+    up: F64,
+    prior: F64,
+    source: UpSource,
+    margin: float | None,
+    problems: tuple[Problem, ...],
+) -> Gravity:
+    off_imu = None if frame.imu is None else _degrees(up, frame.imu)
+    return Gravity(up, prior, source, margin, _degrees(up, frame.convention), off_imu, problems)
+
+
+def _degrees(a: F64, b: F64) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
+def _no_evidence(frame: Frame) -> Problem:
+    return _assumption(
+        frame,
+        f"too few flat places show which way is up: {_text(frame.convention)} of frame "
+        f"'{frame.name}' is taken as up by convention",
+    )
+
+
+def _doubt(frame: Frame, up: F64, other: F64) -> Problem:
+    by = "by convention" if frame.imu is None else f"by {frame.imu_topic}"
+    return _assumption(
+        frame,
+        f"the ground and the walls of the map do not settle which way is up: {_text(up)} of frame "
+        f"'{frame.name}' is taken as up {by}, but {_text(other)} fits better",
+        frame.imu_topic if frame.imu is not None else "",
+    )
+
+
+def _contradiction(frame: Frame, up: F64) -> Problem:
+    assert frame.imu is not None
+    return _assumption(
+        frame,
+        f"{frame.imu_topic} contradicts the map: its up is {_degrees(up, frame.imu):.0f} degrees "
+        f"off the ground; {_text(up)} of frame '{frame.name}' is taken as up from the map: check "
+        "the axes and the sign of the accelerometer",
+        frame.imu_topic,
+    )
+
+
+def _found(frame: Frame, up: F64, *, is_sure: bool) -> Problem:
+    off = _degrees(up, frame.convention)
+    text = (
+        f"up is {_text(up)} of frame '{frame.name}', {off:.0f} degrees off the convention, as the "
+        "ground and the walls of the map show"
+    )
+    if is_sure:
+        return Problem("", ProblemKind.GRAVITY, f"{text}.", lost=False)
+    return _assumption(frame, f"{text}, but another direction fits nearly as well")
+
+
+def _assumption(frame: Frame, text: str, topic: str = "") -> Problem:
+    remedy = "record an IMU, or " if frame.imu is None else ""
+    return Problem(
+        topic,
+        ProblemKind.GRAVITY,
+        f"{frame.log}: {text}; {remedy}give up with --set fusion.up=X,Y,Z.",
+        lost=False,
+        assumed=True,
+    )
+
+
+def _text(direction: F64) -> str:
+    """Such as +z, or (0.50, 0.00, 0.87)."""
+    unit = direction / np.linalg.norm(direction)
+    axis = int(np.argmax(np.abs(unit)))
+    if abs(unit[axis]) > np.cos(np.radians(10.0)):
+        return f"{'+' if unit[axis] > 0 else '-'}{'xyz'[axis]}"
+    return "(" + ", ".join(f"{x:.2f}" for x in unit) + ")"
