@@ -33,18 +33,17 @@ IS_OPPOSITE = np.cos(np.radians(150.0))
 DOUBT = {UpSource.CONVENTION: 0.05, UpSource.IMU: 0.15}  # is said, but the expected one stays
 CLEAR = 0.1  # lead over every other direction without which a finding is unsure
 GIVEN_WITHIN = 0.35  # rad, of a direction that was given; it is refined
-NOTABLE = 40.0  # degrees off the convention
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """The frame ``name`` of log ``log``, in which up is looked for.
+class Expected:
+    """Where up is expected in frame ``frame`` of log ``log``.
 
     ``convention`` (3,) is up by convention, ``imu`` (3,) by the IMU on ``imu_topic``, if any.
     """
 
     log: str
-    name: str
+    frame: str
     convention: F64
     imu: F64 | None = None
     imu_topic: str = ""
@@ -93,17 +92,17 @@ def given_gravity(direction: F64, normals: F64, weights: F64) -> Gravity:
     return Gravity(find_up(normals, weights, prior, GIVEN_WITHIN), prior, UpSource.SETTING)
 
 
-def find_gravity(frame: Frame, normals: F64, weights: F64, evidence: UpEvidence) -> Gravity:
+def find_gravity(expected: Expected, normals: F64, weights: F64, evidence: UpEvidence) -> Gravity:
     """Up as the IMU or the convention expects it, unless the map clearly shows another direction.
 
     ``normals`` (n, 3) and ``weights`` (n,) are of all flat places of the map.
     """
-    expected_by = UpSource.CONVENTION if frame.imu is None else UpSource.IMU
-    prior = frame.convention if frame.imu is None else frame.imu
+    expected_by = UpSource.CONVENTION if expected.imu is None else UpSource.IMU
+    prior = expected.convention if expected.imu is None else expected.imu
     up = find_up(normals, weights, prior)
     if not evidence.is_enough:
-        problems = (_no_evidence(frame),) if frame.imu is None else ()
-        return _gravity(frame, up, prior, expected_by, None, problems)
+        problems = (_no_evidence(expected),) if expected.imu is None else ()
+        return _gravity(expected, up, prior, expected_by, None, problems)
 
     others = evidence.others(up)
     scores = evidence.scores(np.concatenate([up[None], others]))
@@ -117,81 +116,82 @@ def find_gravity(frame: Frame, normals: F64, weights: F64, evidence: UpEvidence)
         source = expected_by
         if source is UpSource.CONVENTION and lead >= CLEAR:
             source = UpSource.MAP
-        problems = (_doubt(frame, up, other),) if doubtful else ()
-        return _gravity(frame, up, prior, source, lead, problems)
+        problems = (_doubt(expected, up, other),) if doubtful else ()
+        return _gravity(expected, up, prior, source, lead, problems)
 
     # the map decides
     margin = float(scores[1 + best] - np.delete(scores, 1 + best).max())
     up = find_up(normals, weights, other)
-    if frame.imu is not None:
-        problems = (_contradiction(frame, up),)
+    if expected.imu is not None:
+        problems = (_contradiction(expected, up),)
     else:
-        problems = (_found(frame, up, is_sure=margin >= CLEAR),)
-    return _gravity(frame, up, other, UpSource.MAP, margin, problems)
+        problems = (_found(expected, up, is_sure=margin >= CLEAR),)
+    return _gravity(expected, up, other, UpSource.MAP, margin, problems)
 
 
 def _gravity(
-    frame: Frame,
+    expected: Expected,
     up: F64,
     prior: F64,
     source: UpSource,
     margin: float | None,
     problems: tuple[Problem, ...],
 ) -> Gravity:
-    off_imu = None if frame.imu is None else _degrees(up, frame.imu)
-    return Gravity(up, prior, source, margin, _degrees(up, frame.convention), off_imu, problems)
+    off_imu = None if expected.imu is None else _degrees(up, expected.imu)
+    return Gravity(up, prior, source, margin, _degrees(up, expected.convention), off_imu, problems)
 
 
 def _degrees(a: F64, b: F64) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def _no_evidence(frame: Frame) -> Problem:
+def _no_evidence(expected: Expected) -> Problem:
     return _assumption(
-        frame,
-        f"too few flat places show which way is up: {_text(frame.convention)} of frame "
-        f"'{frame.name}' is taken as up by convention",
+        expected,
+        f"too few flat places show which way is up: {_text(expected.convention)} of frame "
+        f"'{expected.frame}' is taken as up by convention",
     )
 
 
-def _doubt(frame: Frame, up: F64, other: F64) -> Problem:
-    by = "by convention" if frame.imu is None else f"by {frame.imu_topic}"
+def _doubt(expected: Expected, up: F64, other: F64) -> Problem:
+    by = "by convention" if expected.imu is None else f"by {expected.imu_topic}"
     return _assumption(
-        frame,
+        expected,
         f"the ground and the walls of the map do not settle which way is up: {_text(up)} of frame "
-        f"'{frame.name}' is taken as up {by}, but {_text(other)} fits better",
-        frame.imu_topic if frame.imu is not None else "",
+        f"'{expected.frame}' is taken as up {by}, but {_text(other)} fits better",
+        expected.imu_topic if expected.imu is not None else "",
     )
 
 
-def _contradiction(frame: Frame, up: F64) -> Problem:
-    assert frame.imu is not None
+def _contradiction(expected: Expected, up: F64) -> Problem:
+    assert expected.imu is not None
+    off = _degrees(up, expected.imu)
     return _assumption(
-        frame,
-        f"{frame.imu_topic} contradicts the map: its up is {_degrees(up, frame.imu):.0f} degrees "
-        f"off the ground; {_text(up)} of frame '{frame.name}' is taken as up from the map: check "
-        "the axes and the sign of the accelerometer",
-        frame.imu_topic,
+        expected,
+        f"{expected.imu_topic} contradicts the map: its up is {off:.0f} degrees off; "
+        f"{_text(up)} of frame '{expected.frame}' is taken as up from the ground and the walls of "
+        "the map: check the axes and the sign of the accelerometer",
+        expected.imu_topic,
     )
 
 
-def _found(frame: Frame, up: F64, *, is_sure: bool) -> Problem:
-    off = _degrees(up, frame.convention)
+def _found(expected: Expected, up: F64, *, is_sure: bool) -> Problem:
+    off = _degrees(up, expected.convention)
     text = (
-        f"up is {_text(up)} of frame '{frame.name}', {off:.0f} degrees off the convention, as the "
-        "ground and the walls of the map show"
+        f"up is {_text(up)} of frame '{expected.frame}', {off:.0f} degrees off the convention of "
+        "frames, as the ground and the walls of the map show"
     )
     if is_sure:
         return Problem("", ProblemKind.GRAVITY, f"{text}.", lost=False)
-    return _assumption(frame, f"{text}, but another direction fits nearly as well")
+    return _assumption(expected, f"{text}, but another direction fits nearly as well")
 
 
-def _assumption(frame: Frame, text: str, topic: str = "") -> Problem:
-    remedy = "record an IMU, or " if frame.imu is None else ""
+def _assumption(expected: Expected, text: str, topic: str = "") -> Problem:
+    remedy = "record an IMU, or " if expected.imu is None else ""
     return Problem(
         topic,
         ProblemKind.GRAVITY,
-        f"{frame.log}: {text}; {remedy}give up with --set fusion.up=X,Y,Z.",
+        f"{expected.log}: {text}; {remedy}name it with --set fusion.up=X,Y,Z.",
         lost=False,
         assumed=True,
     )

@@ -11,7 +11,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.messages.stamps import utc
 from semloc_logs.logs.problems import Problem
 from semloc_logs.logs.session.session import Session
-from semloc_logs.mapping.gravity import Frame, Gravity, find_gravity, given_gravity
+from semloc_logs.mapping.gravity import Expected, Gravity, find_gravity, given_gravity
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.up_direction import FlatPlaces, find_up
 from semloc_logs.mapping.up_evidence import UpEvidence
@@ -68,7 +68,7 @@ def _gravity(
     views = [*places.values()]
     normals = np.concatenate([v.normals for v in views])
     weights = np.concatenate([v.weights for v in views])
-    frame = Frame(
+    expected = Expected(
         session.name,
         (session.session_frame if posed else session.base_frame) or "session",
         _convention(session, known),
@@ -78,7 +78,7 @@ def _gravity(
     if fusion.up_vector is not None:
         return given_gravity(np.array(fusion.up_vector), normals, weights)
     evidence = UpEvidence(views, known, fusion.voxel_size / STREET_VOXEL)
-    return find_gravity(frame, normals, weights, evidence)
+    return find_gravity(expected, normals, weights, evidence)
 
 
 def _convention(session: Session, known: F64) -> F64:
