@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.mapping.up_direction import find_up
-from semloc_logs.mapping.up_evidence import UpEvidence
+from semloc_logs.mapping.up_evidence import Sky, UpEvidence
 
 F64 = NDArray[np.float64]
 
@@ -26,12 +26,14 @@ class UpSource(Enum):
 
 
 # by how much the score of another direction must exceed the score of the expected one, to be
-# believed instead; down instead of up needs more, because a ceiling looks like a floor
+# believed instead; upside down needs more, because a ceiling looks like a floor
 LIMIT = {UpSource.CONVENTION: 0.1, UpSource.IMU: 0.25}
-OPPOSITE = 0.1  # more
-IS_OPPOSITE = np.cos(np.radians(150.0))
-DOUBT = {UpSource.CONVENTION: 0.05, UpSource.IMU: 0.15}  # is said, but the expected one stays
+OPPOSITE = {Sky.OPEN: 0.1, Sky.CEILING: 0.2}  # more; nothing is enough where either may be it
+DOUBT = {UpSource.CONVENTION: 0.05, UpSource.IMU: 0.15}  # is told, but the expected one stays
+DOUBT_OPPOSITE = 0.1  # more
+FLAGRANT = 0.6  # against an IMU, where down may be the ceiling
 CLEAR = 0.1  # lead over every other direction without which a finding is unsure
+FAR_OFF = 30.0  # degrees off where it was expected: better directions may be beyond its reach
 GIVEN_WITHIN = 0.35  # rad, of a direction that was given; it is refined
 
 
@@ -97,36 +99,59 @@ def find_gravity(expected: Expected, normals: F64, weights: F64, evidence: UpEvi
 
     ``normals`` (n, 3) and ``weights`` (n,) are of all flat places of the map.
     """
-    expected_by = UpSource.CONVENTION if expected.imu is None else UpSource.IMU
+    by = UpSource.CONVENTION if expected.imu is None else UpSource.IMU
     prior = expected.convention if expected.imu is None else expected.imu
     up = find_up(normals, weights, prior)
     if not evidence.is_enough:
-        problems = (_no_evidence(expected),) if expected.imu is None else ()
-        return _gravity(expected, up, prior, expected_by, None, problems)
+        problems = (_none(expected),) if expected.imu is None else ()
+        return _gravity(expected, up, prior, by, None, problems)
+    if _degrees(up, prior) > FAR_OFF:
+        prior = up
+        up = find_up(normals, weights, prior)
 
-    others = evidence.others(up)
+    others = evidence.others(up)  # the first is down
     scores = evidence.scores(np.concatenate([up[None], others]))
-    best = int(np.argmax(scores[1:]))
-    lead = float(scores[0] - scores[1 + best])
-    other = others[best]
-    limit = LIMIT[expected_by] + (OPPOSITE if float(other @ up) < IS_OPPOSITE else 0.0)
+    sideways = 1 + int(np.argmax(scores[2:])) if len(others) > 1 else 0
+    excess = float(scores[1 + sideways] - scores[:2].max()) if sideways else -np.inf
+    opposite = float(scores[1] - scores[0])
+    sky = evidence.sky(up) if opposite > 0 else Sky.UNKNOWN
 
-    if -lead <= limit:
-        doubtful = -lead > DOUBT[expected_by]
-        source = expected_by
-        if source is UpSource.CONVENTION and lead >= CLEAR:
-            source = UpSource.MAP
-        problems = (_doubt(expected, up, other),) if doubtful else ()
-        return _gravity(expected, up, prior, source, lead, problems)
+    if excess > LIMIT[by]:
+        return _by_map(expected, others[sideways], normals, weights, evidence)
+    if sky in OPPOSITE and opposite > LIMIT[by] + OPPOSITE[sky]:
+        return _by_map(expected, others[0], normals, weights, evidence, sky)
 
-    # the map decides
-    margin = float(scores[1 + best] - np.delete(scores, 1 + best).max())
-    up = find_up(normals, weights, other)
+    lead = float(scores[0] - scores[1:].max())
+    source = UpSource.MAP if by is UpSource.CONVENTION and lead >= CLEAR else by
+    doubt = DOUBT[by] + DOUBT_OPPOSITE
+    if expected.imu is not None and sky is Sky.UNKNOWN:
+        doubt = FLAGRANT
+    other = None
+    if excess > DOUBT[by]:
+        other = others[sideways]
+    elif opposite > doubt:
+        other = others[0]
+    problems = () if other is None else (_doubt(expected, up, other),)
+    return _gravity(expected, up, prior, source, lead, problems)
+
+
+def _by_map(
+    expected: Expected,
+    direction: F64,
+    normals: F64,
+    weights: F64,
+    evidence: UpEvidence,
+    sky: Sky = Sky.OPEN,
+) -> Gravity:
+    """Up near a ``direction`` (3,) that the map shows, against what was expected."""
+    up = find_up(normals, weights, direction)
+    scores = evidence.scores(np.concatenate([up[None], evidence.others(up)]))
+    margin = float(scores[0] - scores[1:].max())
     if expected.imu is not None:
-        problems = (_contradiction(expected, up),)
+        problem = _contradiction(expected, up)
     else:
-        problems = (_found(expected, up, is_sure=margin >= CLEAR),)
-    return _gravity(expected, up, other, UpSource.MAP, margin, problems)
+        problem = _found(expected, up, is_sure=margin >= CLEAR and sky is Sky.OPEN)
+    return _gravity(expected, up, direction, UpSource.MAP, margin, (problem,))
 
 
 def _gravity(
@@ -145,7 +170,7 @@ def _degrees(a: F64, b: F64) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def _no_evidence(expected: Expected) -> Problem:
+def _none(expected: Expected) -> Problem:
     return _assumption(
         expected,
         f"too few flat places show which way is up: {_text(expected.convention)} of frame "

@@ -7,6 +7,8 @@ perpendicular to up. Vehicles and hands move mostly on the level, and turn mostl
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,12 @@ MOST_CANDIDATES = 300  # normals that are tried as up and as down
 APART = np.radians(20.0)  # directions nearer than this are one
 OTHERS = 6  # directions that are compared in full
 
+# whether a ceiling may be taken for the ground
+BEYOND = 0.1  # share of points beyond what would be the ground: the sky is there
+TALL = 4.0  # m that things rise above the ground, where no ceiling is seen
+NEARER = 0.7  # of the distance to the ceiling: sensors are nearer to the floor
+HIGH = 95  # percentile of the heights above the ground
+
 # of the ground below a sensor, at street scale (m)
 LAYER = 0.3  # points this near to the height of the ground are on it
 MARGIN = 0.5  # and so far below it lies what cannot be there
@@ -38,6 +46,28 @@ UNSEEN = 0.3  # share below the ground, where no ground is seen
 HALF_WAY = 3.0
 HALF_TURN = 1.0
 MOST_STEPS = 5.0  # median steps; a longer one is a jump and counts like this
+
+
+class Sky(Enum):
+    """What is above a ground that would be the ceiling of the other way round."""
+
+    OPEN = "open"
+    CEILING = "ceiling"  # farther from the sensor than the ground
+    UNKNOWN = "unknown"  # either may be the ceiling
+
+
+@dataclass(frozen=True, slots=True)
+class _Ground:
+    """The ground of a direction: shares of points ``on`` and ``below`` it.
+
+    It is ``depth`` metres below the sensor, things ``rise`` above it (m).
+    """
+
+    is_seen: bool
+    on: float
+    below: float
+    depth: float
+    rise: float
 
 
 class UpEvidence:
@@ -70,8 +100,20 @@ class UpEvidence:
 
     def scores(self, directions: F64) -> F64:
         """How well ``directions`` (k, 3) fit as up (k,): about 0.2 is bad, above 0.4 good."""
-        ground = np.array([self._ground(u) for u in directions])
+        grounds = [self._ground(u) for u in directions]
+        ground = np.array([GROUND * g.on - BELOW * g.below for g in grounds])
         return np.asarray(self._quick_scores(directions) + ground)
+
+    def sky(self, up: F64) -> Sky:
+        """What is above the ground, if down is ``up`` (3,) in truth: the other way round."""
+        ceiling, ground = self._ground(up), self._ground(-up)
+        if not ground.is_seen:
+            return Sky.UNKNOWN
+        if ceiling.below > BEYOND if ceiling.is_seen else ground.rise > TALL:
+            return Sky.OPEN
+        if ceiling.is_seen and ground.depth < NEARER * ceiling.depth:
+            return Sky.CEILING
+        return Sky.UNKNOWN
 
     def others(self, up: F64) -> F64:
         """The directions (k, 3) that fit best besides ``up`` (3,); the direction down is one."""
@@ -106,19 +148,26 @@ class UpEvidence:
             floor - CEILING * ceiling + WALLS * walls - MOTION * motion + TURNS * turns
         )
 
-    def _ground(self, up: F64) -> float:
-        """The score of the points on the ground that each keyframe sees, and of those below it."""
+    def _ground(self, up: F64) -> _Ground:
+        """The ground that each keyframe sees, if ``up`` (3,) is up."""
+        depths, rises = [], []
         count, on, below = 0, 0, 0
         for p in self._places:
             floor = p.normals @ up > np.cos(FLOOR)
             if np.count_nonzero(floor) < LEAST_FLOOR:
                 continue
-            ground = np.percentile(-p.centres[floor] @ up, LOWEST)
-            depth = -p.points[:: len(p.points) // MOST_POINTS + 1] @ up - ground
-            count += len(depth)
-            on += int(np.count_nonzero(np.abs(depth) < LAYER * self._scale))
-            below += int(np.count_nonzero(depth > MARGIN * self._scale))
-        return (GROUND * on - BELOW * below) / count if count else -BELOW * UNSEEN
+            ground = float(np.percentile(-p.centres[floor] @ up, LOWEST))
+            height = p.points[:: len(p.points) // MOST_POINTS + 1] @ up + ground
+            depths.append(ground)
+            rises.append(float(np.percentile(height, HIGH)))
+            count += len(height)
+            on += int(np.count_nonzero(np.abs(height) < LAYER * self._scale))
+            below += int(np.count_nonzero(height < -MARGIN * self._scale))
+        if not count:
+            return _Ground(False, 0.0, UNSEEN, 0.0, 0.0)
+        return _Ground(
+            True, on / count, below / count, float(np.median(depths)), float(np.median(rises))
+        )
 
 
 def _directions(vectors: F64, half: float) -> F64:

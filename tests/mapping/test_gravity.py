@@ -155,23 +155,28 @@ def test_without_surfaces_the_convention_is_assumed_and_an_imu_is_not() -> None:
     assert (with_imu.source, with_imu.problems) == (UpSource.IMU, ())
 
 
-def test_a_hall_whose_ceiling_shows_more_than_its_floor_is_doubtful() -> None:
-    """The floor is hidden by what stands on it: the convention stays, and the log says so."""
-    rng = np.random.default_rng(0)
-    ceiling = plane(np.array([-9.0, -9.0, 2.0]), 18 * X, 18 * Y)
+@pytest.mark.parametrize(
+    ("share", "is_assumed", "is_flipped"),
+    [(1.0, False, False), (0.6, True, False), (0.0, True, False)],
+)
+def test_a_ceiling_that_shows_more_than_the_floor_is_doubtful(
+    share: float, is_assumed: bool, is_flipped: bool
+) -> None:
+    """The ``share`` of the floor that is seen decides; in between the convention stays, which the
+    log says.
+    """
+    slab = [plane(np.array([-9.0, -9.0, z]), 18 * X, 18 * Y) for z in (2.0, -2.0)]
     walls = [
         plane(np.array([-9.0, -9.0, -2.0]), 18 * X, 4 * Z),
         plane(np.array([-9.0, -9.0, -2.0]), 18 * Y, 4 * Z),
         plane(np.array([9.0, -9.0, -2.0]), 18 * Y, 4 * Z),
     ]
-    floor = plane(np.array([-9.0, -9.0, -2.0]), 18 * X, 18 * Y)
-    floor = floor[rng.random(len(floor)) < 0.8]
-    floor = floor[(np.abs(floor[:, 0]) < 7.2)]
-    points = np.concatenate([ceiling, floor, *walls])
-    expected, flipped = (find(points, convention) for convention in (Z, -Z))
-    assert degrees_between(expected.up, Z) < 1
-    assert expected.is_assumed == ((expected.margin or 0.0) < -0.05)
-    assert degrees_between(flipped.up, -Z) < 1
+    floor = slab[1][slab[1][:, 0] < -9 + 18 * share]
+    found = find(np.concatenate([slab[0], floor, *walls]), Z)
+    assert degrees_between(found.up, -Z if is_flipped else Z) < 1
+    assert found.is_assumed == is_assumed
+    if is_assumed:
+        assert "+z of frame 'odom' is taken as up by convention, but -z" in found.problems[0].text
 
 
 def test_a_direction_that_is_given_overrules_all_and_is_refined() -> None:
