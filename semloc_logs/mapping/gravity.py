@@ -143,7 +143,7 @@ def _by_map(
     evidence: UpEvidence,
     sky: Sky = Sky.OPEN,
 ) -> Gravity:
-    """Up near a ``direction`` (3,) that the map shows, against what was expected."""
+    """Up near a ``direction`` (3,) that the map shows, against the expectation."""
     up = find_up(normals, weights, direction)
     scores = evidence.scores(np.concatenate([up[None], evidence.others(up)]))
     margin = float(scores[0] - scores[1:].max())

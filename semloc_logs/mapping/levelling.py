@@ -30,7 +30,7 @@ DOWN_FRAMES = ("ned", "frd")  # z points down, in frames of this name or with it
 class Level:
     """``session_T_map`` (4, 4), and ``map_T_base`` (n, 4, 4) of every keyframe.
 
-    The map is level; ``gravity`` says by which evidence.
+    The map is level; ``gravity`` holds the evidence.
     """
 
     session_T_map: F64

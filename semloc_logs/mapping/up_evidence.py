@@ -73,8 +73,7 @@ class _Ground:
 class UpEvidence:
     """What the ``places`` of keyframes and the ``poses`` (n, 4, 4) of all show of up.
 
-    All are in one frame; without motion there are no poses. ``scale`` is the voxel size over
-    0.30 m.
+    All are in one frame; a log without poses has n = 0. ``scale`` is the voxel size over 0.30 m.
     """
 
     def __init__(self, places: Sequence[FlatPlaces], poses: F64, scale: float) -> None:
