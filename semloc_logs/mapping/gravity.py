@@ -30,8 +30,8 @@ class UpSource(Enum):
 LIMIT = {UpSource.CONVENTION: 0.1, UpSource.IMU: 0.25}
 OPPOSITE = {Sky.OPEN: 0.1, Sky.CEILING: 0.2}  # more; nothing is enough where either may be it
 DOUBT = {UpSource.CONVENTION: 0.05, UpSource.IMU: 0.15}  # is told, but the expected one stays
-DOUBT_OPPOSITE = 0.1  # more
-FLAGRANT = 0.6  # against an IMU, where down may be the ceiling
+DOUBT_OPPOSITE = {Sky.OPEN: 0.1, Sky.CEILING: 0.15, Sky.UNKNOWN: 0.15}  # in place of it
+FLAGRANT = 0.6  # in place of both, for an IMU where down may be the ceiling
 CLEAR = 0.1  # lead over every other direction without which a finding is unsure
 FAR_OFF = 30.0  # degrees off where it was expected: better directions may be beyond its reach
 GIVEN_WITHIN = 0.35  # rad, of a direction that was given; it is refined
@@ -123,7 +123,7 @@ def find_gravity(expected: Expected, normals: F64, weights: F64, evidence: UpEvi
 
     lead = float(scores[0] - scores[1:].max())
     source = UpSource.MAP if by is UpSource.CONVENTION and lead >= CLEAR else by
-    doubt = DOUBT[by] + DOUBT_OPPOSITE
+    doubt = DOUBT_OPPOSITE[sky]
     if expected.imu is not None and sky is Sky.UNKNOWN:
         doubt = FLAGRANT
     other = None
