@@ -179,6 +179,23 @@ def test_a_ceiling_that_shows_more_than_the_floor_is_doubtful(
         assert "+z of frame 'odom' is taken as up by convention, but -z" in found.problems[0].text
 
 
+@pytest.mark.parametrize(("height", "is_flipped"), [(1.2, True), (2.8, False)])
+def test_the_floor_is_nearer_than_the_ceiling(height: float, is_flipped: bool) -> None:
+    """A hall of 4 m whose floor shows more than its ceiling, with the convention upside down.
+
+    It is doubtful either way: only the sensor below the middle of the hall tells.
+    """
+    floor = plane(np.array([-9.0, -9.0, -height]), 18 * X, 18 * Y)
+    ceiling = plane(np.array([-9.0, -9.0, 4 - height]), 6 * X, 18 * Y)
+    walls = [
+        plane(np.array([-9.0, -9.0, -height]), 18 * X, 4 * Z),
+        plane(np.array([-9.0, -9.0, -height]), 18 * Y, 4 * Z),
+    ]
+    found = find(np.concatenate([floor, ceiling, *walls]), -Z)
+    assert degrees_between(found.up, Z if is_flipped else -Z) < 1
+    assert found.is_assumed
+
+
 def test_a_direction_that_is_given_overrules_all_and_is_refined() -> None:
     places = flat_places(street().astype(np.float32), np.zeros(3), 0.2)
     near = Rotation.from_rotvec(np.radians(8) * Y).as_matrix() @ (3 * Z)
