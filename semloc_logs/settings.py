@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -138,9 +139,29 @@ class Fusion(_Section):
         description="lidar: poses from LIDAR odometry (KISS-ICP, the extra 'odometry') instead of"
         " the poses of the log",
     )
+    up: str = Field(
+        "auto",
+        description="up in the session frame (in the base frame of a log without poses): an axis"
+        " such as +z or -y, or a vector X,Y,Z, refined within 20 degrees; auto: from the IMU, else"
+        " from the ground, walls and motion",
+    )
     clamp: tuple[float, float] = Field(
         (-2.0, 3.5), description="bounds of the log-odds (OctoMap), within +-6"
     )
+
+    @property
+    def up_vector(self) -> tuple[float, float, float] | None:
+        """The direction ``up``, of any length; None for auto."""
+        return _direction(self.up)
+
+    @field_validator("up", mode="before")
+    @classmethod
+    def _check_up(cls, value: Any) -> Any:
+        # YAML makes a list of [0, 0, 1]
+        text = ",".join(map(str, value)) if isinstance(value, list | tuple) else value
+        if isinstance(text, str):
+            _direction(text)
+        return text
 
     @model_validator(mode="after")
     def _check(self) -> Fusion:
@@ -425,6 +446,23 @@ class Resolved(Settings):
 
     def resolved(self) -> Resolved:
         return self
+
+
+def _direction(text: str) -> tuple[float, float, float] | None:
+    """A vector from an axis or from three numbers; None for auto. ValueError for other text."""
+    if text == "auto":
+        return None
+    if len(text) == 2 and text[0] in "+-" and text[1] in "xyz":
+        sign = 1.0 if text[0] == "+" else -1.0
+        x, y, z = (sign if axis == text[1] else 0.0 for axis in "xyz")
+    else:
+        try:
+            x, y, z = (float(number) for number in text.split(","))
+        except ValueError:
+            raise ValueError("up is auto, an axis such as +z, or a vector X,Y,Z") from None
+    if not 1e-9 < math.hypot(x, y, z) < math.inf:
+        raise ValueError("up needs a vector of finite length other than zero")
+    return x, y, z
 
 
 def _given(value: float | None, default: float) -> float:

@@ -19,6 +19,7 @@ class ProblemKind(Enum):
     TRANSFORM = "transform"
     POSE = "pose"
     FIT = "fit"  # poses and range data contradict each other, or the poses themselves
+    GRAVITY = "gravity"  # which way is up
     ROLE = "role"  # which topic plays which role
     STAMP = "stamp"  # times of messages: missing, or of another clock
 

@@ -17,14 +17,14 @@ from semloc_logs.labels.camera_labels import PointLabels
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.selection import KeyframeSelector, thin
-from semloc_logs.mapping.up_direction import surface_normals
+from semloc_logs.mapping.up_direction import FlatPlaces, flat_places
 from semloc_logs.numerics.prefetch import prefetched
 from semloc_logs.settings import ResolvedFusion
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U32 = NDArray[np.uint32]
-MOST_NORMALS = 20  # keyframes whose normals show where up is
+MOST_VIEWS = 20  # keyframes that show where up is
 
 
 @dataclass(slots=True, eq=False)
@@ -69,18 +69,19 @@ class Collected:
             )
         return points, self._load(keyframe, "label"), self._load(keyframe, "sigma")
 
-    def normals(self, most: int = MOST_NORMALS) -> list[tuple[int, F64, F64]]:
-        """Of ``most`` keyframes, evenly spread: number, unit normals (m, 3) and weights (m,).
+    def flat_places(self, most: int = MOST_VIEWS) -> dict[int, FlatPlaces]:
+        """The flat places that ``most`` keyframes show, evenly spread, by number of the keyframe.
 
-        Normals of surfaces are in the session frame, or in the base frame without poses.
+        They are relative to the sensor, in the axes of the session frame, or of the base frame
+        without poses.
         """
-        out = []
+        out = {}
         for i in np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64)).tolist():
             points, _, sigma = self.load(i)
             noise = 0.0 if sigma is None else float(np.median(sigma))
-            normals, weights = surface_normals(points, self.origins[i], 2 * self.cell, noise)
+            places = flat_places(points, self.origins[i], 2 * self.cell, noise)
             pose = self.poses[i]
-            out.append((i, normals if pose is None else normals @ pose[:3, :3].T, weights))
+            out[i] = places if pose is None else places.turned(pose[:3, :3])
         return out
 
     def _save(self, keyframe: int, what: str, values: NDArray[Any] | None) -> None:

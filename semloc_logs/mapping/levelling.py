@@ -1,53 +1,100 @@
-"""The gravity-aligned map frame of a session, from its IMU or from its floors and walls."""
+"""The gravity-aligned map frame of a session, from its IMU, or from its ground and walls."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.messages.stamps import utc
+from semloc_logs.logs.problems import Problem
 from semloc_logs.logs.session.session import Session
+from semloc_logs.mapping.gravity import Expected, Gravity, find_gravity, given_gravity
 from semloc_logs.mapping.keyframes import Collected
-from semloc_logs.mapping.up_direction import find_up
+from semloc_logs.mapping.up_direction import FlatPlaces, find_up
+from semloc_logs.mapping.up_evidence import UpEvidence
 from semloc_logs.numerics.transforms import inverse, rotation_between
+from semloc_logs.settings import STREET_VOXEL, ResolvedFusion
 
 F64 = NDArray[np.float64]
 # voxels; of the tables that are indexed by place the coarse one of the ground ends first
 # (voxels/keys.py)
 REACH = 3_000_000
 UP = np.array([0.0, 0.0, 1.0])
+DOWN_FRAMES = ("ned", "frd")  # z points down, in frames of this name or with it behind a "_"
 
 
-def level(session: Session, collected: Collected) -> tuple[F64, F64]:
-    """``session_T_map`` (4, 4) and ``map_T_base`` (n, 4, 4) of every keyframe.
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """``session_T_map`` (4, 4), and ``map_T_base`` (n, 4, 4) of every keyframe.
 
-    The map is level and has its origin at the first keyframe, because poses may be in UTM and
-    voxels, words and surfaces want small numbers. In a log without poses each keyframe is levelled
-    by itself and the map is the session.
+    The map is level; ``gravity`` holds the evidence.
+    """
+
+    session_T_map: F64
+    map_T_base: F64
+    gravity: Gravity
+
+    @property
+    def problems(self) -> tuple[Problem, ...]:
+        """What is not sure about it."""
+        return self.gravity.problems
+
+
+def level(session: Session, collected: Collected, fusion: ResolvedFusion) -> Level:
+    """The level map frame of a session; its origin is the first keyframe.
+
+    Poses may be in UTM, and voxels, words and surfaces want small numbers. In a log without poses
+    each keyframe is levelled by itself and the map is the session.
+    """
+    known = np.array([p for p in collected.poses if p is not None]).reshape(-1, 4, 4)
+    places = collected.flat_places()
+    gravity = _gravity(session, places, known, fusion)
+    if not len(known):
+        return Level(np.eye(4), _each_level(len(collected), places, gravity), gravity)
+    session_T_map = np.eye(4)
+    session_T_map[:3, :3] = rotation_between(UP, gravity.up)
+    session_T_map[:3, 3] = known[0][:3, 3]
+    return Level(session_T_map, inverse(session_T_map) @ known, gravity)
+
+
+def _gravity(
+    session: Session, places: dict[int, FlatPlaces], known: F64, fusion: ResolvedFusion
+) -> Gravity:
+    """Up in the session frame, or without poses (``known`` (n, 4, 4)) in the base frame."""
+    posed = len(known) > 0
+    views = [*places.values()]
+    normals = np.concatenate([v.normals for v in views])
+    weights = np.concatenate([v.weights for v in views])
+    expected = Expected(
+        session.name,
+        (session.session_frame if posed else session.base_frame) or "session",
+        _convention(session, known),
+        session.imu_up_in_session() if posed else session.imu_up_in_base(),
+        session.roles.imu or "",
+    )
+    if fusion.up_vector is not None:
+        return given_gravity(np.array(fusion.up_vector), normals, weights)
+    evidence = UpEvidence(views, known, fusion.voxel_size / STREET_VOXEL)
+    return find_gravity(expected, normals, weights, evidence)
+
+
+def _convention(session: Session, known: F64) -> F64:
+    """Up by the conventions of frames (REP 103, REP 105).
+
+    A vehicle's frames have z up, and so has its odometry, unless their names say that z is down;
+    a camera's world may be any of its frames, so it is the mean of the camera's up.
     """
     optical = session.base_frame.endswith("_optical") or session.base_frame in {
         c.header.frame_id for c in session.cameras.values()
     }
-    up_in_base = np.array([0.0, -1.0, 0.0]) if optical else UP
-    known = [p for p in collected.poses if p is not None]
-    if not known:
-        return np.eye(4), _each_level(collected, up_in_base)
-    prior = session.imu_up_in_session()
-    if prior is None:
-        # a vehicle's frames follow REP 103, and so does its odometry; a camera's world may be any
-        # of its frames
-        prior = (np.array([p[:3, :3] for p in known]) @ up_in_base).mean(0) if optical else UP
-    normals = collected.normals()
-    session_T_map = np.eye(4)
-    session_T_map[:3, :3] = rotation_between(
-        UP,
-        find_up(
-            np.concatenate([k[1] for k in normals]), np.concatenate([k[2] for k in normals]), prior
-        ),
-    )
-    session_T_map[:3, 3] = known[0][:3, 3]
-    return session_T_map, inverse(session_T_map) @ np.array(known)
+    if optical:
+        up_in_base = np.array([0.0, -1.0, 0.0])
+        return (known[:, :3, :3] @ up_in_base).mean(0) if len(known) else up_in_base
+    frame = session.session_frame if len(known) else session.base_frame
+    return -UP if frame.lower().replace("/", "_").split("_")[-1] in DOWN_FRAMES else UP
 
 
 def check_reach(session: Session, collected: Collected, voxel_size: float) -> None:
@@ -69,17 +116,14 @@ def check_reach(session: Session, collected: Collected, voxel_size: float) -> No
             )
 
 
-def _each_level(collected: Collected, up_in_base: F64) -> F64:
-    """Level poses (n, 4, 4) of keyframes without poses.
+def _each_level(count: int, places: dict[int, FlatPlaces], gravity: Gravity) -> F64:
+    """Level poses (n, 4, 4) of ``count`` keyframes without poses.
 
     The direction of gravity is the one of the nearest keyframe for which it was estimated.
     """
-    up_of = {
-        number: find_up(normals, weights, up_in_base)
-        for number, normals, weights in collected.normals()
-    }
+    up_of = {number: find_up(p.normals, p.weights, gravity.prior) for number, p in places.items()}
     keys = np.array(sorted(up_of))
-    poses = np.tile(np.eye(4), (len(collected), 1, 1))
-    for i in range(len(collected)):
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for i in range(count):
         poses[i, :3, :3] = rotation_between(up_of[int(keys[np.argmin(np.abs(keys - i))])], UP)
     return poses

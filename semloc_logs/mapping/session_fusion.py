@@ -21,7 +21,8 @@ from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.logs.problems import Problem, sentences, sorted_problems, to_report
 from semloc_logs.logs.sensors.depth import RangeNoise
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
-from semloc_logs.mapping.fit.check import SessionFit, check_session
+from semloc_logs.mapping.fit.check import check_session
+from semloc_logs.mapping.gravity import Gravity
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import check_reach, level
 from semloc_logs.mapping.map_tables import LevelSession, write_map
@@ -68,19 +69,20 @@ def fuse_session(
     """
     with closing(_opened(task)) as session:
         labeller = Labeller(task.settings.labels, session)
-        metadata, content, check = _fused(task, session, labeller)
-        _write_trajectory(task.folder, session, metadata)
-        problems = sorted_problems([*session.problems, *check.problems, *labeller.problems])
+        fused = _fused(task, session, labeller)
+        _write_trajectory(task.folder, session, fused.metadata)
+        problems = sorted_problems([*session.problems, *fused.problems, *labeller.problems])
         content = {
             **session.to_json(),
             "problems": sentences(problems),
+            "gravity": fused.gravity.to_json(),
             "labels": labeller.to_json(),
             "name": task.folder.name,
             "fingerprint": task.fingerprint,
             "settings": task.settings.model_dump(mode="json", include={"logs", "fusion", "labels"}),
-            "fit": check.to_json(),
-            **metadata,
-            **content,
+            "fit": fused.check.to_json(),
+            **fused.metadata,
+            **fused.content,
             "skipped": sentences(to_report(problems)),
         }
     on_tables(content)
@@ -104,10 +106,26 @@ def _opened(task: FuseTask) -> Session:
     return open_session([*task.logs], options)
 
 
-def _fused(
-    task: FuseTask, session: Session, labeller: Labeller
-) -> tuple[dict[str, Any], dict[str, Any], SessionFit]:
-    """Read the log and write the tables of the map: their metadata, what they hold, the check."""
+@dataclass(frozen=True, slots=True)
+class _Fused:
+    """The ``metadata`` of the tables, the ``content`` that session.json has of them, and findings.
+
+    ``check``: whether poses and range data fit; ``gravity``: which way is up, and how sure.
+    """
+
+    metadata: dict[str, Any]
+    content: dict[str, Any]
+    check: SessionFit
+    gravity: Gravity
+
+    @property
+    def problems(self) -> list[Problem]:
+        """What the keyframes showed to be wrong or doubtful."""
+        return [*self.check.problems, *self.gravity.problems]
+
+
+def _fused(task: FuseTask, session: Session, labeller: Labeller) -> _Fused:
+    """Read the log and write the tables of the map."""
     fusion = task.settings.fusion
     with _scratch(task.folder) as scratch:
         collected = collect(session, labeller, fusion, scratch, task.folder.name)
@@ -116,7 +134,8 @@ def _fused(
             raise LogError(f"{session.name} gave no usable points: {reasons}")
         check_reach(session, collected, fusion.voxel_size)
         check = check_session(session, collected, fusion.voxel_size)
-        session_T_map, map_T_base = level(session, collected)
+        levelled = level(session, collected, fusion)
+        map_T_base = levelled.map_T_base
 
         def view(keyframe: int) -> KeyframeView:
             points, labels, _ = collected.load(keyframe)
@@ -129,13 +148,15 @@ def _fused(
         metadata = {
             "schema_version": 1,
             "voxel_size": fusion.voxel_size,
-            "session_T_map": session_T_map.tolist(),
+            "session_T_map": levelled.session_T_map.tolist(),
             "label_space": "cityscapes",
             "label_source": labeller.source,
             "version": semloc_logs.__version__,
         }
-        levelled = LevelSession(task.folder.name, collected, labeller, map_T_base, fusion, metadata)
-        return metadata, write_map(levelled, task.folder), check
+        keyframes = LevelSession(
+            task.folder.name, collected, labeller, map_T_base, fusion, metadata
+        )
+        return _Fused(metadata, write_map(keyframes, task.folder), check, levelled.gravity)
 
 
 @contextmanager

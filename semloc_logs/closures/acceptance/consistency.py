@@ -209,9 +209,12 @@ def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float
             off = np.sqrt(
                 (T[0, 3] - U[0, 3]) ** 2 + (T[1, 3] - U[1, 3]) ** 2 + (T[2, 3] - U[2, 3]) ** 2
             )
-            turned = np.arctan2(
-                T[0, 0] * U[1, 0] - T[1, 0] * U[0, 0], T[0, 0] * U[0, 0] + T[1, 0] * U[1, 0]
-            )
+            # the yaw of U inv(T); the axes of the base may point anywhere
+            sine, cosine = 0.0, 0.0
+            for m in range(3):
+                sine += U[1, m] * T[0, m] - U[0, m] * T[1, m]
+                cosine += U[0, m] * T[0, m] + U[1, m] * T[1, m]
+            turned = np.arctan2(sine, cosine)
             if off <= most and abs(turned) <= turn:
                 total += odds[n]
             n += 1

@@ -189,6 +189,27 @@ def test_of_two_poses_in_a_place_each_has_its_share(beside: F64, share: float) -
     assert mode_shares(place(others, MAPS), 0.3).tolist() == [1, 1, 1]
 
 
+@pytest.mark.parametrize(
+    "rotation", [np.diag([1.0, -1, -1]), np.eye(3)[[1, 2, 0]], np.eye(3)[[2, 0, 1]]]
+)
+def test_the_yaw_between_two_poses_does_not_rest_on_the_axes_of_the_base(rotation: F64) -> None:
+    """The base is upside down, or one of its axes points up; the poses differ by 9 degrees of yaw,
+    or by 1 degree.
+    """
+    axes = np.eye(4)
+    axes[:3, :3] = rotation
+    maps = {name: session(m.map_T_base @ axes) for name, m in MAPS.items()}
+    for degrees, share in ((9.0, 1.0), (1.0, 6 / 7)):
+        rows = [alignment(25, 0.6), alignment(25, 0.2)]
+        turned = MAP @ ROAD[25] @ yaw_transform(np.radians(degrees))
+        rows[1] = dataclasses.replace(rows[1], target_T_query=inverse(MAP @ ROAD[25]) @ turned)
+        rows = [
+            dataclasses.replace(a, target_T_query=inverse(axes) @ a.target_T_query @ axes)
+            for a in rows
+        ]
+        assert mode_shares(place(rows, maps), 0.3)[0] == pytest.approx(share)
+
+
 def test_neighbours_do_not_choose_among_the_poses_of_a_place() -> None:
     """Seen from opposite sides a street fits as well a metre further on, and neighbours agree with
     both.

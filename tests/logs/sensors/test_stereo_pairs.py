@@ -283,8 +283,9 @@ def test_the_direction_of_gravity_is_found_at_every_voxel_size(
     collected = Collected(tmp_path, voxel / 3)
     for cloud in room[:3]:
         collected.add(cloud, thin(cloud.points, voxel / 3))
-    _, normals, weights = zip(*collected.normals(), strict=True)
-    up = find_up(np.concatenate(normals), np.concatenate(weights), np.array([0.0, 0.0, 1.0]))
+    places = collected.flat_places().values()
+    normals = np.concatenate([p.normals for p in places])
+    up = find_up(normals, np.concatenate([p.weights for p in places]), np.array([0.0, 0.0, 1.0]))
     assert tilt(up) < 1.5
 
 
