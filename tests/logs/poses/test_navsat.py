@@ -216,8 +216,7 @@ def test_uncertain_and_missing_fixes_are_left_out() -> None:
     assert 2.0 not in found
     check(found, position=0.01, angle=0.1)
     assert sentences(source.problems) == [
-        "/fix: 3 of 103 messages give no fix on Earth, by their status or their position; "
-        "they were left out.",
+        "/fix: 3 of 103 messages report a missing fix; they were left out.",
         "/fix: 1 of 103 messages are less certain than 5 m or out of order; they were left out.",
     ]
 

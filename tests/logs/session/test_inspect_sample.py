@@ -20,6 +20,7 @@ from semloc_logs.numerics.transforms import yaw_transform
 
 S = 1_000_000_000
 SECONDS = 200
+START = S  # a stamp of 0 is a missing one
 XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
 
@@ -31,13 +32,13 @@ def cloud(count: int = 100, seed: int = 1) -> np.ndarray[Any, Any]:
 
 def drive(log: Any, *, late: bool = False) -> Path:
     """200 s at 1 m/s: a LIDAR at 1 Hz, odometry at 10 Hz; ``late``: a second LIDAR at the end."""
-    log.transform("base_link", "lidar", yaw_transform(0.0, (0.0, 0.0, 2.0)), 0)
+    log.transform("base_link", "lidar", yaw_transform(0.0, (0.0, 0.0, 2.0)), START)
     for k in range(SECONDS):
-        log.cloud("/points", k * S, "lidar", cloud(), late_ns=0)
+        log.cloud("/points", START + k * S, "lidar", cloud(), late_ns=0)
     for k in range(SECONDS * 10 + 1):
-        log.pose(k * S // 10, yaw_transform(0.0, (k / 10, 0.0, 0.0)))
+        log.pose(START + k * S // 10, yaw_transform(0.0, (k / 10, 0.0, 0.0)))
     if late:
-        log.cloud("/late/points", (SECONDS - 1) * S, "lidar", cloud(seed=2), late_ns=1)
+        log.cloud("/late/points", START + (SECONDS - 1) * S, "lidar", cloud(seed=2), late_ns=1)
     path: Path = log.write()
     return path
 
@@ -148,7 +149,7 @@ def test_sections_hold_each_message_once(large: None, log: Path) -> None:
         opened.close()
     assert len(sections) > 2 * excerpt.MOST_SAMPLES
     assert sorted(parts) == sorted(whole)
-    assert sorted(poses) == [k * S // 10 for k in range(SECONDS * 10 + 1)]
+    assert sorted(poses) == [START + k * S // 10 for k in range(SECONDS * 10 + 1)]
 
 
 def test_few_chunks_are_read(large: None, recorder: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -214,8 +214,9 @@ def test_why_a_pose_is_missing_is_told_by_the_whole_stream() -> None:
         for k in range(100)
     )
     assert "end 53.9 years after the last pose (1970-01-01T00:00:09.900Z)" in other
-    # recorded when 64 frames are waiting: not a gap, and not before the poses
-    late = reason(odometry(0.1 * k, late=8.0) for k in range(100))
+    # recorded when frames have waited for 10 s: not a gap, and not before the poses
+    sweeps = [sweep(0.1 * k) for k in range(300)]
+    late = reason(odometry(0.1 * k, late=12.0) for k in range(300))
     assert "were recorded later than frames can wait" in late
 
 

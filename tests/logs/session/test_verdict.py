@@ -144,13 +144,14 @@ def test_a_laser_scan_is_not_mapped(recorder: Any) -> None:
 
 def test_a_missing_calibration_stands_in_the_way(recorder: Any) -> None:
     log = recorder()
-    for k in range(3):
-        log.picture("/depth/image", k * S, "camera", np.full((8, 8), 2000, "<u2"), "16UC1")
+    log.transform("base_link", "camera_optical", np.eye(4), S)
+    for k in range(1, 4):
+        log.picture("/depth/image", k * S, "camera_optical", np.full((8, 8), 2000, "<u2"), "16UC1")
         log.pose(k * S, np.eye(4))
     content = inspect_log(log.write())
     assert str(content["verdict"]).startswith("not ready: /depth/image has no CameraInfo")
 
-    log.camera_info("/depth/camera_info", 0, "camera", 8, 8, 10.0)
+    log.camera_info("/depth/camera_info", S, "camera_optical", 8, 8, 10.0)
     content = inspect_log(log.write())
     assert str(content["verdict"]).startswith("ready: depth camera 1 Hz with poses")
 
