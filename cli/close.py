@@ -53,7 +53,8 @@ def command(
     Example:  semloc close -w work --query tuesday --target monday --query-every 5
     """
     from semloc_logs.closures.closure_tables import read_closures
-    from semloc_logs.stages.close import Selection, close
+    from semloc_logs.stages.close import close
+    from semloc_logs.stages.pair_search import Selection
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

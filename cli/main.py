@@ -28,6 +28,7 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "fuse": ("fuse", "Logs -> the semantic map of one session."),
     "describe": ("describe", "Maps -> semantic words."),
     "close": ("close", "Words -> loop closures."),
+    "sessions": ("sessions", "What a workspace holds; rename and remove sessions."),
     "annotate": ("annotate", "Closures -> channels of a log."),
     "index": ("index", "The index of the words: what it holds; up to date."),
     "evaluate": ("evaluate", "Closures against the truth."),

@@ -2,52 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import click
 
 from .console import console
 
 if TYPE_CHECKING:
-    from semloc_logs.stages.inputs import SessionInput
     from semloc_logs.stages.report import Report
     from semloc_logs.workspace import Workspace
 
-    from .options import PoseChoice
-
 SHOWN = 20  # rows of a table; files have them all
-
-
-def session_inputs(
-    logs: Iterable[Path],
-    topics: Mapping[str, str] | None = None,
-    poses: PoseChoice | None = None,
-) -> list[SessionInput]:
-    """Each log is a session; UsageError when two have the same name."""
-    from semloc_logs.stages.inputs import SessionInput, session_name
-
-    by_name: dict[str, Path] = {}
-    for log in logs:
-        name = session_name(log)
-        if name in by_name:
-            raise click.UsageError(
-                f"{by_name[name]} and {log} would both be session '{name}':"
-                " rename one, or fuse them one by one with --session."
-            )
-        by_name[name] = log
-    files = {} if poses is None else poses.by_session(by_name)
-    return [
-        SessionInput(name, (log,), topics or {}, files.get(name)) for name, log in by_name.items()
-    ]
-
-
-def checked_name(name: str) -> str:
-    """A session's name; UsageError when it cannot be a folder's."""
-    if not name or name.startswith(".") or "/" in name or "\0" in name:
-        raise click.UsageError(f"A session cannot be called {name!r}: its name becomes a folder's.")
-    return name
 
 
 def finish(*reports: Report) -> int:

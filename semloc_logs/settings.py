@@ -20,6 +20,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from semloc_logs.errors import SettingsError
 
 STREET_VOXEL = 0.30
+# sections that the tables of a workspace depend on, and settings in them that change no table
+TABLE_SECTIONS = ("logs", "fusion", "labels", "descriptor", "query", "closures")
+OF_MACHINE = frozenset({"logs.memory", "labels.threads"})
 MOST_VOXELS = 1000
 _MOST_BYTES = 1 << 20  # of a YAML file
 LabelSource = Literal["auto", "log", "onnx", "geometry", "uniform"]
@@ -223,15 +226,16 @@ class Closures(_Section):
     probes: int = Field(
         8, ge=1, description="nearest vocabulary cells searched for each query word"
     )
-    hypotheses: int = Field(96, ge=1, description="pooled hypotheses of a query that are verified")
-    places: int = Field(
-        16,
+    hypotheses: int = Field(
+        32,
         ge=1,
-        description="submaps, of all sessions, that a query is verified in: those whose words"
-        " agree best",
+        description="pooled hypotheses of a query in each target session that are verified",
     )
-    session_hypotheses: int = Field(
-        16, ge=1, description="pooled hypotheses of each target session, at least"
+    places: int = Field(
+        4,
+        ge=1,
+        description="submaps of each target session that a query is verified in: those whose words"
+        " agree best",
     )
     candidates: int = Field(
         4,
@@ -340,7 +344,8 @@ class Settings(_Section):
     training: Training = Training()
 
     def resolved(self) -> Resolved:
-        """The same settings with every ``None`` length filled in from the voxel size.
+        """The same settings with every ``None`` length filled in from the voxel size, and absolute
+        paths.
 
         Raises SettingsError where lengths do not go together.
         """
@@ -370,12 +375,33 @@ class Settings(_Section):
         for section, defaults in lengths.items():
             for name, length in defaults.items():
                 content[section][name] = _given(content[section][name], length)
+        # a workspace keeps them, and its next command may run elsewhere
+        for values in content.values():
+            values |= {k: v.absolute() for k, v in values.items() if isinstance(v, Path)}
         return Resolved.model_validate(content)
+
+    def tables(self, *sections: str) -> dict[str, dict[str, Any]]:
+        """The named sections, of those only the settings that tables depend on."""
+        dumped = self.model_dump(mode="json", include=set(sections))
+        return {
+            section: {k: v for k, v in values.items() if f"{section}.{k}" not in OF_MACHINE}
+            for section, values in dumped.items()
+        }
 
     def fingerprint(self, *sections: str) -> str:
         """Hash of the named sections: what a stage's outputs depend on."""
-        dumped = self.model_dump(mode="json", include=set(sections))
-        return hashlib.sha256(json.dumps(dumped, sort_keys=True).encode()).hexdigest()[:16]
+        dumped = json.dumps(self.tables(*sections), sort_keys=True)
+        return hashlib.sha256(dumped.encode()).hexdigest()[:16]
+
+    def given(self) -> dict[str, Any]:
+        """The settings that were given, by key path, as JSON has them; defaults are left out."""
+        return {
+            f"{section}.{name}": value
+            for section in self.model_fields_set
+            for name, value in getattr(self, section)
+            .model_dump(mode="json", exclude_unset=True)
+            .items()
+        }
 
     def dump(self) -> str:
         """YAML that :func:`load` reads back to the same settings."""
@@ -392,6 +418,18 @@ class Resolved(Settings):
 
     def resolved(self) -> Resolved:
         return self
+
+    def differences(self) -> dict[str, dict[str, Any]]:
+        """The settings of the tables that neither defaults nor the voxel size give, by section."""
+        voxel_size = self.fusion.voxel_size
+        expected = Settings(fusion=Fusion(voxel_size=voxel_size)).resolved().tables(*TABLE_SECTIONS)
+        out = {
+            section: {k: v for k, v in values.items() if v != expected[section][k]}
+            for section, values in self.tables(*TABLE_SECTIONS).items()
+        }
+        if voxel_size != STREET_VOXEL:
+            out["fusion"]["voxel_size"] = voxel_size
+        return {section: values for section, values in out.items() if values}
 
 
 def _given(value: float | None, default: float) -> float:
@@ -460,8 +498,13 @@ def load(
             _assign(merged, name[len("SEMLOC_") :].lower().replace("__", "."), value)
     for key, value in (assignments or {}).items():
         _assign(merged, key, value)
+    return validated(merged)
+
+
+def validated(content: Mapping[str, Any]) -> Settings:
+    """The settings of a mapping of sections. SettingsError names a key that is wrong."""
     try:
-        return Settings.model_validate(merged)
+        return Settings.model_validate(content)
     except ValidationError as problem:
         first = problem.errors()[0]
         key = ".".join(str(p) for p in first["loc"])

@@ -11,13 +11,14 @@ from semloc_logs.errors import WorkspaceError
 
 @dataclass(frozen=True, slots=True)
 class SessionFolder:
-    """WORK/sessions/SESSION."""
+    """WORK/sessions/SESSION; ``title`` is the session's name while it is written elsewhere."""
 
     path: Path
+    title: str = ""
 
     @property
     def name(self) -> str:
-        return self.path.name
+        return self.title or self.path.name
 
     @property
     def session_json(self) -> Path:
@@ -72,7 +73,8 @@ class Workspace:
     def sessions(self) -> list[SessionFolder]:
         """Sessions that were fused, by name."""
         files = sorted((self.path / "sessions").glob("*/session.json"))
-        return [SessionFolder(path.parent) for path in files]
+        # what begins with a dot is being written
+        return [SessionFolder(p.parent) for p in files if not p.parent.name.startswith(".")]
 
     def chosen(self, names: Sequence[str]) -> list[SessionFolder]:
         """The fused sessions ``names``, all without names. WorkspaceError where one is missing."""
@@ -86,6 +88,28 @@ class Workspace:
                 " run 'semloc fuse' first."
             )
         return [known[name] for name in names] if names else list(known.values())
+
+    @property
+    def lock(self) -> Path:
+        return self.path / ".lock"
+
+    @property
+    def writer(self) -> Path:
+        """Who has the lock."""
+        return self.path / ".writer"
+
+    @property
+    def settings(self) -> Path:
+        return self.path / "workspace.json"
+
+    def alignments(self, query: str, target: str) -> Path:
+        """The alignments of one session's queries in another."""
+        folder = self.path / "alignments" / f"query={query}" / f"target={target}"
+        return folder / "alignments.parquet"
+
+    def search_parts(self, query: str) -> Path:
+        """Alignments of a session whose search is not over, a file for each task."""
+        return self.path / ".parts" / query
 
     @property
     def closures(self) -> Path:

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from semloc_logs.engines import Engine
-from semloc_logs.errors import LogError, SemlocError
+from semloc_logs.errors import LogError, SemlocError, WorkspaceError
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import content_fingerprint, recover
 from semloc_logs.logs.problems import sentences, to_report
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask, fuse_session
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import SessionInput, fingerprint_of, recorded_fingerprint
+from semloc_logs.stages.lock import one_writer
 from semloc_logs.stages.report import Report
+from semloc_logs.stages.state import keep
+from semloc_logs.tables.atomic_files import replacing_folder
 from semloc_logs.tables.table import read_json, read_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import SessionFolder, Workspace
@@ -25,6 +31,7 @@ from semloc_logs.workspace import SessionFolder, Workspace
 LOGGER = logging.getLogger(__name__)
 
 
+@one_writer
 def fuse(
     sessions: Sequence[SessionInput],
     work: Workspace,
@@ -35,7 +42,8 @@ def fuse(
 ) -> Report:
     """Fuse each session. One that fails is named in ``failed``; the others go on.
 
-    Raises LogError when all of them failed.
+    Raises LogError when all of them failed, WorkspaceError where another log has the name of a
+    session, unless ``overwrite``.
     """
     report = Report()
     tasks: list[FuseTask] = []
@@ -45,7 +53,10 @@ def fuse(
             report.kept.append(session.name)
             report.skipped += read_json(task.folder.session_json)["skipped"]
         else:
+            if not overwrite:
+                _check_same_log(task)
             tasks.append(task)
+    keep(work, settings)
 
     for task, outcome in zip(tasks, engine.map(_fuse_one, tasks), strict=True):
         if isinstance(outcome, SemlocError):
@@ -65,38 +76,67 @@ def _task(session: SessionInput, folder: SessionFolder, settings: Resolved) -> F
     """The task of a session, with the fingerprint of all that its tables depend on."""
     for log in session.logs:
         recover(log)
-    inputs = [content_fingerprint(log) for log in session.logs]
-    if session.poses is not None:
-        inputs.append(f"poses {session.poses.fingerprint()}")
+    made_from = {
+        "content": [content_fingerprint(log) for log in session.logs],
+        "topics": dict(sorted(session.topics.items())),
+        "poses": None if session.poses is None else session.poses.fingerprint(),
+    }
     fingerprint = fingerprint_of(
         (
             settings.fingerprint("logs", "fusion", "labels"),
             label_fingerprint(settings.labels),
-            repr(sorted(session.topics.items())),
-            *inputs,
+            json.dumps(made_from, sort_keys=True),
         )
     )
     logs = tuple(Path(log).absolute() for log in session.logs)
-    return FuseTask(logs, folder, settings, dict(session.topics), fingerprint, session.poses)
+    topics = dict(session.topics)
+    return FuseTask(logs, folder, settings, topics, fingerprint, made_from, session.poses)
+
+
+def _check_same_log(task: FuseTask) -> None:
+    """WorkspaceError where the session of a task was made from other input.
+
+    Made from the same under other settings, or by another version, it is made again.
+    """
+    if not task.folder.session_json.exists():
+        return
+    present = read_json(task.folder.session_json)
+    before = present.get("made_from", task.made_from)
+    changed = [what for what in task.made_from if before.get(what) != task.made_from[what]]
+    if not changed:
+        return
+    name = task.folder.name
+    if "content" in changed:
+        paths = ", ".join(str(log["path"]) for log in present.get("logs", []))
+        raise WorkspaceError(
+            f"Session '{name}' was made from another log ({paths}) than {task.logs[0]}: give this"
+            f" one a name, as in NAME={task.logs[0].name}, or replace '{name}' with --overwrite."
+        )
+    raise WorkspaceError(
+        f"Session '{name}' was made with other {' and '.join(changed)}: give the same, or make it"
+        " again with --overwrite."
+    )
 
 
 def _fuse_one(task: FuseTask) -> FusedSession | SemlocError:
     """An expected error is a result: one bad log does not end the night's work."""
-
-    def draw(content: dict[str, Any]) -> None:
-        # matplotlib is loaded only where something is drawn
-        from semloc_logs.pictures.map_picture import Caption, draw_map
-
-        poses = poses_of(read_table(task.folder.frames))
-        positions = poses[:, :3, 3] if content["posed"] else np.zeros((0, 3))
-        caption = Caption(task.folder.name, content["label_source"], content["voxel_size"])
-        draw_map(task.folder.voxels, positions, caption, task.folder.picture)
-
     try:
-        task.folder.session_json.unlink(missing_ok=True)  # half a replacement must not look done
-        return fuse_session(task, on_tables=draw)
+        # beside the present session, which stays until the new one is whole
+        with replacing_folder(task.folder.path) as scratch:
+            folder = SessionFolder(scratch, task.folder.name)
+            return fuse_session(replace(task, folder=folder), on_tables=partial(_draw, folder))
     except SemlocError as problem:
         return problem
+
+
+def _draw(folder: SessionFolder, content: dict[str, Any]) -> None:
+    # matplotlib is loaded only where something is drawn
+    from semloc_logs.pictures.map_picture import Caption, draw_map
+
+    poses = poses_of(read_table(folder.frames))
+    positions = poses[:, :3, 3] if content["posed"] else np.zeros((0, 3))
+    caption = Caption(folder.name, content["label_source"], content["voxel_size"])
+    draw_map(folder.voxels, positions, caption, folder.picture)
 
 
 def _log_outcome(name: str, fused: FusedSession) -> None:

@@ -20,7 +20,7 @@ from semloc_logs.benchmarks.named import Outcome
 from semloc_logs.cli.main import program
 from semloc_logs.logs.annotation.annotate import AnnotateReport
 from semloc_logs.stages.annotate import Annotation, AnnotationMode
-from semloc_logs.stages.close import Selection
+from semloc_logs.stages.pair_search import Selection
 from semloc_logs.stages.report import Report
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_table

@@ -21,13 +21,12 @@ from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import (
-    CloseTask,
     Fitted,
     QueryContext,
     _each_place_once,
     _rival_score,
     allowed_words,
-    close_queries,
+    close_query,
     find_hypotheses,
     match_words,
 )
@@ -220,7 +219,7 @@ def ask(work: Workspace, request: pytest.FixtureRequest) -> Ask:
         write_session(
             work, name, scene or courtyard(), drive(3, 0.3, 1.0), map_T_scene, source, seed=7
         )
-        return close_queries(CloseTask(work.path, name, (1,), (target,), settings))[0]
+        return close_query(Database(work, (target,), settings), SessionMap(work.session(name)), 1)
 
     return asked
 
