@@ -90,13 +90,9 @@ class Workspace:
         return [known[name] for name in names] if names else list(known.values())
 
     @property
-    def lock(self) -> Path:
-        return self.path / ".lock"
-
-    @property
-    def writer(self) -> Path:
-        """Who has the lock."""
-        return self.path / ".writer"
+    def locks(self) -> Path:
+        """Locks of the workspace and of sessions that are made, and who has them."""
+        return self.path / ".locks"
 
     @property
     def settings(self) -> Path:

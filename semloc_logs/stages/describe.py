@@ -13,7 +13,7 @@ from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of, recorded_fingerprint
-from semloc_logs.stages.lock import one_writer
+from semloc_logs.stages.lock import writing
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.state import keep
 from semloc_logs.subvolumes.submap_descriptors import DescribeTask, variants_for
@@ -34,7 +34,6 @@ KEPT_METADATA = (
 )
 
 
-@one_writer
 def describe(
     work: Workspace,
     names: Sequence[str],
@@ -47,8 +46,19 @@ def describe(
 
     Raises WorkspaceError where a session is missing or was fused with other settings.
     """
-    report = Report()
     folders = work.chosen(names)
+    with writing(work, [folder.name for folder in folders]):
+        return _describe(work, folders, settings, engine, overwrite)
+
+
+def _describe(
+    work: Workspace,
+    folders: Sequence[SessionFolder],
+    settings: Resolved,
+    engine: Engine,
+    overwrite: bool,
+) -> Report:
+    report = Report()
     # a session is comparable with all others, not only with those that are described now
     sources = [str(read_json(f.session_json)["label_source"]) for f in work.sessions()]
     for folder in folders:

@@ -20,7 +20,7 @@ from semloc_logs.logs.problems import sentences, to_report
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask, fuse_session
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import SessionInput, fingerprint_of, recorded_fingerprint
-from semloc_logs.stages.lock import one_writer
+from semloc_logs.stages.lock import writing
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.state import keep
 from semloc_logs.tables.atomic_files import replacing_folder
@@ -31,7 +31,6 @@ from semloc_logs.workspace import SessionFolder, Workspace
 LOGGER = logging.getLogger(__name__)
 
 
-@one_writer
 def fuse(
     sessions: Sequence[SessionInput],
     work: Workspace,
@@ -45,6 +44,17 @@ def fuse(
     Raises LogError when all of them failed, WorkspaceError where another log has the name of a
     session, unless ``overwrite``.
     """
+    with writing(work, [session.name for session in sessions]):
+        return _fuse(sessions, work, settings, engine, overwrite)
+
+
+def _fuse(
+    sessions: Sequence[SessionInput],
+    work: Workspace,
+    settings: Resolved,
+    engine: Engine,
+    overwrite: bool,
+) -> Report:
     report = Report()
     tasks: list[FuseTask] = []
     for session in sessions:

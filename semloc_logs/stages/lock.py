@@ -1,7 +1,8 @@
-"""One writer of a workspace at a time; readers need no lock.
+"""Writers of a workspace: one at a time, or several that make different sessions.
 
-The lock is the kernel's: it ends with its process, however that ends. Beside it a file tells who
-has it. Where files cannot be locked, that file is the lock; one of a process that is gone is taken.
+A lock is the kernel's: it ends with its process, however that ends. Beside it a file tells who has
+it. Where files cannot be locked, that file is the lock; one of a process that is gone is taken.
+Readers need no lock.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ import json
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -25,15 +26,14 @@ from semloc_logs.workspace import Workspace
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 PROBE_BYTES = 1 << 20  # written before the work begins: a disk that is full is found then
+GATE_SECONDS = 5.0  # that other makers of sessions may take to get their locks
+WORKSPACE = "workspace"
 
-_held: dict[Path, int] = {}  # how often this process entered
+_held: set[Path] = set()  # workspaces that this process has for itself
 
 
 def one_writer(stage: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """A stage that has its workspace for itself.
-
-    Raises WorkspaceError at once where another process writes to it, or nothing can be written.
-    """
+    """A stage that has its workspace for itself."""
 
     @functools.wraps(stage)
     def locked(*args: Arguments.args, **options: Arguments.kwargs) -> Result:
@@ -45,39 +45,57 @@ def one_writer(stage: Callable[Arguments, Result]) -> Callable[Arguments, Result
 
 
 @contextmanager
-def writing(work: Workspace) -> Iterator[None]:
-    """The block is the only writer of the workspace; it may be nested."""
+def writing(work: Workspace, sessions: Sequence[str] | None = None) -> Iterator[None]:
+    """The block is the only writer of the workspace, or of its ``sessions``; it may be nested.
+
+    Raises WorkspaceError at once where another process writes there, or nothing can be written.
+    """
     path = work.path.absolute()
     if path in _held:
-        _held[path] += 1
-        try:
-            yield
-        finally:
-            _held[path] -= 1
+        yield
         return
 
     _check_writable(work)
-    with _locked(work):
-        _held[path] = 1
-        try:
-            _recover_sessions(work)
-            yield
-        finally:
-            del _held[path]
+    with ExitStack() as locks:
+        # who has the gate lets nobody else begin
+        gate = locks.enter_context(ExitStack())
+        gate.enter_context(_locked(work, WORKSPACE, 0.0 if sessions is None else GATE_SECONDS))
+        if sessions is None:
+            for name in _locked_sessions(work):
+                with _locked(work, name, 0.0):  # nobody makes it
+                    pass
+            _recover(work, _replaced_sessions(work))
+            _held.add(path)
+            locks.callback(_held.discard, path)
+        else:
+            for name in dict.fromkeys(sessions):
+                locks.enter_context(_locked(work, f"session.{name}", 0.0))
+            gate.close()
+            _recover(work, sessions)
+        yield
 
 
-def _recover_sessions(work: Workspace) -> None:
-    """Put back the sessions that a killed writer was replacing."""
-    for left in sorted((work.path / "sessions").glob(".*.tmp")):
-        name = left.name[1:].removesuffix(".tmp").removesuffix(".old").rpartition(".")[0]
-        recover_folder(left.with_name(name))
+def _locked_sessions(work: Workspace) -> list[str]:
+    return sorted(path.stem for path in work.locks.glob("session.*.lock"))
+
+
+def _replaced_sessions(work: Workspace) -> set[str]:
+    """Sessions that a killed writer was replacing."""
+    left = (work.path / "sessions").glob(".*.tmp")
+    names = (path.name[1:].removesuffix(".tmp").removesuffix(".old") for path in left)
+    return {name.rpartition(".")[0] for name in names}
+
+
+def _recover(work: Workspace, sessions: Iterable[str]) -> None:
+    for name in sorted(sessions):
+        recover_folder(work.session(name).path)
 
 
 def _check_writable(work: Workspace) -> None:
     """WorkspaceError where the workspace is read-only or its disk is full."""
     probe = work.path / f".probe.{socket.gethostname()}.{os.getpid()}"
     try:
-        make_folder(work.path)
+        make_folder(work.locks)
         try:
             with probe.open("wb") as file:
                 file.write(bytes(PROBE_BYTES))
@@ -93,38 +111,40 @@ def _check_writable(work: Workspace) -> None:
 
 
 @contextmanager
-def _locked(work: Workspace) -> Iterator[None]:
-    lock = FileLock(work.lock, timeout=0)
+def _locked(work: Workspace, name: str, seconds: float) -> Iterator[None]:
+    lock = FileLock(work.locks / f"{name}.lock", timeout=seconds)
+    writer = work.locks / f"{name}.json"
     try:
         lock.acquire()
     except Timeout:
-        raise _in_use(work, _writer(work)) from None
+        raise _in_use(work, name, _content(writer)) from None
     except (OSError, NotImplementedError):  # a file system without locks
-        with _by_file(work):
+        with _locked_by_file(work, name):
             yield
         return
     try:
-        work.writer.write_text(_this_process())
+        writer.write_text(_this_process())
         yield
     finally:
-        work.writer.unlink(missing_ok=True)
+        writer.unlink(missing_ok=True)
         lock.release()
 
 
 @contextmanager
-def _by_file(work: Workspace) -> Iterator[None]:
-    writer = _writer(work)
-    if writer.get("host") == socket.gethostname() and not is_alive(int(writer.get("process", 0))):
-        work.writer.unlink(missing_ok=True)
+def _locked_by_file(work: Workspace, name: str) -> Iterator[None]:
+    writer = work.locks / f"{name}.json"
+    content = _content(writer)
+    if content.get("host") == socket.gethostname() and not is_alive(int(content["process"])):
+        writer.unlink(missing_ok=True)
     try:
-        with work.writer.open("x") as file:
+        with writer.open("x") as file:
             file.write(_this_process())
     except FileExistsError:
-        raise _in_use(work, _writer(work)) from None
+        raise _in_use(work, name, _content(writer)) from None
     try:
         yield
     finally:
-        work.writer.unlink(missing_ok=True)
+        writer.unlink(missing_ok=True)
 
 
 def _this_process() -> str:
@@ -132,18 +152,20 @@ def _this_process() -> str:
     return json.dumps({"host": socket.gethostname(), "process": os.getpid(), "since": now})
 
 
-def _writer(work: Workspace) -> dict[str, Any]:
+def _content(writer: Path) -> dict[str, Any]:
     try:
-        content = json.loads(work.writer.read_text())
+        content = json.loads(writer.read_text())
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
 
 
-def _in_use(work: Workspace, writer: dict[str, Any]) -> WorkspaceError:
+def _in_use(work: Workspace, name: str, writer: dict[str, Any]) -> WorkspaceError:
+    session = name.partition("session.")[2]
+    what = f"Session '{session}' of {work.path}" if session else str(work.path)
     who = "another process"
     if writer:
         who = f"process {writer['process']} on {writer['host']} since {writer['since']}"
     return WorkspaceError(
-        f"{work.path} is being written by {who}: wait until it is done; finished work is kept."
+        f"{what} is being written by {who}: wait until it is done; finished work is kept."
     )

@@ -19,6 +19,7 @@ import pytest
 from filelock import FileLock
 
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.stages import lock
 from semloc_logs.stages.lock import writing
 from semloc_logs.workspace import Workspace
 
@@ -27,16 +28,20 @@ import sys, time
 from pathlib import Path
 from semloc_logs.stages.lock import writing
 from semloc_logs.workspace import Workspace
-with writing(Workspace(Path(sys.argv[1]))):
+with writing(Workspace(Path(sys.argv[1])), sys.argv[2:] or None):
     print("ready", flush=True)
     time.sleep(300)
 """
 
 
+def writer(work: Workspace) -> Path:
+    return work.locks / "workspace.json"
+
+
 @contextmanager
-def other_writer(work: Workspace) -> Iterator[subprocess.Popen[bytes]]:
+def other_writer(work: Workspace, *sessions: str) -> Iterator[subprocess.Popen[bytes]]:
     process = subprocess.Popen(
-        [sys.executable, "-c", WRITER, str(work.path)], stdout=subprocess.PIPE
+        [sys.executable, "-c", WRITER, str(work.path), *sessions], stdout=subprocess.PIPE
     )
     try:
         assert process.stdout is not None
@@ -56,16 +61,38 @@ def test_a_second_writer_is_told_who_the_first_one_is(tmp_path: Path) -> None:
         process.send_signal(signal.SIGKILL)
         process.wait()
         with writing(work):
-            assert json.loads(work.writer.read_text())["process"] == os.getpid()
-    assert not work.writer.exists()
+            assert json.loads(writer(work).read_text())["process"] == os.getpid()
+    assert not writer(work).exists()
+
+
+def test_different_sessions_are_made_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the jobs of a cluster do; nobody else writes meanwhile."""
+    monkeypatch.setattr(lock, "GATE_SECONDS", 0.2)
+    work = Workspace(tmp_path / "work")
+    with other_writer(work, "monday", "tuesday"):
+        with writing(work, ["wednesday"]):
+            pass
+        tuesday = writing(work, ["tuesday"])
+        with pytest.raises(WorkspaceError, match="Session 'tuesday' of"), tuesday:
+            pass
+        with pytest.raises(WorkspaceError, match="Session 'monday' of"), writing(work):
+            pass
+    with writing(work):
+        pass
+    with other_writer(work):
+        wednesday = writing(work, ["wednesday"])
+        with pytest.raises(WorkspaceError, match="work is being written by process"), wednesday:
+            pass
 
 
 def test_a_writer_may_enter_again(tmp_path: Path) -> None:
     work = Workspace(tmp_path / "work")
     with writing(work):
-        with writing(work):
+        with writing(work), writing(work, ["monday"]):
             pass
-        assert work.writer.exists()
+        assert writer(work).exists()
     with writing(work):
         pass
 
@@ -79,14 +106,14 @@ def test_where_files_cannot_be_locked_the_name_is_the_lock(
     monkeypatch.setattr(FileLock, "acquire", no_locks)
     work = Workspace(tmp_path / "work")
     with writing(work):
-        assert work.writer.exists()
+        assert writer(work).exists()
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     holder = {"host": socket.gethostname(), "process": gone.pid, "since": "yesterday"}
-    work.writer.write_text(json.dumps(holder))
+    writer(work).write_text(json.dumps(holder))
     with writing(work):
-        assert json.loads(work.writer.read_text())["process"] == os.getpid()
-    work.writer.write_text(json.dumps(holder | {"host": "another"}))
+        assert json.loads(writer(work).read_text())["process"] == os.getpid()
+    writer(work).write_text(json.dumps(holder | {"host": "another"}))
     with pytest.raises(WorkspaceError, match="on another since yesterday"), writing(work):
         pass
 
@@ -103,7 +130,7 @@ def test_a_full_or_read_only_disk_is_found_first(
     sentence = f"cannot be written to .{os.strerror(code)}"
     with pytest.raises(WorkspaceError, match=sentence), writing(work):
         pytest.fail("the work began")
-    assert list(tmp_path.iterdir()) == []
+    assert [p.name for p in tmp_path.iterdir() if p.is_file()] == []
 
 
 def test_the_owner_of_temporary_files_is_in_their_names(tmp_path: Path) -> None:
