@@ -14,6 +14,7 @@ from .options import (
     EngineChoice,
     PoseChoice,
     reading_options,
+    retry_option,
     stage_options,
     work_option,
 )
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     metavar="NAME",
     help="Name of the session; default: the first log's file stem or folder name.",
 )
+@retry_option
 @reading_options
 @stage_options
 def command(
@@ -39,6 +41,7 @@ def command(
     session: str | None,
     topics: dict[str, str],
     poses: PoseChoice,
+    retry_failed: bool,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -59,7 +62,14 @@ def command(
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(sessions)) as opened:
-        report = fuse(sessions, workspace, settings, opened, overwrite=overwrite)
+        report = fuse(
+            sessions,
+            workspace,
+            settings,
+            opened,
+            overwrite=overwrite,
+            retry_failed=retry_failed,
+        )
     if as_json:
         console.result_json(report_json(report, work))
     else:

@@ -64,6 +64,12 @@ overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Do finished work again; replace existing outputs."
 )
 
+retry_option = click.option(
+    "--retry-failed",
+    is_flag=True,
+    help="Read logs again that failed before, with the same content and settings.",
+)
+
 
 def _set_verbosity(_: click.Context, parameter: click.Parameter, count: int) -> None:
     if count:

@@ -15,6 +15,7 @@ from .options import (
     PoseChoice,
     query_options,
     reading_options,
+    retry_option,
     stage_options,
     work_option,
 )
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Also write the closures as channels: to WORK/annotated (copy, sidecar) or into the logs.",
 )
+@retry_option
 @reading_options
 @query_options
 @stage_options
@@ -44,6 +46,7 @@ def command(
     annotation: str,
     topics: dict[str, str],
     poses: PoseChoice,
+    retry_failed: bool,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -68,7 +71,15 @@ def command(
     workspace = Workspace(work)
     mode = AnnotationMode(annotation)
     with console.progress(), engine.open(len(sessions)) as opened:
-        report = run(sessions, workspace, settings, opened, annotation=mode, overwrite=overwrite)
+        report = run(
+            sessions,
+            workspace,
+            settings,
+            opened,
+            annotation=mode,
+            overwrite=overwrite,
+            retry_failed=retry_failed,
+        )
     if as_json:
         console.result_json(report_json(report, work))
     else:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from semloc_logs.errors import SettingsError
+from semloc_logs.errors import SettingsError, did_you_mean
 
 STREET_VOXEL = 0.30
 # sections that the tables of a workspace depend on, and settings in them that change no table
@@ -511,10 +511,17 @@ def validated(content: Mapping[str, Any]) -> Settings:
         if first["type"] == "extra_forbidden":
             raise SettingsError(
                 f"Unknown setting '{key}': 'semloc run --dump-config' prints every key."
+                f"{did_you_mean(key, _keys())}"
             ) from None
         raise SettingsError(
             f"Setting '{key}' cannot be {first.get('input')!r}: {first['msg']}."
         ) from None
+
+
+def _keys() -> list[str]:
+    """Every section, and every setting by its key path."""
+    sections = {name: type(values).model_fields for name, values in Settings()}
+    return [*sections, *(f"{name}.{key}" for name, fields in sections.items() for key in fields)]
 
 
 def _assign(tree: dict[str, Any], key: str, value: str) -> None:

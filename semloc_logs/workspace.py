@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from semloc_logs.errors import WorkspaceError
+from semloc_logs.errors import WorkspaceError, did_you_mean
+
+MOST_NAMED = 12  # sessions in a sentence
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +85,10 @@ class Workspace:
             raise WorkspaceError(f"{self.path} holds no sessions: run 'semloc fuse' first.")
         missing = [name for name in names if name not in known]
         if missing:
+            listed = ", ".join(known) if len(known) <= MOST_NAMED else f"{len(known)} others"
             raise WorkspaceError(
-                f"{self.path} has no session {', '.join(missing)} (it has {', '.join(known)}):"
-                " run 'semloc fuse' first."
+                f"{self.path} has no session {', '.join(missing)} (it has {listed}): run 'semloc"
+                f" fuse' first.{did_you_mean(missing[0], known)}"
             )
         return [known[name] for name in names] if names else list(known.values())
 
@@ -97,6 +100,13 @@ class Workspace:
     @property
     def settings(self) -> Path:
         return self.path / "workspace.json"
+
+    def failure(self, session: str) -> Path:
+        """Why the log of a session could not be fused."""
+        return self.path / "failed" / f"{session}.json"
+
+    def failures(self) -> list[Path]:
+        return sorted((self.path / "failed").glob("*.json"))
 
     def alignments(self, query: str, target: str) -> Path:
         """The alignments of one session's queries in another."""

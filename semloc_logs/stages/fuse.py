@@ -24,7 +24,7 @@ from semloc_logs.stages.lock import writing
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.state import keep
 from semloc_logs.tables.atomic_files import replacing_folder
-from semloc_logs.tables.table import read_json, read_table
+from semloc_logs.tables.table import read_json, read_table, write_json
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import SessionFolder, Workspace
 
@@ -38,14 +38,16 @@ def fuse(
     engine: Engine,
     *,
     overwrite: bool = False,
+    retry_failed: bool = False,
 ) -> Report:
     """Fuse each session. One that fails is named in ``failed``; the others go on.
 
+    The reason is kept, and the same log is not read again unless ``retry_failed`` or ``overwrite``.
     Raises LogError when all of them failed, WorkspaceError where another log has the name of a
     session, unless ``overwrite``.
     """
     with writing(work, [session.name for session in sessions]):
-        return _fuse(sessions, work, settings, engine, overwrite)
+        return _fuse(sessions, work, settings, engine, overwrite, again=overwrite or retry_failed)
 
 
 def _fuse(
@@ -54,6 +56,7 @@ def _fuse(
     settings: Resolved,
     engine: Engine,
     overwrite: bool,
+    again: bool,
 ) -> Report:
     report = Report()
     tasks: list[FuseTask] = []
@@ -62,18 +65,26 @@ def _fuse(
         if not overwrite and recorded_fingerprint(task.folder.session_json) == task.fingerprint:
             report.kept.append(session.name)
             report.skipped += read_json(task.folder.session_json)["skipped"]
+            continue
+        if not overwrite:
+            _check_same_log(task)
+        if not again and recorded_fingerprint(work.failure(session.name)) == task.fingerprint:
+            reason = read_json(work.failure(session.name))["reason"]
+            report.failed.append(f"{reason} It failed before: --retry-failed reads it again.")
         else:
-            if not overwrite:
-                _check_same_log(task)
             tasks.append(task)
     keep(work, settings)
 
     for task, outcome in zip(tasks, engine.map(_fuse_one, tasks), strict=True):
+        failure = work.failure(task.folder.name)
         if isinstance(outcome, SemlocError):
             report.failed.append(str(outcome))
+            content = {"fingerprint": task.fingerprint, "reason": str(outcome)}
+            write_json(failure, content | {"logs": [str(log) for log in task.logs]})
             if len(tasks) > 1:  # the only one is raised below
                 LOGGER.info("%s: %s", task.folder.name, outcome)
         else:
+            failure.unlink(missing_ok=True)
             report.done.append(task.folder.name)
             report.skipped += sentences(to_report(outcome.problems))
             _log_outcome(task.folder.name, outcome)

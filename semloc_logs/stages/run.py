@@ -32,10 +32,14 @@ def run(
     *,
     annotation: AnnotationMode = AnnotationMode.NONE,
     overwrite: bool = False,
+    retry_failed: bool = False,
 ) -> Report:
     """All of it, resumable: sessions are fused, and all of the workspace described and closed."""
     total = _Total()
-    total.add("fuse", fuse(sessions, work, settings, engine, overwrite=overwrite))
+    fused_now = fuse(
+        sessions, work, settings, engine, overwrite=overwrite, retry_failed=retry_failed
+    )
+    total.add("fuse", fused_now)
     fused = [s for s in sessions if work.session(s.name).session_json.exists()]
     # of those that are fused again, words are made again
     total.add("describe", describe(work, [], settings, engine))

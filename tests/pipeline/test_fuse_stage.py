@@ -18,6 +18,7 @@ from semloc_logs.engines import Serial
 from semloc_logs.errors import LogError, WorkspaceError
 from semloc_logs.logs.annotation.annotate import Results, annotate_in_place
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.mapping import session_fusion
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Resolved
@@ -271,6 +272,46 @@ def test_a_log_that_fails_does_not_end_the_others(
     assert [s.name for s in work.sessions()] == ["monday"]
     with pytest.raises(LogError):
         fuse_stage.fuse([no_log], work, tools.coarse_settings(), Serial())
+
+
+def test_a_log_that_failed_is_read_again_when_it_or_the_settings_change_or_on_demand(
+    tools: SimpleNamespace, drives: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "no.mcap"
+    log.write_bytes(b"no log")
+    work = Workspace(tmp_path / "work")
+    read: list[str] = []
+    fuse_session = session_fusion.fuse_session
+
+    def counted(task: FuseTask, **options: Any) -> FusedSession:
+        read.append(task.folder.name)
+        return fuse_session(task, **options)
+
+    monkeypatch.setattr(fuse_stage, "fuse_session", counted)
+
+    def fuse_again(**options: Any) -> tuple[Report, int]:
+        read.clear()
+        settings = options.pop("settings", tools.coarse_settings())
+        inputs = [SessionInput("no", (log,)), *tools.inputs(drives, "monday")]
+        return fuse_stage.fuse(inputs, work, settings, Serial(), **options), read.count("no")
+
+    first, reads = fuse_again()
+    assert (first.done, len(first.failed), reads) == (["monday"], 1, 1)
+    content = read_json(work.failure("no"))
+    assert content["reason"] == first.failed[0]
+    assert content["logs"] == [str(log)]
+    second, reads = fuse_again()
+    assert (second.kept, reads) == (["monday"], 0)
+    assert second.failed == [f"{first.failed[0]} It failed before: --retry-failed reads it again."]
+    assert fuse_again(retry_failed=True)[1] == 1
+    log.write_bytes(b"still no log")
+    assert fuse_again()[1] == 1
+    assert fuse_again()[1] == 0
+    assert fuse_again(settings=tools.coarse_settings(labels__source="uniform"))[1] == 1
+    shutil.copyfile(drives["tuesday"].log, log)
+    fused, _ = fuse_again()
+    assert fused.done == ["no", "monday"]
+    assert work.failures() == []
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7])
