@@ -65,7 +65,7 @@ class LogChoice:
 
     def _checked(self, entries: list[Entry]) -> list[Entry]:
         if not entries:
-            raise click.UsageError("No logs are given: name some, or a --manifest that does.")
+            raise click.UsageError("No LOG is given: name some, or a --manifest that does.")
         return entries
 
 

@@ -29,6 +29,7 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "describe": ("describe", "Maps -> semantic words."),
     "close": ("close", "Words -> loop closures."),
     "sessions": ("sessions", "What a workspace holds; rename and remove sessions."),
+    "doctor": ("doctor", "Every file of a workspace checked, and what mends it."),
     "annotate": ("annotate", "Closures -> channels of a log."),
     "index": ("index", "The index of the words: what it holds; up to date."),
     "evaluate": ("evaluate", "Closures against the truth."),
@@ -63,7 +64,7 @@ class Program(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """UsageError that names the command spelled most like an unknown one."""
         name = args[0] if args else ""
-        if name not in COMMANDS and not name.startswith("-"):
+        if not name.startswith("-") and self.get_command(ctx, name) is None:
             ctx.fail(f"No such command '{name}'.{did_you_mean(name, COMMANDS)}")
         return super().resolve_command(ctx, args)
 

@@ -97,6 +97,9 @@ class Workspace:
         """Locks of the workspace and of sessions that are made, and who has them."""
         return self.path / ".locks"
 
+    def session_lock(self, session: str) -> Path:
+        return self.locks / f"session.{session}.lock"
+
     @property
     def settings(self) -> Path:
         return self.path / "workspace.json"

@@ -208,3 +208,14 @@ def test_resolved_settings_hold_every_length_and_stay_as_they_are() -> None:
 def test_the_environment_is_read_by_load_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SEMLOC_FUSION__VOXEL_SIZE", "0.7")
     assert Settings().fusion.voxel_size == 0.3
+
+
+@pytest.mark.parametrize(
+    ("key", "meant"),
+    [("fusion.voxelsize", "fusion.voxel_size"), ("fussion.hit", "fusion"), ("xyzzy", None)],
+)
+def test_a_key_that_is_spelled_wrong_is_suggested(key: str, meant: str | None) -> None:
+    with pytest.raises(SettingsError) as caught:
+        load(assignments={key: "1"})
+    assert ("Did you mean" in str(caught.value)) == (meant is not None)
+    assert meant is None or f"'{meant}'?" in str(caught.value)

@@ -53,8 +53,7 @@ def decide_all(work: Workspace, maps: Maps, settings: Resolved, *, overwrite: bo
 
     They are of the alignments of all pairs.
     """
-    fingerprint = _decided_from(work, settings)
-    if not overwrite and _is_decided(work, fingerprint):
+    if not overwrite and is_decided(work, settings):
         return False
     # matplotlib is loaded only where something is drawn
     from semloc_logs.pictures.closures_picture import draw_closures
@@ -72,7 +71,7 @@ def decide_all(work: Workspace, maps: Maps, settings: Resolved, *, overwrite: bo
     metadata = {
         **metadata_of(settings, maps.values()),
         "queries": sum(queries.values()),
-        "fingerprint": fingerprint,
+        "fingerprint": _decided_from(work, settings),
         "settings": settings.tables(*SECTIONS),
     }
     # closures.parquet comes last: with its fingerprint it vouches for the other two
@@ -88,7 +87,9 @@ def _decided_from(work: Workspace, settings: Resolved) -> str:
     return fingerprint_of((settings.fingerprint(*SECTIONS), *pairs))
 
 
-def _is_decided(work: Workspace, fingerprint: str) -> bool:
+def is_decided(work: Workspace, settings: Resolved) -> bool:
+    """Whether the tables are there and were decided from the alignments that are there."""
+    fingerprint = _decided_from(work, settings)
     return all(
         table.exists() and read_metadata(table).get("fingerprint") == fingerprint
         for table in (work.closures, work.rejected)

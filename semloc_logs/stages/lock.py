@@ -69,7 +69,7 @@ def writing(work: Workspace, sessions: Sequence[str] | None = None) -> Iterator[
             locks.callback(_held.discard, path)
         else:
             for name in dict.fromkeys(sessions):
-                locks.enter_context(_locked(work, f"session.{name}", 0.0))
+                locks.enter_context(_locked(work, work.session_lock(name).stem, 0.0))
             gate.close()
             _recover(work, sessions)
         yield

@@ -90,7 +90,7 @@ class PairSearch:
         maps = {folder.name: SessionMap(folder) for folder in work.chosen(())}
         for session in maps.values():
             check_settings(session.folder, settings)
-        fingerprints = _fingerprints(maps, settings)
+        fingerprints = pair_fingerprints(maps, settings)
         known = known_pairs(work)
         chosen = [
             pair
@@ -174,7 +174,7 @@ def metadata_of(settings: Resolved, maps: Iterable[SessionMap]) -> dict[str, Any
     }
 
 
-def _fingerprints(maps: Maps, settings: Resolved) -> dict[Pair, str]:
+def pair_fingerprints(maps: Maps, settings: Resolved) -> dict[Pair, str]:
     """All pairs, with what their alignments depend on."""
     words = {name: words_fingerprint(m.folder, settings) for name, m in maps.items()}
     used = settings.tables("query", "closures")

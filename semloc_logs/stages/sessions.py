@@ -86,6 +86,7 @@ def rename_session(work: Workspace, name: str, new_name: str) -> None:
         sync_folder(new.parent)
     shutil.rmtree(work.path / "alignments" / f"query={name}", ignore_errors=True)
     _clear_targets(work, name)
+    work.session_lock(name).unlink(missing_ok=True)
     _decide(work)
 
 
@@ -98,11 +99,15 @@ def remove_session(work: Workspace, name: str) -> None:
     folder.session_json.unlink()  # without it the rest is nothing
     shutil.rmtree(folder.path)
     sync_folder(folder.path.parent)
+    work.session_lock(name).unlink(missing_ok=True)
     _decide(work)
 
 
 def _decide(work: Workspace) -> None:
     """The tables of closures again, where there are any."""
+    if not work.sessions():
+        for path in (work.closures, work.rejected, work.picture):
+            path.unlink(missing_ok=True)
     settings = read_kept(work)
     if settings is not None and work.closures.exists():
         maps = {folder.name: SessionMap(folder) for folder in work.sessions()}

@@ -51,7 +51,7 @@ def test_lines_of_standard_input(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_no_logs_at_all() -> None:
-    with pytest.raises(click.UsageError, match="No logs"):
+    with pytest.raises(click.UsageError, match="No LOG is given"):
         sessions()
 
 
