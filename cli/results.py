@@ -42,41 +42,33 @@ def show_report(verb: str, report: Report) -> None:
 
 
 def show_closures(work: Workspace) -> None:
-    """The closures of a workspace as a table, and where they lie."""
-    import numpy as np
-
+    """The closures of a workspace by pairs of sessions, and where they lie."""
     from semloc_logs.closures.closure_tables import read_closures
 
     rows = read_closures(work.closures)
-    drawn = []
-    for r in rows[:SHOWN]:
-        yaw = np.degrees(2 * np.arctan2(r["q_z"], r["q_w"]))
-        drawn.append(
-            (
-                r["query_session"],
-                f"{r['query_stamp_ns'] / 1e9:.1f}",
-                r["target_session"],
-                f"{r['target_stamp_ns'] / 1e9:.1f}",
-                f"{np.linalg.norm([r['t_x'], r['t_y'], r['t_z']]):.2f}",
-                f"{(yaw + 180) % 360 - 180:.0f}",
-                f"{r['overlap']:.2f}",
-                f"{r['probability']:.4f}",
-            )
+    pairs: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        pairs.setdefault((row["query_session"], row["target_session"]), []).append(row)
+    drawn = [
+        (
+            query,
+            "itself" if target == query else target,
+            len(found),
+            _seconds(found, "query"),
+            f"{min(row['overlap'] for row in found):.2f}",
+            f"{min(row['probability'] for row in found):.4f}",
         )
-    if rows:
-        columns = (
-            "query",
-            "stamp (s)",
-            "target",
-            "stamp (s)",
-            "apart (m)",
-            "yaw (deg)",
-            "overlap#",
-            "probability#",
-        )
-        console.table("", columns, drawn)
-    if len(rows) > SHOWN:
-        console.result(f"... and {len(rows) - SHOWN} more.")
+        for (query, target), found in sorted(pairs.items(), key=lambda p: (-len(p[1]), p[0]))
+    ]
+    if drawn:
+        columns = ("query", "in", "closures#", "over (s)", "overlap from#", "probability from#")
+        console.table("", columns, drawn[:SHOWN])
+    if len(drawn) > SHOWN:
+        console.result(f"... and {len(drawn) - SHOWN} more pairs of sessions.")
+    alone = sorted({f.name for f in work.sessions()} - {name for pair in pairs for name in pair})
+    if rows and alone:
+        listed = ", ".join(alone[:SHOWN]) + (" and others" if len(alone) > SHOWN else "")
+        console.result(f"Without closures: {listed}")
     console.result(
         f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in"
         f" {work.rejected}"
@@ -85,3 +77,9 @@ def show_closures(work: Workspace) -> None:
         console.note(f"To see the best rejected hypothesis: semloc show -w {work.path} -o view.png")
     if work.picture.exists():
         console.result(f"Picture: {work.picture}")
+
+
+def _seconds(rows: list[dict[str, Any]], end: str) -> str:
+    """The time from the first to the last closure."""
+    stamps_ns = [row[f"{end}_stamp_ns"] for row in rows]
+    return f"{(max(stamps_ns) - min(stamps_ns)) / 1e9:.0f}"

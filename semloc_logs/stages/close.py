@@ -13,6 +13,7 @@ from semloc_logs.closures.closure_tables import (
 )
 from semloc_logs.closures.pairs import known_pairs
 from semloc_logs.engines import Engine
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of
 from semloc_logs.stages.lock import one_writer
@@ -90,7 +91,8 @@ def _decided_from(work: Workspace, settings: Resolved) -> str:
 def is_decided(work: Workspace, settings: Resolved) -> bool:
     """Whether the tables are there and were decided from the alignments that are there."""
     fingerprint = _decided_from(work, settings)
-    return all(
-        table.exists() and read_metadata(table).get("fingerprint") == fingerprint
-        for table in (work.closures, work.rejected)
-    )
+    try:
+        tables = [read_metadata(path) for path in (work.closures, work.rejected)]
+    except WorkspaceError:  # missing or damaged
+        return False
+    return all(metadata.get("fingerprint") == fingerprint for metadata in tables)

@@ -76,13 +76,16 @@ def test_overwriting_does_it_again(close: Close, coarse: Workspace, tools: Simpl
     assert alignments == {name for name in tables if name.startswith("alignments/")}
 
 
-@pytest.mark.parametrize("missing", ["closures", "rejected"])
-def test_a_missing_table_is_made_again(
-    close: Close, coarse: Workspace, tools: SimpleNamespace, missing: str
+@pytest.mark.parametrize("name", ["closures", "rejected", "alignments"])
+@pytest.mark.parametrize("is_damaged", [False, True])
+def test_a_missing_or_damaged_table_is_made_again(
+    close: Close, coarse: Workspace, tools: SimpleNamespace, name: str, is_damaged: bool
 ) -> None:
     tables = tools.files(coarse.path)
-    getattr(coarse, missing).unlink()
-    assert was_done(close())
+    path = getattr(coarse, name)
+    path = path("tuesday", "monday") if name == "alignments" else path
+    path.write_bytes(path.read_bytes()[:-9]) if is_damaged else path.unlink()
+    close()
     assert tools.files(coarse.path) == tables
 
 

@@ -26,7 +26,7 @@ def test_sessions_are_listed_in_the_order_of_their_recording(coarse: Workspace) 
     monday, tuesday = list_sessions(coarse)
     assert (monday.name, tuesday.name) == ("monday", "tuesday")
     assert monday.logs[0].endswith("monday.mcap")
-    assert monday.road_m == pytest.approx(18.0, abs=3.0)
+    assert 10.0 < monday.road_m < 20.0
     assert monday.described
     assert (monday.searched, monday.closures) == (2, len(closures(coarse)))
     assert [s.name for s in list_sessions(coarse, ["tuesday"])] == ["tuesday"]
