@@ -36,7 +36,7 @@ from semloc_logs.subvolumes.describe import (
     load_encoder,
     quarter_turns,
 )
-from semloc_logs.words.index import Allowed, Matches
+from semloc_logs.words.index import Allowed, Index, LookUp, Matches, look_ups
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
@@ -49,7 +49,8 @@ DRIVEN_AGAIN = 50
 LEAST_SCORE = 1e-3  # that a rival's score is divided by
 MOST_DISTINCT = 2.0  # a rival's score over an alignment's: more is not worse
 
-_DESCRIBED: WeakKeyDictionary[Query, dict[str, Described]] = WeakKeyDictionary()
+Prepared = tuple[Described, list[list[LookUp]]]
+_PREPARED: WeakKeyDictionary[Query, dict[str, Prepared]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,24 +206,31 @@ def match_words(
 
     The query's ground is at ``ground_z`` (m). The ``yaw`` of a match is of ``target_T_query``.
     """
-    described = _described(query, variant, ground_z, database.settings)
-    closures = database.settings.closures
     index = database.words(variant)
+    described, prepared = _prepared(query, variant, ground_z, database.settings, index)
+    closures = database.settings.closures
     quarters = []
-    for turns in range(4):
-        descriptors = quarter_turns(described.descriptor, turns)
-        matches = index.search(descriptors, closures.neighbours, closures.probes, allowed)
+    for turns, batches in enumerate(prepared):
+        matches = index.find(batches, closures.neighbours, allowed)
         yaw = np.mod(matches.yaw + turns * np.pi / 2, 2 * np.pi)
         quarters.append(replace(matches, yaw=yaw))
     columns = (np.concatenate([getattr(m, f.name) for m in quarters]) for f in fields(Matches))
     return described, Matches(*columns)
 
 
-def _described(query: Query, variant: str, ground_z: float, settings: Resolved) -> Described:
-    """The subvolumes of a query, which is described once for all targets."""
-    of_query = _DESCRIBED.setdefault(query, {})
+def _prepared(
+    query: Query, variant: str, ground_z: float, settings: Resolved, index: Index
+) -> Prepared:
+    """The subvolumes of a query and their look-ups in each quarter turn, once for all targets."""
+    of_query = _PREPARED.setdefault(query, {})
     if variant not in of_query:
-        of_query[variant] = _describe(query, variant, ground_z, settings)
+        described = _describe(query, variant, ground_z, settings)
+        turned = (quarter_turns(described.descriptor, turns) for turns in range(4))
+        probes = settings.closures.probes
+        of_query[variant] = (
+            described,
+            [look_ups(index.vocabulary, descriptors, probes) for descriptors in turned],
+        )
     return of_query[variant]
 
 

@@ -51,6 +51,7 @@ from semloc_logs.voxels.store import (
     write_blocks,
 )
 from semloc_logs.words.index import Matches
+from semloc_logs.words.vocabulary import load_vocabulary
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
@@ -354,7 +355,9 @@ def test_a_near_word_outweighs_several_far_ones(
     several = np.array([150.0, -40.0, 7.0])
 
     class Words:
-        def search(self, descriptor: NDArray[np.float32], *_: Any) -> Matches:
+        vocabulary = load_vocabulary("semantic", None)
+
+        def find(self, *_: Any) -> Matches:
             rows = np.zeros(4, np.int32)
             centre = np.stack([one, several, several, several])
             return Matches(
