@@ -18,6 +18,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.stages import annotate as annotate_stage
 from semloc_logs.stages.annotate import Annotation, AnnotationMode
@@ -244,3 +245,15 @@ def test_annotating_under_another_name_takes_the_closures_of_that_session(
     assert report.closures == sum(
         "monday" in (row["query_session"], row["target_session"]) for row in rows
     )
+
+
+def test_another_log_of_the_same_name_is_refused(
+    labelled: Workspace, drives: Any, tools: SimpleNamespace, tmp_path: Path
+) -> None:
+    """Its closures would be those of another drive."""
+    log = tmp_path / "monday.mcap"
+    log.write_bytes(drives["wednesday"].log.read_bytes())
+    annotation = Annotation(AnnotationMode("copy"), tmp_path / "out.mcap")
+    with pytest.raises(WorkspaceError, match=r"is not the log that session 'monday' was made from"):
+        annotate_stage.annotate(log, labelled, tools.quick_settings(), annotation)
+    assert not (tmp_path / "out.mcap").exists()
