@@ -27,8 +27,11 @@ class Pair:
 
 
 def pairs_of_sessions(maps: Mapping[str, SessionMap]) -> list[Pair]:
-    """All pairs of sessions, each once, by the names of query and target."""
-    order = sorted(maps, key=lambda name: (int(maps[name].stamps_ns[0]), name))
+    """All pairs of sessions, each once, by the names of query and target.
+
+    A log without poses has no map to be searched in: it is the query of those that have one.
+    """
+    order = sorted(maps, key=lambda n: (not maps[n].posed, int(maps[n].stamps_ns[0]), n))
     pairs = [
         Pair(query, target) for number, query in enumerate(order) for target in order[: number + 1]
     ]
