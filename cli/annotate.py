@@ -14,7 +14,7 @@ from .options import (
     json_option,
     overwrite_option,
     path_option,
-    settings_options,
+    tables_settings_options,
     work_option,
 )
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 )
 @overwrite_option
 @json_option
-@settings_options
+@tables_settings_options
 @console_options
 def command(
     log: Path,

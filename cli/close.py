@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     "queries",
     metavar="SESSION",
     multiple=True,
-    help="Session to localise; repeatable; default: all.",
+    help="Search pairs with this session only; repeatable.",
 )
 @click.option(
     "--target",
     "targets",
     metavar="SESSION",
     multiple=True,
-    help="Session to localise it in; repeatable; default: all.",
+    help="And of these the ones with this session; repeatable.",
 )
 @click.option("--no-self", is_flag=True, help="Do not look for revisits within a session.")
 @query_options
@@ -46,14 +46,16 @@ def command(
 ) -> int:
     """Words -> loop closures.
 
-    Every session is localised in all others, and in itself apart from keyframes that are near in
-    time. Writes closures.parquet.
+    Of two sessions the later recorded one is localised in the earlier one, and each in itself apart
+    from keyframes that are near in time. Pairs that were searched before are kept; --query and
+    --target restrict what is searched now. Writes closures.parquet.
 
     \b
     Example:  semloc close -w work --query tuesday --target monday --query-every 5
     """
     from semloc_logs.closures.closure_tables import read_closures
-    from semloc_logs.stages.close import Selection, close
+    from semloc_logs.stages.close import close
+    from semloc_logs.stages.pair_search import Selection
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

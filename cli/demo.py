@@ -9,8 +9,9 @@ import click
 
 from .console import console
 from .evaluate import show_evaluation
+from .inputs import Entry, session_inputs
 from .options import Command, EngineChoice, stage_options
-from .results import finish, report_json, session_inputs
+from .results import finish, report_json
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Resolved
@@ -42,14 +43,15 @@ def command(
     from semloc_logs.simulation.meshes.world import require_ray_caster
     from semloc_logs.stages.annotate import AnnotationMode
     from semloc_logs.stages.run import run
+    from semloc_logs.stages.state import settle
     from semloc_logs.workspace import Workspace
 
-    settings = settings.model_copy(
-        update={"query": settings.query.model_copy(update={"every": QUERY_EVERY})}
-    )
     logs = [output / "monday.mcap", output / "tuesday.bag"]
     truth = output / "truth.json"
     workspace = Workspace(output / "work")
+    query = settings.query.model_copy(update={"every": QUERY_EVERY})
+    given = settings.model_copy(update={"query": query})
+    settings = settle(workspace, given, writes=True, overwrite=overwrite).resolved()
     with console.progress():
         if overwrite or not truth.exists():
             require_ray_caster("semloc demo")
@@ -57,7 +59,7 @@ def command(
             simulate_demo(output)
         with engine.open(len(logs)) as opened:
             report = run(
-                session_inputs(logs),
+                session_inputs(Entry(None, (log,)) for log in logs),
                 workspace,
                 settings,
                 opened,

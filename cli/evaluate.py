@@ -14,7 +14,7 @@ from .options import (
     json_option,
     path_option,
     query_options,
-    settings_options,
+    tables_settings_options,
     work_option,
 )
 from .results import SHOWN
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 @click.option("--no-self", is_flag=True, help="Leave revisits within a session out of the recall.")
 @query_options
 @json_option
-@settings_options
+@tables_settings_options
 @console_options
 def command(work: Path, truth: Path, no_self: bool, as_json: bool, settings: Resolved) -> int:
     """Closures against the truth: a closure is correct within 1 m and 5 degrees.

@@ -15,11 +15,10 @@ from .options import Command, console_options, json_option, work_option
 @json_option
 @console_options
 def command(work: Path, as_json: bool) -> int:
-    """Bring the index of the words up to date and say what it holds. 'semloc close' does the first
-    by itself.
+    """Bring the index of the words of all sessions up to date and say what it holds. 'semloc close'
+    searches each session by itself and does not need it.
 
-    Files are read in full and damaged ones are built again. To remove a session, delete
-    WORK/sessions/SESSION.
+    Files are read in full and damaged ones are built again.
 
     \b
     Example:  semloc index -w work

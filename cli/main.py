@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import click
 
 from semloc_logs import __version__
-from semloc_logs.errors import SemlocError, SettingsError
+from semloc_logs.errors import SemlocError, SettingsError, did_you_mean
 
 from .console import console
 
@@ -28,6 +28,8 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "fuse": ("fuse", "Logs -> the semantic map of one session."),
     "describe": ("describe", "Maps -> semantic words."),
     "close": ("close", "Words -> loop closures."),
+    "sessions": ("sessions", "What a workspace holds; rename and remove sessions."),
+    "doctor": ("doctor", "Every file of a workspace checked, and what mends it."),
     "annotate": ("annotate", "Closures -> channels of a log."),
     "index": ("index", "The index of the words: what it holds; up to date."),
     "evaluate": ("evaluate", "Closures against the truth."),
@@ -56,6 +58,15 @@ class Program(click.Group):
             return None
         found: click.Command = import_module(f".{COMMANDS[cmd_name][0]}", __package__).command
         return found
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """UsageError that names the command spelled most like an unknown one."""
+        name = args[0] if args else ""
+        if not name.startswith("-") and self.get_command(ctx, name) is None:
+            ctx.fail(f"No such command '{name}'.{did_you_mean(name, COMMANDS)}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Without importing them."""

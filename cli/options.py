@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -34,6 +34,7 @@ FLAGS = {  # options that are short for a setting
     "scenes": "training.scenes",
     "seed": "training.seed",
 }
+DUMPED = {"work", "config", "assignments", *FLAGS}  # options that --dump-config looks at
 
 
 class Command(click.Command):
@@ -43,9 +44,9 @@ class Command(click.Command):
         if "--dump-config" in args and any(p.name == "dump_config" for p in self.params):
             given = self.make_parser(ctx).parse_args(args=list(args))[0]
             for parameter in self.params:
-                if parameter.name in given and parameter.name in {"config", "assignments", *FLAGS}:
+                if parameter.name in given and parameter.name in DUMPED:
                     parameter.handle_parse_result(ctx, given, [])
-            click.echo(_explained(_settings(ctx.params)), nl=False)
+            click.echo(_explained(_settled(ctx.params, "stages")), nl=False)
             ctx.exit(0)
         return super().parse_args(ctx, args)
 
@@ -62,6 +63,12 @@ work_option = path_option("-w", "--work", required=True, help="Workspace folder.
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Do finished work again; replace existing outputs."
+)
+
+retry_option = click.option(
+    "--retry-failed",
+    is_flag=True,
+    help="Read logs again that failed before, with the same content and settings.",
 )
 
 
@@ -128,9 +135,15 @@ topic_option = click.option(
 )
 
 
-def settings_options(function: Function) -> Function:
+Use = Literal["nothing", "tables", "stages"]
+
+
+def settings_options(function: Function, *, use: Use = "nothing") -> Function:
     """--config, --set and --dump-config; the command gets ``settings``, lengths filled in from the
     voxel size.
+
+    A command that uses the ``tables`` of a workspace takes the settings that this keeps; one of the
+    ``stages``, which write them, may have --overwrite to change them.
     """
 
     @click.option("--config", type=click.Path(path_type=Path), help="YAML file of settings.")
@@ -145,7 +158,7 @@ def settings_options(function: Function) -> Function:
     @click.option("--dump-config", is_flag=True, help="Print all settings, explained, and exit.")
     @functools.wraps(function)
     def with_settings(*args: Any, dump_config: bool, **options: Any) -> Any:
-        settings = _settings(options)
+        settings = _settled(options, use)
         rest = {k: v for k, v in options.items() if k not in {"config", "assignments", *FLAGS}}
         return function(*args, settings=settings.resolved(), **rest)
 
@@ -165,6 +178,19 @@ def _settings(options: Mapping[str, Any]) -> Settings:
     if options.get("seg_model") is not None:
         assignments.setdefault("labels.source", "onnx")
     return load(options.get("config"), assignments, os.environ)
+
+
+def _settled(options: Mapping[str, Any], use: Use) -> Settings:
+    """The settings of a command: in a workspace its own, too."""
+    given = _settings(options)
+    if use == "nothing" or options.get("work") is None:
+        return given
+    from semloc_logs.stages.state import settle
+    from semloc_logs.workspace import Workspace
+
+    writes = use == "stages"
+    overwrite = writes and bool(options.get("overwrite"))
+    return settle(Workspace(Path(options["work"])), given, writes=writes, overwrite=overwrite)
 
 
 def _explained(settings: Settings) -> str:
@@ -187,6 +213,11 @@ def _yaml_value(value: object) -> str:
         .removesuffix("...\n")
         .strip()
     )
+
+
+def tables_settings_options(function: Function) -> Function:
+    """The same of a command that reads the tables of a workspace."""
+    return settings_options(function, use="tables")
 
 
 def label_options(function: Function) -> Function:
@@ -392,7 +423,7 @@ def stage_options(function: Function) -> Function:
     """Options of every stage: --overwrite, --json, the engine, settings and the console."""
     for decorate in (
         console_options,
-        settings_options,
+        functools.partial(settings_options, use="stages"),
         engine_options,
         json_option,
         overwrite_option,

@@ -2,52 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import click
 
 from .console import console
 
 if TYPE_CHECKING:
-    from semloc_logs.stages.inputs import SessionInput
     from semloc_logs.stages.report import Report
     from semloc_logs.workspace import Workspace
 
-    from .options import PoseChoice
-
 SHOWN = 20  # rows of a table; files have them all
-
-
-def session_inputs(
-    logs: Iterable[Path],
-    topics: Mapping[str, str] | None = None,
-    poses: PoseChoice | None = None,
-) -> list[SessionInput]:
-    """Each log is a session; UsageError when two have the same name."""
-    from semloc_logs.stages.inputs import SessionInput, session_name
-
-    by_name: dict[str, Path] = {}
-    for log in logs:
-        name = session_name(log)
-        if name in by_name:
-            raise click.UsageError(
-                f"{by_name[name]} and {log} would both be session '{name}':"
-                " rename one, or fuse them one by one with --session."
-            )
-        by_name[name] = log
-    files = {} if poses is None else poses.by_session(by_name)
-    return [
-        SessionInput(name, (log,), topics or {}, files.get(name)) for name, log in by_name.items()
-    ]
-
-
-def checked_name(name: str) -> str:
-    """A session's name; UsageError when it cannot be a folder's."""
-    if not name or name.startswith(".") or "/" in name or "\0" in name:
-        raise click.UsageError(f"A session cannot be called {name!r}: its name becomes a folder's.")
-    return name
 
 
 def finish(*reports: Report) -> int:
@@ -78,41 +42,33 @@ def show_report(verb: str, report: Report) -> None:
 
 
 def show_closures(work: Workspace) -> None:
-    """The closures of a workspace as a table, and where they lie."""
-    import numpy as np
-
+    """The closures of a workspace by pairs of sessions, and where they lie."""
     from semloc_logs.closures.closure_tables import read_closures
 
     rows = read_closures(work.closures)
-    drawn = []
-    for r in rows[:SHOWN]:
-        yaw = np.degrees(2 * np.arctan2(r["q_z"], r["q_w"]))
-        drawn.append(
-            (
-                r["query_session"],
-                f"{r['query_stamp_ns'] / 1e9:.1f}",
-                r["target_session"],
-                f"{r['target_stamp_ns'] / 1e9:.1f}",
-                f"{np.linalg.norm([r['t_x'], r['t_y'], r['t_z']]):.2f}",
-                f"{(yaw + 180) % 360 - 180:.0f}",
-                f"{r['overlap']:.2f}",
-                f"{r['probability']:.4f}",
-            )
+    pairs: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        pairs.setdefault((row["query_session"], row["target_session"]), []).append(row)
+    drawn = [
+        (
+            query,
+            "itself" if target == query else target,
+            len(found),
+            _seconds(found, "query"),
+            f"{min(row['overlap'] for row in found):.2f}",
+            f"{min(row['probability'] for row in found):.4f}",
         )
-    if rows:
-        columns = (
-            "query",
-            "stamp (s)",
-            "target",
-            "stamp (s)",
-            "apart (m)",
-            "yaw (deg)",
-            "overlap#",
-            "probability#",
-        )
-        console.table("", columns, drawn)
-    if len(rows) > SHOWN:
-        console.result(f"... and {len(rows) - SHOWN} more.")
+        for (query, target), found in sorted(pairs.items(), key=lambda p: (-len(p[1]), p[0]))
+    ]
+    if drawn:
+        columns = ("query", "in", "closures#", "over (s)", "overlap from#", "probability from#")
+        console.table("", columns, drawn[:SHOWN])
+    if len(drawn) > SHOWN:
+        console.result(f"... and {len(drawn) - SHOWN} more pairs of sessions.")
+    alone = sorted({f.name for f in work.sessions()} - {name for pair in pairs for name in pair})
+    if rows and alone:
+        listed = ", ".join(alone[:SHOWN]) + (" and others" if len(alone) > SHOWN else "")
+        console.result(f"Without closures: {listed}")
     console.result(
         f"{len(rows)} loop closures in {work.closures}; the best rejected hypotheses in"
         f" {work.rejected}"
@@ -121,3 +77,9 @@ def show_closures(work: Workspace) -> None:
         console.note(f"To see the best rejected hypothesis: semloc show -w {work.path} -o view.png")
     if work.picture.exists():
         console.result(f"Picture: {work.picture}")
+
+
+def _seconds(rows: list[dict[str, Any]], end: str) -> str:
+    """The time from the first to the last closure."""
+    stamps_ns = [row[f"{end}_stamp_ns"] for row in rows]
+    return f"{(max(stamps_ns) - min(stamps_ns)) / 1e9:.0f}"

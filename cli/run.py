@@ -8,24 +8,25 @@ from typing import TYPE_CHECKING
 import click
 
 from .console import console
+from .inputs import LogChoice, logs_options, session_inputs
 from .options import (
     Command,
     EngineChoice,
     PoseChoice,
-    logs_argument,
     query_options,
     reading_options,
+    retry_option,
     stage_options,
     work_option,
 )
-from .results import finish, report_json, session_inputs, show_closures
+from .results import finish, report_json, show_closures
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Resolved
 
 
 @click.command(cls=Command)
-@logs_argument
+@logs_options
 @work_option
 @click.option(
     "--annotate",
@@ -35,15 +36,17 @@ if TYPE_CHECKING:
     show_default=True,
     help="Also write the closures as channels: to WORK/annotated (copy, sidecar) or into the logs.",
 )
+@retry_option
 @reading_options
 @query_options
 @stage_options
 def command(
-    logs: tuple[Path, ...],
+    logs: LogChoice,
     work: Path,
     annotation: str,
     topics: dict[str, str],
     poses: PoseChoice,
+    retry_failed: bool,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -51,7 +54,8 @@ def command(
 ) -> int:
     """Logs -> loop closures: fuse, describe, close and, with --annotate, annotate.
 
-    Each LOG is a session.
+    Each LOG is a session, called NAME or after the file. A pattern such as 'drives/*.mcap' stands
+    for the files it matches, '-' for lines of standard input.
 
     Can be interrupted and run again: finished work is kept. A damaged log is named, the others
     are done, and the exit code is 3. A path that does not exist stops the command at once.
@@ -59,7 +63,7 @@ def command(
     \b
     Example:  semloc run monday.mcap tuesday.bag -w work --annotate copy
     """
-    sessions = session_inputs(logs, topics, poses)
+    sessions = session_inputs(logs.each(), topics, poses)
     from semloc_logs.stages.annotate import AnnotationMode
     from semloc_logs.stages.run import run
     from semloc_logs.workspace import Workspace
@@ -67,7 +71,15 @@ def command(
     workspace = Workspace(work)
     mode = AnnotationMode(annotation)
     with console.progress(), engine.open(len(sessions)) as opened:
-        report = run(sessions, workspace, settings, opened, annotation=mode, overwrite=overwrite)
+        report = run(
+            sessions,
+            workspace,
+            settings,
+            opened,
+            annotation=mode,
+            overwrite=overwrite,
+            retry_failed=retry_failed,
+        )
     if as_json:
         console.result_json(report_json(report, work))
     else:

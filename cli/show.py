@@ -24,13 +24,13 @@ from .options import (
     "--at",
     type=float,
     metavar="SECONDS",
-    help="The query nearest to this time, as 'semloc close' prints it or since the start (s).",
+    help="The query nearest to this time, of its log or since its start (s).",
 )
 @click.option(
     "--closure",
     type=int,
     metavar="N",
-    help="Closure N, counted from 1 as 'semloc close' lists them.",
+    help="Closure N of closures.parquet, counted from 1.",
 )
 @click.option(
     "--count",

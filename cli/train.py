@@ -18,7 +18,7 @@ from .options import (
     engine_options,
     json_option,
     path_option,
-    settings_options,
+    tables_settings_options,
 )
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ if TYPE_CHECKING:
 )
 @json_option
 @engine_options
-@settings_options
+@tables_settings_options
 @console_options
 def command(
     variant: str,

@@ -35,12 +35,14 @@ from semloc_logs.numerics.transforms import transform
 from semloc_logs.progress import Listener, listening
 from semloc_logs.settings import Resolved, Settings, load
 from semloc_logs.stages.annotate import Annotation, AnnotationMode, annotate
-from semloc_logs.stages.close import Selection, close
+from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe
 from semloc_logs.stages.fuse import fuse
 from semloc_logs.stages.inputs import SessionInput, session_name
+from semloc_logs.stages.pair_search import Selection
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.run import run
+from semloc_logs.stages.state import settle
 from semloc_logs.tables.table import read_table
 from semloc_logs.workspace import SessionFolder
 from semloc_logs.workspace import Workspace as Folder
@@ -183,7 +185,7 @@ class Workspace:
         progress: Listener | None = None,
     ) -> None:
         self._folder = Folder(Path(path))
-        self._settings = _settings(settings)
+        self._given = _settings(settings)
         self._engine = engine
         self._jobs = jobs
         self._progress = progress
@@ -197,7 +199,13 @@ class Workspace:
 
     @property
     def settings(self) -> Resolved:
-        return self._settings
+        """Those that the workspace keeps, and those that were given; SettingsError where these
+        contradict.
+        """
+        return self._settled(writes=True)
+
+    def _settled(self, *, writes: bool, overwrite: bool = False) -> Resolved:
+        return settle(self._folder, self._given, writes=writes, overwrite=overwrite).resolved()
 
     # -- the stages
 
@@ -219,7 +227,7 @@ class Workspace:
             return run(
                 inputs,
                 self._folder,
-                self._settings,
+                self._settled(writes=True, overwrite=overwrite),
                 engine,
                 annotation=mode,
                 overwrite=overwrite,
@@ -235,13 +243,15 @@ class Workspace:
     ) -> Report:
         """Logs -> the semantic map of each session; arguments as of :meth:`run`."""
         inputs = _inputs(logs, topics, poses)
+        settings = self._settled(writes=True, overwrite=overwrite)
         with self._open_engine() as engine:
-            return fuse(inputs, self._folder, self._settings, engine, overwrite=overwrite)
+            return fuse(inputs, self._folder, settings, engine, overwrite=overwrite)
 
     def describe(self, *sessions: str, overwrite: bool = False) -> Report:
         """Maps -> semantic words of ``sessions``, by default of all."""
+        settings = self._settled(writes=True, overwrite=overwrite)
         with self._open_engine() as engine:
-            return describe(self._folder, sessions, self._settings, engine, overwrite=overwrite)
+            return describe(self._folder, sessions, settings, engine, overwrite=overwrite)
 
     def close(
         self,
@@ -253,8 +263,9 @@ class Workspace:
     ) -> Report:
         """Words -> closures of ``queries`` in ``targets``, by default of all sessions in all."""
         selection = Selection(tuple(queries), tuple(targets), self_closures)
+        settings = self._settled(writes=True, overwrite=overwrite)
         with self._open_engine() as engine:
-            return close(self._folder, self._settings, engine, selection, overwrite=overwrite)
+            return close(self._folder, settings, engine, selection, overwrite=overwrite)
 
     def annotate(
         self,
@@ -268,7 +279,8 @@ class Workspace:
         """Closures -> channels of ``log``: in the file ``output``, or in the log itself."""
         target = None if output is None else Path(output)
         annotation = Annotation(AnnotationMode(mode), target, overwrite)
-        return annotate(Path(log), self._folder, self._settings, annotation, session=session)
+        settings = self._settled(writes=False)
+        return annotate(Path(log), self._folder, settings, annotation, session=session)
 
     # -- contents
 
@@ -297,7 +309,7 @@ class Workspace:
 
     def evaluate(self, truth: PathLike) -> Evaluation:
         """The closures against a truth file."""
-        return evaluate_closures(self._folder, Path(truth), self._settings)
+        return evaluate_closures(self._folder, Path(truth), self._settled(writes=False))
 
     def _table(self, path: Path) -> pa.Table:
         if not path.exists():
@@ -335,14 +347,14 @@ def evaluate(work: Workspace, truth: PathLike) -> Evaluation:
     return work.evaluate(truth)
 
 
-def _settings(settings: Settings | PathLike | Mapping[str, object] | None) -> Resolved:
+def _settings(settings: Settings | PathLike | Mapping[str, object] | None) -> Settings:
     if settings is None:
-        return Settings().resolved()
+        return Settings()
     if isinstance(settings, Settings):
-        return settings.resolved()
+        return settings
     if isinstance(settings, Mapping):
-        return load(assignments={key: str(value) for key, value in settings.items()}).resolved()
-    return load(Path(settings)).resolved()
+        return load(assignments={key: str(value) for key, value in settings.items()})
+    return load(Path(settings))
 
 
 def _inputs(

@@ -4,6 +4,11 @@ The place is a file, a topic, an offset or a time.
 Only :mod:`semloc_logs.cli` turns them into exit codes.
 """
 
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
 
 class SemlocError(Exception):
     """Root of all expected errors; ``str(error)`` is a complete sentence for the user."""
@@ -34,3 +39,9 @@ class ContractError(SemlocError):
 
 class TruthError(SemlocError):
     """A truth file of ``semloc evaluate`` is missing or does not say what it should."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A sentence with the known word that is spelled most like ``word``; empty if none is."""
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f" Did you mean '{near[0]}'?" if near else ""

@@ -18,9 +18,12 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from semloc_logs.errors import SettingsError
+from semloc_logs.errors import SettingsError, did_you_mean
 
 STREET_VOXEL = 0.30
+# sections that the tables of a workspace depend on, and settings in them that change no table
+TABLE_SECTIONS = ("fusion", "labels", "descriptor", "query", "closures")
+OF_MACHINE = frozenset({"logs.memory", "labels.threads"})
 MOST_VOXELS = 1000
 _UNIT = 1e-2  # of a quaternion's squared length, off 1: people write few digits
 _MOST_BYTES = 1 << 20  # of a YAML file
@@ -60,6 +63,12 @@ class Logs(_Section):
         description="pose of a frame in the base frame, by frame name: [x, y, z, qx, qy, qz, qw]"
         " in metres, instead of the transforms of the log",
     )
+    up: str = Field(
+        "auto",
+        description="up in the session frame (in the base frame of a log without poses): an axis"
+        " such as +z or -y, or a vector X,Y,Z, refined within 20 degrees; auto: from the IMU, else"
+        " from the ground, walls and motion",
+    )
     memory: int = Field(
         2 << 30,
         ge=64 << 20,
@@ -73,6 +82,20 @@ class Logs(_Section):
         if any(abs(seconds) > _LARGEST_OFFSET for seconds in offsets.values()):
             raise ValueError(f"an offset is at most {_LARGEST_OFFSET:g} s")
         return offsets
+
+    @field_validator("up", mode="before")
+    @classmethod
+    def _check_up(cls, value: Any) -> Any:
+        # YAML makes a list of [0, 0, 1]
+        text = ",".join(map(str, value)) if isinstance(value, list | tuple) else value
+        if isinstance(text, str):
+            _direction(text)
+        return text
+
+    @property
+    def up_vector(self) -> tuple[float, float, float] | None:
+        """The direction ``up``, of any length; None for auto."""
+        return _direction(self.up)
 
     def __hash__(self) -> int:
         return hash(self.model_dump_json())  # a mapping has no hash of its own
@@ -139,29 +162,9 @@ class Fusion(_Section):
         description="lidar: poses from LIDAR odometry (KISS-ICP, the extra 'odometry') instead of"
         " the poses of the log",
     )
-    up: str = Field(
-        "auto",
-        description="up in the session frame (in the base frame of a log without poses): an axis"
-        " such as +z or -y, or a vector X,Y,Z, refined within 20 degrees; auto: from the IMU, else"
-        " from the ground, walls and motion",
-    )
     clamp: tuple[float, float] = Field(
         (-2.0, 3.5), description="bounds of the log-odds (OctoMap), within +-6"
     )
-
-    @property
-    def up_vector(self) -> tuple[float, float, float] | None:
-        """The direction ``up``, of any length; None for auto."""
-        return _direction(self.up)
-
-    @field_validator("up", mode="before")
-    @classmethod
-    def _check_up(cls, value: Any) -> Any:
-        # YAML makes a list of [0, 0, 1]
-        text = ",".join(map(str, value)) if isinstance(value, list | tuple) else value
-        if isinstance(text, str):
-            _direction(text)
-        return text
 
     @model_validator(mode="after")
     def _check(self) -> Fusion:
@@ -273,15 +276,16 @@ class Closures(_Section):
     probes: int = Field(
         8, ge=1, description="nearest vocabulary cells searched for each query word"
     )
-    hypotheses: int = Field(96, ge=1, description="pooled hypotheses of a query that are verified")
-    places: int = Field(
-        16,
+    hypotheses: int = Field(
+        32,
         ge=1,
-        description="submaps, of all sessions, that a query is verified in: those whose words"
-        " agree best",
+        description="pooled hypotheses of a query in each target session that are verified",
     )
-    session_hypotheses: int = Field(
-        16, ge=1, description="pooled hypotheses of each target session, at least"
+    places: int = Field(
+        4,
+        ge=1,
+        description="submaps of each target session that a query is verified in: those whose words"
+        " agree best",
     )
     candidates: int = Field(
         4,
@@ -394,7 +398,8 @@ class Settings(_Section):
     training: Training = Training()
 
     def resolved(self) -> Resolved:
-        """The same settings with every ``None`` length filled in from the voxel size.
+        """The same settings with every ``None`` length filled in from the voxel size, and absolute
+        paths.
 
         Raises SettingsError where lengths do not go together.
         """
@@ -424,12 +429,33 @@ class Settings(_Section):
         for section, defaults in lengths.items():
             for name, length in defaults.items():
                 content[section][name] = _given(content[section][name], length)
+        # a workspace keeps them, and its next command may run elsewhere
+        for values in content.values():
+            values |= {k: v.absolute() for k, v in values.items() if isinstance(v, Path)}
         return Resolved.model_validate(content)
+
+    def tables(self, *sections: str) -> dict[str, dict[str, Any]]:
+        """The named sections, of those only the settings that tables depend on."""
+        dumped = self.model_dump(mode="json", include=set(sections))
+        return {
+            section: {k: v for k, v in values.items() if f"{section}.{k}" not in OF_MACHINE}
+            for section, values in dumped.items()
+        }
 
     def fingerprint(self, *sections: str) -> str:
         """Hash of the named sections: what a stage's outputs depend on."""
-        dumped = self.model_dump(mode="json", include=set(sections))
-        return hashlib.sha256(json.dumps(dumped, sort_keys=True).encode()).hexdigest()[:16]
+        dumped = json.dumps(self.tables(*sections), sort_keys=True)
+        return hashlib.sha256(dumped.encode()).hexdigest()[:16]
+
+    def given(self) -> dict[str, Any]:
+        """The settings that were given, by key path, as JSON has them; defaults are left out."""
+        return {
+            f"{section}.{name}": value
+            for section in self.model_fields_set
+            for name, value in getattr(self, section)
+            .model_dump(mode="json", exclude_unset=True)
+            .items()
+        }
 
     def dump(self) -> str:
         """YAML that :func:`load` reads back to the same settings."""
@@ -446,6 +472,18 @@ class Resolved(Settings):
 
     def resolved(self) -> Resolved:
         return self
+
+    def differences(self) -> dict[str, dict[str, Any]]:
+        """The settings of the tables that neither defaults nor the voxel size give, by section."""
+        voxel_size = self.fusion.voxel_size
+        expected = Settings(fusion=Fusion(voxel_size=voxel_size)).resolved().tables(*TABLE_SECTIONS)
+        out = {
+            section: {k: v for k, v in values.items() if v != expected[section][k]}
+            for section, values in self.tables(*TABLE_SECTIONS).items()
+        }
+        if voxel_size != STREET_VOXEL:
+            out["fusion"]["voxel_size"] = voxel_size
+        return {section: values for section, values in out.items() if values}
 
 
 def _direction(text: str) -> tuple[float, float, float] | None:
@@ -531,18 +569,30 @@ def load(
             _assign(merged, name[len("SEMLOC_") :].lower().replace("__", "."), value)
     for key, value in (assignments or {}).items():
         _assign(merged, key, value)
+    return validated(merged)
+
+
+def validated(content: Mapping[str, Any]) -> Settings:
+    """The settings of a mapping of sections. SettingsError names a key that is wrong."""
     try:
-        return Settings.model_validate(merged)
+        return Settings.model_validate(content)
     except ValidationError as problem:
         first = problem.errors()[0]
         key = ".".join(str(p) for p in first["loc"])
         if first["type"] == "extra_forbidden":
             raise SettingsError(
                 f"Unknown setting '{key}': 'semloc run --dump-config' prints every key."
+                f"{did_you_mean(key, _keys())}"
             ) from None
         raise SettingsError(
             f"Setting '{key}' cannot be {first.get('input')!r}: {first['msg']}."
         ) from None
+
+
+def _keys() -> list[str]:
+    """Every section, and every setting by its key path."""
+    sections = {name: type(values).model_fields for name, values in Settings()}
+    return [*sections, *(f"{name}.{key}" for name, fields in sections.items() for key in fields)]
 
 
 def _assign(tree: dict[str, Any], key: str, value: str) -> None:

@@ -6,18 +6,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from semloc_logs.errors import WorkspaceError
+from semloc_logs.errors import WorkspaceError, did_you_mean
+
+MOST_NAMED = 12  # sessions in a sentence
 
 
 @dataclass(frozen=True, slots=True)
 class SessionFolder:
-    """WORK/sessions/SESSION."""
+    """WORK/sessions/SESSION; ``title`` is the session's name while it is written elsewhere."""
 
     path: Path
+    title: str = ""
 
     @property
     def name(self) -> str:
-        return self.path.name
+        return self.title or self.path.name
 
     @property
     def session_json(self) -> Path:
@@ -72,7 +75,8 @@ class Workspace:
     def sessions(self) -> list[SessionFolder]:
         """Sessions that were fused, by name."""
         files = sorted((self.path / "sessions").glob("*/session.json"))
-        return [SessionFolder(path.parent) for path in files]
+        # what begins with a dot is being written
+        return [SessionFolder(p.parent) for p in files if not p.parent.name.startswith(".")]
 
     def chosen(self, names: Sequence[str]) -> list[SessionFolder]:
         """The fused sessions ``names``, all without names. WorkspaceError where one is missing."""
@@ -81,11 +85,40 @@ class Workspace:
             raise WorkspaceError(f"{self.path} holds no sessions: run 'semloc fuse' first.")
         missing = [name for name in names if name not in known]
         if missing:
+            listed = ", ".join(known) if len(known) <= MOST_NAMED else f"{len(known)} others"
             raise WorkspaceError(
-                f"{self.path} has no session {', '.join(missing)} (it has {', '.join(known)}):"
-                " run 'semloc fuse' first."
+                f"{self.path} has no session {', '.join(missing)} (it has {listed}): run 'semloc"
+                f" fuse' first.{did_you_mean(missing[0], known)}"
             )
         return [known[name] for name in names] if names else list(known.values())
+
+    @property
+    def locks(self) -> Path:
+        """Locks of the workspace and of sessions that are made, and who has them."""
+        return self.path / ".locks"
+
+    def session_lock(self, session: str) -> Path:
+        return self.locks / f"session.{session}.lock"
+
+    @property
+    def settings(self) -> Path:
+        return self.path / "workspace.json"
+
+    def failure(self, session: str) -> Path:
+        """Why the log of a session could not be fused."""
+        return self.path / "failed" / f"{session}.json"
+
+    def failures(self) -> list[Path]:
+        return sorted((self.path / "failed").glob("*.json"))
+
+    def alignments(self, query: str, target: str) -> Path:
+        """The alignments of one session's queries in another."""
+        folder = self.path / "alignments" / f"query={query}" / f"target={target}"
+        return folder / "alignments.parquet"
+
+    def search_parts(self, query: str) -> Path:
+        """Alignments of a session whose search is not over, a file for each task."""
+        return self.path / ".parts" / query
 
     @property
     def closures(self) -> Path:

@@ -96,6 +96,8 @@ INNER_ORDER = {
         "query",
         "acceptance",
         "closure_tables",
+        "alignment_tables",
+        "pairs",
         "database",
         "visibility",
         "target_surface",

@@ -229,3 +229,14 @@ def test_a_mounting_is_a_position_and_a_unit_quaternion() -> None:
         load(None, {"logs.mountings.lidar": "[0, 0, 1.7, 0, 0, 0, 2]"})
     with pytest.raises(SettingsError, match=r"logs\.mountings\.lidar"):
         load(None, {"logs.mountings.lidar": "[0, 0, 1.7]"})
+
+
+@pytest.mark.parametrize(
+    ("key", "meant"),
+    [("fusion.voxelsize", "fusion.voxel_size"), ("fussion.hit", "fusion"), ("xyzzy", None)],
+)
+def test_a_key_that_is_spelled_wrong_is_suggested(key: str, meant: str | None) -> None:
+    with pytest.raises(SettingsError) as caught:
+        load(assignments={key: "1"})
+    assert ("Did you mean" in str(caught.value)) == (meant is not None)
+    assert meant is None or f"'{meant}'?" in str(caught.value)

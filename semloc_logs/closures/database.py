@@ -17,7 +17,7 @@ from semloc_logs.alignment.target_map import Target
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.voxels.store import Keyframe, read_keyframe
-from semloc_logs.words.catalogue import read_words, segments
+from semloc_logs.words.catalogue import read_words, session_segment
 from semloc_logs.words.index import Index, Part
 from semloc_logs.words.vocabulary import load_vocabulary
 from semloc_logs.workspace import Workspace
@@ -30,6 +30,7 @@ CACHED_TARGETS = 16
 CACHED_SURFACES = 24
 CACHED_SQUARES = 48
 CACHED_KEYFRAMES = 32
+OPEN_DATABASES = 256  # 3 MB each for a kilometre
 # voxels: words of a submap are hidden by squares, keyframes by stretches of road of this length
 SQUARE_VOXELS = 16
 
@@ -59,15 +60,36 @@ class Recent(Generic[Cached]):
         return self._values[key]
 
 
+class Caches:
+    """What was read and made last, of one database or of all that a process has open.
+
+    ``targets`` and ``surfaces`` are made by :mod:`.visibility` and :mod:`.target_surface`.
+    """
+
+    def __init__(self) -> None:
+        self.targets: Recent[Target] = Recent(CACHED_TARGETS)
+        self.surfaces: Recent[Surface] = Recent(CACHED_SURFACES)
+        self.squares: Recent[tuple[I64, F64]] = Recent(CACHED_SQUARES)
+        self.keyframes: Recent[Keyframe] = Recent(CACHED_KEYFRAMES)
+
+
 class Database:
     """Submaps of target sessions; the ``group`` of a submap is its number in :attr:`places`.
 
-    ``targets`` and ``surfaces`` are caches of what :mod:`.visibility` and :mod:`.target_surface`
-    make.
+    ``key`` tells it from others that share its ``caches``.
     """
 
-    def __init__(self, workspace: Workspace, targets: tuple[str, ...], settings: Resolved) -> None:
+    def __init__(
+        self,
+        workspace: Workspace,
+        targets: tuple[str, ...],
+        settings: Resolved,
+        caches: Caches | None = None,
+        key: Hashable = None,
+    ) -> None:
         self._workspace = workspace
+        self.caches = caches or Caches()
+        self.key = key
         self.sessions = {name: SessionMap(workspace.session(name)) for name in targets}
         self.settings = settings
         self.places = [
@@ -76,19 +98,17 @@ class Database:
         self.has_classes = np.array(
             [self.sessions[place.session].has_classes for place in self.places], bool
         )
-        self.targets: Recent[Target] = Recent(CACHED_TARGETS)
-        self.surfaces: Recent[Surface] = Recent(CACHED_SURFACES)
         self._words: dict[str, Index] = {}
-        self._squares: Recent[tuple[I64, F64]] = Recent(CACHED_SQUARES)
-        self._keyframes: Recent[Keyframe] = Recent(CACHED_KEYFRAMES)
 
     def words(self, variant: str) -> Index:
         """All words of ``variant``; groups of its matches are numbers of :attr:`places`."""
         if variant not in self._words:
             numbers = {(place.session, place.submap): g for g, place in enumerate(self.places)}
+            held = [session_segment(s.folder, variant) for s in self.sessions.values()]
             parts = [
-                Part(segment, segment.numbered(numbers, served))
-                for segment, served in segments(self._workspace, variant, tuple(self.sessions))
+                Part(segment, segment.numbered(numbers, self.sessions))
+                for segment in held
+                if segment is not None
             ]
             vocabulary = load_vocabulary(variant, self.settings.descriptor.vocabulary)
             self._words[variant] = Index(vocabulary, parts)
@@ -111,14 +131,16 @@ class Database:
         """A keyframe of a submap's session."""
         place = self.places[group]
         folder = self.session(group).folder.keyframes
-        return self._keyframes.get((place.session, number), lambda: read_keyframe(folder, number))
+        key = (self.key, place.session, number)
+        return self.caches.keyframes.get(key, lambda: read_keyframe(folder, number))
 
     def word_squares(self, variant: str, group: int) -> tuple[I64, F64]:
         """The square (n,) that each word of a submap lies in, and the squares' centres (s, 2).
 
         The centres are in metres, in the map frame.
         """
-        return self._squares.get((variant, group), lambda: self._squares_of(variant, group))
+        key = (self.key, variant, group)
+        return self.caches.squares.get(key, lambda: self._squares_of(variant, group))
 
     def _squares_of(self, variant: str, group: int) -> tuple[I64, F64]:
         edge = SQUARE_VOXELS * self.settings.fusion.voxel_size
@@ -128,7 +150,13 @@ class Database:
         return number.ravel(), (square + 0.5) * edge
 
 
-@lru_cache(maxsize=2)
-def open_database(work: Path, targets: tuple[str, ...], settings: Resolved) -> Database:
-    """The database of a worker process, kept between its tasks."""
-    return Database(Workspace(work), targets, settings)
+_OPEN = Caches()  # of the databases of this process
+
+
+@lru_cache(maxsize=OPEN_DATABASES)
+def open_database(work: Path, target: str, fingerprint: str, settings: Resolved) -> Database:
+    """The database of one session, kept between the tasks of a process.
+
+    ``fingerprint`` is of all that it depends on.
+    """
+    return Database(Workspace(work), (target,), settings, _OPEN, (target, fingerprint))

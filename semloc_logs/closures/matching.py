@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from semloc_logs.alignment.scores import Scores, structure_scores
 from semloc_logs.alignment.search import Candidate, search_hypotheses
 from semloc_logs.alignment.tau import tau
 from semloc_logs.closures.acceptance.calibration import MIN_RELATIVE_SCORE, MIN_SCORE, shipped
+from semloc_logs.closures.alignment_tables import write_part
 from semloc_logs.closures.closure import Alignment, Features
 from semloc_logs.closures.database import Database, open_database
 from semloc_logs.closures.query import build_query
@@ -34,7 +36,7 @@ from semloc_logs.subvolumes.describe import (
     load_encoder,
     quarter_turns,
 )
-from semloc_logs.words.index import Allowed, Matches
+from semloc_logs.words.index import Allowed, Index, LookUp, Matches, look_ups
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
@@ -46,6 +48,9 @@ LEAST_WEIGHT = 1e-3
 DRIVEN_AGAIN = 50
 LEAST_SCORE = 1e-3  # that a rival's score is divided by
 MOST_DISTINCT = 2.0  # a rival's score over an alignment's: more is not worse
+
+Prepared = tuple[Described, list[list[LookUp]]]
+_PREPARED: WeakKeyDictionary[Query, dict[str, Prepared]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,21 +106,35 @@ class Fitted:
 
 
 @dataclass(frozen=True, slots=True)
-class CloseTask:
-    """Some queries of one session against target sessions; picklable."""
+class SearchTask:
+    """Some queries of one session to search in others; picklable.
+
+    ``targets`` are fingerprints of the pairs by session. The alignments go to ``output``.
+    """
 
     work: Path
     session: str
     keyframes: tuple[int, ...]
-    targets: tuple[str, ...]
+    targets: dict[str, str]
     settings: Resolved
+    output: Path
 
 
-def close_queries(task: CloseTask) -> list[list[Alignment]]:
-    """The alignments of each keyframe of the task, best first; nothing is decided about them."""
-    database = open_database(task.work, task.targets, task.settings)
+def search_queries(task: SearchTask) -> int:
+    """Write the alignments of each keyframe of the task, best first; how many there are.
+
+    Each target is searched by itself, so what is found in it does not depend on the others.
+    """
     session = SessionMap(Workspace(task.work).session(task.session))
-    return [close_query(database, session, k) for k in task.keyframes]
+    queries = {k: build_query(session, k, task.settings) for k in task.keyframes}
+    found: list[Alignment] = []
+    for target, fingerprint in task.targets.items():
+        database = open_database(task.work, target, fingerprint, task.settings)
+        for keyframe, query in queries.items():
+            found += search_query(database, session, keyframe, query)
+    found.sort(key=lambda a: (a.query_keyframe, a.target_session))
+    write_part(task.output, task.keyframes, task.targets, found)
+    return len(found)
 
 
 def close_query(
@@ -125,12 +144,25 @@ def close_query(
 
     Hypotheses come from ``find``, by default :func:`find_hypotheses`.
     """
-    visible = visible_to(database, session, keyframe)
-    query, query_T_base = build_query(session, keyframe, database.settings)
+    query = build_query(session, keyframe, database.settings)
+    return search_query(database, session, keyframe, query, find)
+
+
+def search_query(
+    database: Database,
+    session: SessionMap,
+    keyframe: int,
+    built: tuple[Query, F64],
+    find: FindHypotheses | None = None,
+) -> list[Alignment]:
+    """The same of a query that is built already, with its ``query_T_base``."""
+    query, query_T_base = built
     if not len(query.structure[0]):
         return []
 
-    context = QueryContext(visible, session, keyframe, query, query_T_base)
+    context = QueryContext(
+        visible_to(database, session, keyframe), session, keyframe, query, query_T_base
+    )
     hypotheses = (find or find_hypotheses)(context)
     alignments = [
         alignment
@@ -174,20 +206,35 @@ def match_words(
 
     The query's ground is at ``ground_z`` (m). The ``yaw`` of a match is of ``target_T_query``.
     """
-    described = _described(query, variant, ground_z, database.settings)
-    closures = database.settings.closures
     index = database.words(variant)
+    described, prepared = _prepared(query, variant, ground_z, database.settings, index)
+    closures = database.settings.closures
     quarters = []
-    for turns in range(4):
-        descriptors = quarter_turns(described.descriptor, turns)
-        matches = index.search(descriptors, closures.neighbours, closures.probes, allowed)
+    for turns, batches in enumerate(prepared):
+        matches = index.find(batches, closures.neighbours, allowed)
         yaw = np.mod(matches.yaw + turns * np.pi / 2, 2 * np.pi)
         quarters.append(replace(matches, yaw=yaw))
     columns = (np.concatenate([getattr(m, f.name) for m in quarters]) for f in fields(Matches))
     return described, Matches(*columns)
 
 
-def _described(query: Query, variant: str, ground_z: float, settings: Resolved) -> Described:
+def _prepared(
+    query: Query, variant: str, ground_z: float, settings: Resolved, index: Index
+) -> Prepared:
+    """The subvolumes of a query and their look-ups in each quarter turn, once for all targets."""
+    of_query = _PREPARED.setdefault(query, {})
+    if variant not in of_query:
+        described = _describe(query, variant, ground_z, settings)
+        turned = (quarter_turns(described.descriptor, turns) for turns in range(4))
+        probes = settings.closures.probes
+        of_query[variant] = (
+            described,
+            [look_ups(index.vocabulary, descriptors, probes) for descriptors in turned],
+        )
+    return of_query[variant]
+
+
+def _describe(query: Query, variant: str, ground_z: float, settings: Resolved) -> Described:
     descriptor = settings.descriptor
     low, high = query.blocks.bounds()
     return describe_map(
@@ -219,15 +266,17 @@ def find_hypotheses(context: QueryContext, match: MatchWords = match_words) -> l
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
 
-    # each target session has its share, so that one that matches everywhere leaves room for others
+    # each target session has its share, whatever the others have
     owner = np.array([place.session for place in database.places], dtype=object)[group]
-    most = max(closures.session_hypotheses, closures.hypotheses // len(database.sessions))
     cell = VOTE_CELL * context.voxel_size / STREET_VOXEL
     hypotheses: list[Hypothesis] = []
     for name in database.sessions:
         rows = np.flatnonzero(owner == name)
-        hypotheses += pool(group[rows], yaw[rows], translation[rows], weight[rows], cell, most)
-    return keep_best_submaps(hypotheses, closures.places)
+        pooled = pool(
+            group[rows], yaw[rows], translation[rows], weight[rows], cell, closures.hypotheses
+        )
+        hypotheses += keep_best_submaps(pooled, closures.places)
+    return hypotheses
 
 
 def _votes(

@@ -61,8 +61,9 @@ def target_surface(visible: Visibility, group: int, position: F64) -> Surface:
         edge = SQUARE_VOXELS * visible.database.settings.fusion.voxel_size
         afar = (np.floor(position / edge) + 0.5) * edge
     surroundings = _Surroundings(visible, group, ids, middle, afar)
-    key = (group, middle, None if afar is None else afar.tobytes(), ids.tobytes())
-    return visible.database.surfaces.get(key, lambda: _surface(surroundings))
+    seen_from = None if afar is None else afar.tobytes()
+    key = (visible.database.key, group, middle, seen_from, ids.tobytes())
+    return visible.database.caches.surfaces.get(key, lambda: _surface(surroundings))
 
 
 def _middle(visible: Visibility, group: int, ids: I64, position: F64) -> int:

@@ -107,8 +107,8 @@ class Visibility:
             len(ids) == len(self.database.submap_keyframes(group))
             or not (np.linalg.norm(position - self.origin, axis=1) < far).any()
         )
-        key = (group, None if is_whole else ids.tobytes())
-        return self.database.targets.get(
+        key = (self.database.key, group, None if is_whole else ids.tobytes())
+        return self.database.caches.targets.get(
             key, lambda: self._stored(group) if is_whole else self._fused(group, ids)
         )
 

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -23,6 +24,7 @@ from semloc_logs.errors import SemlocError
 from semloc_logs.progress import Progress
 
 PACKAGE_LOGGER = "semloc_logs"
+LEAVE_SECONDS = 3.0  # that workers have to leave: a cluster kills soon after it terminates
 
 Event = Progress | LogRecord
 
@@ -85,13 +87,21 @@ class Processes:
             self._end_events()
 
     def stop(self) -> None:
-        """End the workers now: they unwind, so that temporary files go, and leave."""
+        """End the workers now: they unwind, so that temporary files go, and leave.
+
+        One that is in a long call of a library is killed after a while.
+        """
         if self._pool is None:
             return
         # a public method, terminate_workers, from Python 3.14 on
-        workers = getattr(self._pool, "_processes", None) or {}
-        for worker in list(workers.values()):
+        workers = list((getattr(self._pool, "_processes", None) or {}).values())
+        for worker in workers:
             worker.terminate()
+        deadline = time.monotonic() + LEAVE_SECONDS
+        for worker in workers:
+            worker.join(max(0.0, deadline - time.monotonic()))
+            if worker.is_alive():
+                worker.kill()
         self._pool.shutdown(cancel_futures=True)
         self._pool = None
         self._end_events()

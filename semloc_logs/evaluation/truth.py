@@ -140,6 +140,9 @@ def evaluate_closures(
     has it at either end: a closure found from both ends is reported once. Raises TruthError when
     the truth file is missing or wrong, WorkspaceError without closures.
     """
+    work.chosen(())
+    if not work.closures.exists():
+        raise WorkspaceError(f"{work.path} has no closures yet: run 'semloc close' first.")
     settings = _settings_of(work, settings.resolved())
     sessions = {f.name: SessionMap(f) for f in work.sessions()}
     tracks = read_truth(truth, sessions)

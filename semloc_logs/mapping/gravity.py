@@ -216,7 +216,7 @@ def _assumption(expected: Expected, text: str, topic: str = "") -> Problem:
     return Problem(
         topic,
         ProblemKind.GRAVITY,
-        f"{expected.log}: {text}; {remedy}name it with --set fusion.up=X,Y,Z.",
+        f"{expected.log}: {text}; {remedy}name it with --set logs.up=X,Y,Z.",
         lost=False,
         assumed=True,
     )

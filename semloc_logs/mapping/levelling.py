@@ -16,7 +16,7 @@ from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.up_direction import FlatPlaces, find_up
 from semloc_logs.mapping.up_evidence import UpEvidence
 from semloc_logs.numerics.transforms import inverse, rotation_between
-from semloc_logs.settings import STREET_VOXEL, ResolvedFusion
+from semloc_logs.settings import STREET_VOXEL, Resolved
 
 F64 = NDArray[np.float64]
 # voxels; of the tables that are indexed by place the coarse one of the ground ends first
@@ -43,7 +43,7 @@ class Level:
         return self.gravity.problems
 
 
-def level(session: Session, collected: Collected, fusion: ResolvedFusion) -> Level:
+def level(session: Session, collected: Collected, fusion: Resolved) -> Level:
     """The level map frame of a session; its origin is the first keyframe.
 
     Poses may be in UTM, and voxels, words and surfaces want small numbers. In a log without poses
@@ -61,7 +61,7 @@ def level(session: Session, collected: Collected, fusion: ResolvedFusion) -> Lev
 
 
 def _gravity(
-    session: Session, places: dict[int, FlatPlaces], known: F64, fusion: ResolvedFusion
+    session: Session, places: dict[int, FlatPlaces], known: F64, settings: Resolved
 ) -> Gravity:
     """Up in the session frame, or without poses (``known`` (n, 4, 4)) in the base frame."""
     posed = len(known) > 0
@@ -75,9 +75,9 @@ def _gravity(
         session.imu_up_in_session() if posed else session.imu_up_in_base(),
         session.roles.imu or "",
     )
-    if fusion.up_vector is not None:
-        return given_gravity(np.array(fusion.up_vector), normals, weights)
-    evidence = UpEvidence(views, known, fusion.voxel_size / STREET_VOXEL)
+    if settings.logs.up_vector is not None:
+        return given_gravity(np.array(settings.logs.up_vector), normals, weights)
+    evidence = UpEvidence(views, known, settings.fusion.voxel_size / STREET_VOXEL)
     return find_gravity(expected, normals, weights, evidence)
 
 

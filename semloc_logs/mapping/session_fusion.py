@@ -5,7 +5,6 @@ One pass over the log, bounded memory.
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -39,13 +38,17 @@ READ_RANGE = 2.0
 
 @dataclass(frozen=True, slots=True)
 class FuseTask:
-    """One session to fuse; picklable."""
+    """One session to fuse; picklable.
+
+    ``made_from`` is what session.json keeps about its input, ``fingerprint`` of that and settings.
+    """
 
     logs: tuple[Path, ...]
     folder: SessionFolder
     settings: Resolved
     topics: dict[str, str] = field(default_factory=dict)
     fingerprint: str = ""
+    made_from: dict[str, Any] = field(default_factory=dict)
     poses: TrajectoryFile | None = None
     mountings: Mountings = NO_MOUNTINGS
 
@@ -79,7 +82,8 @@ def fuse_session(
             "labels": labeller.to_json(),
             "name": task.folder.name,
             "fingerprint": task.fingerprint,
-            "settings": task.settings.model_dump(mode="json", include={"logs", "fusion", "labels"}),
+            "made_from": task.made_from,
+            "settings": task.settings.tables("logs", "fusion", "labels"),
             "fit": fused.check.to_json(),
             **fused.metadata,
             **fused.content,
@@ -134,7 +138,7 @@ def _fused(task: FuseTask, session: Session, labeller: Labeller) -> _Fused:
             raise LogError(f"{session.name} gave no usable points: {reasons}")
         check_reach(session, collected, fusion.voxel_size)
         check = check_session(session, collected, fusion.voxel_size)
-        levelled = level(session, collected, fusion)
+        levelled = level(session, collected, task.settings)
         map_T_base = levelled.map_T_base
 
         def view(keyframe: int) -> KeyframeView:
@@ -166,8 +170,6 @@ def _scratch(folder: SessionFolder) -> Iterator[Path]:
     Temporary folders of the system may be memory.
     """
     folder.path.mkdir(parents=True, exist_ok=True)
-    for stale in folder.path.glob(".scratch.*"):  # of a run that was killed
-        shutil.rmtree(stale, ignore_errors=True)
     with tempfile.TemporaryDirectory(prefix=".scratch.", dir=folder.path) as name:
         yield Path(name)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -21,6 +22,7 @@ from semloc_logs.logs.annotation.annotate import (
     annotate_sidecar,
     recover,
 )
+from semloc_logs.logs.containers.open import open_log
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Resolved
@@ -63,6 +65,7 @@ def annotate(
     recover(log)
     name = session or session_name(log)
     own = SessionMap(work.chosen([name])[0])
+    _check_log(log, own)
     results = _results(work, own, name, settings)
     if annotation.mode is AnnotationMode.IN_PLACE:
         return annotate_in_place(log, results)
@@ -70,6 +73,20 @@ def annotate(
         raise WorkspaceError("Annotating needs an output file.")
     write = annotate_sidecar if annotation.mode is AnnotationMode.SIDECAR else annotate_copy
     return write(log, annotation.output, results, overwrite=annotation.overwrite)
+
+
+def _check_log(log: Path, own: SessionMap) -> None:
+    """WorkspaceError where the log is not one that the session was made from, by its start."""
+    with closing(open_log(log)) as opened:
+        start_ns = opened.start_ns
+    logs = own.json["logs"]
+    if start_ns not in [made_from["start_ns"] for made_from in logs]:
+        name = own.folder.name
+        paths = ", ".join(str(made_from["path"]) for made_from in logs)
+        raise WorkspaceError(
+            f"{log} is not the log that session '{name}' was made from ({paths}): name its own"
+            " with --session."
+        )
 
 
 def _results(work: Workspace, own: SessionMap, name: str, settings: Resolved) -> Results:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from semloc_logs import progress
@@ -13,7 +13,9 @@ from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of, recorded_fingerprint
+from semloc_logs.stages.lock import writing
 from semloc_logs.stages.report import Report
+from semloc_logs.stages.state import keep
 from semloc_logs.subvolumes.submap_descriptors import DescribeTask, variants_for
 from semloc_logs.tables.atomic_files import replacing_folder
 from semloc_logs.tables.table import read_json, write_json
@@ -42,26 +44,36 @@ def describe(
 ) -> Report:
     """Describe the sessions ``names`` (all if empty).
 
-    Raises WorkspaceError where a session is missing or has voxels of another size.
+    Raises WorkspaceError where a session is missing or was fused with other settings.
     """
-    report = Report()
     folders = work.chosen(names)
-    contents = {folder.name: read_json(folder.session_json) for folder in folders}
-    sources = [str(content["label_source"]) for content in contents.values()]
+    with writing(work, [folder.name for folder in folders]):
+        return _describe(work, folders, settings, engine, overwrite)
+
+
+def _describe(
+    work: Workspace,
+    folders: Sequence[SessionFolder],
+    settings: Resolved,
+    engine: Engine,
+    overwrite: bool,
+) -> Report:
+    report = Report()
+    # a session is comparable with all others, not only with those that are described now
+    sources = [str(read_json(f.session_json)["label_source"]) for f in work.sessions()]
     for folder in folders:
-        content = contents[folder.name]
-        _check_voxel_size(folder.name, content, settings)
+        check_settings(folder, settings)
+    keep(work, settings)
+    for folder in folders:
+        content = read_json(folder.session_json)
         variants = variants_for(str(content["label_source"]), sources, settings)
-        descriptor = settings.fingerprint("descriptor")
-        parts = (content["fingerprint"], descriptor, _weights(settings), *variants)
-        fingerprint = fingerprint_of(parts)
-        if not overwrite and recorded_fingerprint(folder.words_json) == fingerprint:
+        if not overwrite and is_described(folder, variants, settings):
             report.kept.append(folder.name)
             continue
 
-        folder.words_json.unlink(missing_ok=True)
         words = _describe_session(folder, content, variants, settings, engine)
-        used = settings.model_dump(mode="json", include={"descriptor"})
+        used = settings.tables("descriptor")
+        fingerprint = words_fingerprint(folder, settings)
         done = {"fingerprint": fingerprint, "words": words, "variants": list(variants)}
         write_json(folder.words_json, {**done, "settings": used})
         report.done.append(folder.name)
@@ -69,14 +81,29 @@ def describe(
     return report
 
 
-def _check_voxel_size(name: str, content: dict[str, Any], settings: Resolved) -> None:
-    fused = content["settings"]["fusion"]["voxel_size"]
-    if fused != settings.fusion.voxel_size:
-        raise WorkspaceError(
-            f"Session {name} was fused with voxels of {fused} m, the settings give"
-            f" {settings.fusion.voxel_size} m: add --set fusion.voxel_size={fused},"
-            " or fuse it again."
-        )
+def words_fingerprint(folder: SessionFolder, settings: Resolved) -> str:
+    """Of all that the words of a session depend on, apart from their variants."""
+    fused = read_json(folder.session_json)["fingerprint"]
+    return fingerprint_of((fused, settings.fingerprint("descriptor"), _weights(settings)))
+
+
+def is_described(folder: SessionFolder, variants: Iterable[str], settings: Resolved) -> bool:
+    """Whether a session has words of all ``variants``, made from its present map."""
+    if recorded_fingerprint(folder.words_json) != words_fingerprint(folder, settings):
+        return False
+    return set(variants) <= set(read_json(folder.words_json)["variants"])
+
+
+def check_settings(folder: SessionFolder, settings: Resolved) -> None:
+    """WorkspaceError where a session was fused with other settings of fusion."""
+    fused = read_json(folder.session_json)["settings"]["fusion"]
+    wanted = settings.tables("fusion")["fusion"]
+    for key in wanted:
+        if key in fused and fused[key] != wanted[key]:
+            raise WorkspaceError(
+                f"Session {folder.name} was fused with fusion.{key}={fused[key]}, the settings"
+                f" are fusion.{key}={wanted[key]}: fuse its log again, or take the other value."
+            )
 
 
 def _describe_session(
@@ -110,6 +137,7 @@ def _describe_session(
             progress.report("describe", folder.name, done, len(tasks), "submaps")
         if not tasks:
             write_words(blocks_path(output, 0), 0, [], metadata)
+        folder.words_json.unlink(missing_ok=True)  # it must not vouch for other words
     return words
 
 

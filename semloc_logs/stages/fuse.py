@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from semloc_logs.engines import Engine
-from semloc_logs.errors import LogError, SemlocError
+from semloc_logs.errors import LogError, SemlocError, WorkspaceError
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import content_fingerprint, recover
 from semloc_logs.logs.poses.base_frame import BASE_LINK
@@ -18,10 +21,13 @@ from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings
 from semloc_logs.logs.problems import sentences, to_report
 from semloc_logs.logs.session.lent_transforms import lent_transforms
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask, fuse_session
-from semloc_logs.settings import Resolved
+from semloc_logs.settings import Logs, Resolved
 from semloc_logs.stages.inputs import SessionInput, fingerprint_of, recorded_fingerprint
+from semloc_logs.stages.lock import writing
 from semloc_logs.stages.report import Report
-from semloc_logs.tables.table import read_json, read_table
+from semloc_logs.stages.state import keep
+from semloc_logs.tables.atomic_files import replacing_folder
+from semloc_logs.tables.table import read_json, read_table, write_json
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import SessionFolder, Workspace
 
@@ -35,35 +41,76 @@ def fuse(
     engine: Engine,
     *,
     overwrite: bool = False,
+    retry_failed: bool = False,
 ) -> Report:
     """Fuse each session. One that fails is named in ``failed``; the others go on.
 
-    Raises LogError when all of them failed.
+    The reason is kept, and the same log is not read again unless ``retry_failed`` or ``overwrite``.
+    Raises LogError when all of them failed, WorkspaceError where another log has the name of a
+    session, unless ``overwrite``.
     """
+    with writing(work, [session.name for session in sessions]):
+        return _fuse(sessions, work, settings, engine, overwrite, again=overwrite or retry_failed)
+
+
+def _fuse(
+    sessions: Sequence[SessionInput],
+    work: Workspace,
+    settings: Resolved,
+    engine: Engine,
+    overwrite: bool,
+    again: bool,
+) -> Report:
     report = Report()
     tasks: list[FuseTask] = []
     logs = [log for session in sessions for log in session.logs]
     for session in sessions:
         others = [log for log in logs if log not in session.logs]
-        task = _task(session, work.session(session.name), settings, others)
+        folder = work.session(session.name)
+        reading = settings if overwrite else _as_read_before(folder, settings)
+        task = _task(session, folder, reading, others)
         if not overwrite and recorded_fingerprint(task.folder.session_json) == task.fingerprint:
             report.kept.append(session.name)
             report.skipped += read_json(task.folder.session_json)["skipped"]
+            continue
+        if not overwrite:
+            _check_same_log(task)
+        if not again and recorded_fingerprint(work.failure(session.name)) == task.fingerprint:
+            reason = read_json(work.failure(session.name))["reason"]
+            report.failed.append(f"{reason} It failed before: --retry-failed reads it again.")
         else:
             tasks.append(task)
+    keep(work, settings)
 
     for task, outcome in zip(tasks, engine.map(_fuse_one, tasks), strict=True):
+        failure = work.failure(task.folder.name)
         if isinstance(outcome, SemlocError):
             report.failed.append(str(outcome))
+            content = {"fingerprint": task.fingerprint, "reason": str(outcome)}
+            write_json(failure, content | {"logs": [str(log) for log in task.logs]})
             if len(tasks) > 1:  # the only one is raised below
                 LOGGER.info("%s: %s", task.folder.name, outcome)
         else:
+            failure.unlink(missing_ok=True)
             report.done.append(task.folder.name)
             report.skipped += sentences(to_report(outcome.problems))
             _log_outcome(task.folder.name, outcome)
     if report.failed and not report.done and not report.kept:
         raise LogError(" ".join(report.failed))
     return report
+
+
+def _as_read_before(folder: SessionFolder, settings: Resolved) -> Resolved:
+    """The settings, with those of reading that the session was made with unless others are given.
+
+    They belong to a log: its clocks, its mountings, its direction of up.
+    """
+    is_given = settings.logs != Logs(memory=settings.logs.memory)
+    if is_given or not folder.session_json.exists():
+        return settings
+    recorded = read_json(folder.session_json).get("settings", {}).get("logs", {})
+    logs = Logs.model_validate({**recorded, "memory": settings.logs.memory})
+    return settings.model_copy(update={"logs": logs})
 
 
 def _task(
@@ -75,22 +122,24 @@ def _task(
     """
     for log in session.logs:
         recover(log)
-    inputs = [content_fingerprint(log) for log in session.logs]
-    if session.poses is not None:
-        inputs.append(f"poses {session.poses.fingerprint()}")
     mountings = _mountings(session, settings, others)
-    inputs += [repr(transform) for transform in mountings.lent]
+    made_from = {
+        "content": [content_fingerprint(log) for log in session.logs],
+        "topics": dict(sorted(session.topics.items())),
+        "poses": None if session.poses is None else session.poses.fingerprint(),
+    }
     fingerprint = fingerprint_of(
         (
             settings.fingerprint("logs", "fusion", "labels"),
             label_fingerprint(settings.labels),
-            repr(sorted(session.topics.items())),
-            *inputs,
+            json.dumps(made_from, sort_keys=True),
+            *(repr(transform) for transform in mountings.lent),
         )
     )
     logs = tuple(Path(log).absolute() for log in session.logs)
+    topics = dict(session.topics)
     return FuseTask(
-        logs, folder, settings, dict(session.topics), fingerprint, session.poses, mountings
+        logs, folder, settings, topics, fingerprint, made_from, session.poses, mountings
     )
 
 
@@ -106,23 +155,50 @@ def _mountings(session: SessionInput, settings: Resolved, others: Sequence[Path]
         return NO_MOUNTINGS  # the task meets the same error, and names it
 
 
+def _check_same_log(task: FuseTask) -> None:
+    """WorkspaceError where the session of a task was made from other input.
+
+    Made from the same under other settings, or by another version, it is made again.
+    """
+    if not task.folder.session_json.exists():
+        return
+    present = read_json(task.folder.session_json)
+    before = present.get("made_from", task.made_from)
+    changed = [what for what in task.made_from if before.get(what) != task.made_from[what]]
+    if not changed:
+        return
+    name = task.folder.name
+    if "content" in changed:
+        paths = ", ".join(str(log["path"]) for log in present.get("logs", []))
+        raise WorkspaceError(
+            f"Session '{name}' was made from another log ({paths}) than {task.logs[0]}: give this"
+            f" one a name, as in NAME={task.logs[0].name}, or replace '{name}' with --overwrite."
+        )
+    raise WorkspaceError(
+        f"Session '{name}' was made with other {' and '.join(changed)}: give the same, or make it"
+        " again with --overwrite."
+    )
+
+
 def _fuse_one(task: FuseTask) -> FusedSession | SemlocError:
     """An expected error is a result: one bad log does not end the night's work."""
-
-    def draw(content: dict[str, Any]) -> None:
-        # matplotlib is loaded only where something is drawn
-        from semloc_logs.pictures.map_picture import Caption, draw_map
-
-        poses = poses_of(read_table(task.folder.frames))
-        positions = poses[:, :3, 3] if content["posed"] else np.zeros((0, 3))
-        caption = Caption(task.folder.name, content["label_source"], content["voxel_size"])
-        draw_map(task.folder.voxels, positions, caption, task.folder.picture)
-
     try:
-        task.folder.session_json.unlink(missing_ok=True)  # half a replacement must not look done
-        return fuse_session(task, on_tables=draw)
+        # beside the present session, which stays until the new one is whole
+        with replacing_folder(task.folder.path) as scratch:
+            folder = SessionFolder(scratch, task.folder.name)
+            return fuse_session(replace(task, folder=folder), on_tables=partial(_draw, folder))
     except SemlocError as problem:
         return problem
+
+
+def _draw(folder: SessionFolder, content: dict[str, Any]) -> None:
+    # matplotlib is loaded only where something is drawn
+    from semloc_logs.pictures.map_picture import Caption, draw_map
+
+    poses = poses_of(read_table(folder.frames))
+    positions = poses[:, :3, 3] if content["posed"] else np.zeros((0, 3))
+    caption = Caption(folder.name, content["label_source"], content["voxel_size"])
+    draw_map(folder.voxels, positions, caption, folder.picture)
 
 
 def _log_outcome(name: str, fused: FusedSession) -> None:

@@ -11,10 +11,11 @@ import semloc_logs
 from semloc_logs.engines import Engine
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.annotate import Annotation, AnnotationMode, annotate
-from semloc_logs.stages.close import Selection, close
+from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe
 from semloc_logs.stages.fuse import fuse
 from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.lock import one_writer
 from semloc_logs.stages.report import Report
 from semloc_logs.tables.table import write_json
 from semloc_logs.workspace import Workspace
@@ -22,6 +23,7 @@ from semloc_logs.workspace import Workspace
 LOGGER = logging.getLogger(__name__)
 
 
+@one_writer
 def run(
     sessions: Sequence[SessionInput],
     work: Workspace,
@@ -30,15 +32,18 @@ def run(
     *,
     annotation: AnnotationMode = AnnotationMode.NONE,
     overwrite: bool = False,
+    retry_failed: bool = False,
 ) -> Report:
-    """All of it, resumable: each session is fused and described, all are closed together."""
+    """All of it, resumable: sessions are fused, and all of the workspace described and closed."""
     total = _Total()
-    total.add("fuse", fuse(sessions, work, settings, engine, overwrite=overwrite))
+    fused_now = fuse(
+        sessions, work, settings, engine, overwrite=overwrite, retry_failed=retry_failed
+    )
+    total.add("fuse", fused_now)
     fused = [s for s in sessions if work.session(s.name).session_json.exists()]
-    names = [s.name for s in fused]
-    total.add("describe", describe(work, names, settings, engine, overwrite=overwrite))
-    selection = Selection(queries=tuple(names), targets=tuple(names))
-    total.add("close", close(work, settings, engine, selection, overwrite=overwrite))
+    # of those that are fused again, words are made again
+    total.add("describe", describe(work, [], settings, engine))
+    total.add("close", close(work, settings, engine, overwrite=overwrite))
     if annotation is not AnnotationMode.NONE:
         for session in fused:
             _annotate_logs(session, work, settings, annotation)

@@ -8,8 +8,10 @@ block has ended well, the new state survives a power failure.
 from __future__ import annotations
 
 import glob
+import hashlib
 import os
 import shutil
+import socket
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +20,9 @@ from pathlib import Path
 _UMASK = os.umask(0o022)
 os.umask(_UMASK)
 PUBLIC = 0o666 & ~_UMASK  # permissions of a file that any program would make
+_OLD = ".old.tmp"  # ends the name of a folder that is being replaced
+_HOST = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
+_PROCESS = uuid.uuid4().hex[:6]  # tells this process from an earlier one of the same number
 
 
 def sync_folder(folder: Path) -> None:
@@ -41,8 +46,36 @@ def make_folder(folder: Path) -> None:
 
 
 def stale_temporaries(path: Path) -> list[Path]:
-    """Temporary files or folders for ``path`` that killed writers left behind."""
-    return sorted(path.parent.glob(f".{glob.escape(path.name)}.*.tmp"))
+    """Temporary files or folders for ``path`` that killed writers left behind.
+
+    Those of a process that is alive are not.
+    """
+    found = sorted(path.parent.glob(f".{glob.escape(path.name)}.*.tmp"))
+    return [p for p in found if not _is_in_use(p.name.removeprefix(f".{path.name}."))]
+
+
+def is_alive(process: int) -> bool:
+    """Whether a process of this host runs."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # of another user
+        return True
+    return process > 0
+
+
+def _is_in_use(ending: str) -> bool:
+    """Whether the writer of a temporary is alive, by the end of its name.
+
+    Processes of other hosts count as gone.
+    """
+    host, process, of_process, *_ = [*ending.split(".")[0].split("-"), "", "", ""]
+    if host != _HOST or not process.isdigit():
+        return False
+    if int(process) == os.getpid():
+        return of_process == _PROCESS
+    return is_alive(int(process))
 
 
 def remove_file(path: Path) -> None:
@@ -76,20 +109,23 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     """A temporary folder beside ``path`` that takes its place when the block ends well.
 
     Two renames do it, so a reader in between, or after a kill in between, finds no folder; never
-    half of one.
+    half of one. The next writer puts the old one back.
     """
     make_folder(path.parent)
-    for stale in stale_temporaries(path):
-        shutil.rmtree(stale, ignore_errors=True)
+    recover_folder(path)
     temporary = _temporary(path, ".tmp")
     temporary.mkdir()
     try:
         yield temporary
         _sync_tree(temporary)
         if path.exists():
-            old = _temporary(path, ".old.tmp")
+            old = _temporary(path, _OLD)
             os.replace(path, old)
-            os.replace(temporary, path)
+            try:
+                os.replace(temporary, path)
+            except BaseException:
+                os.replace(old, path)
+                raise
             # the renames are synced first: else a crash could leave a half-removed folder under
             # the old name
             sync_folder(path.parent)
@@ -101,8 +137,18 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def recover_folder(path: Path) -> None:
+    """Remove what killed writers of a folder left, and put back one that was being replaced."""
+    for stale in stale_temporaries(path):
+        if stale.name.endswith(_OLD) and not path.exists():
+            os.replace(stale, path)
+        else:
+            shutil.rmtree(stale, ignore_errors=True)
+
+
 def _temporary(path: Path, suffix: str) -> Path:
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{suffix}")
+    owner = f"{_HOST}-{os.getpid()}-{_PROCESS}-{uuid.uuid4().hex[:8]}"
+    return path.with_name(f".{path.name}.{owner}{suffix}")
 
 
 def _sync_tree(root: Path) -> None:

@@ -94,6 +94,12 @@ def session_words(folder: SessionFolder, variant: str) -> SessionWords | None:
         return None
 
 
+def session_segment(folder: SessionFolder, variant: str) -> Segment | None:
+    """The words of one session in memory, None where it was not described in ``variant``."""
+    words = session_words(folder, variant)
+    return None if words is None else _in_memory([(words, words.read(variant))])
+
+
 @dataclass(slots=True, eq=False)
 class Change:
     """The work of :func:`segments`.

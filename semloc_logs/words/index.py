@@ -365,6 +365,32 @@ class Part:
     group: I64
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LookUp:
+    """Descriptors (n) as every index of a vocabulary looks them up.
+
+    Their nearest ``cells`` (n, p), ``codes`` (n, p) in each of them, ``margin`` (n, p, 64) of the
+    projections from the cells' thresholds, and ``projected`` (n, 64) descriptors.
+    """
+
+    cells: I32
+    margin: F32
+    codes: U64
+    projected: F32
+
+
+def look_ups(vocabulary: Vocabulary, descriptors: F32, probes: int) -> list[LookUp]:
+    """Descriptors (n, N) to be looked for in their ``probes`` nearest cells, in batches."""
+    out = []
+    for first in range(0, len(descriptors), QUERIES):
+        batch = descriptors[first : first + QUERIES]
+        cells = vocabulary.nearest_cells(batch, probes)
+        margin = vocabulary.margins(batch, cells)
+        projected = grid(vocabulary.projected(batch))
+        out.append(LookUp(cells, np.abs(margin), codes_of(margin), projected))
+    return out
+
+
 class Index:
     """Words of a database in segments.
 
@@ -418,10 +444,11 @@ class Index:
 
         They are looked for in its ``probes`` nearest cells.
         """
-        parts = [
-            self._search(descriptors[i : i + QUERIES], k, probes, allowed)
-            for i in range(0, len(descriptors), QUERIES)
-        ]
+        return self.find(look_ups(self.vocabulary, descriptors, probes), k, allowed)
+
+    def find(self, batches: Sequence[LookUp], k: int, allowed: Allowed) -> Matches:
+        """The same for descriptors that :func:`look_ups` prepared."""
+        parts = [self._find(batch, k, allowed) for batch in batches]
         if not parts:
             parts = [self._gather(np.zeros((4, 0), np.int64))]
         query = np.concatenate([m.query + i * QUERIES for i, m in enumerate(parts)]).astype(
@@ -433,15 +460,12 @@ class Index:
         )
         return Matches(query, *rest)
 
-    def _search(self, descriptors: F32, k: int, probes: int, allowed: Allowed) -> Matches:
-        v = self.vocabulary
-        cells = v.nearest_cells(descriptors, probes)
-        margin = v.margins(descriptors, cells)
-        codes = codes_of(margin)
+    def _find(self, batch: LookUp, k: int, allowed: Allowed) -> Matches:
+        codes = batch.codes
         ranges = _choose(
-            grid(v.projected(descriptors)),
-            cells,
-            v.children,
+            batch.projected,
+            batch.cells,
+            self.vocabulary.children,
             self._square,
             self._live,
             self._cell_live,
@@ -461,7 +485,7 @@ class Index:
             return self._gather(np.zeros((4, 0), np.int64))
         m = np.concatenate(scanned, axis=1)
         code, key = (np.concatenate([n[i] for n in candidates]) for i in (0, 1))
-        nearest, hamming = _nearest(np.abs(margin), codes, limit, m[0], m[2], code, key, k)
+        nearest, hamming = _nearest(batch.margin, codes, limit, m[0], m[2], code, key, k)
         query, rank = np.nonzero(nearest >= 0)
         chosen = m[:, nearest[query, rank]]
         return self._gather(np.stack([query, chosen[1], chosen[3], hamming[query, rank]]))

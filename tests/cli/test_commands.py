@@ -20,10 +20,10 @@ from semloc_logs.benchmarks.named import Outcome
 from semloc_logs.cli.main import program
 from semloc_logs.logs.annotation.annotate import AnnotateReport
 from semloc_logs.stages.annotate import Annotation, AnnotationMode
-from semloc_logs.stages.close import Selection
+from semloc_logs.stages.pair_search import Selection
 from semloc_logs.stages.report import Report
 from semloc_logs.tables import contracts
-from semloc_logs.tables.table import write_table
+from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.training.network_training import TrainingRun
 from semloc_logs.training.runs import Packed
 from semloc_logs.voxels.store import pose_columns
@@ -209,12 +209,17 @@ def test_two_logs_of_one_name_are_refused(tmp_path: Path) -> None:
     assert "session 'a'" in done.stderr
 
 
-def test_long_lists_of_closures_are_cut_short(called: Any, tmp_path: Path) -> None:
-    _write_closures(Workspace(tmp_path / "work"), 50)
+def test_closures_are_shown_by_pairs_of_sessions(called: Any, tmp_path: Path) -> None:
+    work = Workspace(tmp_path / "work")
+    _write_closures(work, 50)
+    write_json(work.session("wednesday").session_json, {})
     called("run", Report(closures=50))
     done = semloc("run", "a.mcap", "-w", tmp_path / "work")
-    assert done.stdout.count("0.9987") == 20
-    assert "... and 30 more." in done.stdout
+    row = next(line for line in done.stdout.splitlines() if line.split()[:1] == ["tuesday"])
+    assert row.split() == ["tuesday", "monday", "50", "49", "0.62", "0.9987"]
+    assert "Without closures: wednesday" in done.stdout
+    assert "50 loop closures in" in done.stdout
+    assert max(len(line.rstrip()) for line in done.stdout.splitlines() if "monday" in line) <= 80
 
 
 def test_fuse_makes_all_logs_one_session(called: Any, tmp_path: Path) -> None:

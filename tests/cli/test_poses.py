@@ -264,11 +264,14 @@ def test_a_trajectory_makes_a_map_and_is_part_of_the_fingerprint(tmp_path: Path)
     again, _ = fuse(log, "--poses", poses)
     assert "Done before: a" in again.stdout
     tum(poses, 200.0)
-    changed, _ = fuse(log, "--poses", poses)
+    refused, _ = fuse(log, "--poses", poses)
+    assert refused.exit_code == 1
+    assert "Session 'a' was made with other poses" in refused.stderr
+    changed, _ = fuse(log, "--poses", poses, "--overwrite")
     assert "Fused: a" in changed.stdout
     trajectory = pq.read_table(tmp_path / "work/sessions/a/trajectory.parquet").to_pydict()
     assert trajectory["t_x"][0] == pytest.approx(200.0)
-    framed, _ = fuse(log, "--poses", poses, "--pose-frame", "camera")
+    framed, _ = fuse(log, "--poses", poses, "--pose-frame", "camera", "--overwrite")
     assert framed.exit_code == 1
     assert "the log has no such frame: name one of lidar." in framed.stderr
 
@@ -280,12 +283,12 @@ def test_kitti_poses_with_and_without_times(tmp_path: Path) -> None:
     poses.write_text("".join(f"1 0 0 {SPEED * t} 0 1 0 0 0 0 1 0\n" for t in TIMES))
     times.write_text("".join(f"{t:.6e}\n" for t in TIMES))
     one, session = fuse(log, "--poses", poses)
-    two, timed = fuse(log, "--poses", poses, "--pose-times", times)
+    two, timed = fuse(log, "--poses", poses, "--pose-times", times, "--overwrite")
     assert (one.exit_code, two.exit_code) == (0, 0), one.stderr + two.stderr
     assert session["poses"] == timed["poses"]
     assert session["fingerprint"] != timed["fingerprint"]
     poses.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
-    short, _ = fuse(log, "--poses", poses)
+    short, _ = fuse(log, "--poses", poses, "--overwrite")
     assert short.exit_code == 1
     assert "has 1 poses without stamps but /points has 30 frames" in short.stderr
 

@@ -169,7 +169,7 @@ def test_notes_as_json_lines(failing: Any) -> None:
 
 
 def test_usage_errors_as_json_lines() -> None:
-    done = semloc("run", "--log-format", "json")
+    done = semloc("run", "-w", "w", "--log-format", "json")
     assert done.exit_code == 2
     assert "LOG" in json.loads(done.stderr)["message"]
 
@@ -370,3 +370,11 @@ def test_the_simulation_is_imported_without_the_ray_caster() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("fues", "fuse"), ("anotate", "annotate")])
+def test_a_command_that_is_spelled_wrong_is_suggested(typed: str, meant: str) -> None:
+    done = semloc(typed, "a.mcap")
+    assert done.exit_code == 2
+    assert f"No such command '{typed}'. Did you mean '{meant}'?" in done.stderr
+    assert "Did you mean" not in semloc("xyzzy").stderr

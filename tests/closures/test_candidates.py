@@ -88,12 +88,9 @@ def test_candidates_of_each_session_are_as_many_as_the_settings_name(
     assert calls == [([0], {0: "map 0"}, 7), ([1, 1], {1: "map 1"}, 7)]
 
 
-@pytest.mark.parametrize(
-    ("made", "most"),
-    [({}, 48), ({"hypotheses": 20}, 16), ({"hypotheses": 20, "session_hypotheses": 3}, 10)],
-)
-def test_each_session_has_its_share_of_the_hypotheses(
-    made: dict[str, int], most: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("most", [32, 20])
+def test_each_session_has_its_share_whatever_the_others_have(
+    most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     group = np.array([0, 1, 1])
     votes = (group, np.zeros(3), np.zeros((3, 3)), np.ones(3))
@@ -103,9 +100,10 @@ def test_each_session_has_its_share_of_the_hypotheses(
 
     def pool(group: Any, yaw: Any, translation: Any, weight: Any, cell: float, most: int) -> Any:
         calls.append((group.tolist(), cell, most))
-        return []
+        return [Hypothesis(int(g), (0.0, 0.0, 0.0, 0.0), 1, 1.0) for g in group[:1]]
 
     monkeypatch.setattr(matching, "pool", pool)
-    assert find_hypotheses(context(settings(**made))) == []
+    found = find_hypotheses(context(settings(hypotheses=most, places=1)))
     assert [(groups, n) for groups, _, n in calls] == [([0], most), ([1, 1], most)]
     assert [cell for _, cell, _ in calls] == pytest.approx([2.4, 2.4])
+    assert [h.group for h in found] == [0, 1], "one place in each session"

@@ -21,13 +21,12 @@ from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import (
-    CloseTask,
     Fitted,
     QueryContext,
     _each_place_once,
     _rival_score,
     allowed_words,
-    close_queries,
+    close_query,
     find_hypotheses,
     match_words,
 )
@@ -52,6 +51,7 @@ from semloc_logs.voxels.store import (
     write_blocks,
 )
 from semloc_logs.words.index import Matches
+from semloc_logs.words.vocabulary import load_vocabulary
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
@@ -220,7 +220,7 @@ def ask(work: Workspace, request: pytest.FixtureRequest) -> Ask:
         write_session(
             work, name, scene or courtyard(), drive(3, 0.3, 1.0), map_T_scene, source, seed=7
         )
-        return close_queries(CloseTask(work.path, name, (1,), (target,), settings))[0]
+        return close_query(Database(work, (target,), settings), SessionMap(work.session(name)), 1)
 
     return asked
 
@@ -355,7 +355,9 @@ def test_a_near_word_outweighs_several_far_ones(
     several = np.array([150.0, -40.0, 7.0])
 
     class Words:
-        def search(self, descriptor: NDArray[np.float32], *_: Any) -> Matches:
+        vocabulary = load_vocabulary("semantic", None)
+
+        def find(self, *_: Any) -> Matches:
             rows = np.zeros(4, np.int32)
             centre = np.stack([one, several, several, several])
             return Matches(

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import contextlib
 import importlib
 import logging
+import multiprocessing
 import os
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -11,13 +15,13 @@ from typing import Any
 
 import pytest
 
-from semloc_logs.engines import ENGINES, Engine, make_engine
+from semloc_logs.engines import ENGINES, Engine, make_engine, processes
 from semloc_logs.engines.processes import cores
 from semloc_logs.errors import LogError, SemlocError, SettingsError
 from semloc_logs.progress import Progress, listening
 
 TASKS = """
-import logging, os, time
+import logging, os, signal, time
 from semloc_logs import progress
 from semloc_logs.errors import LogError
 
@@ -40,6 +44,11 @@ def talks(n):
     logging.getLogger("semloc_logs.tasks").info("task %d", n)
     logging.getLogger("semloc_logs.tasks").debug("not wanted")
     return n
+
+def is_deaf(path):
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # as in a long call of a library
+    open(path, "w").close()
+    time.sleep(1000)
 
 def threads(_):
     return {k: os.environ.get(k) for k in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
@@ -106,6 +115,26 @@ def test_a_worker_that_dies_is_an_error_with_advice(tasks: ModuleType) -> None:
         assert list(engine.map(tasks.dies, [0, 1])) == [0, 1]  # a new pool serves what comes next
     finally:
         engine.close()
+
+
+def test_a_worker_that_does_not_leave_is_killed(
+    tasks: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "LEAVE_SECONDS", 0.2)
+    engine = make_engine("processes", 1)
+    begun = tmp_path / "begun"
+
+    def wait() -> None:
+        with contextlib.suppress(Exception):  # the pool is broken, as it should be
+            list(engine.map(tasks.is_deaf, [begun]))
+
+    threading.Thread(target=wait, daemon=True).start()
+    while not begun.exists():
+        time.sleep(0.02)
+    workers = multiprocessing.active_children()
+    assert workers
+    engine.stop()
+    assert not any(worker.is_alive() for worker in workers)
 
 
 def test_workers_share_the_cores(tasks: ModuleType) -> None:

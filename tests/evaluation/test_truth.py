@@ -281,3 +281,14 @@ def test_a_matrix_that_is_no_pose_is_refused(work: Workspace) -> None:
 def test_without_closures_there_is_nothing_to_evaluate(work: Workspace) -> None:
     with pytest.raises(WorkspaceError):
         _evaluate(work)
+
+
+def test_a_workspace_without_sessions_or_closures_is_told_what_to_run(
+    work: Workspace, tmp_path: Path
+) -> None:
+    settings = load().resolved()
+    truth = tmp_path / "truth.json"
+    with pytest.raises(WorkspaceError, match="holds no sessions: run 'semloc fuse' first"):
+        evaluate_closures(Workspace(tmp_path / "empty"), truth, settings)
+    with pytest.raises(WorkspaceError, match="has no closures yet: run 'semloc close' first"):
+        evaluate_closures(work, truth, settings)

@@ -135,7 +135,7 @@ def test_an_imu_that_contradicts_the_map_is_not_believed(imu: F64) -> None:
     (problem,) = found.problems
     assert problem.topic == "/imu"
     assert problem.text.startswith("drive.mcap: /imu contradicts the map: its up is ")
-    assert "fusion.up" in problem.text
+    assert "logs.up" in problem.text
 
 
 def test_an_imu_is_believed_where_the_map_does_not_tell() -> None:
@@ -217,13 +217,13 @@ def test_a_direction_that_is_given_overrules_all_and_is_refined() -> None:
     ],
 )
 def test_the_setting_is_an_axis_or_a_vector(text: str, vector: tuple[float, ...] | None) -> None:
-    assert load(assignments={"fusion.up": text}).fusion.up_vector == vector
+    assert load(assignments={"logs.up": text}).logs.up_vector == vector
 
 
 @pytest.mark.parametrize("text", ["z", "up", "1,2", "0,0,0", "nan,0,1", "1,2,3,4", "5"])
 def test_other_text_is_refused(text: str) -> None:
-    with pytest.raises(SettingsError, match=r"'fusion\.up'"):
-        load(assignments={"fusion.up": text})
+    with pytest.raises(SettingsError, match=r"'logs\.up'"):
+        load(assignments={"logs.up": text})
 
 
 def test_flat_places_face_the_sensor() -> None:
@@ -272,8 +272,8 @@ def levelled(
         imu_up_in_session=lambda: None,
         imu_up_in_base=lambda: None,
     )
-    fusion = load(assignments={f"fusion.{k}": v for k, v in settings.items()}).resolved().fusion
-    return level(cast(Session, session), clouds, fusion)
+    keys = {f"{'logs' if k == 'up' else 'fusion'}.{k}": v for k, v in settings.items()}
+    return level(cast(Session, session), clouds, load(assignments=keys).resolved())
 
 
 TILTED = Rotation.from_euler("yx", [[-60, 0], [90, 0], [0, 90]], degrees=True).as_matrix()

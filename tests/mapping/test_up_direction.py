@@ -118,7 +118,7 @@ def test_two_drives_through_a_basement_agree_on_up(shared: Callable[[str], Path]
                     scratch,
                     name,
                 )
-                session_T_map = level(session, collected, settings.fusion).session_T_map
+                session_T_map = level(session, collected, settings).session_T_map
             finally:
                 session.close()
         finally:

@@ -220,9 +220,9 @@ def renames(
 
     def counted(source: Any, target: Any, **options: Any) -> None:
         nonlocal count
-        if count == stop_at:
-            raise Interrupted
         count += 1
+        if count - 1 == stop_at:
+            raise Interrupted
         replace_(source, target, **options)
 
     with monkeypatch.context() as patch:

@@ -2,7 +2,10 @@
 at three headings.
 """
 
+import contextlib
+import shutil
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import semloc_logs
+from semloc_logs.closures.matching import search_queries
 from semloc_logs.engines import Serial
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import inverse, rotation_angle, transform
@@ -18,8 +22,10 @@ from semloc_logs.settings import Resolved
 from semloc_logs.stages import close as close_stage
 from semloc_logs.stages import describe as describe_stage
 from semloc_logs.stages import fuse as fuse_stage
-from semloc_logs.stages.close import Selection
+from semloc_logs.stages import pair_search
+from semloc_logs.stages import run as run_stage
 from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.pair_search import Selection
 from semloc_logs.stages.report import Report
 from semloc_logs.workspace import Workspace
 
@@ -65,16 +71,21 @@ def test_overwriting_does_it_again(close: Close, coarse: Workspace, tools: Simpl
     assert was_done(close(overwrite=True))
     assert tools.files(coarse.path) == tables
     written = {name for name, time in tools.write_times(coarse.path).items() if time != times[name]}
-    assert written == {"closures.parquet", "closures.png", "rejected.parquet"}
+    alignments = {name for name in written if name.startswith("alignments/")}
+    assert written - alignments == {"closures.parquet", "closures.png", "rejected.parquet"}
+    assert alignments == {name for name in tables if name.startswith("alignments/")}
 
 
-@pytest.mark.parametrize("missing", ["closures", "rejected"])
-def test_a_missing_table_is_made_again(
-    close: Close, coarse: Workspace, tools: SimpleNamespace, missing: str
+@pytest.mark.parametrize("name", ["closures", "rejected", "alignments"])
+@pytest.mark.parametrize("is_damaged", [False, True])
+def test_a_missing_or_damaged_table_is_made_again(
+    close: Close, coarse: Workspace, tools: SimpleNamespace, name: str, is_damaged: bool
 ) -> None:
     tables = tools.files(coarse.path)
-    getattr(coarse, missing).unlink()
-    assert was_done(close())
+    path = getattr(coarse, name)
+    path = path("tuesday", "monday") if name == "alignments" else path
+    path.write_bytes(path.read_bytes()[:-9]) if is_damaged else path.unlink()
+    close()
     assert tools.files(coarse.path) == tables
 
 
@@ -83,7 +94,9 @@ def test_other_words_of_a_session_are_closed(
 ) -> None:
     """The settings stay; another log makes other words."""
     other = SessionInput("monday", (drives["wednesday"].log,))
-    fuse_stage.fuse([other], coarse, tools.coarse_settings(), Serial())
+    fuse_stage.fuse([other], coarse, tools.coarse_settings(), Serial(), overwrite=True)
+    with pytest.raises(WorkspaceError, match="monday lacks semantic words of its present map"):
+        close()
     describe_stage.describe(coarse, [], tools.coarse_settings(), Serial())
     assert was_done(close())
     assert not was_done(close())
@@ -92,10 +105,9 @@ def test_other_words_of_a_session_are_closed(
 @pytest.mark.parametrize(
     "changed",
     [
-        {"fusion__hit": "0.9"},
         {"labels__erode": "3"},
-        {"descriptor__query_stride": "4"},
         {"query__frames": "3"},
+        {"closures__kappa": "9"},
         {"closures__min_probability": "0.5"},
     ],
 )
@@ -105,28 +117,148 @@ def test_settings_are_inputs(close: Close, tools: SimpleNamespace, changed: dict
     assert not was_done(close(settings=settings))
 
 
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"fusion__hit": "0.9"}, r"was fused with fusion\.hit=0\.85"),
+        ({"descriptor__query_stride": "4"}, "lacks semantic words of its present map and settings"),
+    ],
+)
+def test_maps_and_words_of_other_settings_are_refused(
+    close: Close,
+    coarse: Workspace,
+    tools: SimpleNamespace,
+    changed: dict[str, str],
+    sentence: str,
+) -> None:
+    before = tools.files(coarse.path)
+    with pytest.raises(WorkspaceError, match=sentence):
+        close(settings=tools.coarse_settings(**changed))
+    assert tools.files(coarse.path) == before
+
+
 def test_settings_of_the_training_are_none(close: Close, tools: SimpleNamespace) -> None:
     assert not was_done(close(settings=tools.coarse_settings(training__seed="7")))
 
 
 def test_the_version_is_an_input(close: Close, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(semloc_logs, "__version__", "999.0")
+    with pytest.raises(WorkspaceError, match="lacks semantic words"):
+        close()
+
+
+def test_the_decision_alone_is_made_again_for_another_probability(
+    close: Close, coarse: Workspace, tools: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = tools.files(coarse.path)
+    monkeypatch.setattr(pair_search, "search_queries", None)
+    assert was_done(close(settings=tools.coarse_settings(closures__min_probability="0.5")))
+    changed = {n for n, digest in tools.files(coarse.path).items() if before.get(n) != digest}
+    assert changed == {"closures.parquet", "rejected.parquet", "workspace.json"}
+
+
+# -- pairs of sessions
+
+
+def searched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """The pairs whose queries are searched from now on."""
+    pairs: list[tuple[str, str]] = []
+    search = search_queries
+
+    def counted(task: Any) -> int:
+        pairs.extend((task.session, target) for target in task.targets)
+        return search(task)
+
+    monkeypatch.setattr(pair_search, "search_queries", counted)
+    return pairs
+
+
+def test_a_new_session_is_searched_and_nothing_else(
+    close: Close,
+    coarse: Workspace,
+    drives: Any,
+    tools: SimpleNamespace,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Wednesday after the others, and before them: the same bytes as all at once."""
+    pairs = searched(monkeypatch)
+    all_at_once = tools.whole(tmp_path / "all", drives, tools.coarse_settings())
+    assert len(set(pairs)) == 6
+    days = list(drives)
+    assert {(q, t) for q, t in pairs if days.index(q) < days.index(t)} == set()
+    pairs.clear()
+
+    def add(work: Workspace, *names: str) -> None:
+        inputs = tools.inputs(drives, *names)
+        run_stage.run(inputs, work, tools.coarse_settings(), Serial())
+        work.summary.unlink()
+
+    add(coarse, "wednesday")
+    assert set(pairs) == {("wednesday", target) for target in days}
+    other_way = Workspace(tmp_path / "other")
+    for name in ("wednesday", "tuesday", "monday"):
+        add(other_way, name)
+    assert tools.files(coarse.path) == tools.files(all_at_once.path)
+    assert tools.files(other_way.path) == tools.files(all_at_once.path)
+
+
+def test_a_selection_restricts_what_is_searched_and_never_what_is_known(
+    close: Close, coarse: Workspace, tools: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = tools.files(coarse.path)
+    pairs = searched(monkeypatch)
+    for selection in ((("monday",), ("tuesday",)), (("tuesday",), ()), ((), ("monday",))):
+        assert not was_done(close(*selection))
+        assert not was_done(close(*selection, self_closures=False))
+    assert tools.files(coarse.path) == before
+
+    shutil.rmtree(coarse.path / "alignments")
+    assert was_done(close(("monday",), ("tuesday",))), "in either direction"
+    assert set(pairs) == {("tuesday", "monday")}
+    pairs.clear()
+    close(self_closures=False)
+    assert pairs == []
+    close()
+    assert set(pairs) == {("monday", "monday"), ("tuesday", "tuesday")}
+    assert tools.files(coarse.path) == before
+
+
+def test_alignments_of_a_session_that_is_gone_are_forgotten(
+    close: Close, coarse: Workspace, drives: Any, tools: SimpleNamespace
+) -> None:
+    shutil.rmtree(coarse.session("tuesday").path)
     assert was_done(close())
+    left = sorted(str(p.parent) for p in (coarse.path / "alignments").rglob("*.parquet"))
+    assert left == [str(coarse.alignments("monday", "monday").parent)]
+    assert pq.read_metadata(coarse.closures).num_rows == 0
 
 
-def test_closures_within_a_session_are_an_input(close: Close) -> None:
-    assert was_done(close(self_closures=False))
-    assert not was_done(close(self_closures=False))
-    assert was_done(close(self_closures=True))
+def test_a_search_goes_on_at_the_task_it_was_at(
+    close: Close, coarse: Workspace, tools: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed in every task once: each task is done once, and the tables are the same."""
+    before = tools.files(coarse.path)
+    shutil.rmtree(coarse.path / "alignments")
+    monkeypatch.setattr(pair_search, "QUERIES_A_TASK", 1)
+    search = search_queries
+    tasks: list[Any] = []
 
+    def interrupted(task: Any) -> int:
+        if task not in tasks:
+            tasks.append(task)
+            search(task)
+            raise KeyboardInterrupt
+        pytest.fail("a finished task is done again")
 
-def test_queries_and_targets_are_inputs(close: Close) -> None:
-    assert was_done(close(("monday",), ("tuesday", "monday")))
-    assert was_done(close(("monday", "tuesday"), ("monday",))), (
-        "the same names in the same order, but other queries"
-    )
-    assert not was_done(close(("monday", "tuesday"), ("monday",)))
-    assert was_done(close(("monday", "tuesday"), ("tuesday",)))
+    monkeypatch.setattr(pair_search, "search_queries", interrupted)
+    for _ in range(50):
+        with contextlib.suppress(KeyboardInterrupt):
+            close()
+            break
+    assert len(tasks) > 3
+    assert tools.files(coarse.path) == before
+    assert not (coarse.path / ".parts" / "tuesday").exists()
 
 
 def test_sessions_without_the_words_that_are_needed_are_named(
@@ -134,11 +266,12 @@ def test_sessions_without_the_words_that_are_needed_are_named(
 ) -> None:
     uniform = tools.coarse_settings(labels__source="uniform")
     fuse_stage.fuse(tools.inputs(drives, "wednesday"), coarse, uniform, Serial())
-    with pytest.raises(WorkspaceError, match="Session monday lacks geometric and semantic words"):
+    with pytest.raises(WorkspaceError, match="Session monday lacks geometric words"):
         close()
     describe_stage.describe(coarse, ["wednesday"], uniform, Serial())
-    with pytest.raises(WorkspaceError, match="Session monday lacks geometric and semantic words"):
+    with pytest.raises(WorkspaceError, match="Session monday lacks geometric words"):
         close()
+    assert not was_done(close(("monday",), ("tuesday",))), "this pair needs none"
     describe_stage.describe(coarse, [], tools.coarse_settings(), Serial())
     assert was_done(close())
 
@@ -154,17 +287,16 @@ def test_interrupted_closing_is_done_again(
     """Interrupted at the first, second or third of the two tables and the picture, under other
     settings.
     """
-    other = tools.coarse_settings(closures__probes="7")
+    other = tools.coarse_settings(closures__min_probability="0.9")
     first = tools.files(coarse.path)
-    assert tools.renames(monkeypatch, lambda: close(settings=other)) == 3
+    assert tools.renames(monkeypatch, lambda: close(settings=other)) == 4  # and workspace.json
     second = tools.files(coarse.path)
+    step += 1
     assert {name for name in first if first[name] != second[name]} == {
         "closures.parquet",
         "rejected.parquet",
+        "workspace.json",
     }
-    tools.renames(monkeypatch, lambda: close(settings=other, overwrite=True), step)
-    close(settings=other)
-    assert tools.files(coarse.path) == second
     close()
     picture = coarse.picture.read_bytes()
     tools.renames(monkeypatch, lambda: close(settings=other), step)

@@ -15,9 +15,10 @@ import pytest
 
 import semloc_logs
 from semloc_logs.engines import Serial
-from semloc_logs.errors import LogError
+from semloc_logs.errors import LogError, WorkspaceError
 from semloc_logs.logs.annotation.annotate import Results, annotate_in_place
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.mapping import session_fusion
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Resolved
@@ -26,7 +27,7 @@ from semloc_logs.stages import fuse as fuse_stage
 from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.stages.report import Report
 from semloc_logs.tables.table import read_json, read_table
-from semloc_logs.workspace import SessionFolder, Workspace
+from semloc_logs.workspace import Workspace
 
 Fuse = Callable[..., Report]
 
@@ -67,7 +68,10 @@ def test_overwriting_does_it_again(fuse: Fuse, coarse: Workspace, tools: SimpleN
     tables = tools.files(coarse.path)
     times = tools.write_times(coarse.path)
     assert was_done(fuse(overwrite=True))
-    assert tools.files(coarse.path) == tables
+    # a map that is made again has no words yet
+    assert tools.files(coarse.path) == {
+        name: digest for name, digest in tables.items() if "monday/words" not in name
+    }
     written = {name for name, time in tools.write_times(coarse.path).items() if time != times[name]}
     assert {
         "sessions/monday/session.json",
@@ -80,13 +84,17 @@ def test_overwriting_does_it_again(fuse: Fuse, coarse: Workspace, tools: SimpleN
 # -- the logs
 
 
-def test_another_content_of_the_log_is_fused(
-    fuse: Fuse, coarse: Workspace, drives: Any, tmp_path: Path
+def test_another_log_under_a_known_name_replaces_it_only_on_demand(
+    fuse: Fuse, coarse: Workspace, drives: Any, tools: SimpleNamespace, tmp_path: Path
 ) -> None:
     log = Path(shutil.copyfile(drives["monday"].log, tmp_path / "monday.mcap"))
     assert not was_done(fuse([log])), "the same content under another path"
     shutil.copyfile(drives["wednesday"].log, log)
-    assert was_done(fuse([log]))
+    before = tools.files(coarse.path)
+    with pytest.raises(WorkspaceError, match=r"'monday' was made from another log .*--overwrite"):
+        fuse([log])
+    assert tools.files(coarse.path) == before
+    assert was_done(fuse([log], overwrite=True))
     assert (
         read_table(coarse.session("monday").frames)["stamp_ns"][0].as_py()
         == drives["wednesday"].trajectory.stamps_ns[0]
@@ -105,11 +113,14 @@ def test_a_log_that_is_touched_or_annotated_keeps_its_content(
     assert not was_done(fuse([log]))
 
 
-def test_another_log_of_the_session_is_fused(fuse: Fuse, drives: Any) -> None:
+def test_another_log_of_the_session_is_fused_on_demand(fuse: Fuse, drives: Any) -> None:
     both = [drives["monday"].log, drives["tuesday"].log]
-    assert was_done(fuse(both))
+    with pytest.raises(WorkspaceError, match="another log"):
+        fuse(both)
+    assert was_done(fuse(both, overwrite=True))
     assert not was_done(fuse(both))
-    assert was_done(fuse(both[:1]))
+    with pytest.raises(WorkspaceError, match="another log"):
+        fuse(both[:1])
 
 
 # -- settings, topics, version
@@ -147,11 +158,13 @@ def test_settings_of_later_stages_are_none(
 
 
 def test_topics_are_inputs(fuse: Fuse) -> None:
-    assert was_done(fuse(topics={"lidar": "/lidar/points", "pose": "/odometry"}))
-    assert not was_done(fuse(topics={"pose": "/odometry", "lidar": "/lidar/points"})), (
-        "their order means nothing"
-    )
-    assert was_done(fuse(topics={"lidar": "/lidar/points"}))
+    topics = {"lidar": "/lidar/points", "pose": "/odometry"}
+    with pytest.raises(WorkspaceError, match="'monday' was made with other topics"):
+        fuse(topics=topics)
+    assert was_done(fuse(topics=topics, overwrite=True))
+    assert not was_done(fuse(topics=dict(reversed(topics.items())))), "their order means nothing"
+    with pytest.raises(WorkspaceError, match="other topics"):
+        fuse(topics={"lidar": "/lidar/points"})
 
 
 def test_the_version_is_an_input(fuse: Fuse, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,7 +181,9 @@ def test_the_file_of_poses_is_an_input(
     file = tmp_path / "poses.tum"
     twin = tmp_path / "twin.tum"
     write_truth(file, drives["monday"].trajectory)
-    assert was_done(fuse(poses=TrajectoryFile(file)))
+    with pytest.raises(WorkspaceError, match="'monday' was made with other poses"):
+        fuse(poses=TrajectoryFile(file))
+    assert was_done(fuse(poses=TrajectoryFile(file), overwrite=True))
     first = read_table(coarse.session("monday").trajectory)
     # in the world; in the frame of the odometry it is near 100
     assert first["t_x"][0].as_py() == pytest.approx(-9.0, abs=0.05)
@@ -176,9 +191,10 @@ def test_the_file_of_poses_is_an_input(
     assert not was_done(fuse(poses=TrajectoryFile(twin))), "the same content under another path"
     lines = file.read_text().splitlines()
     file.write_text("\n".join(lines[1:]) + "\n")
-    assert was_done(fuse(poses=TrajectoryFile(file)))
-    assert was_done(fuse(poses=TrajectoryFile(file, frame="lidar")))
-    assert was_done(fuse()), "back to the poses of the log"
+    for other in (TrajectoryFile(file), TrajectoryFile(file, frame="lidar"), None):
+        with pytest.raises(WorkspaceError, match="other poses"):
+            fuse(poses=other)
+        assert was_done(fuse(poses=other, overwrite=True))
 
 
 def test_the_file_of_a_label_space_is_an_input(
@@ -258,7 +274,47 @@ def test_a_log_that_fails_does_not_end_the_others(
         fuse_stage.fuse([no_log], work, tools.coarse_settings(), Serial())
 
 
-@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_a_log_that_failed_is_read_again_when_it_or_the_settings_change_or_on_demand(
+    tools: SimpleNamespace, drives: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "no.mcap"
+    log.write_bytes(b"no log")
+    work = Workspace(tmp_path / "work")
+    read: list[str] = []
+    fuse_session = session_fusion.fuse_session
+
+    def counted(task: FuseTask, **options: Any) -> FusedSession:
+        read.append(task.folder.name)
+        return fuse_session(task, **options)
+
+    monkeypatch.setattr(fuse_stage, "fuse_session", counted)
+
+    def fuse_again(**options: Any) -> tuple[Report, int]:
+        read.clear()
+        settings = options.pop("settings", tools.coarse_settings())
+        inputs = [SessionInput("no", (log,)), *tools.inputs(drives, "monday")]
+        return fuse_stage.fuse(inputs, work, settings, Serial(), **options), read.count("no")
+
+    first, reads = fuse_again()
+    assert (first.done, len(first.failed), reads) == (["monday"], 1, 1)
+    content = read_json(work.failure("no"))
+    assert content["reason"] == first.failed[0]
+    assert content["logs"] == [str(log)]
+    second, reads = fuse_again()
+    assert (second.kept, reads) == (["monday"], 0)
+    assert second.failed == [f"{first.failed[0]} It failed before: --retry-failed reads it again."]
+    assert fuse_again(retry_failed=True)[1] == 1
+    log.write_bytes(b"still no log")
+    assert fuse_again()[1] == 1
+    assert fuse_again()[1] == 0
+    assert fuse_again(settings=tools.coarse_settings(labels__source="uniform"))[1] == 1
+    shutil.copyfile(drives["tuesday"].log, log)
+    fused, _ = fuse_again()
+    assert fused.done == ["no", "monday"]
+    assert work.failures() == []
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
 def test_an_interrupted_session_is_done_again(
     share: float,
     fuse: Fuse,
@@ -266,34 +322,36 @@ def test_an_interrupted_session_is_done_again(
     tools: SimpleNamespace,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Interrupted after a share of its files, under other settings: neither these nor the old
-    settings take the mixture for done.
+    """Interrupted after a share of its files, under other settings: the present session stays
+    whole, with its words, until the new one is.
     """
     folder = coarse.session("monday")
     other = tools.coarse_settings(fusion__hit="0.9", fusion__keyframe_resolution="0.3")
-    first = fused_files(tools, folder)
+    first = tools.files(folder.path)
     steps = tools.renames(monkeypatch, lambda: fuse(settings=other))
-    second = fused_files(tools, folder)
+    second = tools.files(folder.path)
     assert steps > 5
-    assert {name for name in first if first[name] != second.get(name)} >= {
-        "keyframes/part-00000.parquet",
-        "session.json",
-    }
+    assert first.keys() - second.keys() == {n for n in first if n.startswith("words")}
     tools.renames(monkeypatch, fuse, round(share * (steps - 1)))
-    assert was_done(fuse(settings=other)), "what was done before the interruption"
-    assert fused_files(tools, folder) == second
-    tools.renames(monkeypatch, fuse, round(share * (steps - 1)))
+    assert tools.files(folder.path) == second
+    assert [p.name for p in folder.path.parent.iterdir() if p.name.startswith(".")] == []
     assert was_done(fuse()), "what was interrupted"
-    assert fused_files(tools, folder) == first
+    assert tools.files(folder.path) == {n: d for n, d in first.items() if not n.startswith("words")}
 
 
-def fused_files(tools: SimpleNamespace, folder: SessionFolder) -> dict[str, str]:
-    """Digests of what fusing writes."""
-    return {
-        name: digest
-        for name, digest in tools.files(folder.path).items()
-        if not name.startswith("words")
-    }
+def test_a_killed_replacement_is_put_back(
+    fuse: Fuse, coarse: Workspace, tools: SimpleNamespace
+) -> None:
+    """Killed between the two renames: the session is away under another name."""
+    before = tools.files(coarse.path)
+    folder = coarse.session("monday").path
+    folder.rename(folder.with_name(".monday.0badcafe.old.tmp"))
+    half = folder.with_name(".monday.0badcafe.tmp")
+    half.mkdir()
+    (half / "session.json").write_text("{}")
+    assert [s.name for s in coarse.sessions()] == ["tuesday"]
+    assert not was_done(fuse())
+    assert tools.files(coarse.path) == before
 
 
 # -- what fusing makes of the known drives

@@ -5,10 +5,12 @@ Split or not, compressed or not, with or without metadata.yaml.
 
 from __future__ import annotations
 
+import re
 import shutil
 import tempfile
 from collections.abc import Collection, Iterator
 from functools import partial
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -30,6 +32,7 @@ from semloc_logs.logs.log import Log, Message, Section
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".db3", ".mcap")
 _MAX_METADATA = 64 << 20
+SPLIT_GAP_NS = 5 * 10**9  # between the files of one recording: a recorder splits without a pause
 
 
 class Rosbag2Log(BaseLog):
@@ -69,6 +72,8 @@ class Rosbag2Log(BaseLog):
     def _open(self) -> None:
         metadata = self._metadata()
         self._open_files(self._listed(metadata) if metadata else self._found())
+        if not (self.path / "metadata.yaml").exists():
+            self._check_splits()
         self.streams = merged_streams(self._files)
         self.encoding = encoding_of(self.streams) or self._files[0].encoding
         starts = [f.start_ns for f in self._files if f.start_ns is not None]
@@ -98,6 +103,24 @@ class Rosbag2Log(BaseLog):
             )
         for failure in failures:
             self._problems.add(failure)
+
+    def _check_splits(self) -> None:
+        """LogError where files without a metadata.yaml are not the splits of one recording.
+
+        These follow each other in time and have names that differ in their numbers only.
+        """
+        timed = [f for f in self._files if f.start_ns is not None and f.end_ns is not None]
+        timed.sort(key=lambda f: f.start_ns or 0)
+        for before, after in pairwise(timed):
+            pause_ns = (after.start_ns or 0) - (before.end_ns or 0)
+            names = {re.sub(r"\d+", "", Path(f.path).name) for f in (before, after)}
+            if abs(pause_ns) > SPLIT_GAP_NS or len(names) > 1:
+                raise LogError(
+                    f"{self.path} is not a ROS 2 bag: it has no metadata.yaml, and"
+                    f" {Path(before.path).name} and {Path(after.path).name} are not splits of one"
+                    f" recording; give its logs one by one, such as"
+                    f" {self.path}/*{Path(after.path).suffix}."
+                )
 
     def _metadata(self) -> dict[str, Any]:
         """The information of metadata.yaml; empty when it is missing or unusable."""

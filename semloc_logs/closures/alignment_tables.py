@@ -1,0 +1,113 @@
+"""The tables of alignments: WORK/alignments/query=A/target=B, and the parts they are made of.
+
+A part holds what one task has found: some queries of a session in several targets. When all queries
+are done, the parts become one table for each target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from semloc_logs.closures.closure import FEATURES, Alignment, Features
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.tables import contracts
+from semloc_logs.tables.table import read_metadata, read_table, write_table
+from semloc_logs.voxels.store import pose_columns, poses_of
+
+TARGET = "target_session"  # a column of parts
+
+
+def alignment_table(alignments: Sequence[Alignment]) -> pa.Table:
+    """The rows of alignments, in their order."""
+    columns: dict[str, Any] = {
+        name: [getattr(a, name) for a in alignments]
+        for name in (
+            "query_keyframe",
+            "target_keyframe",
+            "query_stamp_ns",
+            "target_stamp_ns",
+            "overlap",
+            "inliers",
+            "words",
+        )
+    }
+    poses = np.array([a.target_T_query for a in alignments]).reshape(-1, 4, 4)
+    columns |= pose_columns(poses)
+    columns["covariance"] = [a.covariance.ravel().tolist() for a in alignments]
+    columns["alone"] = [a.probability for a in alignments]
+    columns |= {name: [getattr(a.features, name) for a in alignments] for name in FEATURES}
+    return contracts.table("alignments", columns)
+
+
+def read_alignments(path: Path, query: str, target: str) -> list[Alignment]:
+    """The alignments of session ``query`` in ``target``."""
+    table = read_table(path)
+    poses = poses_of(table)
+    return [
+        Alignment(
+            query_session=query,
+            target_session=target,
+            query_keyframe=row["query_keyframe"],
+            target_keyframe=row["target_keyframe"],
+            query_stamp_ns=row["query_stamp_ns"],
+            target_stamp_ns=row["target_stamp_ns"],
+            target_T_query=pose,
+            covariance=np.array(row["covariance"]).reshape(6, 6),
+            overlap=row["overlap"],
+            probability=row["alone"],
+            inliers=row["inliers"],
+            words=row["words"],
+            features=Features(*(row[name] for name in FEATURES)),
+        )
+        for row, pose in zip(table.to_pylist(), poses, strict=True)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What one task has found; ``targets`` are fingerprints by session."""
+
+    path: Path
+    keyframes: tuple[int, ...]
+    targets: dict[str, str]
+
+
+def write_part(
+    path: Path,
+    keyframes: Sequence[int],
+    targets: dict[str, str],
+    found: Sequence[Alignment],
+) -> None:
+    """The alignments of the queries at ``keyframes`` in all ``targets``."""
+    table = alignment_table(found)
+    names = pa.array([a.target_session for a in found], pa.string())
+    metadata = {"keyframes": list(keyframes), "targets": targets}
+    write_table(path, table.append_column(TARGET, names), metadata)
+
+
+def read_parts(folder: Path) -> list[Part]:
+    """The parts in a folder; damaged ones are left out."""
+    parts = []
+    for path in sorted(folder.glob("*.parquet")):
+        try:
+            metadata = read_metadata(path)
+            parts.append(Part(path, tuple(metadata["keyframes"]), dict(metadata["targets"])))
+        except (WorkspaceError, KeyError, TypeError):
+            continue
+    return parts
+
+
+def joined_parts(parts: Iterable[Part], target: str) -> pa.Table:
+    """The alignments with one target, in the order of the parts."""
+    tables = [contracts.schema("alignments").empty_table()]
+    for part in parts:
+        table = read_table(part.path)
+        tables.append(table.filter(pc.equal(table[TARGET], target)).drop_columns([TARGET]))
+    return pa.concat_tables([t.replace_schema_metadata(None) for t in tables])

@@ -1,0 +1,108 @@
+"""Pairs of sessions: which one is searched in which, and what is there of it.
+
+The later recorded session is the query, the earlier one the target, and each session is searched in
+itself. So pairs do not depend on when sessions were added, and a new one leaves the others alone.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from semloc_logs.closures.alignment_tables import Part, joined_parts, read_parts
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
+from semloc_logs.tables.atomic_files import remove_file
+from semloc_logs.tables.table import read_metadata, write_table
+from semloc_logs.workspace import Workspace
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Pair:
+    """A session whose queries are searched, and the one they are searched in."""
+
+    query: str
+    target: str
+
+
+def pairs_of_sessions(maps: Mapping[str, SessionMap]) -> list[Pair]:
+    """All pairs of sessions, each once, by the names of query and target.
+
+    A log without poses has no map to be searched in: it is the query of those that have one.
+    """
+    order = sorted(maps, key=lambda n: (not maps[n].posed, int(maps[n].stamps_ns[0]), n))
+    pairs = [
+        Pair(query, target) for number, query in enumerate(order) for target in order[: number + 1]
+    ]
+    return sorted(pairs)
+
+
+def known_pairs(work: Workspace) -> dict[Pair, str]:
+    """The pairs whose alignments are there, with the fingerprints of what they were made from."""
+    found: dict[Pair, str] = {}
+    for path in (work.path / "alignments").glob("query=*/target=*/alignments.parquet"):
+        query, target = (
+            folder.name.partition("=")[2] for folder in (path.parent.parent, path.parent)
+        )
+        try:
+            found[Pair(query, target)] = str(read_metadata(path).get("fingerprint"))
+        except WorkspaceError:  # damaged
+            found[Pair(query, target)] = ""
+    return found
+
+
+def forget(work: Workspace, pairs: Iterable[Pair]) -> None:
+    """Remove the alignments of pairs."""
+    for pair in pairs:
+        path = work.alignments(pair.query, pair.target)
+        remove_file(path)
+        for folder in (path.parent, path.parent.parent):
+            if not any(folder.iterdir()):
+                folder.rmdir()
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """Queries of a session, in chunks, and the targets that each has still to be searched in."""
+
+    session: str
+    fingerprints: Mapping[str, str]  # of the pairs, by target
+    chunks: Sequence[tuple[int, ...]]
+    parts: Sequence[Part]
+
+    def targets(self, chunk: tuple[int, ...]) -> dict[str, str]:
+        """The targets without a part of this chunk, with their fingerprints."""
+        return {t: f for t, f in self.fingerprints.items() if self._part(chunk, t) is None}
+
+    def _part(self, chunk: tuple[int, ...], target: str) -> Part | None:
+        for part in self.parts:
+            is_same = part.targets.get(target) == self.fingerprints[target]
+            if is_same and part.keyframes == chunk:
+                return part
+        return None
+
+    def of(self, target: str) -> list[Part]:
+        """The parts of a target, in the order of the chunks."""
+        parts = [self._part(chunk, target) for chunk in self.chunks]
+        return [part for part in parts if part is not None]
+
+
+def missing(
+    work: Workspace,
+    session: str,
+    fingerprints: Mapping[str, str],
+    chunks: Sequence[tuple[int, ...]],
+) -> Missing:
+    """What is left to search of a session, by the parts that are there."""
+    return Missing(session, fingerprints, chunks, read_parts(work.search_parts(session)))
+
+
+def finish(work: Workspace, done: Missing, metadata: Mapping[str, Mapping[str, object]]) -> None:
+    """Parts of all chunks -> a table for each target, with its metadata; the parts are removed."""
+    queries = sum(len(chunk) for chunk in done.chunks)
+    for target, fingerprint in done.fingerprints.items():
+        content = {**metadata[target], "fingerprint": fingerprint, "queries": queries}
+        table = joined_parts(done.of(target), target)
+        write_table(work.alignments(done.session, target), table, content, ("query_keyframe",))
+    shutil.rmtree(work.search_parts(done.session), ignore_errors=True)

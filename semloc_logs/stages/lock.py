@@ -1,0 +1,171 @@
+"""Writers of a workspace: one at a time, or several that make different sessions.
+
+A lock is the kernel's: it ends with its process, however that ends. Beside it a file tells who has
+it. Where files cannot be locked, that file is the lock; one of a process that is gone is taken.
+Readers need no lock.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import socket
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from filelock import FileLock, Timeout
+
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.tables.atomic_files import is_alive, make_folder, recover_folder
+from semloc_logs.workspace import Workspace
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+PROBE_BYTES = 1 << 20  # written before the work begins: a disk that is full is found then
+GATE_SECONDS = 5.0  # that other makers of sessions may take to get their locks
+WORKSPACE = "workspace"
+
+_held: set[Path] = set()  # workspaces that this process has for itself
+
+
+def one_writer(stage: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """A stage that has its workspace for itself."""
+
+    @functools.wraps(stage)
+    def locked(*args: Arguments.args, **options: Arguments.kwargs) -> Result:
+        work = next(a for a in (*args, *options.values()) if isinstance(a, Workspace))
+        with writing(work):
+            return stage(*args, **options)
+
+    return locked
+
+
+@contextmanager
+def writing(work: Workspace, sessions: Sequence[str] | None = None) -> Iterator[None]:
+    """The block is the only writer of the workspace, or of its ``sessions``; it may be nested.
+
+    Raises WorkspaceError at once where another process writes there, or nothing can be written.
+    """
+    path = work.path.absolute()
+    if path in _held:
+        yield
+        return
+
+    _check_writable(work)
+    with ExitStack() as locks:
+        # who has the gate lets nobody else begin
+        gate = locks.enter_context(ExitStack())
+        gate.enter_context(_locked(work, WORKSPACE, 0.0 if sessions is None else GATE_SECONDS))
+        if sessions is None:
+            for name in _locked_sessions(work):
+                with _locked(work, name, 0.0):  # nobody makes it
+                    pass
+            _recover(work, _replaced_sessions(work))
+            _held.add(path)
+            locks.callback(_held.discard, path)
+        else:
+            for name in dict.fromkeys(sessions):
+                locks.enter_context(_locked(work, work.session_lock(name).stem, 0.0))
+            gate.close()
+            _recover(work, sessions)
+        yield
+
+
+def _locked_sessions(work: Workspace) -> list[str]:
+    return sorted(path.stem for path in work.locks.glob("session.*.lock"))
+
+
+def _replaced_sessions(work: Workspace) -> set[str]:
+    """Sessions that a killed writer was replacing."""
+    left = (work.path / "sessions").glob(".*.tmp")
+    names = (path.name[1:].removesuffix(".tmp").removesuffix(".old") for path in left)
+    return {name.rpartition(".")[0] for name in names}
+
+
+def _recover(work: Workspace, sessions: Iterable[str]) -> None:
+    for name in sorted(sessions):
+        recover_folder(work.session(name).path)
+
+
+def _check_writable(work: Workspace) -> None:
+    """WorkspaceError where the workspace is read-only or its disk is full."""
+    probe = work.path / f".probe.{socket.gethostname()}.{os.getpid()}"
+    try:
+        make_folder(work.locks)
+        try:
+            with probe.open("wb") as file:
+                file.write(bytes(PROBE_BYTES))
+                file.flush()
+                os.fsync(file.fileno())
+        finally:
+            probe.unlink(missing_ok=True)
+    except OSError as problem:
+        raise WorkspaceError(
+            f"{work.path} cannot be written to ({problem.strerror or problem}): free some space, or"
+            " choose a folder that this user may write to."
+        ) from None
+
+
+@contextmanager
+def _locked(work: Workspace, name: str, seconds: float) -> Iterator[None]:
+    lock = FileLock(work.locks / f"{name}.lock", timeout=seconds)
+    writer = work.locks / f"{name}.json"
+    try:
+        lock.acquire()
+    except Timeout:
+        raise _in_use(work, name, _content(writer)) from None
+    except (OSError, NotImplementedError):  # a file system without locks
+        with _locked_by_file(work, name):
+            yield
+        return
+    try:
+        writer.write_text(_this_process())
+        yield
+    finally:
+        writer.unlink(missing_ok=True)
+        lock.release()
+
+
+@contextmanager
+def _locked_by_file(work: Workspace, name: str) -> Iterator[None]:
+    writer = work.locks / f"{name}.json"
+    content = _content(writer)
+    if content.get("host") == socket.gethostname() and not is_alive(int(content["process"])):
+        writer.unlink(missing_ok=True)
+    try:
+        with writer.open("x") as file:
+            file.write(_this_process())
+    except FileExistsError:
+        raise _in_use(work, name, _content(writer)) from None
+    try:
+        yield
+    finally:
+        writer.unlink(missing_ok=True)
+
+
+def _this_process() -> str:
+    now = time.strftime("%Y-%m-%d %H:%M:%S")
+    return json.dumps({"host": socket.gethostname(), "process": os.getpid(), "since": now})
+
+
+def _content(writer: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(writer.read_text())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _in_use(work: Workspace, name: str, writer: dict[str, Any]) -> WorkspaceError:
+    session = name.partition("session.")[2]
+    what = f"Session '{session}' of {work.path}" if session else str(work.path)
+    who = "another process"
+    if writer:
+        who = f"process {writer['process']} on {writer['host']} since {writer['since']}"
+    return WorkspaceError(
+        f"{what} is being written by {who}: wait until it is done; finished work is kept."
+    )

@@ -1,0 +1,221 @@
+"""Words -> alignments of each pair of sessions: what is not there yet is searched."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import semloc_logs
+from semloc_logs import progress
+from semloc_logs.closures.matching import SearchTask, search_queries
+from semloc_logs.closures.pairs import (
+    Missing,
+    Pair,
+    finish,
+    forget,
+    known_pairs,
+    missing,
+    pairs_of_sessions,
+)
+from semloc_logs.closures.query import query_keyframes
+from semloc_logs.engines import Engine
+from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.session_map import SessionMap
+from semloc_logs.settings import Resolved
+from semloc_logs.stages.describe import check_settings, is_described, words_fingerprint
+from semloc_logs.stages.inputs import fingerprint_of
+from semloc_logs.stages.state import OF_DECISION
+from semloc_logs.subvolumes.submap_descriptors import variants_for
+from semloc_logs.workspace import Workspace
+
+QUERIES_A_TASK = 8
+Maps = Mapping[str, SessionMap]
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Sessions to search and sessions to search them in; all where empty.
+
+    It restricts what is searched now, never what is known.
+    """
+
+    queries: tuple[str, ...] = ()
+    targets: tuple[str, ...] = ()
+    self_closures: bool = True
+
+    def has(self, pair: Pair) -> bool:
+        """Whether a pair is to be searched; which of the two was recorded later does not matter."""
+        if pair.query == pair.target and not self.self_closures:
+            return False
+        return any(
+            (not self.queries or query in self.queries)
+            and (not self.targets or target in self.targets)
+            for query, target in ((pair.query, pair.target), (pair.target, pair.query))
+        )
+
+
+EVERYTHING = Selection()
+
+
+@dataclass(frozen=True, slots=True)
+class PairSearch:
+    """The pairs of a workspace to search: all that are ``chosen`` and not up to date.
+
+    ``fingerprints`` are of what the alignments of every pair depend on, ``known`` those of the
+    alignments that are there.
+    """
+
+    work: Workspace
+    maps: Maps
+    settings: Resolved
+    fingerprints: Mapping[Pair, str]
+    known: Mapping[Pair, str]
+    chosen: Sequence[Pair]
+
+    @classmethod
+    def of(
+        cls,
+        work: Workspace,
+        settings: Resolved,
+        selection: Selection = EVERYTHING,
+        *,
+        overwrite: bool = False,
+    ) -> PairSearch:
+        """WorkspaceError where a session or its words are missing."""
+        work.chosen((*selection.queries, *selection.targets))
+        maps = {folder.name: SessionMap(folder) for folder in work.chosen(())}
+        for session in maps.values():
+            check_settings(session.folder, settings)
+        misfits = misfits_of(maps, settings)
+        fingerprints = pair_fingerprints(maps, settings)
+        known = known_pairs(work)
+        chosen = [
+            pair
+            for pair, fingerprint in fingerprints.items()
+            if selection.has(pair)
+            and not misfits.keys() & {pair.query, pair.target}
+            and (overwrite or known.get(pair) != fingerprint)
+        ]
+        _check_words(work, chosen, maps, settings)
+        return cls(work, maps, settings, fingerprints, known, chosen)
+
+    def run(self, engine: Engine) -> None:
+        """Search the pairs; each session that is done gets its tables of alignments.
+
+        A session whose search was interrupted goes on where it was. Alignments that belong to no
+        present pair are removed.
+        """
+        for pair in self.chosen:
+            if self.known.get(pair) == self.fingerprints[pair]:  # to be overwritten
+                shutil.rmtree(self.work.search_parts(pair.query), ignore_errors=True)
+        sessions = self._missing()
+        tasks = [task for one in sessions for task in self._tasks(one)]
+        results = zip(tasks, engine.map(search_queries, tasks), strict=True)
+        for one in sessions:
+            total = sum(len(chunk) for chunk in one.chunks)
+            count = sum(task.session == one.session for task in tasks)
+            for number in range(1, count + 1):
+                next(results)
+                done = total * number // count
+                progress.report("close", one.session, done, total, "queries")
+            finish(self.work, self._left(one), self._metadata(one))
+        stale = [p for p, made_from in self.known.items() if made_from != self.fingerprints.get(p)]
+        forget(self.work, [p for p in stale if p not in self.chosen])
+
+    def _missing(self) -> list[Missing]:
+        """What is left to search of each session."""
+        of_targets: dict[str, dict[str, str]] = {}
+        for pair in self.chosen:
+            of_targets.setdefault(pair.query, {})[pair.target] = self.fingerprints[pair]
+        out = []
+        for session, fingerprints in of_targets.items():
+            keyframes = query_keyframes(self.maps[session], self.settings)
+            chunks = [
+                tuple(keyframes[first : first + QUERIES_A_TASK])
+                for first in range(0, len(keyframes), QUERIES_A_TASK)
+            ]
+            out.append(missing(self.work, session, fingerprints, chunks))
+        return out
+
+    def _left(self, one: Missing) -> Missing:
+        """The same after some tasks are done."""
+        return missing(self.work, one.session, one.fingerprints, one.chunks)
+
+    def _tasks(self, one: Missing) -> list[SearchTask]:
+        path = self.work.path.absolute()
+        tasks = []
+        for chunk in one.chunks:
+            targets = one.targets(chunk)
+            if targets:
+                name = f"{chunk[0]:06d}-{fingerprint_of(targets.values())}.parquet"
+                output = Workspace(path).search_parts(one.session) / name
+                task = SearchTask(path, one.session, chunk, targets, self.settings, output)
+                tasks.append(task)
+        return tasks
+
+    def _metadata(self, one: Missing) -> dict[str, dict[str, Any]]:
+        """Of the table of each target."""
+        return {
+            target: metadata_of(self.settings, (self.maps[one.session], self.maps[target]))
+            for target in one.fingerprints
+        }
+
+
+def misfits_of(maps: Maps, settings: Resolved) -> dict[str, str]:
+    """Sessions that get no closures, since these would be false, and the sentences that say so."""
+    if settings.closures.misfits:
+        return {}
+    return {
+        name: f"Session {name} gets no closures: its poses do not fit ({'; '.join(misfits)});"
+        " --set closures.misfits=true searches it all the same."
+        for name, session_map in sorted(maps.items())
+        if (misfits := session_map.misfits)
+    }
+
+
+def metadata_of(settings: Resolved, maps: Iterable[SessionMap]) -> dict[str, Any]:
+    """The metadata that tables about some sessions share."""
+    return {
+        "schema_version": 1,
+        "voxel_size": settings.fusion.voxel_size,
+        "session_T_map": np.eye(4).tolist(),
+        "label_space": "cityscapes",
+        "label_source": ",".join(sorted({m.label_source for m in maps})),
+        "version": semloc_logs.__version__,
+    }
+
+
+def pair_fingerprints(maps: Maps, settings: Resolved) -> dict[Pair, str]:
+    """All pairs, with what their alignments depend on."""
+    words = {name: words_fingerprint(m.folder, settings) for name, m in maps.items()}
+    used = settings.tables("query", "closures")
+    for key in OF_DECISION:
+        section, name = key.split(".")
+        del used[section][name]
+    return {
+        pair: fingerprint_of((words[pair.query], words[pair.target], repr(used)))
+        for pair in pairs_of_sessions(maps)
+    }
+
+
+def _check_words(work: Workspace, pairs: Iterable[Pair], maps: Maps, settings: Resolved) -> None:
+    """WorkspaceError where a session lacks words that a pair is searched with."""
+    needed: dict[str, set[str]] = {}
+    for pair in pairs:
+        both = {pair.query, pair.target}
+        sources = [maps[name].label_source for name in both]
+        # classes are compared where both ends know them
+        common = set.intersection(*(set(variants_for(s, sources, settings)) for s in sources))
+        for name in both:
+            needed.setdefault(name, set()).update(common)
+    for name, variants in sorted(needed.items()):
+        maps[name].check_version()
+        if not is_described(maps[name].folder, variants, settings):
+            raise WorkspaceError(
+                f"Session {name} lacks {' and '.join(sorted(variants))} words of its present map"
+                f" and settings: run 'semloc describe -w {work.path}' first."
+            )

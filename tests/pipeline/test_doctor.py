@@ -1,0 +1,107 @@
+"""`doctor`: each kind of damage is named with its file and with what mends it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from semloc_logs.stages.doctor import examine
+from semloc_logs.tables.table import read_json, write_json
+from semloc_logs.workspace import Workspace
+
+MONDAY = "sessions/monday/"
+
+
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def without_a_column(path: Path) -> None:
+    table = pq.read_table(path, partitioning=None)
+    pq.write_table(table.drop_columns([table.column_names[0]]), path)
+
+
+def without_a_row(path: Path) -> None:
+    table = pq.read_table(path, partitioning=None)
+    pq.write_table(table.slice(1), path)
+
+
+def of_another_map(path: Path) -> None:
+    write_json(path, read_json(path) | {"fingerprint": "0" * 16})
+
+
+def test_a_whole_workspace_has_no_faults(coarse: Workspace) -> None:
+    result = examine(coarse)
+    assert result.findings == ()
+    tables = len(list(coarse.path.rglob("*.parquet")))
+    assert result.files == tables
+    assert result.rows > 1000
+
+
+@pytest.mark.parametrize(
+    ("file", "damage", "fault", "remedy"),
+    [
+        (
+            MONDAY + "frames.parquet",
+            cut_off,
+            "cannot be read",
+            "fuse .*monday.* --over",
+        ),
+        (MONDAY + "frames.parquet", Path.unlink, "is missing", "fuse .*monday.*"),
+        (
+            MONDAY + "trajectory.parquet",
+            without_a_column,
+            "column stamp_ns",
+            "fuse .*monday",
+        ),
+        (MONDAY + "frames.parquet", without_a_row, "rows are there of", "fuse .*monday.*"),
+        (MONDAY + "session.json", cut_off, "cannot be read", "fuse LOG"),
+        (MONDAY + "words.json", of_another_map, "of another map", "describe monday"),
+        (
+            MONDAY + "words/submap-00000.parquet",
+            cut_off,
+            "cannot be read",
+            "describe monday",
+        ),
+        (
+            "alignments/query=tuesday/target=monday/alignments.parquet",
+            Path.unlink,
+            "tuesday was not searched in monday",
+            "semloc close",
+        ),
+        (
+            "alignments/query=tuesday/target=monday/alignments.parquet",
+            cut_off,
+            "damaged",
+            "semloc close",
+        ),
+        ("closures.parquet", cut_off, "cannot be read", "semloc close .* --overwrite"),
+        ("rejected.parquet", Path.unlink, "is missing", "semloc close .* --overwrite"),
+    ],
+)
+def test_damage_is_named_with_what_mends_it(
+    coarse: Workspace, file: str, damage: Callable[[Path], None], fault: str, remedy: str
+) -> None:
+    damage(coarse.path / file)
+    before = {p: p.read_bytes() for p in coarse.path.rglob("*") if p.is_file()}
+    first = examine(coarse).findings[0]
+    assert str(first.path).startswith(str(coarse.path / Path(file).parts[0]))
+    assert re.search(fault, first.fault)
+    assert re.search(remedy, first.remedy)
+    assert {p: p.read_bytes() for p in coarse.path.rglob("*") if p.is_file()} == before
+
+
+def test_other_settings_and_sessions_that_are_gone_are_named(coarse: Workspace) -> None:
+    shutil.rmtree(coarse.session("tuesday").path)
+    faults = {f.fault for f in examine(coarse).findings}
+    assert "the alignments are of sessions that are gone" in faults
+    content = read_json(coarse.settings)
+    content["given"]["fusion"]["hit"] = 0.9
+    write_json(coarse.settings, content)
+    faults = {f.fault for f in examine(coarse).findings}
+    assert any("monday was fused with fusion.hit=0.85" in fault for fault in faults)

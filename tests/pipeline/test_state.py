@@ -1,0 +1,132 @@
+"""The settings that a workspace keeps: every stage takes them, and a contradiction is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from semloc_logs.engines import Serial
+from semloc_logs.errors import SettingsError, WorkspaceError
+from semloc_logs.settings import Settings, load
+from semloc_logs.stages import describe as describe_stage
+from semloc_logs.stages import fuse as fuse_stage
+from semloc_logs.stages.state import keep, read_kept, settle
+from semloc_logs.tables.table import read_json, write_json
+from semloc_logs.workspace import Workspace
+
+ROOM = {"fusion.voxel_size": "0.05"}
+
+
+def kept(folder: Path, **given: str) -> Workspace:
+    """A workspace with a session and these settings."""
+    work = Workspace(folder / "work")
+    write_json(work.session("a").session_json, {})
+    keep(work, load(assignments=given).resolved())
+    return work
+
+
+def given(**settings: str) -> Settings:
+    return load(assignments={key.replace("__", "."): value for key, value in settings.items()})
+
+
+def test_later_commands_take_them(tmp_path: Path) -> None:
+    work = kept(tmp_path, **ROOM, **{"labels.source": "geometry"})
+    settled = settle(work, given(training__seed="3")).resolved()
+    assert (settled.fusion.voxel_size, settled.labels.source) == (0.05, "geometry")
+    assert settled.training.seed == 3
+    assert settled.fusion.max_range == pytest.approx(50 * 0.05 / 0.30)
+
+
+@pytest.mark.parametrize(
+    ("key", "before", "after"),
+    [
+        ("fusion.voxel_size", "0.05", "0.3"),
+        ("fusion.max_range", "8.333333333333334", "9.0"),
+        ("labels.source", "geometry", "uniform"),
+        ("descriptor.stride", "8", "4"),
+        ("query.frames", "5", "1"),
+        ("closures.kappa", "10.0", "5.0"),
+    ],
+)
+def test_a_contradiction_is_refused_with_both_values(
+    tmp_path: Path, key: str, before: str, after: str
+) -> None:
+    work = kept(tmp_path, **ROOM, **{"labels.source": "geometry"})
+    contradicting = load(assignments={key: after})
+    for writes in (False, True):
+        with pytest.raises(SettingsError, match=f"{key}={before}, and {key}={after} is given"):
+            settle(work, contradicting, writes=writes)
+    settled = settle(work, contradicting, writes=True, overwrite=True)
+    section, name = key.split(".")
+    assert str(getattr(getattr(settled, section), name)) == after
+    assert settle(work, load(assignments={key: before})) is not None, "the same value is none"
+
+
+@pytest.mark.parametrize("key", ["logs.memory", "labels.threads", "training.seed"])
+def test_what_changes_no_table_is_free(tmp_path: Path, key: str) -> None:
+    work = kept(tmp_path)
+    value = {"logs.memory": "1000000000", "labels.threads": "2", "training.seed": "7"}[key]
+    for writes in (False, True):
+        settle(work, load(assignments={key: value}), writes=writes)
+    content = work.settings.read_bytes()
+    keep(work, load(assignments={key: value}).resolved())
+    assert work.settings.read_bytes() == content
+
+
+def test_a_stage_may_choose_the_probability_and_a_reader_may_not(tmp_path: Path) -> None:
+    work = kept(tmp_path)
+    lenient = given(closures__min_probability="0.5")
+    settled = settle(work, lenient, writes=True)
+    keep(work, settled.resolved())
+    assert settle(work, Settings()).closures.min_probability == 0.5
+    with pytest.raises(SettingsError, match="min_probability"):
+        settle(work, given(closures__min_probability="0.9"))
+
+
+def test_nothing_contradicts_before_there_is_a_session(tmp_path: Path) -> None:
+    work = Workspace(tmp_path / "work")
+    keep(work, load(assignments=ROOM).resolved())
+    settled = settle(work, given(fusion__voxel_size="0.3"), writes=True).resolved()
+    assert (settled.fusion.voxel_size, settled.fusion.max_range) == (0.3, 50.0)
+
+
+def test_paths_hold_wherever_the_next_command_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    work = kept(tmp_path, **{"descriptor.weights": "w.safetensors"})
+    monkeypatch.chdir("/")
+    assert settle(work, Settings()).descriptor.weights == tmp_path / "w.safetensors"
+
+
+def test_a_file_of_another_version_is_named(tmp_path: Path) -> None:
+    work = kept(tmp_path)
+    write_json(work.settings, {"given": {"fusion": {"gone": 1}}})
+    with pytest.raises(WorkspaceError, match=r"workspace\.json is of another version"):
+        read_kept(work)
+
+
+def test_every_stage_writes_them_down(
+    coarse: Workspace, drives: Any, tools: SimpleNamespace
+) -> None:
+    settings = tools.coarse_settings()
+    content = read_json(coarse.settings)
+    assert content["settings"] == settings.tables(*content["settings"])
+    assert settle(coarse, Settings()).resolved() == settings
+    coarse.settings.unlink()
+    describe_stage.describe(coarse, [], settings, Serial())
+    assert read_json(coarse.settings) == content
+    coarse.settings.unlink()
+    fuse_stage.fuse(tools.inputs(drives, "monday"), coarse, settings, Serial())
+    assert read_json(coarse.settings) == content
+
+
+def test_sessions_of_other_settings_are_not_described(
+    coarse: Workspace, tools: SimpleNamespace
+) -> None:
+    other = tools.coarse_settings(fusion__hit="0.9")
+    with pytest.raises(WorkspaceError, match=r"monday was fused with fusion\.hit=0\.85, .*0\.9"):
+        describe_stage.describe(coarse, [], other, Serial())
