@@ -1,6 +1,6 @@
 """MCAP files: by their index where it can be trusted, else by walking over all records.
 
-Memory holds overlapping chunks only.
+Memory holds overlapping chunks only, within its limit.
 """
 
 from __future__ import annotations
@@ -19,29 +19,35 @@ from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import (
     BaseLog,
+    MessageOrTime,
     closed_on_error,
     encoding_of,
     in_log_time_order,
     open_file,
     read_exactly,
 )
+from semloc_logs.logs.containers.chunks import Chunk, Entry, Index, chunk_messages, new_index
 from semloc_logs.logs.containers.mcap_records import (
+    CHUNK_HEAD,
     HEAD,
     MAGIC,
     MESSAGE,
     MESSAGE_BODY,
     chunk_head,
     chunk_records,
+    claimed_size,
     parse,
     spans,
     walk,
 )
+from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
 from semloc_logs.logs.problems import Problems
 
 _FOOTER = struct.Struct("<BQQQI")
 _LOOSE = 1 << 22  # messages outside chunks are read in runs of about this many bytes
+_CHANNEL_BYTES = 16  # in memory for a byte of a channel's record: its metadata are many short texts
 
 
 class Part(NamedTuple):
@@ -58,13 +64,20 @@ class Part(NamedTuple):
 class McapLog(BaseLog):
     """An MCAP file of any profile. LogError unless it starts as one."""
 
-    def __init__(self, path: Path, name: str = "", problems: Problems | None = None) -> None:
-        super().__init__(path, "mcap", problems)
+    def __init__(
+        self,
+        path: Path,
+        name: str = "",
+        problems: Problems | None = None,
+        memory: Memory | None = None,
+    ) -> None:
+        super().__init__(path, "mcap", problems, memory)
         self._name = name or path.name
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._kinds: dict[int, tuple[str, str, str, Definition]] = {}
         self._parts: list[Part] = []
+        self._definition_bytes = 0
         self._file = open_file(path)
         with closed_on_error(self._file, path):
             self._size = self._file.seek(0, 2)
@@ -129,6 +142,13 @@ class McapLog(BaseLog):
             or not len(MAGIC) <= summary_start <= footer_at
         ):
             return None  # not closed, truncated, or closed without a summary (0)
+        if footer_at - summary_start > self._memory.most_of_definitions:
+            self._problems.add(
+                f"{self._name}: the index at byte {summary_start} has {footer_at - summary_start} "
+                "bytes, too many for logs.memory, so the whole file was walked.",
+                lost=False,
+            )
+            return None
         summary = read_exactly(self._file, summary_start, footer_at - summary_start, self._size)
         if crc and zlib.crc32(tail[: _FOOTER.size - 4], zlib.crc32(summary)) != crc:
             self._problems.add(
@@ -160,6 +180,7 @@ class McapLog(BaseLog):
         )
         if not known or sum(counts.values()) != statistics.message_count:
             return None  # allowed, but then only a walk finds the contents of the file
+        known_sets: dict[frozenset[int], frozenset[int]] = {}  # most chunks have the same channels
         for i in indexes:
             if i.chunk_start_offset + i.chunk_length > self._size:
                 raise LogError(
@@ -173,7 +194,7 @@ class McapLog(BaseLog):
                     i.chunk_length,
                     i.message_start_time,
                     i.message_end_time,
-                    channels,
+                    known_sets.setdefault(channels, channels),
                     True,
                 )
             )
@@ -214,7 +235,7 @@ class McapLog(BaseLog):
                     self._scan_loose(offset, size, loose, counts)
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                     body_size = size - HEAD.size
-                    body = read_exactly(self._file, offset + HEAD.size, body_size, self._size)
+                    body = self._read(offset + HEAD.size, body_size)
                     self._define(opcode, body)
             except LogError as error:
                 self._problems.add(
@@ -241,12 +262,15 @@ class McapLog(BaseLog):
         return counts
 
     def _scan_chunk(self, offset: int, size: int, counts: Counter[int]) -> None:
-        found = self._walk(self._unpack_chunk(offset, size), offset)
-        if found:
-            times = [f[0] for f in found]
-            channels = frozenset(f[1] for f in found)
-            counts.update(f[1] for f in found if f[1] in self._channels)
-            self._parts.append(Part(offset, size, min(times), max(times), channels, True))
+        data = self._unpack_chunk(offset, size)
+        found = new_index(len(data), self._memory)
+        self._walk(offset, data, found)
+        if len(found):
+            start_ns = min(entry[0] for entry in found)
+            end_ns = max(entry[0] for entry in found)
+            by_channel = Counter(entry[1] for entry in found)
+            counts.update({c: n for c, n in by_channel.items() if c in self._channels})
+            self._parts.append(Part(offset, size, start_ns, end_ns, frozenset(by_channel), True))
 
     def _scan_loose(self, offset: int, size: int, loose: list[Part], counts: Counter[int]) -> None:
         _, _, channel, _, log_time, _ = MESSAGE.unpack(
@@ -265,68 +289,97 @@ class McapLog(BaseLog):
 
     # -- reading
 
-    def _load(self, part: Part, wanted: frozenset[str] | None) -> Iterator[Message]:
-        """The messages of one part in log-time order; its bytes live as long as this iterator."""
+    def _load(self, part: Part, wanted: frozenset[str] | None) -> Iterator[MessageOrTime]:
+        """The messages of one part in log-time order."""
+        whole = self._unpack_chunk if part.chunk else self._read
+        chunk = Chunk(
+            start_ns=part.start_ns,
+            claimed_size=partial(self._claimed_size, part),
+            unpack=partial(whole, part.offset, part.size),
+            walk=partial(self._walk, part.offset),
+            is_wanted=partial(self._is_wanted, wanted),
+            message=self._message,
+        )
         try:
-            if part.chunk:
-                data = self._unpack_chunk(part.offset, part.size)
-            else:
-                data = read_exactly(self._file, part.offset, part.size, self._size)
+            yield from chunk_messages(chunk, self._memory)
         except (LogError, OSError) as error:
+            what = "chunk" if part.chunk else "record"
             self._problems.add(
-                f"{self._name}: the chunk at byte {part.offset} was skipped: {error}."
+                f"{self._name}: the {what} at byte {part.offset} was skipped: {error}."
             )
-            return
-        view = memoryview(data)
-        found = self._walk(data, part.offset)
-        found.sort(key=lambda f: f[0])  # stable, and nearly free for sorted input
-        for log_time, channel, start, end in found:
-            if channel not in self._channels:
-                self._problems.add(
-                    f"{self._name}: messages of channel {channel} were skipped: "
-                    "the file does not say what it is."
-                )
-                continue
-            topic, type_, encoding, definition = self._kind(channel)
-            if wanted is None or topic in wanted:
-                yield Message(topic, type_, encoding, log_time, view[start:end], definition)
 
-    def _unpack_chunk(self, offset: int, size: int) -> bytes:
-        record = read_exactly(self._file, offset, size, self._size)
-        return chunk_records(record, chunk_head(record))
+    def _is_wanted(self, wanted: frozenset[str] | None, channel: int) -> bool:
+        if channel not in self._channels:
+            self._problems.add(
+                f"{self._name}: messages of channel {channel} were skipped: "
+                "the file does not say what it is."
+            )
+            return False
+        return wanted is None or self._kind(channel)[0] in wanted
 
-    def _walk(self, data: bytes, offset: int) -> list[tuple[int, int, int, int]]:
-        """(log time, channel, start, end) of the messages in ``data``.
+    def _message(self, entry: Entry, view: memoryview) -> Message:
+        log_time, channel, start, end = entry
+        topic, type_, encoding, definition = self._kind(channel)
+        return Message(topic, type_, encoding, log_time, view[start:end], definition)
+
+    def _read(self, offset: int, size: int) -> bytes:
+        self._memory.check(size)
+        return read_exactly(self._file, offset, size, self._size)
+
+    def _claimed_size(self, part: Part) -> int:
+        """Bytes of a part in memory."""
+        if not part.chunk:
+            return part.size
+        return claimed_size(self._read(part.offset, min(part.size, CHUNK_HEAD)))
+
+    def _unpack_chunk(self, offset: int, size: int) -> bytes | bytearray:
+        record = self._read(offset, size)
+        return chunk_records(record, chunk_head(record), self._memory)
+
+    def _walk(self, offset: int, data: bytes | bytearray, found: Index) -> None:
+        """Puts (log time, channel, start, end) of the messages in ``data`` into ``found``.
 
         Learns of schemas and channels on the way.
         """
-        found = []
         unpack = MESSAGE.unpack_from
         record_size = HEAD.size
         message = int(Opcode.MESSAGE)
+        append = found.append
         try:
             for opcode, start, end in spans(data):
                 if opcode == message:
                     if end - start < MESSAGE_BODY:
                         raise LogError(f"a message has {end - start} bytes")
                     _, _, channel, _, log_time, _ = unpack(data, start - record_size)
-                    found.append((log_time, channel, start + MESSAGE_BODY, end))
+                    append((log_time, channel, start + MESSAGE_BODY, end))
                 else:
-                    self._define(opcode, data[start:end])
+                    self._define(opcode, bytes(data[start:end]))
         except LogError as error:
             self._problems.add(
                 f"{self._name}: the chunk at byte {offset} is damaged inside: {error}; "
                 f"{len(found)} messages of it are used."
             )
-        return found
 
     def _define(self, opcode: int, body: bytes) -> None:
         if opcode == Opcode.SCHEMA:
             schema = parse(Schema.read, body)
-            self._schemas.setdefault(schema.id, schema)
+            if schema.id not in self._schemas:
+                self._count_definition(len(body))
+                self._schemas[schema.id] = schema
         elif opcode == Opcode.CHANNEL:
+            self._memory.check(_CHANNEL_BYTES * len(body))
             channel = parse(Channel.read, body)
-            self._channels.setdefault(channel.id, channel)
+            if channel.id not in self._channels:
+                self._count_definition(_CHANNEL_BYTES * len(body))
+                self._channels[channel.id] = channel
+
+    def _count_definition(self, size: int) -> None:
+        """LogError where the schemas and channels take too much memory."""
+        if self._definition_bytes + size > self._memory.most_of_definitions:
+            raise LogError(
+                f"its schemas and channels take more than {self._memory.most_of_definitions} bytes"
+            )
+        self._definition_bytes += size
 
     def _topic(self, channel: int) -> str:
         return self._kind(channel)[0] if channel in self._channels else ""

@@ -18,12 +18,14 @@ from mcap.records import McapRecord
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import SizedFile, decompress, read_exactly
+from semloc_logs.logs.containers.memory import Memory
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # of a record: opcode, length of its body
 MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish time
 MESSAGE_BODY = MESSAGE.size - HEAD.size  # bytes of a message's body before its data
 _CHUNK = struct.Struct("<BQQQQII")  # head, times, size and CRC unpacked, length of the compression
+CHUNK_HEAD = _CHUNK.size  # bytes at the start of a chunk record that state its sizes
 _DATA_LENGTH = struct.Struct("<Q")
 
 Record = TypeVar("Record")
@@ -56,7 +58,7 @@ def parse(read: Callable[[ReadDataStream], Record], body: bytes) -> Record:
         raise LogError(f"a record cannot be parsed ({reason})") from error
 
 
-def spans(data: bytes) -> Iterator[tuple[int, int, int]]:
+def spans(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
     """(opcode, start of the body, end of the body) of the records in ``data``, in their order.
 
     ``LogError`` where they stop to fit.
@@ -92,6 +94,13 @@ def walk(file: SizedFile, position: int, end: int) -> Iterator[tuple[int, int, i
         position += size
 
 
+def claimed_size(head: bytes) -> int:
+    """The size that a chunk record claims for its records, from its first bytes."""
+    if len(head) < CHUNK_HEAD:
+        raise LogError("its head is cut off")
+    return int(_CHUNK.unpack_from(head)[4])
+
+
 def chunk_head(record: bytes) -> ChunkHead:
     """The claims of a whole chunk record; ``LogError`` when they do not fit the record."""
     try:
@@ -109,9 +118,10 @@ def chunk_head(record: bytes) -> ChunkHead:
     return ChunkHead(start_ns, end_ns, size, crc, compression, data)
 
 
-def chunk_records(record: bytes, head: ChunkHead) -> bytes:
+def chunk_records(record: bytes, head: ChunkHead, memory: Memory) -> bytes | bytearray:
     """The records in a chunk; memory grows with the data, not with the claimed size."""
-    data = decompress(record[head.data], head.compression, head.unpacked_size)
-    if head.crc and zlib.crc32(data) != head.crc:
+    data = memoryview(record)[head.data]
+    unpacked = decompress(data, head.compression, head.unpacked_size, memory)
+    if head.crc and zlib.crc32(unpacked) != head.crc:
         raise LogError("its checksum does not match its data")
-    return data
+    return unpacked

@@ -21,6 +21,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import PoseSample
 from semloc_logs.logs.containers.base import decompress, in_log_time_order
 from semloc_logs.logs.containers.mcap import McapLog
+from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.problems import sentences
@@ -281,14 +282,15 @@ def test_decompression_believes_no_claim(compression: str) -> None:
         "lz4": lz4.frame.compress,
         "bz2": bz2.compress,
     }[compression]
+    memory = Memory(64 << 20)
     for content in (b"", b"abc", bytes(10_000_000)):
         packed = pack(content)
-        assert decompress(packed, compression, len(content)) == content
+        assert decompress(packed, compression, len(content), memory) == content
         for wrong in (len(content) + 1, len(content) - 1, 1 << 40):
             if wrong >= 0:
                 with pytest.raises(LogError):
-                    decompress(packed, compression, wrong)
+                    decompress(packed, compression, wrong, memory)
     with pytest.raises(LogError):
-        decompress(b"garbage", compression, 7)
+        decompress(b"garbage", compression, 7, memory)
     with pytest.raises(LogError):
-        decompress(pack(bytes(range(256)) * 4)[:200], compression, 1024)
+        decompress(pack(bytes(range(256)) * 4)[:200], compression, 1024, memory)
