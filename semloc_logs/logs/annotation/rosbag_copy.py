@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import MessageDefinitionFormat
@@ -31,16 +31,20 @@ class _Sqlite(Sqlite3Reader):
     """With the messages that lie in a file beside it."""
 
     def open(self) -> None:
-        self.dbconn = sqlite_file.connect(Path(self.path))
+        self.dbconn = sqlite_file.connect(Path(str(self.path)))
         self._open()
 
 
 class _Folder(DirectoryReader):
-    STORAGE_PLUGINS: ClassVar = {**DirectoryReader.STORAGE_PLUGINS, "sqlite3": _Sqlite}
+    def __init__(self, path: Any) -> None:
+        super().__init__(path)
+        self.STORAGE_PLUGINS = {**DirectoryReader.STORAGE_PLUGINS, "sqlite3": _Sqlite}
 
 
 class _Ros2(Reader2):
-    STORAGE_PLUGINS: ClassVar = {**Reader2.STORAGE_PLUGINS, "dir": _Folder, ".db3": _Sqlite}
+    def __init__(self, path: Path) -> None:
+        self.STORAGE_PLUGINS = {**Reader2.STORAGE_PLUGINS, "dir": _Folder, ".db3": _Sqlite}
+        super().__init__(path)
 
 
 @contextlib.contextmanager

@@ -23,6 +23,7 @@ from semloc_logs.logs.log import Message
 Entry = tuple[int, int, int, int]  # log time, channel, start and end of the message's data
 LARGE = 1 << 24  # bytes of a chunk; recorders make smaller ones
 _ENTRY_BYTES = 220  # of an entry in a list, with its numbers
+_MESSAGE_BYTES = 250  # of a message beside its data
 _COMPACT_BYTES = 56  # of an entry in a compact index while it is sorted
 
 
@@ -124,7 +125,7 @@ def _in_batches(chunk: Chunk, memory: Memory) -> Iterator[MessageOrTime]:
         yield due
         messages, due = _batch(chunk, memory, given, due)
         given += len(messages)
-        with memory.held(sum(len(m.data) for m in messages)):
+        with memory.held(sum(_MESSAGE_BYTES + len(m.data) for m in messages)):
             messages.reverse()
             while messages:
                 yield messages.pop()
@@ -145,7 +146,7 @@ def _batch(chunk: Chunk, memory: Memory, given: int, due: int) -> tuple[list[Mes
     alone = False
     for entry in index.in_order(chunk.is_wanted, given):
         time, _, start, end = entry
-        room -= end - start
+        room -= end - start + _MESSAGE_BYTES
         if alone or (room < 0 and (messages or time > due)):
             return messages, time
         alone = room < 0

@@ -77,7 +77,7 @@ class _Found:
         key = struct.unpack_from("<H", raw, 9)[0]
         if key not in kept:
             self.keep(len(raw))
-            kept[key] = bytes(raw)
+            kept[key] = raw
 
     def message(self, head: bytes) -> None:
         """Count a message by the first 22 bytes of its record's content."""
@@ -161,9 +161,9 @@ def _visit_chunk(found: _Found, record: bytes, offset: int) -> None:
     found.keep(_RECORD_BYTES)
     for opcode, start, stop in spans(data):
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            found.definition(opcode, data[start - HEAD.size : stop])
+            found.definition(opcode, bytes(data[start - HEAD.size : stop]))
         elif opcode == Opcode.MESSAGE:
-            found.message(data[start : min(stop, start + MESSAGE_BODY)])
+            found.message(bytes(data[start : min(stop, start + MESSAGE_BODY)]))
     found.chunks.append(
         ChunkIndex(
             chunk_length=len(record),

@@ -62,7 +62,7 @@ class Memory:
         array = np.frombuffer(data, np.uint8)
         self.used += len(data)
         weakref.finalize(array, self._free, len(data)).atexit = False
-        return memoryview(array)
+        return memoryview(array)  # type: ignore[arg-type]  # before Python 3.12
 
     @contextmanager
     def held(self, size: int) -> Iterator[None]:
