@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -30,9 +32,43 @@ QOS_KEY = "offered_qos_profiles"
 class _Sqlite(Sqlite3Reader):
     """With the messages that lie in a file beside it."""
 
-    def open(self) -> None:
-        self.dbconn = sqlite_file.connect(Path(str(self.path)))
-        self._open()
+    def __init__(self, path: Any) -> None:
+        overlay = sqlite_file.overlay_of(path)
+        whole: Any = path if overlay is None else _Whole(path, overlay)
+        super().__init__(whole)
+
+
+class _Whole:
+    """A file with the pages beside it, as rosbags takes files that are not on this disk."""
+
+    def __init__(self, path: Path, overlay: sqlite_file.Overlay) -> None:
+        self._path, self._overlay = path, overlay
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+    def open(self, mode: str) -> _WholeFile:
+        return _WholeFile(sqlite_file.OverlaidFile(self._path, self._overlay))
+
+    def stat(self) -> os.stat_result:
+        status = list(self._path.stat())
+        status[stat.ST_SIZE] = self._overlay.page_count * self._overlay.page_size
+        return os.stat_result(status)
+
+
+class _WholeFile:
+    def __init__(self, file: sqlite_file.OverlaidFile) -> None:
+        self._file = file
+        self._position = 0
+
+    def seek(self, offset: int) -> None:
+        self._position = offset
+
+    def read(self, size: int) -> bytes:
+        return self._file.xRead(size, self._position)
+
+    def close(self) -> None:
+        self._file.xClose()
 
 
 class _Folder(DirectoryReader):

@@ -236,14 +236,16 @@ class _ReadingVfs(apsw.VFS):
         if overlay is None:  # gone meanwhile
             raise apsw.CantOpenError(f"{path} changed while it was opened")
         flags[1] = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_MAIN_DB
-        return _OverlaidFile(path, overlay)
+        return OverlaidFile(path, overlay)
 
     def xAccess(self, pathname: str, flags: int) -> bool:
         """No file beside the database is of interest to sqlite."""
         return False
 
 
-class _OverlaidFile(apsw.VFSFile):
+class OverlaidFile(apsw.VFSFile):
+    """The file at ``path`` with the pages of ``overlay`` in their places."""
+
     def __init__(self, path: Path, overlay: Overlay) -> None:
         self._overlay = overlay
         self._files = [os.open(path, os.O_RDONLY)]

@@ -222,7 +222,7 @@ def test_a_file_that_grows_without_measure_is_not_unpacked(tmp_path: Path) -> No
     piece = bytes(64 * MIB)
     packed = b"".join([*(packer.compress(piece) for _ in range(48)), packer.flush()])
     (tmp_path / "x.db3.zstd").write_bytes(packed)
-    with pytest.raises(LogError, match="grows from .* bytes, which no log does"):
+    with pytest.raises(LogError, match=r"grows from .* bytes, which no log does"):
         open_log(tmp_path, LIMIT)
 
 
