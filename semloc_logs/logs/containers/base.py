@@ -148,11 +148,11 @@ def in_log_time_order(
         if len(heap) == 1:
             due = waiting[-1][0] if waiting else None
             for following in opened:
-                if due is not None and _time(following) >= due:
-                    heap[0] = (_time(following), order, following, opened)
+                if due is not None and (time := _time(following)) >= due:
+                    heap[0] = (time, order, following, opened)
                     break
-                if isinstance(following, Message):
-                    yield following
+                if following.__class__ is not int:
+                    yield following  # type: ignore[misc]  # a message
                 del following
             else:
                 heappop(heap)

@@ -18,8 +18,9 @@ import numpy as np
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import MessageOrTime
 from semloc_logs.logs.containers.memory import Memory
-from semloc_logs.logs.log import Message
+from semloc_logs.logs.log import Definition, Message
 
+Kind = tuple[str, str, str, Definition]  # topic, type and encoding of a channel
 Entry = tuple[int, int, int, int]  # log time, channel, start and end of the message's data
 LARGE = 1 << 24  # bytes of a chunk; recorders make smaller ones
 _ENTRY_BYTES = 220  # of an entry in a list, with its numbers
@@ -61,11 +62,14 @@ class CompactIndex:
     def __iter__(self) -> Iterator[Entry]:
         return zip(self._times, self._channels, self._starts, self._ends, strict=True)
 
-    def in_order(self, is_wanted: Callable[[int], bool], first: int) -> Iterator[Entry]:
-        """The wanted entries in log-time order without the ``first`` of them."""
+    def channels(self) -> list[int]:
+        """The channels of the entries."""
+        return [int(c) for c in np.unique(np.frombuffer(self._channels, np.uint64))]
+
+    def in_order(self, wanted: list[int], first: int) -> Iterator[Entry]:
+        """The entries of the ``wanted`` channels by log time, without the ``first`` of them."""
         times = np.frombuffer(self._times, np.uint64)
         channels = np.frombuffer(self._channels, np.uint64)
-        wanted = [c for c in np.unique(channels).tolist() if is_wanted(c)]
         rows = np.flatnonzero(np.isin(channels, np.array(wanted, np.uint64)))
         rows = rows[np.argsort(times[rows], kind="stable")][first:]
         for k in map(int, rows):
@@ -83,17 +87,15 @@ class Chunk:
     """A chunk as its container reads it.
 
     ``start_ns``: a lower bound of its times. ``claimed_size()``: its bytes, decompressed;
-    ``unpack()``: these. ``walk`` puts the entries in them into an index. ``is_wanted``: whether
-    the messages of a channel are. ``message``: of an entry and of a view of the bytes. LogError and
-    OSError pass by.
+    ``unpack()``: these. ``walk`` puts the entries in them into an index. ``kind`` of a channel;
+    None where its messages are not wanted. LogError and OSError pass by.
     """
 
     start_ns: int
     claimed_size: Callable[[], int]
     unpack: Callable[[], bytes | bytearray]
     walk: Callable[[bytes | bytearray, Index], None]
-    is_wanted: Callable[[int], bool]
-    message: Callable[[Entry, memoryview], Message]
+    kind: Callable[[int], Kind | None]
 
 
 def chunk_messages(chunk: Chunk, memory: Memory) -> Iterator[MessageOrTime]:
@@ -112,10 +114,12 @@ def _kept(chunk: Chunk, memory: Memory) -> Iterator[Message]:
     found.sort(key=itemgetter(0))  # stable, and nearly free for sorted input
     view = memory.counted(data)
     del data
+    kinds = {channel: chunk.kind(channel) for channel in sorted({entry[1] for entry in found})}
     with memory.held(_ENTRY_BYTES * len(found)):
-        for entry in found:
-            if chunk.is_wanted(entry[1]):
-                yield chunk.message(entry, view)
+        for time, channel, start, end in found:
+            if (kind := kinds[channel]) is not None:
+                topic, type_, encoding, definition = kind
+                yield Message(topic, type_, encoding, time, view[start:end], definition)
 
 
 def _in_batches(chunk: Chunk, memory: Memory) -> Iterator[MessageOrTime]:
@@ -134,7 +138,7 @@ def _in_batches(chunk: Chunk, memory: Memory) -> Iterator[MessageOrTime]:
 def _batch(chunk: Chunk, memory: Memory, given: int, due: int) -> tuple[list[Message], int | None]:
     """Messages behind the first ``given``, as many as there is room for, and the next one's time.
 
-    A message for which there is no room comes alone, at its time.
+    A message without room comes alone, at its time.
     """
     data = chunk.unpack()
     index = CompactIndex(memory)
@@ -144,12 +148,13 @@ def _batch(chunk: Chunk, memory: Memory, given: int, due: int) -> tuple[list[Mes
     room = (memory.most_of_overlapping + memory.most_of_copies - memory.used + len(view)) // 2
     messages: list[Message] = []
     alone = False
-    for entry in index.in_order(chunk.is_wanted, given):
-        time, _, start, end = entry
+    kinds = {c: kind for c in index.channels() if (kind := chunk.kind(c)) is not None}
+    for time, channel, start, end in index.in_order(list(kinds), given):
         room -= end - start + _MESSAGE_BYTES
         if alone or (room < 0 and (messages or time > due)):
             return messages, time
         alone = room < 0
-        message = chunk.message(entry, view)
-        messages.append(message if alone else message._replace(data=bytes(message.data)))
+        topic, type_, encoding, definition = kinds[channel]
+        content = view[start:end] if alone else bytes(view[start:end])
+        messages.append(Message(topic, type_, encoding, time, content, definition))
     return messages, None

@@ -26,7 +26,7 @@ from semloc_logs.logs.containers.base import (
     open_file,
     read_exactly,
 )
-from semloc_logs.logs.containers.chunks import Chunk, Entry, Index, chunk_messages, new_index
+from semloc_logs.logs.containers.chunks import Chunk, Index, Kind, chunk_messages, new_index
 from semloc_logs.logs.containers.mcap_records import (
     CHUNK_HEAD,
     HEAD,
@@ -297,8 +297,7 @@ class McapLog(BaseLog):
             claimed_size=partial(self._claimed_size, part),
             unpack=partial(whole, part.offset, part.size),
             walk=partial(self._walk, part.offset),
-            is_wanted=partial(self._is_wanted, wanted),
-            message=self._message,
+            kind=partial(self._wanted_kind, wanted),
         )
         try:
             yield from chunk_messages(chunk, self._memory)
@@ -308,19 +307,15 @@ class McapLog(BaseLog):
                 f"{self._name}: the {what} at byte {part.offset} was skipped: {error}."
             )
 
-    def _is_wanted(self, wanted: frozenset[str] | None, channel: int) -> bool:
+    def _wanted_kind(self, wanted: frozenset[str] | None, channel: int) -> Kind | None:
         if channel not in self._channels:
             self._problems.add(
                 f"{self._name}: messages of channel {channel} were skipped: "
                 "the file does not say what it is."
             )
-            return False
-        return wanted is None or self._kind(channel)[0] in wanted
-
-    def _message(self, entry: Entry, view: memoryview) -> Message:
-        log_time, channel, start, end = entry
-        topic, type_, encoding, definition = self._kind(channel)
-        return Message(topic, type_, encoding, log_time, view[start:end], definition)
+            return None
+        kind = self._kind(channel)
+        return kind if wanted is None or kind[0] in wanted else None
 
     def _read(self, offset: int, size: int) -> bytes:
         self._memory.check(size)

@@ -65,7 +65,7 @@ class _Found:
     loose: int = 0
 
     def keep(self, size: int) -> None:
-        """Counts what is kept; LogError where it is too much."""
+        """Counts the bytes that are kept; LogError where it is too much."""
         self.kept += size
         if self.kept > self.memory.most_of_one:
             raise LogError(

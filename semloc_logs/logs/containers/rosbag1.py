@@ -22,7 +22,7 @@ from semloc_logs.logs.containers.base import (
     open_file,
     read_exactly,
 )
-from semloc_logs.logs.containers.chunks import Chunk, Entry, Index, chunk_messages, new_index
+from semloc_logs.logs.containers.chunks import Chunk, Index, Kind, chunk_messages, new_index
 from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
@@ -215,8 +215,7 @@ class Rosbag1Log(BaseLog):
             claimed_size=partial(self._claimed_size, part.offset),
             unpack=partial(self._unpack_chunk, part.offset),
             walk=partial(self._walk, part.offset),
-            is_wanted=wanted.__contains__,
-            message=self._message,
+            kind=partial(self._wanted_kind, wanted),
         )
         try:
             yield from chunk_messages(chunk, self._memory)
@@ -225,10 +224,11 @@ class Rosbag1Log(BaseLog):
                 f"{self.path.name}: the chunk at byte {part.offset} was skipped: {error}."
             )
 
-    def _message(self, entry: Entry, view: memoryview) -> Message:
-        log_time, connection, start, end = entry
+    def _wanted_kind(self, wanted: set[int], connection: int) -> Kind | None:
+        if connection not in wanted:
+            return None
         topic, type_, definition = self._connections[connection]
-        return Message(topic, type_, "ros1", log_time, view[start:end], definition)
+        return topic, type_, "ros1", definition
 
     def _chunk(self, offset: int) -> tuple[Fields, int, int]:
         fields, start, end = self._record(offset)

@@ -212,7 +212,7 @@ class SqliteLog(BaseLog):
 
 
 def _text(column: str) -> str:
-    """A column of text as bytes: what is not UTF-8 is replaced, not refused."""
+    """A column of text as bytes: parts that are not UTF-8 are replaced, not refused."""
     return f"CAST({column} AS BLOB)"
 
 
@@ -221,7 +221,7 @@ def _decoded(text: bytes | None) -> str:
 
 
 def _connect(path: Path) -> apsw.Connection:
-    """Opens for reading only; the text of an error says what is wrong."""
+    """Opens for reading only; the text of an error states the fault."""
     if sqlite_file.overlay_of(path) is None:
         _refuse_cut_off(path)
     database = sqlite_file.connect(path)
