@@ -269,7 +269,7 @@ def _bound_memory(runtime: Any, memory: int) -> None:
     place = runtime.OrtMemoryInfo(
         "Cpu", runtime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, runtime.OrtMemType.DEFAULT
     )
-    # grows by what is needed, not by powers of two
+    # grows by the bytes that are needed, not by powers of two
     arena = {
         "max_mem": memory,
         "arena_extend_strategy": 1,

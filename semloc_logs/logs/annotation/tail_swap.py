@@ -200,7 +200,7 @@ def _load(side: Path, fd: int) -> _Saved:
 def _own_bytes(side: Path, fd: int) -> bytes:
     """The content of ``side``; LogError unless it is a file of the log's owner or of this user.
 
-    Anyone may write beside a log in a shared folder, and the log is changed by what is read here.
+    Anyone may write beside a log in a shared folder, and the content is written into the log.
     """
     try:
         file = os.open(side, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
