@@ -30,7 +30,7 @@ def session_inputs(
 
     by_name: dict[str, Path] = {}
     for log in logs:
-        name = session_name(log)
+        name = checked_name(session_name(log))
         if name in by_name:
             raise click.UsageError(
                 f"{by_name[name]} and {log} would both be session '{name}':"
@@ -45,9 +45,13 @@ def session_inputs(
 
 def checked_name(name: str) -> str:
     """A session's name; UsageError when it cannot be a folder's."""
-    if not name or name.startswith(".") or "/" in name or "\0" in name:
-        raise click.UsageError(f"A session cannot be called {name!r}: its name becomes a folder's.")
-    return name
+    from semloc_logs.errors import WorkspaceError
+    from semloc_logs.workspace import checked_name as checked
+
+    try:
+        return checked(name)
+    except WorkspaceError as error:
+        raise click.UsageError(str(error)) from None
 
 
 def finish(*reports: Report) -> int:

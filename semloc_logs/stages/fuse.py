@@ -101,7 +101,8 @@ def _mountings(session: SessionInput, settings: Resolved, others: Sequence[Path]
     elif settings.fusion.odometry == "lidar":
         child = BASE_LINK
     try:
-        return lent_transforms(session.logs, others, session.topics, child)
+        memory = settings.logs.memory
+        return lent_transforms(session.logs, others, session.topics, child, memory=memory)
     except SemlocError:
         return NO_MOUNTINGS  # the task meets the same error, and names it
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import glob
 import os
+import secrets
 import shutil
-import uuid
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,8 @@ from pathlib import Path
 _UMASK = os.umask(0o022)
 os.umask(_UMASK)
 PUBLIC = 0o666 & ~_UMASK  # permissions of a file that any program would make
+PUBLIC_FOLDER = 0o777 & ~_UMASK
+_NOFOLLOW = getattr(os, "O_NOFOLLOW", 0)  # a system without it has no such links in shared folders
 
 
 def sync_folder(folder: Path) -> None:
@@ -59,12 +62,18 @@ def replacing_file(path: Path, suffix: str = ".tmp", *, mode: int = PUBLIC) -> I
     removed.
     """
     make_folder(path.parent)
-    temporary = _temporary(path, suffix)
+    # made here and new, so that a writer which opens it by name meets no link of someone else
+    handle, name = tempfile.mkstemp(suffix, f".{path.name}.", path.parent)
+    os.close(handle)
+    temporary = Path(name)
     try:
         yield temporary
-        with temporary.open("rb+") as written:
-            os.fchmod(written.fileno(), mode)  # some writers make private files
-            os.fsync(written.fileno())
+        written = os.open(temporary, os.O_RDWR | _NOFOLLOW)
+        try:
+            os.fchmod(written, mode)  # the file is private until now
+            os.fsync(written)
+        finally:
+            os.close(written)
         os.replace(temporary, path)
         sync_folder(path.parent)
     finally:
@@ -81,13 +90,14 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     make_folder(path.parent)
     for stale in stale_temporaries(path):
         shutil.rmtree(stale, ignore_errors=True)
-    temporary = _temporary(path, ".tmp")
-    temporary.mkdir()
+    temporary = Path(tempfile.mkdtemp(".tmp", f".{path.name}.", path.parent))
     try:
         yield temporary
+        temporary.chmod(PUBLIC_FOLDER)
         _sync_tree(temporary)
         if path.exists():
-            old = _temporary(path, ".old.tmp")
+            # the rename fails where there is a link of this name
+            old = path.with_name(f".{path.name}.{secrets.token_hex(4)}.old.tmp")
             os.replace(path, old)
             os.replace(temporary, path)
             # the renames are synced first: else a crash could leave a half-removed folder under
@@ -99,10 +109,6 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         sync_folder(path.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _temporary(path: Path, suffix: str) -> Path:
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{suffix}")
 
 
 def _sync_tree(root: Path) -> None:
