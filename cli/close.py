@@ -48,7 +48,7 @@ def command(
 
     Of two sessions the later recorded one is localised in the earlier one, and each in itself apart
     from keyframes that are near in time. Pairs that were searched before are kept; --query and
-    --target restrict what is searched now. Writes closures.parquet.
+    --target restrict the search, not the result. Writes closures.parquet.
 
     \b
     Example:  semloc close -w work --query tuesday --target monday --query-every 5

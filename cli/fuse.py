@@ -48,7 +48,7 @@ def command(
     settings: Resolved,
 ) -> int:
     """Logs -> the semantic map of one session: keyframes, submaps, voxels, trajectory. Several logs
-    are one session, recorded back to back; those of a --manifest are sessions of their own.
+    are one session, recorded back to back; the sessions of a --manifest are sessions of their own.
 
     Nothing is done again that is there for the same content, settings and version. Another log
     under the name of a known session is refused without --overwrite. Lengths are metres.

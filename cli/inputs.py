@@ -44,7 +44,7 @@ class LogChoice:
     manifest: Path | None
 
     def each(self) -> list[Entry]:
-        """Each log a session, and those of the manifest."""
+        """Each log as a session, and the sessions of the manifest."""
         return self._checked([*_given(self.logs), *self._listed()])
 
     def joined(self, name: str | None) -> list[Entry]:
@@ -115,9 +115,13 @@ def session_inputs(
 
 def checked_name(name: str) -> str:
     """A session's name; UsageError when it cannot be a folder's."""
-    if not name or name.startswith(".") or "/" in name or "\0" in name:
-        raise click.UsageError(f"A session cannot be called {name!r}: its name becomes a folder's.")
-    return name
+    from semloc_logs.errors import WorkspaceError
+    from semloc_logs.workspace import checked_name as checked
+
+    try:
+        return checked(name)
+    except WorkspaceError as error:
+        raise click.UsageError(str(error)) from None
 
 
 def _given(logs: Iterable[str]) -> Iterator[Entry]:

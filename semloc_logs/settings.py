@@ -195,6 +195,11 @@ class Labels(_Section):
         None, description="YAML file that describes input and output of the model"
     )
     threads: int = Field(1, ge=1, le=64, description="threads of the model in each job")
+    memory: int = Field(
+        4 << 30,
+        ge=16 << 20,
+        description="bytes that the model and its results may take in each job",
+    )
     erode: int = Field(
         2,
         ge=0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,20 @@ from pathlib import Path
 from semloc_logs.errors import WorkspaceError, did_you_mean
 
 MOST_NAMED = 12  # sessions in a sentence
+
+
+def checked_name(name: str) -> str:
+    """``name``, if a folder can have it as a session's name; else WorkspaceError.
+
+    It may come from the name of a log, from an option, or from a table: none may lead elsewhere.
+    """
+    unfit = any(c in "/\\" or unicodedata.category(c) in ("Cc", "Cs") for c in name)
+    if not name or name.startswith(".") or unfit:
+        raise WorkspaceError(
+            f"A session cannot be called {name!r}, because a folder gets its name: rename the log, "
+            "or name the session, without '.' at its start, separators and control characters."
+        )
+    return name
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +85,8 @@ class Workspace:
     path: Path
 
     def session(self, name: str) -> SessionFolder:
-        return SessionFolder(self.path / "sessions" / name)
+        """The folder of the session ``name``; WorkspaceError for a name that leads elsewhere."""
+        return SessionFolder(self.path / "sessions" / checked_name(name))
 
     def sessions(self) -> list[SessionFolder]:
         """Sessions that were fused, by name."""

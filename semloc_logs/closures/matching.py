@@ -123,7 +123,7 @@ class SearchTask:
 def search_queries(task: SearchTask) -> int:
     """Write the alignments of each keyframe of the task, best first; how many there are.
 
-    Each target is searched by itself, so what is found in it does not depend on the others.
+    Each target is searched by itself, so its alignments do not depend on the others.
     """
     session = SessionMap(Workspace(task.work).session(task.session))
     queries = {k: build_query(session, k, task.settings) for k in task.keyframes}

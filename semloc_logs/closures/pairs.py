@@ -1,4 +1,4 @@
-"""Pairs of sessions: which one is searched in which, and what is there of it.
+"""Pairs of sessions: which one is searched in which, and its alignments so far.
 
 The later recorded session is the query, the earlier one the target, and each session is searched in
 itself. So pairs do not depend on when sessions were added, and a new one leaves the others alone.

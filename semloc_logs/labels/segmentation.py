@@ -1,7 +1,8 @@
 """The user's ONNX model: camera picture -> Cityscapes train ids of its pixels.
 
 It runs in onnxruntime (the extra ``onnx``) or, where that is not installed, in OpenCV, in as many
-threads as ``labels.threads`` allows.
+threads as ``labels.threads`` allows. ``labels.memory`` bounds the memory of onnxruntime, and the
+size of input and output of both.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from semloc_logs.labels.segmentation_spec import Spec, read_spec
 from semloc_logs.labels.space import U8, U32, UNLABELLED, UNPAINTED, is_file_name, read_space
 from semloc_logs.settings import Labels
 
+_MEMORY: int = Labels.model_fields["memory"].default  # bytes
 Net = Callable[[NDArray[Any]], NDArray[Any]]  # a batch of one picture -> the output
 
 
@@ -68,8 +70,15 @@ class Segmenter:
     """
 
     def __init__(
-        self, net: Net, runtime: str, spec: Spec, spec_path: Path, model_path: Path
+        self,
+        net: Net,
+        runtime: str,
+        spec: Spec,
+        spec_path: Path,
+        model_path: Path,
+        memory: int = _MEMORY,
     ) -> None:
+        self._memory = memory
         self._net, self._runtime, self._spec, self._path = net, runtime, spec, model_path
         self._space = spec.label_space(spec_path)
         ignored = spec.ignored(self._space)
@@ -88,8 +97,10 @@ class Segmenter:
         spec = read_spec(spec_path)
         if not model_path.is_file():
             raise SettingsError(f"Model {model_path} is missing: --seg-model takes an ONNX file.")
-        net, runtime = _load(model_path, spec, settings.threads)
-        return cls(net, runtime, spec, spec_path, model_path)
+        rows, columns = spec.input.size
+        _check_memory(model_path, "an input", 3 * 4 * rows * columns, settings.memory)
+        net, runtime = _load(model_path, spec, settings)
+        return cls(net, runtime, spec, spec_path, model_path, settings.memory)
 
     def to_json(self) -> dict[str, Any]:
         """For session.json."""
@@ -165,6 +176,9 @@ class Segmenter:
         SettingsError when the output has not the form that the spec describes.
         """
         spec = self._spec.output
+        # classes are found in a copy and kept as numbers of 8 bytes
+        needed = 2 * output.nbytes + 8 * output.size
+        _check_memory(self._path, "an output", needed, self._memory)
         given = " x ".join(map(str, output.shape))
         image = (
             output.reshape([n for n in output.shape if n != 1] or [1])
@@ -231,25 +245,54 @@ def _resized(picture: U8, rows: int, columns: int) -> U8:
     return np.asarray(resized, np.uint8)
 
 
-def _load(path: Path, spec: Spec, threads: int) -> tuple[Net, str]:
+def _check_memory(path: Path, what: str, size: int, memory: int) -> None:
+    """SettingsError where a model has an input or an output that is too large."""
+    if size > memory:
+        raise SettingsError(
+            f"Model {path} has {what} that takes {size} bytes, more than labels.memory ({memory}): "
+            "choose a smaller one, or set labels.memory."
+        )
+
+
+def _load(path: Path, spec: Spec, settings: Labels) -> tuple[Net, str]:
     try:
         import onnxruntime
     except ImportError:
-        return _load_cv2(path, spec, threads), f"opencv {cv2.__version__}"
+        return _load_cv2(path, spec, settings.threads), f"opencv {cv2.__version__}"
     return _load_onnxruntime(
-        onnxruntime, path, spec, threads
+        onnxruntime, path, spec, settings
     ), f"onnxruntime {onnxruntime.__version__}"
 
 
-def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, threads: int) -> Net:
+def _bound_memory(runtime: Any, memory: int) -> None:
+    """Lets the sessions of this process take at most so many bytes together."""
+    place = runtime.OrtMemoryInfo(
+        "Cpu", runtime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, runtime.OrtMemType.DEFAULT
+    )
+    # grows by the bytes that are needed, not by powers of two
+    arena = {
+        "max_mem": memory,
+        "arena_extend_strategy": 1,
+        "initial_chunk_size_bytes": -1,
+        "max_dead_bytes_per_chunk": -1,
+    }
+    runtime.create_and_register_allocator(place, runtime.OrtArenaCfg(arena))
+
+
+def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, settings: Labels) -> Net:
+    _bound_memory(runtime, settings.memory)
     options = runtime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.add_session_config_entry("session.use_env_allocators", "1")
+    options.intra_op_num_threads, options.inter_op_num_threads = settings.threads, 1
     options.use_deterministic_compute = True
     options.log_severity_level = 4
     try:
         session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the runtime raises many types, and the file may be anything
-        raise SettingsError(f"Model {path} cannot be read as ONNX: {_short(error)}.") from None
+        raise SettingsError(
+            _too_large(path, error, settings)
+            or f"Model {path} cannot be read as ONNX: {_short(error)}."
+        ) from None
     inputs = {i.name: i for i in session.get_inputs()}
     outputs = [o.name for o in session.get_outputs()]
     name = spec.input.name or (next(iter(inputs)) if len(inputs) == 1 else "")
@@ -271,11 +314,22 @@ def _load_onnxruntime(runtime: Any, path: Path, spec: Spec, threads: int) -> Net
             return np.asarray(session.run([output], {name: batch})[0])
         except Exception as error:
             raise SettingsError(
-                f"Model {path} fails on an input of {' x '.join(map(str, batch.shape))}: "
+                _too_large(path, error, settings)
+                or f"Model {path} fails on an input of {' x '.join(map(str, batch.shape))}: "
                 f"{_short(error)}."
             ) from None
 
     return run
+
+
+def _too_large(path: Path, error: Exception, settings: Labels) -> str:
+    """The sentence about a model that needs more memory; "" for another error."""
+    if "Available memory of" not in str(error):
+        return ""
+    return (
+        f"Model {path} needs more memory than labels.memory ({settings.memory} bytes): choose a "
+        "smaller one, or set labels.memory."
+    )
 
 
 def _check_shape(path: Path, spec: Spec, shape: list[Any], type_: str) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from queue import Empty, Full, Queue
 from threading import Event, Thread
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 T = TypeVar("T")
 _END = object()
@@ -93,59 +92,3 @@ def _put(item: object, queue: Queue[object], left: Event) -> None:
             return
         except Full:
             continue
-
-
-class Lookahead(Generic[T]):
-    """``make(0)``, ``make(1)``, ... in two threads, up to ``depth`` of them before they are taken.
-
-    One thread is the caller's: where the other has not come far enough, the caller works as well
-    instead of waiting. For work that releases the interpreter's lock. Exceptions of ``make`` are
-    raised by :meth:`take`. Within :func:`in_callers_thread` each result is made when it is taken.
-    """
-
-    def __init__(self, make: Callable[[int], T], count: int, depth: int = 2) -> None:
-        self._make = make
-        self._count = count
-        self._depth = depth
-        self._next = 0  # the first that is not planned
-        self._planned: dict[int, Future[T]] = {}
-        self._pool: ThreadPoolExecutor | None = None
-        if not _IN_CALLERS_THREAD.get():
-            self._pool = ThreadPoolExecutor(1, thread_name_prefix=THREAD_NAME)
-
-    def __enter__(self) -> Lookahead[T]:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Waits for the other thread; what has not begun is not made any more."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-
-    def take(self, number: int) -> T:
-        """``make(number)``, for numbers that only grow."""
-        if self._pool is None:
-            return self._make(number)
-        last = min(number + self._depth, self._count - 1)
-        for following in range(max(self._next, number + 1), last + 1):
-            self._planned[following] = self._pool.submit(self._make, following)
-        self._next = max(self._next, last + 1)
-
-        planned = self._planned.pop(number, None)
-        if planned is None or planned.cancel():  # nobody has begun it
-            return self._make(number)
-        while not planned.done() and self._help():
-            pass
-        return planned.result()
-
-    def _help(self) -> bool:
-        """Makes a later result that the other thread has not begun; False without any."""
-        number = next((n for n, planned in self._planned.items() if planned.cancel()), None)
-        if number is None:
-            return False
-        made: Future[T] = Future()
-        try:
-            made.set_result(self._make(number))
-        except Exception as error:
-            made.set_exception(error)
-        self._planned[number] = made
-        return True

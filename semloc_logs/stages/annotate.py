@@ -105,7 +105,8 @@ def _results(work: Workspace, own: SessionMap, name: str, settings: Resolved) ->
         "fusion.voxel_size": str(settings.fusion.voxel_size),
     }
     frame_id = str(own.json.get("session_frame") or "") or None
-    return Results(records, name, notes, times, frame_id=frame_id)
+    memory = settings.logs.memory
+    return Results(records, name, notes, times, frame_id=frame_id, memory=memory)
 
 
 def _record(work: Workspace, own: SessionMap, name: str, row: dict[str, Any]) -> ClosureRecord:

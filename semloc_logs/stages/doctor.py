@@ -35,7 +35,7 @@ class Finding:
 
 @dataclass(slots=True)
 class Examination:
-    """What was checked, and what is wrong."""
+    """The checks, and their findings."""
 
     files: int = 0
     rows: int = 0

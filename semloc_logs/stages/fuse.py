@@ -101,7 +101,7 @@ def _fuse(
 
 
 def _as_read_before(folder: SessionFolder, settings: Resolved) -> Resolved:
-    """The settings, with those of reading that the session was made with unless others are given.
+    """The settings; reading is as the session was made with, unless other values are given.
 
     They belong to a log: its clocks, its mountings, its direction of up.
     """
@@ -150,7 +150,8 @@ def _mountings(session: SessionInput, settings: Resolved, others: Sequence[Path]
     elif settings.fusion.odometry == "lidar":
         child = BASE_LINK
     try:
-        return lent_transforms(session.logs, others, session.topics, child)
+        memory = settings.logs.memory
+        return lent_transforms(session.logs, others, session.topics, child, memory=memory)
     except SemlocError:
         return NO_MOUNTINGS  # the task meets the same error, and names it
 

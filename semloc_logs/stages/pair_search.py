@@ -1,4 +1,4 @@
-"""Words -> alignments of each pair of sessions: what is not there yet is searched."""
+"""Words -> alignments of each pair of sessions: the missing ones are searched."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Maps = Mapping[str, SessionMap]
 class Selection:
     """Sessions to search and sessions to search them in; all where empty.
 
-    It restricts what is searched now, never what is known.
+    It restricts the search; known alignments stay.
     """
 
     queries: tuple[str, ...] = ()
@@ -65,7 +65,7 @@ EVERYTHING = Selection()
 class PairSearch:
     """The pairs of a workspace to search: all that are ``chosen`` and not up to date.
 
-    ``fingerprints`` are of what the alignments of every pair depend on, ``known`` those of the
+    ``fingerprints`` are of what the alignments of every pair depend on, ``known`` of the
     alignments that are there.
     """
 

@@ -14,11 +14,11 @@ from semloc_logs.stages.annotate import Annotation, AnnotationMode, annotate
 from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe
 from semloc_logs.stages.fuse import fuse
-from semloc_logs.stages.inputs import SessionInput
+from semloc_logs.stages.inputs import SessionInput, session_name
 from semloc_logs.stages.lock import one_writer
 from semloc_logs.stages.report import Report
 from semloc_logs.tables.table import write_json
-from semloc_logs.workspace import Workspace
+from semloc_logs.workspace import Workspace, checked_name
 
 LOGGER = logging.getLogger(__name__)
 
@@ -82,9 +82,10 @@ def _annotate_logs(
 
 
 def _output(session: SessionInput, log: Path, work: Workspace, mode: AnnotationMode) -> Path:
-    stem = session.name if log.is_dir() else log.stem
+    # several logs of one session have names of their own
+    name = checked_name(session.name if len(session.logs) == 1 else session_name(log))
     ending = ".semloc.mcap" if mode is AnnotationMode.SIDECAR else ".mcap"
-    return work.annotated / f"{stem}{ending}"
+    return work.annotated / f"{name}{ending}"
 
 
 def _write_summary(work: Workspace, report: Report) -> None:

@@ -12,6 +12,7 @@ import hashlib
 import os
 import shutil
 import socket
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +24,8 @@ PUBLIC = 0o666 & ~_UMASK  # permissions of a file that any program would make
 _OLD = ".old.tmp"  # ends the name of a folder that is being replaced
 _HOST = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
 _PROCESS = uuid.uuid4().hex[:6]  # tells this process from an earlier one of the same number
+PUBLIC_FOLDER = 0o777 & ~_UMASK
+_NOFOLLOW = getattr(os, "O_NOFOLLOW", 0)  # a system without it has no such links in shared folders
 
 
 def sync_folder(folder: Path) -> None:
@@ -92,12 +95,18 @@ def replacing_file(path: Path, suffix: str = ".tmp", *, mode: int = PUBLIC) -> I
     removed.
     """
     make_folder(path.parent)
-    temporary = _temporary(path, suffix)
+    # made here and new, so that a writer which opens it by name meets no link of someone else
+    handle, name = tempfile.mkstemp(suffix, f".{path.name}.{_owner()}-", path.parent)
+    os.close(handle)
+    temporary = Path(name)
     try:
         yield temporary
-        with temporary.open("rb+") as written:
-            os.fchmod(written.fileno(), mode)  # some writers make private files
-            os.fsync(written.fileno())
+        written = os.open(temporary, os.O_RDWR | _NOFOLLOW)
+        try:
+            os.fchmod(written, mode)  # the file is private until now
+            os.fsync(written)
+        finally:
+            os.close(written)
         os.replace(temporary, path)
         sync_folder(path.parent)
     finally:
@@ -114,9 +123,10 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     make_folder(path.parent)
     recover_folder(path)
     temporary = _temporary(path, ".tmp")
-    temporary.mkdir()
+    temporary.mkdir(0o700)  # fails where something, such as a link, has the name
     try:
         yield temporary
+        temporary.chmod(PUBLIC_FOLDER)
         _sync_tree(temporary)
         if path.exists():
             old = _temporary(path, _OLD)
@@ -147,8 +157,12 @@ def recover_folder(path: Path) -> None:
 
 
 def _temporary(path: Path, suffix: str) -> Path:
-    owner = f"{_HOST}-{os.getpid()}-{_PROCESS}-{uuid.uuid4().hex[:8]}"
-    return path.with_name(f".{path.name}.{owner}{suffix}")
+    return path.with_name(f".{path.name}.{_owner()}-{uuid.uuid4().hex[:8]}{suffix}")
+
+
+def _owner() -> str:
+    """This process, in the name of a temporary."""
+    return f"{_HOST}-{os.getpid()}-{_PROCESS}"
 
 
 def _sync_tree(root: Path) -> None:

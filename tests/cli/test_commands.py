@@ -72,6 +72,25 @@ def called(
     return put
 
 
+# -- names of sessions
+
+
+@pytest.mark.parametrize(
+    ("log", "shown"),
+    [("...mcap", "'..'"), ("..mcap", "'.'"), (".mcap", "'.mcap'"), ("a\nb.mcap", "'a\\nb'")],
+)
+@pytest.mark.parametrize("command", ["fuse", "run"])
+def test_a_log_whose_name_leads_elsewhere_is_refused(
+    tmp_path: Path, command: str, log: str, shown: str
+) -> None:
+    (tmp_path / log).write_bytes(b"\x89MCAP0\r\n")
+    work = tmp_path / "work" / "here"
+    done = semloc(command, tmp_path / log, "-w", work)
+    assert done.exit_code == 2
+    assert f"A session cannot be called {shown}" in done.stderr
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([log])
+
+
 # -- settings
 
 

@@ -265,3 +265,69 @@ def test_the_fingerprint_follows_the_files(tmp_path: Path) -> None:
         assert fingerprint(Labels(space=str(space))) != before
     with pytest.raises(SettingsError, match="cannot be read"):
         fingerprint(settings.model_copy(update={"model": tmp_path / "none.onnx"}))
+
+
+def save_expanding(path: Path, times: int) -> Path:
+    """The sum of ``times`` copies of the input: large on the way, small at the end."""
+    x = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3, 8, 16])
+    y = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
+    nodes = [
+        helper.make_node("Expand", ["x", "shape"], ["many"]),
+        helper.make_node("ReduceMax", ["many"], ["y"], axes=[0], keepdims=1),
+    ]
+    shape = numpy_helper.from_array(np.array([times, 3, 8, 16], np.int64), "shape")
+    model = helper.make_model(
+        helper.make_graph(nodes, "expanding", [x], [y], [shape]),
+        opset_imports=[helper.make_opsetid("", 13)],
+    )
+    model.ir_version = 8
+    onnx.save(model, str(path))
+    return path
+
+
+@pytest.mark.parametrize(("times", "fits"), [(10_000, True), (100_000, False)])
+def test_a_model_that_takes_too_much_memory_is_refused(
+    tmp_path: Path, times: int, fits: bool
+) -> None:
+    """A copy has 1536 bytes: 15 MB and 154 MB, where 64 MiB are allowed."""
+    spec = tmp_path / "spec.yaml"
+    content = {"input": {"size": [8, 16]}, "classes": ["road", "vegetation", "car"]}
+    spec.write_text(yaml.safe_dump(content))
+    path = save_expanding(tmp_path / "model.onnx", times)
+    settings = Labels(source="onnx", model=path, spec=spec, memory=64 << 20)
+    segmenter = Segmenter.open(settings)
+    if fits:
+        assert segmenter.train_ids(stripes())[0, 0] == ROAD
+    else:
+        with pytest.raises(SettingsError, match=r"needs more memory than labels\.memory"):
+            segmenter.train_ids(stripes())
+        # the limit holds for each model that is opened
+        larger = settings.model_copy(update={"memory": 1 << 30})
+        assert Segmenter.open(larger).train_ids(stripes())[0, 0] == ROAD
+
+
+def test_an_input_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
+    spec = tmp_path / "spec.yaml"
+    content = {"input": {"size": [4096, 4096]}, "classes": ["road"]}
+    spec.write_text(yaml.safe_dump(content))
+    path = save_model(tmp_path / "model.onnx")
+    with pytest.raises(SettingsError, match="an input that takes 201326592 bytes"):
+        Segmenter.open(Labels(source="onnx", model=path, spec=spec, memory=64 << 20))
+
+
+@pytest.mark.parametrize("runtime", ["onnxruntime", "opencv"])
+def test_an_output_that_takes_too_much_memory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runtime: str
+) -> None:
+    """700 classes of 128 x 128 pixels are 46 MB, and 184 MB with the copies in which the class is
+    found.
+    """
+    if runtime == "opencv":
+        monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    spec = tmp_path / "spec.yaml"
+    content = {"input": {"size": [128, 128]}, "classes": [f"class {k}" for k in range(700)]}
+    spec.write_text(yaml.safe_dump(content))
+    path = save_model(tmp_path / "model.onnx", 128, 128, classes=700)
+    settings = Labels(source="onnx", model=path, spec=spec, memory=150 << 20)
+    with pytest.raises(SettingsError, match=r"an output that takes 183500800 bytes"):
+        Segmenter.open(settings).train_ids(stripes())

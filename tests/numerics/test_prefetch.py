@@ -6,12 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from semloc_logs.numerics.prefetch import (
-    THREAD_NAME,
-    Lookahead,
-    in_callers_thread,
-    prefetched,
-)
+from semloc_logs.numerics.prefetch import THREAD_NAME, in_callers_thread, prefetched
 
 
 def test_items_come_in_their_order() -> None:
@@ -77,59 +72,3 @@ def test_items_are_made_as_they_are_taken_where_one_thread_is_wanted() -> None:
     assert set(threads) == {threading.current_thread()}
     list(prefetched(items()))
     assert threads[-1] is not threading.current_thread()
-
-
-# -- look-ahead
-
-
-def test_results_are_made_ahead_and_taken_in_order() -> None:
-    made: list[int] = []
-
-    def make(number: int) -> int:
-        made.append(number)
-        return number * number
-
-    with Lookahead(make, 10, depth=2) as ahead:
-        assert made == []
-        assert ahead.take(0) == 0
-        time.sleep(0.3)
-        assert sorted(made) == [0, 1, 2]
-        assert [ahead.take(k) for k in range(1, 10)] == [k * k for k in range(1, 10)]
-    assert sorted(made) == list(range(10))
-    assert not [t for t in threading.enumerate() if t.name.startswith(THREAD_NAME)]
-
-
-def test_two_results_are_made_at_once() -> None:
-    meeting = threading.Barrier(2)
-
-    def make(number: int) -> int:
-        meeting.wait(timeout=20)  # only if another thread comes here, too
-        return number
-
-    with Lookahead(make, 4, depth=2) as ahead:
-        assert [ahead.take(k) for k in range(4)] == [0, 1, 2, 3]
-
-
-def test_an_exception_is_raised_where_its_result_is_taken() -> None:
-    def make(number: int) -> int:
-        if number == 1:
-            raise KeyError("lost")
-        return number
-
-    with Lookahead(make, 3) as ahead:
-        assert ahead.take(0) == 0
-        with pytest.raises(KeyError, match="lost"):
-            ahead.take(1)
-        assert ahead.take(2) == 2
-
-
-def test_nothing_is_made_ahead_in_the_callers_thread() -> None:
-    threads = set()
-
-    def make(number: int) -> int:
-        threads.add(threading.current_thread())
-        return number
-
-    with in_callers_thread(), Lookahead(make, 5) as ahead:
-        assert [ahead.take(k) for k in range(5)] == list(range(5))
-    assert threads == {threading.current_thread()}

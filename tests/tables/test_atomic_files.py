@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 
 from semloc_logs.tables.atomic_files import (
+    PUBLIC,
+    PUBLIC_FOLDER,
     make_folder,
     remove_file,
     replacing_file,
@@ -87,6 +89,41 @@ def test_what_a_killed_run_left_is_removed_and_nothing_else(tmp_path: Path) -> N
         (temporary / "x").write_text("new")
     assert leftovers(tmp_path) == [".other.0badcafe.tmp"]
     assert sorted(p.name for p in tmp_path.iterdir() if p.name[0] != ".") == ["a[1]", "a[1].tmp"]
+
+
+def test_temporary_names_are_new_files_of_this_user(tmp_path: Path) -> None:
+    """In a shared folder nobody can have prepared one as a link to somewhere else."""
+    names = set()
+    for _ in range(20):
+        with replacing_file(tmp_path / "file", ".png") as temporary:
+            assert temporary.is_file()
+            assert not temporary.is_symlink()
+            assert temporary.stat().st_mode & 0o777 == 0o600
+            assert temporary.suffix == ".png"
+            names.add(temporary.name)
+        with replacing_folder(tmp_path / "folder") as folder:
+            assert folder.stat().st_mode & 0o777 == 0o700
+            names.add(folder.name)
+    assert len(names) == 40
+    assert (tmp_path / "file").stat().st_mode & 0o777 == PUBLIC
+    assert (tmp_path / "folder").stat().st_mode & 0o777 == PUBLIC_FOLDER
+
+
+def test_a_temporary_that_became_a_link_is_not_published(tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.write_text("of someone else")
+
+    def swapped() -> None:
+        with replacing_file(tmp_path / "file", mode=0o444) as temporary:
+            temporary.unlink()
+            temporary.symlink_to(other)
+
+    with pytest.raises(OSError, match="symbolic link"):
+        swapped()
+    assert not (tmp_path / "file").exists()
+    assert other.read_text() == "of someone else"
+    assert other.stat().st_mode & 0o200
+    assert not leftovers(tmp_path)
 
 
 WRITER = """

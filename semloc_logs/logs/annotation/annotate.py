@@ -45,6 +45,8 @@ from semloc_logs.logs.annotation.tail_swap import (
     swap_tail,
 )
 from semloc_logs.logs.containers.mcap_records import MAGIC
+from semloc_logs.logs.containers.memory import DEFAULT, Memory
+from semloc_logs.logs.containers.sqlite_file import side_files
 from semloc_logs.tables.atomic_files import replacing_file
 
 __all__ = [
@@ -91,7 +93,7 @@ class Results:
     The ``closures`` in which ``session`` takes part, and the ``settings`` behind them.
     ``log_times`` maps the stamp (ns) of an end in this log to the receive time (ns) of the frame
     there; ``frame_id`` is the frame of the log's pose stream, for the markers; None:
-    semloc/SESSION.
+    semloc/SESSION. ``memory``: bytes of the log that may be in memory at once.
     """
 
     closures: Sequence[ClosureRecord]
@@ -99,6 +101,7 @@ class Results:
     settings: Mapping[str, str]
     log_times: Mapping[int, int]
     frame_id: str | None = None
+    memory: int = DEFAULT
 
     def plan(self, output: Path, end: LogEnd, facts: LogFacts) -> tuple[AppendPlan, AnnotateReport]:
         """How a file that ends with ``end`` takes the results."""
@@ -136,10 +139,10 @@ def annotate_copy(
     _refuse(log, output, overwrite)
     recover(log)
     if not _is_mcap(log):
-        with opened(log) as readers, _published(output) as file:
-            write_copy(log, readers, file, LIBRARY)
+        with opened(log, results.memory) as readers, _published(output) as file:
+            write_copy(log, readers, file, LIBRARY, results.memory)
             file.flush()
-            end = read_end(file, log)
+            end = read_end(file, log, Memory(results.memory))
             plan, report = results.plan(output, end, bag_facts(log, readers))
             _finish(file, plan)
             return report
@@ -148,7 +151,7 @@ def annotate_copy(
         os.fdopen(os.dup(source), "rb") as original,
         _published(output) as file,
     ):
-        end = read_end(original, log)
+        end = read_end(original, log, Memory(results.memory))
         plan, report = results.plan(output, end, _mcap_facts(end))
         copy_start(source, file.fileno(), plan.start)
         _finish(file, plan)
@@ -172,7 +175,7 @@ def annotate_in_place(log: Path, results: Results) -> AnnotateReport:
     with locked(log) as fd:
         recover_locked(log, fd)
         with os.fdopen(os.dup(fd), "rb") as file:
-            end = read_end(file, log)
+            end = read_end(file, log, Memory(results.memory))
         plan, report = results.plan(log, end, _mcap_facts(end))
         swap_tail(log, fd, plan)
         return report
@@ -188,9 +191,9 @@ def annotate_sidecar(
     _refuse(log, output, overwrite)
     recover(log)
     if _is_mcap(log):
-        facts = _facts_for_sidecar(log)
+        facts = _facts_for_sidecar(log, Memory(results.memory))
     else:
-        with opened(log) as readers:
+        with opened(log, results.memory) as readers:
             facts = bag_facts(log, readers)
     start, end = empty_end(facts.profile, LIBRARY)
     with _published(output) as file:
@@ -214,7 +217,10 @@ def content_fingerprint(log: Path) -> str:
         for path in sorted(
             p
             for p in folder.rglob("*")
-            if p.is_file() and not p.name.startswith(".") and SIDE_SUFFIX not in p.name
+            if p.is_file()
+            and not p.name.startswith(".")
+            and SIDE_SUFFIX not in p.name
+            and not p.name.endswith("-shm")  # the index of a -wal file, with its locks
         ):
             digest.update(bytes.fromhex(_file_fingerprint(path)))
         return digest.hexdigest()
@@ -227,7 +233,11 @@ def content_fingerprint(log: Path) -> str:
 def _file_fingerprint(path: Path) -> str:
     stop = (content_end(path) if _is_mcap(path) else None) or path.stat().st_size
     with path.open("rb") as file:
-        return str(hash_range(file, 0, stop).hexdigest())
+        digest = hash_range(file, 0, stop)
+    for side in side_files(path):
+        with side.open("rb") as file:
+            digest.update(hash_range(file, 0, side.stat().st_size).digest())
+    return str(digest.hexdigest())
 
 
 def _mcap_facts(end: LogEnd) -> LogFacts:
@@ -255,11 +265,11 @@ def _mcap_facts(end: LogEnd) -> LogFacts:
     )
 
 
-def _facts_for_sidecar(log: Path) -> LogFacts:
+def _facts_for_sidecar(log: Path, memory: Memory) -> LogFacts:
     with log.open("rb") as original:
         header = read_header(original, log)
         try:
-            return _mcap_facts(read_end(original, log))
+            return _mcap_facts(read_end(original, log, memory))
         except LogError:  # a log that is cut off has its profile at least
             return _mcap_facts(empty_end(header.profile, LIBRARY)[1])
 

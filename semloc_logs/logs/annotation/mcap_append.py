@@ -42,6 +42,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.annotation.channels import RUN_KEY, NewChannel, NewMessage
 from semloc_logs.logs.containers.mcap_records import HEAD, MAGIC, Record, parse, raw, spans
 from semloc_logs.logs.containers.mcap_scan import SUMMARY_ORDER, Summary, scan
+from semloc_logs.logs.containers.memory import Memory
 
 METADATA_PREFIX = "semloc/"
 CHUNK_SIZE = 1 << 20  # bytes of a chunk before compression
@@ -114,21 +115,23 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     return header
 
 
-def read_end(file: BinaryIO, path: Path) -> LogEnd:
-    """The end of an MCAP file, our own earlier records taken away.
+def read_end(file: BinaryIO, path: Path, memory: Memory | None = None) -> LogEnd:
+    """The end of an MCAP file, our own earlier records taken away, within ``memory``.
 
     A file whose summary is missing or incomplete is scanned for what it should list. Raises
     ``LogError`` when the file is cut off or damaged, or when it holds records of ours that another
     tool moved.
     """
+    memory = Memory() if memory is None else memory
     header = read_header(file, path)
-    tail = _read_tail(file, path)
+    tail = _read_tail(file, path, memory)
     own = _own_metadata(file, tail)
-    summary = _complete_summary(tail.groups, path) or scan(file, tail.data_end, path)
+    summary = _complete_summary(tail.groups, path) or scan(file, tail.data_end, path, memory)
     start = tail.data_end
     crc = tail.crc
     if own is not None:
         start, crc, summary = _without_own(own, summary, path)
+    _check(path, tail.data_end - start, start, memory)
     file.seek(start)
     old_tail = file.read(tail.data_end - start) + tail.data
     schemas = _definitions(Schema.read, summary.groups.get(Opcode.SCHEMA, ()), path, start)
@@ -196,7 +199,7 @@ def content_end(log: Path) -> int | None:
     """
     try:
         with log.open("rb") as file:
-            tail = _read_tail(file, log)
+            tail = _read_tail(file, log, Memory())
             own = _own_metadata(file, tail)
             return tail.data_end if own is None else int(own.metadata["start"])
     except LogError:
@@ -206,7 +209,7 @@ def content_end(log: Path) -> int | None:
 # -- reading
 
 
-def _read_tail(file: BinaryIO, path: Path) -> _Tail:
+def _read_tail(file: BinaryIO, path: Path, memory: Memory) -> _Tail:
     """The end of a file from DataEnd on; ``LogError`` when it is cut off or damaged."""
     size = file.seek(0, 2)
     cut = LogError(f"{path} is cut off or damaged at its end (offset {size}); {_advice(path)}")
@@ -222,6 +225,7 @@ def _read_tail(file: BinaryIO, path: Path) -> _Tail:
     if not len(MAGIC) + _DATA_END_SIZE <= summary_start <= footer_at:
         raise cut
 
+    _check(path, 2 * (footer_at - summary_start), summary_start, memory)
     before_at = max(0, summary_start - _DATA_END_SIZE - _PADDING)
     file.seek(before_at)
     data = file.read(footer_at - before_at)
@@ -236,6 +240,12 @@ def _read_tail(file: BinaryIO, path: Path) -> _Tail:
     groups = _groups(summary, cut)
     crc = int.from_bytes(record[9:13], "little")
     return _Tail(summary_start - len(record), crc, groups, record + summary + end)
+
+
+def _check(path: Path, size: int, offset: int, memory: Memory) -> None:
+    """LogError where a part of the file is too large for memory."""
+    if size > memory.most_of_one:
+        raise LogError(f"{path}: its end from offset {offset} on {memory.too_much(size)}.")
 
 
 def _groups(summary: bytes, error: LogError) -> dict[int, list[bytes]]:

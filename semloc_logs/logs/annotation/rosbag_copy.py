@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,20 +14,82 @@ from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2.metadata import dump_qos_v8
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.annotation.channels import LogFacts, is_old_marker
+from semloc_logs.logs.containers import sqlite_file
+from semloc_logs.logs.containers.base import unpack_whole
+from semloc_logs.logs.containers.memory import DEFAULT, Memory
+from semloc_logs.logs.containers.open import open_log
+from semloc_logs.logs.messages.type_names import ros2_type
 
 QOS_KEY = "offered_qos_profiles"
 
 
+class _Sqlite(Sqlite3Reader):
+    """With the messages that lie in a file beside it."""
+
+    def __init__(self, path: Any) -> None:
+        overlay = sqlite_file.overlay_of(path)
+        whole: Any = path if overlay is None else _Whole(path, overlay)
+        super().__init__(whole)
+
+
+class _Whole:
+    """A file with the pages beside it, as rosbags takes files that are not on this disk."""
+
+    def __init__(self, path: Path, overlay: sqlite_file.Overlay) -> None:
+        self._path, self._overlay = path, overlay
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+    def open(self, mode: str) -> _WholeFile:
+        return _WholeFile(sqlite_file.OverlaidFile(self._path, self._overlay))
+
+    def stat(self) -> os.stat_result:
+        status = list(self._path.stat())
+        status[stat.ST_SIZE] = self._overlay.page_count * self._overlay.page_size
+        return os.stat_result(status)
+
+
+class _WholeFile:
+    def __init__(self, file: sqlite_file.OverlaidFile) -> None:
+        self._file = file
+        self._position = 0
+
+    def seek(self, offset: int) -> None:
+        self._position = offset
+
+    def read(self, size: int) -> bytes:
+        return self._file.xRead(size, self._position)
+
+    def close(self) -> None:
+        self._file.xClose()
+
+
+class _Folder(DirectoryReader):
+    def __init__(self, path: Any) -> None:
+        super().__init__(path)
+        self.STORAGE_PLUGINS = {**DirectoryReader.STORAGE_PLUGINS, "sqlite3": _Sqlite}
+
+
+class _Ros2(Reader2):
+    def __init__(self, path: Path) -> None:
+        self.STORAGE_PLUGINS = {**Reader2.STORAGE_PLUGINS, "dir": _Folder, ".db3": _Sqlite}
+        super().__init__(path)
+
+
 @contextlib.contextmanager
-def opened(log: Path) -> Iterator[Sequence[Any]]:
+def opened(log: Path, memory: int = DEFAULT) -> Iterator[Sequence[Any]]:
     """Open rosbags readers of a .bag, a .db3, or a ROS 2 bag folder.
 
     Of a folder without metadata.yaml: readers of the .db3 or .mcap files in it.
     """
+    open_log(log, memory).close()  # a log that is too large for memory ends here
     with contextlib.ExitStack() as stack:
         with _told(log):
             readers = [stack.enter_context(r) for r in _readers(log)]
@@ -63,16 +127,20 @@ def bag_facts(log: Path, readers: Sequence[Any]) -> LogFacts:
     )
 
 
-def write_copy(log: Path, readers: Sequence[Any], file: BinaryIO, library: str) -> int:
+def write_copy(
+    log: Path, readers: Sequence[Any], file: BinaryIO, library: str, memory: int = DEFAULT
+) -> int:
     """Write every message of an open bag as it is to an MCAP file; returns their number.
 
-    Raises ``LogError`` when fewer messages come out than the bag counts.
+    At most ``memory`` bytes of the bag are in memory at once. Raises ``LogError`` when fewer
+    messages come out than the bag counts.
     """
     ros1 = isinstance(readers[0], Reader1)
     writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start("ros1" if ros1 else "ros2", library)
     schemas: dict[tuple[str, str, str], int] = {}
     written = 0
+    by_kind: dict[tuple[str, str, str], int] = {}
     for reader in readers:
         channels: dict[int, int] = {}
         for connection in reader.connections:
@@ -83,9 +151,15 @@ def write_copy(log: Path, readers: Sequence[Any], file: BinaryIO, library: str) 
             channels[connection.id] = writer.register_channel(
                 connection.topic, encoding, schemas[schema], metadata
             )
-        for connection, time, data in _guarded(log, reader):
-            writer.add_message(channels[connection.id], max(0, time), bytes(data), max(0, time))
-            written += 1
+            if not ros1:
+                kind = (connection.topic, ros2_type(connection.msgtype), encoding)
+                by_kind.setdefault(kind, channels[connection.id])
+        if ros1:
+            for connection, time, data in _guarded(log, reader, Memory(memory)):
+                writer.add_message(channels[connection.id], max(0, time), bytes(data), max(0, time))
+                written += 1
+    if not ros1:
+        written = _copy_messages(log, memory, by_kind, writer)
     expected = sum(r.message_count for r in readers)
     if written != expected:
         raise LogError(
@@ -101,20 +175,42 @@ def _readers(log: Path) -> list[Any]:
         return [Reader1(log)]
     folder = log.parent if log.name == "metadata.yaml" else log
     if not folder.is_dir():
-        return [Reader2(log)]
+        return [_Ros2(log)]
     if (folder / "metadata.yaml").exists():
-        return [Reader2(folder)]
+        return [_Ros2(folder)]
     files = sorted(f for f in folder.iterdir() if f.suffix in (".db3", ".mcap"))
     if not files:
         raise LogError(
             f"{folder} holds no ROS 2 bag: neither metadata.yaml nor .db3 or .mcap files; "
             "give the folder of a bag."
         )
-    return [Reader2(f) for f in files]
+    return [_Ros2(f) for f in files]
 
 
-def _guarded(log: Path, reader: Any) -> Iterator[tuple[Any, int, bytes]]:
-    """The messages of a reader, with one kind of error; errors of their writer pass by."""
+def _copy_messages(
+    log: Path, memory: int, channels: dict[tuple[str, str, str], int], writer: Writer
+) -> int:
+    """Writes the messages of a ROS 2 bag, whose topics have one channel each; their number."""
+    written = 0
+    with contextlib.closing(open_log(log, memory)) as source:
+        for message in source.messages():
+            channel = channels.get((message.topic, message.type, message.encoding))
+            if channel is not None:
+                time = max(0, message.log_time_ns)
+                writer.add_message(channel, time, bytes(message.data), time)
+                written += 1
+    return written
+
+
+def _guarded(log: Path, reader: Any, memory: Memory) -> Iterator[tuple[Any, int, bytes]]:
+    """The messages of a ROS 1 reader, with one kind of error; errors of their writer pass by."""
+
+    def bounded(data: bytes) -> bytes:
+        return bytes(unpack_whole(data, memory))
+
+    reader.chunks = {
+        at: chunk._replace(decompressor=bounded) for at, chunk in reader.chunks.items()
+    }
     with _told(log):
         messages = reader.messages(reader.connections) if reader.connections else iter(())
     while True:

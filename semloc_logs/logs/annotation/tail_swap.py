@@ -8,6 +8,7 @@ the saved tail of an interrupted run and puts it back, or finds that the new tai
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import struct
@@ -176,12 +177,12 @@ def _save(side: Path, saved: _Saved) -> None:
     sizes = (saved.offset, saved.old_size, saved.new_size)
     fields = _FIELDS.pack(*sizes, saved.guard, saved.new_digest, digest)
     with replacing_file(side, mode=0o600) as temporary:
-        temporary.touch(0o600)  # private from the start: it holds what the log holds
+        # private from the start: it holds what the log holds
         temporary.write_bytes(_MAGIC + fields + saved.old_tail)
 
 
-def _load(side: Path) -> _Saved:
-    data = side.read_bytes()
+def _load(side: Path, fd: int) -> _Saved:
+    data = _own_bytes(side, fd)
     head = len(_MAGIC) + _FIELDS.size
     if len(data) >= head and data.startswith(_MAGIC):
         offset, old_size, new_size, guard, new_digest, digest = _FIELDS.unpack(
@@ -196,9 +197,27 @@ def _load(side: Path) -> _Saved:
     )
 
 
+def _own_bytes(side: Path, fd: int) -> bytes:
+    """The content of ``side``; LogError unless it is a file of the log's owner or of this user.
+
+    Anyone may write beside a log in a shared folder, and the content is written into the log.
+    """
+    try:
+        file = os.open(side, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise LogError(f"{side} is a symbolic link, so it was not used; delete it.") from None
+    with os.fdopen(file, "rb") as opened:
+        owner = os.fstat(file).st_uid
+        if owner not in (os.fstat(fd).st_uid, os.geteuid()):
+            raise LogError(f"{side} is a file of another user, so it was not used; delete it.")
+        return opened.read()
+
+
 def _repair(path: Path, fd: int, side: Path) -> None:
     """Keep a finished new tail, else put the saved one back; then drop the saved one."""
-    saved = _load(side)
+    saved = _load(side, fd)
     size = os.fstat(fd).st_size
     fits = saved.offset <= size <= max(saved.old_size, saved.new_size)
     if not fits or _guard(fd, saved.offset) != saved.guard:

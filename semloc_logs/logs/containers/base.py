@@ -9,20 +9,22 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heappop, heappush, heapreplace
 from pathlib import Path
-from typing import BinaryIO, Protocol, TypeVar
+from typing import BinaryIO, Protocol
 
 import lz4.frame
 import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Frame
+from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.log import Log, Message, Reading, Section, Stream
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.messages.topic_clocks import TopicClocks
 from semloc_logs.logs.problems import Problem, Problems
 
-# no recorder writes chunks of 2 GiB; a larger claim is damage or a decompression bomb
-MAX_CHUNK = 2 << 30
+Bytes = bytes | bytearray | memoryview
+# a message, or in its place the log time of one that is read when its turn has come
+MessageOrTime = Message | int
 _STEP = 1 << 22
 _PLAUSIBLE_GROWTH = 64  # point clouds and pictures shrink by less
 
@@ -30,7 +32,13 @@ _PLAUSIBLE_GROWTH = 64  # point clouds and pictures shrink by less
 class BaseLog(ABC):
     """The parts of :class:`~semloc_logs.logs.log.Log` that do not depend on the container."""
 
-    def __init__(self, path: Path, format: str, problems: Problems | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        format: str,
+        problems: Problems | None = None,
+        memory: Memory | None = None,
+    ) -> None:
         self.path = path
         self.format = format
         self.encoding = ""
@@ -38,6 +46,7 @@ class BaseLog(ABC):
         self.end_ns: int | None = None
         self.streams: list[Stream] = []
         self._problems = Problems() if problems is None else problems
+        self._memory = Memory() if memory is None else memory
         self._decoder = Decoder(self._problems)
 
     @property
@@ -125,47 +134,58 @@ def merged_streams(logs: Sequence[Log]) -> list[Stream]:
 
 
 def in_log_time_order(
-    parts: Iterable[tuple[int, Callable[[], Iterator[Message]]]],
+    parts: Iterable[tuple[int, Callable[[], Iterator[MessageOrTime]]]],
 ) -> Iterator[Message]:
     """Merges parts: each a lower bound of its log times and a function that opens it.
 
     Each part is in log-time order by itself. It is opened when its time has come, so memory holds
-    only parts that overlap; equal times keep the order of the parts.
+    only parts that overlap; equal times keep the order of the parts. A part that yields the time of
+    its next message is resumed when that time has come, and reads the message then.
     """
     waiting = sorted(
         ((start, k, part) for k, (start, part) in enumerate(parts)),
         key=lambda w: w[:2],
         reverse=True,
     )
-    heap: list[tuple[int, int, Message, Iterator[Message]]] = []
+    heap: list[tuple[int, int, MessageOrTime | None, Iterator[MessageOrTime]]] = []
 
     def open_due() -> None:
         while waiting and (not heap or waiting[-1][0] <= heap[0][0]):
             _, order, part = waiting.pop()
             opened = iter(part())
             if (first := next(opened, None)) is not None:
-                heappush(heap, (first.log_time_ns, order, first, opened))
+                heappush(heap, (_time(first), order, first, opened))
 
     while waiting or heap:
         open_due()
         if not heap:
             continue
-        _, order, message, opened = heap[0]
-        yield message
+        time, order, item, opened = heap[0]
+        heap[0] = (time, order, None, opened)  # a message may keep much memory alive
+        if isinstance(item, Message):
+            yield item
+        item = None
         # nearly always: parts rarely overlap, so run through this one until the next is due
         if len(heap) == 1:
             due = waiting[-1][0] if waiting else None
-            for message in opened:
-                if due is not None and message.log_time_ns >= due:
-                    heap[0] = (message.log_time_ns, order, message, opened)
+            for following in opened:
+                if due is not None and (time := _time(following)) >= due:
+                    heap[0] = (time, order, following, opened)
                     break
-                yield message
+                if following.__class__ is not int:
+                    yield following  # type: ignore[misc]  # a message
+                del following
             else:
                 heappop(heap)
-        elif (following := next(opened, None)) is not None:
-            heapreplace(heap, (following.log_time_ns, order, following, opened))
+        elif (following_ := next(opened, None)) is not None:
+            heapreplace(heap, (_time(following_), order, following_, opened))
+            following_ = None
         else:
             heappop(heap)
+
+
+def _time(item: MessageOrTime) -> int:
+    return item if isinstance(item, int) else item.log_time_ns
 
 
 def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> bytes:
@@ -181,21 +201,16 @@ def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> byt
     return data
 
 
-Bytes = TypeVar("Bytes", bytes, memoryview)
-
-
-def decompress(data: Bytes, compression: str, size: int) -> Bytes | bytes:
+def decompress(data: Bytes, compression: str, size: int, memory: Memory) -> Bytes:
     """The ``size`` bytes that ``data`` holds; ``data`` itself where it is not compressed.
 
-    LogError for another size, a claim beyond reason or damaged data.
+    LogError for another size, a claim beyond ``memory`` or damaged data.
     """
-    unpacked: Bytes | bytes
+    memory.check(max(size, len(data)))
     if compression in ("", "none"):
         unpacked = data
     elif compression not in ("zstd", "lz4", "bz2"):
         raise LogError(f"the compression {compression[:40]!r} is unknown")
-    elif size > MAX_CHUNK:
-        raise LogError(f"a chunk claims {size} bytes, more than {MAX_CHUNK}")
     else:
         try:
             unpacked = _unpack(data, compression, size)
@@ -213,7 +228,20 @@ def decompress(data: Bytes, compression: str, size: int) -> Bytes | bytes:
     return unpacked
 
 
-def _unpack(data: bytes | memoryview, compression: str, size: int) -> bytes:
+def unpack_whole(data: bytes, memory: Memory) -> Bytes:
+    """What ``data``, as a ROS 1 bag compresses its chunks, hold, whatever size is claimed."""
+    most = memory.most_of_one
+    if data.startswith(b"BZh"):
+        unpacked: Bytes = _gather(_feed(bz2.BZ2Decompressor(), data), most)
+    elif data.startswith(b"\x04\x22\x4d\x18"):
+        unpacked = _gather(_feed(lz4.frame.LZ4FrameDecompressor(), data), most)
+    else:
+        unpacked = data
+    memory.check(len(unpacked))
+    return unpacked
+
+
+def _unpack(data: Bytes, compression: str, size: int) -> bytes | bytearray:
     """Decompresses plausible sizes at once, and claims to grow by more than that in steps."""
     plausible = size <= max(_PLAUSIBLE_GROWTH * len(data), _STEP)
     if compression == "zstd":
@@ -232,12 +260,12 @@ class _Engine(Protocol):
     @property
     def eof(self) -> bool: ...
 
-    def decompress(self, data: bytes | memoryview, max_length: int = -1) -> bytes: ...
+    def decompress(self, data: Bytes, max_length: int = -1) -> bytes: ...
 
 
-def _feed(engine: _Engine, data: bytes | memoryview) -> Callable[[int], bytes]:
+def _feed(engine: _Engine, data: Bytes) -> Callable[[int], bytes]:
     """A function that reads at most so many decompressed bytes of ``data``."""
-    rest: list[bytes | memoryview] = [data]
+    rest = [data]
 
     def read(size: int) -> bytes:
         if engine.eof:
@@ -247,11 +275,16 @@ def _feed(engine: _Engine, data: bytes | memoryview) -> Callable[[int], bytes]:
     return read
 
 
-def _gather(read: Callable[[int], bytes], size: int) -> bytes:
-    """At most ``size + 1`` bytes: one too many shows that the claim was too small."""
-    pieces = []
-    have = 0
-    while have <= size and (piece := read(min(_STEP, size + 1 - have))):
-        pieces.append(piece)
-        have += len(piece)
-    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+def _gather(read: Callable[[int], bytes], size: int) -> bytes | bytearray:
+    """At most ``size + 1`` bytes: one too many shows that the claim was too small.
+
+    They grow in place, so that memory never holds them twice.
+    """
+    first = read(min(_STEP, size + 1))
+    if len(first) > size or not (piece := read(min(_STEP, size + 1 - len(first)))):
+        return first
+    gathered = bytearray(first)
+    while piece:
+        gathered += piece
+        piece = read(min(_STEP, size + 1 - len(gathered))) if len(gathered) <= size else b""
+    return gathered

@@ -1,11 +1,10 @@
 """MCAP files: by their index where it can be trusted, else by walking over all records.
 
-Memory holds overlapping chunks only.
+Memory holds overlapping chunks only, within its limit.
 """
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from collections import Counter
@@ -20,14 +19,17 @@ from mcap.records import Channel, Header, Schema, Statistics
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import (
     BaseLog,
+    Bytes,
+    MessageOrTime,
     closed_on_error,
     encoding_of,
     in_log_time_order,
     open_file,
     read_exactly,
 )
-from semloc_logs.logs.containers.buffers import Buffers
+from semloc_logs.logs.containers.chunks import Chunk, Index, Kind, chunk_messages, new_index
 from semloc_logs.logs.containers.mcap_records import (
+    CHUNK_HEAD,
     HEAD,
     MAGIC,
     MESSAGE,
@@ -35,20 +37,20 @@ from semloc_logs.logs.containers.mcap_records import (
     IndexedChunk,
     chunk_head,
     chunk_records,
+    claimed_size,
     indexed_chunk,
     parse,
     spans,
-    unpack_chunk_into,
     walk,
 )
+from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
 from semloc_logs.logs.problems import Problems
-from semloc_logs.numerics.prefetch import Lookahead
 
 _FOOTER = struct.Struct("<BQQQI")
-_AHEAD_BYTES = 16 << 20  # larger chunks are not unpacked ahead of their turn
 _LOOSE = 1 << 22  # messages outside chunks are read in runs of about this many bytes
+_CHANNEL_BYTES = 16  # in memory for a byte of a channel's record: its metadata are many short texts
 
 
 class Part(NamedTuple):
@@ -65,14 +67,21 @@ class Part(NamedTuple):
 class McapLog(BaseLog):
     """An MCAP file of any profile. LogError unless it starts as one."""
 
-    def __init__(self, path: Path, name: str = "", problems: Problems | None = None) -> None:
-        super().__init__(path, "mcap", problems)
+    def __init__(
+        self,
+        path: Path,
+        name: str = "",
+        problems: Problems | None = None,
+        memory: Memory | None = None,
+    ) -> None:
+        super().__init__(path, "mcap", problems, memory)
         self._name = name or path.name
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._kinds: dict[int, tuple[str, str, str, Definition]] = {}
         self._publishers: dict[int, str] = {}  # of channels that share their topic
         self._parts: list[Part] = []
+        self._definition_bytes = 0
         self._file = open_file(path)
         with closed_on_error(self._file, path):
             self._size = self._file.seek(0, 2)
@@ -84,30 +93,12 @@ class McapLog(BaseLog):
         A damaged chunk is skipped and named in ``problems``.
         """
         wanted = None if topics is None else frozenset(topics)
-        # in the order in which they are opened
-        parts = sorted(
-            (
-                p
-                for p in self._parts
-                if wanted is None
-                or not p.channels
-                or any(self._topic(c) in wanted for c in p.channels)
-            ),
-            key=lambda p: p.start_ns,
+        parts = (
+            p
+            for p in self._parts
+            if wanted is None or not p.channels or any(self._topic(c) in wanted for c in p.channels)
         )
-        buffers = Buffers()
-        unpack = partial(_unpacked_ahead, self._file.fileno(), buffers)
-
-        def load(ahead: Lookahead[_Unpacked | None], number: int, part: Part) -> Iterator[Message]:
-            unpacked = ahead.take(number)
-            yield from self._load(part, wanted, unpacked and unpacked.data)
-            if unpacked is not None:
-                buffers.give(unpacked.buffer)
-
-        with Lookahead(lambda k: unpack(parts[k]), len(parts)) as ahead:
-            yield from in_log_time_order(
-                (part.start_ns, partial(load, ahead, k, part)) for k, part in enumerate(parts)
-            )
+        return in_log_time_order((p.start_ns, partial(self._load, p, wanted)) for p in parts)
 
     def sections(self) -> list[Section]:
         """The chunks and runs of messages outside chunks, by their first log time."""
@@ -169,6 +160,13 @@ class McapLog(BaseLog):
             or not len(MAGIC) <= summary_start <= footer_at
         ):
             return None  # not closed, truncated, or closed without a summary (0)
+        if footer_at - summary_start > self._memory.most_of_definitions:
+            self._problems.add(
+                f"{self._name}: the index at byte {summary_start} has {footer_at - summary_start} "
+                "bytes, too many for logs.memory, so the whole file was walked.",
+                lost=False,
+            )
+            return None
         summary = read_exactly(self._file, summary_start, footer_at - summary_start, self._size)
         if crc and zlib.crc32(tail[: _FOOTER.size - 4], zlib.crc32(summary)) != crc:
             self._problems.add(
@@ -216,12 +214,15 @@ class McapLog(BaseLog):
         """Statistics and chunk indexes; learns of schemas and channels on the way."""
         statistics: Statistics | None = None
         indexes: list[IndexedChunk] = []
+        known_sets: dict[frozenset[int], frozenset[int]] = {}  # most chunks have the same channels
         for opcode, start, end in spans(summary):
             body = summary[start:end]
             if opcode == Opcode.STATISTICS:
                 statistics = parse(Statistics.read, body)
             elif opcode == Opcode.CHUNK_INDEX:
-                indexes.append(indexed_chunk(body))
+                chunk = indexed_chunk(body)
+                channels = known_sets.setdefault(chunk.channels, chunk.channels)
+                indexes.append(chunk._replace(channels=channels))
             else:
                 self._define(opcode, body)
         return statistics, indexes
@@ -244,7 +245,7 @@ class McapLog(BaseLog):
                     self._scan_loose(offset, size, loose, counts)
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                     body_size = size - HEAD.size
-                    body = read_exactly(self._file, offset + HEAD.size, body_size, self._size)
+                    body = self._read(offset + HEAD.size, body_size)
                     self._define(opcode, body)
             except LogError as error:
                 self._problems.add(
@@ -271,12 +272,15 @@ class McapLog(BaseLog):
         return counts
 
     def _scan_chunk(self, offset: int, size: int, counts: Counter[int]) -> None:
-        found = self._walk(self._unpack_chunk(offset, size), offset)
-        if found:
-            times = [f[0] for f in found]
-            channels = frozenset(f[1] for f in found)
-            counts.update(f[1] for f in found if f[1] in self._channels)
-            self._parts.append(Part(offset, size, min(times), max(times), channels, True))
+        data = self._unpack_chunk(offset, size)
+        found = new_index(len(data), self._memory)
+        self._walk(offset, data, found)
+        if len(found):
+            start_ns = min(entry[0] for entry in found)
+            end_ns = max(entry[0] for entry in found)
+            by_channel = Counter(entry[1] for entry in found)
+            counts.update({c: n for c, n in by_channel.items() if c in self._channels})
+            self._parts.append(Part(offset, size, start_ns, end_ns, frozenset(by_channel), True))
 
     def _scan_loose(self, offset: int, size: int, loose: list[Part], counts: Counter[int]) -> None:
         _, _, channel, _, log_time, _ = MESSAGE.unpack(
@@ -296,82 +300,97 @@ class McapLog(BaseLog):
     # -- reading
 
     def _load_topics(self, part: Part, topics: Collection[str] | None) -> Iterator[Message]:
-        return self._load(part, None if topics is None else frozenset(topics))
+        wanted = None if topics is None else frozenset(topics)
+        return in_log_time_order([(part.start_ns, partial(self._load, part, wanted))])
 
-    def _load(
-        self, part: Part, wanted: frozenset[str] | None, unpacked: memoryview | None = None
-    ) -> Iterator[Message]:
-        """The messages of one part in log-time order; its bytes live as long as this iterator.
-
-        ``unpacked``: the records of the part, where a thread has made them.
-        """
+    def _load(self, part: Part, wanted: frozenset[str] | None) -> Iterator[MessageOrTime]:
+        """The messages of one part in log-time order."""
+        whole = self._unpack_chunk if part.chunk else self._read
+        chunk = Chunk(
+            start_ns=part.start_ns,
+            claimed_size=partial(self._claimed_size, part),
+            unpack=partial(whole, part.offset, part.size),
+            walk=partial(self._walk, part.offset),
+            kind=partial(self._wanted_kind, wanted),
+        )
         try:
-            data: bytes | memoryview
-            if unpacked is not None:
-                data = unpacked
-            elif part.chunk:
-                data = self._unpack_chunk(part.offset, part.size)
-            else:
-                data = read_exactly(self._file, part.offset, part.size, self._size)
+            yield from chunk_messages(chunk, self._memory)
         except (LogError, OSError) as error:
+            what = "chunk" if part.chunk else "record"
             self._problems.add(
-                f"{self._name}: the chunk at byte {part.offset} was skipped: {error}."
+                f"{self._name}: the {what} at byte {part.offset} was skipped: {error}."
             )
-            return
-        view = memoryview(data)
-        publishers = self._publishers
-        found = self._walk(data, part.offset)
-        found.sort(key=lambda f: f[0])  # stable, and nearly free for sorted input
-        for log_time, channel, start, end in found:
-            if channel not in self._channels:
-                self._problems.add(
-                    f"{self._name}: messages of channel {channel} were skipped: "
-                    "the file does not say what it is."
-                )
-                continue
-            topic, type_, encoding, definition = self._kind(channel)
-            if wanted is None or topic in wanted:
-                publisher = publishers.get(channel, "")
-                yield Message(
-                    topic, type_, encoding, log_time, view[start:end], definition, publisher
-                )
 
-    def _unpack_chunk(self, offset: int, size: int) -> bytes | memoryview:
-        record = read_exactly(self._file, offset, size, self._size)
-        return chunk_records(record, chunk_head(record))
+    def _wanted_kind(self, wanted: frozenset[str] | None, channel: int) -> Kind | None:
+        if channel not in self._channels:
+            self._problems.add(
+                f"{self._name}: messages of channel {channel} were skipped: "
+                "the file does not say what it is."
+            )
+            return None
+        topic, type_, encoding, definition = self._kind(channel)
+        if wanted is not None and topic not in wanted:
+            return None
+        return Kind(topic, type_, encoding, definition, self._publishers.get(channel, ""))
 
-    def _walk(self, data: bytes | memoryview, offset: int) -> list[tuple[int, int, int, int]]:
-        """(log time, channel, start, end) of the messages in ``data``.
+    def _read(self, offset: int, size: int) -> bytes:
+        self._memory.check(size)
+        return read_exactly(self._file, offset, size, self._size)
+
+    def _claimed_size(self, part: Part) -> int:
+        """Bytes of a part in memory."""
+        if not part.chunk:
+            return part.size
+        return claimed_size(self._read(part.offset, min(part.size, CHUNK_HEAD)))
+
+    def _unpack_chunk(self, offset: int, size: int) -> Bytes:
+        record = self._read(offset, size)
+        return chunk_records(record, chunk_head(record), self._memory)
+
+    def _walk(self, offset: int, data: Bytes, found: Index) -> None:
+        """Puts (log time, channel, start, end) of the messages in ``data`` into ``found``.
 
         Learns of schemas and channels on the way.
         """
-        found = []
         unpack = MESSAGE.unpack_from
         record_size = HEAD.size
         message = int(Opcode.MESSAGE)
+        append = found.append
         try:
             for opcode, start, end in spans(data):
                 if opcode == message:
                     if end - start < MESSAGE_BODY:
                         raise LogError(f"a message has {end - start} bytes")
                     _, _, channel, _, log_time, _ = unpack(data, start - record_size)
-                    found.append((log_time, channel, start + MESSAGE_BODY, end))
+                    append((log_time, channel, start + MESSAGE_BODY, end))
                 else:
-                    self._define(opcode, data[start:end])
+                    self._define(opcode, bytes(data[start:end]))
         except LogError as error:
             self._problems.add(
                 f"{self._name}: the chunk at byte {offset} is damaged inside: {error}; "
                 f"{len(found)} messages of it are used."
             )
-        return found
 
-    def _define(self, opcode: int, body: bytes | memoryview) -> None:
+    def _define(self, opcode: int, body: bytes) -> None:
         if opcode == Opcode.SCHEMA:
             schema = parse(Schema.read, body)
-            self._schemas.setdefault(schema.id, schema)
+            if schema.id not in self._schemas:
+                self._count_definition(len(body))
+                self._schemas[schema.id] = schema
         elif opcode == Opcode.CHANNEL:
+            self._memory.check(_CHANNEL_BYTES * len(body))
             channel = parse(Channel.read, body)
-            self._channels.setdefault(channel.id, channel)
+            if channel.id not in self._channels:
+                self._count_definition(_CHANNEL_BYTES * len(body))
+                self._channels[channel.id] = channel
+
+    def _count_definition(self, size: int) -> None:
+        """LogError where the schemas and channels take too much memory."""
+        if self._definition_bytes + size > self._memory.most_of_definitions:
+            raise LogError(
+                f"its schemas and channels take more than {self._memory.most_of_definitions} bytes"
+            )
+        self._definition_bytes += size
 
     def _shared_channels(self) -> dict[int, str]:
         """The node, or else the number, of each channel whose stream has several."""
@@ -407,37 +426,3 @@ class McapLog(BaseLog):
                 return c.topic, type_, c.message_encoding, definition  # its schema may still come
             self._kinds[channel] = (c.topic, type_, c.message_encoding, definition)
         return self._kinds[channel]
-
-
-class _Unpacked(NamedTuple):
-    """The records of a chunk, and the memory that they lie in."""
-
-    data: memoryview
-    buffer: bytearray
-
-
-def _unpacked_ahead(descriptor: int, buffers: Buffers, part: Part) -> _Unpacked | None:
-    """The records of a chunk of usual size; None for all others, and where anything is wrong.
-
-    Then the chunk is read again when its turn has come, and the fault is named. Positioned reads
-    leave the position of the file alone, and a file that is cut off while it is read gives an
-    error, where a memory map would end the program.
-    """
-    if not part.chunk or not 0 < part.size <= _AHEAD_BYTES:
-        return None
-    packed = buffers.take(part.size)
-    record = memoryview(packed)[: part.size]
-    try:
-        if os.preadv(descriptor, [record], part.offset) != part.size:
-            return None
-        head = chunk_head(record)
-        if head.compression != "zstd" or head.unpacked_size > _AHEAD_BYTES:
-            return None
-        buffer = buffers.take(head.unpacked_size)
-        data = memoryview(buffer)[: head.unpacked_size]
-        if not unpack_chunk_into(data, record, head):
-            return None
-    except (LogError, OSError, OverflowError):
-        return None
-    buffers.give(packed)
-    return _Unpacked(data.toreadonly(), buffer)

@@ -11,20 +11,21 @@ from collections.abc import Callable, Iterator
 from io import BytesIO
 from typing import NamedTuple, TypeVar
 
-import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.containers.base import SizedFile, decompress, read_exactly
+from semloc_logs.logs.containers.base import Bytes, SizedFile, decompress, read_exactly
+from semloc_logs.logs.containers.memory import Memory
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # of a record: opcode, length of its body
 MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish time
 MESSAGE_BODY = MESSAGE.size - HEAD.size  # bytes of a message's body before its data
 _CHUNK = struct.Struct("<BQQQQII")  # head, times, size and CRC unpacked, length of the compression
+CHUNK_HEAD = _CHUNK.size  # bytes at the start of a chunk record that state its sizes
 _DATA_LENGTH = struct.Struct("<Q")
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # times, offset, size, bytes of the message indexes' offsets
 _INDEX_OFFSET = struct.Struct("<HQ")  # channel, offset of its message index
@@ -60,7 +61,7 @@ def raw(record: McapRecord) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def parse(read: Callable[[ReadDataStream], Record], body: bytes | memoryview) -> Record:
+def parse(read: Callable[[ReadDataStream], Record], body: bytes) -> Record:
     """A record from its body; ``LogError`` when the bytes make no sense."""
     try:
         return read(ReadDataStream(BytesIO(body)))
@@ -69,7 +70,7 @@ def parse(read: Callable[[ReadDataStream], Record], body: bytes | memoryview) ->
         raise LogError(f"a record cannot be parsed ({reason})") from error
 
 
-def spans(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
+def spans(data: Bytes) -> Iterator[tuple[int, int, int]]:
     """(opcode, start of the body, end of the body) of the records in ``data``, in their order.
 
     ``LogError`` where they stop to fit.
@@ -118,11 +119,18 @@ def indexed_chunk(body: bytes) -> IndexedChunk:
     return IndexedChunk(offset, size, start_ns, end_ns, channels)
 
 
-def chunk_head(record: bytes | memoryview) -> ChunkHead:
+def claimed_size(head: bytes) -> int:
+    """The size that a chunk record claims for its records, from its first bytes."""
+    if len(head) < CHUNK_HEAD:
+        raise LogError("its head is cut off")
+    return int(_CHUNK.unpack_from(head)[4])
+
+
+def chunk_head(record: bytes) -> ChunkHead:
     """The claims of a whole chunk record; ``LogError`` when they do not fit the record."""
     try:
         opcode, length, start_ns, end_ns, size, crc, name_length = _CHUNK.unpack_from(record)
-        compression = str(record[_CHUNK.size : _CHUNK.size + name_length], "utf-8")
+        compression = record[_CHUNK.size : _CHUNK.size + name_length].decode()
         (data_length,) = _DATA_LENGTH.unpack_from(record, _CHUNK.size + name_length)
     except (struct.error, UnicodeDecodeError) as error:
         raise LogError(f"its head is damaged ({error})") from error
@@ -135,25 +143,15 @@ def chunk_head(record: bytes | memoryview) -> ChunkHead:
     return ChunkHead(start_ns, end_ns, size, crc, compression, data)
 
 
-def chunk_records(record: bytes, head: ChunkHead) -> bytes | memoryview:
+def chunk_records(record: bytes, head: ChunkHead, memory: Memory) -> Bytes:
     """The records in a chunk; memory grows with the data, not with the claimed size.
 
     An uncompressed chunk is not copied: the result is a view of ``record``.
     """
-    data = decompress(memoryview(record)[head.data], head.compression, head.unpacked_size)
-    if head.crc and zlib.crc32(data) != head.crc:
+    data = memoryview(record)[head.data]
+    if head.data.stop != len(record):
+        data = memoryview(bytes(data))  # a view would keep the rest of the record in memory
+    unpacked = decompress(data, head.compression, head.unpacked_size, memory)
+    if head.crc and zlib.crc32(unpacked) != head.crc:
         raise LogError("its checksum does not match its data")
-    return data
-
-
-def unpack_chunk_into(out: memoryview, record: memoryview, head: ChunkHead) -> bool:
-    """Fills ``out`` with the records of a zstd chunk; False where they are not as claimed."""
-    reader = zstandard.ZstdDecompressor().stream_reader(record[head.data], read_across_frames=True)
-    filled = 0
-    try:
-        while filled < len(out) and (count := reader.readinto(out[filled:])):
-            filled += count
-        is_whole = filled == len(out) and not reader.read(1)
-    except (zstandard.ZstdError, MemoryError):
-        return False
-    return is_whole and (not head.crc or zlib.crc32(out) == head.crc)
+    return unpacked

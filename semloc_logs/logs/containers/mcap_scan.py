@@ -24,6 +24,7 @@ from semloc_logs.logs.containers.mcap_records import (
     spans,
     walk,
 )
+from semloc_logs.logs.containers.memory import Memory
 
 MAX_NAMES = 1 << 16  # bytes at the start of attachments and metadata in which their names lie
 SUMMARY_ORDER = (
@@ -45,8 +46,14 @@ class Summary:
     loose_messages: int
 
 
+_ENTRY_BYTES = 100  # in memory for an entry of a record that is kept
+_RECORD_BYTES = 1000  # and for the record
+
+
 @dataclass(slots=True)
 class _Found:
+    memory: Memory
+    kept: int = 0  # bytes
     schemas: dict[int, bytes] = field(default_factory=dict)
     channels: dict[int, bytes] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
@@ -57,11 +64,22 @@ class _Found:
     end_ns: int = 0
     loose: int = 0
 
+    def keep(self, size: int) -> None:
+        """Counts the bytes that are kept; LogError where it is too much."""
+        self.kept += size
+        if self.kept > self.memory.most_of_one:
+            raise LogError(
+                f"what its summary lists takes more than {self.memory.most_of_one} bytes"
+            )
+
     def definition(self, opcode: int, raw: bytes) -> None:
         kept = self.schemas if opcode == Opcode.SCHEMA else self.channels
-        kept.setdefault(struct.unpack_from("<H", raw, 9)[0], raw)
+        key = struct.unpack_from("<H", raw, 9)[0]
+        if key not in kept:
+            self.keep(len(raw))
+            kept[key] = raw
 
-    def message(self, head: bytes | memoryview) -> None:
+    def message(self, head: bytes) -> None:
         """Count a message by the first 22 bytes of its record's content."""
         channel, _, log_time, _ = struct.unpack("<HIQQ", head)
         self.counts[channel] = self.counts.get(channel, 0) + 1
@@ -69,13 +87,13 @@ class _Found:
         self.end_ns = max(self.end_ns, log_time)
 
 
-def scan(file: BinaryIO, data_end: int, path: Path) -> Summary:
+def scan(file: BinaryIO, data_end: int, path: Path, memory: Memory) -> Summary:
     """Walk the records of the data section, which ends at ``data_end``.
 
     Chunks are decompressed one at a time and their checksums verified. Raises ``LogError`` where a
-    record does not fit or is damaged.
+    record does not fit, is damaged, or is too large for ``memory``.
     """
-    found = _Found()
+    found = _Found(memory)
     offset = end = len(MAGIC)
     try:
         for opcode, start, size in walk(file, offset, data_end):
@@ -96,6 +114,8 @@ def scan(file: BinaryIO, data_end: int, path: Path) -> Summary:
 def _visit(found: _Found, file: BinaryIO, opcode: int, offset: int, size: int) -> None:
     """Note one record of ``size`` bytes; the file is at the start of its body."""
     length = size - HEAD.size
+    if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK):
+        found.memory.check(length)
     if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
         found.definition(opcode, HEAD.pack(opcode, length) + file.read(length))
     elif opcode == Opcode.MESSAGE:
@@ -109,14 +129,17 @@ def _visit(found: _Found, file: BinaryIO, opcode: int, offset: int, size: int) -
         # writers differ on whether a channel without messages in the chunk gets an index; one
         # without entries tells nothing
         if entries:
+            found.keep(_ENTRY_BYTES)
             chunk.message_index_offsets[channel] = offset
         chunk_end = chunk.chunk_start_offset + chunk.chunk_length
         chunk.message_index_length = offset + size - chunk_end
     elif opcode == Opcode.ATTACHMENT:
         body = file.read(min(length, MAX_NAMES))
+        found.keep(_RECORD_BYTES + len(body))
         found.attachments.append(parse(_attachment_index(offset, size), body))
     elif opcode == Opcode.METADATA:
         name = parse(ReadDataStream.read_prefixed_string, file.read(min(length, MAX_NAMES)))
+        found.keep(_RECORD_BYTES + len(name))
         found.metadata.append(MetadataIndex(offset, size, name))
 
 
@@ -134,12 +157,13 @@ def _attachment_index(offset: int, size: int) -> Callable[[ReadDataStream], Atta
 
 def _visit_chunk(found: _Found, record: bytes, offset: int) -> None:
     head = chunk_head(record)
-    data = chunk_records(record, head)
+    data = chunk_records(record, head, found.memory)
+    found.keep(_RECORD_BYTES)
     for opcode, start, stop in spans(data):
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             found.definition(opcode, bytes(data[start - HEAD.size : stop]))
         elif opcode == Opcode.MESSAGE:
-            found.message(data[start : min(stop, start + MESSAGE_BODY)])
+            found.message(bytes(data[start : min(stop, start + MESSAGE_BODY)]))
     found.chunks.append(
         ChunkIndex(
             chunk_length=len(record),

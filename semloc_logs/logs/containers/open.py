@@ -8,6 +8,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.logs.containers import rosbag1
 from semloc_logs.logs.containers.mcap import McapLog
 from semloc_logs.logs.containers.mcap_records import MAGIC
+from semloc_logs.logs.containers.memory import DEFAULT, Memory
 from semloc_logs.logs.containers.rosbag1 import Rosbag1Log
 from semloc_logs.logs.containers.rosbag2 import Rosbag2Log
 from semloc_logs.logs.containers.sqlite import SqliteLog
@@ -16,14 +17,16 @@ from semloc_logs.logs.log import Log
 _SQLITE = b"SQLite format 3\0"
 
 
-def open_log(path: str | Path) -> Log:
+def open_log(path: str | Path, memory: int = DEFAULT) -> Log:
     """The log at ``path``: an MCAP file, a ROS 1 bag, a ROS 2 bag directory or one of its files.
 
-    LogError describes the file where it is not a log, or its damage.
+    At most ``memory`` bytes of it are in memory at once (``logs.memory``). LogError describes the
+    file where it is not a log, or its damage.
     """
     path = Path(path)
+    limit = Memory(memory)
     if path.is_dir():
-        return Rosbag2Log(path)
+        return Rosbag2Log(path, limit)
     try:
         with path.open("rb") as file:
             head = file.read(512)
@@ -34,13 +37,13 @@ def open_log(path: str | Path) -> Log:
             f"{path} cannot be opened: {getattr(error, 'strerror', None) or error}."
         ) from error
     if path.name == "metadata.yaml":
-        return Rosbag2Log(path.parent)
+        return Rosbag2Log(path.parent, limit)
     if head.startswith(MAGIC):
-        return McapLog(path)
+        return McapLog(path, memory=limit)
     if head.startswith(b"#ROSBAG V"):
-        return Rosbag1Log(path)
+        return Rosbag1Log(path, limit)
     if head.startswith(_SQLITE):
-        return SqliteLog(path)
+        return SqliteLog(path, memory=limit)
     raise LogError(f"{path} {_description(head)}")
 
 

@@ -16,12 +16,16 @@ from typing import NamedTuple
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import (
     BaseLog,
+    Bytes,
+    MessageOrTime,
     closed_on_error,
     decompress,
     in_log_time_order,
     open_file,
     read_exactly,
 )
+from semloc_logs.logs.containers.chunks import Chunk, Index, Kind, chunk_messages, new_index
+from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
 
@@ -30,6 +34,7 @@ _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
 _MAX_HEAD = 1 << 20
+_MOST_CONNECTIONS = 1 << 16  # in a chunk
 
 Fields = dict[bytes, bytes]
 
@@ -55,12 +60,13 @@ class Connection(NamedTuple):
 class Rosbag1Log(BaseLog):
     """A ROS 1 bag. LogError unless it is one of format 2.0 without encryption."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "rosbag1")
+    def __init__(self, path: Path, memory: Memory | None = None) -> None:
+        super().__init__(path, "rosbag1", memory=memory)
         self.encoding = "ros1"
         self._connections: dict[int, Connection] = {}
         self._publishers: dict[int, str] = {}  # of connections that share their topic
         self._parts: list[Part] = []
+        self._definition_bytes = 0
         self._file = open_file(path)
         with closed_on_error(self._file, path):
             self._size = self._file.seek(0, 2)
@@ -80,12 +86,13 @@ class Rosbag1Log(BaseLog):
         """The chunks by their first log time; a chunk ends where the next one starts."""
         offsets = sorted({self._size, *(p.offset for p in self._parts)})
         end_of = dict(pairwise(offsets))
+        known = self._connections
         return [
             Section(
                 part.start_ns,
                 part.end_ns,
                 end_of[part.offset] - part.offset,
-                frozenset(self._connections[c].topic for c in part.connections),
+                frozenset(known[c].topic for c in part.connections if c in known),
                 partial(self._load_topics, part),
             )
             for part in sorted(self._parts, key=lambda p: (p.start_ns, p.offset))
@@ -174,11 +181,9 @@ class Rosbag1Log(BaseLog):
 
     def _index_part(self, fields: Fields, start: int, end: int, counts: Counter[int]) -> None:
         count = _number(fields, b"count", "<I")
-        if end - start != 8 * count:
+        if end - start != 8 * count or count > _MOST_CONNECTIONS:
             raise _DamageError("a chunk info has the wrong size")
-        pairs = dict(
-            struct.iter_unpack("<II", read_exactly(self._file, start, end - start, self._size))
-        )
+        pairs = dict(struct.iter_unpack("<II", self._read(start, end)))
         offset = _number(fields, b"chunk_pos", "<Q")
         if offset >= self._size:
             raise _DamageError(
@@ -194,9 +199,16 @@ class Rosbag1Log(BaseLog):
             return
         connection = _number(fields, b"conn", "<I")
         if connection not in self._connections:
-            self._connections[connection] = _connection(
-                fields, read_exactly(self._file, start, end - start, self._size)
+            self._add_connection(connection, fields, self._read(start, end))
+
+    def _add_connection(self, connection: int, fields: Fields, data: bytes) -> None:
+        """Learns of a connection; LogError where all of them take too much memory."""
+        self._definition_bytes += len(data)
+        if self._definition_bytes > self._memory.most_of_definitions:
+            raise _DamageError(
+                f"its connections take more than {self._memory.most_of_definitions} bytes"
             )
+        self._connections[connection] = _connection(fields, data)
 
     def _scan(self) -> Counter[int]:
         """Walks over all records, decompresses each chunk once and counts readable messages."""
@@ -223,58 +235,69 @@ class Rosbag1Log(BaseLog):
 
     def _scan_chunk(self, offset: int, counts: Counter[int]) -> None:
         try:
-            messages = self._walk(self._unpack_chunk(offset), offset)
+            data = self._unpack_chunk(offset)
+            messages = new_index(len(data), self._memory)
+            self._walk(offset, data, messages)
         except LogError as error:
             self._problems.add(
                 f"{self.path.name}: the chunk at byte {offset} was skipped: {error}."
             )
             return
-        known = [(time, c) for time, c, _, _ in messages if c in self._connections]
-        if known:
-            times = [time for time, _ in known]
-            counts.update(connection for _, connection in known)
-            connections = frozenset(connection for _, connection in known)
-            self._parts.append(Part(offset, min(times), max(times), connections))
+        connections = Counter(c for _, c, _, _ in messages if c in self._connections)
+        if connections:
+            start_ns = min(time for time, c, _, _ in messages if c in connections)
+            end_ns = max(time for time, c, _, _ in messages if c in connections)
+            counts.update(connections)
+            self._parts.append(Part(offset, start_ns, end_ns, frozenset(connections)))
 
     # -- reading
 
     def _load_topics(self, part: Part, topics: Collection[str] | None) -> Iterator[Message]:
-        return self._load(part, self._ids(topics))
+        wanted = self._ids(topics)
+        return in_log_time_order([(part.start_ns, partial(self._load, part, wanted))])
 
-    def _load(self, part: Part, wanted: set[int]) -> Iterator[Message]:
+    def _load(self, part: Part, wanted: set[int]) -> Iterator[MessageOrTime]:
+        """The messages of one chunk in log-time order."""
+        chunk = Chunk(
+            start_ns=part.start_ns,
+            claimed_size=partial(self._claimed_size, part.offset),
+            unpack=partial(self._unpack_chunk, part.offset),
+            walk=partial(self._walk, part.offset),
+            kind=partial(self._wanted_kind, wanted),
+        )
         try:
-            data = self._unpack_chunk(part.offset)
+            yield from chunk_messages(chunk, self._memory)
         except (LogError, OSError) as error:
             self._problems.add(
                 f"{self.path.name}: the chunk at byte {part.offset} was skipped: {error}."
             )
-            return
-        view = memoryview(data)
-        publishers = self._publishers
-        messages = self._walk(data, part.offset)
-        messages.sort(key=lambda m: m[0])  # stable, and nearly free where they are in order already
-        for log_time, connection, start, end in messages:
-            if connection in wanted:
-                topic, type_, definition, _ = self._connections[connection]
-                publisher = publishers.get(connection, "")
-                yield Message(
-                    topic, type_, "ros1", log_time, view[start:end], definition, publisher
-                )
 
-    def _unpack_chunk(self, offset: int) -> bytes:
+    def _wanted_kind(self, wanted: set[int], connection: int) -> Kind | None:
+        if connection not in wanted:
+            return None
+        topic, type_, definition, _ = self._connections[connection]
+        return Kind(topic, type_, "ros1", definition, self._publishers.get(connection, ""))
+
+    def _chunk(self, offset: int) -> tuple[Fields, int, int]:
         fields, start, end = self._record(offset)
         if _number(fields, b"op", "<B") != _CHUNK:
             raise _DamageError("it is not the chunk that the index claims")
-        compression = fields.get(b"compression", b"none").decode(errors="replace")
-        return decompress(
-            read_exactly(self._file, start, end - start, self._size),
-            compression,
-            _number(fields, b"size", "<I"),
-        )
+        return fields, start, end
 
-    def _walk(self, data: bytes, offset: int) -> list[tuple[int, int, int, int]]:
-        """(log time, connection, start, end) of the messages in ``data``; takes connections."""
-        messages = []
+    def _claimed_size(self, offset: int) -> int:
+        return _number(self._chunk(offset)[0], b"size", "<I")
+
+    def _unpack_chunk(self, offset: int) -> Bytes:
+        fields, start, end = self._chunk(offset)
+        compression = fields.get(b"compression", b"none").decode(errors="replace")
+        size = _number(fields, b"size", "<I")
+        return decompress(self._read(start, end), compression, size, self._memory)
+
+    def _walk(self, offset: int, data: Bytes, found: Index) -> None:
+        """Puts (log time, connection, start, end) of the messages in ``data`` into ``found``.
+
+        Learns of connections on the way.
+        """
         position = 0
         size = len(data)
         try:
@@ -283,18 +306,21 @@ class Rosbag1Log(BaseLog):
                 op = fields.get(b"op")
                 if op == b"\x02":
                     connection = _number(fields, b"conn", "<I")
-                    messages.append((_time(fields, b"time"), connection, start, end))
+                    found.append((_time(fields, b"time"), connection, start, end))
                 elif op == b"\x07":
                     connection = _number(fields, b"conn", "<I")
                     if connection not in self._connections:
-                        self._connections[connection] = _connection(fields, data[start:end])
+                        self._add_connection(connection, fields, bytes(data[start:end]))
                 position = end
-        except _DamageError as error:
+        except LogError as error:
             self._problems.add(
                 f"{self.path.name}: the chunk at byte {offset} is damaged inside: {error}; "
-                f"{len(messages)} messages of it are used."
+                f"{len(found)} messages of it are used."
             )
-        return messages
+
+    def _read(self, start: int, end: int) -> bytes:
+        self._memory.check(end - start)
+        return read_exactly(self._file, start, end - start, self._size)
 
     def _record(self, offset: int) -> tuple[Fields, int, int]:
         """Fields, start and end of the data of the record at ``offset`` of the file."""
@@ -318,7 +344,7 @@ class _DamageError(LogError):
     """A record does not make sense."""
 
 
-def _split(data: bytes, position: int) -> tuple[Fields, int, int]:
+def _split(data: Bytes, position: int) -> tuple[Fields, int, int]:
     """Fields, start and end of the data of the record at ``position`` of a chunk."""
     size = len(data)
     if position + 4 > size:
@@ -329,7 +355,7 @@ def _split(data: bytes, position: int) -> tuple[Fields, int, int]:
     end = head + 4 + _U32.unpack_from(data, head)[0]
     if end > size:
         raise _DamageError(f"a record at byte {position} in it is cut off")
-    return _fields(data[position + 4 : head]), head + 4, end
+    return _fields(bytes(data[position + 4 : head])), head + 4, end
 
 
 def _fields(head: bytes) -> Fields:

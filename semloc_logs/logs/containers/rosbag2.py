@@ -19,27 +19,29 @@ import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import (
-    MAX_CHUNK,
     BaseLog,
     encoding_of,
     in_log_time_order,
     merged_streams,
 )
 from semloc_logs.logs.containers.mcap import McapLog
+from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.containers.sqlite import SqliteLog
 from semloc_logs.logs.log import Log, Message, Section
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".db3", ".mcap")
-_MAX_METADATA = 64 << 20
 SPLIT_GAP_NS = 5 * 10**9  # between the files of one recording: a recorder splits without a pause
+_MAX_METADATA = 4 << 20  # as objects it takes a hundred times as much
+_FREE = 256 << 20  # bytes of a disk that stay free
+_PLAUSIBLE_GROWTH = 200  # of a file that is zstd-compressed as a whole; logs shrink by less
 
 
 class Rosbag2Log(BaseLog):
     """A ROS 2 bag directory. LogError when it holds no file that can be read."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "rosbag2")
+    def __init__(self, path: Path, memory: Memory | None = None) -> None:
+        super().__init__(path, "rosbag2", memory=memory)
         self._files: list[Log] = []
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         try:
@@ -214,8 +216,8 @@ class Rosbag2Log(BaseLog):
             with path.open("rb") as file:
                 head = file.read(16)
         if head.startswith(b"SQLite format 3\0"):
-            return SqliteLog(path, name, self._problems)
-        return McapLog(path, name, self._problems)
+            return SqliteLog(path, name, self._problems, self._memory)
+        return McapLog(path, name, self._problems, self._memory)
 
     def _unpack(self, path: Path) -> Path:
         """A decompressed copy in a temporary folder that lives as long as this log."""
@@ -226,10 +228,16 @@ class Rosbag2Log(BaseLog):
             with path.open("rb") as packed, target.open("wb") as plain:
                 reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
                 written = 0
+                size = path.stat().st_size
                 while piece := reader.read(1 << 22):
                     written += len(piece)
                     free = shutil.disk_usage(self._folder.name).free
-                    if free < MAX_CHUNK // 8:
+                    if written > max(_PLAUSIBLE_GROWTH * size, self._memory.limit):
+                        raise LogError(
+                            f"{path} grows from {size} to more than {written} bytes, which no log "
+                            "does; if it is right, decompress it first."
+                        )
+                    if free < _FREE:
                         raise LogError(
                             f"{path} needs more than the {written} bytes that "
                             f"{self._folder.name} can take; decompress it first."

@@ -6,18 +6,20 @@ Its messages may be zstd-compressed one by one.
 from __future__ import annotations
 
 import contextlib
-import sqlite3
+import re
 from collections import Counter
 from collections.abc import Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
+import apsw
 import zstandard
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.containers.base import MAX_CHUNK, BaseLog, decompress
+from semloc_logs.logs.containers import sqlite_file
+from semloc_logs.logs.containers.base import BaseLog, Bytes, decompress
+from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.definitions import is_standard
 from semloc_logs.logs.messages.type_names import ros2_type
@@ -27,19 +29,31 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message starts like this
 _SECTION_BYTES = 4 << 20  # about as much as a chunk of other containers holds
 _MOST_SECTIONS = 4096
 # the text of an error quotes the file, so that it may itself not be UTF-8
-_DAMAGE = (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError)
+_DAMAGE = (apsw.Error, UnicodeDecodeError, OverflowError, MemoryError)
+_TABLE = re.compile(r"\s*create\s+table\b", re.IGNORECASE)  # not a view, which computes its rows
+_MOST_TOPICS = 1 << 16
 
 
 class SqliteLog(BaseLog):
     """A ``.db3`` file. LogError unless it holds the tables of rosbag2."""
 
-    def __init__(self, path: Path, name: str = "", problems: Problems | None = None) -> None:
-        super().__init__(path, "rosbag2", problems)
+    def __init__(
+        self,
+        path: Path,
+        name: str = "",
+        problems: Problems | None = None,
+        memory: Memory | None = None,
+    ) -> None:
+        super().__init__(path, "rosbag2", problems, memory)
         self._name = name or path.name
         self._damaged = False
         self._topics: dict[int, tuple[str, str, str, Definition]] = {}
+        self._state = sqlite_file.state(path)
         try:
             self._database = _connect(path)
+            # sqlite refuses longer values before it makes room for them
+            longest = min(self._memory.most_of_one, (1 << 31) - 1)
+            self._database.limit(apsw.SQLITE_LIMIT_LENGTH, longest)
         except (*_DAMAGE, OSError) as error:
             raise LogError(
                 f"{path} cannot be read as a sqlite3 bag: {error}; "
@@ -88,16 +102,18 @@ class SqliteLog(BaseLog):
         self._problems.forget_skipped(topics, file=self._name)
         read = 0
         try:
-            for topic_id, log_time, data in self._rows(wanted, between):
+            for topic_id, log_time, data, size in self._rows(wanted, between):
                 topic, type_, encoding, definition = self._topics[topic_id]
                 read += 1
-                if not isinstance(data, bytes) or not isinstance(log_time, int):
+                if data is None or log_time is None:
                     reason = f"row {read} of {self._name} holds no bytes or no time"
+                    if size is not None and size > self._memory.most_of_one:
+                        reason = f"row {read} of {self._name} {self._memory.too_much(size)}"
                     self._problems.skip(topic, reason, file=self._name)
                     continue
                 if data.startswith(ZSTD_MAGIC):
                     try:
-                        data = _decompress(data)
+                        data = _decompress(data, self._memory)
                     except LogError as error:
                         reason = f"at {log_time} ns {error}"
                         self._problems.skip(topic, reason, file=self._name)
@@ -108,13 +124,26 @@ class SqliteLog(BaseLog):
                 f"{self._name}: reading ended after {read} messages because the file is damaged "
                 f"({error})."
             )
+        if sqlite_file.state(self.path) != self._state:
+            self._problems.add(
+                f"{self._name} was written to while it was read, so messages may be missing or "
+                "damaged; read it again when its recording has ended."
+            )
 
     def _rows(
         self, topic_ids: list[int], between: tuple[int, int] | None
-    ) -> Iterator[tuple[int, Any, Any]]:
-        """(topic id, log time, data) in log-time order; the order of recording breaks ties."""
+    ) -> Iterator[tuple[int, Any, Any, Any]]:
+        """(topic id, log time, data, size of the data); the order of recording breaks ties.
+
+        In log-time order. A time that is not a whole number, and data that are not bytes or too
+        many, are None.
+        """
         marks = ",".join("?" * len(topic_ids))
-        columns = "SELECT topic_id, timestamp, data FROM messages"
+        fits = f"typeof(data) = 'blob' AND length(data) <= {self._memory.most_of_one}"
+        columns = (
+            "SELECT topic_id, CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END, "
+            f"CASE WHEN {fits} THEN data END, length(data) FROM messages"
+        )
         where = f"WHERE topic_id IN ({marks})"
         if not self._damaged:
             if between is not None:
@@ -141,20 +170,22 @@ class SqliteLog(BaseLog):
 
     def _open(self) -> None:
         execute = self._database.execute
-        tables = {
-            name for (name,) in execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-        }
+        rows = execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+        tables = {name for name, sql in rows if _TABLE.match(sql or "")}
         if not {"topics", "messages"} <= tables:
             raise ValueError("it has no tables topics and messages")
         definitions = self._definitions() if "message_definitions" in tables else {}
         for id_, topic, type_, format_ in execute(
-            "SELECT id, name, type, serialization_format FROM topics"
+            f"SELECT id, {_text('name')}, {_text('type')}, {_text('serialization_format')} "
+            "FROM topics"
         ):
-            type_ = ros2_type(str(type_))
+            if len(self._topics) == _MOST_TOPICS:
+                raise ValueError(f"it names more than {_MOST_TOPICS} topics")
+            type_ = ros2_type(_decoded(type_))
             self._topics[int(id_)] = (
-                str(topic),
+                _decoded(topic),
                 type_,
-                str(format_),
+                _decoded(format_),
                 definitions.get(type_, Definition(type_, "", b"")),
             )
         counts: Counter[tuple[str, str, str]] = Counter()
@@ -162,9 +193,9 @@ class SqliteLog(BaseLog):
             for id_, count in execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"):
                 if id_ in self._topics:
                     counts[self._topics[id_][:3]] += count
-            start, end = execute("SELECT MIN(timestamp), MAX(timestamp) FROM messages").fetchone()
+            [(start, end)] = execute("SELECT MIN(timestamp), MAX(timestamp) FROM messages")
             if any(counts.values()) and not (isinstance(start, int) and isinstance(end, int)):
-                raise sqlite3.DatabaseError("time stamps are not integers")
+                raise apsw.CorruptError("time stamps are not integers")
             self.start_ns, self.end_ns = start, end
         except _DAMAGE as error:
             self._recount(counts, error)
@@ -200,40 +231,42 @@ class SqliteLog(BaseLog):
 
     def _definitions(self) -> dict[str, Definition]:
         definitions = {}
+        kept = 0
         rows = self._database.execute(
-            "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            f"SELECT {_text('topic_type')}, {_text('encoding')}, "
+            f"{_text('encoded_message_definition')} FROM message_definitions"
         )
         for type_, encoding, text in rows:
-            name = ros2_type(str(type_))
-            if isinstance(text, str) and text.strip():
-                definitions[name] = Definition(name, str(encoding), text.encode())
+            name = ros2_type(_decoded(type_))
+            kept += len(text or b"")
+            if kept > self._memory.most_of_definitions:
+                raise ValueError(f"its definitions {self._memory.too_much(kept)}")
+            if text and text.strip():
+                definitions[name] = Definition(name, _decoded(encoding), text)
         return definitions
 
 
-def _connect(path: Path) -> sqlite3.Connection:
-    """Opens for reading only.
+def _text(column: str) -> str:
+    """A column of text as bytes: parts that are not UTF-8 are replaced, not refused."""
+    return f"CAST({column} AS BLOB)"
 
-    A bag in a folder that cannot be written needs ``immutable``, one with a journal must not have
-    it.
-    """
-    _refuse_cut_off(path)
-    address = f"file:{quote(str(path.absolute()))}"
-    for mode in ("mode=ro", "mode=ro&immutable=1"):
-        database = sqlite3.connect(f"{address}?{mode}", uri=True, check_same_thread=False)
-        try:
-            database.text_factory = lambda text: text.decode(errors="replace")
-            database.execute("PRAGMA trusted_schema = OFF")
-            database.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
-        except sqlite3.OperationalError:
-            database.close()
-            if "immutable" in mode:
-                raise
-        except _DAMAGE:
-            database.close()
-            raise
-        else:
-            return database
-    raise LogError(f"{path} cannot be opened.")
+
+def _decoded(text: bytes | None) -> str:
+    return (text or b"").decode(errors="replace")
+
+
+def _connect(path: Path) -> apsw.Connection:
+    """Opens for reading only; the text of an error states the fault."""
+    if sqlite_file.overlay_of(path) is None:
+        _refuse_cut_off(path)
+    database = sqlite_file.connect(path)
+    try:
+        for _ in database.execute("SELECT name FROM sqlite_master LIMIT 1"):
+            pass
+    except BaseException:
+        database.close()
+        raise
+    return database
 
 
 def _refuse_cut_off(path: Path) -> None:
@@ -250,11 +283,11 @@ def _refuse_cut_off(path: Path) -> None:
         )
 
 
-def _decompress(data: bytes) -> bytes:
+def _decompress(data: bytes, memory: Memory) -> Bytes:
     try:
         size = zstandard.frame_content_size(data)
     except zstandard.ZstdError as error:
         raise LogError(f"its zstd data are damaged ({error})") from error
-    if not 0 <= size <= MAX_CHUNK:
+    if size < 0:
         raise LogError("its zstd data do not contain their size")
-    return decompress(data, "zstd", size)
+    return decompress(data, "zstd", size, memory)

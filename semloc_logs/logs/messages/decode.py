@@ -10,6 +10,7 @@ from semloc_logs.logs.log import Definition, Message
 from semloc_logs.logs.messages import cloud, image, livox, pose_messages
 from semloc_logs.logs.messages.definitions import Parser, UndecodableError, json_type, parser
 from semloc_logs.logs.messages.headers import BAD_VALUES, Convert, check_time, ros
+from semloc_logs.logs.messages.large_messages import check_size
 from semloc_logs.logs.messages.livox import livox_parser
 from semloc_logs.logs.messages.point_times import PointTimes
 from semloc_logs.logs.problems import Problems
@@ -35,6 +36,7 @@ class Decoder:
         decoded: list[Frame] = []  # keeps the frames before the damaged part of a message
         try:
             check_time(message.log_time_ns)
+            check_size(message)
             frames = convert(self._parse(message), message)
             decoded.extend(
                 self._times.checked(frame) if isinstance(frame, LidarFrame) else frame

@@ -89,7 +89,7 @@ def ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, An
 
 
 def _ros_types(encoding: str, type_: str, definition: Definition) -> dict[str, Any]:
-    standard = _standard_types("ros1" if encoding == "ros1" else "ros2")
+    standard = standard_types(encoding)
     text = definition.text.decode(errors="replace")
     if len(text) > _MAX_TEXT:
         raise UndecodableError(f"its definition has {len(text)} characters")
@@ -179,6 +179,11 @@ def _names(field: Any) -> list[str]:
 def is_standard(type_: str) -> bool:
     """Whether a ROS 2 type can be decoded without a definition in the log."""
     return type_ in _standard_types("ros2")
+
+
+def standard_types(encoding: str) -> dict[str, Any]:
+    """The fields of the types that ROS defines, for messages in ``cdr`` or ``ros1``."""
+    return _standard_types("ros1" if encoding == "ros1" else "ros2")
 
 
 @cache

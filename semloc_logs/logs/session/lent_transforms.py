@@ -16,6 +16,7 @@ import numpy as np
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, PoseSample, TransformSample
 from semloc_logs.logs.containers.base import merged_streams
+from semloc_logs.logs.containers.memory import DEFAULT
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Log
 from semloc_logs.logs.poses.base_frame import BASE_LINK
@@ -31,21 +32,27 @@ _SAME = 1e-3  # m, and of a quaternion: two logs give the same mounting
 
 
 def lent_transforms(
-    paths: Sequence[Path], others: Sequence[Path], topics: Mapping[str, str], child: str | None
+    paths: Sequence[Path],
+    others: Sequence[Path],
+    topics: Mapping[str, str],
+    child: str | None,
+    *,
+    memory: int = DEFAULT,
 ) -> Mountings:
     """The static transforms that the session of the logs ``paths`` holds from its start.
 
     These are its own, and the ones that it lacks between the frames of its sensors and its base
     frame and that one of the ``others`` has. ``topics`` overrules roles; ``child``: the frame of
-    poses that are not in the log. LogError for logs that cannot be read.
+    poses that are not in the log. At most ``memory`` bytes of a log are in memory at once. LogError
+    for logs that cannot be read.
     """
     logs: list[Log] = []
     try:
-        logs.extend(open_log(path) for path in paths)
+        logs.extend(open_log(path, memory) for path in paths)
         logs.sort(key=lambda log: (log.start_ns is None, log.start_ns or 0))
         frames = _Frames(logs, topics, child)
         missing = frames.missing()
-        lent = _Lent(frames.tree, frames.reference, missing) if missing else None
+        lent = _Lent(frames.tree, frames.reference, missing, memory) if missing else None
     finally:
         for log in logs:
             log.close()
@@ -129,7 +136,10 @@ class _Frames:
 class _Lent:
     """Static transforms of other logs that connect the ``missing`` frames with ``reference``."""
 
-    def __init__(self, tree: TransformTree, reference: str, missing: Sequence[str]) -> None:
+    def __init__(
+        self, tree: TransformTree, reference: str, missing: Sequence[str], memory: int
+    ) -> None:
+        self._memory = memory
         self._own = tree
         self._reference = reference
         self._missing = missing
@@ -138,7 +148,7 @@ class _Lent:
     def take(self, path: Path) -> None:
         """Reads the static transforms of a log."""
         try:
-            with closing(open_log(path)) as log:
+            with closing(open_log(path, self._memory)) as log:
                 topics = guess_roles(log.streams).tf_static
                 edges = [f for f in log.frames(topics) if isinstance(f, TransformSample)]
         except LogError:

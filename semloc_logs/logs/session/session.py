@@ -75,7 +75,8 @@ def open_session(paths: Sequence[Path], options: SessionOptions | None = None) -
         raise LogError("A session needs at least one log: none was named.")
     logs: list[Log] = []
     try:
-        logs.extend(open_log(Path(path)) for path in paths)
+        memory = (options or SessionOptions()).logs.memory
+        logs.extend(open_log(Path(path), memory) for path in paths)
         logs.sort(key=lambda log: (log.start_ns is None, log.start_ns or 0))
         return Session(logs, options)
     except BaseException:

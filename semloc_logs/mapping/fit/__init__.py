@@ -1,1 +1,1 @@
-"""Whether the poses of a log fit its range data, and what is wrong where they do not."""
+"""Whether the poses of a log fit its range data, and the fault where they do not."""

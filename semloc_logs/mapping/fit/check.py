@@ -123,7 +123,7 @@ class StreamFit:
         return any(f.severity is Severity.WRONG for f in self.findings)
 
     def untold(self) -> str:
-        """The sentence that says what could not be checked; empty where all could."""
+        """A sentence about the faults that could not be checked; empty where all could."""
         if self.pairs < LEAST_PAIRS:
             return (
                 f"{self.topic}: whether the poses fit its clouds cannot be told: only {self.pairs}"
@@ -429,7 +429,9 @@ def _rotation_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -
             turns.append(f"{angle:.1f} \u00b1 {spread:.1f} degrees about {axis}")
     convention = ""
     if rotation.magnitude() > np.radians(45) and _is_axis_rotation(rotation):
-        convention = ", as where the axes of an optical frame are taken for those of a body frame"
+        convention = (
+            ", as where the axes of an optical frame are taken for the axes of a body frame"
+        )
     return (
         f"its mounting is turned by {', '.join(turns)} of the base frame{convention}; correct its"
         " transform"

@@ -198,6 +198,7 @@ def _sink(path: Path, format_: str) -> Iterator[_Sink]:
 def _file_sink(path: Path, format_: str) -> Iterator[_Sink]:
     """A bag or an MCAP file."""
     if format_ == "bag":
+        path.unlink()  # this writer makes the file itself
         file = BagFile(path)
         file.set_compression(BagFile.CompressionFormat.LZ4)
         with file:

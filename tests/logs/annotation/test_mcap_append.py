@@ -378,7 +378,7 @@ def test_damaged_bytes_give_a_log_error_or_a_result(data: st.DataObject) -> None
 
 # place of a length in a chunk record, what the error states
 CLAIMS = {
-    "unpacked size": (25, "a chunk claims"),
+    "unpacked size": (25, "it claims"),
     "packed size": (9 + 8 + 8 + 8 + 4 + 4 + len("zstd"), "its data claim"),
     "record": (1, "record reaches beyond the data section"),
 }

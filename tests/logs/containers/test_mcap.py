@@ -22,11 +22,11 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import PoseSample
 from semloc_logs.logs.containers.base import decompress, in_log_time_order
 from semloc_logs.logs.containers.mcap import McapLog
-from semloc_logs.logs.containers.mcap_records import indexed_chunk
+from semloc_logs.logs.containers.mcap_records import chunk_head, chunk_records, indexed_chunk
+from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.log import Definition, Message, Stream
 from semloc_logs.logs.problems import sentences
-from semloc_logs.numerics.prefetch import in_callers_thread
 
 ENTRIES = [
     ("/a", 10),
@@ -188,30 +188,32 @@ def test_an_index_that_points_behind_the_file_is_not_used(tmp_path: Path) -> Non
     assert "is damaged" in sentences(log.problems)[0]
 
 
-@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD])
-def test_chunks_that_are_unpacked_ahead_read_the_same(
-    tmp_path: Path, compression: CompressionType
-) -> None:
-    entries = [(topic, 100 * k + time) for k in range(50) for topic, time in ENTRIES]
-    path = write(tmp_path / "a.mcap", entries, compression)
-    log = McapLog(path)
-    ahead = [(m.topic, m.log_time_ns, bytes(m.data)) for m in log.messages()]
-    with in_callers_thread():
-        alone = [(m.topic, m.log_time_ns, bytes(m.data)) for m in log.messages()]
-    log.close()
-    assert len(ahead) == len(entries)
-    assert ahead == alone
-
-
 def test_kept_messages_stay_as_they_are(tmp_path: Path) -> None:
     entries = [(topic, 100 * k + time) for k in range(200) for topic, time in ENTRIES]
     log = McapLog(write(tmp_path / "a.mcap", entries))
     kept = list(log.messages())
-    # memory of chunks is used again, but not while a message of it is alive
+    # the memory of a chunk lives as long as a message of it
     copies = [bytes(m.data) for m in log.messages()]
     assert [bytes(m.data) for m in kept] == copies
     assert copies == [pose(m.log_time_ns) for m in kept]
     log.close()
+
+
+def test_records_of_an_uncompressed_chunk_are_not_copied() -> None:
+    records = b"records"
+    head = struct.pack("<QQQII", 1, 2, len(records), zlib.crc32(records), 0)
+    body = head + struct.pack("<Q", len(records)) + records
+    record = struct.pack("<BQ", 6, len(body)) + body
+    view = chunk_records(record, chunk_head(record), Memory())
+    assert isinstance(view, memoryview)
+    assert bytes(view) == records
+    assert view.obj is record
+    # what follows the records does not stay in memory with them
+    longer = struct.pack("<BQ", 6, len(body) + 1000) + body + bytes(1000)
+    view = chunk_records(longer, chunk_head(longer), Memory())
+    assert isinstance(view, memoryview)
+    assert bytes(view) == records
+    assert view.obj is not longer
 
 
 def test_a_log_that_is_cut_off_while_it_is_read(tmp_path: Path) -> None:
@@ -334,14 +336,15 @@ def test_decompression_believes_no_claim(compression: str) -> None:
         "lz4": lz4.frame.compress,
         "bz2": bz2.compress,
     }[compression]
+    memory = Memory(64 << 20)
     for content in (b"", b"abc", bytes(10_000_000)):
         packed = pack(content)
-        assert decompress(packed, compression, len(content)) == content
+        assert decompress(packed, compression, len(content), memory) == content
         for wrong in (len(content) + 1, len(content) - 1, 1 << 40):
             if wrong >= 0:
                 with pytest.raises(LogError):
-                    decompress(packed, compression, wrong)
+                    decompress(packed, compression, wrong, memory)
     with pytest.raises(LogError):
-        decompress(b"garbage", compression, 7)
+        decompress(b"garbage", compression, 7, memory)
     with pytest.raises(LogError):
-        decompress(pack(bytes(range(256)) * 4)[:200], compression, 1024)
+        decompress(pack(bytes(range(256)) * 4)[:200], compression, 1024, memory)

@@ -11,6 +11,8 @@ import pytest
 
 from semloc_logs.engines import Serial
 from semloc_logs.errors import LogError
+from semloc_logs.logs.containers.open import open_log
+from semloc_logs.logs.log import Log
 from semloc_logs.logs.session.lent_transforms import lent_transforms
 from semloc_logs.logs.session.session import SessionOptions, open_session
 from semloc_logs.numerics.transforms import Array, yaw_transform
@@ -108,6 +110,24 @@ def test_a_log_that_cannot_be_read(part: Part, tmp_path: Path) -> None:
     np.testing.assert_allclose(origin, [1, 0, 2])
     with pytest.raises(LogError):
         lent_transforms([broken], [], {}, None)
+
+
+def test_all_logs_are_read_within_the_memory_of_the_settings(
+    part: Part, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[tuple[str, int]] = []
+
+    def noted(path: Path, memory: int) -> Log:
+        opened.append((path.name, memory))
+        return open_log(path, memory)
+
+    monkeypatch.setattr("semloc_logs.logs.session.lent_transforms.open_log", noted)
+    sessions = [SessionInput(name, (part(name, m),)) for name, m in (("a", None), ("b", MOUNT))]
+    settings = load(None, {"logs.memory": "100000000"}).resolved()
+    fuse(sessions, Workspace(tmp_path / "work"), settings, Serial())
+    assert ("a.mcap", 100_000_000) in opened
+    assert ("b.mcap", 100_000_000) in opened
+    assert {memory for _, memory in opened} == {100_000_000}
 
 
 def test_fuse_depends_on_the_lent_transform_and_reports_assumptions(
