@@ -79,6 +79,22 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    @cached_property
+    def _motions(self) -> dict[int, tuple[F64, Bools]]:
+        return {}
+
+    def motion(self, poses_at: PosesAt, shift_ns: int) -> tuple[F64, Bools]:
+        """``target_T_source`` (n, 4, 4) by the poses at shifted stamps, and which are known (n,).
+
+        Few shifts are tried many times, so they are kept; ``poses_at`` is always the same.
+        """
+        if shift_ns not in self._motions:
+            poses, known = poses_at((self.stamps_ns + shift_ns).ravel())
+            poses = poses.reshape(-1, 2, 4, 4)
+            both_known = np.asarray(known.reshape(-1, 2).all(1))
+            self._motions[shift_ns] = inverse(poses[:, 0]) @ poses[:, 1], both_known
+        return self._motions[shift_ns]
+
     def residuals(self, predicted: F64) -> F64:
         """Differences (n, 6) to ``predicted`` (n, 4, 4), in standard deviations."""
         off = difference(self.measured, predicted)
@@ -113,11 +129,8 @@ def pose_motion(pairs: Pairs, poses_at: PosesAt, parameters: F64) -> F64:
 
     nan where a pose is unknown.
     """
-    shift_ns = round(float(parameters[CLOCK]) * 1e9)
-    poses, known = poses_at((pairs.stamps_ns + shift_ns).ravel())
-    poses = poses.reshape(-1, 2, 4, 4)
-    known = np.asarray(known.reshape(-1, 2).all(1))
-    motion = inverse(poses[:, 0]) @ poses[:, 1]
+    motion, known = pairs.motion(poses_at, round(float(parameters[CLOCK]) * 1e9))
+    motion = motion.copy()
     motion[:, :3, 3] *= np.exp(parameters[SCALE])
     mounting = np.eye(4)
     mounting[:3, :3] = Rotation.from_rotvec(parameters[ROTATION]).as_matrix()
