@@ -385,3 +385,19 @@ def test_the_poses_of_a_session_are_the_true_ones(
         (drive.session_T_world @ drive.world_T_base(frames["stamp_ns"][0].as_py()))[:3, 3],
         atol=2e-3,
     )
+
+
+def test_settings_of_reading_stay_with_their_session(
+    fuse: Fuse, coarse: Workspace, tools: SimpleNamespace
+) -> None:
+    def recorded() -> str:
+        content = read_json(coarse.session("monday").session_json)
+        return str(content["settings"]["logs"]["up"])
+
+    assert was_done(fuse(settings=tools.coarse_settings(logs__up="+z")))
+    assert not was_done(fuse())  # nothing is said of reading: as before
+    assert recorded() == "+z"
+    assert was_done(fuse(settings=tools.coarse_settings(logs__up="0,0,2")))
+    assert recorded() == "0,0,2"
+    assert was_done(fuse(overwrite=True))
+    assert recorded() == "auto"
