@@ -18,7 +18,7 @@ from semloc_logs.mapping.up_direction import LEAST_NORMALS, FlatPlaces, refined
 
 F64 = NDArray[np.float64]
 
-# chosen by hand on real and simulated drives, so that up leads on all of them. A floor counts whole,
+# chosen by hand on real and simulated drives, for the lead of up on them. A floor counts whole,
 # because a map without one is rare; the others decide between a floor and a wall or a ceiling.
 CEILING, WALLS, GROUND, BELOW, MOTION, TURNS = 0.5, 0.3, 0.5, 0.5, 0.5, 0.3
 SPREAD = 0.1  # rad, of the normals of a floor or of walls: streets rise and fall
