@@ -117,7 +117,7 @@ def find_gravity(expected: Expected, normals: F64, weights: F64, evidence: UpEvi
     opposite = float(scores[1] - scores[0])
     sky = evidence.sky(up) if opposite > 0 else Sky.UNKNOWN
 
-    # a camera before a wall of a room sees little else; a street is no room
+    # a camera before a wall of a room sees little else; outdoors the ground is seen too
     if excess > LIMIT[by] and (
         float(scores[:2].max()) < FITS or evidence.sky(-others[sideways]) is Sky.OPEN
     ):
