@@ -29,9 +29,10 @@ class UpSource(Enum):
 # believed instead; upside down needs more, because a ceiling looks like a floor
 LIMIT = {UpSource.CONVENTION: 0.1, UpSource.IMU: 0.25}
 OPPOSITE = {Sky.OPEN: 0.1, Sky.CEILING: 0.2}  # more; nothing is enough where either may be it
-DOUBT = {UpSource.CONVENTION: 0.05, UpSource.IMU: 0.15}  # is told, but the expected one stays
+DOUBT = {UpSource.CONVENTION: 0.1, UpSource.IMU: 0.15}  # is told, but the expected one stays
 DOUBT_OPPOSITE = {Sky.OPEN: 0.1, Sky.CEILING: 0.15, Sky.UNKNOWN: 0.15}  # in place of it
 FLAGRANT = 0.45  # in place of both, for an IMU where down may be the ceiling
+FITS = 0.4  # score of an expected direction that stays in a room
 CLEAR = 0.1  # lead over every other direction without which a finding is unsure
 FAR_OFF = 30.0  # degrees off where it was expected: better directions may be beyond its reach
 GIVEN_WITHIN = 0.35  # rad, of a direction that was given; it is refined
@@ -116,7 +117,10 @@ def find_gravity(expected: Expected, normals: F64, weights: F64, evidence: UpEvi
     opposite = float(scores[1] - scores[0])
     sky = evidence.sky(up) if opposite > 0 else Sky.UNKNOWN
 
-    if excess > LIMIT[by]:
+    # a camera before a wall of a room sees little else; outdoors the ground is seen too
+    if excess > LIMIT[by] and (
+        float(scores[:2].max()) < FITS or evidence.sky(-others[sideways]) is Sky.OPEN
+    ):
         return _by_map(expected, others[sideways], normals, weights, evidence)
     if sky in OPPOSITE and opposite > LIMIT[by] + OPPOSITE[sky]:
         return _by_map(expected, others[0], normals, weights, evidence, sky)

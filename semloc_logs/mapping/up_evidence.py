@@ -18,8 +18,8 @@ from semloc_logs.mapping.up_direction import LEAST_NORMALS, FlatPlaces, refined
 
 F64 = NDArray[np.float64]
 
-# fitted to nothing: shares of one are compared with shares of one. A floor counts whole, because a
-# map without one is rare; the others decide between a floor and a wall, a floor and a ceiling.
+# chosen by hand on real and simulated drives, for the lead of up on them. A floor counts whole,
+# because a map without one is rare; the others decide between a floor and a wall or a ceiling.
 CEILING, WALLS, GROUND, BELOW, MOTION, TURNS = 0.5, 0.3, 0.5, 0.5, 0.5, 0.3
 SPREAD = 0.1  # rad, of the normals of a floor or of walls: streets rise and fall
 MOST_NORMALS = 6000  # that a direction is compared with
@@ -30,6 +30,7 @@ OTHERS = 6  # directions that are compared in full
 # whether a ceiling may be taken for the ground
 BEYOND = 0.1  # share of points beyond what would be the ground: the sky is there
 TALL = 4.0  # m that things rise above the ground, where no ceiling is seen
+WIDE = 12.0  # m to which the ground is seen, where all of it is not a ceiling of a room
 NEARER = 0.7  # of the distance to the ceiling: sensors are nearer to the floor
 HIGH = 95  # percentile of the heights above the ground
 
@@ -37,7 +38,7 @@ HIGH = 95  # percentile of the heights above the ground
 LAYER = 0.3  # points this near to the height of the ground are on it
 MARGIN = 0.5  # and so far below it lies what cannot be there
 FLOOR = np.radians(8.0)  # normals this near to up may belong to the ground
-LOWEST = 90  # percentile of the heights of flat places below the sensor
+LOWEST = 90  # percentile of the depths of flat places below the sensor, and of their distances
 LEAST_FLOOR = 20  # flat places that show the ground
 MOST_POINTS = 1500  # of a keyframe, that may lie below the ground
 UNSEEN = 0.3  # share below the ground, where no ground is seen
@@ -60,7 +61,7 @@ class Sky(Enum):
 class _Ground:
     """The ground of a direction: shares of points ``on`` and ``below`` it.
 
-    It is ``depth`` metres below the sensor, things ``rise`` above it (m).
+    It is ``depth`` metres below the sensor and ``reach`` wide around it, things ``rise`` above it.
     """
 
     is_seen: bool
@@ -68,6 +69,7 @@ class _Ground:
     below: float
     depth: float
     rise: float
+    reach: float
 
 
 class UpEvidence:
@@ -108,9 +110,11 @@ class UpEvidence:
         ceiling, ground = self._ground(up), self._ground(-up)
         if not ground.is_seen:
             return Sky.UNKNOWN
-        if ceiling.below > BEYOND if ceiling.is_seen else ground.rise > TALL:
+        if not ceiling.is_seen:
+            return Sky.OPEN if ground.rise > TALL or ground.reach > WIDE else Sky.UNKNOWN
+        if ceiling.below > BEYOND:
             return Sky.OPEN
-        if ceiling.is_seen and ground.depth < NEARER * ceiling.depth:
+        if ground.depth < NEARER * ceiling.depth:
             return Sky.CEILING
         return Sky.UNKNOWN
 
@@ -149,7 +153,7 @@ class UpEvidence:
 
     def _ground(self, up: F64) -> _Ground:
         """The ground that each keyframe sees, if ``up`` (3,) is up."""
-        depths, rises = [], []
+        sizes = []
         count, on, below = 0, 0, 0
         for p in self._places:
             floor = p.normals @ up > np.cos(FLOOR)
@@ -157,16 +161,15 @@ class UpEvidence:
                 continue
             ground = float(np.percentile(-p.centres[floor] @ up, LOWEST))
             height = p.points[:: len(p.points) // MOST_POINTS + 1] @ up + ground
-            depths.append(ground)
-            rises.append(float(np.percentile(height, HIGH)))
+            away = np.linalg.norm(np.cross(p.centres[floor], up), axis=1)
+            sizes.append((ground, np.percentile(height, HIGH), np.percentile(away, LOWEST)))
             count += len(height)
             on += int(np.count_nonzero(np.abs(height) < LAYER * self._scale))
             below += int(np.count_nonzero(height < -MARGIN * self._scale))
         if not count:
-            return _Ground(False, 0.0, UNSEEN, 0.0, 0.0)
-        return _Ground(
-            True, on / count, below / count, float(np.median(depths)), float(np.median(rises))
-        )
+            return _Ground(False, 0.0, UNSEEN, 0.0, 0.0, 0.0)
+        depth, rise, reach = np.median(sizes, axis=0).tolist()
+        return _Ground(True, on / count, below / count, depth, rise, reach)
 
 
 def _directions(vectors: F64, half: float) -> F64:

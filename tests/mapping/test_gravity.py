@@ -196,6 +196,21 @@ def test_the_floor_is_nearer_than_the_ceiling(height: float, is_flipped: bool) -
     assert found.is_assumed
 
 
+@pytest.mark.parametrize("imu", [None, Z])
+def test_a_wall_that_fills_the_view_is_not_the_ground(imu: F64 | None) -> None:
+    """A camera before a wall sees a strip of floor; walls beside it are perpendicular to up."""
+    wall = plane(np.array([2.0, -3.0, -1.0]), 6 * Y, 3 * Z)
+    floor = plane(np.array([1.0, -3.0, -1.0]), 1.0 * X, 6 * Y)
+    sides = [plane(np.array([0.5, y, -1.0]), 1.5 * X, 3 * Z) for y in (-3.0, 3.0)]
+    points = np.concatenate([wall, wall + 0.003, floor, *sides])
+    poses = straight()
+    poses[:, :2, 3] = poses[:, 1::-1, 3]  # along the wall
+    found = find(points, Z, poses, imu)
+    assert degrees_between(found.up, Z) < 1
+    assert found.is_assumed
+    assert "fits better" in found.problems[0].text
+
+
 def test_a_direction_that_is_given_overrules_all_and_is_refined() -> None:
     places = flat_places(street().astype(np.float32), np.zeros(3), 0.2)
     near = Rotation.from_rotvec(np.radians(8) * Y).as_matrix() @ (3 * Z)
