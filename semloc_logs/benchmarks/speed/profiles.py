@@ -21,6 +21,7 @@ from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.logs.annotation.annotate import content_fingerprint
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.mapping import map_tables
+from semloc_logs.mapping.fit.check import check_session
 from semloc_logs.mapping.ground import GroundMapper, ground_height
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.levelling import level
@@ -47,7 +48,8 @@ SPANS = (  # of fusing
     Span("scratch files", (Collected.add, Collected.load)),
     Span("direction of gravity", (level,)),
     Span("ground", (ground_height, ground_surface, GroundMapper.add, GroundMapper.finish)),
-    Span("labels", (Labeller.labels, Labeller.take)),
+    Span("check of poses", (check_session,)),
+    Span("labels", (Labeller.labels, Labeller.take, Labeller.conclude)),
     Span("keyframes written", (keep_keyframes,), pulled=map_tables),
     Span("integrate", (Fuser.take, Carver.marks)),
     Span("finish of maps", (Fuser.finish,)),

@@ -51,7 +51,9 @@ LEAST_PAIRS = 4
 # from zero by so many standard deviations
 LEAST_GAIN = 12.0
 LEAST_SIGMAS = 5.0
-# squared distances in the median beyond which other readings of the poses are tried
+# squared distances in the median beyond which other starts of registration are tried, and beyond
+# which other readings of the poses are
+DOUBTFUL = 15.0
 FAR_OFF = 40.0
 MUCH_NEARER = 0.05  # such a reading explains the pairs when it lowers the median to this share
 TRIED = 4  # pairs that show whether another start is better
@@ -214,12 +216,16 @@ def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
     if len(given.pairs) < LEAST_PAIRS:
         return StreamFit(topic, len(given.pairs))
     none = fit(given.pairs, poses_at, np.zeros(0, np.int64), np.zeros(PARAMETERS))
-    if (start := _better_start(clouds, given, none.squares)) is not None:
+    # poses from which registration hardly moves are not far off
+    is_doubtful = float(np.nanmedian(none.squares)) > DOUBTFUL
+    start = _better_start(clouds, given, none.squares) if is_doubtful else None
+    if start is not None:
         stream = _judged(topic, clouds, poses_at, registered(clouds, numbers, start))
         if stream.findings:
             return stream
     stream = _judged(topic, clouds, poses_at, given)
-    if not stream.findings:
+    # a sensor that looks one way sees other surfaces soon: registration ends where it sees more
+    if not stream.findings and not clouds.sees_one_side():
         _contradictions(stream, given, poses_at, clouds.voxel)
     return stream
 

@@ -35,6 +35,10 @@ BETTER = 1.1
 NOISE_VOXELS = 0.05
 NOISE_WAY = 0.01
 NOISE_ROTATION = 0.003
+LOOKED_AT = 5  # keyframes that show the field of view
+# mean of the unit directions of the points: 0 all around, with ground below about 0.3, 0.64 over a
+# half circle, 0.9 for a camera
+ONE_SIDE = 0.6
 LEAST_RMS = 0.02  # voxels; distances to planes are not smaller
 UNTOLD = 1e-4  # information along a direction that no plane fixes (1/m^2): 100 m, or any angle
 LEAST_SHARE = 0.02  # of the points on planes, for a registration
@@ -78,6 +82,17 @@ class Clouds:
         if not speeds:
             return 0.0, 0.0
         return float(np.quantile(speeds, 0.9)), float(np.quantile(turn_rates, 0.9))
+
+    def sees_one_side(self) -> bool:
+        """Whether the sensor has a narrow field of view: its points lie on one side of it."""
+        resultants = []
+        for number in np.unique(np.linspace(0, len(self.rows) - 1, LOOKED_AT).astype(np.int64)):
+            points, _, _ = self.collected.load(int(self.rows[number]))
+            rays = points - self.collected.origins[int(self.rows[number])]
+            lengths = np.linalg.norm(rays, axis=1)
+            directions = rays[lengths > 0] / lengths[lengths > 0, None]
+            resultants.append(float(np.linalg.norm(directions.mean(0))) if len(directions) else 0.0)
+        return bool(resultants) and float(np.median(resultants)) > ONE_SIDE
 
     def pose(self, number: int) -> F64 | None:
         """``session_T_base`` (4, 4) as the poses of the log give it."""

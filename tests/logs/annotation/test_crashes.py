@@ -32,6 +32,7 @@ from semloc_logs.logs.annotation.annotate import (
     recover,
 )
 from semloc_logs.logs.annotation.tail_swap import locked
+from semloc_logs.tables import atomic_files
 from tests.lossy_disk import Crash, LossyDisk, Tree, read_tree, write_tree
 
 IN_PLACE_SYNCS = 4  # saved tail, its name, the log, the removal of the saved tail
@@ -124,6 +125,7 @@ def mended(state: Tree, folder: Path) -> Tree | str:
     log = write_tree(state, folder) / "log.mcap"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda handle: None)  # only what is in memory counts here
+        patch.setattr(atomic_files, "_PROCESS", "later")  # the writer is dead, this is another
         try:
             recover(log)
         except LogError as error:
