@@ -37,12 +37,16 @@ def settle(
     free = OF_DECISION if writes else frozenset()
     before = _by_key(kept.resolved())
     after = _by_key(settled.resolved())
+    bound = _bound_sections(work)
     contradicting = [
         key
         for key in given.given()
-        if key in before and key not in free and before[key] != after[key]
+        if key.split(".")[0] in bound
+        and key in before
+        and key not in free
+        and before[key] != after[key]
     ]
-    if contradicting and not overwrite and work.sessions():
+    if contradicting and not overwrite:
         key = contradicting[0]
         remedy = (
             "or add --overwrite to make its tables again" if writes else "as its tables have it"
@@ -81,6 +85,19 @@ def keep(work: Workspace, settings: Resolved) -> None:
     }
     if not work.settings.exists() or read_json(work.settings) != content:
         write_json(work.settings, content)
+
+
+def _bound_sections(work: Workspace) -> set[str]:
+    """The sections that tables of the workspace depend on already."""
+    sessions = work.sessions()
+    bound: set[str] = set()
+    if sessions:
+        bound |= {"fusion", "labels"}
+    if any(folder.words_json.exists() for folder in sessions):
+        bound.add("descriptor")
+    if work.closures.exists() or any((work.path / "alignments").glob("*/*/*.parquet")):
+        bound |= {"query", "closures"}
+    return bound
 
 
 def _by_key(settings: Resolved) -> dict[str, Any]:

@@ -21,9 +21,12 @@ ROOM = {"fusion.voxel_size": "0.05"}
 
 
 def kept(folder: Path, **given: str) -> Workspace:
-    """A workspace with a session and these settings."""
+    """A workspace with a session, its words, its alignments and these settings."""
     work = Workspace(folder / "work")
     write_json(work.session("a").session_json, {})
+    write_json(work.session("a").words_json, {})
+    work.alignments("a", "a").parent.mkdir(parents=True)
+    work.alignments("a", "a").touch()
     keep(work, load(assignments=given).resolved())
     return work
 
@@ -63,6 +66,19 @@ def test_a_contradiction_is_refused_with_both_values(
     section, name = key.split(".")
     assert str(getattr(getattr(settled, section), name)) == after
     assert settle(work, load(assignments={key: before})) is not None, "the same value is none"
+
+
+def test_a_section_binds_once_tables_depend_on_it(tmp_path: Path) -> None:
+    work = kept(tmp_path)
+    other = given(descriptor__stride="4"), given(query__every="4"), given(fusion__hit="1")
+    work.alignments("a", "a").unlink()
+    assert settle(work, other[1]).query.every == 4
+    with pytest.raises(SettingsError, match="stride"):
+        settle(work, other[0])
+    work.session("a").words_json.unlink()
+    assert settle(work, other[0]).descriptor.stride == 4
+    with pytest.raises(SettingsError, match="hit"):
+        settle(work, other[2])
 
 
 @pytest.mark.parametrize("key", ["logs.memory", "labels.threads", "training.seed"])
