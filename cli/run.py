@@ -54,7 +54,7 @@ def command(
 ) -> int:
     """Logs -> loop closures: fuse, describe, close and, with --annotate, annotate.
 
-    Each LOG is a session, called NAME or after the file. A pattern such as 'drives/*.mcap' stands
+    Each LOG is a session, called NAME or after the file. A quoted shell pattern stands
     for the files it matches, '-' for lines of standard input.
 
     Can be interrupted and run again: finished work is kept. A damaged log is named, the others
