@@ -80,7 +80,7 @@ def _fuse(
             report.failed.append(f"{reason} It failed before: --retry-failed reads it again.")
         else:
             tasks.append(task)
-    keep(work, settings)
+    keep(work, settings, overwrite=overwrite)
 
     for task, outcome in zip(tasks, engine.map(_fuse_one, tasks), strict=True):
         failure = work.failure(task.folder.name)

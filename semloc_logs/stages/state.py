@@ -17,6 +17,8 @@ from semloc_logs.workspace import Workspace
 # decides about alignments that are there already, which takes seconds: each close may choose
 OF_DECISION = frozenset({"closures.min_probability", "closures.misfits"})
 
+OF_MAPS = ("fusion", "labels")  # sections that maps depend on
+
 
 def settle(
     work: Workspace, given: Settings, *, writes: bool = False, overwrite: bool = False
@@ -71,11 +73,11 @@ def read_kept(work: Workspace) -> Settings | None:
         ) from None
 
 
-def keep(work: Workspace, settings: Resolved) -> None:
+def keep(work: Workspace, settings: Resolved, *, overwrite: bool = False) -> None:
     """Write workspace.json, where it does not hold the same already.
 
     ``given`` are the settings that differ from the defaults, for later commands; ``settings`` are
-    all of them.
+    all of them. The settings of maps stay as the first session has them, unless ``overwrite``.
     """
     content: dict[str, Any] = {
         "schema_version": 1,
@@ -83,18 +85,25 @@ def keep(work: Workspace, settings: Resolved) -> None:
         "given": settings.differences(),
         "settings": settings.tables(*TABLE_SECTIONS),
     }
+    if not overwrite and work.settings.exists() and work.sessions():
+        before = read_json(work.settings)
+        for part in ("given", "settings"):
+            for section in OF_MAPS:
+                content[part].pop(section, None)
+                if section in before[part]:
+                    content[part][section] = before[part][section]
     if not work.settings.exists() or read_json(work.settings) != content:
         write_json(work.settings, content)
 
 
 def _bound_sections(work: Workspace) -> set[str]:
-    """The sections that tables of the workspace depend on already."""
-    sessions = work.sessions()
+    """The sections that tables of several sessions depend on already.
+
+    Maps alone are not compared with each other: until words are made, each may have its own.
+    """
     bound: set[str] = set()
-    if sessions:
-        bound |= {"fusion", "labels"}
-    if any(folder.words_json.exists() for folder in sessions):
-        bound.add("descriptor")
+    if any(folder.words_json.exists() for folder in work.sessions()):
+        bound |= {"fusion", "labels", "descriptor"}
     if work.closures.exists() or any((work.path / "alignments").glob("*/*/*.parquet")):
         bound |= {"query", "closures"}
     return bound

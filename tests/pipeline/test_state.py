@@ -75,10 +75,17 @@ def test_a_section_binds_once_tables_depend_on_it(tmp_path: Path) -> None:
     assert settle(work, other[1]).query.every == 4
     with pytest.raises(SettingsError, match="stride"):
         settle(work, other[0])
-    work.session("a").words_json.unlink()
-    assert settle(work, other[0]).descriptor.stride == 4
     with pytest.raises(SettingsError, match="hit"):
         settle(work, other[2])
+    work.session("a").words_json.unlink()
+    assert settle(work, other[0]).descriptor.stride == 4
+    settled = settle(work, other[2]).resolved()
+    assert settled.fusion.hit == 1
+    # of that session alone: later ones take the settings of the first
+    keep(work, settled)
+    assert settle(work, given()).fusion.hit == Settings().fusion.hit
+    keep(work, settled, overwrite=True)
+    assert settle(work, given()).fusion.hit == 1
 
 
 @pytest.mark.parametrize("key", ["logs.memory", "labels.threads", "training.seed"])
