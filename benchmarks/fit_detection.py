@@ -28,10 +28,11 @@ from numpy.typing import NDArray
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.poses.plausibility import implausible
 from semloc_logs.logs.poses.track import PoseTrack
-from semloc_logs.logs.session.session import Session, SessionOptions, open_session
+from semloc_logs.logs.session.session import Session, open_session
 from semloc_logs.mapping.fit.check import StreamFit, check_stream
 from semloc_logs.mapping.fit.pairs import Clouds
 from semloc_logs.mapping.keyframes import Collected, collect
+from semloc_logs.mapping.session_fusion import reading_options
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.settings import Labels, load
 
@@ -62,11 +63,9 @@ class Drive:
 
 def read(log: Path, assignments: dict[str, str], folder: Path) -> Drive:
     """The keyframes of the first stream of a log."""
-    settings = load(assignments=assignments)
-    fusion = settings.resolved().fusion
-    options = SessionOptions(
-        min_range=fusion.min_range, max_range=2 * fusion.max_range, logs=settings.logs
-    )
+    settings = load(assignments=assignments).resolved()
+    fusion = settings.fusion
+    options = reading_options(settings, {})
     begun = time.process_time()
     with closing(open_session([log], options)) as session:
         labeller = Labeller(Labels(source="uniform"), session)
@@ -153,7 +152,7 @@ def row_of(drive: Drive) -> dict[str, Any]:
     fit = drive.check()
     seconds = time.process_time() - begun
     jump = implausible(drive.track)
-    speed, turn_rate = drive.clouds.rates()
+    speed, turn_rate = drive.clouds.rates
     way = drive.track.length()
     row: dict[str, Any] = {
         "log": drive.name,

@@ -6,9 +6,9 @@ One pass over the log, bounded memory.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -96,18 +96,21 @@ def fuse_session(
 
 def _opened(task: FuseTask) -> Session:
     """The session of the task's logs."""
-    fusion = task.settings.fusion
-    options = SessionOptions(
-        topics=task.topics,
+    options = reading_options(task.settings, task.topics)
+    return open_session([*task.logs], replace(options, poses=task.poses, mountings=task.mountings))
+
+
+def reading_options(settings: Resolved, topics: Mapping[str, str]) -> SessionOptions:
+    """How a log is read to be fused, or to be checked as it would be fused."""
+    fusion = settings.fusion
+    return SessionOptions(
+        topics=topics,
         min_range=fusion.min_range,
         max_range=READ_RANGE * fusion.max_range,
         noise=RangeNoise(fusion.depth_noise, fusion.disparity_noise),
-        poses=task.poses,
         odometry=fusion.odometry,
-        logs=task.settings.logs,
-        mountings=task.mountings,
+        logs=settings.logs,
     )
-    return open_session([*task.logs], options)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,23 +10,18 @@ from typing import Any
 
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.problems import sentences, to_report
-from semloc_logs.logs.session.session import SessionOptions, open_session
+from semloc_logs.logs.session.session import open_session
 from semloc_logs.mapping.fit.check import SessionFit, check_session
 from semloc_logs.mapping.keyframes import collect
+from semloc_logs.mapping.session_fusion import reading_options
 from semloc_logs.settings import Labels, Settings
-
-READ_RANGE = 2.0  # of the largest range that is fused, as fusing reads it
 
 
 def check_log(log: Path, settings: Settings, topics: Mapping[str, str]) -> SessionFit:
     """Reads the keyframes of a log and checks them. LogError and RoleError as in fusing."""
-    fusion = settings.resolved().fusion
-    options = SessionOptions(
-        topics=topics,
-        min_range=fusion.min_range,
-        max_range=READ_RANGE * fusion.max_range,
-        logs=settings.logs,
-    )
+    resolved = settings.resolved()
+    fusion = resolved.fusion
+    options = reading_options(resolved, topics)
     with closing(open_session([log], options)) as session, tempfile.TemporaryDirectory() as folder:
         labeller = Labeller(Labels(source="uniform"), session)
         collected = collect(session, labeller, fusion, Path(folder), log.name)

@@ -16,7 +16,6 @@ from semloc_logs.workspace import Workspace
 
 # decides about alignments that are there already, which takes seconds: each close may choose
 OF_DECISION = frozenset({"closures.min_probability", "closures.misfits"})
-
 OF_MAPS = ("fusion", "labels")  # sections that maps depend on
 
 
@@ -103,7 +102,7 @@ def _bound_sections(work: Workspace) -> set[str]:
     """
     bound: set[str] = set()
     if any(folder.words_json.exists() for folder in work.sessions()):
-        bound |= {"fusion", "labels", "descriptor"}
+        bound |= {*OF_MAPS, "descriptor"}
     if work.closures.exists() or any((work.path / "alignments").glob("*/*/*.parquet")):
         bound |= {"query", "closures"}
     return bound

@@ -1,4 +1,4 @@
-"""Hypotheses at the same pose are merged; those of opposite headings stay apart."""
+"""Hypotheses at the same pose are merged; hypotheses with opposite headings stay separate."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def test_a_log_is_called_after_its_file_or_as_it_is_named(tmp_path: Path) -> Non
     assert sessions("x/a.mcap", "second=y/a.mcap") == {"a": ["x/a.mcap"], "second": ["y/a.mcap"]}
     odd = tmp_path / "k=v.mcap"
     odd.touch()
-    assert sessions(odd) == {"k=v": [str(odd)]}, "a file that exists is no name"
+    assert sessions(odd) == {"k=v": [str(odd)]}, "the text is a path because the file exists"
     assert sessions("dir/k=v.mcap") == {"k=v": ["dir/k=v.mcap"]}, "nor is a folder"
 
 

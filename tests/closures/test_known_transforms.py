@@ -326,7 +326,7 @@ def test_a_second_place_that_fits_as_well_is_a_rival(work: Workspace, ask: Ask) 
     assert second.features.distinct == pytest.approx(1.0, abs=0.02)
     assert 0.3 < alone.features.distinct < 0.8
     assert max(first.probability, second.probability) < 0.99 < alone.probability
-    # the better place is the rival of the worse one: its score by that of the worse
+    # the better place is the rival of the worse one: the ratio of their scores
     worse = ask(here)[1]
     assert worse.features.distinct == pytest.approx(1 / alone.features.distinct, rel=0.02)
 
@@ -380,7 +380,7 @@ def test_a_near_word_outweighs_several_far_ones(
     assert sorted(h.pose[0] for h in found[:4]) == pytest.approx(
         [0.25 + k * np.pi / 2 for k in range(4)]
     )
-    for h in found:  # the word of the query lies on that of the map
+    for h in found:  # the query word lies on the map word
         at = apply(
             yaw_transform(h.pose[0], np.array(h.pose[1:])), described.centre[:1].astype(float) * V
         )[0]

@@ -77,8 +77,12 @@ def implausible(track: PoseTrack) -> Jump | None:
 
 def _turns(poses: F64) -> F64:
     """Angle (n - 1,) of each step, radians."""
-    steps = np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]
-    cosine = 0.5 * (np.trace(steps, axis1=1, axis2=2) - 1.0)
+    return _angles(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+
+
+def _angles(rotations: F64) -> F64:
+    """Angles (n,) of rotations (n, 3, 3), radians."""
+    cosine = 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0)
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
@@ -97,9 +101,7 @@ def _around(values: F64) -> F64:
 def _restarts(poses: F64, breaks: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Steps (n - 1,) after which the pose is the identity, from farther away."""
     offsets = np.linalg.norm(poses[:, :3, 3], axis=1)
-    cosine = 0.5 * (np.trace(poses[:, :3, :3], axis1=1, axis2=2) - 1.0)
-    angles = np.arccos(np.clip(cosine, -1.0, 1.0))
-    at_identity = (offsets < AT_IDENTITY) & (angles < TURNED_AT_IDENTITY)
+    at_identity = (offsets < AT_IDENTITY) & (_angles(poses[:, :3, :3]) < TURNED_AT_IDENTITY)
     return np.asarray(breaks & at_identity[1:] & (offsets[:-1] > FAR))
 
 

@@ -215,10 +215,10 @@ def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
     given = registered(clouds, numbers)
     if len(given.pairs) < LEAST_PAIRS:
         return StreamFit(topic, len(given.pairs))
-    none = fit(given.pairs, poses_at, np.zeros(0, np.int64), np.zeros(PARAMETERS))
+    squares = given.pairs.squares(pose_motion(given.pairs, poses_at, np.zeros(PARAMETERS)))
     # poses from which registration hardly moves are not far off
-    is_doubtful = float(np.nanmedian(none.squares)) > DOUBTFUL
-    start = _better_start(clouds, given, none.squares) if is_doubtful else None
+    is_doubtful = float(np.nanmedian(squares)) > DOUBTFUL
+    start = _better_start(clouds, given, squares) if is_doubtful else None
     if start is not None:
         stream = _judged(topic, clouds, poses_at, registered(clouds, numbers, start))
         if stream.findings:
@@ -306,9 +306,7 @@ def _other_reading(pairs: Pairs, poses_at: PosesAt, given: Estimate) -> Finding 
     far = float(np.nanmedian(given.squares))
     if far < FAR_OFF:
         return None
-    poses, known = poses_at(pairs.stamps_ns.ravel())
-    poses = poses.reshape(-1, 2, 4, 4)
-    known = np.asarray(known.reshape(-1, 2).all(1))
+    poses, known = pairs.poses(poses_at)
     fixed = np.tile(np.eye(4), (len(pairs), 1, 1))
     inverted = poses[:, 0] @ inverse(poses[:, 1])
     for predicted, text in (
@@ -405,7 +403,7 @@ def _significant(estimate: Estimate, fault: Fault) -> F64:
 def _effect(parameters: F64, fault: Fault, clouds: Clouds) -> float:
     """What a fault does to a closure, in voxels (:data:`NOTED`, :data:`WRONG`)."""
     if fault is Fault.CLOCK:
-        speed, turn_rate = clouds.rates()
+        speed, turn_rate = clouds.rates
         shift = max(speed / clouds.voxel, turn_rate * NEAR_VOXELS)
         return abs(float(parameters[CLOCK])) * shift
     if fault is Fault.ROTATION:

@@ -55,7 +55,8 @@ class Fault(Enum):
         return np.array(_COLUMNS[self.value], np.int64)
 
 
-_COLUMNS = {"clock": [CLOCK], "rotation": [1, 2, 3], "lever": [4, 5, 6], "scale": [SCALE]}
+_ALL = range(PARAMETERS)
+_COLUMNS = {"clock": [CLOCK], "rotation": _ALL[ROTATION], "lever": _ALL[LEVER], "scale": [SCALE]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +90,14 @@ class Pairs:
         Few shifts are tried many times, so they are kept; ``poses_at`` is always the same.
         """
         if shift_ns not in self._motions:
-            poses, known = poses_at((self.stamps_ns + shift_ns).ravel())
-            poses = poses.reshape(-1, 2, 4, 4)
-            both_known = np.asarray(known.reshape(-1, 2).all(1))
-            self._motions[shift_ns] = inverse(poses[:, 0]) @ poses[:, 1], both_known
+            poses, known = self.poses(poses_at, shift_ns)
+            self._motions[shift_ns] = inverse(poses[:, 0]) @ poses[:, 1], known
         return self._motions[shift_ns]
+
+    def poses(self, poses_at: PosesAt, shift_ns: int = 0) -> tuple[F64, Bools]:
+        """``session_T_base`` (n, 2, 4, 4) of target and source, and where both are known (n,)."""
+        poses, known = poses_at((self.stamps_ns + shift_ns).ravel())
+        return poses.reshape(-1, 2, 4, 4), np.asarray(known.reshape(-1, 2).all(1))
 
     def residuals(self, predicted: F64) -> F64:
         """Differences (n, 6) to ``predicted`` (n, 4, 4), in standard deviations."""

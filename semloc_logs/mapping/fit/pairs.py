@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,7 @@ I64 = NDArray[np.int64]
 # the second keyframe of a pair has moved so far (voxels), or turned so far (rad)
 APART = 6.0
 TURNED = 0.17
-LONGEST_NS = (
-    3_000_000_000  # between both; later ones have drifted apart, or something stood between
-)
+LONGEST_NS = 3_000_000_000  # between both; odometry of later ones has drifted apart
 MOST_POINTS = 1500  # of a source
 COARSE, FINE = 4.0, 2.0  # edge of the cells (voxels)
 SPEEDS = (1.0, 0.6, 1.4)  # shares of the last speed
@@ -45,7 +44,7 @@ LEAST_SHARE = 0.02  # of the points on planes, for a registration
 CORRELATED = 12.0  # points of one surface share their error: as many count as one
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Clouds:
     """The keyframes of one stream: ``rows`` of ``collected``, ``voxel`` is the voxel size (m)."""
 
@@ -67,6 +66,7 @@ class Clouds:
         points = points[thin(points, self.voxel)]
         return points[:: max(1, len(points) // MOST_POINTS)].astype(float)
 
+    @cached_property
     def rates(self) -> tuple[float, float]:
         """Speed (m/s) and turn rate (rad/s) that the drive reaches in a tenth of its steps."""
         stamps_ns = self.stamps_ns()

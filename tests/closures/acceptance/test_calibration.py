@@ -169,7 +169,7 @@ def test_which_model_decides() -> None:
     assert by(own_probability=0.7, neighbours=3, far_support=0.1) == pytest.approx(together)
     assert by(own_probability=0.7, neighbours=3, far_conflict=0.1) == pytest.approx(together)
     assert by(own_probability=0.7, far_support=5.0) == 0.7
-    # what is impossible by itself stays so
+    # an impossible alignment stays impossible
     assert by(own_probability=0.0, neighbours=3, far_support=5.0) == 0.0
     assert by(own_probability=0.7, neighbours=3, ambiguity=0.5) == pytest.approx(near)
     assert by(own_probability=0.7, neighbours=3, ambiguity=0.51) == pytest.approx(near / 2)
