@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.mask_grid import wanted_bits
+from semloc_logs.alignment.mask_grid import MaskGrid, build_mask_grid, wanted_bits
 from semloc_logs.labels.space import GROUND, cityscapes
 from semloc_logs.voxels.grid import BlockMap
 
@@ -49,6 +49,14 @@ def structure_mask(label: U8) -> NDArray[np.bool_]:
     dynamic[: len(cityscapes().dynamic)] = cityscapes().dynamic
     dynamic[list(GROUND)] = True
     return ~dynamic[label]
+
+
+def structure_of(blocks: BlockMap, voxel_size: float) -> tuple[F64, U8]:
+    """Centres (n, 3) in metres and class bits (n,) of the structure voxels of a map."""
+    ijk, label = blocks.occupied()
+    keep = structure_mask(label)
+    centres = (ijk[keep].astype(float) + 0.5) * voxel_size
+    return centres, wanted_bits(label[keep], cityscapes().coarse)
 
 
 def view_centres(position: F64, mean: F64, voxel_size: float) -> F64:
@@ -119,9 +127,12 @@ class Query:
     @cached_property
     def structure(self) -> tuple[F64, U8]:
         """Centres (n, 3) in metres and class bits (n,) of all structure voxels."""
-        ijk, label = self.occupied
-        keep = structure_mask(label)
-        return self._centres(ijk[keep]), wanted_bits(label[keep], cityscapes().coarse)
+        return structure_of(self.blocks, self.voxel_size)
+
+    @cached_property
+    def mask_grid(self) -> MaskGrid:
+        """Bit masks to look a target's voxels up in."""
+        return build_mask_grid(self.blocks, self.voxel_size, cityscapes().coarse)
 
     def _centres(self, ijk: NDArray[np.int32]) -> F64:
         return np.asarray((ijk.astype(float) + 0.5) * self.voxel_size)

@@ -11,12 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.mask_grid import FREE_BIT, look_up
+from semloc_logs.alignment.mask_grid import FREE_BIT, MaskGrid, look_up
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.target_map import Target
-from semloc_logs.numerics.transforms import apply
+from semloc_logs.numerics.transforms import apply, inverse
 
 F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+DOUBT = 400  # voxels that are added to what is observed, and their shares in wrong poses
+DOUBTFUL_ALIGNED, DOUBTFUL_FREE = 0.5, 0.25
 ENOUGH_COVERAGE = 0.5  # of the query's structure in observed space: less of it lowers the score
 
 
@@ -29,16 +32,30 @@ def alignment_score(
 
 
 class Scores(NamedTuple):
-    """Shares of a query's structure, and the number of ``aligned`` structure voxels.
+    """Counts of structure voxels: all, those in observed space, ``aligned`` and in ``free`` space.
 
-    ``structure``: within a voxel of structure of its class, of what falls into observed space;
-    ``coverage``: in observed space; ``contradiction``: in free space.
+    Aligned are those within a voxel of structure of their class.
     """
 
-    structure: float
-    coverage: float
-    contradiction: float
+    total: int
+    observed: int
     aligned: int
+    free: int
+
+    @property
+    def structure(self) -> float:
+        """Share of the observed voxels that are aligned."""
+        return self.aligned / max(self.observed, 1)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the voxels in observed space."""
+        return self.observed / max(self.total, 1)
+
+    @property
+    def contradiction(self) -> float:
+        """Share of the voxels in free space."""
+        return self.free / max(self.total, 1)
 
     @property
     def score(self) -> float:
@@ -47,17 +64,37 @@ class Scores(NamedTuple):
 
 
 def structure_scores(query: Query, target: Target, target_T_query: F64) -> Scores:
-    """The scores of an alignment."""
-    centres, bits = query.structure
+    """The scores of a query's structure on a target's map."""
+    return _scores(query.structure, target.mask_grid, target_T_query)
+
+
+def reverse_scores(query: Query, target: Target, target_T_query: F64) -> Scores:
+    """The scores of a target's structure on a query's map."""
+    return _scores(target.structure, query.mask_grid, inverse(target_T_query))
+
+
+def mutual_shares(forward: Scores, reverse: Scores) -> tuple[float, float]:
+    """Of the voxels that the other side observed, the shares that are aligned and in free space.
+
+    They are weighted geometric means of both sides, where the worse side counts twice: what is new
+    or gone contradicts one side alone, a wrong pose both. A handful of voxels fits anywhere, so
+    some are added that fit as in wrong poses.
+    """
+    sides = (forward, reverse)
+    aligned = [(s.aligned + DOUBT * DOUBTFUL_ALIGNED) / (s.observed + DOUBT) for s in sides]
+    free = [(s.free + DOUBT * DOUBTFUL_FREE) / (s.observed + DOUBT) for s in sides]
+    return _weighted(min(aligned), max(aligned)), _weighted(max(free), min(free))
+
+
+def _weighted(worse: float, better: float) -> float:
+    return float(np.cbrt(worse * worse * better))
+
+
+def _scores(structure: tuple[F64, U8], grid: MaskGrid, grid_T_structure: F64) -> Scores:
+    centres, bits = structure
     if not len(centres):
-        return Scores(0.0, 0.0, 0.0, 0)
-    mask = look_up(target.mask_grid, apply(target_T_query, centres))
-    observed = mask != 0
+        return Scores(0, 0, 0, 0)
+    mask = look_up(grid, apply(grid_T_structure, centres))
     aligned = (mask & bits) != 0
     free = (mask & FREE_BIT) != 0
-    return Scores(
-        float(aligned.sum() / max(observed.sum(), 1)),
-        float(observed.mean()),
-        float(free.mean()),
-        int(aligned.sum()),
-    )
+    return Scores(len(mask), int((mask != 0).sum()), int(aligned.sum()), int(free.sum()))

@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.mask_grid import MaskGrid, build_mask_grid
+from semloc_logs.alignment.query_map import structure_of
 from semloc_logs.alignment.surface import Surface, flattened_surface, surface_of, thin_points
 from semloc_logs.labels.space import cityscapes
 from semloc_logs.mapping.selection import thin
 from semloc_logs.voxels.grid import BlockMap
 
 F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
 # of correspondences, voxels: the model of the acceptance was fitted with them
 COARSE_RADII = (3.0, 1.5)
 FINE_RADII = (0.7, 0.4)
@@ -36,6 +38,11 @@ class Target:
     def mask_grid(self) -> MaskGrid:
         """Bit masks to look voxels up in."""
         return build_mask_grid(self.blocks, self.voxel_size, cityscapes().coarse)
+
+    @cached_property
+    def structure(self) -> tuple[F64, U8]:
+        """Centres (n, 3) in metres and class bits (n,) of all structure voxels."""
+        return structure_of(self.blocks, self.voxel_size)
 
     @cached_property
     def surface(self) -> Surface:

@@ -41,7 +41,6 @@ def alignment_table(alignments: Sequence[Alignment]) -> pa.Table:
     poses = np.array([a.target_T_query for a in alignments]).reshape(-1, 4, 4)
     columns |= pose_columns(poses)
     columns["covariance"] = [a.covariance.ravel().tolist() for a in alignments]
-    columns["alone"] = [a.probability for a in alignments]
     columns |= {name: [getattr(a.features, name) for a in alignments] for name in FEATURES}
     return contracts.table("alignments", columns)
 
@@ -61,7 +60,6 @@ def read_alignments(path: Path, query: str, target: str) -> list[Alignment]:
             target_T_query=pose,
             covariance=np.array(row["covariance"]).reshape(6, 6),
             overlap=row["overlap"],
-            probability=row["alone"],
             inliers=row["inliers"],
             words=row["words"],
             features=Features(*(row[name] for name in FEATURES)),

@@ -41,10 +41,9 @@ class Features(Columns, Generic[Value]):
     coverage: Value
     contradiction: Value
     fit: Value
-    rmse: Value
-    distinct: Value
     support: Value
     stiffness: Value
+    range_sigma: Value
 
 
 FEATURES = tuple(f.name for f in fields(Features))
@@ -54,10 +53,11 @@ FEATURES = tuple(f.name for f in fields(Features))
 class Agreement(Columns, Generic[Value]):
     """How other queries of the session vote on an alignment.
 
-    ``own_probability`` is what the alignment's own features give. ``support`` and ``conflict`` are
-    sums of own probabilities of near neighbours that agree and that do not; ``far_support`` and
-    ``far_conflict`` those farther along the road. ``ambiguity`` in [0, 1] is how much the road
-    around either end matches other places. See ``schemas/parquet/rejected.json``.
+    ``own_probability`` is what the features of the query's alignments with the target give.
+    ``support`` and ``conflict`` are sums of own probabilities of near neighbours that agree and
+    that do not; ``far_support`` and ``far_conflict`` those farther along the road. ``ambiguity`` in
+    [0, 1] is how much the road around either end matches other places. See
+    ``schemas/parquet/rejected.json``.
     """
 
     own_probability: Value
@@ -77,8 +77,8 @@ class Agreement(Columns, Generic[Value]):
 class Alignment:
     """A verified hypothesis before any decision about it.
 
-    ``probability`` is by the alignment's own features. The keyframes are the query's, and the
-    target's nearest one; ``covariance`` (6, 6) is in the axes of the target's, metres and radians.
+    The keyframes are the query's, and the target's nearest one; ``covariance`` (6, 6) is in the
+    axes of the target's, metres and radians.
     """
 
     query_session: str
@@ -90,7 +90,6 @@ class Alignment:
     target_T_query: F64
     covariance: F64
     overlap: float
-    probability: float
     inliers: int
     words: int
     features: Features[float]
@@ -101,21 +100,34 @@ class Alignment:
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
 
+class Veto(Enum):
+    """What rejects an alignment whatever its probability is."""
+
+    CONTRADICTS_ODOMETRY = "contradicts_odometry"
+    AMBIGUOUS_PLACE = "ambiguous_place"
+    LOOSE_FIT = "loose_fit"
+
+
 @dataclass(frozen=True, slots=True)
 class Decision:
     """The probability of an alignment after all queries are compared, and its factors.
 
-    ``probability`` is the product of ``place_probability`` (the place is right),
-    ``position_confidence`` (the position is known well enough) and ``mode_share`` (of the poses
-    that fit this place, this is the right one). At least ``min_probability`` is required.
+    ``probability`` is the product of ``place_probability`` (the place is right), ``mode_share`` (of
+    the poses that fit this place, this is the right one) and ``position_confidence`` (the position
+    is known well enough). At least ``min_probability`` and no ``vetoes`` are required.
     """
 
-    probability: float
-    agreement: Agreement[float]
+    vetoes: frozenset[Veto]
     place_probability: float
-    position_confidence: float
     mode_share: float
+    position_confidence: float
+    agreement: Agreement[float]
     min_probability: float
+
+    @property
+    def probability(self) -> float:
+        """The product of the factors."""
+        return self.place_probability * self.mode_share * self.position_confidence
 
 
 class Reason(Enum):
@@ -129,14 +141,10 @@ class Reason(Enum):
         "neighbouring queries conflict: of {neighbours:.0f}, {support:.1f} support this place and"
         " {conflict:.1f} match elsewhere"
     )
-    UNOBSERVED = "only {coverage:.0f} % of the query's structure falls into observed space"
-    STRUCTURE_MISMATCH = (
-        "only {structure:.0f} % of the query's structure lies on structure of its class"
-    )
-    RIVAL_PLACE = "another place fits nearly as well ({rival:.0f} % of this score)"
-    BETTER_RIVAL = "another place fits better (this one has at most {of_rival:.0f} % of its score)"
+    FREE_SPACE = "{contradiction:.0f} % of the structure of both sides lies in free space"
+    RIVAL_PLACE = "other places fit too: by itself this one has a probability of {own:.2f}"
     LOOSE_FIT = "only {fit:.0f} % of the points lie on a surface"
-    WEAK_EVIDENCE = "the evidence together is too weak"
+    UNCERTAIN_RANGES = "the ranges are too uncertain ({range_sigma:.1f} voxels)"
     SECOND_CHOICE = "another place of the same session fits better"
 
 
@@ -160,9 +168,9 @@ class Rejected:
     def sentence(self) -> str:
         """The reason with its figures."""
         sentence = self.reason.value.format(**self.figures())
-        if self.reason is Reason.SECOND_CHOICE:
-            return sentence
         decision = self.decision
+        if self.reason is Reason.SECOND_CHOICE or decision.vetoes:
+            return sentence
         return (
             f"probability {decision.probability:.3f} below {decision.min_probability:g}: {sentence}"
         )
@@ -178,9 +186,8 @@ class Rejected:
             "neighbours": agreement.neighbours,
             "support": agreement.support,
             "conflict": agreement.conflict,
-            "coverage": 100 * features.coverage,
-            "structure": 100 * features.structure,
-            "rival": 100 * features.distinct,
-            "of_rival": 100 / max(features.distinct, 1.0),
+            "contradiction": 100 * features.contradiction,
+            "own": agreement.own_probability,
             "fit": 100 * features.fit,
+            "range_sigma": features.range_sigma,
         }

@@ -10,19 +10,18 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.covariance import covariance_of, stiffness
+from semloc_logs.alignment.covariance import Roads, covariance_of, stiffness
 from semloc_logs.alignment.hypotheses import Hypothesis, keep_best_submaps, pool, same_place
 from semloc_logs.alignment.icp import Fit
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit, measured
-from semloc_logs.alignment.scores import Scores, structure_scores
+from semloc_logs.alignment.scores import Scores, mutual_shares, reverse_scores, structure_scores
 from semloc_logs.alignment.search import Candidate, search_hypotheses
 from semloc_logs.alignment.tau import tau
-from semloc_logs.closures.acceptance.calibration import MIN_RELATIVE_SCORE, MIN_SCORE, shipped
 from semloc_logs.closures.alignment_tables import write_part
 from semloc_logs.closures.closure import Alignment, Features
 from semloc_logs.closures.database import Database, open_database
-from semloc_logs.closures.query import build_query
+from semloc_logs.closures.query import build_query, query_members, road_along, road_of
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import Visibility, visible_to
 from semloc_logs.labels.space import cityscapes
@@ -44,10 +43,9 @@ VOTE_CELL = 2.4  # m, at voxels of 0.30 m: edge of the cells that word matches v
 # the weight of a word match falls to LEAST_WEIGHT at so many bits between the words
 FAR_WORD = 32.0
 LEAST_WEIGHT = 1e-3
-# voxels of road between two places of a target that may be one, driven again
-DRIVEN_AGAIN = 50
-LEAST_SCORE = 1e-3  # that a rival's score is divided by
-MOST_DISTINCT = 2.0  # a rival's score over an alignment's: more is not worse
+# of the best score, and a score: no right alignment has less
+MIN_RELATIVE_SCORE = 0.8
+MIN_SCORE = 0.3
 
 Prepared = tuple[Described, list[list[LookUp]]]
 _PREPARED: WeakKeyDictionary[Query, dict[str, Prepared]] = WeakKeyDictionary()
@@ -95,7 +93,8 @@ class Fitted:
     """A candidate after a fit on the points.
 
     ``nearest`` is the target's keyframe nearest to it, ``view`` (3,) where the query looks, in the
-    target's map.
+    target's map; ``range_sigma`` the median standard deviation of points along their rays, metres,
+    of the query or of the target's surface, whichever is larger.
     """
 
     candidate: Candidate
@@ -103,6 +102,7 @@ class Fitted:
     view: F64
     fit: Fit
     scores: Scores
+    range_sigma: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +171,11 @@ def search_query(
     ]
     return sorted(
         alignments,
-        key=lambda a: (-a.probability, -a.features.structure, a.target_session, a.target_stamp_ns),
+        key=lambda a: (
+            a.features.contradiction - a.features.structure,
+            a.target_session,
+            a.target_stamp_ns,
+        ),
     )
 
 
@@ -316,7 +320,7 @@ def align_candidates(context: QueryContext, candidates: list[Candidate]) -> list
         best = max((f.scores.score for f in fine), default=0.0)
         fine.append(_fine(context, fitted, best))
     fine = _each_place_once(fine, context.voxel_size)
-    return [_alignment(context, f, _rival_score(context, f, fine)) for f in fine]
+    return [_alignment(context, f) for f in fine]
 
 
 def _coarse(context: QueryContext, candidate: Candidate) -> Fitted:
@@ -333,6 +337,7 @@ def _coarse(context: QueryContext, candidate: Candidate) -> Fitted:
         apply(candidate.target_T_query, query.view_centre[None])[0],
         fit,
         structure_scores(query, target, fit.target_T_query),
+        query.sigma,
     )
 
 
@@ -349,7 +354,12 @@ def _fine(context: QueryContext, fitted: Fitted, best_score: float) -> Fitted:
         return replace(fitted, fit=measured(start, target.surface, query))
     surface = target_surface(context.visible, group, fitted.view)
     fit = fine_fit(start, surface, query)
-    return replace(fitted, fit=fit, scores=structure_scores(query, target, fit.target_T_query))
+    return replace(
+        fitted,
+        fit=fit,
+        scores=structure_scores(query, target, fit.target_T_query),
+        range_sigma=max(query.sigma, surface.sigma),
+    )
 
 
 def _each_place_once(fitted: list[Fitted], voxel_size: float) -> list[Fitted]:
@@ -362,39 +372,18 @@ def _each_place_once(fitted: list[Fitted], voxel_size: float) -> list[Fitted]:
     return kept
 
 
-def _rival_score(context: QueryContext, one: Fitted, fitted: list[Fitted]) -> float:
-    """The best score of another place.
-
-    The same place, driven again and moved by the drift of the target's odometry, is not another.
-    """
-    distance = context.target_session(one.candidate.group).distance
-    best = 0.0
-    for other in fitted:
-        if other is one:
-            continue
-        road = abs(float(distance[one.nearest] - distance[other.nearest]))
-        driven_again = road > DRIVEN_AGAIN * context.voxel_size and same_place(
-            one.fit.target_T_query, other.fit.target_T_query, context.voxel_size, road
-        )
-        if not driven_again:
-            best = max(best, other.scores.score)
-    return best
-
-
-def _alignment(context: QueryContext, fitted: Fitted, rival_score: float) -> Alignment:
-    """The alignment of one candidate with its features, probability and covariance."""
+def _alignment(context: QueryContext, fitted: Fitted) -> Alignment:
+    """The alignment of one candidate with its features and covariance."""
     visible = context.visible
     session = context.session
     group = fitted.candidate.group
     target_session = context.target_session(group)
-    features = _features(fitted, rival_score, context.voxel_size)
+    features = _features(context, fitted)
     overlap, inliers = _overlap(context, fitted)
 
     map_T_query_base = fitted.fit.target_T_query @ context.query_T_base
     nearest = visible.nearest_keyframe(group, map_T_query_base[:3, 3])
     map_T_target = target_session.map_T_base[nearest]
-    viewing = visible.viewing_keyframe(group, fitted.view)
-    road = abs(float(target_session.distance[nearest] - target_session.distance[viewing]))
     return Alignment(
         query_session=session.folder.name,
         target_session=target_session.folder.name,
@@ -404,29 +393,46 @@ def _alignment(context: QueryContext, fitted: Fitted, rival_score: float) -> Ali
         target_stamp_ns=int(target_session.stamps_ns[nearest]),
         target_T_query=inverse(map_T_target) @ map_T_query_base,
         covariance=covariance_of(
-            fitted.fit, map_T_query_base, map_T_target, context.voxel_size, road
+            fitted.fit,
+            map_T_query_base,
+            map_T_target,
+            context.voxel_size,
+            _roads(context, fitted, nearest),
         ),
         overlap=overlap,
-        probability=float(shipped().own(features)),
         inliers=inliers,
         words=fitted.candidate.votes,
         features=features,
     )
 
 
-def _features(fitted: Fitted, rival_score: float, voxel_size: float) -> Features[float]:
-    scores = fitted.scores
-    fit = fitted.fit
-    distinct = max(rival_score, 0.0) / max(scores.score, LEAST_SCORE)
+def _roads(context: QueryContext, fitted: Fitted, nearest: int) -> Roads:
+    """The road that the query, its target and what lies between them were driven along."""
+    group = fitted.candidate.group
+    target = context.target_session(group)
+    viewing = context.visible.viewing_keyframe(group, fitted.view)
+    settings = context.settings
+    return Roads(
+        query=road_of(context.session, query_members(context.session, context.keyframe, settings)),
+        target=road_along(target, viewing, settings.closures.surface_keyframes),
+        between=abs(float(target.distance[nearest] - target.distance[viewing])),
+    )
+
+
+def _features(context: QueryContext, fitted: Fitted) -> Features[float]:
+    """The evidence of both sides: the query on the target's map, and this on the query's."""
+    forward = fitted.scores
+    target = context.visible.target(fitted.candidate.group)
+    reverse = reverse_scores(context.query, target, fitted.fit.target_T_query)
+    structure, contradiction = mutual_shares(forward, reverse)
     return Features(
-        structure=scores.structure,
-        coverage=scores.coverage,
-        contradiction=scores.contradiction,
-        fit=fit.inliers,
-        rmse=fit.rmse / voxel_size,
-        distinct=min(distinct, MOST_DISTINCT),
-        support=float(np.log10(scores.aligned + 1)),
-        stiffness=float(np.log10(stiffness(fit) + 1)),
+        structure=structure,
+        coverage=forward.coverage,
+        contradiction=contradiction,
+        fit=fitted.fit.inliers,
+        support=float(np.log10(forward.aligned + reverse.aligned + 1)),
+        stiffness=float(np.log10(stiffness(fitted.fit) + 1)),
+        range_sigma=fitted.range_sigma / context.voxel_size,
     )
 
 

@@ -53,6 +53,17 @@ def query_members(session: SessionMap, keyframe: int, settings: Resolved) -> lis
     return [i for i in range(first, first + count) if distance[i] <= settings.query.radius]
 
 
+def road_along(session: SessionMap, keyframe: int, count: int) -> float:
+    """Metres of road that the ``count`` keyframes nearest to one were driven along."""
+    away = np.abs(session.distance - session.distance[keyframe])
+    return road_of(session, np.argsort(away, kind="stable")[:count].tolist())
+
+
+def road_of(session: SessionMap, keyframes: list[int]) -> float:
+    """Metres of road between the first and the last of some keyframes."""
+    return float(np.ptp(session.distance[keyframes]))
+
+
 def build_query(session: SessionMap, keyframe: int, settings: Resolved) -> tuple[Query, F64]:
     """The query map in a level frame whose origin is the base at ``keyframe``.
 

@@ -1,14 +1,14 @@
 """How probable is it that an alignment is right? Learnt from queries in simulated towns, of which
 many have never been visited.
 
-Every town is judged against its truth into a table of its own; the three logistic models of the
+Every town is judged against its truth into a table of its own; the two logistic models of the
 acceptance are fitted on all of them. The report on each town is by models that never saw
 it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,17 +19,19 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.closures.acceptance.calibration import (
-    NEIGHBOUR_EVIDENCE,
+    EVIDENCE,
+    VOTES,
     Calibration,
+    Evidence,
     Model,
-    NeighbourEvidence,
+    Votes,
+    fit_additions,
     fit_logistic,
-    has_far,
-    is_plausible,
+    is_loose,
     position_confidence,
-    probability_ignoring_rivals,
+    probability_of,
 )
-from semloc_logs.closures.acceptance.consistency import count_votes, mode_shares
+from semloc_logs.closures.acceptance.consistency import count_votes, place_odds
 from semloc_logs.closures.acceptance.placements import Placed, contradicts_odometry
 from semloc_logs.closures.closure import FEATURES, Agreement, Features
 from semloc_logs.closures.closure_tables import keyframe_at
@@ -42,28 +44,14 @@ from semloc_logs.workspace import Workspace
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-# The sign with which evidence may count. The plane distances of fitting points (rmse) say more
-# about the sensor than about the place.
-SIGNS = {
-    "structure": 1,
-    "coverage": 1,
-    "contradiction": -1,
-    "fit": 1,
-    "rmse": 0,
-    "distinct": -1,
-    "support": 1,
-    "stiffness": 1,
-}
-# of ``NEIGHBOUR_EVIDENCE``
-TOGETHER_SIGNS = (1, 1, 1, -1, 1, -1)
-NEAR_SIGNS = (0, 1, 1, -1, 0, 0)
-# how towns of copied blocks begin, and how much they count for an alignment by itself
-COPIES, COPIES_COUNT = "repeating", 0.01
+# the sign with which evidence may count
+SIGNS = (-1, 1, -1)  # of ``EVIDENCE``
+VOTE_SIGNS = (1, -1, 1, -1)  # of ``VOTES``
+COPIES = "repeating"  # in the names of towns of copied blocks
 SURE = 0.99  # what would be accepted
 # how much streets look like others by chance, in however few towns it was not seen
-BY_CHANCE = 0.05
+BY_CHANCE = 0.001
 EXTREMES = 0.05  # of a town's lookalikes count as outliers
-FEWEST = 0.002  # of the right alignments have less support than any that is accepted
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
 THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 
@@ -93,12 +81,7 @@ class Judged:
     @property
     def copies(self) -> Bools:
         """Which lie in towns of copied blocks (n,)."""
-        return np.array([town.startswith(COPIES) for town in self.town], bool)
-
-    @property
-    def counts(self) -> F64:
-        """How much each counts (n,) for the model of an alignment by itself."""
-        return np.where(self.copies, COPIES_COUNT, 1.0)
+        return np.array([COPIES in town for town in self.town], bool)
 
     def __len__(self) -> int:
         return len(self.town)
@@ -152,7 +135,6 @@ def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
         "target_session",
         "query_stamp_ns",
         "target_stamp_ns",
-        "probability",
         "reason",
         "sigma",
         *FEATURES,
@@ -193,7 +175,6 @@ def read_judged(paths: Sequence[Path]) -> Judged:
         poses("own"),
         poses("at"),
         column["sigma"],
-        column["probability"],
         np.full(len(table), np.nan),
         np.ones(len(table), bool),
     )
@@ -217,20 +198,19 @@ def fit_signed(
     x: F64,
     right: Bools,
     signs: Sequence[int],
-    counts: F64,
     ridge: float = 0.3,
-    offset: F64 | float = 0.0,
+    offset: F64 | None = None,
 ) -> Calibration:
-    """A logistic model of ``right`` (n,) on ``x`` (n, d), whose rows count ``counts`` (n,) times,
-    with weights that have the ``signs``.
+    """A logistic model of ``right`` (n,) on ``x`` (n, d) with weights that have the ``signs``.
 
-    ``offset`` (n,) are log-odds that are known already.
+    ``offset`` (n,) are log-odds that are known already: the model adds to them, and adds nothing
+    where ``x`` is 0.
 
     Features whose weight would have the wrong sign are left out one by one: in few towns they stand
     for something else.
     """
     finite = np.where(np.isfinite(x), x, np.nan)
-    low = np.nanquantile(finite, 0.005, axis=0)
+    low = np.zeros(x.shape[1]) if offset is not None else np.nanquantile(finite, 0.005, axis=0)
     high = np.nanquantile(finite, 0.999, axis=0)
     clipped = np.clip(x, low, high)
     sign = np.array(signs)
@@ -238,45 +218,49 @@ def fit_signed(
     weights = np.zeros(x.shape[1])
     bias = 0.0
     while len(used):
-        fitted, bias = fit_logistic(clipped[:, used], right, ridge, counts, offset)
+        if offset is None:
+            fitted, bias = fit_logistic(clipped[:, used], right, ridge)
+        else:
+            fitted = fit_additions(clipped[:, used], right, ridge, offset)
         strength = fitted * sign[used] * clipped[:, used].std(0)
         if strength.min() >= 0:
             weights[used] = fitted
             break
         used = np.delete(used, int(np.argmin(strength)))
-    return Calibration(tuple(weights.tolist()), tuple(low.tolist()), tuple(high.tolist()), bias)
+    typical = np.median(x[right], axis=0)
+    columns = [tuple(column.tolist()) for column in (weights, low, high, typical)]
+    return Calibration(columns[0], columns[1], columns[2], columns[3], bias)
 
 
 def fit_alone(judged: Judged, rows: Bools) -> Calibration:
     """The model of an alignment's own features, from the clear ones among ``rows`` (n,).
 
-    An alignment looks the same in each copy of a block, so nothing of its own can tell them apart;
-    as many copies as these towns have would only teach to doubt every place that a single sweep
-    finds. Where there are neighbours, they tell.
+    An alignment looks the same in each copy of a block, so nothing of its own can tell them apart:
+    it is of ordinary towns.
     """
-    rows = rows & judged.clear
-    return fit_signed(
-        judged.features.part(rows).vector(),
-        judged.right[rows],
-        [SIGNS[n] for n in FEATURES],
-        judged.counts[rows],
-    )
+    rows = rows & judged.clear & ~judged.copies
+    values = Evidence.of(judged.features.part(rows)).vector()
+    return fit_signed(values, judged.right[rows], SIGNS)
 
 
-def fit_agreement(
-    judged: Judged, agreement: Agreement[F64], rows: Bools, alone: Calibration
-) -> Model:
-    """The models of the ``agreement`` (n,), from the clear ones that have neighbours among ``rows``
-    (n,), beside ``alone``.
+def fit_votes(judged: Judged, agreement: Agreement[F64], rows: Bools, own: F64) -> Calibration:
+    """The model of what the ``agreement`` (n,) adds to log-odds ``own`` (n,), from clear ``rows``.
 
-    Neighbours in the same copy of a block agree about any copy. So the models are of streets
-    that look like no others. How much like others is too much: the geometric mean of the right ones
-    of the ordinary town that has the most of it and the wrong ones that would be accepted of the
-    city of copies that has the least: as many times the one as the other is it.
+    Neighbours in the same copy of a block agree about any copy, so it is of ordinary towns.
     """
-    rows = rows & judged.clear & (agreement.neighbours > 0)
-    ordinary = _agreement_model(judged, agreement, rows & ~judged.copies, alone, 1.0)
-    taken = rows & (ordinary.agreed(agreement) >= SURE)
+    rows = rows & judged.clear & (agreement.neighbours > 0) & ~judged.copies
+    values = Votes.of(agreement).vector()[rows]
+    return fit_signed(values, judged.right[rows], VOTE_SIGNS, offset=own[rows])
+
+
+def max_ambiguity(judged: Judged, agreement: Agreement[F64], p: F64) -> float:
+    """How ambiguous is too much, of what probabilities ``p`` (n,) would accept.
+
+    The geometric mean of right ones of the ordinary town that has the most of it, and of wrong ones
+    of the city of copies that has the least: as many times the one as the other is it. An ordinary
+    town whose streets look like others as much as copies do is given up where they do.
+    """
+    taken = (p >= SURE) & (agreement.neighbours > 0)
     right = taken & judged.right & ~judged.copies
     fooled = taken & ~judged.right & judged.copies
     most = [
@@ -287,86 +271,49 @@ def fit_agreement(
         np.quantile(agreement.ambiguity[fooled & (judged.town == town)], EXTREMES)
         for town in sorted(set(judged.town[fooled]))
     ]
-    # an ordinary town whose streets look like others as much as copies do is given up where they do
-    most_alike = (
-        float(np.sqrt(max([BY_CHANCE, *(m for m in most if m < min(least))]) * min(least)))
-        if least
-        else 1.0
-    )
-    rows = rows & (agreement.ambiguity <= most_alike)
-    return _agreement_model(judged, agreement, rows, alone, most_alike)
+    if not least:
+        return 1.0
+    return float(np.sqrt(max([BY_CHANCE, *(m for m in most if m < min(least))]) * min(least)))
 
 
-def _agreement_model(
-    judged: Judged, agreement: Agreement[F64], rows: Bools, alone: Calibration, most_alike: float
-) -> Model:
-    """Near neighbours add to an alignment's log-odds: they are so often right together that they
-    would outweigh what it looks like.
-    """
-    values = NeighbourEvidence.of(agreement).vector()[rows]
-    right = judged.right[rows]
-    counts = np.ones(rows.sum())
-    near = fit_signed(
-        values, right, NEAR_SIGNS, counts, offset=_log_odds(agreement.own_probability[rows])
-    )
-    near = replace(
-        near,
-        weights=(1.0, *near.weights[1:]),
-        low=(-30.0, *near.low[1:]),
-        high=(30.0, *near.high[1:]),
-    )
-    together = fit_signed(values, right, TOGETHER_SIGNS, counts)
-    return Model(
-        alone,
-        near,
-        together,
-        float(np.quantile(judged.features.support[judged.right], FEWEST)),
-        most_alike,
-    )
-
-
-def agreement_of(judged: Judged, alone: F64, without_rivals: F64) -> Agreement[F64]:
-    """The agreement (n,) within each town, when alignments have the probabilities ``alone`` (n,) by
-    themselves.
-    """
+def agreement_of(judged: Judged, own: F64) -> Agreement[F64]:
+    """The agreement (n,) within each town of alignments with log-odds ``own`` (n,)."""
     out = Agreement(*np.zeros((7, len(judged))))
-    for town in sorted(set(judged.town)):
-        mine = np.flatnonzero(judged.town == town)
-        part = replace(
-            judged.placed.part(mine),
-            own_probability=alone[mine],
-            probability_ignoring_rivals=without_rivals[mine],
+    for mine in _towns(judged):
+        votes = count_votes(
+            replace(judged.placed.part(mine), log_odds=own[mine]), judged.voxel_size
         )
-        votes = count_votes(part, judged.voxel_size)
         for name in (f.name for f in fields(Agreement)):
             getattr(out, name)[mine] = getattr(votes, name)
     return out
 
 
+def _towns(judged: Judged) -> list[NDArray[np.int64]]:
+    return [np.flatnonzero(judged.town == town) for town in sorted(set(judged.town))]
+
+
 def decided_by(model: Model, judged: Judged) -> F64:
-    """The probabilities (n,) that the acceptance gives with ``model``."""
-    alone = model.own(judged.features)
-    without_rivals = probability_ignoring_rivals(model.own, judged.features)
-    p = model.decided(agreement_of(judged, alone, without_rivals))
-    return np.where(possible(judged), p * where_right(judged, alone), 0.0)
+    """The probabilities (n,) that the acceptance gives with ``model``, 0 where there is a veto."""
+    own = model.own_log_odds(judged.features)
+    agreement = agreement_of(judged, own)
+    p = probability(judged, own, model.log_odds(own, agreement))
+    return np.where(model.is_ambiguous(agreement) | ~possible(judged), 0.0, p)
 
 
-def where_right(judged: Judged, alone: F64) -> F64:
-    """Probability (n,) that an alignment has the right pose of its place, by the probabilities
-    ``alone`` (n,) of the poses there.
-    """
-    share = np.ones(len(judged))
-    for mine in (np.flatnonzero(judged.town == town) for town in sorted(set(judged.town))):
-        share[mine] = mode_shares(
-            replace(judged.placed.part(mine), own_probability=alone[mine]), judged.voxel_size
-        )
-    return position_confidence(judged.placed.sigma, judged.voxel_size) * share
+def probability(judged: Judged, own: F64, with_votes: F64) -> F64:
+    """The product of the factors (n,), of log-odds ``own`` and ``with_votes`` (n,)."""
+    out = position_confidence(judged.placed.sigma, judged.voxel_size)
+    for mine in _towns(judged):
+        placed = judged.placed.part(mine)
+        out[mine] *= place_odds(placed, with_votes[mine], judged.voxel_size).place_probability
+        out[mine] *= place_odds(placed, own[mine], judged.voxel_size).mode_share
+    return out
 
 
 def possible(judged: Judged) -> Bools:
-    """Which alignments (n,) acceptance considers at all."""
+    """Which alignments (n,) have no veto of their own."""
     return np.asarray(
-        ~contradicts_odometry(judged.placed, judged.voxel_size) & is_plausible(judged.features)
+        ~contradicts_odometry(judged.placed, judged.voxel_size) & ~is_loose(judged.features)
     )
 
 
@@ -384,79 +331,45 @@ class Fitted:
 def fit(judged: Judged) -> Fitted:
     """Fit all models, and each of them without each town in turn.
 
-    The models of neighbours learn from results of the model alone on towns it had not seen.
-    Where the held-out log-odds turn out too sure (Platt, Probabilistic outputs for support vector
-    machines, 1999), the first and the last are tempered.
+    The model of the votes learns from log-odds on towns that the model alone had not seen. Where
+    held-out log-odds turn out too sure (Platt, Probabilistic outputs for support vector machines,
+    1999), the first is tempered.
     """
-    towns = sorted(set(judged.town))
     kept = possible(judged)
-    held = {town: judged.town == town for town in towns}
-    alone = np.zeros(len(judged))
-    without_rivals = np.zeros(len(judged))
-    for mine in held.values():
-        own = _by_features(fit_alone(judged, ~mine & kept))
-        features = judged.features.part(mine)
-        alone[mine] = own(features)
-        without_rivals[mine] = probability_ignoring_rivals(own, features)
+    own = np.zeros(len(judged))
+    for mine in _towns(judged):
+        others = np.ones(len(judged), bool)
+        others[mine] = False
+        unseen = Evidence.of(judged.features.part(mine)).vector()
+        own[mine] = fit_alone(judged, others & kept).log_odds(unseen)
     whole = fit_alone(judged, kept)
-    tempered = _temper(whole, alone, judged, kept, judged.counts)
-    alone = _tempered(alone, whole, tempered)
-    without_rivals = np.where(without_rivals > 0, _tempered(without_rivals, whole, tempered), 0.0)
-    agreement = agreement_of(judged, alone, without_rivals)
-    probability = np.zeros(len(judged))
-    alike = np.zeros(len(judged), bool)
-    for mine in held.values():
-        model = fit_agreement(judged, agreement, ~mine & kept, tempered)
-        probability[mine] = model.agreed(agreement.part(mine))
-        alike[mine] = model.is_ambiguous(agreement.part(mine))
-    model = fit_agreement(judged, agreement, kept, tempered)
-    far = (agreement.neighbours > 0) & has_far(agreement)
-    together = _temper(
-        model.together, probability, judged, kept & far & ~alike, np.ones(len(judged))
-    )
-    probability = np.where(far, _tempered(probability, model.together, together), probability)
-    probability = np.where(
-        kept, np.where(alike, probability / 2, probability) * where_right(judged, alone), 0.0
-    )
-    return Fitted(replace(model, together=together), alone, probability)
-
-
-def _by_features(model: Calibration) -> Callable[[Features[F64]], F64]:
-    return lambda features: model.probability(features.vector())
-
-
-def _log_odds(p: F64) -> F64:
-    p = np.clip(p, 1e-9, 1 - 1e-9)
-    return np.asarray(np.log(p / (1 - p)))
-
-
-def _temper(
-    model: Calibration, held_out: F64, judged: Judged, rows: Bools, counts: F64
-) -> Calibration:
-    """``model`` with its log-odds scaled by at most one and moved, so that the ``held_out``
-    probabilities (n,) of ``rows`` would fit.
-    """
-    rows = rows & judged.clear
-    scale, shift = fit_logistic(
-        _log_odds(held_out[rows])[:, None], judged.right[rows], 1e-3, counts[rows]
-    )
-    if scale[0] >= 1:
-        return model
-    factor = max(float(scale[0]), 0.3)
-    return replace(
-        model, weights=tuple(factor * w for w in model.weights), bias=factor * model.bias + shift
+    scale, shift = _temper(own, judged, kept)
+    own = np.minimum(scale * own + shift, np.log(judged.clear.sum()))
+    model = replace(
+        whole, weights=tuple(scale * w for w in whole.weights), bias=scale * whole.bias + shift
     )
 
+    agreement = agreement_of(judged, own)
+    total = np.zeros(len(judged))
+    for mine in _towns(judged):
+        others = np.ones(len(judged), bool)
+        others[mine] = False
+        votes = fit_votes(judged, agreement, others & kept, own)
+        total[mine] = own[mine] + votes.log_odds(Votes.of(agreement.part(mine)).vector())
+    total = np.minimum(total, np.log(judged.clear.sum()))
+    p = np.where(kept, probability(judged, own, total), 0.0)
+    most_alike = max_ambiguity(judged, agreement, p)
+    most = float(np.log(judged.clear.sum()))
+    fitted = Model(model, fit_votes(judged, agreement, kept, own), most, most_alike)
+    p = np.where(fitted.is_ambiguous(agreement), 0.0, p)
+    return Fitted(fitted, probability_of(own), p)
 
-def _tempered(p: F64, before: Calibration, after: Calibration) -> F64:
-    """Probabilities of models like ``before``, tempered as ``after`` is."""
-    k = int(np.argmax(np.abs(before.weights)))
-    if before == after or before.weights[k] == 0:
-        return p
-    factor = after.weights[k] / before.weights[k]
-    return np.asarray(
-        1 / (1 + np.exp(-(factor * _log_odds(p) + after.bias - factor * before.bias)))
-    )
+
+def _temper(held_out: F64, judged: Judged, rows: Bools) -> tuple[float, float]:
+    """Scale, at most one, and shift of the ``held_out`` log-odds (n,) so that they fit ``rows``."""
+    rows = rows & judged.clear & ~judged.copies
+    scale, shift = fit_logistic(held_out[rows][:, None], judged.right[rows], 1e-3)
+    return (1.0, 0.0) if scale[0] >= 1 else (max(float(scale[0]), 0.3), float(shift))
 
 
 # -- reports
@@ -521,18 +434,14 @@ def recall_at(
 
 
 def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
-    """The content of calibration.json: three logistic models of named features clipped to low ..
-    high, and what they are made from.
-    """
+    """The content of calibration.json: the models and what they are made from."""
     return {
-        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature;"
-        " 'near' where a query has neighbours, "
-        "'together' where it has far ones too; at most a half where lookalike exceeds most_alike",
-        "alone": fitted.model.own_features.to_json(FEATURES),
-        "least_support": round(fitted.model.min_support, 4),
+        "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature,"
+        " clipped to low .. high; 'votes' add to those of 'own'; where lookalike exceeds most_alike"
+        " nothing is accepted",
+        "own": fitted.model.own.to_json(EVIDENCE),
+        "votes": fitted.model.votes.to_json(VOTES),
         "most_alike": round(fitted.model.max_ambiguity, 4),
-        "near": fitted.model.near.to_json(NEIGHBOUR_EVIDENCE),
-        "together": fitted.model.together.to_json(NEIGHBOUR_EVIDENCE),
         "towns": len(set(judged.town)),
         "alignments": int(judged.clear.sum()),
         "right": int((judged.right & judged.clear).sum()),

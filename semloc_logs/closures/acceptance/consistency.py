@@ -9,7 +9,7 @@ road instead of all pairs).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT, SAME_PLACE_VOXELS
 from semloc_logs.closures.acceptance.ambiguity import ambiguity
-from semloc_logs.closures.acceptance.calibration import LEAST_ODDS
 from semloc_logs.closures.acceptance.placements import ARM, FAR, Placed, pairs_of, query_roads
 from semloc_logs.closures.closure import Agreement
 from semloc_logs.numerics.transforms import inverse
@@ -34,13 +33,16 @@ MOST_SLACK = SAME_PLACE_VOXELS
 # rad, and rad a metre
 TURN = np.radians(4.0)
 TURN_DRIFT = np.radians(0.02)
+# voxels of road between two places of a target that may be one, driven again
+DRIVEN_AGAIN = 50
 MIN_VOTE = 0.02  # alignments less probable than this do not vote
 
 
 def count_votes(placed: Placed, voxel_size: float) -> Agreement[F64]:
     """The votes on each alignment (n,); the order of the alignments does not matter."""
     n = len(placed)
-    votes = Agreement(placed.own_probability.copy(), *np.zeros((6, n)))
+    own_probability = place_odds(placed, placed.log_odds, voxel_size).share
+    votes = Agreement(own_probability, *np.zeros((6, n)))
     support = np.zeros(n)
     pairs = pairs_of(placed)
     roads = query_roads(placed)
@@ -54,7 +56,7 @@ def count_votes(placed: Placed, voxel_size: float) -> Agreement[F64]:
             - 1.0
         )
         sums, sums_ignoring_rivals = _sums(
-            group, (group.own_probability, group.probability_ignoring_rivals), voxel_size
+            group, (own_probability[rows], group.probability_ignoring_rivals), voxel_size
         )
         votes.support[rows] = sums[0]
         votes.conflict[rows] = sums[1]
@@ -173,38 +175,83 @@ def _agrees(
     return bool(off <= most * most and np.arccos(min(max((trace - 1) / 2, -1.0), 1.0)) <= turn)
 
 
-def mode_shares(placed: Placed, voxel_size: float) -> F64:
-    """Share (n,) of each pose mode in the odds of all poses of its query in the same place.
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceOdds:
+    """Odds of the alignments (n,) of a query with a target: one of them is right, or none.
 
-    One of them is right. Neighbours tell which place is right, not which of two poses in it that
-    they support equally: a metre along the road, where each camera saw the other sides of things.
-    Only the own probabilities of the alignments tell that.
+    ``own`` are those of the alignment, ``place`` of all poses of its place, ``rivals`` of all other
+    places, in units of those of no place (or of ``none``, where they would be too large).
     """
-    own = np.clip(placed.own_probability, 0.0, 1 - LEAST_ODDS)
-    odds = own / (1 - own)
-    out = np.ones(len(placed))
-    for rows in pairs_of(placed).values():
+
+    own: F64
+    place: F64
+    rivals: F64
+    none: F64
+
+    @property
+    def share(self) -> F64:
+        """The probability of the alignment (n,)."""
+        return self.own / (self.none + self.place + self.rivals)
+
+    @property
+    def place_probability(self) -> F64:
+        """The probability of its place (n,)."""
+        return self.place / (self.none + self.place + self.rivals)
+
+    @property
+    def mode_share(self) -> F64:
+        """Its share (n,) in the odds of all poses of its place."""
+        return self.own / self.place
+
+
+def place_odds(placed: Placed, log_odds: F64, voxel_size: float) -> PlaceOdds:
+    """What alignments with ``log_odds`` (n,) leave to each other.
+
+    Poses of one place are modes: a metre along the road, where each camera saw the other sides of
+    things. A place that the target passed twice is no rival of itself.
+    """
+    out = np.ones((4, len(placed)))
+    for rows in pairs_of(placed, posed=False).values():
         group = placed.part(rows)
-        out[rows] = _shares(
-            group.query, group.target_T_query, odds[rows], 2 * MOST_SLACK * voxel_size, 2 * TURN
+        out[:, rows] = _place_odds(
+            group.query,
+            group.target_T_query,
+            group.target_road,
+            log_odds[rows],
+            (2 * MOST_SLACK * voxel_size, 2 * TURN, DRIVEN_AGAIN * voxel_size),
         )
-    return out
+    return PlaceOdds(*out)
 
 
 @njit(cache=True, nogil=True)
-def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float) -> F64:
-    """Mode shares of alignments ordered by ``query`` (n,).
+def _place_odds(
+    query: I64,
+    target_T_query: F64,
+    target_road: F64,
+    log_odds: F64,
+    bounds: tuple[float, float, float],
+) -> F64:
+    """Own odds, those of the place, of its rivals, and of none (4, n), ordered by ``query`` (n,).
 
-    In one place are poses within ``most`` metres and ``turn`` radians about z.
+    In one place are poses within ``bounds[0]`` metres and ``bounds[1]`` radians about z. From
+    ``bounds[2]`` metres of road on they may also be apart by the drift of the target's odometry.
     """
-    out = np.ones(len(query))
+    most, turn, again = bounds
+    out = np.ones((4, len(query)))
     first = 0
     for k in range(len(query)):
         first = first if query[first] == query[k] else k
-        n = first
-        total = 0.0
+        end = first
+        largest = 0.0
+        while end < len(query) and query[end] == query[k]:
+            largest = max(largest, log_odds[end])
+            end += 1
+        # in units of the largest odds, so that nothing overflows
+        own = np.exp(log_odds[k] - largest)
+        place = 0.0
+        rivals = 0.0
         T = target_T_query[k]
-        while n < len(query) and query[n] == query[k]:
+        for n in range(first, end):
             U = target_T_query[n]
             off = np.sqrt(
                 (T[0, 3] - U[0, 3]) ** 2 + (T[1, 3] - U[1, 3]) ** 2 + (T[2, 3] - U[2, 3]) ** 2
@@ -214,9 +261,19 @@ def _shares(query: I64, target_T_query: F64, odds: F64, most: float, turn: float
             for m in range(3):
                 sine += U[1, m] * T[0, m] - U[0, m] * T[1, m]
                 cosine += U[0, m] * T[0, m] + U[1, m] * T[1, m]
-            turned = np.arctan2(sine, cosine)
-            if off <= most and abs(turned) <= turn:
-                total += odds[n]
-            n += 1
-        out[k] = odds[k] / total if total > 0 else 1.0
+            turned = abs(np.arctan2(sine, cosine))
+            road = abs(target_road[k] - target_road[n])
+            odds = np.exp(log_odds[n] - largest)
+            if off <= most and turned <= turn:
+                place += odds
+            elif not (
+                road > again
+                and off <= most + ODOMETRY_DRIFT * road
+                and turned <= turn + TURN_DRIFT * road
+            ):
+                rivals += odds
+        out[0, k] = own
+        out[1, k] = place
+        out[2, k] = rivals
+        out[3, k] = np.exp(-largest)
     return out

@@ -7,14 +7,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from semloc_logs.closures.acceptance.calibration import (
-    is_plausible,
+    EVIDENCE,
+    Evidence,
+    Model,
+    is_loose,
     position_confidence,
+    probability_of,
     shipped,
 )
-from semloc_logs.closures.acceptance.consistency import count_votes, mode_shares
+from semloc_logs.closures.acceptance.consistency import count_votes, place_odds
 from semloc_logs.closures.acceptance.placements import (
-    Bools,
-    Placed,
     contradicts_odometry,
     features_of,
     place,
@@ -26,28 +28,36 @@ from semloc_logs.closures.closure import (
     Features,
     Reason,
     Rejected,
+    Veto,
 )
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 
-# the weakest evidence of an improbable alignment is named, in this order, if it is beyond its bound
-LOW_COVERAGE = 0.2
-LOW_STRUCTURE = 0.5
-NEAR_RIVAL = 0.85
-LOW_FIT = 0.5
+REASON_OF_VETO = {
+    Veto.CONTRADICTS_ODOMETRY: Reason.CONTRADICTS_ODOMETRY,
+    Veto.AMBIGUOUS_PLACE: Reason.AMBIGUOUS_PLACE,
+    Veto.LOOSE_FIT: Reason.LOOSE_FIT,
+}
+REASON_OF_EVIDENCE = {
+    "log_contradiction": Reason.FREE_SPACE,
+    "stiffness": Reason.LOOSE_FIT,
+    "range_sigma": Reason.UNCERTAIN_RANGES,
+}
 
 
 def decide(
-    alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Resolved
+    alignments: Sequence[Alignment],
+    maps: Mapping[str, SessionMap],
+    settings: Resolved,
+    model: Model | None = None,
 ) -> list[Closure | Rejected]:
     """What becomes of the alignments of all queries, best first for each query.
 
-    For each target session at most one alignment of a query is accepted.
+    For each target session at most one alignment of a query is accepted. The ``model`` is that of
+    the package unless another is given.
     """
-    placed = place(alignments, maps)
-    plausible = is_plausible(features_of(alignments))
-    refuted = contradicts_odometry(placed, settings.fusion.voxel_size)
-    decisions = _decisions(placed, plausible, refuted, settings)
+    model = model or shipped()
+    decisions = _decisions(alignments, maps, settings, model)
     order = sorted(
         range(len(alignments)), key=lambda k: _order(alignments[k], decisions[k].probability)
     )
@@ -58,13 +68,8 @@ def decide(
         a = alignments[k]
         decision = decisions[k]
         query = (a.query_session, a.query_keyframe, a.target_session)
-        reason = None
-        if refuted[k]:
-            reason = Reason.CONTRADICTS_ODOMETRY
-        elif not decision.probability >= decision.min_probability:  # nor a NaN
-            weakest = weakest_evidence(a.features)
-            reason = weakest if not plausible[k] else low_probability(weakest, decision)
-        elif query in answered:
+        reason = why_rejected(decision, a.features, model)
+        if reason is None and query in answered:
             reason = Reason.SECOND_CHOICE
         answered.add(query)
         outcomes.append(Closure(a, decision) if reason is None else Rejected(a, decision, reason))
@@ -72,58 +77,61 @@ def decide(
 
 
 def _decisions(
-    placed: Placed, plausible: Bools, refuted: Bools, settings: Resolved
+    alignments: Sequence[Alignment],
+    maps: Mapping[str, SessionMap],
+    settings: Resolved,
+    model: Model,
 ) -> list[Decision]:
-    """The probability of each alignment (n,): 0 if it is not ``plausible`` or is ``refuted``."""
+    """The decision about each alignment (n,)."""
+    placed = place(alignments, maps, model)
     voxel_size = settings.fusion.voxel_size
     votes = count_votes(placed, voxel_size)
-    of_place = np.where(plausible, shipped().decided(votes), 0.0)
+    with_votes = model.log_odds(placed.log_odds, votes)
+    of_place = place_odds(placed, with_votes, voxel_size).place_probability
+    # neighbours tell which place is right, and share its errors: not which pose in it
+    of_mode = place_odds(placed, placed.log_odds, voxel_size).mode_share
     of_position = position_confidence(placed.sigma, voxel_size)
-    of_mode = mode_shares(placed, voxel_size)
-    probability = np.where(refuted | ~plausible, 0.0, of_place * of_position * of_mode)
+    vetoes = {
+        Veto.CONTRADICTS_ODOMETRY: contradicts_odometry(placed, voxel_size),
+        Veto.AMBIGUOUS_PLACE: model.is_ambiguous(votes),
+        Veto.LOOSE_FIT: is_loose(features_of(alignments)),
+    }
     return [
         Decision(
-            probability=float(probability[k]),
-            agreement=votes.row(k),
+            vetoes=frozenset(veto for veto, which in vetoes.items() if which[k]),
             place_probability=float(of_place[k]),
-            position_confidence=float(of_position[k]),
             mode_share=float(of_mode[k]),
+            position_confidence=float(of_position[k]),
+            agreement=votes.row(k),
             min_probability=settings.closures.min_probability,
         )
         for k in range(len(placed))
     ]
 
 
-def low_probability(weakest: Reason, decision: Decision) -> Reason:
-    """Which factor makes the probability of a plausible alignment too low, else the ``weakest``."""
+def why_rejected(decision: Decision, features: Features[float], model: Model) -> Reason | None:
+    """The veto or the factor that rejects an alignment, None where it is accepted."""
     required = decision.min_probability
+    if Veto.CONTRADICTS_ODOMETRY in decision.vetoes:
+        return Reason.CONTRADICTS_ODOMETRY
+    if decision.probability >= required:
+        return next((REASON_OF_VETO[veto] for veto in Veto if veto in decision.vetoes), None)
     if decision.place_probability >= required:
-        if decision.mode_share < decision.position_confidence:
-            return Reason.POSE_MODES
-        return Reason.UNCERTAIN_POSITION
+        uncertain = decision.position_confidence <= decision.mode_share
+        return Reason.UNCERTAIN_POSITION if uncertain else Reason.POSE_MODES
 
-    agreement = decision.agreement
-    halved = agreement.ambiguity > shipped().max_ambiguity
-    if halved and 2 * decision.place_probability >= required:  # ambiguity alone rejects it
-        return Reason.AMBIGUOUS_PLACE
-    if agreement.own_probability >= required and agreement.neighbours:
+    own = decision.agreement.own_probability
+    if own >= required:
         return Reason.NEIGHBOURS_CONFLICT
-    return weakest
+    ignoring_rivals = probability_of(model.own_log_odds(features))
+    return Reason.RIVAL_PLACE if ignoring_rivals >= required else weakest(features, model)
 
 
-def weakest_evidence(features: Features[float]) -> Reason:
-    """The first feature that is worse than in right alignments."""
-    if features.coverage < LOW_COVERAGE:
-        return Reason.UNOBSERVED
-    if features.structure < LOW_STRUCTURE:
-        return Reason.STRUCTURE_MISMATCH
-    if features.distinct > 1.0:
-        return Reason.BETTER_RIVAL
-    if features.distinct > NEAR_RIVAL:
-        return Reason.RIVAL_PLACE
-    if features.fit < LOW_FIT:
-        return Reason.LOOSE_FIT
-    return Reason.WEAK_EVIDENCE
+def weakest(features: Features[float], model: Model) -> Reason:
+    """The evidence that takes most from the log-odds, beside that of typical right alignments."""
+    own = model.own
+    terms = np.array(own.weights) * (Evidence.of(features).vector() - np.array(own.typical))
+    return REASON_OF_EVIDENCE[EVIDENCE[int(np.argmin(terms))]]
 
 
 def _order(a: Alignment, probability: float) -> tuple[str, int, float, float, str, int]:

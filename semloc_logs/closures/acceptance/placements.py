@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.closures.acceptance.calibration import probability_ignoring_rivals, shipped
+from semloc_logs.closures.acceptance.calibration import Model, probability_of
 from semloc_logs.closures.closure import FEATURES, Alignment, Columns, Features
 from semloc_logs.mapping.session_map import SessionMap
 
@@ -29,9 +29,8 @@ class Placed(Columns):
     ``query`` (n,) numbers a session's queries, ``road`` and ``target_road`` (n,) are metres along
     the two drives, ``map_T_query`` and ``target_T_query`` (n, 4, 4) the query's base in its own map
     by odometry and in the target's by alignment, ``sigma`` (n,) the standard deviation of the
-    latter's position in metres, ``own_probability`` (n,) the probability of its own features and
-    ``probability_ignoring_rivals`` (n,) the same if no other place fitted nearly as well.
-    ``posed``: whether odometry is known.
+    latter's position in metres, ``log_odds`` (n,) those of its own features. ``posed``: whether
+    odometry is known.
     """
 
     query_session: NDArray[np.object_]
@@ -42,9 +41,13 @@ class Placed(Columns):
     map_T_query: F64
     target_T_query: F64
     sigma: F64
-    own_probability: F64
-    probability_ignoring_rivals: F64
+    log_odds: F64
     posed: Bools
+
+    @property
+    def probability_ignoring_rivals(self) -> F64:
+        """By its own features (n,), as if no other place fitted."""
+        return probability_of(self.log_odds)
 
 
 def features_of(alignments: Sequence[Alignment]) -> Features[F64]:
@@ -54,8 +57,8 @@ def features_of(alignments: Sequence[Alignment]) -> Features[F64]:
     )
 
 
-def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Placed:
-    """Where alignments put their queries."""
+def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], model: Model) -> Placed:
+    """Where alignments put their queries, and the log-odds that the ``model`` gives them."""
     ends = [
         (maps[a.query_session], a.query_keyframe, maps[a.target_session], a.target_keyframe)
         for a in alignments
@@ -78,8 +81,7 @@ def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Pl
             ]
         ),
         np.array([a.sigma for a in alignments], float),
-        np.array([a.probability for a in alignments], float),
-        probability_ignoring_rivals(shipped().own, features_of(alignments)),
+        model.own_log_odds(features_of(alignments)),
         np.array([q.posed for q, _, _, _ in ends], bool),
     )
 
@@ -87,10 +89,10 @@ def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap]) -> Pl
 Pairs = dict[tuple[str, str], I64]
 
 
-def pairs_of(placed: Placed) -> Pairs:
-    """Rows of each query session and target session with odometry, in the order of names.
+def pairs_of(placed: Placed, *, posed: bool = True) -> Pairs:
+    """Rows of each query session and target session, in the order of names.
 
-    They are ordered by query, and then by place.
+    They are ordered by query, and then by place; with ``posed`` only those with odometry.
     """
     names, number = np.unique(
         np.concatenate([placed.query_session, placed.target_session]).astype(str),
@@ -100,7 +102,7 @@ def pairs_of(placed: Placed) -> Pairs:
     target = number[len(placed) :]
     at = placed.target_T_query[:, :3, 3]
     rows = np.lexsort((at[:, 2], at[:, 1], at[:, 0], placed.query, target, query))
-    rows = rows[placed.posed[rows]]
+    rows = rows[placed.posed[rows]] if posed else rows
     cuts = np.flatnonzero(np.diff(query[rows] * len(names) + target[rows])) + 1
     return {
         (str(names[query[r[0]]]), str(names[target[r[0]]])): r

@@ -2,22 +2,26 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from functools import partial
 from importlib.resources import files
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.closures.acceptance.calibration import (
-    NEIGHBOUR_EVIDENCE,
+    EVIDENCE,
+    VOTES,
     Calibration,
-    Model,
-    NeighbourEvidence,
+    Evidence,
+    Votes,
+    fit_additions,
     fit_logistic,
-    is_plausible,
+    is_loose,
+    log_odds,
     position_confidence,
-    probability_ignoring_rivals,
+    probability_of,
     shipped,
 )
 from semloc_logs.closures.closure import FEATURES, Agreement, Features
@@ -29,12 +33,11 @@ F64 = NDArray[np.float64]
 GOOD = Features(
     structure=0.95,
     coverage=0.9,
-    contradiction=0.02,
+    contradiction=0.03,
     fit=0.95,
-    rmse=0.1,
-    distinct=0.2,
     support=3.0,
-    stiffness=3.0,
+    stiffness=2.0,
+    range_sigma=0.0,
 )
 
 
@@ -42,27 +45,25 @@ def columns(*features: Features[float]) -> Features[F64]:
     return Features(*(np.array([getattr(f, name) for f in features]) for name in FEATURES))
 
 
-def alone(features: Features[float], model: Calibration | None = None) -> float:
-    return float((model or shipped().own_features).probability(features.vector()))
+def own(features: Features[float]) -> float:
+    return float(probability_of(shipped().own_log_odds(features)))
 
 
-def decided_by(model: Model, **votes: float) -> float:
+def decided(own_log_odds: float, **votes: float) -> float:
     names = [f.name for f in dataclasses.fields(Agreement)]
     assert set(votes) <= set(names)
-    return float(model.decided(Agreement(*(np.array([votes.get(n, 0.0)]) for n in names)))[0])
+    agreement = Agreement(*(np.array([votes.get(n, 0.0)]) for n in names))
+    return float(shipped().log_odds(np.array([own_log_odds]), agreement)[0])
 
 
-def decided(**votes: float) -> float:
-    return decided_by(shipped(), **votes)
-
-
-def test_features_and_votes_are_named_as_in_the_files_and_in_their_order() -> None:
+def test_evidence_and_votes_are_named_as_in_the_files_and_in_their_order() -> None:
     content = json.loads(
         files("semloc_logs.closures.acceptance").joinpath("calibration.json").read_text()
     )
-    assert tuple(content["alone"]["features"]) == FEATURES
-    assert tuple(content["together"]["features"]) == NEIGHBOUR_EVIDENCE
-    assert len(dataclasses.fields(NeighbourEvidence)) == len(NEIGHBOUR_EVIDENCE)
+    assert tuple(content["own"]["features"]) == EVIDENCE
+    assert tuple(f.name for f in dataclasses.fields(Evidence)) == EVIDENCE
+    assert tuple(content["votes"]["features"]) == VOTES
+    assert len(dataclasses.fields(Votes)) == len(VOTES)
     table = [c["name"] for c in contracts.contract("rejected")["columns"]]
     assert [n for n in table if n in FEATURES] == list(FEATURES)
     assert [n for n in table if n in AGREEMENT_COLUMNS] == list(AGREEMENT_COLUMNS)
@@ -76,160 +77,123 @@ def test_rows_of_columns() -> None:
     assert votes.row(1) == Agreement(1.0, 11.0, 21.0, 31.0, 41.0, 51.0, 61.0)
     some = votes.part(np.array([1]))
     assert (len(some), some.ambiguity.tolist()) == (1, [61.0])
-    assert GOOD.vector().tolist() == [0.95, 0.9, 0.02, 0.95, 0.1, 0.2, 3.0, 3.0]
-    assert columns(GOOD, GOOD).vector().shape == (2, 8)
+    assert GOOD.vector().tolist() == [0.95, 0.9, 0.03, 0.95, 3.0, 2.0, 0.0]
+    assert columns(GOOD, GOOD).vector().shape == (2, 7)
 
 
-def test_values_of_the_agreement_by_hand() -> None:
-    votes = Agreement(*(np.array([x, x]) for x in (0.75, 4.0, 3.0, 1.0, np.e - 1, 0.0, 0.5)))
-    values = NeighbourEvidence.of(votes).vector()
-    assert values.shape == (2, len(NEIGHBOUR_EVIDENCE))
-    np.testing.assert_allclose(values[1], [np.log(3), np.log(4), 0.75, np.log(2), 1.0, 0.0])
+def test_evidence_and_votes_by_hand() -> None:
+    two = Evidence.of(columns(GOOD, dataclasses.replace(GOOD, contradiction=0.0)))
+    np.testing.assert_allclose(two.vector(), [[np.log(0.03), 2, 0], [np.log(1e-4), 2, 0]])
+    agreement = Agreement(*(np.array([x, x]) for x in (0.75, 4.0, 3.0, 1.0, np.e - 1, 0.0, 0.5)))
+    np.testing.assert_allclose(Votes.of(agreement).vector()[1], [np.log(4), np.log(2), 1.0, 0.0])
 
 
-def test_without_neighbours_the_alignment_alone_decides() -> None:
-    assert decided(own_probability=0.4321) == 0.4321
-    assert decided(own_probability=0.995, ambiguity=shipped().max_ambiguity) == 0.995
+def test_without_votes_the_alignment_alone_decides() -> None:
+    assert decided(-1.25) == -1.25
+    assert decided(3.5, neighbours=12) == 3.5  # neighbours that say nothing take nothing
 
 
-def test_in_ambiguous_places_nothing_is_more_probable_than_a_half() -> None:
-    assert decided(own_probability=0.995, ambiguity=0.9) == 0.995 / 2
-    assert (
-        decided(
-            own_probability=0.9999, neighbours=12, support=12.0, far_support=80.0, ambiguity=0.9
-        )
-        <= 0.5
+@given(
+    st.floats(-20, 20),
+    st.lists(st.floats(0, 50), min_size=4, max_size=4),
+    st.sampled_from(["support", "far_support", "conflict", "far_conflict"]),
+    st.floats(0, 20),
+)
+def test_agreeing_votes_never_lower_and_opposing_ones_never_raise(
+    log_odds: float, votes: list[float], which: str, more: float
+) -> None:
+    names = ("support", "conflict", "far_support", "far_conflict")
+    before = dict(zip(names, votes, strict=True))
+    after = before | {which: before[which] + more}
+    change = decided(log_odds, **after) - decided(log_odds, **before)
+    assert change >= 0 if "support" in which else change <= 0
+
+
+@given(
+    st.floats(0, 1),
+    st.floats(0, 4),
+    st.floats(0, 3),
+    st.sampled_from(["contradiction", "stiffness", "range_sigma"]),
+    st.floats(0, 1),
+)
+def test_more_contradiction_or_sigma_never_helps_and_more_stiffness_never_harms(
+    contradiction: float, stiffness: float, sigma: float, which: str, more: float
+) -> None:
+    before = dataclasses.replace(
+        GOOD, contradiction=contradiction, stiffness=stiffness, range_sigma=sigma
     )
+    after = dataclasses.replace(before, **{which: getattr(before, which) + more})
+    change = float(shipped().own_log_odds(after)) - float(shipped().own_log_odds(before))
+    assert change >= 0 if which == "stiffness" else change <= 0
 
 
-def test_without_rivals_an_alignment_is_judged_as_if_it_were_the_only_one() -> None:
-    def own(features: Features[F64]) -> F64:
-        return np.asarray(1.0 - features.distinct / 10)
+def test_each_vote_of_the_shipped_model_counts() -> None:
+    for name, weight in zip(VOTES, shipped().votes.weights, strict=True):
+        assert weight < 0 if "opposing" in name else weight > 0
 
-    several = columns(*(dataclasses.replace(GOOD, distinct=d) for d in (0.2, 1.4, 1.5)))
-    np.testing.assert_allclose(probability_ignoring_rivals(own, several), [1.0, 1.0, 0.0])
+
+def test_no_probability_is_more_than_the_calibration_has_seen() -> None:
+    model = shipped()
+    certain = dataclasses.replace(GOOD, contradiction=1e-4, stiffness=4.0)
+    assert model.own_log_odds(certain) <= model.max_log_odds
+    assert decided(50.0, support=99.0, far_support=99.0) == model.max_log_odds
+    content = json.loads(
+        files("semloc_logs.closures.acceptance").joinpath("calibration.json").read_text()
+    )
+    assert model.max_log_odds == pytest.approx(np.log(content["alignments"]))
+
+
+def test_which_places_are_ambiguous() -> None:
+    model = dataclasses.replace(shipped(), max_ambiguity=0.125)
+    votes = Agreement(*np.zeros((6, 3)), np.array([0.0, 0.125, 0.126]))
+    assert model.is_ambiguous(votes).tolist() == [False, False, True]
 
 
 @pytest.mark.parametrize(
-    ("change", "possible"),
-    [
-        ({}, True),
-        ({"distinct": 1.2}, True),
-        ({"distinct": 1.3}, False),
-        ({"structure": 0.31, "contradiction": 0.02}, False),
-        ({"structure": 0.5, "coverage": 0.25, "contradiction": 0.0}, False),
-        ({"fit": 0.1}, True),
-        ({"fit": 0.1, "stiffness": 0.2}, False),
-    ],
+    ("change", "loose"),
+    [({}, False), ({"fit": 0.1}, False), ({"fit": 0.1, "stiffness": 0.2}, True)],
 )
-def test_which_alignments_are_plausible(change: dict[str, float], possible: bool) -> None:
-    assert is_plausible(columns(dataclasses.replace(GOOD, **change))).tolist() == [possible]
+def test_which_alignments_their_points_do_not_hold(change: dict[str, float], loose: bool) -> None:
+    assert is_loose(columns(dataclasses.replace(GOOD, **change))).tolist() == [loose]
 
 
-def test_neighbours_add_and_take() -> None:
-    several = {"own_probability": 0.9, "neighbours": 12}
-    assert (
-        decided(**several, support=9.0)
-        > decided(**several, support=3.0)
-        > decided(**several, support=3.0, conflict=6.0)
-    )
-    assert decided(own_probability=0.97, neighbours=12, conflict=10.0) < 0.9
-
-
-def test_less_support_than_the_least_is_never_right() -> None:
-    """However well the rest fits: a handful of voxels fits anywhere."""
-    model = dataclasses.replace(shipped(), min_support=3.0)
-    features = columns(*(dataclasses.replace(GOOD, support=s) for s in (2.999, 3.0, 4.0)))
-    np.testing.assert_array_equal(model.own(features) > 0.9, [False, True, True])
-    assert model.own(features)[0] == 0.0
-    assert shipped().min_support > 3.0
-    too_few = dataclasses.replace(GOOD, support=shipped().min_support - 1e-4)
-    assert shipped().own(too_few) == 0.0
-
-
-def steep(weights: dict[str, float], bias: float) -> Calibration:
-    """A model of some of the values of agreement."""
-    n = len(NEIGHBOUR_EVIDENCE)
-    return Calibration(
-        tuple(weights.get(name, 0.0) for name in NEIGHBOUR_EVIDENCE), (-9.0,) * n, (9.0,) * n, bias
-    )
-
-
-def test_which_model_decides() -> None:
-    """Near neighbours only: the model of near ones; far ones too, whether they agree or not: the
-    other. No neighbours: the alignment.
-    """
-    model = dataclasses.replace(
-        shipped(), near=steep({}, -1.0), together=steep({}, 1.0), max_ambiguity=0.5
-    )
-    by = partial(decided_by, model)
-    near = 1 / (1 + np.exp(1.0))
-    together = 1 / (1 + np.exp(-1.0))
-    assert by(own_probability=0.7, neighbours=3) == pytest.approx(near)
-    assert by(own_probability=0.7, neighbours=3, far_support=0.1) == pytest.approx(together)
-    assert by(own_probability=0.7, neighbours=3, far_conflict=0.1) == pytest.approx(together)
-    assert by(own_probability=0.7, far_support=5.0) == 0.7
-    # an impossible alignment stays impossible
-    assert by(own_probability=0.0, neighbours=3, far_support=5.0) == 0.0
-    assert by(own_probability=0.7, neighbours=3, ambiguity=0.5) == pytest.approx(near)
-    assert by(own_probability=0.7, neighbours=3, ambiguity=0.51) == pytest.approx(near / 2)
-
-
-def test_logistic_regression_counts_rows_and_takes_offsets() -> None:
-    """A row that counts three times is three rows; log-odds that are known already are not fitted
-    again.
-    """
-    rng = np.random.default_rng(1)
-    x = rng.normal(0, 1, (400, 2))
-    right = rng.random(400) < 1 / (1 + np.exp(-(x @ [1.0, -2.0] + 0.5)))
-    twice = np.r_[np.arange(400), np.arange(100)]
-    counts = np.r_[np.full(100, 2.0), np.ones(300)]
-    z = (x - x[twice].mean(0)) / x[twice].std(0)  # scaled alike, so that the ridge is one
-    (w, b), (expected, bias) = (
-        fit_logistic(z, right, 1e-9, counts),
-        fit_logistic(z[twice], right[twice], 1e-9),
-    )
-    np.testing.assert_allclose([*w, b], [*expected, bias], rtol=1e-5)
-    w, b = fit_logistic(x[:, :1], right, 1e-9, offset=-2.0 * x[:, 1])
-    np.testing.assert_allclose([w[0], b], [1.0, 0.5], atol=0.3)
-    assert abs(fit_logistic(x[:, :1], right, 1e-9)[0][0] - w[0]) > 0.1
+def test_log_odds_and_back() -> None:
+    p = np.array([0.0, 0.25, 0.5, 1.0])
+    np.testing.assert_allclose(probability_of(log_odds(p)), p, atol=1e-8)
+    assert log_odds(p)[1] == pytest.approx(-np.log(3))
 
 
 def test_a_model_as_json_and_back() -> None:
-    model = shipped().together
-    assert Calibration.from_json(model.to_json(NEIGHBOUR_EVIDENCE), NEIGHBOUR_EVIDENCE) == model
+    model = shipped().votes
+    assert Calibration.from_json(model.to_json(VOTES), VOTES) == model
 
 
-def test_probability_by_hand() -> None:
-    model = Calibration((2.0, 0, 0, 0, 0, -1.0, 0, 0), (0.0,) * 8, (1.0,) * 8, 0.5)
-    one = dataclasses.replace(GOOD, structure=0.25, distinct=0.5)
-    assert alone(one, model) == pytest.approx(1 / (1 + np.exp(-0.5)))
-    clipped = dataclasses.replace(one, structure=7.0, distinct=-3.0)
-    assert alone(clipped, model) == pytest.approx(1 / (1 + np.exp(-2.5)))
+def test_log_odds_by_hand() -> None:
+    model = Calibration((2.0, -1.0), (0.0,) * 2, (1.0,) * 2, (0.0,) * 2, 0.5)
+    assert model.log_odds(np.array([0.25, 0.5])) == pytest.approx(0.5)
+    assert model.log_odds(np.array([7.0, -3.0])) == pytest.approx(2.5)  # clipped to 1 and 0
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_probabilities_are_numbers_whatever_the_features(value: float) -> None:
     for name in FEATURES:
-        p = alone(dataclasses.replace(GOOD, **{name: value}))
+        p = own(dataclasses.replace(GOOD, **{name: value}))
         assert 0 <= p <= 1
 
 
 def test_the_shipped_calibration_knows_good_from_bad() -> None:
-    bad = Features(
-        structure=0.2,
-        coverage=0.3,
-        contradiction=0.5,
-        fit=0.2,
-        rmse=0.9,
-        distinct=0.98,
-        support=1.0,
-        stiffness=0.5,
-    )
-    assert alone(GOOD) > 0.95
-    assert alone(bad) < 0.01
-    for name, worse in (("structure", 0.5), ("contradiction", 0.4), ("distinct", 1.1)):
-        assert alone(dataclasses.replace(GOOD, **{name: worse})) <= alone(GOOD)
+    assert own(GOOD) > 0.99
+    assert own(dataclasses.replace(GOOD, contradiction=0.25)) < 0.01
+
+
+def test_additions_are_to_log_odds_that_are_known() -> None:
+    """What is known already is not fitted again, and nothing adds nothing."""
+    rng = np.random.default_rng(1)
+    x = rng.normal(0, 1, (4000, 2))
+    right = rng.random(4000) < 1 / (1 + np.exp(-(x @ [1.0, -2.0])))
+    weights = fit_additions(x[:, :1], right, 1e-9, -2.0 * x[:, 1])
+    np.testing.assert_allclose(weights, [1.0], atol=0.1)
+    assert abs(fit_additions(x[:, :1], right, 1e-9, np.zeros(4000))[0] - 1.0) > 0.2
 
 
 def test_logistic_regression_recovers_known_weights() -> None:

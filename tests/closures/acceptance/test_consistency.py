@@ -12,6 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT
+from semloc_logs.closures.acceptance.calibration import (
+    Calibration,
+    Model,
+    log_odds,
+)
 from semloc_logs.closures.acceptance.consistency import (
     MIN_VOTE,
     MOST_SLACK,
@@ -21,7 +26,7 @@ from semloc_logs.closures.acceptance.consistency import (
     TURN_DRIFT,
     _sums,
     count_votes,
-    mode_shares,
+    place_odds,
 )
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.acceptance.placements import (
@@ -33,7 +38,14 @@ from semloc_logs.closures.acceptance.placements import (
     place,
     query_roads,
 )
-from semloc_logs.closures.closure import Agreement, Alignment, Closure, Features, Rejected
+from semloc_logs.closures.closure import (
+    Agreement,
+    Alignment,
+    Closure,
+    Features,
+    Rejected,
+    Veto,
+)
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import STREET_VOXEL, Settings
@@ -42,7 +54,15 @@ F64 = NDArray[np.float64]
 Outcome = Closure | Rejected
 SETTINGS = Settings().resolved()
 MAP = yaw_transform(0.7, (40.0, -20.0, 1.0))  # target map from query map
-GOOD = Features(0.9, 0.9, 0.0, 0.9, 0.1, 0.2, 3.5, 3.0)
+GOOD = Features(0.9, 0.9, 0.0, 0.9, 3.5, 3.0, 0.0)
+ANYTHING = (-50.0,) * 3, (50.0,) * 3, (0.0,) * 3
+# the stiffness of an alignment is its log-odds
+MODEL = Model(
+    Calibration((0.0, 1.0, 0.0), *ANYTHING, 0.0),
+    Calibration((2.0, -3.0, 1.0, -1.0), (0.0,) * 4, (3.0,) * 4, (0.0,) * 4, 0.0),
+    50.0,
+    0.125,
+)
 
 
 def bend(n: int, step: float = 2.0) -> F64:
@@ -87,17 +107,16 @@ def alignment(
         inverse(MAPS[target].map_T_base[at]) @ moved,
         np.eye(6) * 1e-4,
         0.8,
-        alone,
         900,
         5,
-        GOOD,
+        dataclasses.replace(GOOD, stiffness=float(log_odds(np.array(alone)))),
     )
 
 
 def decided(
     rows: list[Alignment], maps: dict[str, SessionMap] | None = None
 ) -> dict[tuple[int, int], Outcome]:
-    out = decide(rows, maps or MAPS, SETTINGS)
+    out = decide(rows, maps or MAPS, SETTINGS, MODEL)
     assert len(out) == len(rows)
     return {(o.alignment.query_keyframe, o.alignment.target_keyframe): o for o in out}
 
@@ -152,21 +171,53 @@ def test_neighbours_rescue_a_right_one_and_a_second_choice_that_agrees_is_promot
         alignment(25, 0.9),
         alignment(25, 0.95, at=50),
     ]
-    lenient = Settings.model_validate({"closures": {"min_probability": 0.91}}).resolved()
-    first, second = (o for o in decide(rows, MAPS, lenient) if o.alignment.query_keyframe == 25)
-    assert (first.alignment.target_keyframe, first.decision.agreement.own_probability) == (25, 0.9)
-    assert (second.alignment.target_keyframe, accepted(first), accepted(second)) == (
-        50,
-        True,
-        False,
+    first, second = (
+        o for o in decide(rows, MAPS, SETTINGS, MODEL) if o.alignment.query_keyframe == 25
     )
-    assert first.decision.probability > 0.91 > second.decision.probability
+    # odds of 9 and 19 and 1 for neither
+    assert first.alignment.target_keyframe == 25
+    assert first.decision.agreement.own_probability == pytest.approx(9 / 29)
+    assert second.alignment.target_keyframe == 50
+    assert second.decision.agreement.own_probability == pytest.approx(19 / 29)
+    assert accepted(first)
+    assert "neighbouring queries conflict" not in sentence(second)
+    assert second.decision.probability < 0.01
 
 
-def test_of_a_query_one_place_of_each_target_is_accepted() -> None:
-    found = decided([alignment(25, 0.999), alignment(25, 0.998, at=50)])
+def test_two_places_that_fit_alike_leave_each_other_no_certainty() -> None:
+    found = decided([alignment(25, 0.9999), alignment(25, 0.9999, at=50)])
+    for at in (25, 50):  # odds of 9999, twice, and 1
+        assert found[25, at].decision.probability == pytest.approx(9999 / 19999)
+        assert "other places fit too: by itself this one has a probability of 0.50" in sentence(
+            found[25, at]
+        )
+    found = decided([alignment(25, 0.9999), alignment(25, 0.6, at=50)])
     assert accepted(found[25, 25])
-    assert sentence(found[25, 50]) == "another place of the same session fits better"
+    assert not accepted(found[25, 50])
+
+
+def test_of_a_street_that_the_target_drove_twice_one_place_is_accepted() -> None:
+    """500 m of road lie between both, after which odometry may be 5 m off: they are no rivals."""
+    twice = SimpleNamespace(
+        map_T_base=np.tile(MAPS["b"].map_T_base, (2, 1, 1)),
+        distance=np.r_[MAPS["b"].distance, 500.0 + MAPS["b"].distance],
+        posed=True,
+    )
+    maps = {**MAPS, "b": cast(SessionMap, twice)}
+    again = dataclasses.replace(
+        alignment(25, 0.998),
+        target_keyframe=60 + 25,
+        target_T_query=yaw_transform(0.0, (3.0, 0.0, 0.0)),
+    )
+    found = decided([alignment(25, 0.999), again], maps)
+    assert accepted(found[25, 25])
+    assert sentence(found[25, 85]) == "another place of the same session fits better"
+
+
+def shares(rows: list[Alignment], maps: dict[str, SessionMap] = MAPS) -> F64:
+    """Mode shares (n,)."""
+    placed = place(rows, maps, MODEL)
+    return place_odds(placed, placed.log_odds, 0.3).mode_share
 
 
 @pytest.mark.parametrize(
@@ -180,13 +231,11 @@ def test_of_a_query_one_place_of_each_target_is_accepted() -> None:
 )
 def test_of_two_poses_in_a_place_each_has_its_share(beside: F64, share: float) -> None:
     two = [alignment(25, 0.6), alignment(25, 0.2, beside)]
-    assert mode_shares(place(two, MAPS), 0.3) == pytest.approx(
-        [share, 1 - share if share < 1 else 1]
-    )
+    assert shares(two, MAPS) == pytest.approx([share, 1 - share if share < 1 else 1])
     turned = dataclasses.replace(alignment(25, 0.2), target_T_query=yaw_transform(np.radians(9.0)))
-    assert mode_shares(place([two[0], turned], MAPS), 0.3).tolist() == [1, 1]
+    assert shares([two[0], turned], MAPS).tolist() == [1, 1]
     others = [alignment(25, 0.6), alignment(26, 0.2), alignment(25, 0.2, query="b", target="a")]
-    assert mode_shares(place(others, MAPS), 0.3).tolist() == [1, 1, 1]
+    assert shares(others, MAPS).tolist() == [1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -207,7 +256,7 @@ def test_the_yaw_between_two_poses_does_not_rest_on_the_axes_of_the_base(rotatio
             dataclasses.replace(a, target_T_query=inverse(axes) @ a.target_T_query @ axes)
             for a in rows
         ]
-        assert mode_shares(place(rows, maps), 0.3)[0] == pytest.approx(share)
+        assert shares(rows, maps)[0] == pytest.approx(share)
 
 
 def test_neighbours_do_not_choose_among_the_poses_of_a_place() -> None:
@@ -215,12 +264,17 @@ def test_neighbours_do_not_choose_among_the_poses_of_a_place() -> None:
     both.
     """
     sure = [alignment(k, 0.999) for k in range(20, 31) if k != 25]
-    alone = decide([*sure, alignment(25, 0.6)], MAPS, SETTINGS)
+    alone = decide([*sure, alignment(25, 0.96)], MAPS, SETTINGS, MODEL)
     assert [accepted(o) for o in alone if o.alignment.query_keyframe == 25] == [True]
     both = decide(
-        [*sure, alignment(25, 0.6), alignment(25, 0.2, yaw_transform(0.0, (1.0, 0.0, 0.0)))],
+        [
+            *sure,
+            alignment(25, 0.96),
+            alignment(25, 0.8, yaw_transform(0.0, (1.0, 0.0, 0.0))),  # odds of 6 : 1
+        ],
         MAPS,
         SETTINGS,
+        MODEL,
     )
     reasons = [sentence(o) for o in both if o.alignment.query_keyframe == 25]
     assert len(reasons) == 2
@@ -232,7 +286,7 @@ def test_sessions_that_overlap_each_other_do_not_contradict() -> None:
     maps = {**MAPS, "c": session(yaw_transform(2.0, (500.0, 0.0, 0.0)) @ MAP @ ROAD)}
     rows = [alignment(k, 0.99) for k in range(20, 31)]
     both = rows + [dataclasses.replace(a, target_session="c") for a in rows]
-    for a in decide(both, maps, SETTINGS):
+    for a in decide(both, maps, SETTINGS, MODEL):
         assert (a.decision.agreement.neighbours, a.decision.agreement.conflict) == (10, 0.0)
 
 
@@ -254,10 +308,10 @@ def in_street(k: int, at: int, query: str = "a", target: str = "b") -> Alignment
 
 def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself() -> None:
     refuted, right = sorted(
-        decide([in_street(5, 50, target="a"), in_street(5, 5)], STREETS, SETTINGS),
+        decide([in_street(5, 50, target="a"), in_street(5, 5)], STREETS, SETTINGS, MODEL),
         key=lambda o: o.alignment.target_session,
     )
-    assert refuted.decision.probability == 0.0
+    assert refuted.decision.vetoes == {Veto.CONTRADICTS_ODOMETRY}
     assert "contradicts the session's own odometry" in sentence(refuted)
     assert right.decision.probability > 0.9
 
@@ -288,7 +342,6 @@ def test_how_far_off_its_own_odometry_a_session_may_be(
             at,
             half,
             half,
-            half,
             np.array([posed]),
         )
 
@@ -304,7 +357,7 @@ def test_roads_of_queries_are_counted_once_whatever_answers() -> None:
         alignment(20, 0.5, at=50),
         alignment(40, 0.5, query="b", target="a"),
     ]
-    roads = query_roads(place(rows, MAPS))
+    roads = query_roads(place(rows, MAPS, MODEL))
     assert {name: road.tolist() for name, road in roads.items()} == {"a": [40.0, 60.0], "b": [80.0]}
 
 
@@ -315,12 +368,12 @@ def test_alignments_of_one_pair_of_sessions_belong_together() -> None:
         alignment(40, 0.5, query="b", target="a"),
         alignment(25, 0.5),
     ]
-    assert {pair: r.tolist() for pair, r in pairs_of(place(rows, MAPS)).items()} == {
+    assert {pair: r.tolist() for pair, r in pairs_of(place(rows, MAPS, MODEL)).items()} == {
         ("a", "b"): [1, 3, 0],
         ("b", "a"): [2],
     }
     unposed = {"a": session(ROAD, posed=False), "b": MAPS["b"]}
-    assert {pair: r.tolist() for pair, r in pairs_of(place(rows, unposed)).items()} == {
+    assert {pair: r.tolist() for pair, r in pairs_of(place(rows, unposed, MODEL)).items()} == {
         ("b", "a"): [2]
     }
 
@@ -328,21 +381,32 @@ def test_alignments_of_one_pair_of_sessions_belong_together() -> None:
 def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_else() -> None:
     once = [in_street(k, k, target="c") for k in COPIED]
     assert all(
-        accepted(a) and a.decision.agreement.ambiguity == 0 for a in decide(once, STREETS, SETTINGS)
+        accepted(a) and a.decision.agreement.ambiguity == 0
+        for a in decide(once, STREETS, SETTINGS, MODEL)
     )
-    twice = [in_street(k, at) for k in COPIED for at in (k, k + 30)]
+    # the second place of each fits less well, so that of rivals alone they would be accepted
+    twice = [
+        dataclasses.replace(
+            in_street(k, k + off), features=dataclasses.replace(GOOD, stiffness=fits)
+        )
+        for k in COPIED
+        for off, fits in ((0, 12.0), (30, 4.0))
+    ]
     there = [in_street(k, k, "c", "a") for k in COPIED]
     back = [in_street(k, k, "b", "c") for k in COPIED]
-    for a in decide(once + twice + there + back, STREETS, SETTINGS):
-        assert a.decision.agreement.ambiguity > 0.9
-        assert "ambiguous place" in sentence(a)
+    found = decide(once + twice + there + back, STREETS, SETTINGS, MODEL)
+    assert all(a.decision.agreement.ambiguity > 0.9 for a in found)
+    assert not any(accepted(a) for a in found)
+    assert sum("ambiguous place" in sentence(a) for a in found) == len(found) - len(COPIED)
 
 
 def test_two_queries_of_a_street_do_not_make_all_of_it_look_like_others() -> None:
     right = [in_street(k, k, target="c") for k in range(2, 60)]
     twice = [in_street(k, at) for k in (30, 31) for at in (k - 25, k + 15)]
     found = [
-        a for a in decide(right + twice, STREETS, SETTINGS) if a.alignment.target_session == "c"
+        a
+        for a in decide(right + twice, STREETS, SETTINGS, MODEL)
+        if a.alignment.target_session == "c"
     ]
     assert all(accepted(a) and a.decision.agreement.ambiguity < 0.05 for a in found)
 
@@ -357,16 +421,20 @@ def test_a_second_place_as_far_off_as_the_target_may_have_drifted_is_the_same(
         distance=np.r_[STREETS["b"].distance, road + STREETS["b"].distance],
     )
     rows = [in_street(k, at) for k in COPIED for at in (k, 100 + k + 12)]
-    found = decide(rows, {**STREETS, "b": cast(SessionMap, twice)}, SETTINGS)
+    found = decide(rows, {**STREETS, "b": cast(SessionMap, twice)}, SETTINGS, MODEL)
     assert all((a.decision.agreement.ambiguity > 0.9) == alike for a in found)
 
 
 def test_three_sessions_that_contradict_each_other_look_like_others() -> None:
     """Of b and c, which lie on each other, a is in b where it is, and in c one block on."""
     rows = [in_street(k, k) for k in COPIED] + [in_street(k, k, "b", "c") for k in COPIED]
-    consistent = decide(rows + [in_street(k, k, target="c") for k in COPIED], STREETS, SETTINGS)
+    consistent = decide(
+        rows + [in_street(k, k, target="c") for k in COPIED], STREETS, SETTINGS, MODEL
+    )
     assert all(accepted(a) and a.decision.agreement.ambiguity == 0 for a in consistent)
-    for a in decide(rows + [in_street(k, k + 40, target="c") for k in COPIED], STREETS, SETTINGS):
+    for a in decide(
+        rows + [in_street(k, k + 40, target="c") for k in COPIED], STREETS, SETTINGS, MODEL
+    ):
         if "a" in (a.alignment.query_session, a.alignment.target_session):
             assert a.decision.agreement.ambiguity > 0.9
             assert not accepted(a)
@@ -374,7 +442,7 @@ def test_three_sessions_that_contradict_each_other_look_like_others() -> None:
 
 def test_streets_that_a_session_itself_has_twice_are_ambiguous() -> None:
     rows = [in_street(k, k) for k in COPIED] + [in_street(k, k + 40, target="a") for k in COPIED]
-    for a in decide(rows, STREETS, SETTINGS):
+    for a in decide(rows, STREETS, SETTINGS, MODEL):
         assert a.decision.agreement.ambiguity > 0.9
         assert not accepted(a)
 
@@ -382,25 +450,29 @@ def test_streets_that_a_session_itself_has_twice_are_ambiguous() -> None:
 @pytest.mark.parametrize("at", [lambda k: (7 * k) % 100, lambda k: k + 9])
 def test_second_places_that_do_not_agree_or_lie_in_the_same_view_are_no_copies(at: Any) -> None:
     rows = [in_street(k, where) for k in COPIED for where in (k, at(k))]
-    assert all(a.decision.agreement.ambiguity < 0.02 for a in decide(rows, STREETS, SETTINGS))
+    assert all(
+        a.decision.agreement.ambiguity < 0.02 for a in decide(rows, STREETS, SETTINGS, MODEL)
+    )
 
 
 def test_a_second_place_that_fits_much_worse_is_no_copy() -> None:
-    worse = dataclasses.replace(GOOD, distinct=1.5)
+    worse = dataclasses.replace(GOOD, stiffness=-5.0)
     rows = [in_street(k, k) for k in COPIED] + [
         dataclasses.replace(in_street(k, k + 30), features=worse) for k in COPIED
     ]
-    assert all(a.decision.agreement.ambiguity == 0 for a in decide(rows, STREETS, SETTINGS))
+    assert all(
+        a.decision.agreement.ambiguity < 0.01 for a in decide(rows, STREETS, SETTINGS, MODEL)
+    )
 
 
 def test_without_other_alignments_all_votes_are_zero() -> None:
-    votes = count_votes(place([alignment(20, 0.5)], MAPS), 0.3)
+    votes = count_votes(place([alignment(20, 0.5)], MAPS, MODEL), 0.3)
     assert dataclasses.astuple(votes.row(0)) == (0.5, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_without_odometry_nobody_is_a_neighbour() -> None:
     maps = {"a": session(ROAD, posed=False), "b": MAPS["b"]}
-    for a in decide([alignment(k, 0.992) for k in range(20, 24)], maps, SETTINGS):
+    for a in decide([alignment(k, 0.992) for k in range(20, 24)], maps, SETTINGS, MODEL):
         assert a.decision.agreement == Agreement(0.992, 0, 0, 0, 0, 0, 0)
         assert accepted(a)
 
@@ -432,12 +504,14 @@ def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
         ]
 
     maps = {**STREETS, **MAPS, "b": STREETS["b"]}
-    assert keys(decide(rows, maps, SETTINGS)) == keys(decide(shuffled, maps, SETTINGS))
+    assert keys(decide(rows, maps, SETTINGS, MODEL)) == keys(
+        decide(shuffled, maps, SETTINGS, MODEL)
+    )
 
 
 def test_of_none() -> None:
-    assert decide([], MAPS, SETTINGS) == []
-    nothing = place([], {})
+    assert decide([], MAPS, SETTINGS, MODEL) == []
+    nothing = place([], {}, MODEL)
     assert len(count_votes(nothing, 0.3)) == 0
     assert not contradicts_odometry(nothing, 0.3).any()
 
@@ -523,11 +597,11 @@ def test_voters_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
         road[query],
         error @ MAP @ road[query],
         rng.uniform(0.01, 0.5, 50) * scale,
-        rng.uniform(0, 1, 50) ** 4,
-        rng.uniform(0, 1, 50) ** 4,
+        rng.normal(-2, 3, 50),
         np.ones(50, bool),
     )
-    probabilities = placed.own_probability, placed.probability_ignoring_rivals
+    own = place_odds(placed, placed.log_odds, voxel_size).share
+    probabilities = own, placed.probability_ignoring_rivals
     for found, expected in zip(
         _sums(placed, probabilities, voxel_size),
         slow_sums(placed, probabilities, voxel_size),
