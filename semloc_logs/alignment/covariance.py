@@ -23,9 +23,11 @@ UNKNOWN_NOISE = 1.0  # m: of a fit without points
 LEAST_INFLATION = 2.0
 INFLATION_OF_SHARE = 0.5
 LEAST_SHARE = 0.05
+UNCERTAIN_INFLATION = 12.0  # where ranges are uncertain: all points of a wall are off alike
 # of the road that a query's and a target's keyframes come from: the mean of several drifts less
 # than one of them
 LOCAL_DRIFT = 0.003
+LOCAL_TURN_DRIFT = 2e-4  # rad a metre
 # standard deviations that uncertain ranges of a query, and of a target, may all be off by
 RANGE_BIAS = 1.0
 # share of the bias' variance that query and target have in common, and that cancels where both look
@@ -59,14 +61,21 @@ class Roads:
     between: float = 0.0
 
     @property
-    def variance(self) -> float:
-        """Of the position along one axis, square metres."""
-        local = LOCAL_DRIFT**2 * (self.query**2 + self.target**2) / 4
-        return (local + (ODOMETRY_DRIFT * self.between) ** 2) / 3
+    def covariance(self) -> F64:
+        """What drift adds (6, 6): square metres and square radians."""
+        local = (self.query**2 + self.target**2) / 4
+        position = (LOCAL_DRIFT**2 * local + (ODOMETRY_DRIFT * self.between) ** 2) / 3
+        return np.diag([position] * 3 + [LOCAL_TURN_DRIFT**2 * local / 3] * 3)
 
 
 def covariance_of(
-    fit: Fit, map_T_query: F64, map_T_target: F64, voxel_size: float, roads: Roads = Roads()
+    fit: Fit,
+    map_T_query: F64,
+    map_T_target: F64,
+    voxel_size: float,
+    roads: Roads = Roads(),
+    *,
+    uncertain: bool = False,
 ) -> F64:
     """Covariance (6, 6) of target_T_query in the target's axes (docs/reference/tables.md).
 
@@ -74,8 +83,11 @@ def covariance_of(
     nothing (along a corridor) the error is as large as the search lets it be: the bounds of the
     same place. Uncertain ranges may all be too long or too short, which no number of points
     averages out. Where keyframes along ``roads`` made the maps, their odometry drifts.
+    ``uncertain``: whether the ranges of either side are.
     """
-    about_centre = _about_centre(fit, voxel_size)
+    share = max(fit.inliers, LEAST_SHARE)
+    inflation = max(LEAST_INFLATION, INFLATION_OF_SHARE / share**2)
+    about_centre = _about_centre(fit, voxel_size, UNCERTAIN_INFLATION if uncertain else inflation)
 
     # from the centre of the query to its base, and into the target's axes
     x, y, z = map_T_query[:3, 3] - fit.centre
@@ -84,21 +96,18 @@ def covariance_of(
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = map_T_target[:3, :3].T
 
-    drift = np.diag([roads.variance] * 3 + [0.0] * 3)
-    C = turned @ A @ about_centre @ A.T @ turned.T + drift + FLOOR
+    C = turned @ A @ about_centre @ A.T @ turned.T + roads.covariance + FLOOR
     return np.asarray((C + C.T) / 2)
 
 
-def _about_centre(fit: Fit, voxel_size: float) -> F64:
+def _about_centre(fit: Fit, voxel_size: float, inflation: float) -> F64:
     """Covariance (6, 6) of left increments about the query's centre, in the map's axes."""
-    noise = max(fit.rmse if np.isfinite(fit.rmse) else UNKNOWN_NOISE, LEAST_NOISE) ** 2
+    noise = max(fit.rmse if np.isfinite(fit.rmse) else UNKNOWN_NOISE, LEAST_NOISE) ** 2 * inflation
     prior = np.diag(
         [1 / (SAME_PLACE_VOXELS * voxel_size) ** 2] * 3
         + [1 / np.radians(SAME_PLACE_DEGREES) ** 2] * 3
     )
     information, bias = _beyond_normal_noise(fit.information, fit.range_bias)
-    share = max(fit.inliers, LEAST_SHARE)
-    noise *= max(LEAST_INFLATION, INFLATION_OF_SHARE / share**2)
     covariance = np.asarray(np.linalg.inv(information / noise + prior))
 
     of_query, of_target = RANGE_BIAS * bias / noise @ covariance

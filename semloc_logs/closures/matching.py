@@ -17,6 +17,7 @@ from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit, measured
 from semloc_logs.alignment.scores import Scores, mutual_shares, reverse_scores, structure_scores
 from semloc_logs.alignment.search import Candidate, search_hypotheses
+from semloc_logs.alignment.target_map import is_uncertain
 from semloc_logs.alignment.tau import tau
 from semloc_logs.closures.alignment_tables import write_part
 from semloc_logs.closures.closure import Alignment, Features
@@ -398,6 +399,7 @@ def _alignment(context: QueryContext, fitted: Fitted) -> Alignment:
             map_T_target,
             context.voxel_size,
             _roads(context, fitted, nearest),
+            uncertain=is_uncertain(fitted.range_sigma, context.voxel_size),
         ),
         overlap=overlap,
         inliers=inliers,
