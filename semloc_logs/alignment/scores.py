@@ -18,8 +18,8 @@ from semloc_logs.numerics.transforms import apply, inverse
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
-DOUBT = 400  # voxels that are added to what is observed, and their shares in wrong poses
-DOUBTFUL_ALIGNED, DOUBTFUL_FREE = 0.5, 0.25
+DOUBT = 150  # voxels that are added to what is observed, and their shares in wrong poses
+DOUBTFUL_ALIGNED, DOUBTFUL_FREE = 0.5, 0.2
 ENOUGH_COVERAGE = 0.5  # of the query's structure in observed space: less of it lowers the score
 
 

@@ -254,7 +254,7 @@ def fit_votes(judged: Judged, agreement: Agreement[F64], rows: Bools, own: F64) 
 
 
 def max_ambiguity(judged: Judged, agreement: Agreement[F64], p: F64) -> float:
-    """How ambiguous is too much, of what probabilities ``p`` (n,) would accept.
+    """How ambiguous is too much, of what probabilities ``p`` (n,) would accept without rivals.
 
     The geometric mean of right ones of the ordinary town that has the most of it, and of wrong ones
     of the city of copies that has the least: as many times the one as the other is it. An ordinary
@@ -358,7 +358,7 @@ def fit(judged: Judged) -> Fitted:
         total[mine] = own[mine] + votes.log_odds(Votes.of(agreement.part(mine)).vector())
     total = np.minimum(total, np.log(judged.clear.sum()))
     p = np.where(kept, probability(judged, own, total), 0.0)
-    most_alike = max_ambiguity(judged, agreement, p)
+    most_alike = max_ambiguity(judged, agreement, np.where(kept, probability_of(total), 0.0))
     most = float(np.log(judged.clear.sum()))
     fitted = Model(model, fit_votes(judged, agreement, kept, own), most, most_alike)
     p = np.where(fitted.is_ambiguous(agreement), 0.0, p)

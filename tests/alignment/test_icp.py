@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.covariance import COMMON_BIAS, RANGE_BIAS, covariance_of, stiffness
+from semloc_logs.alignment.covariance import (
+    COMMON_BIAS,
+    RANGE_BIAS,
+    Roads,
+    covariance_of,
+    stiffness,
+)
 from semloc_logs.alignment.hypotheses import SAME_PLACE_VOXELS
 from semloc_logs.alignment.icp import Fit, Step, Weighting, _add_point, align
 from semloc_logs.alignment.query_map import Query
@@ -213,10 +219,11 @@ def held(
     pull: F64 | None = None,
     rmse: float = 0.1,
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    inliers: float = 1.0,
 ) -> Fit:
     return Fit(
         np.eye(4),
-        1.0,
+        inliers,
         1000,
         rmse,
         information,
@@ -225,18 +232,26 @@ def held(
     )
 
 
-def test_covariance_by_hand() -> None:
+@pytest.mark.parametrize(
+    ("share", "uncertain", "inflation"),
+    [
+        (1.0, False, 2.0),  # points share their errors: two count as one
+        (0.25, False, 8.0),  # of fewer points more meet a surface by chance: 0.5 / share^2
+        (0.01, False, 200.0),  # no less than 5 %
+        (1.0, True, 12.0),
+    ],
+)
+def test_covariance_by_hand(share: float, uncertain: bool, inflation: float) -> None:
     """1200 in each direction of position, 4800 about each axis (arms of 2 m), planes of 0.1 m
     noise.
 
-    Normals 2 degrees off may pretend to know 3600 sin^2(2 degrees) = 4.38 of each; points share
-    their errors, so twelve count as one. Beside that the search bounds the error: 0.99 m and 5
-    degrees; a centimetre and a milliradian come on top.
+    Normals 2 degrees off may pretend to know 3600 sin^2(2 degrees) = 4.38 of each. Beside that the
+    search bounds the error: 0.99 m and 5 degrees; a centimetre and a milliradian come on top.
     """
-    C = covariance_of(held(np.diag([1200.0] * 3 + [4800.0] * 3)), np.eye(4), np.eye(4), 0.3)
-    position = 1 / ((1200 - 4.3845) / (12 * 0.01) + 1 / 0.99**2) + 1e-4
-    angle = 1 / ((4800 - 4 * 4.3845) / (12 * 0.01) + 131.31) + 1e-6
-    np.testing.assert_allclose([position, angle], [2.0036e-4, 2.600e-5], rtol=1e-3)
+    fit = held(np.diag([1200.0] * 3 + [4800.0] * 3), inliers=share)
+    C = covariance_of(fit, np.eye(4), np.eye(4), 0.3, uncertain=uncertain)
+    position = 1 / ((1200 - 4.3845) / (inflation * 0.01) + 1 / 0.99**2) + 1e-4
+    angle = 1 / ((4800 - 4 * 4.3845) / (inflation * 0.01) + 131.31) + 1e-6
     np.testing.assert_allclose(C, np.diag([position] * 3 + [angle] * 3), rtol=1e-4, atol=1e-12)
 
 
@@ -327,10 +342,10 @@ def test_covariance_grows_with_the_lever_arm() -> None:
     far = covariance_of(found, yaw_transform(0.0, (100.0, 0.0, 0.0)), np.eye(4), 0.3)
     np.testing.assert_allclose(far[3:, 3:], near[3:, 3:])
     centre = found.centre[0]
-    drift = (0.01 * 100) ** 2 / 3  # of a hundred metres between the target's keyframe and the query
-    expected = near[1, 1] + ((100 - centre) ** 2 - centre**2) * (near[5, 5] - 1e-6) + drift
+    expected = near[1, 1] + ((100 - centre) ** 2 - centre**2) * (near[5, 5] - 1e-6)
     assert far[1, 1] == pytest.approx(expected, rel=0.05)
-    assert far[0, 0] < 2 * near[0, 0] + 1e-6 + drift
+    # the distance alone adds nothing along the arm
+    assert far[0, 0] < 2 * near[0, 0] + 1e-6
 
 
 def test_errors_of_many_fits_stay_within_the_covariance() -> None:
@@ -513,7 +528,22 @@ def test_a_fit_that_meets_too_little_knows_nothing() -> None:
     assert not found.range_bias.any()
 
 
-def test_what_was_seen_farther_along_the_road_is_less_certain_by_the_drift_between() -> None:
+@pytest.mark.parametrize(
+    ("roads", "position", "angle"),
+    [
+        (Roads(), 0.0, 0.0),
+        (Roads(between=30.0), 0.3**2 / 3, 0.0),  # 1 % of the way
+        (Roads(query=20.0), 0.03**2 / 3, 0.002**2 / 3),  # 0.3 % and 0.2 mrad a metre of half of it
+        (Roads(target=20.0), 0.03**2 / 3, 0.002**2 / 3),
+        (Roads(20.0, 20.0, 30.0), (0.3**2 + 2 * 0.03**2) / 3, 2 * 0.002**2 / 3),
+    ],
+)
+def test_where_odometry_bridges_a_road_its_drift_is_added(
+    roads: Roads, position: float, angle: float
+) -> None:
     found = fit(np.eye(4), SMALL)
-    near, far = (covariance_of(found, np.eye(4), np.eye(4), 0.3, road) for road in (0.0, 30.0))
-    np.testing.assert_allclose(np.diag(far - near), [0.3**2 / 3] * 3 + [0.0] * 3, atol=1e-12)
+    alone, bridged = (
+        covariance_of(found, np.eye(4), np.eye(4), 0.3, given) for given in (Roads(), roads)
+    )
+    expected = [position] * 3 + [angle] * 3
+    np.testing.assert_allclose(np.diag(bridged - alone), expected, atol=1e-12)

@@ -17,7 +17,13 @@ from semloc_logs.alignment.mask_grid import (
 )
 from semloc_logs.alignment.query_map import Evidence, Query, structure_mask
 from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit, measured
-from semloc_logs.alignment.scores import Scores, alignment_score, structure_scores
+from semloc_logs.alignment.scores import (
+    Scores,
+    alignment_score,
+    mutual_shares,
+    reverse_scores,
+    structure_scores,
+)
 from semloc_logs.alignment.search import Candidate, search, search_hypotheses
 from semloc_logs.alignment.surface import thin_points
 from semloc_logs.alignment.target_map import PLANE_NOISE, UNCERTAIN_RADII, Target
@@ -363,9 +369,9 @@ def test_structure_scores_by_hand() -> None:
         (0, 0, 1): 13,
     }
     query = Query(block_map(query_cells), points_of(query_cells), V)
-    assert structure_scores(query, target, np.eye(4)) == (2 / 4, 4 / 5, 1 / 5, 2)
+    assert structure_scores(query, target, np.eye(4)) == (5, 4, 2, 1)
     bare = Query(block_map({(0, 0, 0): 0}), np.zeros((1, 3)), V)
-    assert structure_scores(bare, target, np.eye(4)) == (0.0, 0.0, 0.0, 0)
+    assert structure_scores(bare, target, np.eye(4)) == (0, 0, 0, 0)
     assert structure_mask(np.array([0, 1, 9, 2, 5, 8, 13, 255], np.uint8)).tolist() == [
         False,
         False,
@@ -378,6 +384,28 @@ def test_structure_scores_by_hand() -> None:
     ]
 
 
+def test_reverse_scores_are_of_the_targets_structure_on_the_querys_map() -> None:
+    """The query lies three voxels along the target's x: roles are exchanged, the pose inverted."""
+    query = Query(block_map({(0, 0, 0): 2, (0, 0, 1): 254, (4, 0, 0): 254}), np.zeros((1, 3)), V)
+    target = Target(block_map({(3, 0, 0): 2, (7, 0, 0): 5, (20, 0, 0): 8}), V)
+    moved = np.eye(4)
+    moved[0, 3] = 3 * V
+    assert reverse_scores(query, target, moved) == (3, 2, 1, 1)
+    assert reverse_scores(query, target, np.eye(4)) != (3, 2, 1, 1)
+
+
+def test_shares_of_both_sides_by_hand() -> None:
+    """150 voxels are added to each, half of them aligned and a fifth in free space."""
+    good = Scores(2000, 850, 725, 20)  # 800 and 50 of 1000
+    bad = Scores(3000, 850, 425, 370)  # 500 and 400 of 1000
+    aligned, free = mutual_shares(good, bad)
+    assert aligned == pytest.approx((0.5**2 * 0.8) ** (1 / 3))
+    assert free == pytest.approx((0.4**2 * 0.05) ** (1 / 3))
+    assert mutual_shares(bad, good) == (aligned, free)
+    nothing = Scores(0, 0, 0, 0)
+    assert mutual_shares(nothing, nothing) == pytest.approx((0.5, 0.2))
+
+
 def test_scores_of_alignments_by_hand() -> None:
     """Below a coverage of a half the structure counts less in proportion; what contradicts free
     space is taken off in full.
@@ -385,7 +413,9 @@ def test_scores_of_alignments_by_hand() -> None:
     assert float(alignment_score(0.8, 0.25, 0.1)) == pytest.approx(0.8 * 0.5 - 0.1)
     assert float(alignment_score(0.8, 0.5, 0.1)) == pytest.approx(0.7)
     assert float(alignment_score(0.8, 0.9, 0.1)) == pytest.approx(0.7)
-    assert Scores(0.8, 0.25, 0.1, 99).score == pytest.approx(0.3)
+    scores = Scores(100, 25, 20, 10)
+    assert (scores.structure, scores.coverage, scores.contradiction) == (0.8, 0.25, 0.1)
+    assert scores.score == pytest.approx(0.3)
     np.testing.assert_allclose(
         alignment_score(np.array([1.0, 0.5]), np.array([0.1, 1.0]), np.array([0.0, 0.25])),
         [0.2, 0.25],

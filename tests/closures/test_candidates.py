@@ -17,7 +17,6 @@ from semloc_logs.closures.matching import (
     Fitted,
     QueryContext,
     _each_place_once,
-    _rival_score,
     find_hypotheses,
     verify_hypotheses,
 )
@@ -42,33 +41,17 @@ def context(made: Resolved, road: tuple[float, ...] = (0.0, 2000.0)) -> QueryCon
     return QueryContext(cast(Any, visible), cast(Any, None), 0, cast(Any, "query"), np.eye(4))
 
 
-def fitted(x: float, score: float, nearest: int = 0) -> Fitted:
+def fitted(x: float, score: float) -> Fitted:
     """A fit at ``x`` metres; the score is the structure where all of it is observed."""
     none = np.zeros((6, 6))
     fit = Fit(yaw_transform(0.0, (x, 0, 0)), 1.0, 100, 0.1, none, np.zeros(3), np.zeros((2, 6)))
-    scores = Scores(score, 1.0, 0.0, 100)
-    return Fitted(Candidate(0, np.eye(4), 0.5, 3), nearest, np.zeros(3), fit, scores)
+    scores = Scores(100, 100, round(100 * score), 0)
+    return Fitted(Candidate(0, np.eye(4), 0.5, 3), 0, np.zeros(3), fit, scores, 0.0)
 
 
 def test_the_best_fit_of_each_place_is_kept() -> None:
     rows = [fitted(0.5, 0.4), fitted(0.0, 0.6), fitted(9.0, 0.5)]
     assert [f.scores.score for f in _each_place_once(rows, 0.3)] == [0.6, 0.5]
-
-
-@pytest.mark.parametrize(
-    ("x", "road", "rival"),
-    [
-        (30.0, 2000.0, 0.4),  # farther than 2 km of road may drift, 20 m
-        (15.0, 2000.0, 0.0),  # the same place, driven again
-        (15.0, 1000.0, 0.4),  # 10 m of drift and 1 m
-        (0.5, 10.0, 0.4),  # on the same pass
-    ],
-)
-def test_a_rival_is_another_place(x: float, road: float, rival: float) -> None:
-    one = fitted(0.0, 0.6)
-    other = fitted(x, 0.4, nearest=1)
-    found = _rival_score(context(settings(), (0.0, road)), one, [one, other])
-    assert found == pytest.approx(rival)
 
 
 def test_candidates_of_each_session_are_as_many_as_the_settings_name(

@@ -35,7 +35,7 @@ ROAD = dict.fromkeys("abc", np.arange(100.0))
 def alignment(query: str, i: int, target: str, j: int) -> Alignment:
     rng = np.random.default_rng(i)
     half = rng.standard_normal((6, 6))
-    features = Features(0.9, 0.9, 0.0, 0.9, 0.1, 0.2, 3.0, 3.0)
+    features = Features(0.9, 0.9, 0.0, 0.9, 3.0, 3.0, 0.0)
     return Alignment(
         query_session=query,
         target_session=target,
@@ -46,7 +46,6 @@ def alignment(query: str, i: int, target: str, j: int) -> Alignment:
         target_T_query=yaw_transform(0.1 * i, (0.5, 0.25, -0.1)),
         covariance=half @ half.T,
         overlap=0.75,
-        probability=0.9,
         inliers=1000 + i,
         words=i,
         features=features,
@@ -55,7 +54,7 @@ def alignment(query: str, i: int, target: str, j: int) -> Alignment:
 
 def decision(probability: float) -> Decision:
     agreement = Agreement(0.9, 7.0, 5.0, 1.0, 2.0, 0.5, 0.25)
-    return Decision(probability, agreement, probability, 1.0, 1.0, 0.99)
+    return Decision(frozenset(), probability, 1.0, 1.0, agreement, 0.99)
 
 
 def closure(query: str, i: int, target: str, j: int, probability: float = 0.995) -> Closure:

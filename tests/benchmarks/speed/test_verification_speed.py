@@ -100,6 +100,6 @@ def test_the_transform_put_in_comes_back(made: Scene) -> None:
     fine = fine_fit(coarse.target_T_query, surface_of(made.points, 2 * v), made.query)
     assert np.linalg.norm((inverse(truth) @ fine.target_T_query)[:3, 3]) < 0.01
     assert yaw_between(fine.target_T_query, truth) < 0.001
-    structure, _, contradiction, _ = structure_scores(made.query, made.target, fine.target_T_query)
-    assert structure > 0.9
-    assert contradiction < 0.05
+    scores = structure_scores(made.query, made.target, fine.target_T_query)
+    assert scores.structure > 0.9
+    assert scores.contradiction < 0.05
