@@ -18,7 +18,7 @@ from semloc_logs.numerics.transforms import apply, inverse
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
-DOUBT = 150  # voxels that are added to what is observed, and their shares in wrong poses
+DOUBT = 150  # voxels that are added to the observed ones, and their shares in wrong poses
 DOUBTFUL_ALIGNED, DOUBTFUL_FREE = 0.5, 0.2
 ENOUGH_COVERAGE = 0.5  # of the query's structure in observed space: less of it lowers the score
 
@@ -76,9 +76,9 @@ def reverse_scores(query: Query, target: Target, target_T_query: F64) -> Scores:
 def mutual_shares(forward: Scores, reverse: Scores) -> tuple[float, float]:
     """Of the voxels that the other side observed, the shares that are aligned and in free space.
 
-    They are weighted geometric means of both sides, where the worse side counts twice: what is new
-    or gone contradicts one side alone, a wrong pose both. A handful of voxels fits anywhere, so
-    some are added that fit as in wrong poses.
+    They are weighted geometric means of both sides, where the worse side counts twice: new or
+    missing things contradict one side alone, a wrong pose both. A handful of voxels fits anywhere,
+    so some are added that fit as in wrong poses.
     """
     sides = (forward, reverse)
     aligned = [(s.aligned + DOUBT * DOUBTFUL_ALIGNED) / (s.observed + DOUBT) for s in sides]

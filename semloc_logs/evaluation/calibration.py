@@ -437,7 +437,7 @@ def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:
     """The content of calibration.json: the models and what they are made from."""
     return {
         "note": "made by benchmarks/calibrate.py; log-odds = bias + sum of weight * feature,"
-        " clipped to low .. high; 'votes' add to those of 'own'; where lookalike exceeds most_alike"
+        " clipped to low .. high; 'votes' add to 'own'; where lookalike exceeds most_alike"
         " nothing is accepted",
         "own": fitted.model.own.to_json(EVIDENCE),
         "votes": fitted.model.votes.to_json(VOTES),

@@ -142,7 +142,7 @@ def test_what_is_said_of_a_town_does_not_depend_on_its_truth() -> None:
     before = fit(data)
     after = fit(replace(data, right=lied))
     mine = data.town == "t1"
-    # tempering looks at all towns; the order within a town is that of the models of the other towns,
+    # tempering looks at all towns; the models of the other towns order the alignments of a town,
     # apart from the most certain ones, which are equally certain
     certain = [f.alone[mine] > f.alone[mine].max() - 1e-6 for f in (before, after)]
     below = ~(certain[0] | certain[1])

@@ -20,6 +20,7 @@ from semloc_logs.alignment.query_map import Query
 from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
 from semloc_logs.benchmarks.localisation.city import DATABASE, WorldDrive
 from semloc_logs.benchmarks.spans import FunctionTimes, Span, span_seconds
+from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.closure import Alignment, Closure
 from semloc_logs.closures.database import Database
@@ -186,7 +187,7 @@ class OurTask:
         return Answer(
             keyframe,
             seconds,
-            first.probability if first else -np.inf,
+            float(shipped().own_log_odds(first.features)) if first else -np.inf,
             error_m,
             error_deg,
             True,

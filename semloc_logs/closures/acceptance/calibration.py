@@ -39,7 +39,7 @@ class Evidence(Columns, Generic[Value]):
     """What the features of alignments say about their places (n,).
 
     Coverage, fit and support are left out: they fall with the distance between the sensors, and
-    what was not seen is no evidence. Beside contradiction the structure tells nothing more.
+    unseen structure tells nothing. Beside contradiction the structure tells nothing more.
     """
 
     log_contradiction: Value

@@ -179,8 +179,8 @@ def _agrees(
 class PlaceOdds:
     """Odds of the alignments (n,) of a query with a target: one of them is right, or none.
 
-    ``own`` are those of the alignment, ``place`` of all poses of its place, ``rivals`` of all other
-    places, in units of those of no place (or of ``none``, where they would be too large).
+    ``own`` belong to the alignment, ``place`` to all poses of its place, ``rivals`` to all other
+    places, and ``none`` to no place at all.
     """
 
     own: F64
@@ -208,7 +208,7 @@ def place_odds(placed: Placed, log_odds: F64, voxel_size: float) -> PlaceOdds:
     """What alignments with ``log_odds`` (n,) leave to each other.
 
     Poses of one place are modes: a metre along the road, where each camera saw the other sides of
-    things. A place that the target passed twice is no rival of itself.
+    things. A place that the target passed twice is not its own rival.
     """
     out = np.ones((4, len(placed)))
     for rows in pairs_of(placed, posed=False).values():
@@ -231,7 +231,7 @@ def _place_odds(
     log_odds: F64,
     bounds: tuple[float, float, float],
 ) -> F64:
-    """Own odds, those of the place, of its rivals, and of none (4, n), ordered by ``query`` (n,).
+    """The fields of :class:`PlaceOdds` (4, n), ordered by ``query`` (n,).
 
     In one place are poses within ``bounds[0]`` metres and ``bounds[1]`` radians about z. From
     ``bounds[2]`` metres of road on they may also be apart by the drift of the target's odometry.

@@ -53,8 +53,8 @@ def decide(
 ) -> list[Closure | Rejected]:
     """What becomes of the alignments of all queries, best first for each query.
 
-    For each target session at most one alignment of a query is accepted. The ``model`` is that of
-    the package unless another is given.
+    For each target session at most one alignment of a query is accepted. Without a ``model``
+    the one of the package decides.
     """
     model = model or shipped()
     decisions = _decisions(alignments, maps, settings, model)
@@ -128,7 +128,7 @@ def why_rejected(decision: Decision, features: Features[float], model: Model) ->
 
 
 def weakest(features: Features[float], model: Model) -> Reason:
-    """The evidence that takes most from the log-odds, beside that of typical right alignments."""
+    """The evidence that takes most from the log-odds, compared with typical right alignments."""
     own = model.own
     terms = np.array(own.weights) * (Evidence.of(features).vector() - np.array(own.typical))
     return REASON_OF_EVIDENCE[EVIDENCE[int(np.argmin(terms))]]

@@ -29,7 +29,7 @@ class Placed(Columns):
     ``query`` (n,) numbers a session's queries, ``road`` and ``target_road`` (n,) are metres along
     the two drives, ``map_T_query`` and ``target_T_query`` (n, 4, 4) the query's base in its own map
     by odometry and in the target's by alignment, ``sigma`` (n,) the standard deviation of the
-    latter's position in metres, ``log_odds`` (n,) those of its own features. ``posed``: whether
+    latter's position in metres, ``log_odds`` (n,) the odds of its own features. ``posed``: whether
     odometry is known.
     """
 

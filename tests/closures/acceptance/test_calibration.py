@@ -146,7 +146,8 @@ def test_no_probability_is_more_than_the_calibration_has_seen() -> None:
 
 def test_which_places_are_ambiguous() -> None:
     model = dataclasses.replace(shipped(), max_ambiguity=0.125)
-    votes = Agreement(*np.zeros((6, 3)), np.array([0.0, 0.125, 0.126]))
+    none = np.zeros(3)
+    votes = Agreement(none, none, none, none, none, none, np.array([0.0, 0.125, 0.126]))
     assert model.is_ambiguous(votes).tolist() == [False, False, True]
 
 
