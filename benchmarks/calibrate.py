@@ -16,7 +16,7 @@ import argparse
 import json
 from pathlib import Path
 
-from towns import Place, Town, collect, short_towns
+from towns import Place, Town, collect
 
 import semloc_logs.closures.acceptance
 from semloc_logs.engines.processes import single_threaded
@@ -31,12 +31,10 @@ from semloc_logs.pictures.reliability_diagram import draw_reliability
 
 LATER = ("summer", "autumn", "snow")
 TOWNS = (
-    Town("drawn", 1, noise=0.12, seasons=LATER),
-    Town("geometry", 2, ("hdl64",), "geometry", roadworks=4.0),
-    Town("repeating", 3, noise=0.05, repeating=True),
-    Town("sparse", 4, ("vlp16",), noise=0.12, seasons=LATER, drift=0.015),
-    Town("repeating-geometry", 5, ("hdl64",), "geometry", repeating=True),
-    Town("stereo", 6, ("stereo",), noise=0.12),
+    Town("drawn", 1, noise=0.12, seasons=LATER, length=110.0),
+    Town("geometry", 2, ("hdl64",), "geometry", roadworks=4.0, length=110.0),
+    Town("sparse", 4, ("vlp16",), noise=0.12, seasons=LATER, drift=0.015, length=110.0),
+    Town("stereo", 6, ("stereo",), noise=0.12, length=110.0),
     Town(
         "there-and-back",
         7,
@@ -45,26 +43,71 @@ TOWNS = (
         trajectory="00",
         start=300.0,
         seasons=("summer", "snow"),
-        length=160.0,
+        sessions=2,
+        length=140.0,
     ),
-    Town("mixed", 8, ("depth", "hdl32"), noise=0.08, sessions=2),
-    Town("repeating-sparse", 9, ("vlp16",), noise=0.12, repeating=True, drift=0.015),
-    Town("uniform", 10, ("hdl32",), "uniform"),
+    Town("mixed", 8, ("depth", "hdl32"), noise=0.08, sessions=1, length=120.0),
+    Town("uniform", 10, ("hdl32",), "uniform", sessions=2),
     Town(
-        "there-and-back-geometry",
+        "back-geometry",
         11,
         ("hdl32",),
         "geometry",
         trajectory="05",
         start=200.0,
+        sessions=2,
+        length=140.0,
+    ),
+    Town("stereo-lidar", 12, ("stereo", "vlp32"), noise=0.12, sessions=1, length=120.0),
+    Town("rosette", 41, ("rosette", "hdl32"), "geometry", noise=0.1, sessions=1, length=120.0),
+    Town("camera-1", 81, ("stereo",), noise=0.1, length=140.0),
+    Town("plain-20", 120, noise=0.1, labels="geometry", sessions=4, length=110.0),
+    Town("plain-21", 121, ("vlp16", "hdl64"), "geometry", noise=0.1, sessions=2),
+    Town("repeating-a", 3, noise=0.05, repeating=True, sessions=2, length=160.0),
+    Town(
+        "repeating-b", 103, labels="geometry", noise=0.05, repeating=True, sessions=2, length=160.0
+    ),
+    Town("repeating-c", 104, ("vlp16",), noise=0.1, repeating=True, sessions=2, length=160.0),
+    Town(
+        "repeating-d",
+        105,
+        ("hdl64",),
+        "geometry",
+        noise=0.05,
+        repeating=True,
+        sessions=4,
         length=160.0,
     ),
-    Town("stereo-lidar", 12, ("stereo", "vlp32"), noise=0.12, sessions=2),
-    Town("repeating-uniform", 13, ("vlp32",), "uniform", repeating=True),
-    Town("repeating-stereo", 14, ("stereo", "hdl32"), "geometry", repeating=True, sessions=2),
-    Town("long", 15, noise=0.12, seasons=("summer", "winter"), length=260.0, sessions=2),
-    *short_towns(0, 8),
-    *short_towns(10, 19),
+    Town("repeating-e", 106, noise=0.1, repeating=True, sessions=2, length=160.0),
+    Town(
+        "repeating-f", 107, labels="geometry", noise=0.05, repeating=True, sessions=2, length=160.0
+    ),
+    Town("single-hdl64", 31, ("hdl64",), "geometry", noise=0.1, sessions=2, sweeps=11.0),
+    Town("single-hdl64b", 35, ("hdl64",), noise=0.1, sessions=2, sweeps=11.0),
+    Town(
+        "single-mixed",
+        32,
+        ("vlp16", "raster"),
+        "geometry",
+        noise=0.1,
+        sessions=2,
+        length=100.0,
+        sweeps=11.0,
+    ),
+    Town(
+        "single-rosette", 33, ("rosette", "hdl32"), "geometry", noise=0.1, sessions=1, sweeps=11.0
+    ),
+    Town("single-vlp16", 34, ("vlp16",), noise=0.1, sessions=2, sweeps=11.0),
+    Town(
+        "single-repeating",
+        36,
+        ("hdl64",),
+        "geometry",
+        noise=0.1,
+        repeating=True,
+        sessions=2,
+        sweeps=11.0,
+    ),
 )
 
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from semloc_logs.engines import make_engine
 from semloc_logs.evaluation.calibration import judge_town, read_judged
@@ -26,6 +28,9 @@ from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.tables.table import read_metadata
 from semloc_logs.workspace import Workspace
 
+CLOUD = "sensor_msgs/msg/PointCloud2"
+LATCHED = ("/tf_static", "/lidar/label_space")
+AROUND_NS = 300_000_000  # of a single sweep: its poses
 FIRST_SEED = 200  # training has the seeds below
 
 
@@ -35,7 +40,8 @@ class Town:
     ``sensors``.
 
     ``trajectory``: number of a recorded drive that the streets lie along, driven there and back.
-    ``labels`` is the source of the classes.
+    ``labels`` is the source of the classes. With ``sweeps`` single sweeps so many metres apart are
+    sessions of their own, instead of the drives.
     """
 
     name: str
@@ -51,6 +57,7 @@ class Town:
     start: float = 0.0
     sessions: int = 3
     length: float = 130.0
+    sweeps: float = 0.0
 
 
 def short_towns(first: int, count: int) -> list[Town]:
@@ -133,6 +140,13 @@ class Place:
             for k in range(town.sessions):
                 logs[f"{sensor}_{k}"] = place / f"session_{k}.mcap"
                 truth[f"{sensor}_{k}"] = {"trajectory": f"{sensor}/session_{k}.tum"}
+        if town.sweeps:
+            drives = logs
+            logs = {}
+            for name, log in drives.items():
+                cut = single_sweeps(log, home / "sweeps", name, town.sweeps)
+                logs |= cut
+                truth |= dict.fromkeys(cut, truth.pop(name))
         (home / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
         return logs
 
@@ -150,6 +164,48 @@ class Place:
         describe(work, [], settings, engine)
         close(work, settings, engine)
         return work
+
+
+def single_sweeps(log: Path, folder: Path, name: str, every: float) -> dict[str, Path]:
+    """Logs by name of single sweeps of a drive, ``every`` so many metres: each with its poses."""
+    folder.mkdir(exist_ok=True)
+    track = np.loadtxt(log.with_suffix(".tum"))
+    steps = np.linalg.norm(np.diff(track[:, 1:4], axis=0), axis=1)
+    road = np.concatenate([[0.0], np.cumsum(steps)])
+    wanted = np.interp(np.arange(every / 4, road[-1], every), road, track[:, 0])
+    with log.open("rb") as stream:
+        messages = list(make_reader(stream).iter_messages())
+    times = np.array([m.log_time for s, _, m in messages if s and s.name == CLOUD])
+    made = {}
+    for number, second in enumerate(wanted):
+        at = int(times[np.argmin(np.abs(times / 1e9 - second))])
+        made[f"{name}_{number:02d}"] = path = folder / f"{name}_{number:02d}.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start(profile="ros2")
+            channels: dict[int, int] = {}
+            for schema, channel, message in messages:
+                if schema and _belongs(schema.name, channel.topic, message.log_time - at):
+                    if channel.id not in channels:
+                        known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                        channels[channel.id] = writer.register_channel(
+                            channel.topic, channel.message_encoding, known, channel.metadata
+                        )
+                    writer.add_message(
+                        channels[channel.id],
+                        message.log_time,
+                        message.data,
+                        message.publish_time,
+                    )
+            writer.finish()
+    return made
+
+
+def _belongs(kind: str, topic: str, later_ns: int) -> bool:
+    """Whether a message, so much later than a sweep, belongs to the log of this sweep."""
+    if topic in LATCHED:
+        return True
+    return later_ns == 0 if kind == CLOUD else abs(later_ns) < AROUND_NS
 
 
 @dataclass(frozen=True, slots=True)
