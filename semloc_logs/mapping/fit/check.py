@@ -36,7 +36,8 @@ from semloc_logs.mapping.fit.model import (
     pose_motion,
     starts,
 )
-from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, choose, motion, registered
+from semloc_logs.mapping.fit.other_starts import better_start
+from semloc_logs.mapping.fit.pairs import Clouds, Registered, choose, registered
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import inverse
 
@@ -56,8 +57,6 @@ LEAST_SIGMAS = 5.0
 DOUBTFUL = 15.0
 FAR_OFF = 40.0
 MUCH_NEARER = 0.05  # such a reading explains the pairs when it lowers the median to this share
-TRIED = 4  # pairs that show whether another start is better
-BETTER_START = 1.15  # another start is better when so many times the points lie on planes
 # a pair contradicts its poses when registration brings so many times the points onto planes
 CONTRADICTS = 1.15
 TELLING = 0.2  # registrations with a smaller share of points on planes may have ended anywhere
@@ -82,9 +81,6 @@ WRONG_TURN = 0.05  # rad, within a pair
 NEAR_VOXELS = 33.0  # a rotation moves points at this distance (10 m at 0.30 m voxels)
 # of the scale, which moves the far end of a submap: odometry of wheels is off by 1 to 2 %
 SCALE_NOTED, SCALE_WRONG = 0.03, 0.06
-
-
-Start = Callable[[F64], F64]  # a motion (4, 4) by the poses -> the start of a registration
 
 
 class Severity(Enum):
@@ -218,7 +214,7 @@ def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
     squares = given.pairs.squares(pose_motion(given.pairs, poses_at, np.zeros(PARAMETERS)))
     # poses from which registration hardly moves are not far off
     is_doubtful = float(np.nanmedian(squares)) > DOUBTFUL
-    start = _better_start(clouds, given, squares) if is_doubtful else None
+    start = better_start(clouds, poses_at, given, squares) if is_doubtful else None
     if start is not None:
         stream = _judged(topic, clouds, poses_at, registered(clouds, numbers, start))
         if stream.findings:
@@ -251,54 +247,6 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
         joint = fit(pairs, poses_at, np.arange(PARAMETERS), estimate.parameters)
         _enter(stream, joint, clouds)
     return stream
-
-
-def _better_start(clouds: Clouds, found: Registered, squares: F64) -> Start | None:
-    """The motion that brings far more points onto planes than registration does.
-
-    It is tried on the few pairs that contradict the poses most, by ``squares`` (n,), and on as many
-    evenly spread.
-
-    A fault such as another convention of axes makes it from the given one exactly, so it need not
-    be registered; registration from the given motion may have ended anywhere.
-    """
-    worst = np.argsort(-squares, kind="stable")[:TRIED]
-    evenly = np.linspace(0, len(squares) - 1, TRIED).round().astype(np.int64)
-    rows = np.union1d(worst, evenly)
-    starts = _other_starts()
-    registrar = Registrar(clouds)
-    shares = np.zeros(len(starts))
-    for target, source in found.numbers[rows].tolist():
-        given = motion(clouds, target, source)
-        shares += registrar.shares(target, source, [start(given) for start in starts])
-    best = int(np.argmax(shares))
-    needed = BETTER_START * max(float(found.share[rows].sum()), 1e-9)
-    return starts[best] if shares[best] > needed else None
-
-
-def _other_starts() -> list[Start]:
-    """Motions that faults make of a given motion: none, other units, its inverse, other axes."""
-
-    def scaled(factor: float) -> Start:
-        def start(motion: F64) -> F64:
-            out = motion.copy()
-            out[:3, 3] *= factor
-            return out
-
-        return start
-
-    def turned(rotation: F64) -> Start:
-        mounting = np.eye(4)
-        mounting[:3, :3] = rotation
-        return lambda motion: inverse(mounting) @ motion @ mounting
-
-    axes = Rotation.create_group("O").as_matrix()
-    return [
-        lambda _: np.eye(4),
-        inverse,
-        *(scaled(factor) for factor in (0.1, 0.5, 2.0, 10.0)),
-        *(turned(rotation) for rotation in axes if np.trace(rotation) < 2.9),
-    ]
 
 
 def _other_reading(pairs: Pairs, poses_at: PosesAt, given: Estimate) -> Finding | None:

@@ -43,6 +43,9 @@ UNTOLD = 1e-4  # information along a direction that no plane fixes (1/m^2): 100 
 LEAST_SHARE = 0.02  # of the points on planes, for a registration
 CORRELATED = 12.0  # points of one surface share their error: as many count as one
 
+# numbers of the target and the source of a pair -> where its registration starts (4, 4)
+Start = Callable[[int, int], F64]
+
 
 @dataclass(frozen=True, eq=False)
 class Clouds:
@@ -203,11 +206,11 @@ def covariance_of(fit: Fit, voxel: float) -> F64:
 
 
 def registered(
-    clouds: Clouds, numbers: Sequence[tuple[int, int]], start: Callable[[F64], F64] | None = None
+    clouds: Clouds, numbers: Sequence[tuple[int, int]], start: Start | None = None
 ) -> Registered:
     """The pairs ``numbers`` registered from the motion that the poses give.
 
-    ``start`` makes a further start (4, 4) of it. Where few points lie on planes then, speeds about
+    ``start`` gives another, which is preferred. Where few points lie on planes then, speeds about
     the one of the last pair that fitted are tried, too.
     """
     registrar = Registrar(clouds)
@@ -216,7 +219,7 @@ def registered(
     given_shares = []
     for target, source in numbers:
         given = motion(clouds, target, source)
-        starts = [given] if start is None else [given, start(given)]
+        starts = [given] if start is None else [start(target, source), given]
         fits.append(registrar.fit(target, source, starts))
         given_shares.append(float(registrar.shares(target, source, [given])[0]))
     usual = float(np.median([fit.share for fit in fits])) if fits else 0.0
