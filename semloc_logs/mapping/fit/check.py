@@ -36,8 +36,16 @@ from semloc_logs.mapping.fit.model import (
     pose_motion,
     starts,
 )
-from semloc_logs.mapping.fit.other_starts import better_start
-from semloc_logs.mapping.fit.pairs import Clouds, Registered, choose, registered
+from semloc_logs.mapping.fit.other_starts import Doubted
+from semloc_logs.mapping.fit.pairs import (
+    Clouds,
+    Registered,
+    Start,
+    choose,
+    motion,
+    noise,
+    registered,
+)
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import inverse
 
@@ -213,12 +221,14 @@ def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
         return StreamFit(topic, len(given.pairs))
     squares = given.pairs.squares(pose_motion(given.pairs, poses_at, np.zeros(PARAMETERS)))
     # poses from which registration hardly moves are not far off
-    is_doubtful = float(np.nanmedian(squares)) > DOUBTFUL
-    start = better_start(clouds, poses_at, given, squares) if is_doubtful else None
-    if start is not None:
-        stream = _judged(topic, clouds, poses_at, registered(clouds, numbers, start))
-        if stream.findings:
-            return stream
+    if float(np.nanmedian(squares)) > DOUBTFUL:
+        doubted = Doubted.of(clouds, given, squares)
+        for start in (doubted.motion(), doubted.clock(poses_at)):
+            if start is not None:
+                found = registered(clouds, numbers, start)
+                stream = _judged(topic, clouds, poses_at, found)
+                if stream.findings:
+                    return stream
     stream = _judged(topic, clouds, poses_at, given)
     # a sensor that looks one way sees other surfaces soon: registration ends where it sees more
     if not stream.findings and not clouds.sees_one_side():
@@ -242,11 +252,30 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
         stream.findings.append(reading)
         return stream
     estimate, faults = _explained(pairs, poses_at, none)
-    if float(np.nanmedian(estimate.squares)) < FAR_OFF:
+    if faults:
+        # a registration from there ends at the right motion where others did not
+        refined = registered(clouds, found.numbers.tolist(), _start(clouds, poses_at, estimate))
+        pairs = refined.pairs
+        none = fit(pairs, poses_at, np.zeros(0, np.int64), zero)
+        estimate, faults = _explained(pairs, poses_at, none)
+    if float(np.nanmedian(estimate.squares)) < FAR_OFF * noise(clouds, found):
         _describe(stream, estimate, faults, clouds)
         joint = fit(pairs, poses_at, np.arange(PARAMETERS), estimate.parameters)
         _enter(stream, joint, clouds)
     return stream
+
+
+def _start(clouds: Clouds, poses_at: PosesAt, estimate: Estimate) -> Start:
+    """Registration starts from the motions that the estimate gives; from the poses without one."""
+    stamps_ns = clouds.stamps_ns()
+
+    def start(target: int, source: int) -> F64:
+        one = Pairs(stamps_ns[[[target, source]]], np.eye(4)[None], np.eye(6)[None])
+        predicted = pose_motion(one, poses_at, estimate.parameters)[0]
+        is_known = bool(np.isfinite(predicted).all())
+        return predicted if is_known else motion(clouds, target, source)
+
+    return start
 
 
 def _other_reading(pairs: Pairs, poses_at: PosesAt, given: Estimate) -> Finding | None:

@@ -7,6 +7,7 @@ Registration from the motion that wrong poses give may end anywhere; from such a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,36 +18,57 @@ from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, Start, 
 from semloc_logs.numerics.transforms import inverse
 
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 
 TRIED = 4  # pairs that show whether another start is better
-# another start is better when so many times the points lie on planes as by the poses, and hardly
-# less than where registration from the poses ended
-BETTER_START = 1.15
-AS_GOOD = 0.9
+# a motion is better when so many times the points lie on planes as where registration ended
+BETTER = 1.15
+# another clock is better when they are so many times as many as by the poses, and hardly fewer than
+# where registration ended: it may end at a motion that the sensor cannot tell from the right one
+BETTER_THAN_POSES, AS_GOOD = 1.15, 0.9
 
 
-def better_start(
-    clouds: Clouds, poses_at: PosesAt, found: Registered, squares: F64
-) -> Start | None:
-    """The start that brings far more points onto planes than the poses do.
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubted:
+    """The pairs that show whether another start is better.
 
-    It is tried on the few pairs that contradict the poses most, by ``squares`` (n,), and on as many
-    evenly spread.
+    They are few: the ones that contradict the poses most, and as many evenly spread. ``share`` and
+    ``given_share`` are sums as in :class:`~semloc_logs.mapping.fit.pairs.Registered`.
     """
-    worst = np.argsort(-squares, kind="stable")[:TRIED]
-    evenly = np.linspace(0, len(squares) - 1, TRIED).round().astype(np.int64)
-    rows = np.union1d(worst, evenly)
-    starts = [*_of_motion(clouds), *_of_clocks(clouds, poses_at)]
-    registrar = Registrar(clouds)
-    shares = np.zeros(len(starts))
-    for target, source in found.numbers[rows].tolist():
-        motions = [start(target, source) for start in starts]
-        shares += registrar.shares(target, source, motions)
-    best = int(np.argmax(shares))
-    by_poses = float(found.given_share[rows].sum())
-    registered = float(found.share[rows].sum())
-    is_better = shares[best] > max(BETTER_START * by_poses, AS_GOOD * registered, 1e-9)
-    return starts[best] if is_better else None
+
+    clouds: Clouds
+    numbers: I64
+    share: float
+    given_share: float
+
+    @staticmethod
+    def of(clouds: Clouds, found: Registered, squares: F64) -> Doubted:
+        """Those of ``found``, with their squared distances (n,) to the poses."""
+        worst = np.argsort(-squares, kind="stable")[:TRIED]
+        evenly = np.linspace(0, len(squares) - 1, TRIED).round().astype(np.int64)
+        rows = np.union1d(worst, evenly)
+        share, given_share = (float(s[rows].sum()) for s in (found.share, found.given_share))
+        return Doubted(clouds, found.numbers[rows], share, given_share)
+
+    def motion(self) -> Start | None:
+        """Other axes, units or none at all, where they bring far more points onto planes."""
+        start, share = self._best(_of_motion(self.clouds))
+        return start if share > max(BETTER * self.share, 1e-9) else None
+
+    def clock(self, poses_at: PosesAt) -> Start | None:
+        """The poses at other times, where they bring far more points onto planes."""
+        start, share = self._best(list(_of_clocks(self.clouds, poses_at)))
+        least = max(BETTER_THAN_POSES * self.given_share, AS_GOOD * self.share, 1e-9)
+        return start if share > least else None
+
+    def _best(self, starts: list[Start]) -> tuple[Start, float]:
+        registrar = Registrar(self.clouds)
+        shares = np.zeros(len(starts))
+        for target, source in self.numbers.tolist():
+            motions = [start(target, source) for start in starts]
+            shares += registrar.shares(target, source, motions)
+        best = int(np.argmax(shares))
+        return starts[best], float(shares[best])
 
 
 def _of_motion(clouds: Clouds) -> list[Start]:
