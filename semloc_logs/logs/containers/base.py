@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heappop, heappush, heapreplace
+from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -78,7 +79,7 @@ class BaseLog(ABC):
         """Releases the files."""
 
 
-def open_file(path: Path) -> BinaryIO:
+def open_file(path: Path) -> BufferedReader:
     """``path`` for reading; LogError when that is not possible."""
     try:
         return path.open("rb")
@@ -104,9 +105,6 @@ class SizedFile(Protocol):
 
     def read(self, size: int = -1, /) -> bytes:
         """At most ``size`` bytes."""
-
-    def readinto(self, buffer: memoryview, /) -> int:
-        """Reads into ``buffer``; the number of bytes."""
 
 
 def encoding_of(streams: Iterable[Stream]) -> str:
@@ -206,7 +204,7 @@ def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> byt
     return data
 
 
-def read_into(file: SizedFile, offset: int, buffer: memoryview, file_size: int) -> None:
+def read_into(file: BufferedReader, offset: int, buffer: memoryview, file_size: int) -> None:
     """As :func:`read_exactly`, into a ``buffer`` of the size that is wanted."""
     size = len(buffer)
     if offset < 0 or offset + size > file_size:

@@ -61,7 +61,8 @@ LEAST_PAIRS = 4
 LEAST_GAIN = 12.0
 LEAST_SIGMAS = 5.0
 # squared distances in the median beyond which other starts of registration are tried, and beyond
-# which other readings of the poses are
+# which other readings of the poses are; with noisy registrations they remain where faults explain
+# the pairs
 DOUBTFUL = 15.0
 FAR_OFF = 40.0
 MUCH_NEARER = 0.05  # such a reading explains the pairs when it lowers the median to this share
@@ -258,7 +259,8 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
         pairs = refined.pairs
         none = fit(pairs, poses_at, np.zeros(0, np.int64), zero)
         estimate, faults = _explained(pairs, poses_at, none)
-    if float(np.nanmedian(estimate.squares)) < FAR_OFF * noise(clouds, found):
+    rest = float(np.nanmedian(estimate.squares))
+    if rest < FAR_OFF or rest < FAR_OFF * noise(clouds, found):
         _describe(stream, estimate, faults, clouds)
         joint = fit(pairs, poses_at, np.arange(PARAMETERS), estimate.parameters)
         _enter(stream, joint, clouds)

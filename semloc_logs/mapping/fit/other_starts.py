@@ -25,7 +25,7 @@ TRIED = 4  # pairs that show whether another start is better
 BETTER = 1.15
 # another clock is better when they are so many times as many as by the poses, and hardly fewer than
 # where registration ended: it may end at a motion that the sensor cannot tell from the right one
-BETTER_THAN_POSES, AS_GOOD = 1.15, 0.9
+BETTER_THAN_POSES, AS_GOOD = 1.15, 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
