@@ -439,7 +439,7 @@ def test_inspect_takes_settings(tmp_path: Path) -> None:
     assert "logs.time_offset names /none" in refused.stderr
     (tmp_path / "c.yaml").write_text("logs: {memory: 1}")
     unknown = semloc("inspect", log, "--config", tmp_path / "c.yaml")
-    assert unknown.exit_code == 1
+    assert unknown.exit_code == 2
     assert "logs.memory" in unknown.stderr
     (tmp_path / "c.yaml").write_text("logs: {time_offset: {/note: 5}}")
     assert semloc("inspect", log, "--config", tmp_path / "c.yaml").exit_code == 0
