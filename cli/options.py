@@ -138,9 +138,11 @@ topic_option = click.option(
 Use = Literal["nothing", "tables", "stages"]
 
 
-def settings_options(function: Function, *, use: Use = "nothing") -> Function:
-    """--config, --set and --dump-config; the command gets ``settings``, lengths filled in from the
-    voxel size.
+def settings_options(
+    function: Function, *, use: Use = "nothing", is_resolved: bool = True
+) -> Function:
+    """--config, --set and --dump-config; the command gets ``settings``, unless not ``is_resolved``
+    with lengths filled in from the voxel size.
 
     A command that uses the ``tables`` of a workspace takes the settings that this keeps; one of the
     ``stages``, which write them, may have --overwrite to change them.
@@ -159,8 +161,9 @@ def settings_options(function: Function, *, use: Use = "nothing") -> Function:
     @functools.wraps(function)
     def with_settings(*args: Any, dump_config: bool, **options: Any) -> Any:
         settings = _settled(options, use)
+        given = settings.resolved() if is_resolved else settings
         rest = {k: v for k, v in options.items() if k not in {"config", "assignments", *FLAGS}}
-        return function(*args, settings=settings.resolved(), **rest)
+        return function(*args, settings=given, **rest)
 
     return with_settings
 
@@ -213,6 +216,11 @@ def _yaml_value(value: object) -> str:
         .removesuffix("...\n")
         .strip()
     )
+
+
+def given_settings_options(function: Function) -> Function:
+    """The same with the settings as they are given."""
+    return settings_options(function, is_resolved=False)
 
 
 def tables_settings_options(function: Function) -> Function:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -67,14 +67,14 @@ def _fuse(
     for session in sessions:
         others = [log for log in logs if log not in session.logs]
         folder = work.session(session.name)
-        reading = settings if overwrite else _as_read_before(folder, settings)
+        present = {} if overwrite else _present(folder)
+        reading = _as_read_before(present, settings)
         task = _task(session, folder, reading, others)
-        if not overwrite and recorded_fingerprint(task.folder.session_json) == task.fingerprint:
+        if present.get("fingerprint") == task.fingerprint:
             report.kept.append(session.name)
-            report.skipped += read_json(task.folder.session_json)["skipped"]
+            report.skipped += present["skipped"]
             continue
-        if not overwrite:
-            _check_same_log(task)
+        _check_same_log(task, present)
         if not again and recorded_fingerprint(work.failure(session.name)) == task.fingerprint:
             reason = read_json(work.failure(session.name))["reason"]
             report.failed.append(f"{reason} It failed before: --retry-failed reads it again.")
@@ -100,15 +100,20 @@ def _fuse(
     return report
 
 
-def _as_read_before(folder: SessionFolder, settings: Resolved) -> Resolved:
+def _present(folder: SessionFolder) -> dict[str, Any]:
+    """The content of session.json; empty where there is none."""
+    return read_json(folder.session_json) if folder.session_json.exists() else {}
+
+
+def _as_read_before(present: Mapping[str, Any], settings: Resolved) -> Resolved:
     """The settings; reading is as the session was made with, unless other values are given.
 
     They belong to a log: its clocks, its mountings, its direction of up.
     """
     is_given = settings.logs != Logs(memory=settings.logs.memory)
-    if is_given or not folder.session_json.exists():
+    if is_given or not present:
         return settings
-    recorded = read_json(folder.session_json).get("settings", {}).get("logs", {})
+    recorded = present.get("settings", {}).get("logs", {})
     logs = Logs.model_validate({**recorded, "memory": settings.logs.memory})
     return settings.model_copy(update={"logs": logs})
 
@@ -156,14 +161,11 @@ def _mountings(session: SessionInput, settings: Resolved, others: Sequence[Path]
         return NO_MOUNTINGS  # the task meets the same error, and names it
 
 
-def _check_same_log(task: FuseTask) -> None:
-    """WorkspaceError where the session of a task was made from other input.
+def _check_same_log(task: FuseTask, present: Mapping[str, Any]) -> None:
+    """WorkspaceError where the ``present`` session of a task was made from other input.
 
     Made from the same under other settings, or by another version, it is made again.
     """
-    if not task.folder.session_json.exists():
-        return
-    present = read_json(task.folder.session_json)
     before = present.get("made_from", task.made_from)
     changed = [what for what in task.made_from if before.get(what) != task.made_from[what]]
     if not changed:

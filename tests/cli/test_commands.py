@@ -432,6 +432,19 @@ def test_inspect_of_metadata_is_of_its_folder(tmp_path: Path) -> None:
     assert [log["path"] for log in json.loads(done.stdout)] == [str(tmp_path)]
 
 
+def test_inspect_takes_settings(tmp_path: Path) -> None:
+    log = _log(tmp_path / "a.mcap")
+    refused = semloc("inspect", log, "--set", "logs.time_offset./none=1")
+    assert refused.exit_code == 1
+    assert "logs.time_offset names /none" in refused.stderr
+    (tmp_path / "c.yaml").write_text("logs: {memory: 1}")
+    unknown = semloc("inspect", log, "--config", tmp_path / "c.yaml")
+    assert unknown.exit_code == 2
+    assert "logs.memory" in unknown.stderr
+    (tmp_path / "c.yaml").write_text("logs: {time_offset: {/note: 5}}")
+    assert semloc("inspect", log, "--config", tmp_path / "c.yaml").exit_code == 0
+
+
 def test_inspect_full_reads_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("semloc_logs.logs.session.excerpt.WHOLE_BYTES", 0)
     log = _log(tmp_path / "a.mcap")

@@ -64,6 +64,17 @@ def test_nothing_is_done_twice(fuse: Fuse, coarse: Workspace, tools: SimpleNames
     assert tools.write_times(coarse.path) == before
 
 
+@pytest.mark.parametrize("changes", [{}, {"fusion.carve": "false"}])
+def test_session_json_is_read_once(
+    fuse: Fuse, tools: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, changes: dict[str, str]
+) -> None:
+    read: list[Path] = []
+    monkeypatch.setattr(fuse_stage, "read_json", lambda path: read.append(path) or read_json(path))
+    done = was_done(fuse(settings=tools.coarse_settings(**changes)))
+    assert done == bool(changes)
+    assert [path.name for path in read] == ["session.json"]
+
+
 def test_overwriting_does_it_again(fuse: Fuse, coarse: Workspace, tools: SimpleNamespace) -> None:
     tables = tools.files(coarse.path)
     times = tools.write_times(coarse.path)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import bz2
+import threading
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heappop, heappush, heapreplace
+from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -27,6 +29,7 @@ Bytes = bytes | bytearray | memoryview
 MessageOrTime = Message | int
 _STEP = 1 << 22
 _PLAUSIBLE_GROWTH = 64  # point clouds and pictures shrink by less
+_engines = threading.local()
 
 
 class BaseLog(ABC):
@@ -76,7 +79,7 @@ class BaseLog(ABC):
         """Releases the files."""
 
 
-def open_file(path: Path) -> BinaryIO:
+def open_file(path: Path) -> BufferedReader:
     """``path`` for reading; LogError when that is not possible."""
     try:
         return path.open("rb")
@@ -201,6 +204,19 @@ def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> byt
     return data
 
 
+def read_into(file: BufferedReader, offset: int, buffer: memoryview, file_size: int) -> None:
+    """As :func:`read_exactly`, into a ``buffer`` of the size that is wanted."""
+    size = len(buffer)
+    if offset < 0 or offset + size > file_size:
+        raise LogError(
+            f"{size} bytes are claimed at byte {offset}, but the file ends at byte {file_size}"
+        )
+    file.seek(offset)
+    count = file.readinto(buffer)
+    if count != size:
+        raise LogError(f"only {count} of {size} bytes could be read at byte {offset}")
+
+
 def decompress(data: Bytes, compression: str, size: int, memory: Memory) -> Bytes:
     """The ``size`` bytes that ``data`` holds; ``data`` itself where it is not compressed.
 
@@ -246,7 +262,7 @@ def _unpack(data: Bytes, compression: str, size: int) -> bytes | bytearray:
     plausible = size <= max(_PLAUSIBLE_GROWTH * len(data), _STEP)
     if compression == "zstd":
         if plausible and zstandard.frame_content_size(data) in (size, -1):
-            return bytes(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
+            return bytes(_zstd().decompress(data, max_output_size=size))
         return _gather(
             zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True).read, size
         )
@@ -254,6 +270,14 @@ def _unpack(data: Bytes, compression: str, size: int) -> bytes | bytearray:
         engine = bz2.BZ2Decompressor()
         return _gather(_feed(engine, data), size)
     return _gather(_feed(lz4.frame.LZ4FrameDecompressor(), data), size)
+
+
+def _zstd() -> zstandard.ZstdDecompressor:
+    """A decompressor, one a thread: making one takes as long as a small chunk."""
+    engine = getattr(_engines, "zstd", None)
+    if engine is None:
+        engine = _engines.zstd = zstandard.ZstdDecompressor()
+    return engine
 
 
 class _Engine(Protocol):

@@ -26,10 +26,19 @@ from semloc_logs.logs.containers.base import (
     in_log_time_order,
     open_file,
     read_exactly,
+    read_into,
 )
-from semloc_logs.logs.containers.chunks import Chunk, Index, Kind, chunk_messages, new_index
+from semloc_logs.logs.containers.chunks import (
+    LARGE,
+    Chunk,
+    Index,
+    Kind,
+    chunk_messages,
+    new_index,
+)
 from semloc_logs.logs.containers.mcap_records import (
     CHUNK_HEAD,
+    COMPRESSION_END,
     HEAD,
     MAGIC,
     MESSAGE,
@@ -39,6 +48,7 @@ from semloc_logs.logs.containers.mcap_records import (
     chunk_records,
     claimed_size,
     indexed_chunk,
+    is_compressed,
     parse,
     spans,
     walk,
@@ -82,6 +92,7 @@ class McapLog(BaseLog):
         self._publishers: dict[int, str] = {}  # of channels that share their topic
         self._parts: list[Part] = []
         self._definition_bytes = 0
+        self._buffer = bytearray()  # for compressed chunks
         self._file = open_file(path)
         with closed_on_error(self._file, path):
             self._size = self._file.seek(0, 2)
@@ -344,8 +355,24 @@ class McapLog(BaseLog):
         return claimed_size(self._read(part.offset, min(part.size, CHUNK_HEAD)))
 
     def _unpack_chunk(self, offset: int, size: int) -> Bytes:
-        record = self._read(offset, size)
+        record = self._chunk_record(offset, size)
         return chunk_records(record, chunk_head(record), self._memory)
+
+    def _chunk_record(self, offset: int, size: int) -> Bytes:
+        """A chunk record: in a buffer that the next one overwrites where it is compressed.
+
+        A buffer that is used again spares the pages of a new one.
+        """
+        self._memory.check(size)
+        start = read_exactly(self._file, offset, min(size, COMPRESSION_END), self._size)
+        if size > LARGE or not is_compressed(start):
+            self._buffer = bytearray()
+            return self._read(offset, size)
+        if len(self._buffer) < size:
+            self._buffer = bytearray(size)
+        record = memoryview(self._buffer)[:size]
+        read_into(self._file, offset, record, self._size)
+        return record
 
     def _walk(self, offset: int, data: Bytes, found: Index) -> None:
         """Puts (log time, channel, start, end) of the messages in ``data`` into ``found``.

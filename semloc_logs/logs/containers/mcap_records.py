@@ -26,6 +26,7 @@ MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish
 MESSAGE_BODY = MESSAGE.size - HEAD.size  # bytes of a message's body before its data
 _CHUNK = struct.Struct("<BQQQQII")  # head, times, size and CRC unpacked, length of the compression
 CHUNK_HEAD = _CHUNK.size  # bytes at the start of a chunk record that state its sizes
+COMPRESSION_END = CHUNK_HEAD + 8  # bytes at its start that tell whether it is compressed
 _DATA_LENGTH = struct.Struct("<Q")
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # times, offset, size, bytes of the message indexes' offsets
 _INDEX_OFFSET = struct.Struct("<HQ")  # channel, offset of its message index
@@ -126,11 +127,19 @@ def claimed_size(head: bytes) -> int:
     return int(_CHUNK.unpack_from(head)[4])
 
 
-def chunk_head(record: bytes) -> ChunkHead:
+def is_compressed(head: bytes) -> bool:
+    """Whether a chunk record is compressed, from its first bytes."""
+    if len(head) < CHUNK_HEAD:
+        raise LogError("its head is cut off")
+    length = _CHUNK.unpack_from(head)[6]
+    return head[CHUNK_HEAD : CHUNK_HEAD + length] not in (b"", b"none")
+
+
+def chunk_head(record: Bytes) -> ChunkHead:
     """The claims of a whole chunk record; ``LogError`` when they do not fit the record."""
     try:
         opcode, length, start_ns, end_ns, size, crc, name_length = _CHUNK.unpack_from(record)
-        compression = record[_CHUNK.size : _CHUNK.size + name_length].decode()
+        compression = bytes(record[_CHUNK.size : _CHUNK.size + name_length]).decode()
         (data_length,) = _DATA_LENGTH.unpack_from(record, _CHUNK.size + name_length)
     except (struct.error, UnicodeDecodeError) as error:
         raise LogError(f"its head is damaged ({error})") from error
@@ -143,13 +152,13 @@ def chunk_head(record: bytes) -> ChunkHead:
     return ChunkHead(start_ns, end_ns, size, crc, compression, data)
 
 
-def chunk_records(record: bytes, head: ChunkHead, memory: Memory) -> Bytes:
+def chunk_records(record: Bytes, head: ChunkHead, memory: Memory) -> Bytes:
     """The records in a chunk; memory grows with the data, not with the claimed size.
 
     An uncompressed chunk is not copied: the result is a view of ``record``.
     """
     data = memoryview(record)[head.data]
-    if head.data.stop != len(record):
+    if head.compression in ("", "none") and head.data.stop != len(record):
         data = memoryview(bytes(data))  # a view would keep the rest of the record in memory
     unpacked = decompress(data, head.compression, head.unpacked_size, memory)
     if head.crc and zlib.crc32(unpacked) != head.crc:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from semloc_logs.errors import LogError
 from semloc_logs.frames import (
     Camera,
     DepthFrame,
@@ -27,12 +26,12 @@ from semloc_logs.frames import (
     TransformSample,
 )
 from semloc_logs.logs.containers.open import open_log
-from semloc_logs.logs.log import Log, Message, Reading, Stream
+from semloc_logs.logs.log import Log, Message, Stream
 from semloc_logs.logs.messages.decode import Decoder
 from semloc_logs.logs.messages.definitions import UndecodableError, parser
-from semloc_logs.logs.messages.stamps import time_range, utc
 from semloc_logs.logs.messages.topic_clocks import TopicClocks
 from semloc_logs.logs.poses.base_frame import BasePoses
+from semloc_logs.logs.poses.mountings import Mountings
 from semloc_logs.logs.poses.navsat import navsat_poses
 from semloc_logs.logs.problems import (
     NoCloud,
@@ -44,29 +43,23 @@ from semloc_logs.logs.problems import (
     to_report,
     without_loss_of,
 )
-from semloc_logs.logs.role_types import no_sensor
 from semloc_logs.logs.roles import guess_roles
 from semloc_logs.logs.sensors.camera_clouds import CameraClouds
-from semloc_logs.logs.sensors.depth import DepthUnits, Unprojector
-from semloc_logs.logs.sensors.rectification import rectification
-from semloc_logs.logs.sensors.stereo_pairs import is_rectified
 from semloc_logs.logs.session.excerpt import Excerpt
 from semloc_logs.logs.session.frame_queue import RangeFrame
-from semloc_logs.logs.session.pose_problems import never_moves, no_poses
+from semloc_logs.logs.session.obstacles import Seen, obstacles_of
+from semloc_logs.logs.session.reading import reading_of
 from semloc_logs.logs.session.stamp_offsets import StampOffsets, stamp_problems
 from semloc_logs.logs.session.verdict import (
-    SCAN_REMEDY,
     Command,
     Look,
     far_range,
-    is_planar,
     travelled,
     verdict_of,
 )
+from semloc_logs.settings import Logs
 
 _TRIES = 5  # messages of a range sensor that are decoded in search of a good one
-# a sensor that starts so far outside of the poses has another clock
-_OTHER_CLOCK_NS = 60_000_000_000
 # moving transforms wait so long for the first frames of all sensors and for an edge below odom; the
 # tree remembers twice as much
 _TF_PATIENCE_NS = 30_000_000_000
@@ -76,9 +69,15 @@ _FARTHEST = 80.0
 
 
 def inspect_log(
-    path: str | Path, topics: Mapping[str, str] | None = None, *, full: bool = False
+    path: str | Path,
+    topics: Mapping[str, str] | None = None,
+    *,
+    full: bool = False,
+    logs: Logs | None = None,
 ) -> dict[str, object]:
     """The object that ``semloc inspect --json`` prints for one log; ``topics`` overrules roles.
+
+    ``logs``: the settings of reading, as they would be for fusing.
 
     Keys: ``path``, ``format``, ``encoding``, ``size_bytes``, ``start_ns``, ``end_ns``,
     ``duration_s``, ``streams`` (topic, type, role, count of readable messages, rate_hz),
@@ -89,9 +88,10 @@ def inspect_log(
     session.json), ``verdict``, the command ``suggested`` and the ``voxel_size`` (m) that suits the
     log. LogError for a file that is not a log, RoleError when an override is impossible.
     """
-    log = open_log(path)
+    settings = logs or Logs()
+    log = open_log(path, settings.memory)
     try:
-        return _Inspection(log, topics, full=full).to_json()
+        return _Inspection(log, topics, settings, full=full).to_json()
     finally:
         log.close()
 
@@ -111,14 +111,18 @@ def refused_log(path: str | Path, reason: str) -> dict[str, object]:
 
 
 class _Inspection:
-    def __init__(self, log: Log, topics: Mapping[str, str] | None, *, full: bool) -> None:
+    def __init__(
+        self, log: Log, topics: Mapping[str, str] | None, settings: Logs, *, full: bool
+    ) -> None:
         self._log = log
-        self._command = Command(str(log.path), topics or {})
+        self._settings = settings
+        self._command = Command(str(log.path), topics or {}, settings)
         self._roles = guess_roles(log.streams, topics)
         navsat = navsat_poses(self._roles, log.streams)
         named = navsat if self._roles.pose is not None else None
         static_count = sum(s.count for s in log.streams if s.topic in self._roles.tf_static)
-        self._poses = BasePoses(self._roles, static_count, named, navsat)
+        mountings = Mountings(given=settings.mountings)
+        self._poses = BasePoses(self._roles, static_count, named, navsat, mountings)
         self._has_fixes = navsat is not None
         self._cameras: dict[str, Camera] = {}
         self._first: dict[str, RangeFrame] = {}
@@ -127,7 +131,8 @@ class _Inspection:
         self._tries: Counter[str] = Counter()
         self._undecodable = Problems()
         self._decoder = Decoder(self._undecodable)
-        self._clocks = TopicClocks(Reading(left_out=self._roles.left_out))
+        reading = reading_of(settings, self._roles, log.streams, log.path.name)
+        self._clocks = TopicClocks(reading)
         self._stamp_offsets = StampOffsets()
         self._facts: dict[str, dict[str, object]] = {}
         self._ranging = {*self._roles.ranging, *self._roles.topics("stereo_right")}
@@ -250,7 +255,7 @@ class _Inspection:
         """The object of :func:`inspect_log`."""
         log = self._log
         base = self._poses.base
-        obstacles = self._obstacles()
+        obstacles = obstacles_of(self._seen())
         problems = self._problems(obstacles)
         verdict = verdict_of(self._look(), problems, is_reported=bool(to_report(problems)))
         return {
@@ -377,6 +382,20 @@ class _Inspection:
 
     # -- problems
 
+    def _seen(self) -> Seen:
+        return Seen(
+            self._log.path.name,
+            [replace(s, count=self._count(s)) for s in self._log.streams],
+            self._roles,
+            self._poses,
+            self._cameras,
+            self._first,
+            self._right,
+            self._empty,
+            depth_unit=self._settings.depth_unit,
+            is_complete=self._excerpt.is_complete,
+        )
+
     def _problems(self, obstacles: Sequence[Problem]) -> list[Problem]:
         unused = {s.topic for s in self._log.streams if self._roles.role_of(s.topic) is None}
         base = self._poses.base
@@ -406,154 +425,6 @@ class _Inspection:
                 )
                 yield Problem(s.topic, ProblemKind.MESSAGE, text, lost=True)
 
-    def _obstacles(self) -> list[Problem]:
-        """Problems that keep the log, or a part of it, from being fused; nothing is lost yet."""
-        roles = self._roles
-        if not any(self._count(s) for s in self._log.streams):
-            return [_obstacle("", ProblemKind.FILE, f"{self._log.path.name} holds no messages.")]
-        obstacles = list(roles.problems)
-        if not roles.ranging:
-            obstacles.append(_obstacle("", ProblemKind.ROLE, no_sensor(self._log.streams)))
-        base = self._poses.base
-        if base is not None and base.pose_frame is None and not roles.problems:
-            obstacles.append(no_poses())
-        elif not len(self._poses.track) and not roles.problems:
-            text = f"{roles.pose or 'TF'} gave no usable pose."
-            obstacles.append(_obstacle(roles.pose or "", ProblemKind.POSE, text))
-        for topic, count in sorted(self._empty.items()):
-            clouds = f"{count} cloud{'s' if count > 1 else ''}"
-            text = f"{topic}: no point with a position in the first {clouds}."
-            obstacles.append(_obstacle(topic, ProblemKind.FRAME, text))
-        for topic in roles.depth:
-            obstacles += self._depth_obstacles(topic)
-        obstacles += self._stereo_obstacles()
-        obstacles += self._pose_obstacles()
-        for topic, frame in self._first.items():
-            obstacles += self._sensor_obstacles(topic, frame)
-        return obstacles
-
-    def _depth_obstacles(self, topic: str) -> Iterator[Problem]:
-        info = self._roles.info_of.get(topic)
-        frame = self._first.get(topic)
-        if isinstance(frame, DepthFrame):
-            units = DepthUnits()
-            units.metres(frame)
-            yield from units.problems
-        if info is None or info not in self._cameras:
-            text = (
-                f"{topic} has no CameraInfo: it cannot become points; record it, or name it with "
-                f"--topic camera_info=TOPIC."
-            )
-            yield _obstacle(topic, ProblemKind.CALIBRATION, text)
-        elif isinstance(frame, DepthFrame):
-            try:
-                unprojector = Unprojector(
-                    self._cameras[info], *frame.depth.shape, rectified="rect" in topic
-                )
-                for text in unprojector.assumptions:
-                    yield _assumption(topic, text)
-            except LogError as error:
-                yield _obstacle(topic, ProblemKind.CALIBRATION, str(error))
-
-    def _stereo_obstacles(self) -> list[Problem]:
-        roles = self._roles
-        if roles.stereo_left is None or roles.stereo_right is None:
-            return []
-        pair = (roles.stereo_left, roles.stereo_right)
-        left_camera, right_camera = (self._cameras.get(roles.info_of.get(t, "")) for t in pair)
-        obstacles = [
-            _obstacle(
-                topic,
-                ProblemKind.CALIBRATION,
-                f"{topic} has no CameraInfo: the pair cannot become points; record it, or name "
-                f"both with --topic camera_info=TOPIC,TOPIC.",
-            )
-            for topic, camera in zip(pair, (left_camera, right_camera), strict=True)
-            if camera is None
-        ]
-        left = self._first.get(pair[0])
-        right = self._right
-        if left_camera is None or right_camera is None:
-            return obstacles
-        if not isinstance(left, ImageFrame) or right is None:
-            return obstacles
-
-        if left.image.shape[:2] != right.image.shape[:2]:
-            sizes = " and ".join(f"{i.shape[1]} x {i.shape[0]}" for i in (left.image, right.image))
-            text = (
-                f"{pair[0]}, {pair[1]} have pictures of {sizes} pixels: "
-                f"a stereo pair needs the same size."
-            )
-            return [_obstacle(pair[0], ProblemKind.CALIBRATION, text)]
-        right_T_left = self._poses.tree.lookup(
-            right.header.frame_id, left.header.frame_id, left.header.stamp_ns
-        )
-        try:
-            how = rectification(
-                left_camera,
-                right_camera,
-                left.image.shape[:2],
-                right_T_left,
-                rectified=is_rectified(roles),
-            )
-            obstacles += [_assumption(pair[0], text) for text in how.assumptions]
-        except LogError as error:
-            obstacles.append(_obstacle(pair[0], ProblemKind.CALIBRATION, str(error)))
-        return obstacles
-
-    def _pose_obstacles(self) -> list[Problem]:
-        track = self._poses.track
-        source = self._poses.source
-        # of a sample most fixes are left out on purpose
-        is_known = source is not None and self._excerpt.is_complete
-        obstacles = [replace(p, lost=False) for p in source.problems] if source and is_known else []
-        name = source.name if source else self._roles.pose or "TF"
-        if not track.moves:
-            obstacles += never_moves(name, track)
-        if not self._excerpt.is_complete:
-            return obstacles
-        if gaps := track.gaps():
-            longest = max(gaps, key=lambda gap: gap[1] - gap[0])
-            count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
-            text = (
-                f"The poses have {count} from {time_range(*longest)}: "
-                f"frames in it get no pose and are left out."
-            )
-            obstacles.append(_obstacle(name, ProblemKind.POSE, text))
-        return obstacles
-
-    def _sensor_obstacles(self, topic: str, frame: RangeFrame) -> Iterator[Problem]:
-        """A missing transform to the base frame, or another clock than the clock of the poses."""
-        track = self._poses.track
-        base = self._poses.base
-        if isinstance(frame, LidarFrame) and is_planar(frame.points):
-            text = f"{topic}: all points lie in one plane: {SCAN_REMEDY}"
-            yield _obstacle(topic, ProblemKind.ROLE, text)
-        stamp_ns = frame.header.stamp_ns
-        frame_id = frame.header.frame_id
-        if (
-            base is not None
-            and not self._poses.tree.connected(base.name, frame_id)
-            and base.assumed != frame_id.lstrip("/")
-            and not self._poses.is_fixed(frame_id)
-        ):
-            text = (
-                f"No transform leads from '{frame_id}', the frame of {topic}, to the base frame "
-                f"'{base.name}': its frames are left out; record /tf_static."
-            )
-            yield _obstacle(topic, ProblemKind.TRANSFORM, text)
-        start_ns = track.start_ns
-        end_ns = track.end_ns
-        if start_ns is None or end_ns is None:
-            return
-        if not start_ns - _OTHER_CLOCK_NS < stamp_ns < end_ns + _OTHER_CLOCK_NS:
-            text = (
-                f"{topic} starts at {utc(stamp_ns)} but the poses cover "
-                f"{time_range(start_ns, end_ns)}: frames without a pose are left out; where the "
-                f"clocks differ, give --set logs.time_offset.{topic}=SECONDS."
-            )
-            yield _obstacle(topic, ProblemKind.POSE, text)
-
     def _sensor(self, frame: RangeFrame) -> dict[str, object]:
         base_T_sensor = self._poses.base_T(frame.header.frame_id, frame.header.stamp_ns)
         content: dict[str, object] = {
@@ -571,14 +442,6 @@ class _Inspection:
         encoding = self._facts.get(frame.header.topic, {}).get("encoding", "")
         far = _rounded(self._range(frame.header.topic))
         return content | {"width": width, "height": height, "encoding": encoding, "range_m": far}
-
-
-def _obstacle(topic: str, kind: ProblemKind, text: str) -> Problem:
-    return Problem(topic, kind, text, lost=False)
-
-
-def _assumption(topic: str, text: str) -> Problem:
-    return Problem(topic, ProblemKind.CALIBRATION, text, lost=False, assumed=True)
 
 
 def _rounded(value: float | None) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,7 +17,7 @@ from semloc_logs.logs.problems import sentences as texts_of
 from semloc_logs.logs.role_types import kind_of, no_sensor, packets
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session import units
-from semloc_logs.settings import STREET_VOXEL, Settings
+from semloc_logs.settings import STREET_VOXEL, Logs, Settings
 
 # a voxel size (m) suits sensors whose points lie within this range (m): a room at 0.05 m voxels is
 # a street in miniature, and so is a floor of offices at 0.10 m
@@ -63,16 +63,23 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """The log and the roles that the user chose, for the command that is suggested."""
+    """The log, and the roles and settings of reading that the user chose, for the command that is
+    suggested.
+    """
 
     path: str
     topics: Mapping[str, str]
+    logs: Logs = field(default_factory=Logs)
 
     def text(self, *options: str) -> str:
         """``semloc run LOG -w work`` with options."""
         words = ["semloc", "run", self.path, "-w", "work"]
         for role, topic in self.topics.items():
             words += ["--topic", f"{role}={topic}"]
+        for key, value in self.logs.model_dump(mode="json", exclude_defaults=True).items():
+            named = value if isinstance(value, dict) else {"": value}
+            for name, one in named.items():
+                words += ["--set", f"logs.{key}{name and '.' + name}={one}"]
         return shlex.join([*words, *options])
 
 

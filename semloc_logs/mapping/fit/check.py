@@ -36,7 +36,16 @@ from semloc_logs.mapping.fit.model import (
     pose_motion,
     starts,
 )
-from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, choose, motion, registered
+from semloc_logs.mapping.fit.other_starts import Doubted
+from semloc_logs.mapping.fit.pairs import (
+    Clouds,
+    Registered,
+    Start,
+    choose,
+    motion,
+    noise,
+    registered,
+)
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import inverse
 
@@ -52,12 +61,11 @@ LEAST_PAIRS = 4
 LEAST_GAIN = 12.0
 LEAST_SIGMAS = 5.0
 # squared distances in the median beyond which other starts of registration are tried, and beyond
-# which other readings of the poses are
+# which other readings of the poses are; with noisy registrations they remain where faults explain
+# the pairs
 DOUBTFUL = 15.0
 FAR_OFF = 40.0
 MUCH_NEARER = 0.05  # such a reading explains the pairs when it lowers the median to this share
-TRIED = 4  # pairs that show whether another start is better
-BETTER_START = 1.15  # another start is better when so many times the points lie on planes
 # a pair contradicts its poses when registration brings so many times the points onto planes
 CONTRADICTS = 1.15
 TELLING = 0.2  # registrations with a smaller share of points on planes may have ended anywhere
@@ -82,9 +90,6 @@ WRONG_TURN = 0.05  # rad, within a pair
 NEAR_VOXELS = 33.0  # a rotation moves points at this distance (10 m at 0.30 m voxels)
 # of the scale, which moves the far end of a submap: odometry of wheels is off by 1 to 2 %
 SCALE_NOTED, SCALE_WRONG = 0.03, 0.06
-
-
-Start = Callable[[F64], F64]  # a motion (4, 4) by the poses -> the start of a registration
 
 
 class Severity(Enum):
@@ -217,12 +222,14 @@ def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
         return StreamFit(topic, len(given.pairs))
     squares = given.pairs.squares(pose_motion(given.pairs, poses_at, np.zeros(PARAMETERS)))
     # poses from which registration hardly moves are not far off
-    is_doubtful = float(np.nanmedian(squares)) > DOUBTFUL
-    start = _better_start(clouds, given, squares) if is_doubtful else None
-    if start is not None:
-        stream = _judged(topic, clouds, poses_at, registered(clouds, numbers, start))
-        if stream.findings:
-            return stream
+    if float(np.nanmedian(squares)) > DOUBTFUL:
+        doubted = Doubted.of(clouds, given, squares)
+        for start in (doubted.motion(), doubted.clock(poses_at)):
+            if start is not None:
+                found = registered(clouds, numbers, start)
+                stream = _judged(topic, clouds, poses_at, found)
+                if stream.findings:
+                    return stream
     stream = _judged(topic, clouds, poses_at, given)
     # a sensor that looks one way sees other surfaces soon: registration ends where it sees more
     if not stream.findings and not clouds.sees_one_side():
@@ -246,59 +253,31 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
         stream.findings.append(reading)
         return stream
     estimate, faults = _explained(pairs, poses_at, none)
-    if float(np.nanmedian(estimate.squares)) < FAR_OFF:
+    if faults:
+        # a registration from there ends at the right motion where others did not
+        refined = registered(clouds, found.numbers.tolist(), _start(clouds, poses_at, estimate))
+        pairs = refined.pairs
+        none = fit(pairs, poses_at, np.zeros(0, np.int64), zero)
+        estimate, faults = _explained(pairs, poses_at, none)
+    rest = float(np.nanmedian(estimate.squares))
+    if rest < FAR_OFF or rest < FAR_OFF * noise(clouds, found):
         _describe(stream, estimate, faults, clouds)
         joint = fit(pairs, poses_at, np.arange(PARAMETERS), estimate.parameters)
         _enter(stream, joint, clouds)
     return stream
 
 
-def _better_start(clouds: Clouds, found: Registered, squares: F64) -> Start | None:
-    """The motion that brings far more points onto planes than registration does.
+def _start(clouds: Clouds, poses_at: PosesAt, estimate: Estimate) -> Start:
+    """Registration starts from the motions that the estimate gives; from the poses without one."""
+    stamps_ns = clouds.stamps_ns()
 
-    It is tried on the few pairs that contradict the poses most, by ``squares`` (n,), and on as many
-    evenly spread.
+    def start(target: int, source: int) -> F64:
+        one = Pairs(stamps_ns[[[target, source]]], np.eye(4)[None], np.eye(6)[None])
+        predicted = pose_motion(one, poses_at, estimate.parameters)[0]
+        is_known = bool(np.isfinite(predicted).all())
+        return predicted if is_known else motion(clouds, target, source)
 
-    A fault such as another convention of axes makes it from the given one exactly, so it need not
-    be registered; registration from the given motion may have ended anywhere.
-    """
-    worst = np.argsort(-squares, kind="stable")[:TRIED]
-    evenly = np.linspace(0, len(squares) - 1, TRIED).round().astype(np.int64)
-    rows = np.union1d(worst, evenly)
-    starts = _other_starts()
-    registrar = Registrar(clouds)
-    shares = np.zeros(len(starts))
-    for target, source in found.numbers[rows].tolist():
-        given = motion(clouds, target, source)
-        shares += registrar.shares(target, source, [start(given) for start in starts])
-    best = int(np.argmax(shares))
-    needed = BETTER_START * max(float(found.share[rows].sum()), 1e-9)
-    return starts[best] if shares[best] > needed else None
-
-
-def _other_starts() -> list[Start]:
-    """Motions that faults make of a given motion: none, other units, its inverse, other axes."""
-
-    def scaled(factor: float) -> Start:
-        def start(motion: F64) -> F64:
-            out = motion.copy()
-            out[:3, 3] *= factor
-            return out
-
-        return start
-
-    def turned(rotation: F64) -> Start:
-        mounting = np.eye(4)
-        mounting[:3, :3] = rotation
-        return lambda motion: inverse(mounting) @ motion @ mounting
-
-    axes = Rotation.create_group("O").as_matrix()
-    return [
-        lambda _: np.eye(4),
-        inverse,
-        *(scaled(factor) for factor in (0.1, 0.5, 2.0, 10.0)),
-        *(turned(rotation) for rotation in axes if np.trace(rotation) < 2.9),
-    ]
+    return start
 
 
 def _other_reading(pairs: Pairs, poses_at: PosesAt, given: Estimate) -> Finding | None:

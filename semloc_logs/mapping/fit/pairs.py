@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from semloc_logs.mapping.fit.model import Pairs
+from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Pairs, difference
 from semloc_logs.mapping.fit.plane_cells import Fit, PlaneCells, register, share_at
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.selection import thin
@@ -41,7 +41,11 @@ ONE_SIDE = 0.6
 LEAST_RMS = 0.02  # voxels; distances to planes are not smaller
 UNTOLD = 1e-4  # information along a direction that no plane fixes (1/m^2): 100 m, or any angle
 LEAST_SHARE = 0.02  # of the points on planes, for a registration
+THERE_AND_BACK = 12  # pairs that show the noise of registration
 CORRELATED = 12.0  # points of one surface share their error: as many count as one
+
+# numbers of the target and the source of a pair -> where its registration starts (4, 4)
+Start = Callable[[int, int], F64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,11 +207,11 @@ def covariance_of(fit: Fit, voxel: float) -> F64:
 
 
 def registered(
-    clouds: Clouds, numbers: Sequence[tuple[int, int]], start: Callable[[F64], F64] | None = None
+    clouds: Clouds, numbers: Sequence[tuple[int, int]], start: Start | None = None
 ) -> Registered:
     """The pairs ``numbers`` registered from the motion that the poses give.
 
-    ``start`` makes a further start (4, 4) of it. Where few points lie on planes then, speeds about
+    ``start`` gives another, which is preferred. Where few points lie on planes then, speeds about
     the one of the last pair that fitted are tried, too.
     """
     registrar = Registrar(clouds)
@@ -216,7 +220,7 @@ def registered(
     given_shares = []
     for target, source in numbers:
         given = motion(clouds, target, source)
-        starts = [given] if start is None else [given, start(given)]
+        starts = [given] if start is None else [start(target, source), given]
         fits.append(registrar.fit(target, source, starts))
         given_shares.append(float(registrar.shares(target, source, [given])[0]))
     usual = float(np.median([fit.share for fit in fits])) if fits else 0.0
@@ -231,6 +235,25 @@ def registered(
         if fits[i].share >= LITTLE * usual:
             last = _rate(fits[i].target_T_source, seconds)
     return _kept(clouds, numbers, fits, np.array(given_shares))
+
+
+def noise(clouds: Clouds, found: Registered) -> float:
+    """How many times the squares of registrations are as large as their covariances have them; 1 at
+    least.
+
+    The sensor shows it without poses: some pairs are registered there and back, each time with the
+    planes of the other cloud.
+    """
+    registrar = Registrar(clouds)
+    rows = np.unique(np.linspace(0, len(found.pairs) - 1, THERE_AND_BACK).round().astype(np.int64))
+    squares = []
+    for row in rows.tolist():
+        target, source = found.numbers[row].tolist()
+        there = found.pairs.measured[row]
+        back = inverse(registrar.fit(source, target, [inverse(there)]).target_T_source)
+        off = difference(there[None], back[None])[0]
+        squares.append(float(off @ np.linalg.solve(2 * found.pairs.covariance[row], off)))
+    return max(1.0, float(np.median(squares)) / MEDIAN_OF_6)
 
 
 def _kept(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,6 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.errors import LogError, RoleError
 from semloc_logs.logs.session.inspect import inspect_log
+from semloc_logs.numerics import transforms
+from semloc_logs.settings import Logs
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 S = 1_000_000_000
@@ -69,6 +71,30 @@ def test_ambiguity_is_a_problem_and_not_an_error(tmp_path: Path) -> None:
     assert chosen["poses"]["count"] == 40
     with pytest.raises(RoleError, match="no topic '/c'"):
         inspect_log(tmp_path / "two.bag", {"pose": "/c"})
+
+
+def test_settings_of_reading_hold_and_are_in_the_suggested_command(recorder: Any) -> None:
+    log = recorder("ros2")
+    points = np.array([(x, y, x * y / 9) for x in range(1, 9) for y in range(9)], "f4,f4,f4")
+    points.dtype.names = ("x", "y", "z")
+    for k in range(40):
+        pose = transforms.yaw_transform(0.0, (0.5 * k, 0.0, 0.0))
+        log.pose(100 * S + k * S // 2, pose)
+        log.cloud("/points", 500 * S + k * S // 2, "lidar", points, late_ns=-400 * S)
+    path = log.write()
+    as_it_is = inspect(path)
+    assert any(p.startswith("/points starts at") for p in as_it_is["problems"])
+    assert as_it_is["sensors"]["/points"]["base_T_sensor"][2] == [0, 0, 1, 0]
+    settings = Logs(time_offset={"points": -400}, mountings={"lidar": (0, 0, 2, 0, 0, 0, 1)})
+    tried = inspect_log(path, logs=settings)
+    sensor: Any = tried["sensors"]
+    assert sensor["/points"]["base_T_sensor"][2] == [0, 0, 1, 2]
+    assert not any("starts at" in problem for problem in cast(Any, tried["problems"]))
+    suggested = str(tried["suggested"])
+    assert "--set logs.time_offset.points=-400.0" in suggested
+    assert "--set 'logs.mountings.lidar=[0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0]'" in suggested
+    with pytest.raises(LogError, match="time_offset names /none"):
+        inspect_log(path, logs=Logs(time_offset={"/none": 1.0}))
 
 
 def test_odometry_that_was_never_filled_in(tmp_path: Path) -> None:

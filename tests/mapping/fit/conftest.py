@@ -54,6 +54,19 @@ def straight(seconds: F64) -> F64:
     return np.array([yaw_transform(0.0, (3.0 * s, 0.0, 1.5)) for s in seconds])
 
 
+def seen_by_camera(points: F64, rng: np.random.Generator) -> F64:
+    """Points (n, 3) within 40 degrees of x, with the noise of a depth camera: 0.3 % of the range,
+    and steps of 1 % of it.
+    """
+    ranges = np.linalg.norm(points, axis=1)
+    seen = points[:, 0] > np.cos(np.radians(40.0)) * ranges
+    points = points[seen]
+    ranges = ranges[seen]
+    noisy = ranges * (1.0 + rng.normal(0, 0.003, len(ranges)))
+    step = 0.01 * ranges
+    return points * (np.round(noisy / step) * step / ranges)[:, None]
+
+
 def drive(
     folder: Path,
     poses_of: Callable[[F64], F64] = winding,
@@ -63,13 +76,16 @@ def drive(
     base_T_assumed: F64 | None = None,
     scale: float = 1.0,
     is_fixed: bool = False,
+    is_camera: bool = False,
 ) -> tuple[Clouds, PoseTrack]:
     """Keyframes three times a second, and the poses twenty times a second.
 
     The clouds are stamped ``clock`` seconds late; their mounting is wrong by ``base_T_assumed``
     (true base frame from the one of the clouds); ``scale`` times as large; or in the session frame.
+    A LIDAR sees all around, a camera ahead.
     """
     world = street()
+    rng = np.random.default_rng(5)
     times = np.arange(0.0, seconds, 0.05)
     track = PoseTrack()
     for time, pose in zip(times, poses_of(times), strict=True):
@@ -79,6 +95,8 @@ def drive(
     for time, pose in zip(taken, poses_of(taken), strict=True):
         points = apply(inverse(pose), world)
         points = points[np.linalg.norm(points, axis=1) < 18.0]
+        if is_camera:
+            points = seen_by_camera(points, rng)
         if is_fixed:
             points = apply(pose, points)
         if base_T_assumed is not None:

@@ -14,6 +14,8 @@ import pytest
 from semloc_logs.mapping.fit.check import SessionFit, Severity, StreamFit, check_stream
 from semloc_logs.mapping.fit.plane_cells import PlaneCells, register
 from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle
+from semloc_logs.settings import load
+from semloc_logs.stages.check import check_log
 
 TOPIC = "/points"  # of the drives
 Check = Callable[..., StreamFit]
@@ -79,6 +81,33 @@ def test_the_offset_of_a_clock_is_found(check: Check, late: float) -> None:
     assert f"--set logs.time_offset.{TOPIC}={-late:+.1f}" in _only(fit)
     estimate, sigma = fit.parameters["clock_s"]
     assert estimate == pytest.approx(-late, abs=max(0.02, 4 * sigma))
+
+
+@pytest.mark.parametrize("is_camera", [False, True])
+@pytest.mark.parametrize("late", [-0.8, -0.4, -0.1, 0.1, 0.4, 0.8])
+def test_an_offset_of_either_sign_is_found_for_a_lidar_and_a_camera(
+    check: Check, late: float, is_camera: bool
+) -> None:
+    fit = check(clock=late, is_camera=is_camera)
+    assert f"{abs(late):.1f}" in _only(fit)
+    assert "clock of the poses" in _only(fit)
+    estimate, sigma = fit.parameters["clock_s"]
+    assert estimate == pytest.approx(-late, abs=max(0.03, 4 * sigma))
+
+
+def test_a_camera_whose_poses_fit_is_not_accused(check: Check) -> None:
+    assert check(is_camera=True).findings == []
+
+
+@pytest.mark.parametrize("late", [-0.4, 0.1, 0.4])
+def test_the_offset_of_a_real_depth_camera_is_found(
+    shared: Callable[[str], Path], late: float
+) -> None:
+    log = shared("logs/room_a.mcap")
+    topic = "/camera/depth/image"
+    offset = {f"logs.time_offset.{topic}": str(late), "fusion.voxel_size": "0.05"}
+    [stream] = check_log(log, load(assignments=offset), {}).streams
+    assert f"--set logs.time_offset.{topic}={-late:+.1f}" in _only(stream)
 
 
 @pytest.mark.parametrize("axis", [1, 2])

@@ -1,0 +1,118 @@
+"""Starts of registration that faults make of the poses: other axes, units, clocks.
+
+A fault such as another convention of axes or another clock makes a start from the poses exactly.
+Registration from the motion that wrong poses give may end anywhere; from such a start it need not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from semloc_logs.mapping.fit.model import LONGEST_OFFSET, OFFSET_STEP, PosesAt
+from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, Start, motion
+from semloc_logs.numerics.transforms import inverse
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+TRIED = 4  # pairs that show whether another start is better
+# a motion is better when so many times the points lie on planes as where registration ended
+BETTER = 1.15
+# another clock is better when they are so many times as many as by the poses, and hardly fewer than
+# where registration ended: it may end at a motion that the sensor cannot tell from the right one
+BETTER_THAN_POSES, AS_GOOD = 1.15, 0.8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubted:
+    """The pairs that show whether another start is better.
+
+    They are few: the ones that contradict the poses most, and as many evenly spread. ``share`` and
+    ``given_share`` are sums as in :class:`~semloc_logs.mapping.fit.pairs.Registered`.
+    """
+
+    clouds: Clouds
+    numbers: I64
+    share: float
+    given_share: float
+
+    @staticmethod
+    def of(clouds: Clouds, found: Registered, squares: F64) -> Doubted:
+        """Those of ``found``, with their squared distances (n,) to the poses."""
+        worst = np.argsort(-squares, kind="stable")[:TRIED]
+        evenly = np.linspace(0, len(squares) - 1, TRIED).round().astype(np.int64)
+        rows = np.union1d(worst, evenly)
+        share, given_share = (float(s[rows].sum()) for s in (found.share, found.given_share))
+        return Doubted(clouds, found.numbers[rows], share, given_share)
+
+    def motion(self) -> Start | None:
+        """Other axes, units or none at all, where they bring far more points onto planes."""
+        start, share = self._best(_of_motion(self.clouds))
+        return start if share > max(BETTER * self.share, 1e-9) else None
+
+    def clock(self, poses_at: PosesAt) -> Start | None:
+        """The poses at other times, where they bring far more points onto planes."""
+        start, share = self._best(list(_of_clocks(self.clouds, poses_at)))
+        least = max(BETTER_THAN_POSES * self.given_share, AS_GOOD * self.share, 1e-9)
+        return start if share > least else None
+
+    def _best(self, starts: list[Start]) -> tuple[Start, float]:
+        registrar = Registrar(self.clouds)
+        shares = np.zeros(len(starts))
+        for target, source in self.numbers.tolist():
+            motions = [start(target, source) for start in starts]
+            shares += registrar.shares(target, source, motions)
+        best = int(np.argmax(shares))
+        return starts[best], float(shares[best])
+
+
+def _of_motion(clouds: Clouds) -> list[Start]:
+    """Motions that faults make of a given one: none, its inverse, other units, other axes."""
+
+    def start(change: Callable[[F64], F64]) -> Start:
+        return lambda target, source: change(motion(clouds, target, source))
+
+    axes = Rotation.create_group("O").as_matrix()
+    return [
+        start(lambda _: np.eye(4)),
+        start(inverse),
+        *(start(_scaled(factor)) for factor in (0.1, 0.5, 2.0, 10.0)),
+        *(start(_turned(rotation)) for rotation in axes if np.trace(rotation) < 2.9),
+    ]
+
+
+def _scaled(factor: float) -> Callable[[F64], F64]:
+    def change(motion: F64) -> F64:
+        out = motion.copy()
+        out[:3, 3] *= factor
+        return out
+
+    return change
+
+
+def _turned(rotation: F64) -> Callable[[F64], F64]:
+    mounting = np.eye(4)
+    mounting[:3, :3] = rotation
+    return lambda motion: inverse(mounting) @ motion @ mounting
+
+
+def _of_clocks(clouds: Clouds, poses_at: PosesAt) -> Iterator[Start]:
+    """Motions by the poses at other times; as given where a pose is unknown."""
+    stamps_ns = clouds.stamps_ns()
+    steps = round(LONGEST_OFFSET / OFFSET_STEP)
+    for step in range(-steps, steps + 1):
+        shift_ns = round(step * OFFSET_STEP * 1e9)
+
+        def start(target: int, source: int, shift_ns: int = shift_ns) -> F64:
+            poses, known = poses_at(stamps_ns[[target, source]] + shift_ns)
+            if not known.all():
+                return motion(clouds, target, source)
+            return np.asarray(inverse(poses[0]) @ poses[1])
+
+        if shift_ns:
+            yield start
