@@ -56,8 +56,19 @@ def path_option(*names: str, help: str, required: bool = False) -> Callable[[Fun
     return click.option(*names, type=click.Path(path_type=Path), required=required, help=help)
 
 
+class LogPath(click.Path):
+    """The path of a file or folder, or an address on a server."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Any:
+        from semloc_logs.logs.remote import log_path
+
+        return log_path(value)
+
+
 logs_argument = click.argument(
-    "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
+    "logs", metavar="LOG...", nargs=-1, required=True, type=LogPath()
 )
 work_option = path_option("-w", "--work", required=True, help="Workspace folder.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")

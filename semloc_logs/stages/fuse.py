@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from semloc_logs.engines import Engine
-from semloc_logs.errors import LogError, SemlocError, WorkspaceError
+from semloc_logs.errors import LogError, RemoteError, SemlocError, WorkspaceError
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import content_fingerprint, recover
 from semloc_logs.logs.poses.base_frame import BASE_LINK
@@ -86,8 +86,9 @@ def _fuse(
         failure = work.failure(task.folder.name)
         if isinstance(outcome, SemlocError):
             report.failed.append(str(outcome))
-            content = {"fingerprint": task.fingerprint, "reason": str(outcome)}
-            write_json(failure, content | {"logs": [str(log) for log in task.logs]})
+            if not isinstance(outcome, RemoteError):  # else the log may be good
+                content = {"fingerprint": task.fingerprint, "reason": str(outcome)}
+                write_json(failure, content | {"logs": [str(log) for log in task.logs]})
             if len(tasks) > 1:  # the only one is raised below
                 LOGGER.info("%s: %s", task.folder.name, outcome)
         else:
@@ -136,7 +137,7 @@ def _task(
             *(repr(transform) for transform in mountings.lent),
         )
     )
-    logs = tuple(Path(log).absolute() for log in session.logs)
+    logs = tuple(log.absolute() for log in session.logs)
     topics = dict(session.topics)
     return FuseTask(
         logs, folder, settings, topics, fingerprint, made_from, session.poses, mountings
