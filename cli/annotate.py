@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from .completion import session_names
 from .console import console
 from .options import (
     Command,
@@ -38,7 +39,10 @@ if TYPE_CHECKING:
 )
 @click.option("--sidecar", type=LogPath(), help="Write an MCAP file with the results only.")
 @click.option(
-    "--session", metavar="NAME", help="Session of the log; default: its file stem or folder name."
+    "--session",
+    metavar="NAME",
+    shell_complete=session_names,
+    help="Session of the log; default: its file stem or folder name.",
 )
 @overwrite_option
 @json_option

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .options import check_role
+
 if TYPE_CHECKING:
     from semloc_logs.logs.remote import RemotePath
     from semloc_logs.stages.inputs import SessionInput
@@ -191,6 +193,8 @@ def _listed(manifest: Path) -> Iterator[Entry]:
                     f"{manifest}, line {number}: topics are of the form ROLE=TOPIC;ROLE=TOPIC."
                 )
             topics = {role: topic for role, _, topic in pairs}
+        for role in topics:
+            check_role(role)
         poses = folder / str(row["poses"]) if row.get("poses") else None
         yield Entry(str(row["name"]) if row.get("name") else None, logs, topics, poses)
 

@@ -32,6 +32,12 @@ class RoleError(SemlocError):
     """
 
 
+class TopicError(RoleError):
+    """``--topic`` names a topic that the log does not have or that cannot play the role (wrong
+    usage).
+    """
+
+
 class SettingsError(SemlocError):
     """A setting is unknown or has an impossible value (wrong usage)."""
 

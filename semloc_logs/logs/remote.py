@@ -80,7 +80,7 @@ class RemotePath(PosixPath):
                 f" {scheme}://{'HOST' if is_web else 'BUCKET'}/PATH."
             )
         path = cls(f"{scheme}:", host, *names.split("/"))
-        path.url = f"{scheme}{url[len(scheme):].rstrip('/')}"
+        path.url = f"{scheme}{url[len(scheme) :].rstrip('/')}"
         return path
 
     def _address(self) -> str:
@@ -273,9 +273,7 @@ def uploading(path: RemotePath) -> Iterator[BinaryIO]:
     Its first megabyte can be read again, and its last 64 can be changed.
     """
     if EXTRAS[path.scheme] == "http":
-        raise RemoteError(
-            f"{path} cannot be written: results go to a file, or to s3:// or gs://."
-        )
+        raise RemoteError(f"{path} cannot be written: results go to a file, or to s3:// or gs://.")
     try:
         system = _file_system(path)
         target = system.open(path.url, "wb", block_size=_PART, autocommit=False)

@@ -33,7 +33,6 @@ from semloc_logs.logs.annotation.annotate import (
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.remote import BLOCK, RemotePath, log_path, uploading
 from semloc_logs.stages.inputs import session_name
-
 from tests.servers import Bucket, WebServer, s3_server, web_server
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

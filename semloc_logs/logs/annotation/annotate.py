@@ -318,7 +318,7 @@ def _refuse(log: Path, output: Path, overwrite: bool) -> None:
     if not log.exists():
         raise LogError(f"{log} does not exist; give the path of a log.")
     if output.exists():
-        if output == log or not (is_remote(output) or is_remote(log)) and output.samefile(log):
+        if output == log or (not (is_remote(output) or is_remote(log)) and output.samefile(log)):
             raise LogError(f"{output} is the log itself; give another output, or use `--in-place`.")
         if output.is_dir() or not overwrite:
             raise LogError(f"{output} exists already; give another output, or `--overwrite`.")

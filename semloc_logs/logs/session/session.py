@@ -100,7 +100,7 @@ class Session:
         try:
             self.roles: Roles = self._find_roles()
         except RoleError as error:
-            raise RoleError(f"{self.name}: {error}") from error
+            raise type(error)(f"{self.name}: {error}") from error
         if not self.roles.ranging:
             raise RoleError(f"{self.name}: {no_sensor(self.streams)}")
         self._reading = reading_of(self._options.logs, self.roles, self.streams, self.name)
