@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from .completion import session_names
 from .console import console
 from .options import (
     Command,
+    LogPath,
     console_options,
     json_option,
     overwrite_option,
-    path_option,
     tables_settings_options,
     work_option,
 )
@@ -23,17 +24,25 @@ if TYPE_CHECKING:
 
 
 @click.command(cls=Command)
-@click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
+@click.argument("log", metavar="LOG", type=LogPath())
 @work_option
-@path_option("-o", "--output", help="Write a copy of the log with the results to this MCAP file.")
+@click.option(
+    "-o",
+    "--output",
+    type=LogPath(),
+    help="Write a copy of the log with the results to this MCAP file.",
+)
 @click.option(
     "--in-place",
     is_flag=True,
     help="Write the results into the log itself (MCAP only); crash-safe.",
 )
-@path_option("--sidecar", help="Write an MCAP file with the results only.")
+@click.option("--sidecar", type=LogPath(), help="Write an MCAP file with the results only.")
 @click.option(
-    "--session", metavar="NAME", help="Session of the log; default: its file stem or folder name."
+    "--session",
+    metavar="NAME",
+    shell_complete=session_names,
+    help="Session of the log; default: its file stem or folder name.",
 )
 @overwrite_option
 @json_option

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from .completion import session_names
 from .console import console
 from .options import Command, EngineChoice, query_options, stage_options, work_option
 from .results import finish, report_json, show_closures
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     "queries",
     metavar="SESSION",
     multiple=True,
+    shell_complete=session_names,
     help="Search pairs with this session only; repeatable.",
 )
 @click.option(
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     "targets",
     metavar="SESSION",
     multiple=True,
+    shell_complete=session_names,
     help="And of these the ones with this session; repeatable.",
 )
 @click.option("--no-self", is_flag=True, help="Do not look for revisits within a session.")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from .completion import session_names
 from .console import console
 from .options import Command, EngineChoice, stage_options, work_option
 from .results import finish, report_json, show_report
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @click.command(cls=Command)
-@click.argument("sessions", metavar="[SESSION...]", nargs=-1)
+@click.argument("sessions", metavar="[SESSION...]", nargs=-1, shell_complete=session_names)
 @work_option
 @stage_options
 def command(

@@ -80,6 +80,23 @@ def show_evaluation(result: Evaluation) -> None:
         console.table("Closures against the truth, worst first", columns, drawn)
     if len(rows) > SHOWN:
         console.result(f"... and {len(rows) - SHOWN} more.")
+    if len(result.pairs) > 1:
+        columns = ("sessions", "", "closures#", "false#", "possible#", "answered#", "recall#")
+        drawn_pairs = [
+            (
+                p.sessions[0],
+                "itself" if p.sessions[1] == p.sessions[0] else p.sessions[1],
+                p.closures,
+                p.false,
+                p.possible,
+                p.answered,
+                None if p.recall is None else f"{p.recall:.3f}",
+            )
+            for p in sorted(result.pairs, key=lambda p: (-p.possible, p.sessions))
+        ]
+        console.table("Pairs of sessions", columns, drawn_pairs[:SHOWN])
+        if len(drawn_pairs) > SHOWN:
+            console.result(f"... and {len(drawn_pairs) - SHOWN} more pairs.")
     console.result(f"{result.closures} closures: {result.correct} correct, {result.false} false")
     if result.median_error_m is not None:
         console.result(

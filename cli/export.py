@@ -7,14 +7,22 @@ from typing import Literal
 
 import click
 
+from .completion import session_names
 from .console import console
-from .options import Command, console_options, json_option, path_option, work_option
+from .options import (
+    Command,
+    console_options,
+    json_option,
+    overwrite_option,
+    path_option,
+    work_option,
+)
 
 POINTS = ("ply", "pcd", "las", "laz", "xyz")
 
 
 @click.command(cls=Command)
-@click.argument("sessions", metavar="[SESSION...]", nargs=-1)
+@click.argument("sessions", metavar="[SESSION...]", nargs=-1, shell_complete=session_names)
 @work_option
 @click.option(
     "--format",
@@ -42,6 +50,7 @@ POINTS = ("ply", "pcd", "las", "laz", "xyz")
     help="Only points within this box of that frame (m).",
 )
 @path_option("-o", "--output", help="Folder of the files; default: WORK/export.")
+@overwrite_option
 @json_option
 @console_options
 def command(
@@ -52,6 +61,7 @@ def command(
     frame: Literal["session", "map"] | None,
     bounds: tuple[float, float, float, float] | None,
     output: Path | None,
+    overwrite: bool,
     as_json: bool,
 ) -> int:
     """Sessions for other programs: poses of the base frame (tum, kitti), a pose graph with the
@@ -77,7 +87,8 @@ def command(
     from semloc_logs.workspace import Workspace
 
     selection = Selection(what or "voxels", frame or "session", bounds)
-    paths = export(Workspace(work), sessions, form, output or work / "export", selection)
+    folder = output or work / "export"
+    paths = export(Workspace(work), sessions, form, folder, selection, overwrite=overwrite)
     if as_json:
         console.result_json({"files": [str(p) for p in paths]})
     else:

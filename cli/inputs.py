@@ -15,7 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .options import check_role
+
 if TYPE_CHECKING:
+    from semloc_logs.logs.remote import RemotePath
     from semloc_logs.stages.inputs import SessionInput
 
     from .options import PoseChoice
@@ -141,12 +144,27 @@ def _given(logs: Iterable[str]) -> Iterator[Entry]:
 
 def _expanded(text: str) -> list[Path]:
     """The paths that a pattern such as ``drives/*.mcap`` matches; other paths as they are."""
+    from semloc_logs.logs.remote import RemotePath, log_path
+
+    path = log_path(text)
+    if isinstance(path, RemotePath):
+        return _matches(path) if path.scheme in ("s3", "gs") and glob.has_magic(text) else [path]
     if glob.has_magic(text) and not Path(text).exists():
         paths = sorted(Path(p) for p in glob.glob(text))
         if not paths:
             raise click.UsageError(f"{text} matches no file.")
         return paths
     return [Path(text)]
+
+
+def _matches(pattern: RemotePath) -> list[Path]:
+    """The files on a server that a pattern matches; itself where it is the name of one."""
+    found = pattern.matches()
+    if not found and pattern.exists():
+        return [pattern]
+    if not found:
+        raise click.UsageError(f"{pattern} matches no file.")
+    return list(found)
 
 
 def _listed(manifest: Path) -> Iterator[Entry]:
@@ -164,7 +182,7 @@ def _listed(manifest: Path) -> Iterator[Entry]:
                 f"{manifest}, line {number}: unknown column {unknown[0]!r}; there are"
                 f" {', '.join(COLUMNS)}."
             )
-        logs = tuple(folder / log for log in _several(row.get("logs")))
+        logs = tuple(_beside(folder, log) for log in _several(row.get("logs")))
         if not logs:
             raise click.UsageError(f"{manifest}, line {number}: it names no logs.")
         topics = row.get("topics") or {}
@@ -175,6 +193,8 @@ def _listed(manifest: Path) -> Iterator[Entry]:
                     f"{manifest}, line {number}: topics are of the form ROLE=TOPIC;ROLE=TOPIC."
                 )
             topics = {role: topic for role, _, topic in pairs}
+        for role in topics:
+            check_role(role)
         poses = folder / str(row["poses"]) if row.get("poses") else None
         yield Entry(str(row["name"]) if row.get("name") else None, logs, topics, poses)
 
@@ -195,6 +215,14 @@ def _rows(text: str, manifest: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:
         if not isinstance(content, dict):
             raise click.UsageError(f"{manifest}, line {number}: not a JSON object.")
         yield number, content
+
+
+def _beside(folder: Path, log: str) -> Path:
+    """A log as a manifest names it: relative to its folder, or an address."""
+    from semloc_logs.logs.remote import is_remote, log_path
+
+    path = log_path(log)
+    return path if is_remote(path) else folder / path
 
 
 def _several(cell: Any) -> list[str]:

@@ -82,7 +82,9 @@ def command(
     if as_json:
         console.result_json(contents)
     if failed and not inspected:
-        raise failed[0] if len(failed) == 1 else LogError(" ".join(str(p) for p in failed))
+        kinds = {type(problem) for problem in failed}
+        kind = kinds.pop() if len(kinds) == 1 else LogError
+        raise kind(" ".join(str(p) for p in failed))
     if not as_json:
         from semloc_logs.logs.session.inspect_text import inspect_text
 

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import click
 
 from semloc_logs import __version__
-from semloc_logs.errors import SemlocError, SettingsError, did_you_mean
+from semloc_logs.errors import SemlocError, SettingsError, TopicError, did_you_mean
 
 from .console import console
 
@@ -110,7 +110,7 @@ class Program(click.Group):
             else:
                 problem.show()
             return problem.exit_code
-        except SettingsError as problem:
+        except (SettingsError, TopicError) as problem:
             console.error(str(problem))
             return 2
         except SemlocError as problem:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from .completion import role_names, setting_keys
 from .console import console
 
 if TYPE_CHECKING:
@@ -56,9 +57,16 @@ def path_option(*names: str, help: str, required: bool = False) -> Callable[[Fun
     return click.option(*names, type=click.Path(path_type=Path), required=required, help=help)
 
 
-logs_argument = click.argument(
-    "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
+class LogPath(click.Path):
+    """The path of a file or folder, or an address on a server."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from semloc_logs.logs.remote import log_path
+
+        return log_path(value)
+
+
+logs_argument = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LogPath())
 work_option = path_option("-w", "--work", required=True, help="Workspace folder.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 overwrite_option = click.option(
@@ -125,12 +133,35 @@ def pairs(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> dic
     return out
 
 
+def _topics(
+    ctx: click.Context, parameter: click.Parameter, values: tuple[str, ...]
+) -> dict[str, str]:
+    """Topics by role. UsageError for an unknown role."""
+    chosen = pairs(ctx, parameter, values)
+    for role in chosen:
+        check_role(role)
+    return chosen
+
+
+def check_role(role: str) -> None:
+    """UsageError unless a topic can have this role."""
+    from semloc_logs.errors import did_you_mean
+    from semloc_logs.logs.role_types import ROLES
+
+    if role not in ROLES:
+        raise click.UsageError(
+            f"The role '{role}' is unknown; the roles are {', '.join(ROLES)}."
+            f"{did_you_mean(role, ROLES)}"
+        )
+
+
 topic_option = click.option(
     "--topic",
     "topics",
     metavar="ROLE=TOPIC",
     multiple=True,
-    callback=pairs,
+    callback=_topics,
+    shell_complete=role_names,
     help="Topic that plays a role, such as lidar=/points; repeatable.",
 )
 
@@ -155,6 +186,7 @@ def settings_options(
         metavar="KEY.PATH=VALUE",
         multiple=True,
         callback=pairs,
+        shell_complete=setting_keys,
         help="One setting, such as fusion.voxel_size=0.3 (m); repeatable.",
     )
     @click.option("--dump-config", is_flag=True, help="Print all settings, explained, and exit.")

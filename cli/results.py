@@ -74,6 +74,10 @@ def show_closures(work: Workspace) -> None:
         f" {work.rejected}"
     )
     if not rows:
+        from semloc_logs.stages.hints import voxel_size_hint
+
+        if hint := voxel_size_hint(work):
+            console.note(hint)
         console.note(f"To see the best rejected hypothesis: semloc show -w {work.path} -o view.png")
     if work.picture.exists():
         console.result(f"Picture: {work.picture}")

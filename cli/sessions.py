@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from .completion import actions, session_names
 from .console import console
 from .inputs import checked_name
 from .options import Command, console_options, json_option, work_option
@@ -16,8 +17,13 @@ ACTIONS = {"show": 1, "rename": 2, "remove": 1}  # and the number of names
 
 
 @click.command(cls=Command)
-@click.argument("action", metavar="[show|rename|remove]", required=False)
-@click.argument("names", metavar="[NAME [NEW_NAME]]", nargs=-1)
+@click.argument(
+    "action",
+    metavar="[show|rename|remove]",
+    required=False,
+    shell_complete=actions(*ACTIONS),
+)
+@click.argument("names", metavar="[NAME [NEW_NAME]]", nargs=-1, shell_complete=session_names)
 @work_option
 @json_option
 @console_options

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from .completion import session_names
 from .console import console
 from .options import (
     Command,
@@ -19,7 +20,12 @@ from .options import (
 
 @click.command(cls=Command)
 @work_option
-@click.option("--query", metavar="SESSION", help="Only queries of this session.")
+@click.option(
+    "--query",
+    metavar="SESSION",
+    shell_complete=session_names,
+    help="Only queries of this session.",
+)
 @click.option(
     "--at",
     type=float,

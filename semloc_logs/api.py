@@ -30,6 +30,7 @@ from semloc_logs.logs.annotation.annotate import AnnotateReport
 from semloc_logs.logs.containers import open as containers
 from semloc_logs.logs.log import Log
 from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
+from semloc_logs.logs.remote import log_path
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.progress import Listener, listening
@@ -277,10 +278,10 @@ class Workspace:
         overwrite: bool = False,
     ) -> AnnotateReport:
         """Closures -> channels of ``log``: in the file ``output``, or in the log itself."""
-        target = None if output is None else Path(output)
+        target = None if output is None else log_path(output)
         annotation = Annotation(AnnotationMode(mode), target, overwrite)
         settings = self._settled(writes=False)
-        return annotate(Path(log), self._folder, settings, annotation, session=session)
+        return annotate(log_path(log), self._folder, settings, annotation, session=session)
 
     # -- contents
 
@@ -366,13 +367,13 @@ def _inputs(
     if isinstance(logs, Mapping):
         named = logs.items()
     else:
-        named = [(session_name(Path(log)), log) for log in logs]
+        named = [(session_name(log_path(log)), log) for log in logs]
     files = {name: TrajectoryFile(Path(path)) for name, path in (poses or {}).items()}
     inputs: dict[str, SessionInput] = {}
     for name, paths in named:
         if name in inputs:
             raise ValueError(f"two logs would both be session {name!r}: name them in a mapping")
         several = [paths] if isinstance(paths, str | Path) else paths
-        logs_of_session = tuple(Path(path) for path in several)
+        logs_of_session = tuple(log_path(path) for path in several)
         inputs[name] = SessionInput(name, logs_of_session, topics or {}, files.get(name))
     return list(inputs.values())

@@ -18,10 +18,23 @@ class LogError(SemlocError):
     """A log cannot be read or written: missing, truncated, corrupt, or not a log at all."""
 
 
+class RemoteError(SemlocError):
+    """A server gives no answer, or cannot do what reading or writing needs.
+
+    What could not be read is not damage: nothing is skipped for it.
+    """
+
+
 class RoleError(SemlocError):
     """The streams of a log leave open which topic has which role.
 
     The sentence lists the options that settle it.
+    """
+
+
+class TopicError(RoleError):
+    """``--topic`` names a topic that the log does not have or that cannot play the role (wrong
+    usage).
     """
 
 

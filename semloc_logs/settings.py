@@ -13,7 +13,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -598,6 +598,18 @@ def _keys() -> list[str]:
     """Every section, and every setting by its key path."""
     sections = {name: type(values).model_fields for name, values in Settings()}
     return [*sections, *(f"{name}.{key}" for name, fields in sections.items() for key in fields)]
+
+
+def choices() -> dict[str, tuple[str, ...]]:
+    """The key of every setting, with its values where it has a few fixed ones."""
+    found: dict[str, tuple[str, ...]] = {}
+    for section, values in Settings():
+        for name, field in type(values).model_fields.items():
+            kinds = (field.annotation, *get_args(field.annotation))
+            fixed = [v for kind in kinds if get_origin(kind) is Literal for v in get_args(kind)]
+            of_switch = ("true", "false") if bool in kinds else ()
+            found[f"{section}.{name}"] = tuple(map(str, fixed)) or of_switch
+    return found
 
 
 def _assign(tree: dict[str, Any], key: str, value: str) -> None:

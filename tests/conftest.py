@@ -52,3 +52,4 @@ def _load_helper(name: str) -> None:
 
 
 _load_helper("lossy_disk")
+_load_helper("servers")

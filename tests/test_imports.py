@@ -44,6 +44,7 @@ ORDER = [
 INNER_ORDER = {
     "logs": [
         "problems",
+        "remote",
         "log",
         "topic_pairs",
         "role_types",

@@ -126,7 +126,9 @@ def _query_then_best(row: Rejected) -> tuple[str, int, float, str, int]:
 
 
 def read_closures(path: Path) -> list[dict[str, Any]]:
-    """Rows of closures.parquet."""
+    """Rows of closures.parquet. WorkspaceError where it is missing or damaged."""
+    if not path.exists():
+        raise WorkspaceError(f"{path.parent} has no closures yet: run 'semloc close' first.")
     rows: list[dict[str, Any]] = read_table(path).to_pylist()
     return rows
 

@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -67,15 +68,34 @@ class Judged:
 
 
 @dataclass(frozen=True, slots=True)
+class PairFigures:
+    """The figures of two ``sessions``, sorted, or of one and itself: ``possible`` are the queries
+    of either near the other one, ``answered`` those with a correct closure of the two.
+    """
+
+    sessions: tuple[str, str]
+    closures: int
+    correct: int
+    false: int
+    possible: int
+    answered: int
+
+    @property
+    def recall(self) -> float | None:
+        return self.answered / self.possible if self.possible else None
+
+
+@dataclass(frozen=True, slots=True)
 class Evaluation:
     """The figures: medians over all judged closures; ``recall`` = ``answered`` / ``possible``
-    queries, None without possible ones.
+    queries, None without possible ones. ``pairs``: of those that have closures or could have.
     """
 
     rows: list[Judged]
     queries: int
     possible: int
     answered: int
+    pairs: list[PairFigures] = field(default_factory=list)
 
     @property
     def closures(self) -> int:
@@ -120,7 +140,8 @@ class Evaluation:
             "answered",
         )
         return {name: getattr(self, name) for name in figures} | {
-            "rows": [asdict(r) for r in self.rows]
+            "pairs": [asdict(p) | {"recall": p.recall} for p in self.pairs],
+            "rows": [asdict(r) for r in self.rows],
         }
 
 
@@ -147,8 +168,8 @@ def evaluate_closures(
     sessions = {f.name: SessionMap(f) for f in work.sessions()}
     tracks = read_truth(truth, sessions)
     rows = [judge_closure(row, tracks) for row in read_closures(work.closures)]
-    queries, possible, answered = _count_queries(sessions, tracks, rows, settings, self_closures)
-    return Evaluation(rows, queries, possible, answered)
+    counts = _count_queries(sessions, tracks, rows, settings, self_closures)
+    return Evaluation(rows, counts.queries, counts.possible, counts.answered, _pairs(rows, counts))
 
 
 def _settings_of(work: Workspace, settings: Resolved) -> Resolved:
@@ -200,16 +221,47 @@ def _pose(track: TrueTrack | None, stamp_ns: int) -> F64 | None:
 # -- recall
 
 
+@dataclass(slots=True)
+class _Counts:
+    """Queries of known true pose, how many of them are possible, and how many of the latter are
+    answered; the same by pairs of sessions.
+    """
+
+    queries: int = 0
+    possible: int = 0
+    answered: int = 0
+    possible_of: Counter[tuple[str, str]] = field(default_factory=Counter)
+    answered_of: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+
+def _pair(one: str, other: str) -> tuple[str, str]:
+    return (one, other) if one <= other else (other, one)
+
+
+def _pairs(rows: list[Judged], counts: _Counts) -> list[PairFigures]:
+    judged: dict[tuple[str, str], list[Judged]] = {}
+    for row in rows:
+        judged.setdefault(_pair(row.query_session, row.target_session), []).append(row)
+    return [
+        PairFigures(
+            pair,
+            closures=len(found := judged.get(pair, [])),
+            correct=sum(r.correct is True for r in found),
+            false=sum(r.correct is False for r in found),
+            possible=counts.possible_of[pair],
+            answered=counts.answered_of[pair],
+        )
+        for pair in sorted({*judged, *counts.possible_of})
+    ]
+
+
 def _count_queries(
     sessions: Mapping[str, SessionMap],
     tracks: Mapping[str, TrueTrack],
     rows: list[Judged],
     settings: Resolved,
     self_closures: bool,
-) -> tuple[int, int, int]:
-    """Queries of known true pose, how many of them are possible, and how many of the latter are
-    answered.
-    """
+) -> _Counts:
     positions: dict[str, F64] = {}
     known: dict[str, NDArray[np.bool_]] = {}
     for name, track in tracks.items():
@@ -217,43 +269,55 @@ def _count_queries(
         positions[name] = poses[:, :3, 3]
     trees = {name: cKDTree(p[known[name]]) for name, p in positions.items() if known[name].any()}
     right = _correct_ends(sessions, rows)
-    counts = [0, 0, 0]
+    counts = _Counts()
     for name in trees:
         mine = sessions[name]
         for k in query_keyframes(mine, settings):
             if not known[name][k]:
                 continue
-            counts[0] += 1
+            counts.queries += 1
             here = positions[name][k]
-            others = any(
-                tree.query(here)[0] <= REVISIT_M for other, tree in trees.items() if other != name
-            )
-            if not (
-                others
-                or (
-                    self_closures
-                    and _revisits_itself(mine, positions[name], known[name], k, settings.closures)
-                )
+            near = [
+                other
+                for other, tree in trees.items()
+                if other != name and tree.query(here)[0] <= REVISIT_M
+            ]
+            if self_closures and _revisits_itself(
+                mine, positions[name], known[name], k, settings.closures
             ):
+                near.append(name)
+            if not near:
                 continue
-            counts[1] += 1
-            counts[2] += _is_answered(positions[name], k, right.get(name, []), settings.query.every)
-    return counts[0], counts[1], counts[2]
+            answered_in = {
+                other
+                for other, ends in right.get(name, {}).items()
+                if _is_answered(positions[name], k, ends, settings.query.every)
+            }
+            counts.possible += 1
+            counts.answered += bool(answered_in)
+            pairs = {_pair(name, other) for other in near}
+            counts.possible_of.update(pairs)
+            counts.answered_of.update(pairs & {_pair(name, other) for other in answered_in})
+    return counts
 
 
 def _correct_ends(
     sessions: Mapping[str, SessionMap], rows: list[Judged]
-) -> dict[str, list[tuple[int, bool]]]:
-    """Keyframes at the ends of correct closures by session, and whether they were the query."""
-    out: dict[str, list[tuple[int, bool]]] = {}
+) -> dict[str, dict[str, list[tuple[int, bool]]]]:
+    """Keyframes of a session at the ends of correct closures with another one, and whether they
+    were the query.
+    """
+    out: dict[str, dict[str, list[tuple[int, bool]]]] = {}
     for row in rows:
         if row.correct:
-            for session, stamp, is_query in (
-                (row.query_session, row.query_stamp_ns, True),
-                (row.target_session, row.target_stamp_ns, False),
-            ):
+            ends = (
+                (row.query_session, row.query_stamp_ns, row.target_session, True),
+                (row.target_session, row.target_stamp_ns, row.query_session, False),
+            )
+            for session, stamp, other, is_query in ends:
                 keyframe = int(np.argmin(np.abs(sessions[session].stamps_ns - stamp)))
-                out.setdefault(session, []).append((keyframe, is_query))
+                found = out.setdefault(session, {}).setdefault(other, [])
+                found.append((keyframe, is_query))
     return out
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
@@ -47,31 +48,46 @@ def export(
     form: str,
     output: Path,
     selection: Selection | None = None,
+    *,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
 
     ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``:
     one pose graph of all; the point formats: ``selection``, by default the centres of all occupied
     voxels in the session frame. Raises WorkspaceError when a session is not there or does not fit
-    the format, SemlocError when a library is missing.
+    the format, or a file exists and ``overwrite`` is not set; SemlocError when a library is
+    missing.
     """
     sessions = {folder.name: SessionMap(folder) for folder in work.chosen(names)}
+    chosen = selection or Selection()
     if form == "g2o":
-        path = output / "closures.g2o"
+        path = _free(output / "closures.g2o", overwrite)
         _write(path, pose_graph(sessions, work).encode())
         return [path]
-    paths = []
+    paths = {name: _free(output / _file_name(name, form, chosen), overwrite) for name in sessions}
     for name, session in sessions.items():
         if form in ("tum", "kitti"):
-            paths.append(output / f"{name}.{'txt' if form == 'kitti' else form}")
-            _write(paths[-1], (tum if form == "tum" else kitti)(session))
+            _write(paths[name], (tum if form == "tum" else kitti)(session))
             continue
-        chosen = selection or Selection()
         points = SessionPoints(session, chosen.what, chosen.frame, chosen.bounds)
-        paths.append(output / f"{name}{'-keyframes' if chosen.what == 'keyframes' else ''}.{form}")
-        with replacing_file(paths[-1], suffix=f".{form}") as temporary:
+        with replacing_file(paths[name], suffix=f".{form}") as temporary:
             WRITERS[form](temporary, points)
-    return paths
+    return list(paths.values())
+
+
+def _file_name(session: str, form: str, chosen: Selection) -> str:
+    if form == "kitti":
+        return f"{session}.txt"
+    is_of_keyframes = form != "tum" and chosen.what == "keyframes"
+    return f"{session}{'-keyframes' if is_of_keyframes else ''}.{form}"
+
+
+def _free(path: Path, overwrite: bool) -> Path:
+    """``path``; WorkspaceError where it exists and must not be replaced."""
+    if path.exists() and not overwrite:
+        raise WorkspaceError(f"{path} exists already: give --overwrite or another folder with -o.")
+    return path
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from semloc_logs.errors import RoleError
+from semloc_logs.errors import TopicError
 from semloc_logs.logs.log import Stream
 from semloc_logs.logs.problems import Problem, ProblemKind, sentences
 
@@ -131,7 +131,7 @@ def read_choice(streams: Sequence[Stream], overrides: Mapping[str, str]) -> Choi
     for role, value in overrides.items():
         flag = f"--topic {role}={value}"
         if role not in ROLES:
-            raise RoleError(
+            raise TopicError(
                 f"{flag}: the role '{role}' is unknown; the roles are {', '.join(ROLES)}."
             )
         found = []
@@ -142,13 +142,13 @@ def read_choice(streams: Sequence[Stream], overrides: Mapping[str, str]) -> Choi
             if not narrowed and role == "pose":
                 pose_frame = rest
             elif not narrowed:
-                raise RoleError(f"{flag}: {topic} has no such messages, but {_kinds(candidates)}.")
+                raise TopicError(f"{flag}: {topic} has no such messages, but {_kinds(candidates)}.")
             chosen.setdefault(topic, best_stream(narrowed or candidates))
             if len(narrowed) == 1:
                 decided.add(topic)
             found.append(topic)
         if role in SINGLE and len(found) > 1:
-            raise RoleError(f"{flag}: the role '{role}' takes one topic, not {len(found)}.")
+            raise TopicError(f"{flag}: the role '{role}' takes one topic, not {len(found)}.")
         topics[role] = tuple(dict.fromkeys(found))
     return Choice(topics, chosen, frozenset(decided), pose_frame)
 
@@ -170,7 +170,7 @@ def _split(streams: Sequence[Stream], wanted: str, flag: str) -> tuple[str, str]
             if name.startswith(f"{spelled(topic)}:"):
                 return topic, name[len(spelled(topic)) + 1 :]
     listed = _listed(sorted(streams, key=lambda s: s.topic))
-    raise RoleError(f"{flag}: the log has no topic '{wanted}'; its topics are {listed}.")
+    raise TopicError(f"{flag}: the log has no topic '{wanted}'; its topics are {listed}.")
 
 
 def _without_slash(topic: str) -> str:
@@ -184,12 +184,12 @@ def _that_can(role: str, streams: Sequence[Stream], topic: str, flag: str) -> li
     if not able:
         scans = [s for s in of_topic if kind_of(s.type) in SCANS]
         if scans and role in ("lidar", "depth"):
-            raise RoleError(
+            raise TopicError(
                 f"{flag}: {topic} is a {scans[0].type}, and a 2-D scan cannot be mapped."
             )
         types = " or ".join(sorted({s.type for s in of_topic}))
         listed = _listed(sorted(streams, key=lambda s: s.topic))
-        raise RoleError(
+        raise TopicError(
             f"{flag}: messages of type {types} cannot be the {role}; the topics are {listed}."
         )
     return able

@@ -160,6 +160,7 @@ def choose(work: Workspace, wanted: Wanted) -> list[Choice]:
 
 
 def _choices(work: Workspace, path: Path) -> list[Choice]:
+    work.chosen(())
     if not path.exists():
         raise WorkspaceError(f"{path} does not exist: run 'semloc close -w {work.path}' first.")
     return [

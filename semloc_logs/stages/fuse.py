@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 
 from semloc_logs.engines import Engine
-from semloc_logs.errors import LogError, SemlocError, WorkspaceError
+from semloc_logs.errors import (
+    LogError,
+    RemoteError,
+    SemlocError,
+    TopicError,
+    WorkspaceError,
+)
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import content_fingerprint, recover
 from semloc_logs.logs.poses.base_frame import BASE_LINK
@@ -63,6 +69,7 @@ def _fuse(
 ) -> Report:
     report = Report()
     tasks: list[FuseTask] = []
+    is_usage = True
     logs = [log for session in sessions for log in session.logs]
     for session in sessions:
         others = [log for log in logs if log not in session.logs]
@@ -78,6 +85,7 @@ def _fuse(
         if not again and recorded_fingerprint(work.failure(session.name)) == task.fingerprint:
             reason = read_json(work.failure(session.name))["reason"]
             report.failed.append(f"{reason} It failed before: --retry-failed reads it again.")
+            is_usage = False
         else:
             tasks.append(task)
     keep(work, settings, overwrite=overwrite)
@@ -86,8 +94,10 @@ def _fuse(
         failure = work.failure(task.folder.name)
         if isinstance(outcome, SemlocError):
             report.failed.append(str(outcome))
-            content = {"fingerprint": task.fingerprint, "reason": str(outcome)}
-            write_json(failure, content | {"logs": [str(log) for log in task.logs]})
+            is_usage = is_usage and isinstance(outcome, TopicError)
+            if not isinstance(outcome, RemoteError | TopicError):  # else the log may be good
+                content = {"fingerprint": task.fingerprint, "reason": str(outcome)}
+                write_json(failure, content | {"logs": [str(log) for log in task.logs]})
             if len(tasks) > 1:  # the only one is raised below
                 LOGGER.info("%s: %s", task.folder.name, outcome)
         else:
@@ -96,7 +106,8 @@ def _fuse(
             report.skipped += sentences(to_report(outcome.problems))
             _log_outcome(task.folder.name, outcome)
     if report.failed and not report.done and not report.kept:
-        raise LogError(" ".join(report.failed))
+        kind = TopicError if is_usage else LogError
+        raise kind(" ".join(report.failed))
     return report
 
 
@@ -141,7 +152,7 @@ def _task(
             *(repr(transform) for transform in mountings.lent),
         )
     )
-    logs = tuple(Path(log).absolute() for log in session.logs)
+    logs = tuple(log.absolute() for log in session.logs)
     topics = dict(session.topics)
     return FuseTask(
         logs, folder, settings, topics, fingerprint, made_from, session.poses, mountings

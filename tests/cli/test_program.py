@@ -20,7 +20,14 @@ from semloc_logs.cli import main as main_module
 from semloc_logs.cli.console import console
 from semloc_logs.cli.main import COMMANDS, program
 from semloc_logs.cli.options import Command, EngineChoice, console_options
-from semloc_logs.errors import LogError, RoleError, SettingsError, WorkspaceError
+from semloc_logs.errors import (
+    LogError,
+    RemoteError,
+    RoleError,
+    SettingsError,
+    TopicError,
+    WorkspaceError,
+)
 from semloc_logs.progress import Progress
 
 HEAVY = (
@@ -110,6 +117,8 @@ def test_help_lists_every_command() -> None:
         (RoleError("There is no LIDAR."), 1, "Error: There is no LIDAR."),
         (WorkspaceError("work has no session."), 1, "Error: work has no session."),
         (SettingsError("Unknown setting 'x'."), 2, "Error: Unknown setting 'x'."),
+        (TopicError("--topic lidar=/x: the log has no topic '/x'."), 2, "Error: --topic lidar=/x"),
+        (RemoteError("https://h/x cannot be read."), 1, "Error: https://h/x cannot be read."),
         (click.UsageError("Give one."), 2, "Error: Give one."),
         (
             PermissionError(13, "Permission denied", "/data/x"),

@@ -292,3 +292,34 @@ def test_a_workspace_without_sessions_or_closures_is_told_what_to_run(
         evaluate_closures(Workspace(tmp_path / "empty"), truth, settings)
     with pytest.raises(WorkspaceError, match="has no closures yet: run 'semloc close' first"):
         evaluate_closures(work, truth, settings)
+
+
+def test_recall_of_each_pair_of_sessions(work: Workspace) -> None:
+    # c drives x = 100 .. 120, far from both, and d drives as a does, 2 m beside it
+    _session(work, "c", 2000, _poses(np.arange(100.0, 121.0)))
+    _session(work, "d", 3000, _poses(np.arange(21.0), 2.0))
+    truth = json.loads((work.path.parent / "truth.json").read_text())
+    truth |= {name: {"T_common_session": np.eye(4).tolist()} for name in "cd"}
+    (work.path.parent / "truth.json").write_text(json.dumps(truth))
+    _closures(
+        work,
+        [
+            ("d", 3000, "a", 0, yaw_transform(0.0, (0.0, 2.0, 0.0))),  # right, at the first query
+            ("d", 3010, "a", 10, yaw_transform(0.0, (5.0, 2.0, 0.0))),  # 5 m: false
+            ("c", 2000, "b", 1030, yaw_transform(0.0, (0.0, 0.0, 0.0))),  # 60 m: false
+        ],
+    )
+    result = _evaluate(work)
+    pairs = {p.sessions: p for p in result.pairs}
+    assert sorted(pairs) == [("a", "b"), ("a", "d"), ("b", "c"), ("b", "d")]
+    assert (pairs["a", "d"].closures, pairs["a", "d"].correct, pairs["a", "d"].false) == (2, 1, 1)
+    # queries every 2 m, 11 of each: all of them near the other; the first of d, and a's there
+    assert (pairs["a", "d"].possible, pairs["a", "d"].answered) == (22, 2)
+    assert pairs["a", "d"].recall == pytest.approx(2 / 22)
+    assert (pairs["a", "b"].closures, pairs["a", "b"].answered, pairs["a", "b"].recall) == (0, 0, 0)
+    assert (pairs["b", "c"].possible, pairs["b", "c"].recall) == (0, None)
+    listed = {tuple(p["sessions"]): p["recall"] for p in result.to_json()["pairs"]}
+    assert listed == {pair: p.recall for pair, p in pairs.items()}
+    # a query that several sessions can answer counts once in all
+    assert result.answered == 2
+    assert result.possible < sum(p.possible for p in result.pairs)

@@ -166,3 +166,19 @@ def test_files_of_the_workspace_are_not_touched(work: Workspace, tmp_path: Path)
     export(work, [], "tum", tmp_path / "out")
     assert {p: p.read_bytes() for p in work.path.rglob("*") if p.is_file()} == before
     assert json.loads(work.session("a").session_json.read_text())["voxel_size"] == 0.5
+
+
+@pytest.mark.parametrize("form", ["tum", "kitti", "g2o", "ply", "xyz"])
+def test_a_file_is_replaced_only_when_told(work: Workspace, tmp_path: Path, form: str) -> None:
+    paths = export(work, [], form, tmp_path / "out")
+    paths[-1].write_bytes(b"mine")
+    with pytest.raises(WorkspaceError, match=r"exists already: give --overwrite"):
+        export(work, [], form, tmp_path / "out")
+    assert paths[-1].read_bytes() == b"mine"
+    if len(paths) > 1:
+        paths[0].unlink()
+        with pytest.raises(WorkspaceError, match="exists already"):
+            export(work, [], form, tmp_path / "out")
+        assert not paths[0].exists(), "nothing is written where one file is in the way"
+    assert export(work, [], form, tmp_path / "out", overwrite=True) == paths
+    assert paths[-1].read_bytes() != b"mine"

@@ -47,6 +47,7 @@ from semloc_logs.logs.annotation.tail_swap import (
 from semloc_logs.logs.containers.mcap_records import MAGIC
 from semloc_logs.logs.containers.memory import DEFAULT, Memory
 from semloc_logs.logs.containers.sqlite_file import side_files
+from semloc_logs.logs.remote import RemotePath, is_remote, uploading
 from semloc_logs.tables.atomic_files import replacing_file
 
 __all__ = [
@@ -60,6 +61,7 @@ __all__ = [
     "recover",
 ]
 
+_BLOCK = 1 << 22  # bytes copied at once from or to a server
 LIBRARY = f"semloc_logs {__version__}"
 _ENCODINGS: dict[str, Encoding] = {
     "cdr": "ros2",
@@ -134,7 +136,7 @@ def annotate_copy(
 
     An MCAP log is copied undecoded; a .bag, a .db3 or a bag folder is converted, message by
     message. Raises ``LogError``, and leaves nothing behind, when the log is damaged or ``output``
-    exists and ``overwrite`` is not set.
+    exists and ``overwrite`` is not set. Both may be addresses; RemoteError where a server fails.
     """
     _refuse(log, output, overwrite)
     recover(log)
@@ -146,14 +148,13 @@ def annotate_copy(
             plan, report = results.plan(output, end, bag_facts(log, readers))
             _finish(file, plan)
             return report
-    with (
-        locked(log, shared=True) as source,
-        os.fdopen(os.dup(source), "rb") as original,
-        _published(output) as file,
-    ):
+    with _source(log) as original, _published(output) as file:
         end = read_end(original, log, Memory(results.memory))
         plan, report = results.plan(output, end, _mcap_facts(end))
-        copy_start(source, file.fileno(), plan.start)
+        if is_remote(log) or is_remote(output):
+            _copy_bytes(original, file, plan.start)
+        else:
+            copy_start(original.fileno(), file.fileno(), plan.start)
         _finish(file, plan)
         return report
 
@@ -165,6 +166,11 @@ def annotate_in_place(log: Path, results: Results) -> AnnotateReport:
     point leaves a log that is whole, or that :func:`recover` makes whole. Errors as for
     :func:`annotate_copy`.
     """
+    if is_remote(log):
+        raise LogError(
+            f"{log} is on a server, where files cannot be changed in place; "
+            "use `-o OUT.mcap` or `--sidecar OUT.mcap`."
+        )
     if not log.exists():
         raise LogError(f"{log} does not exist; give the path of a log.")
     if not _is_mcap(log):
@@ -207,7 +213,7 @@ def content_fingerprint(log: Path) -> str:
     """sha256 of the recorded content without our own records.
 
     Annotating a log in place does not change it. ``log`` is a file, a bag folder, or the
-    metadata.yaml in it. Reads every byte once.
+    metadata.yaml in it. Reads every byte once; on a server that has strong ETags it hashes these.
     """
     folder = log.parent if log.name == "metadata.yaml" else log
     try:
@@ -216,7 +222,7 @@ def content_fingerprint(log: Path) -> str:
         digest = hashlib.sha256()
         for path in sorted(
             p
-            for p in folder.rglob("*")
+            for p in (folder.iterdir() if is_remote(folder) else folder.rglob("*"))
             if p.is_file()
             and not p.name.startswith(".")
             and SIDE_SUFFIX not in p.name
@@ -231,6 +237,8 @@ def content_fingerprint(log: Path) -> str:
 
 
 def _file_fingerprint(path: Path) -> str:
+    if isinstance(path, RemotePath) and (tag := path.etag()) is not None:
+        return hashlib.sha256(f"{path.stat().st_size} {tag}".encode()).hexdigest()
     stop = (content_end(path) if _is_mcap(path) else None) or path.stat().st_size
     with path.open("rb") as file:
         digest = hash_range(file, 0, stop)
@@ -310,7 +318,7 @@ def _refuse(log: Path, output: Path, overwrite: bool) -> None:
     if not log.exists():
         raise LogError(f"{log} does not exist; give the path of a log.")
     if output.exists():
-        if output.samefile(log):
+        if output == log or (not (is_remote(output) or is_remote(log)) and output.samefile(log)):
             raise LogError(f"{output} is the log itself; give another output, or use `--in-place`.")
         if output.is_dir() or not overwrite:
             raise LogError(f"{output} exists already; give another output, or `--overwrite`.")
@@ -319,6 +327,10 @@ def _refuse(log: Path, output: Path, overwrite: bool) -> None:
 @contextlib.contextmanager
 def _published(output: Path) -> Iterator[BinaryIO]:
     """A file that becomes ``output`` when the block ends well, and vanishes when it does not."""
+    if isinstance(output, RemotePath):
+        with uploading(output) as upload:
+            yield upload
+        return
     try:
         with replacing_file(output) as temporary, temporary.open("w+b") as file:
             yield file
@@ -326,6 +338,28 @@ def _published(output: Path) -> Iterator[BinaryIO]:
         raise LogError(
             f"{output} could not be written ({error.strerror}); make room or give another output."
         ) from error
+
+
+@contextlib.contextmanager
+def _source(log: Path) -> Iterator[BinaryIO]:
+    """``log`` to read, locked against writers where it is a local file."""
+    if is_remote(log):
+        with log.open("rb") as file:
+            yield file
+        return
+    with locked(log, shared=True) as fd, os.fdopen(os.dup(fd), "rb") as file:
+        yield file
+
+
+def _copy_bytes(source: BinaryIO, target: BinaryIO, length: int) -> None:
+    """Copy the first ``length`` bytes of a file to another."""
+    source.seek(0)
+    while length > 0:
+        block = source.read(min(length, _BLOCK))
+        if not block:
+            raise LogError("The log became shorter while it was copied; let its recording end.")
+        target.write(block)
+        length -= len(block)
 
 
 def _finish(file: BinaryIO, plan: AppendPlan) -> None:

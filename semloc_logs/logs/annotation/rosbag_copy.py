@@ -18,13 +18,14 @@ from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
 
-from semloc_logs.errors import LogError
+from semloc_logs.errors import LogError, SemlocError
 from semloc_logs.logs.annotation.channels import LogFacts, is_old_marker
 from semloc_logs.logs.containers import sqlite_file
 from semloc_logs.logs.containers.base import unpack_whole
 from semloc_logs.logs.containers.memory import DEFAULT, Memory
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.messages.type_names import ros2_type
+from semloc_logs.logs.remote import is_remote
 
 QOS_KEY = "offered_qos_profiles"
 
@@ -34,14 +35,15 @@ class _Sqlite(Sqlite3Reader):
 
     def __init__(self, path: Any) -> None:
         overlay = sqlite_file.overlay_of(path)
-        whole: Any = path if overlay is None else _Whole(path, overlay)
+        is_plain = overlay is None and not is_remote(path)
+        whole: Any = path if is_plain else _Whole(path, overlay)
         super().__init__(whole)
 
 
 class _Whole:
     """A file with the pages beside it, as rosbags takes files that are not on this disk."""
 
-    def __init__(self, path: Path, overlay: sqlite_file.Overlay) -> None:
+    def __init__(self, path: Path, overlay: sqlite_file.Overlay | None) -> None:
         self._path, self._overlay = path, overlay
 
     def __str__(self) -> str:
@@ -52,7 +54,8 @@ class _Whole:
 
     def stat(self) -> os.stat_result:
         status = list(self._path.stat())
-        status[stat.ST_SIZE] = self._overlay.page_count * self._overlay.page_size
+        if self._overlay is not None:
+            status[stat.ST_SIZE] = self._overlay.page_count * self._overlay.page_size
         return os.stat_result(status)
 
 
@@ -229,7 +232,7 @@ def _told(log: Path) -> Iterator[None]:
     """
     try:
         yield
-    except LogError:
+    except SemlocError:
         raise
     except Exception as error:
         raise LogError(

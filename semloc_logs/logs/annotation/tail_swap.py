@@ -18,6 +18,7 @@ from pathlib import Path
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.annotation.mcap_append import AppendPlan
+from semloc_logs.logs.remote import is_remote
 from semloc_logs.tables.atomic_files import remove_file, replacing_file, stale_temporaries
 
 try:
@@ -114,6 +115,8 @@ def recover(path: Path) -> bool:
     do. Raises ``LogError`` when another process is writing right now, or when the saved tail does
     not belong to the log.
     """
+    if is_remote(path):
+        return False
     side = _side(path)
     if not path.is_file() or not (side.exists() or stale_temporaries(side)):
         return False

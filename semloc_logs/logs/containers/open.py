@@ -13,17 +13,19 @@ from semloc_logs.logs.containers.rosbag1 import Rosbag1Log
 from semloc_logs.logs.containers.rosbag2 import Rosbag2Log
 from semloc_logs.logs.containers.sqlite import SqliteLog
 from semloc_logs.logs.log import Log
+from semloc_logs.logs.remote import log_path
 
 _SQLITE = b"SQLite format 3\0"
 
 
 def open_log(path: str | Path, memory: int = DEFAULT) -> Log:
-    """The log at ``path``: an MCAP file, a ROS 1 bag, a ROS 2 bag directory or one of its files.
+    """The log at ``path``, which may be an address: an MCAP file, a ROS 1 bag, a ROS 2 bag
+    directory or one of its files.
 
     At most ``memory`` bytes of it are in memory at once (``logs.memory``). LogError describes the
     file where it is not a log, or its damage.
     """
-    path = Path(path)
+    path = log_path(path)
     limit = Memory(memory)
     if path.is_dir():
         return Rosbag2Log(path, limit)

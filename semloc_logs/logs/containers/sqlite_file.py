@@ -11,7 +11,6 @@ The formats: https://www.sqlite.org/fileformat2.html.
 
 from __future__ import annotations
 
-import os
 import struct
 from dataclasses import dataclass
 from functools import cache
@@ -24,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
+from semloc_logs.logs.remote import is_remote, log_path
 
 _VFS = "semloc-read"
 _WAL_HEAD = struct.Struct(">IIIIIIII")  # magic, version, page size, sequence, salts, checksums
@@ -52,7 +52,7 @@ def connect(path: Path) -> apsw.Connection:
     overlay = overlay_of(path)
     address = f"file:{quote(str(path.absolute()))}?immutable=1"
     flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
-    vfs = None if overlay is None else _vfs().name
+    vfs = None if overlay is None and not is_remote(path) else _vfs().name
     database = apsw.Connection(address, flags=flags, vfs=vfs)
     database.execute("PRAGMA trusted_schema = OFF")
     return database
@@ -231,12 +231,16 @@ class _ReadingVfs(apsw.VFS):
         """A database; temporary files are the ones of the system."""
         if not isinstance(name, apsw.URIFilename):
             return super().xOpen(name, flags)
-        path = Path(name.filename())
+        path = log_path(name.filename())
         overlay = overlay_of(path)
-        if overlay is None:  # gone meanwhile
+        if overlay is None and not is_remote(path):  # gone meanwhile
             raise apsw.CantOpenError(f"{path} changed while it was opened")
         flags[1] = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_MAIN_DB
         return OverlaidFile(path, overlay)
+
+    def xFullPathname(self, name: str) -> str:
+        """Addresses as they are."""
+        return name if is_remote(log_path(name)) else super().xFullPathname(name)
 
     def xAccess(self, pathname: str, flags: int) -> bool:
         """No file beside the database is of interest to sqlite."""
@@ -244,26 +248,35 @@ class _ReadingVfs(apsw.VFS):
 
 
 class OverlaidFile(apsw.VFSFile):
-    """The file at ``path`` with the pages of ``overlay`` in their places."""
+    """The file at ``path`` with the pages of ``overlay``, if there is one, in their places."""
 
-    def __init__(self, path: Path, overlay: Overlay) -> None:
+    def __init__(self, path: Path, overlay: Overlay | None) -> None:
         self._overlay = overlay
-        self._files = [os.open(path, os.O_RDONLY)]
-        self._files.append(os.open(overlay.path, os.O_RDONLY))
+        self._files = [path.open("rb")]
+        if overlay is not None:
+            self._files.append(overlay.path.open("rb"))
 
     def xRead(self, amount: int, offset: int) -> bytes:
+        if self._overlay is None:
+            return self._read(0, amount, offset)
         page, inside = divmod(offset, self._overlay.page_size)
         at = self._overlay.pages.get(page + 1)
         if at is None:
-            return os.pread(self._files[0], amount, offset)
-        return os.pread(self._files[1], amount, at + inside)
+            return self._read(0, amount, offset)
+        return self._read(1, amount, at + inside)
+
+    def _read(self, file: int, amount: int, offset: int) -> bytes:
+        self._files[file].seek(offset)
+        return self._files[file].read(amount)
 
     def xFileSize(self) -> int:
+        if self._overlay is None:
+            return self._files[0].seek(0, 2)
         return self._overlay.page_count * self._overlay.page_size
 
     def xClose(self) -> None:
         while self._files:
-            os.close(self._files.pop())
+            self._files.pop().close()
 
     def xFileControl(self, op: int, ptr: int) -> bool:
         return False

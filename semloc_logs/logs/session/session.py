@@ -76,7 +76,7 @@ def open_session(paths: Sequence[Path], options: SessionOptions | None = None) -
     logs: list[Log] = []
     try:
         memory = (options or SessionOptions()).logs.memory
-        logs.extend(open_log(Path(path), memory) for path in paths)
+        logs.extend(open_log(path, memory) for path in paths)
         logs.sort(key=lambda log: (log.start_ns is None, log.start_ns or 0))
         return Session(logs, options)
     except BaseException:
@@ -100,7 +100,7 @@ class Session:
         try:
             self.roles: Roles = self._find_roles()
         except RoleError as error:
-            raise RoleError(f"{self.name}: {error}") from error
+            raise type(error)(f"{self.name}: {error}") from error
         if not self.roles.ranging:
             raise RoleError(f"{self.name}: {no_sensor(self.streams)}")
         self._reading = reading_of(self._options.logs, self.roles, self.streams, self.name)
