@@ -145,6 +145,19 @@ class Workspace:
         return self.path / "rejected.parquet"
 
     @property
+    def optimized(self) -> Path:
+        """Trajectories in common frames, and the graph that they come from."""
+        return self.path / "optimized"
+
+    def optimized_trajectory(self, session: str) -> Path:
+        return self.optimized / f"{checked_name(session)}.parquet"
+
+    @property
+    def graph_closures(self) -> Path:
+        """What became of every closure; sessions have any name, so it has a folder of its own."""
+        return self.optimized / "graph" / "closures.parquet"
+
+    @property
     def annotated(self) -> Path:
         return self.path / "annotated"
 
