@@ -63,10 +63,16 @@ def optimise_graph(graph: PoseGraph, settings: ResolvedOptimize) -> Optimised:
     sets = consistent_sets(graph, settings)
     consistent = _consistent(graph, sets)
     placement = place_sessions(graph, sets)
+    placed = placement.common_T_map[graph.chain_of] @ graph.map_T_base
+
+    # a coarse graph tells closures apart, a fine one has the poses
+    coarse = problem_of(graph, settings, coarse=True)
+    solver = Solver(coarse, _anchors(coarse, placement.component), placed[coarse.kept])
+    rough = solver.solve(placed[coarse.kept], consistent.astype(float), settings.seconds)
+    carried = _all_poses(graph, coarse, rough.common_T_base)
     problem = problem_of(graph, settings)
-    initial = placement.common_T_map[problem.chain] @ graph.map_T_base[problem.kept]
-    solver = Solver(problem, _anchors(problem, placement.component), initial)
-    solution = solver.solve(initial, consistent.astype(float), settings.seconds)
+    solver = Solver(problem, _anchors(problem, placement.component), carried[problem.kept])
+    solution = solver.refined(carried[problem.kept], rough.weight)
     solution = _readmitted(solver, solution)
     kept = solution.weight > 0.5
     verdict = [
@@ -80,7 +86,7 @@ def optimise_graph(graph: PoseGraph, settings: ResolvedOptimize) -> Optimised:
         component,
         verdict,
         solution.squared_error,
-        solution.method,
+        rough.method,
     )
 
 
@@ -99,7 +105,7 @@ def _readmitted(solver: Solver, solution: Solution) -> Solution:
         fits = solution.squared_error <= BOUND
         if np.array_equal(fits, solution.weight > 0.5):
             break
-        solution = solver.refined(solution, fits.astype(float))
+        solution = solver.refined(solution.common_T_base, fits.astype(float))
     return solution
 
 

@@ -1,4 +1,4 @@
-"""The graph that is solved: a vertex every few metres of road.
+"""The graph that is solved: vertices every few metres of road, and not every keyframe.
 
 A closure is moved to the nearest vertex along its session's odometry.
 """
@@ -17,6 +17,7 @@ from semloc_logs.settings import ResolvedOptimize
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
+COARSE = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,28 +60,37 @@ class Problem:
     up: Directions
 
 
-def problem_of(graph: PoseGraph, settings: ResolvedOptimize) -> Problem:
-    """Thin ``graph`` to one vertex in ``settings.vertex_spacing`` metres of road."""
+def problem_of(graph: PoseGraph, settings: ResolvedOptimize, *, coarse: bool = False) -> Problem:
+    """Thin ``graph`` to a vertex where closures end, at most one in ``vertex_spacing`` metres.
+
+    Elsewhere, and everywhere in a ``coarse`` problem, there is one in COARSE times as much road.
+    """
     noise = OdometryNoise.of(settings)
-    kept = _kept(graph, settings.vertex_spacing)
-    chain = graph.chain_of[kept]
+    kept = _kept(graph, settings.vertex_spacing, coarse=coarse)
     odometry = _odometry(graph, kept, noise)
     loops = _moved_loops(graph, kept, noise, settings)
-    return Problem(kept, chain, odometry, loops, _up(graph, kept, settings))
+    return Problem(kept, graph.chain_of[kept], odometry, loops, _up(graph, kept, settings))
 
 
-def _kept(graph: PoseGraph, spacing: float) -> I64:
-    """The first vertex of every ``spacing`` metres of road, and the last of a session."""
-    kept: list[int] = []
-    for first, chain in zip(graph.first, graph.chains, strict=True):
-        if not len(chain):
-            continue
-        cell = np.floor(chain.distance / spacing).astype(np.int64)
-        starts = np.flatnonzero(np.diff(cell, prepend=-1))
-        kept += (first + starts).tolist()
-        if starts[-1] != len(chain) - 1:
-            kept.append(int(first + len(chain) - 1))
-    return np.array(kept, np.int64)
+def _kept(graph: PoseGraph, spacing: float, *, coarse: bool) -> I64:
+    """The first vertex of each stretch of road, of each with a closure's end, and the last one."""
+    wide = _starts(graph, np.floor(graph.distance / (COARSE * spacing)))
+    last = graph.first + np.array([len(chain) for chain in graph.chains], np.int64) - 1
+    kept = np.zeros(graph.vertices, bool)
+    kept[wide] = True
+    kept[last] = True
+    if not coarse:
+        narrow = _starts(graph, np.floor(graph.distance / spacing))
+        ends = np.concatenate([graph.loops.target, graph.loops.query])
+        kept[narrow[np.searchsorted(narrow, ends, "right") - 1]] = True
+    return np.flatnonzero(kept)
+
+
+def _starts(graph: PoseGraph, stretch: F64) -> I64:
+    """The first vertex of each ``stretch`` (n,) of road of each session."""
+    chain = graph.chain_of
+    is_start = (np.diff(stretch, prepend=-1) != 0) | (np.diff(chain, prepend=-1) != 0)
+    return np.flatnonzero(is_start)
 
 
 def _odometry(graph: PoseGraph, kept: I64, noise: OdometryNoise) -> Edges:

@@ -110,14 +110,12 @@ class Solver:
             poses = self._solved(poses, weight, STEP_ITERATIONS)
             squared = squared_errors(loops, poses)
             mu *= SCHEDULE_STEP
-        poses = self._solved(poses, weight, LAST_ITERATIONS)
-        return Solution(poses, weight, squared_errors(loops, poses), Method.GNC)
+        return Solution(poses, np.round(weight), squared, Method.GNC)
 
-    def refined(self, solution: Solution, weight: F64) -> Solution:
-        """From ``solution``, with other weights of the closures."""
-        poses = self._solved(solution.common_T_base, weight, LAST_ITERATIONS)
-        squared = squared_errors(self._problem.loops, poses)
-        return Solution(poses, weight, squared, solution.method)
+    def refined(self, initial: F64, weight: F64) -> Solution:
+        """Least squares from ``initial`` (v, 4, 4) with given weights of the closures."""
+        poses = self._solved(initial, weight, LAST_ITERATIONS)
+        return Solution(poses, weight, squared_errors(self._problem.loops, poses), Method.GNC)
 
     def cauchy(self, initial: F64, start: F64) -> Solution:
         """Weights of a Cauchy distribution, iterated; a closure above the bound is refused."""
