@@ -29,6 +29,7 @@ FILES_OF_TABLES = {  # table -> where it lies in a workspace
     "rejected": "rejected.parquet",
     "optimized": "optimized/NAME.parquet",
     "graph_closures": "optimized/graph/closures.parquet",
+    "vertices": "optimized/graph/vertices.parquet",
     "alignments": "alignments/query=NAME/target=NAME/alignments.parquet",
     "trajectory": "sessions/NAME/trajectory.parquet",
     "frames": "sessions/NAME/frames.parquet",

@@ -158,6 +158,16 @@ class Workspace:
         return self.optimized / "graph" / "closures.parquet"
 
     @property
+    def graph_vertices(self) -> Path:
+        """Which keyframes the vertices of the graph are, and their poses."""
+        return self.optimized / "graph" / "vertices.parquet"
+
+    @property
+    def graph_file(self) -> Path:
+        """The graph as g2o text."""
+        return self.optimized / "graph.g2o"
+
+    @property
     def annotated(self) -> Path:
         return self.path / "annotated"
 

@@ -32,7 +32,7 @@ class SessionErrors:
     """Errors of one session, None where nothing can be compared."""
 
     session: str
-    component: int
+    frame: str
     poses: int
     ate_before_m: float | None
     ate_after_m: float | None
@@ -115,7 +115,7 @@ class _Compared:
     """True poses of a session at the stamps where all are known, and the two estimates."""
 
     session: str
-    component: int
+    frame: str
     truth: F64
     before: F64
     after: F64
@@ -159,14 +159,14 @@ def _pooled(parts: list[F64]) -> float | None:
 
 def _together(compared: list[_Compared]) -> list[F64]:
     """Distances (n,) of each component, all of its sessions under one alignment."""
-    by_component: dict[int, list[_Compared]] = {}
+    by_frame: dict[str, list[_Compared]] = {}
     for part in compared:
-        by_component.setdefault(part.component, []).append(part)
+        by_frame.setdefault(part.frame, []).append(part)
     return [
         aligned_distances(
             np.concatenate([p.truth for p in parts]), np.concatenate([p.after for p in parts])
         )
-        for parts in by_component.values()
+        for parts in by_frame.values()
     ]
 
 
@@ -175,7 +175,7 @@ def _session_errors(part: _Compared) -> SessionErrors:
     after_m, after_deg = relative_errors(part.truth, part.after, RPE_ROAD_M)
     return SessionErrors(
         part.session,
-        part.component,
+        part.frame,
         len(part.truth),
         rms(aligned_distances(part.truth, part.before)),
         rms(aligned_distances(part.truth, part.after)),
@@ -201,5 +201,5 @@ def _compared(work: Workspace, session: SessionMap, track: TrueTrack) -> _Compar
     after = poses_of(optimized)
     before = poses_of(recorded) if same else after
     true_poses, known = track.at(stamps_ns)
-    component = int(read_metadata(path)["component"])
-    return _Compared(name, component, true_poses[known], before[known], after[known])
+    frame = str(read_metadata(path)["frame"])
+    return _Compared(name, frame, true_poses[known], before[known], after[known])

@@ -98,3 +98,11 @@ class PoseGraph:
     def with_loops(self, loops: Loops) -> PoseGraph:
         """The same sessions with other closures."""
         return replace(self, loops=loops)
+
+
+def turned_covariance(target_R_source: F64, covariance: F64) -> F64:
+    """Covariances (n, 6, 6) of position and rotation in other axes, by rotations (n, 3, 3)."""
+    turn = np.zeros((len(covariance), 6, 6))
+    turn[:, :3, :3] = target_R_source
+    turn[:, 3:, 3:] = target_R_source
+    return np.asarray(turn @ covariance @ np.swapaxes(turn, 1, 2))

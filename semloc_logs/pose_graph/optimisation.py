@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.pose_graph.carried_poses import SolvedPoses
 from semloc_logs.pose_graph.consistent_sets import ConsistentSet, consistent_sets
-from semloc_logs.pose_graph.graph import PoseGraph
+from semloc_logs.pose_graph.graph import PoseGraph, turned_covariance
 from semloc_logs.pose_graph.initial_poses import place_sessions
 from semloc_logs.pose_graph.problem import Problem, problem_of
 from semloc_logs.pose_graph.solver import BOUND, Method, Solution, Solver
@@ -40,25 +40,36 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Optimised:
-    """Poses ``common_T_base`` (n, 4, 4) of all vertices of a graph.
+    """Poses ``solved`` (v, 4, 4) of the vertices of ``problem``, which thins ``graph``.
 
-    ``component`` (k,) is the frame of each chain: the map frame of the first chain in it.
-    ``verdict`` (m,) and ``squared_error`` (m,), whitened, are of the closures.
+    ``component`` (k,) tells which chains share a frame: the map frame of their first. ``verdict``
+    (m,) and ``squared_error`` (m,), whitened, are of the closures, ``covariance`` (v, 6, 6) of the
+    poses, if it was requested.
     """
 
-    common_T_base: F64
+    graph: PoseGraph
+    problem: Problem
+    solved: F64
     component: I64
     verdict: list[Verdict]
     squared_error: F64
     method: Method
+    covariance: F64 | None = None
 
     @property
     def kept(self) -> Mask:
         """Which closures (m,) hold."""
         return np.array([verdict is Verdict.KEPT for verdict in self.verdict], bool)
 
+    @property
+    def common_T_base(self) -> F64:
+        """Poses (n, 4, 4) of all vertices of the graph."""
+        return _all_poses(self.graph, self.problem, self.solved)
 
-def optimise_graph(graph: PoseGraph, settings: ResolvedOptimize) -> Optimised:
+
+def optimise_graph(
+    graph: PoseGraph, settings: ResolvedOptimize, *, covariances: bool = False
+) -> Optimised:
     """Solve ``graph``. SemlocError where GTSAM is not installed."""
     sets = consistent_sets(graph, settings)
     consistent = _consistent(graph, sets)
@@ -80,13 +91,20 @@ def optimise_graph(graph: PoseGraph, settings: ResolvedOptimize) -> Optimised:
         for k, c in zip(kept, consistent, strict=True)
     ]
     component = _components(graph, kept)
-    poses = _in_own_frames(graph, problem, solution.common_T_base, component)
+    common_T_solved = _to_own_frames(graph, problem, solution.common_T_base, component)
+    covariance = None
+    if covariances:
+        marginal = solver.covariances(solution.common_T_base, solution.weight)
+        covariance = turned_covariance(common_T_solved[:, :3, :3], marginal)
     return Optimised(
-        _all_poses(graph, problem, poses),
+        graph,
+        problem,
+        common_T_solved @ solution.common_T_base,
         component,
         verdict,
         solution.squared_error,
         rough.method,
+        covariance,
     )
 
 
@@ -126,15 +144,14 @@ def _components(graph: PoseGraph, kept: Mask) -> I64:
     return np.asarray(np.argsort(np.argsort(first))[numbers], np.int64)
 
 
-def _in_own_frames(graph: PoseGraph, problem: Problem, poses: F64, component: I64) -> F64:
-    """Poses (v, 4, 4), each component in the map frame of its first session."""
-    out = poses.copy()
+def _to_own_frames(graph: PoseGraph, problem: Problem, poses: F64, component: I64) -> F64:
+    """Transforms (v, 4, 4) of solved poses into the map frame of their component's first chain."""
+    out = np.empty_like(poses)
     of_vertex = component[problem.chain]
     for number in np.unique(of_vertex):
         rows = np.flatnonzero(of_vertex == number)
         first = rows[0]
-        map_T_common = graph.map_T_base[problem.kept[first]] @ inverse(poses[first])
-        out[rows] = map_T_common @ poses[rows]
+        out[rows] = graph.map_T_base[problem.kept[first]] @ inverse(poses[first])
     return out
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.numerics.transforms import inverse
-from semloc_logs.pose_graph.graph import Loops, PoseGraph
+from semloc_logs.pose_graph.graph import Loops, PoseGraph, turned_covariance
 from semloc_logs.pose_graph.odometry_noise import OdometryNoise
 from semloc_logs.settings import ResolvedOptimize
 
@@ -35,6 +35,10 @@ class Edges:
 
     def __len__(self) -> int:
         return len(self.a)
+
+    def part(self, rows: NDArray[np.bool_]) -> Edges:
+        """Some of the edges."""
+        return Edges(self.a[rows], self.b[rows], self.a_T_b[rows], self.root[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,11 +126,8 @@ def _moved_loops(
     axis = np.arange(3)
     covariance[:, axis, axis] += noise.position_variance(moved)[:, None]
     covariance[:, axis + 3, axis + 3] += noise.turn_variance(moved)[:, None]
-    # the rotations to_query turn errors into the axes of the vertex
-    turn = np.zeros((len(loops), 6, 6))
-    turn[:, :3, :3] = np.swapaxes(to_query[:, :3, :3], 1, 2)
-    turn[:, 3:, 3:] = turn[:, :3, :3]
-    covariance = turn @ covariance @ np.swapaxes(turn, 1, 2)
+    # into the axes of the vertex
+    covariance = turned_covariance(np.swapaxes(to_query[:, :3, :3], 1, 2), covariance)
     root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
     return Edges(target, query, to_target @ loops.target_T_query @ to_query, root)
 
@@ -139,10 +140,8 @@ def _floor(settings: ResolvedOptimize) -> F64:
 
 def _in_axes_of_query(loops: Loops) -> F64:
     """Covariances (m, 6, 6) with increments in the query's axes instead of the target's."""
-    turn = np.zeros((len(loops), 6, 6))
-    turn[:, :3, :3] = np.swapaxes(loops.target_T_query[:, :3, :3], 1, 2)
-    turn[:, 3:, 3:] = turn[:, :3, :3]
-    return np.asarray(turn @ loops.covariance @ np.swapaxes(turn, 1, 2))
+    query_R_target = np.swapaxes(loops.target_T_query[:, :3, :3], 1, 2)
+    return turned_covariance(query_R_target, loops.covariance)
 
 
 def nearest_kept(graph: PoseGraph, kept: I64, vertices: I64) -> I64:

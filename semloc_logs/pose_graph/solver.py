@@ -21,6 +21,7 @@ from scipy.stats import chi2
 
 from semloc_logs.errors import SemlocError
 from semloc_logs.numerics.transforms import inverse
+from semloc_logs.pose_graph.graph import turned_covariance
 from semloc_logs.pose_graph.problem import Edges, Problem
 
 LOGGER = logging.getLogger(__name__)
@@ -128,23 +129,43 @@ class Solver:
         poses = self._solved(poses, weight, LAST_ITERATIONS)
         return Solution(poses, weight, squared_errors(loops, poses), Method.CAUCHY)
 
+    def covariances(self, poses: F64, weight: F64) -> F64:
+        """Marginal covariances (v, 6, 6) of ``poses`` (v, 4, 4), by the weights of the closures.
+
+        Increments are in the axes of the frame, x y z rotation-x rotation-y rotation-z.
+        """
+        marginals = self._gtsam.Marginals(self._weighted(weight), self._values(poses))
+        local = np.array([marginals.marginalCovariance(k) for k in range(len(poses))])
+        # GTSAM orders a pose's error as rotation, position, in the axes of the pose
+        local = np.roll(np.roll(local.reshape(-1, 6, 6), 3, axis=1), 3, axis=2)
+        return turned_covariance(poses[:, :3, :3], local)
+
+    def _weighted(self, weight: F64) -> Any:
+        """All factors, the closures with these weights."""
+        loops = self._problem.loops
+        graph = self._gtsam.NonlinearFactorGraph(self._fixed)
+        for row in np.flatnonzero(weight > 0).tolist():
+            root = loops.root[row] * np.sqrt(weight[row])
+            graph.add(_between(self._gtsam, loops, row, root))
+        return graph
+
+    def _values(self, poses: F64) -> Any:
+        values = self._gtsam.Values()
+        for vertex, pose in enumerate(poses):
+            values.insert(vertex, self._gtsam.Pose3(pose))
+        return values
+
     def _solved(self, initial: F64, weight: F64, iterations: int) -> F64:
         """Least squares with these weights of the closures, at most so many iterations."""
         gtsam = self._gtsam
-        graph = gtsam.NonlinearFactorGraph(self._fixed)
-        loops = self._problem.loops
-        for row in np.flatnonzero(weight > 0).tolist():
-            root = loops.root[row] * np.sqrt(weight[row])
-            graph.add(_between(gtsam, loops, row, root))
-        values = gtsam.Values()
-        for vertex, pose in enumerate(initial):
-            values.insert(vertex, gtsam.Pose3(pose))
+        graph = self._weighted(weight)
         parameters = gtsam.LevenbergMarquardtParams()
         if self._ordering is None:
             self._ordering = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
         parameters.setOrdering(self._ordering)
         parameters.setMaxIterations(iterations)
         parameters.setRelativeErrorTol(TOLERANCE)
+        values = self._values(initial)
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
         return np.array([solved.atPose3(k).matrix() for k in range(len(initial))])
 
