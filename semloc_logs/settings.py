@@ -327,6 +327,38 @@ class Closures(_Section):
     )
 
 
+class Optimize(_Section):
+    """The pose graph of all sessions and their closures."""
+
+    odometry_drift: float = Field(
+        0.01, gt=0, le=1, description="share of the road that odometry is off after 100 m"
+    )
+    odometry_turn_deg: float = Field(
+        0.5, gt=0, le=180, description="degrees that odometry turns too much after 100 m"
+    )
+    closure_sigma: float | None = Field(
+        None,
+        gt=0,
+        description="uncertainty of position (m) of every closure beside its covariance: the maps"
+        " drift, too; default 0.1 m at 0.30 m voxels",
+    )
+    closure_sigma_deg: float = Field(
+        0.5, gt=0, le=180, description="the same of its rotation, degrees"
+    )
+    gravity_sigma_deg: float = Field(
+        2.0, gt=0, le=180, description="uncertainty of up in the map frame of a session, degrees"
+    )
+    vertex_spacing: float | None = Field(
+        None,
+        gt=0,
+        description="a pose is solved for after so much road (m), those between follow; default"
+        " 5 m at 0.30 m voxels",
+    )
+    seconds: float = Field(
+        300.0, ge=0, description="for the robust solution; Cauchy weights decide after that"
+    )
+
+
 class Training(_Section):
     """The encoder-decoder's training (supplement 1)."""
 
@@ -391,6 +423,13 @@ class ResolvedClosures(Closures):
     exclude_distance: float
 
 
+class ResolvedOptimize(Optimize):
+    """The same with every length."""
+
+    closure_sigma: float
+    vertex_spacing: float
+
+
 class Settings(_Section):
     """The whole configuration as given; see each section."""
 
@@ -400,6 +439,7 @@ class Settings(_Section):
     descriptor: Descriptor = Descriptor()
     query: Query = Query()
     closures: Closures = Closures()
+    optimize: Optimize = Optimize()
     training: Training = Training()
 
     def resolved(self) -> Resolved:
@@ -429,6 +469,7 @@ class Settings(_Section):
             "descriptor": {"reach": 30 * scale},
             "query": {"every": 2 * scale, "radius": 24 * scale},
             "closures": {"exclude_distance": 50 * scale},
+            "optimize": {"closure_sigma": v / 3, "vertex_spacing": 5 * scale},
         }
         content = self.model_dump()
         for section, defaults in lengths.items():
@@ -474,6 +515,7 @@ class Resolved(Settings):
     descriptor: ResolvedDescriptor
     query: ResolvedQuery
     closures: ResolvedClosures
+    optimize: ResolvedOptimize
 
     def resolved(self) -> Resolved:
         return self

@@ -145,6 +145,29 @@ class Workspace:
         return self.path / "rejected.parquet"
 
     @property
+    def optimized(self) -> Path:
+        """Trajectories in common frames, and the graph that they come from."""
+        return self.path / "optimized"
+
+    def optimized_trajectory(self, session: str) -> Path:
+        return self.optimized / f"{checked_name(session)}.parquet"
+
+    @property
+    def graph_closures(self) -> Path:
+        """What became of every closure; sessions have any name, so it has a folder of its own."""
+        return self.optimized / "graph" / "closures.parquet"
+
+    @property
+    def graph_vertices(self) -> Path:
+        """Which keyframes the vertices of the graph are, and their poses."""
+        return self.optimized / "graph" / "vertices.parquet"
+
+    @property
+    def graph_file(self) -> Path:
+        """The graph as g2o text."""
+        return self.optimized / "graph.g2o"
+
+    @property
     def annotated(self) -> Path:
         return self.path / "annotated"
 

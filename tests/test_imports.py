@@ -30,6 +30,7 @@ ORDER = [
     "words",
     "alignment",
     "closures",
+    "pose_graph",
     "pictures",
     "exports",
     "engines",

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.mapping.session_map import SessionMap
-from semloc_logs.numerics.transforms import inverse, transform, translation_quaternion
+from semloc_logs.numerics.transforms import inverse, transform
+from semloc_logs.pose_graph.g2o import edge_line, vertex_line
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
@@ -32,10 +33,7 @@ def pose_graph(sessions: dict[str, SessionMap], work: Workspace) -> str:
         first[name] = count
         count += len(session.stamps_ns)
         lines.append(f"# {name}: vertices {first[name]} .. {count - 1}")
-        lines += [
-            f"VERTEX_SE3:QUAT {first[name] + i} {_pose_text(pose)}"
-            for i, pose in enumerate(session.map_T_base)
-        ]
+        lines += [vertex_line(first[name] + i, pose) for i, pose in enumerate(session.map_T_base)]
     for name, session in sessions.items():
         if session.posed:
             lines += _odometry(first[name], session.map_T_base)
@@ -57,7 +55,7 @@ def _closure_edge(target: int, query: int, row: dict[str, Any]) -> str:
     # from the target's axes into the query's
     turn = np.kron(np.eye(2), target_T_query[:3, :3].T)
     covariance = turn @ np.array(row["covariance"]).reshape(6, 6) @ turn.T
-    return _edge(target, query, target_T_query, covariance)
+    return edge_line(target, query, target_T_query, np.linalg.inv(covariance))
 
 
 def _odometry(first: int, poses: F64) -> list[str]:
@@ -67,15 +65,6 @@ def _odometry(first: int, poses: F64) -> list[str]:
         step = inverse(poses[i]) @ poses[i + 1]
         road = float(np.linalg.norm(step[:3, 3]))
         sigma = np.repeat([a + b * road for a, b in (ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD)], 3)
-        edges.append(_edge(first + i, first + i + 1, step, np.diag(sigma**2)))
+        information = np.linalg.inv(np.diag(sigma**2))
+        edges.append(edge_line(first + i, first + i + 1, step, information))
     return edges
-
-
-def _edge(a: int, b: int, a_T_b: F64, covariance: F64) -> str:
-    upper = np.linalg.inv(covariance)[np.triu_indices(6)]
-    return f"EDGE_SE3:QUAT {a} {b} {_pose_text(a_T_b)} " + " ".join(f"{x:.9g}" for x in upper)
-
-
-def _pose_text(pose: F64) -> str:
-    t, q = translation_quaternion(pose)
-    return " ".join(f"{x:.9g}" for x in (*t, *q))

@@ -1,0 +1,91 @@
+"""semloc optimize."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from .console import console
+from .options import (
+    Command,
+    console_options,
+    json_option,
+    overwrite_option,
+    path_option,
+    tables_settings_options,
+    work_option,
+)
+
+if TYPE_CHECKING:
+    from semloc_logs.evaluation.trajectory_errors import TrajectoryErrors
+    from semloc_logs.settings import Resolved
+
+
+@click.command(cls=Command)
+@work_option
+@path_option("--truth", help="Truth file as of semloc evaluate: trajectory errors are printed.")
+@click.option(
+    "--covariances", is_flag=True, help="Also write how uncertain the pose of each vertex is."
+)
+@overwrite_option
+@json_option
+@tables_settings_options
+@console_options
+def command(
+    work: Path,
+    truth: Path | None,
+    covariances: bool,
+    overwrite: bool,
+    as_json: bool,
+    settings: Resolved,
+) -> int:
+    """Closures -> all sessions in one frame, by a robust pose graph.
+
+    Sessions that closures connect get poses in the map frame of the first of them. Closures that
+    contradict odometry and the other closures are refused. Writes optimized/.
+
+    \b
+    Example:  semloc optimize -w work
+    """
+    from semloc_logs.evaluation.trajectory_errors import trajectory_errors
+    from semloc_logs.stages.optimise import optimise
+    from semloc_logs.workspace import Workspace
+
+    workspace = Workspace(work)
+    with console.progress():
+        report = optimise(workspace, settings, covariances=covariances, overwrite=overwrite)
+    errors = None if truth is None else trajectory_errors(workspace, truth)
+    if as_json:
+        console.result_json(asdict(report) | ({} if errors is None else errors.to_json()))
+        return 0
+    frames = "1 frame" if report.frames == 1 else f"{report.frames} frames"
+    console.result(
+        f"{report.sessions} sessions in {frames} by {report.closures} closures,"
+        f" {report.rejected} of them refused: {workspace.optimized}"
+    )
+    if errors is not None:
+        show_trajectory_errors(errors)
+    return 0
+
+
+def show_trajectory_errors(errors: TrajectoryErrors) -> None:
+    """Errors of each session before and after, and of all together."""
+    rows = [
+        (
+            row.session,
+            row.frame,
+            *(
+                "-" if value is None else f"{value:.3f}"
+                for value in (row.ate_before_m, row.ate_after_m, row.rpe_before_m, row.rpe_after_m)
+            ),
+        )
+        for row in errors.trajectories
+    ]
+    columns = ("session", "frame", "ATE before (m)", "after (m)", "RPE before (m)", "after (m)")
+    console.table("Trajectories against the truth, each aligned alone", columns, rows)
+    if errors.ate_after_m is not None:
+        before = "-" if errors.ate_before_m is None else f"{errors.ate_before_m:.3f} m"
+        console.result(f"ATE {before} before, {errors.ate_after_m:.3f} m after")

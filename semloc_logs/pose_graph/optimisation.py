@@ -1,0 +1,169 @@
+"""All sessions in one frame: consistent sets, initial poses, a robust solution, and what it says
+of each closure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from semloc_logs.numerics.transforms import inverse
+from semloc_logs.pose_graph.carried_poses import SolvedPoses
+from semloc_logs.pose_graph.consistent_sets import ConsistentSet, consistent_sets
+from semloc_logs.pose_graph.graph import PoseGraph, turned_covariance
+from semloc_logs.pose_graph.initial_poses import place_sessions
+from semloc_logs.pose_graph.problem import Problem, problem_of
+from semloc_logs.pose_graph.solver import BOUND, Method, Solution, Solver
+from semloc_logs.settings import ResolvedOptimize
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+# closures of two sessions that agree, from which on the ones that do not are doubted
+CONFIRMED = 3
+SAME_PLACE_M = 1e-6  # keeps keyframes of one place in order
+READMISSIONS = 3  # times that refused closures which fit the solution come back
+
+
+class Verdict(Enum):
+    """What became of a closure."""
+
+    KEPT = "kept"
+    INCONSISTENT = "contradicts the other closures of these two sessions"
+    OUTLIER = "contradicts the other sessions and closures"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optimised:
+    """Poses ``solved`` (v, 4, 4) of the vertices of ``problem``, which thins ``graph``.
+
+    ``component`` (k,) tells which chains share a frame: the map frame of their first. ``verdict``
+    (m,) and ``squared_error`` (m,), whitened, are of the closures, ``covariance`` (v, 6, 6) of the
+    poses, if it was requested.
+    """
+
+    graph: PoseGraph
+    problem: Problem
+    solved: F64
+    component: I64
+    verdict: list[Verdict]
+    squared_error: F64
+    method: Method
+    covariance: F64 | None = None
+
+    @property
+    def kept(self) -> Mask:
+        """Which closures (m,) hold."""
+        return np.array([verdict is Verdict.KEPT for verdict in self.verdict], bool)
+
+    @property
+    def common_T_base(self) -> F64:
+        """Poses (n, 4, 4) of all vertices of the graph."""
+        return _all_poses(self.graph, self.problem, self.solved)
+
+
+def optimise_graph(
+    graph: PoseGraph, settings: ResolvedOptimize, *, covariances: bool = False
+) -> Optimised:
+    """Solve ``graph``. SemlocError where GTSAM is not installed."""
+    sets = consistent_sets(graph, settings)
+    consistent = _consistent(graph, sets)
+    placement = place_sessions(graph, sets)
+    placed = placement.common_T_map[graph.chain_of] @ graph.map_T_base
+
+    # a coarse graph tells closures apart, a fine one has the poses
+    coarse = problem_of(graph, settings, coarse=True)
+    solver = Solver(coarse, _anchors(coarse, placement.component), placed[coarse.kept])
+    rough = solver.solve(placed[coarse.kept], consistent.astype(float), settings.seconds)
+    carried = _all_poses(graph, coarse, rough.common_T_base)
+    problem = problem_of(graph, settings)
+    solver = Solver(problem, _anchors(problem, placement.component), carried[problem.kept])
+    solution = solver.refined(carried[problem.kept], rough.weight)
+    solution = _readmitted(solver, solution)
+    kept = solution.weight > 0.5
+    verdict = [
+        Verdict.KEPT if k else Verdict.OUTLIER if c else Verdict.INCONSISTENT
+        for k, c in zip(kept, consistent, strict=True)
+    ]
+    component = _components(graph, kept)
+    common_T_solved = _to_own_frames(graph, problem, solution.common_T_base, component)
+    covariance = None
+    if covariances:
+        marginal = solver.covariances(solution.common_T_base, solution.weight)
+        covariance = turned_covariance(common_T_solved[:, :3, :3], marginal)
+    return Optimised(
+        graph,
+        problem,
+        common_T_solved @ solution.common_T_base,
+        component,
+        verdict,
+        solution.squared_error,
+        rough.method,
+        covariance,
+    )
+
+
+def _consistent(graph: PoseGraph, sets: list[ConsistentSet]) -> Mask:
+    """The closures (m,) of each pair of sessions that do not contradict several others of it."""
+    consistent = np.ones(len(graph.loops), bool)
+    for pair in sets:
+        if len(pair.members) >= CONFIRMED:
+            consistent[pair.others] = False
+    return consistent
+
+
+def _readmitted(solver: Solver, solution: Solution) -> Solution:
+    """The solution with every closure that fits it, and without those that do not any more."""
+    for _ in range(READMISSIONS):
+        fits = solution.squared_error <= BOUND
+        if np.array_equal(fits, solution.weight > 0.5):
+            break
+        solution = solver.refined(solution.common_T_base, fits.astype(float))
+    return solution
+
+
+def _anchors(problem: Problem, component: I64) -> I64:
+    """The first vertex of each component."""
+    _, first = np.unique(component[problem.chain], return_index=True)
+    return np.asarray(first, np.int64)
+
+
+def _components(graph: PoseGraph, kept: Mask) -> I64:
+    """Chains (k,) that closures connect, numbered by their first."""
+    count = len(graph.chains)
+    a = graph.chain_of[graph.loops.target[kept]]
+    b = graph.chain_of[graph.loops.query[kept]]
+    links = coo_matrix((np.ones(len(a)), (a, b)), (count, count))
+    _, labels = connected_components(links, directed=False)
+    _, first, numbers = np.unique(labels, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[numbers], np.int64)
+
+
+def _to_own_frames(graph: PoseGraph, problem: Problem, poses: F64, component: I64) -> F64:
+    """Transforms (v, 4, 4) of solved poses into the map frame of their component's first chain."""
+    out = np.empty_like(poses)
+    of_vertex = component[problem.chain]
+    for number in np.unique(of_vertex):
+        rows = np.flatnonzero(of_vertex == number)
+        first = rows[0]
+        out[rows] = graph.map_T_base[problem.kept[first]] @ inverse(poses[first])
+    return out
+
+
+def _all_poses(graph: PoseGraph, problem: Problem, poses: F64) -> F64:
+    """Poses (n, 4, 4) of all vertices of the graph."""
+    out = np.empty((graph.vertices, 4, 4))
+    bounds = np.searchsorted(problem.kept, [*graph.first, graph.vertices])
+    for k, (first, chain) in enumerate(zip(graph.first, graph.chains, strict=True)):
+        rows = slice(bounds[k], bounds[k + 1])
+        known = problem.kept[rows] - first
+        # keyframes of several sensors, or of a vehicle that stands, are at one place of the road
+        place = chain.distance + SAME_PLACE_M * np.arange(len(chain))
+        solved = SolvedPoses(place[known], chain.map_T_base[known], poses[rows])
+        out[first : first + len(chain)] = solved.carried(place, chain.map_T_base)
+    return out

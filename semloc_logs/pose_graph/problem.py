@@ -1,0 +1,161 @@
+"""The graph that is solved: vertices every few metres of road, and not every keyframe.
+
+A closure is moved to the nearest vertex along its session's odometry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.numerics.transforms import inverse
+from semloc_logs.pose_graph.graph import Loops, PoseGraph, turned_covariance
+from semloc_logs.pose_graph.odometry_noise import OdometryNoise
+from semloc_logs.settings import ResolvedOptimize
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+COARSE = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edges:
+    """Relative poses ``a_T_b`` (m, 4, 4) of the vertices ``b`` in the vertices ``a``.
+
+    ``root`` (m, 6, 6) are square roots of their information: ``root @ error`` has unit variance,
+    for errors (x y z rotation-x rotation-y rotation-z) in the axes of ``b``.
+    """
+
+    a: I64
+    b: I64
+    a_T_b: F64
+    root: F64
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+    def part(self, rows: NDArray[np.bool_]) -> Edges:
+        """Some of the edges."""
+        return Edges(self.a[rows], self.b[rows], self.a_T_b[rows], self.root[rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Directions:
+    """Where up is in the base frames (g, 3) of some ``vertices`` (g,), to ``sigma`` radians."""
+
+    vertices: I64
+    up: F64
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """``kept`` are the graph's vertices (v,) that are solved for, ``chain`` (v,) their sessions.
+
+    ``odometry`` connects neighbours of a chain, ``loops`` are in the order of the closures.
+    """
+
+    kept: I64
+    chain: I64
+    odometry: Edges
+    loops: Edges
+    up: Directions
+
+
+def problem_of(graph: PoseGraph, settings: ResolvedOptimize, *, coarse: bool = False) -> Problem:
+    """Thin ``graph`` to a vertex where closures end, at most one in ``vertex_spacing`` metres.
+
+    Elsewhere, and everywhere in a ``coarse`` problem, there is one in COARSE times as much road.
+    """
+    noise = OdometryNoise.of(settings)
+    kept = _kept(graph, settings.vertex_spacing, coarse=coarse)
+    odometry = _odometry(graph, kept, noise)
+    loops = _moved_loops(graph, kept, noise, settings)
+    return Problem(kept, graph.chain_of[kept], odometry, loops, _up(graph, kept, settings))
+
+
+def _kept(graph: PoseGraph, spacing: float, *, coarse: bool) -> I64:
+    """The first vertex of each stretch of road, of each with a closure's end, and the last one."""
+    wide = _starts(graph, np.floor(graph.distance / (COARSE * spacing)))
+    last = graph.first + np.array([len(chain) for chain in graph.chains], np.int64) - 1
+    kept = np.zeros(graph.vertices, bool)
+    kept[wide] = True
+    kept[last] = True
+    if not coarse:
+        narrow = _starts(graph, np.floor(graph.distance / spacing))
+        ends = np.concatenate([graph.loops.target, graph.loops.query])
+        kept[narrow[np.searchsorted(narrow, ends, "right") - 1]] = True
+    return np.flatnonzero(kept)
+
+
+def _starts(graph: PoseGraph, stretch: F64) -> I64:
+    """The first vertex of each ``stretch`` (n,) of road of each session."""
+    chain = graph.chain_of
+    is_start = (np.diff(stretch, prepend=-1) != 0) | (np.diff(chain, prepend=-1) != 0)
+    return np.flatnonzero(is_start)
+
+
+def _odometry(graph: PoseGraph, kept: I64, noise: OdometryNoise) -> Edges:
+    chain = graph.chain_of[kept]
+    a = np.flatnonzero(chain[1:] == chain[:-1])
+    b = a + 1
+    poses = graph.map_T_base[kept]
+    road = graph.distance[kept[b]] - graph.distance[kept[a]]
+    root = np.zeros((len(a), 6, 6))
+    axis = np.arange(3)
+    root[:, axis, axis] = (1.0 / np.sqrt(noise.position_variance(road)))[:, None]
+    root[:, axis + 3, axis + 3] = (1.0 / np.sqrt(noise.turn_variance(road)))[:, None]
+    return Edges(a, b, inverse(poses[a]) @ poses[b], root)
+
+
+def _moved_loops(
+    graph: PoseGraph, kept: I64, noise: OdometryNoise, settings: ResolvedOptimize
+) -> Edges:
+    """The closures, moved along the road to the nearest vertices that are kept."""
+    loops = graph.loops
+    target = nearest_kept(graph, kept, loops.target)
+    query = nearest_kept(graph, kept, loops.query)
+    poses = graph.map_T_base
+    to_target = inverse(poses[kept[target]]) @ poses[loops.target]
+    to_query = inverse(poses[loops.query]) @ poses[kept[query]]
+    covariance = _in_axes_of_query(loops) + _floor(settings)
+    moved = np.abs(graph.distance[kept[target]] - graph.distance[loops.target])
+    moved = moved + np.abs(graph.distance[kept[query]] - graph.distance[loops.query])
+    axis = np.arange(3)
+    covariance[:, axis, axis] += noise.position_variance(moved)[:, None]
+    covariance[:, axis + 3, axis + 3] += noise.turn_variance(moved)[:, None]
+    # into the axes of the vertex
+    covariance = turned_covariance(np.swapaxes(to_query[:, :3, :3], 1, 2), covariance)
+    root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), 1, 2)
+    return Edges(target, query, to_target @ loops.target_T_query @ to_query, root)
+
+
+def _floor(settings: ResolvedOptimize) -> F64:
+    """What maps and poses of a place add to the covariance of a closure (6, 6)."""
+    sigma = [settings.closure_sigma] * 3 + [float(np.radians(settings.closure_sigma_deg))] * 3
+    return np.diag(np.square(sigma))
+
+
+def _in_axes_of_query(loops: Loops) -> F64:
+    """Covariances (m, 6, 6) with increments in the query's axes instead of the target's."""
+    query_R_target = np.swapaxes(loops.target_T_query[:, :3, :3], 1, 2)
+    return turned_covariance(query_R_target, loops.covariance)
+
+
+def nearest_kept(graph: PoseGraph, kept: I64, vertices: I64) -> I64:
+    """Index into ``kept`` of the vertex of the same session that is nearest along the road."""
+    after = np.clip(np.searchsorted(kept, vertices), 0, len(kept) - 1)
+    before = np.clip(np.searchsorted(kept, vertices, "right") - 1, 0, len(kept) - 1)
+    same_after = graph.chain_of[kept[after]] == graph.chain_of[vertices]
+    to_after = np.abs(graph.distance[kept[after]] - graph.distance[vertices])
+    to_before = np.abs(graph.distance[kept[before]] - graph.distance[vertices])
+    return np.where(same_after & (to_after < to_before), after, before)
+
+
+def _up(graph: PoseGraph, kept: I64, settings: ResolvedOptimize) -> Directions:
+    level = np.array([chain.level for chain in graph.chains], bool)
+    vertices = np.flatnonzero(level[graph.chain_of[kept]])
+    up = graph.map_T_base[kept[vertices]][:, 2, :3]
+    return Directions(vertices, up, float(np.radians(settings.gravity_sigma_deg)))
