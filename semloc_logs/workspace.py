@@ -153,5 +153,9 @@ class Workspace:
         return self.path / "closures.png"
 
     @property
+    def report(self) -> Path:
+        return self.path / "report.html"
+
+    @property
     def summary(self) -> Path:
         return self.path / "run.json"

@@ -32,6 +32,7 @@ ORDER = [
     "closures",
     "pictures",
     "exports",
+    "report_page",
     "engines",
     "stages",
     "simulation",

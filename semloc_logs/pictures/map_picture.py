@@ -72,9 +72,19 @@ def draw_map(voxels: Path, trajectory: NDArray[np.floating], caption: Caption, p
     sheet.save(path)
 
 
-def _canvas(voxels: Path, drive: F64, low: I64, high: I64) -> tuple[Canvas, bool]:
+def bare_map(voxels: Path, drive: F64, most: int) -> tuple[Canvas, bool]:
+    """The map without letters, at most ``most`` pixels along an edge; ``drive`` (n, 3) in voxels.
+
+    The second value tells whether it was cut because the drive is indoors.
+    """
+    return _canvas(voxels, drive, *_extent(voxels, drive), most)
+
+
+def _canvas(
+    voxels: Path, drive: F64, low: I64, high: I64, most: int = LARGE_MAP
+) -> tuple[Canvas, bool]:
     """The map from ``low`` to ``high``, and whether it was cut because the drive is indoors."""
-    step = max(1, -(-int((high - low).max()) // LARGE_MAP))
+    step = max(1, -(-int((high - low).max()) // most))
     canvas = Canvas.over(low, high, step)
     for ijk, label in _rows(voxels):
         canvas.add(ijk, label)
