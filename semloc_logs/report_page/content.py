@@ -37,7 +37,7 @@ class Tables:
     """The tables of a workspace; ``outcomes`` are its alignments with what decided about them."""
 
     maps: Mapping[str, SessionMap]
-    closures: Sequence[Row]
+    closures: list[dict[str, Any]]
     rejected: Sequence[Row]
     outcomes: Mapping[Key, Closure | Rejected]
     placement: Placement

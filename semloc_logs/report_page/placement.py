@@ -22,6 +22,8 @@ from semloc_logs.workspace import Workspace
 F64 = NDArray[np.float64]
 GAP = 0.06  # between groups, over the width of the picture
 LEAST_GAP = 10.0  # metres
+ASPECT = 1.6  # of the picture: width over height
+MOST_COLUMNS = 40  # of groups
 
 
 @dataclass(slots=True, eq=False)
@@ -244,17 +246,33 @@ def _lay_out(placement: Placement) -> None:
         return
     sizes = np.array([high - low for low, high in boxes])
     gap = max(LEAST_GAP, GAP * float(sizes.max()))
-    width = max(float(sizes[:, 0].max()), float(np.sqrt(np.prod(sizes + gap, axis=1).sum())))
-    x = y = row_height = 0.0
-    for group, (low, high) in zip(placement.groups, boxes, strict=True):
-        size = high - low
-        if x > 0 and x + size[0] > width:
-            x = 0.0
-            y -= row_height + gap
-            row_height = 0.0
-        shift = np.array([x, y]) - np.array([low[0], high[1]])
+    most = np.cumsum(sizes[:, 0] + gap)
+    layouts = [_rows(sizes, gap, float(width)) for width in most[:MOST_COLUMNS]]
+    corners = min(layouts, key=lambda c: _extent(c, sizes))
+    for group, corner, (low, high) in zip(placement.groups, corners, boxes, strict=True):
+        shift = corner - [low[0], high[1]]
         for name in group:
             placement.common_T_base[name][:, :2, 3] += shift
             placement.common_T_map[name][:2, 3] += shift
-        x += size[0] + gap
-        row_height = max(row_height, float(size[1]))
+
+
+def _rows(sizes: F64, gap: float, width: float) -> F64:
+    """Upper left corners (n, 2) of boxes (n, 2) in rows not wider than ``width``."""
+    corners = np.zeros((len(sizes), 2))
+    x = y = row_height = 0.0
+    for k, (box_width, box_height) in enumerate(sizes.tolist()):
+        if x > 0 and x + box_width > width:
+            x = 0.0
+            y -= row_height + gap
+            row_height = 0.0
+        corners[k] = x, y
+        x += box_width + gap
+        row_height = max(row_height, box_height)
+    return corners
+
+
+def _extent(corners: F64, sizes: F64) -> float:
+    """The height of a picture of the usual shape that holds all boxes."""
+    width = float((corners[:, 0] + sizes[:, 0]).max())
+    height = -float((corners[:, 1] - sizes[:, 1]).min())
+    return max(width / ASPECT, height)

@@ -39,7 +39,7 @@ def write_report(
     placement = place_sessions(work, maps, closures)
     tables = Tables(maps, closures, rejected, _outcomes(work, maps, settings), placement)
     content = content_of(work, tables, _settings_of(work))
-    pictures = {} if slim else _sheets(content, maps, tables)
+    pictures = {} if slim else _pictures(work, content, tables)
     path = output or work.report
     with replacing_file(path) as temporary:
         # a name that is not Unicode becomes a replacement character
@@ -66,22 +66,20 @@ def _settings_of(work: Workspace) -> dict[str, Any]:
     return settings if isinstance(settings, dict) else {}
 
 
-def _sheets(content: dict[str, Any], maps: dict[str, SessionMap], tables: Tables) -> dict[str, str]:
-    """The maps of sessions as pictures by their ids; where they lie is added to ``content``."""
+def _pictures(work: Workspace, content: dict[str, Any], tables: Tables) -> dict[str, str]:
+    """Pictures by their ids; where the maps lie is added to ``content``."""
     # matplotlib and OpenCV are loaded only where something is drawn
+    from semloc_logs.report_page.closure_pictures import closure_pictures
     from semloc_logs.report_page.map_sheets import map_sheet, sheet_size
 
     pictures = {}
-    most = sheet_size(len(maps))
+    most = sheet_size(len(tables.maps))
     for number, session in enumerate(content["sessions"]):
-        name = session["name"]
-        if name not in tables.placement.common_T_map:  # a log without poses
+        T = tables.placement.common_T_map.get(session["name"])
+        sheet = None if T is None else map_sheet(tables.maps[session["name"]], most)
+        if T is None or sheet is None:  # a log without poses, an empty map
             continue
-        sheet = map_sheet(maps[name], most)
-        if sheet is None:
-            continue
-        T = tables.placement.common_T_map[name]
         session["place"] = [float(T[0, 3]), float(T[1, 3]), float(np.arctan2(T[1, 0], T[0, 0]))]
         session["sheet"] = {k: v for k, v in asdict(sheet).items() if k != "picture"}
         pictures[f"sheet-{number}"] = sheet.picture
-    return pictures
+    return pictures | closure_pictures(work, tables.closures)

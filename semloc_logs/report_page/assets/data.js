@@ -78,7 +78,9 @@ function plural(count, noun) {
 /** Close to 1 more digits are shown: 0.9993. */
 function probabilityText(p) {
   if (!Number.isFinite(p)) return "-";
-  return p.toFixed(p >= 0.99995 || p < 0.00005 ? 1 : p > 0.99 ? 4 : 3);
+  if (p >= 0.99995) return "> 0.9999";
+  if (p > 0 && p < 0.0005) return "< 0.001";
+  return p.toFixed(p > 0.99 ? 4 : 3);
 }
 
 function degreesText(radians) {

@@ -3,6 +3,9 @@
 const PICK = 9; // pixels around the pointer
 const MOST_ZOOM = 400; // pixels a metre
 const FIT = 0.92; // share of the canvas that everything fills
+const MANY_CLOSURES = 1500; // on the map, from which on they are drawn finer from far away
+const SLOW = 14; // ms of a painting, from which on the last one is moved while the view moves
+const REST = 130; // ms without movement after which it is painted again
 const PLACES_FROM = 3; // pixels between places, from which on they are drawn
 
 class MapView {
@@ -110,14 +113,14 @@ class MapView {
     this.x = x - (px - this.width / 2) / this.scale;
     this.y = y + (py - this.height / 2) / this.scale;
     this.isFitted = false;
-    this.draw();
+    this.draw(true);
   }
 
   pan(dx, dy) {
     this.x -= dx / this.scale;
     this.y += dy / this.scale;
     this.isFitted = false;
-    this.draw();
+    this.draw(true);
   }
 
   /** Bring row `k` into view, closer if its ends could not be told apart. */
@@ -141,15 +144,44 @@ class MapView {
 
   // -- drawing
 
-  draw() {
+  draw(isMoving = false) {
+    this.isMoving = isMoving && (this.isMoving || !this.frames);
     if (this.frames) return;
     this.frames = requestAnimationFrame(() => {
       this.frames = 0;
-      this.paint();
+      if (this.isMoving && this.last && this.paintMs > SLOW) this.paintMoved();
+      else this.paint();
+      this.isMoving = false;
     });
   }
 
+  /** The last painting as seen from here; it is painted anew when the view rests. */
+  paintMoved() {
+    const c = this.context;
+    const ratio = devicePixelRatio || 1;
+    const zoom = this.scale / this.last.scale;
+    c.setTransform(ratio, 0, 0, ratio, 0, 0);
+    c.fillStyle = this.last.background;
+    c.fillRect(0, 0, this.width, this.height);
+    const dx = this.width / 2 + (this.last.x - this.x) * this.scale - (zoom * this.width) / 2;
+    const dy = this.height / 2 - (this.last.y - this.y) * this.scale - (zoom * this.height) / 2;
+    c.drawImage(this.copy, dx, dy, zoom * this.width, zoom * this.height);
+    clearTimeout(this.rest);
+    this.rest = setTimeout(() => this.draw(), REST);
+  }
+
+  keep() {
+    this.copy = this.copy || document.createElement("canvas");
+    if (this.copy.width !== this.canvas.width || this.copy.height !== this.canvas.height) {
+      this.copy.width = this.canvas.width;
+      this.copy.height = this.canvas.height;
+    }
+    this.copy.getContext("2d").drawImage(this.canvas, 0, 0);
+    this.last = { x: this.x, y: this.y, scale: this.scale, background: css("--panel") };
+  }
+
   paint() {
+    clearTimeout(this.rest);
     const began = performance.now();
     const ratio = devicePixelRatio || 1;
     const c = this.context;
@@ -166,7 +198,9 @@ class MapView {
     this.paintSelected();
     this.paintScale();
     this.paintGroups();
-    this.canvas.dataset.paintMs = (performance.now() - began).toFixed(1);
+    this.keep();
+    this.paintMs = performance.now() - began;
+    this.canvas.dataset.paintMs = this.paintMs.toFixed(1);
   }
 
   worldFor(s) {
@@ -244,17 +278,20 @@ class MapView {
     const rows = data.closures;
     const byStep = Array.from({ length: STEPS }, () => []);
     for (const k of state.shown) byStep[stepOf(rows.probability[k])].push(k);
-    const radius = rows.count > 3000 && this.scale < 2 ? 1.6 : 2.8;
+    const isDense = state.shown.length > MANY_CLOSURES && this.scale < 3;
+    const radius = isDense ? 1.1 : 2.8;
+    c.globalAlpha = isDense ? 0.55 : 1;
     const offsets = data.sessions.map((_, s) => this.offset(s));
     const left = this.width / 2 - this.x * this.scale;
     const top = this.height / 2 + this.y * this.scale;
     const xy = rows.xy;
-    rampColours().forEach((colour, step) => {
+    // the least probable last, so that they are seen
+    [...rampColours().entries()].reverse().forEach(([step, colour]) => {
       const some = byStep[step];
       if (!some.length) return;
       c.strokeStyle = colour;
       c.fillStyle = colour;
-      c.lineWidth = 1.6;
+      c.lineWidth = isDense ? 0.7 : 1.6;
       c.beginPath();
       for (const k of some) {
         const a = offsets[rows.sessions[2 * k]];
@@ -271,6 +308,7 @@ class MapView {
       c.stroke();
       c.fill();
     });
+    c.globalAlpha = 1;
   }
 
   paintSelected() {

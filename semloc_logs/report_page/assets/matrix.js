@@ -29,8 +29,9 @@ function buildMatrix() {
       td.style.background = `rgb(var(--high) / ${(0.18 + (0.5 * Math.log(1 + count)) / Math.log(1 + most)).toFixed(2)})`;
       td.title = `${names}: ${plural(count, "closure")}`;
     } else if (k >= 0) {
-      td.textContent = probabilityText(data.rejected.probability[k]).slice(0, 4);
+      td.textContent = data.rejected.probability[k].toFixed(2);
       td.className = "none";
+      td.style.background = `rgb(var(--low) / ${(0.05 + 0.35 * data.rejected.probability[k]).toFixed(2)})`;
       td.title = `${names}: no closure; ${reasonText(data.rejected, k)}`;
     } else {
       td.textContent = "-";

@@ -110,6 +110,12 @@ function warningCell(s) {
 
 // -- run
 
+function settingText(value) {
+  if (value === null) return "-";
+  if (typeof value === "number" && !Number.isInteger(value)) return String(Number(value.toPrecision(8)));
+  return typeof value === "object" ? JSON.stringify(value) : String(value);
+}
+
 function buildRun() {
   const parts = [];
   const seconds = Object.entries(data.run.seconds || {});
@@ -119,7 +125,7 @@ function buildRun() {
   const left = [...(data.run.skipped || []), ...data.failed.map((f) => `${f.session}: ${f.reason}`)];
   parts.push(el("div", {}, el("h3", {}, "Input that was left out"), left.length ? left.map((text) => el("p", { class: "warn" }, text)) : el("p", {}, "none")));
   const groups = Object.entries(data.settings).map(([section, values]) =>
-    el("details", {}, el("summary", {}, section), facts(Object.entries(values).map(([key, value]) => [key, value === null ? "-" : typeof value === "object" ? JSON.stringify(value) : String(value)]))));
+    el("details", {}, el("summary", {}, section), facts(Object.entries(values).map(([key, value]) => [key, settingText(value)]))));
   parts.push(el("div", {}, el("h3", {}, "Settings of the tables"), groups.length ? groups : el("p", {}, "not known")));
   byId("run-tables").replaceChildren(...parts);
 }
