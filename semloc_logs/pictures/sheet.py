@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
@@ -19,6 +21,7 @@ from matplotlib.text import Text
 from matplotlib.transforms import IdentityTransform
 from numpy.typing import NDArray
 
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.pictures.colours import INK, SOFT, WHITE, Colour, Legend, web_colour
 from semloc_logs.pictures.fonts import written
 from semloc_logs.pictures.map_marks import DPI, SMALL, TEXT, scale_bar
@@ -38,6 +41,7 @@ AXIS_LENGTH = 34
 FOOT_HEIGHT = 58  # holds the scale bar and the axes of the map
 SWATCH = 46  # of a legend entry: the patch of colour, and the room around it
 SEPARATOR = "  |  "
+FORMATS = ("png", "svg", "pdf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -281,6 +285,18 @@ class Sheet:
         """PNG."""
         write_png(path, self.image())
 
+    def write(self, file: BinaryIO, form: str) -> None:
+        """SVG or PDF, the same bytes each time; its letters are outlines or in the file."""
+        metadata: dict[str, Any] = {"Date": None} if form == "svg" else {"CreationDate": None}
+        with rc_context({"svg.hashsalt": "semloc", "pdf.fonttype": 42}):
+            self._figure.savefig(file, format=form, metadata=metadata)
+
+    @property
+    def points(self) -> tuple[float, float]:
+        """Width and height in points, as a page has them."""
+        width, height = self._figure.get_size_inches()
+        return float(width) * 72, float(height) * 72
+
 
 def rendered(figure: Figure) -> U8:
     """The pixels (height, width, 3) of a figure with a canvas of Agg, RGB."""
@@ -302,3 +318,45 @@ def below_each_other(images: Sequence[U8]) -> U8:
     return np.vstack(
         [np.pad(i, ((0, 0), (0, width - i.shape[1]), (0, 0)), constant_values=255) for i in images]
     )
+
+
+def write_sheets(path: Path, sheets: Sequence[Sheet]) -> None:
+    """PNG, SVG or PDF by the ending of ``path``, which appears complete or not at all.
+
+    In a PNG and an SVG the sheets are in one column, in a PDF each is a page. WorkspaceError for
+    another ending.
+    """
+    form = path.suffix.lower().removeprefix(".")
+    if form not in FORMATS:
+        raise WorkspaceError(
+            f"{path} does not end in {', '.join(f'.{f}' for f in FORMATS)}: give a name that does."
+        )
+    if form == "png":
+        write_png(path, below_each_other([sheet.image() for sheet in sheets]))
+        return
+    with replacing_file(path) as temporary, temporary.open("wb") as file:
+        if form == "svg":
+            file.write(_svg_column(sheets).encode())
+        else:
+            from matplotlib.backends.backend_pdf import PdfPages
+
+            metadata: dict[str, Any] = {"CreationDate": None}
+            with PdfPages(file, metadata=metadata) as pages:
+                for sheet in sheets:
+                    sheet.write(pages, form)
+
+
+def _svg_column(sheets: Sequence[Sheet]) -> str:
+    """One SVG with the sheets below each other."""
+    parts = []
+    top = 0.0
+    for sheet in sheets:
+        buffer = BytesIO()
+        sheet.write(buffer, "svg")
+        drawn = buffer.getvalue().decode()
+        parts.append(f'<svg x="0" y="{top:g}" ' + drawn[drawn.index("<svg") + len("<svg ") :])
+        top += sheet.points[1]
+    width = max(sheet.points[0] for sheet in sheets)
+    size = f'width="{width:g}pt" height="{top:g}pt" viewBox="0 0 {width:g} {top:g}"'
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" version="1.1" {size}>'
+    return "\n".join(['<?xml version="1.0" encoding="utf-8"?>', head, *parts, "</svg>\n"])

@@ -9,9 +9,9 @@ from typing import Any
 from semloc_logs.errors import SemlocError
 from semloc_logs.pictures.closure_scene import ClosureScene
 from semloc_logs.pictures.closure_view import Choice, closing_settings, closure_view
+from semloc_logs.pictures.placement import pose_of
 from semloc_logs.pictures.solids import top_view
 from semloc_logs.report_page.map_sheets import webp
-from semloc_logs.report_page.placement import pose_of
 from semloc_logs.workspace import Workspace
 
 MOST = 40  # closures with pictures: half a second each

@@ -16,8 +16,8 @@ from semloc_logs.closures.closure import FEATURES, Agreement, Closure, Rejected
 from semloc_logs.closures.closure_tables import AGREEMENT_COLUMNS
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
+from semloc_logs.pictures.placement import Placement, keyframe_near, pose_of
 from semloc_logs.report_page.packed import BYTE, FLOAT, INDEX, SIGNED, packed
-from semloc_logs.report_page.placement import Placement, keyframe_near, pose_of
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_json
 from semloc_logs.workspace import Workspace

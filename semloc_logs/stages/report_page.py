@@ -12,9 +12,9 @@ from semloc_logs.closures.closure import Closure, Rejected
 from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
+from semloc_logs.pictures.placement import Tie, place_sessions
 from semloc_logs.report_page.content import Key, Tables, content_of
 from semloc_logs.report_page.page import page
-from semloc_logs.report_page.placement import place_sessions
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.close import decided_alignments
 from semloc_logs.tables.atomic_files import replacing_file
@@ -36,7 +36,7 @@ def write_report(
         )
     closures = read_closures(work.closures)
     rejected = read_closures(work.rejected)
-    placement = place_sessions(work, maps, closures)
+    placement = place_sessions(work, maps, [Tie.of_row(row) for row in closures])
     tables = Tables(maps, closures, rejected, _outcomes(work, maps, settings), placement)
     content = content_of(work, tables, _settings_of(work))
     pictures = {} if slim else _pictures(work, content, tables)

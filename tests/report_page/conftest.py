@@ -15,6 +15,12 @@ from typing import Any
 
 import pytest
 
+from semloc_logs.settings import Settings
+from semloc_logs.simulation.output.workspace_tables import TablesPlan, write_tables
+from semloc_logs.stages.report_page import write_report
+from semloc_logs.tables.table import read_json, write_json
+from semloc_logs.workspace import Workspace
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PATIENCE = 60.0  # seconds for an answer on a loaded machine
 FLAGS = (
@@ -182,3 +188,27 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     opened = Browser(program, tmp_path_factory.mktemp("chromium"))
     yield opened
     opened.close()
+
+
+HOSTILE = "<img src=x onerror=alert(1)>&\"' {{data}}"
+TOPIC = "/</script><script>alert(2)</script>"
+
+
+@pytest.fixture(scope="session")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """Four drives on two roads that nothing connects, one of them with a hostile name."""
+    work = Workspace(tmp_path_factory.mktemp("tables") / "streets & <b>lanes<b>")
+    plan = TablesPlan(sessions=4, closures=30, road=400.0, groups=2)
+    write_tables(work, plan, ("monday", HOSTILE, "wednesday", "thursday"))
+    path = work.session("monday").session_json
+    content = read_json(path)
+    content["streams"][0]["topic"] = TOPIC
+    content["skipped"] = ["Topic /gps: <i>no fix</i> in the first 3 s."]
+    write_json(path, content)
+    return work
+
+
+@pytest.fixture(scope="session")
+def report(tables: Workspace) -> Path:
+    """The page of these drives."""
+    return write_report(tables, Settings().resolved())

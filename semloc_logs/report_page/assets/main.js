@@ -60,6 +60,7 @@ function start() {
   showSummary();
   buildLegend();
   const view = new MapView(byId("map"));
+  globalThis.VIEW = view;
   document.querySelectorAll("[data-view]").forEach((button) => button.addEventListener("click", () => {
     const actions = { in: () => view.zoom(1.5), out: () => view.zoom(1 / 1.5), fit: () => view.fit() };
     actions[button.dataset.view]();

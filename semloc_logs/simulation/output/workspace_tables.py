@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -213,7 +214,7 @@ def _voxels(drive: _Drive, rng: np.random.Generator) -> dict[str, NDArray[np.gen
     walls = np.arange(0, EVERY, VOXEL)
     n = len(drive.map_T_base)
     seen = (np.sin(np.arange(n) / 7.0 + drive.group) > -0.5)[:, None]
-    parts = []
+    parts: list[tuple[F64, NDArray[Any], NDArray[Any], NDArray[Any]]] = []
     road = np.stack(np.broadcast_arrays(np.zeros((n, 1)), across[None]), -1)
     parts.append((road, np.zeros(road.shape[:2]), np.full(road.shape[:2], ROAD), np.ones((n, 1))))
     for side in (-1, 1):
@@ -342,8 +343,7 @@ def _decision(probability: float, rng: np.random.Generator) -> Decision:
 
 def _write_alignments(work: Workspace, closures: list[Closure], rejected: list[Rejected]) -> None:
     pairs: dict[tuple[str, str], list[Alignment]] = {}
-    for row in (*closures, *rejected):
-        a = row.alignment
+    for a in [*(row.alignment for row in closures), *(row.alignment for row in rejected)]:
         pairs.setdefault((a.query_session, a.target_session), []).append(a)
     for (query, target), alignments in sorted(pairs.items()):
         alignments.sort(key=lambda a: a.query_keyframe)

@@ -41,6 +41,32 @@ class Placement:
     optimised: set[str] = field(default_factory=set)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Tie:
+    """A closure as the picture needs it."""
+
+    query: str
+    target: str
+    query_stamp_ns: int
+    target_stamp_ns: int
+    target_T_query: F64
+    probability: float
+    overlap: float
+
+    @classmethod
+    def of_row(cls, row: Mapping[str, Any]) -> Tie:
+        """Of a row of closures.parquet."""
+        return cls(
+            row["query_session"],
+            row["target_session"],
+            row["query_stamp_ns"],
+            row["target_stamp_ns"],
+            pose_of(row),
+            row["probability"],
+            row["overlap"],
+        )
+
+
 def pose_of(row: Mapping[str, Any]) -> F64:
     """``target_T_query`` (4, 4) of a row of closures.parquet."""
     return transform(
@@ -49,9 +75,9 @@ def pose_of(row: Mapping[str, Any]) -> F64:
 
 
 def place_sessions(
-    work: Workspace, maps: Mapping[str, SessionMap], closures: Sequence[Mapping[str, Any]]
+    work: Workspace, maps: Mapping[str, SessionMap], ties: Sequence[Tie]
 ) -> Placement:
-    """The poses of all keyframes in one picture; ``closures`` are rows of closures.parquet."""
+    """The poses of all keyframes in one picture."""
     placement = Placement()
     for name, session in maps.items():
         poses = _optimised(work, session)
@@ -60,14 +86,14 @@ def place_sessions(
             placement.common_T_map[name] = fitted(session.map_T_base, poses)
             placement.optimised.add(name)
 
-    links = _best_links(maps, closures)
+    links = _best_links(maps, ties)
     placement.groups = _groups(maps, links)
     for group in placement.groups:
         _place_group(placement, group, maps, links)
     _lay_out(placement)
     for session in maps.values():
         if not session.posed:
-            _place_frames(placement, session, maps, closures)
+            _place_frames(placement, session, maps, ties)
     return placement
 
 
@@ -121,30 +147,27 @@ class _Link:
     probability: float
 
 
-def _best_links(
-    maps: Mapping[str, SessionMap], closures: Sequence[Mapping[str, Any]]
-) -> list[_Link]:
+def _best_links(maps: Mapping[str, SessionMap], ties: Sequence[Tie]) -> list[_Link]:
     """A link for each pair of different sessions with poses, the most probable first."""
-    best: dict[tuple[str, str], Mapping[str, Any]] = {}
-    for row in closures:
-        ends = (row["query_session"], row["target_session"])
-        known = all(name in maps and maps[name].posed for name in ends)
-        if not known or ends[0] == ends[1]:
+    best: dict[tuple[str, str], Tie] = {}
+    for tie in ties:
+        known = all(name in maps and maps[name].posed for name in (tie.query, tie.target))
+        if not known or tie.query == tie.target:
             continue
-        other = best.get(ends)
-        rank = (row["probability"], row["overlap"])
-        if other is None or rank > (other["probability"], other["overlap"]):
-            best[ends] = row
+        other = best.get((tie.query, tie.target))
+        rank = (tie.probability, tie.overlap)
+        if other is None or rank > (other.probability, other.overlap):
+            best[tie.query, tie.target] = tie
     links = [
         _Link(
-            query,
-            target,
-            keyframe_near(maps[query], row["query_stamp_ns"]),
-            keyframe_near(maps[target], row["target_stamp_ns"]),
-            pose_of(row),
-            row["probability"],
+            tie.query,
+            tie.target,
+            keyframe_near(maps[tie.query], tie.query_stamp_ns),
+            keyframe_near(maps[tie.target], tie.target_stamp_ns),
+            tie.target_T_query,
+            tie.probability,
         )
-        for (query, target), row in best.items()
+        for tie in best.values()
     ]
     return sorted(links, key=lambda link: (-link.probability, link.query, link.target))
 
@@ -215,21 +238,21 @@ def _place_frames(
     placement: Placement,
     session: SessionMap,
     maps: Mapping[str, SessionMap],
-    closures: Sequence[Mapping[str, Any]],
+    ties: Sequence[Tie],
 ) -> None:
     """Keyframes of a log without poses, each where its most probable closure puts it."""
     name = session.folder.name
     poses = np.full((len(session.stamps_ns), 4, 4), np.nan)
     best = np.full(len(poses), -1.0)
-    for row in closures:
-        target = placement.common_T_base.get(row["target_session"])
-        if row["query_session"] != name or target is None:
+    for tie in ties:
+        target = placement.common_T_base.get(tie.target)
+        if tie.query != name or target is None:
             continue
-        keyframe = keyframe_near(session, row["query_stamp_ns"])
-        if row["probability"] > best[keyframe]:
-            best[keyframe] = row["probability"]
-            end = keyframe_near(maps[row["target_session"]], row["target_stamp_ns"])
-            poses[keyframe] = target[end] @ pose_of(row)
+        keyframe = keyframe_near(session, tie.query_stamp_ns)
+        if tie.probability > best[keyframe]:
+            best[keyframe] = tie.probability
+            end = keyframe_near(maps[tie.target], tie.target_stamp_ns)
+            poses[keyframe] = target[end] @ tie.target_T_query
     placement.common_T_base[name] = poses
 
 
