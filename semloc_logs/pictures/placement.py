@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import interpolate, inverse, transform, yaw_transform
-from semloc_logs.tables.table import read_table
+from semloc_logs.tables.table import read_metadata, read_table
 from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import Workspace
 
@@ -32,13 +32,14 @@ class Placement:
 
     ``common_T_base`` (n, 4, 4) are the poses of the keyframes, NaN where they are not known;
     ``common_T_map`` (4, 4) lays the session's map below them. ``groups`` are names of sessions,
-    the largest group first. ``optimised`` are the sessions with optimised poses.
+    the largest group first. ``optimised`` are the sessions with optimised poses, with their frames:
+    poses of the same frame belong together.
     """
 
     common_T_base: dict[str, F64] = field(default_factory=dict)
     common_T_map: dict[str, F64] = field(default_factory=dict)
     groups: list[list[str]] = field(default_factory=list)
-    optimised: set[str] = field(default_factory=set)
+    optimised: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,14 +81,14 @@ def place_sessions(
     """The poses of all keyframes in one picture."""
     placement = Placement()
     for name, session in maps.items():
-        poses = _optimised(work, session)
+        poses, frame = _optimised(work, session)
         if poses is not None:
             placement.common_T_base[name] = poses
             placement.common_T_map[name] = fitted(session.map_T_base, poses)
-            placement.optimised.add(name)
+            placement.optimised[name] = frame
 
     links = _best_links(maps, ties)
-    placement.groups = _groups(maps, links)
+    placement.groups = _groups(maps, links, placement.optimised)
     for group in placement.groups:
         _place_group(placement, group, maps, links)
     _lay_out(placement)
@@ -97,11 +98,14 @@ def place_sessions(
     return placement
 
 
-def _optimised(work: Workspace, session: SessionMap) -> F64 | None:
-    """Poses (n, 4, 4) of the keyframes by optimized/SESSION.parquet; None where it is missing."""
+def _optimised(work: Workspace, session: SessionMap) -> tuple[F64 | None, str]:
+    """Poses (n, 4, 4) of the keyframes by optimized/SESSION.parquet, and their frame.
+
+    None where the file is missing or is of an earlier log.
+    """
     path = work.path / "optimized" / f"{session.folder.name}.parquet"
     if not path.exists() or not session.posed:
-        return None
+        return None, ""
     table = read_table(path)
     stamps_ns = np.asarray(table["stamp_ns"].to_numpy())
     covers = (
@@ -109,9 +113,10 @@ def _optimised(work: Workspace, session: SessionMap) -> F64 | None:
         and stamps_ns[0] <= session.stamps_ns[-1]
         and (session.stamps_ns[0] <= stamps_ns[-1])
     )
-    if not covers:  # of an earlier log
-        return None
-    return interpolate(stamps_ns, poses_of(table), session.stamps_ns)
+    if not covers:
+        return None, ""
+    frame = str(read_metadata(path).get("frame", ""))
+    return interpolate(stamps_ns, poses_of(table), session.stamps_ns), frame
 
 
 def fitted(map_T_base: F64, common_T_base: F64) -> F64:
@@ -180,8 +185,13 @@ def keyframe_near(session: SessionMap, stamp_ns: int) -> int:
     return right if stamps_ns[right] - stamp_ns <= stamp_ns - stamps_ns[left] else left
 
 
-def _groups(maps: Mapping[str, SessionMap], links: Sequence[_Link]) -> list[list[str]]:
-    """Sessions with poses that links connect, the largest group first, by time within one."""
+def _groups(
+    maps: Mapping[str, SessionMap], links: Sequence[_Link], frames: Mapping[str, str]
+) -> list[list[str]]:
+    """Sessions with poses that links connect, the largest group first, by time within one.
+
+    Those that have ``frames`` belong together if these are the same, and only then.
+    """
     parent = {name: name for name in maps if maps[name].posed}
 
     def root(name: str) -> str:
@@ -190,8 +200,16 @@ def _groups(maps: Mapping[str, SessionMap], links: Sequence[_Link]) -> list[list
             name = parent[name]
         return name
 
+    first_of: dict[str, str] = {}
+    for name, frame in frames.items():
+        parent[root(name)] = root(first_of.setdefault(frame, name))
+    roots = {root(name) for name in frames}
     for link in links:
-        parent[root(link.query)] = root(link.target)
+        one, other = root(link.query), root(link.target)
+        if one in roots:
+            one, other = other, one
+        if one not in roots:  # it is laid on the frame, or joins the other without one
+            parent[one] = other
     order = sorted(parent, key=lambda n: (int(maps[n].stamps_ns[0]), n))
     groups: dict[str, list[str]] = {}
     for name in order:
@@ -209,7 +227,7 @@ def _place_group(
     members = set(group)
     if not members & placement.common_T_base.keys():
         _place(placement, maps[group[0]], np.eye(4))
-    inside = [link for link in links if link.query in members]
+    inside = [link for link in links if {link.query, link.target} <= members]
     while not members <= placement.common_T_base.keys():
         link = next(
             link

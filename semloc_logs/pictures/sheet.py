@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -18,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.text import Text
-from matplotlib.transforms import IdentityTransform
+from matplotlib.transforms import Affine2D, Transform
 from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
@@ -42,6 +43,8 @@ FOOT_HEIGHT = 58  # holds the scale bar and the axes of the map
 SWATCH = 46  # of a legend entry: the patch of colour, and the room around it
 SEPARATOR = "  |  "
 FORMATS = ("png", "svg", "pdf")
+VECTOR: dict[str, Any] = {"svg.hashsalt": "semloc", "pdf.fonttype": 42}  # TrueType in a PDF
+POINTS = re.compile(r'(width|height)="([\d.]+)pt"')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,19 +71,22 @@ class Lettering:
 class _Pixels(Artist):
     """RGB ``picture`` (height, width, 3) as it is, from pixel (left, low) of the figure.
 
-    Images of matplotlib are resampled by floats even then, which takes 100 bytes for each pixel.
+    ``to_canvas`` leads from these pixels to the units of a renderer. Images of matplotlib are
+    resampled by floats even then, which takes 100 bytes for each pixel.
     """
 
-    def __init__(self, picture: U8, left: int, low: int) -> None:
+    def __init__(self, picture: U8, left: int, low: int, to_canvas: Transform) -> None:
         super().__init__()
         self._picture = picture
         self._corner = (left, low)
+        self._to_canvas = to_canvas
         self.set_zorder(-1)  # below the axes
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw into ``renderer``, whose rows run upwards."""
         rows = cv2.cvtColor(self._picture, cv2.COLOR_RGB2RGBA)[::-1]
-        renderer.draw_image(renderer.new_gc(), *self._corner, np.ascontiguousarray(rows))
+        x, y = self._to_canvas.transform(self._corner)
+        renderer.draw_image(renderer.new_gc(), round(x, 3), round(y, 3), np.ascontiguousarray(rows))
 
 
 class Sheet:
@@ -93,6 +99,8 @@ class Sheet:
         self._scale: float = max(1.0, longest / ORDINARY)
         self._figure = Figure(dpi=DPI * self._scale, facecolor=web_colour(WHITE))
         FigureCanvasAgg(self._figure)
+        # of pixels of the sheet; SVG and PDF count in points
+        self._to_canvas = Affine2D().scale(1 / self._dpi) + self._figure.dpi_scale_trans
         gaps = [self._px(GAP) * max(len(row) - 1, 0) for row in rows]
         body = max([w + g for w, g in zip(widths, gaps, strict=True)], default=0)
         self._width = max(body, self._px(NARROWEST)) + 2 * self._px(PAD)
@@ -145,7 +153,7 @@ class Sheet:
             fontfamily=families,
             color=web_colour(colour),
             va="bottom",
-            transform=IdentityTransform(),
+            transform=self._to_canvas,
             parse_math=False,
         )
 
@@ -205,7 +213,7 @@ class Sheet:
             ],
             loc="lower left",
             bbox_to_anchor=(self._px(PAD), bottom),
-            bbox_transform=IdentityTransform(),
+            bbox_transform=self._to_canvas,
             borderaxespad=0,
             borderpad=0,
             frameon=False,
@@ -240,7 +248,7 @@ class Sheet:
         for panel in row:
             height, width = panel.picture.shape[:2]
             low = bottom + row_height - height
-            self._figure.add_artist(_Pixels(panel.picture, left, low))
+            self._figure.add_artist(_Pixels(panel.picture, left, low, self._to_canvas))
             axes = self._area(left, low, width, height)
             axes.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
             for number, line in enumerate(reversed(panel.caption.splitlines())):
@@ -288,7 +296,7 @@ class Sheet:
     def write(self, file: BinaryIO, form: str) -> None:
         """SVG or PDF, the same bytes each time; its letters are outlines or in the file."""
         metadata: dict[str, Any] = {"Date": None} if form == "svg" else {"CreationDate": None}
-        with rc_context({"svg.hashsalt": "semloc", "pdf.fonttype": 42}):
+        with rc_context(VECTOR):
             self._figure.savefig(file, format=form, metadata=metadata)
 
     @property
@@ -341,7 +349,8 @@ def write_sheets(path: Path, sheets: Sequence[Sheet]) -> None:
             from matplotlib.backends.backend_pdf import PdfPages
 
             metadata: dict[str, Any] = {"CreationDate": None}
-            with PdfPages(file, metadata=metadata) as pages:
+            # fonts are written at the end
+            with rc_context(VECTOR), PdfPages(file, metadata=metadata) as pages:
                 for sheet in sheets:
                     sheet.write(pages, form)
 
@@ -354,7 +363,11 @@ def _svg_column(sheets: Sequence[Sheet]) -> str:
         buffer = BytesIO()
         sheet.write(buffer, "svg")
         drawn = buffer.getvalue().decode()
-        parts.append(f'<svg x="0" y="{top:g}" ' + drawn[drawn.index("<svg") + len("<svg ") :])
+        _, _, after = drawn.partition("<svg ")
+        attributes, _, content = after.partition(">")
+        # the units of the column are points
+        attributes = POINTS.sub(r'\1="\2"', attributes)
+        parts.append(f'<svg x="0" y="{top:g}" {attributes}>{content}')
         top += sheet.points[1]
     width = max(sheet.points[0] for sheet in sheets)
     size = f'width="{width:g}pt" height="{top:g}pt" viewBox="0 0 {width:g} {top:g}"'

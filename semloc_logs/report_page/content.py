@@ -34,13 +34,17 @@ NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tables:
-    """The tables of a workspace; ``outcomes`` are its alignments with what decided about them."""
+    """The tables of a workspace; ``outcomes`` are its alignments with what decided about them.
+
+    ``refused`` are the closures that the optimised poses do not rest on, with the reason.
+    """
 
     maps: Mapping[str, SessionMap]
     closures: list[dict[str, Any]]
     rejected: Sequence[Row]
     outcomes: Mapping[Key, Closure | Rejected]
     placement: Placement
+    refused: Mapping[Key, str]
 
 
 def key_of(row: Row) -> Key:
@@ -196,6 +200,11 @@ def _closures(tables: Tables, number: Mapping[str, int]) -> dict[str, Any]:
             np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], 1)
         ),
         "offset": packed(offset),
+        "refused": {
+            str(k): tables.refused[key]
+            for k, row in enumerate(rows)
+            if (key := key_of(row)) in tables.refused
+        },
         "evidence": packed(np.array(evidence).reshape(len(rows), len(missing))),
     }
 

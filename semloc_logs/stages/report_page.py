@@ -13,7 +13,7 @@ from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.pictures.placement import Tie, place_sessions
-from semloc_logs.report_page.content import Key, Tables, content_of
+from semloc_logs.report_page.content import Key, Tables, content_of, key_of
 from semloc_logs.report_page.page import page
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.close import decided_alignments
@@ -37,7 +37,8 @@ def write_report(
     closures = read_closures(work.closures)
     rejected = read_closures(work.rejected)
     placement = place_sessions(work, maps, [Tie.of_row(row) for row in closures])
-    tables = Tables(maps, closures, rejected, _outcomes(work, maps, settings), placement)
+    outcomes = _outcomes(work, maps, settings)
+    tables = Tables(maps, closures, rejected, outcomes, placement, _refused(work))
     content = content_of(work, tables, _settings_of(work))
     pictures = {} if slim else _pictures(work, content, tables)
     path = output or work.report
@@ -58,6 +59,14 @@ def _outcomes(
         if key not in outcomes or isinstance(outcome, Closure):
             outcomes[key] = outcome
     return outcomes
+
+
+def _refused(work: Workspace) -> dict[Key, str]:
+    """Closures that the optimisation refused, with the reason."""
+    path = work.path / "optimized" / "graph" / "closures.parquet"
+    if not path.exists():
+        return {}
+    return {key_of(row): row["reason"] for row in read_closures(path) if not row["kept"]}
 
 
 def _settings_of(work: Workspace) -> dict[str, Any]:

@@ -91,12 +91,28 @@ def test_optimised_poses_are_used_and_the_others_are_laid_on_them(tmp_path: Path
     turned = yaw_transform(np.pi / 2, (100.0, 0.0, 0.0))
     columns = {"stamp_ns": maps["a"].stamps_ns, **pose_columns(turned @ straight(3))}
     path = tmp_path / "optimized" / "a.parquet"
-    write_table(path, contracts.table("trajectory", columns), {})
+    write_table(path, contracts.table("trajectory", columns), {"frame": "a"})
     rows = [closure(("b", 50), ("a", 1), np.eye(4), 0.99)]
     placement = place_sessions(Workspace(tmp_path), maps, rows)
-    assert placement.optimised == {"a"}
+    assert placement.optimised == {"a": "a"}
     np.testing.assert_allclose(placement.common_T_base["a"][2, :2, 3], [100, 20], atol=1e-9)
     np.testing.assert_allclose(placement.common_T_base["b"][1, :2, 3], [100, 20], atol=1e-9)
+
+
+def test_optimised_frames_stay_apart_whatever_closures_tell(tmp_path: Path) -> None:
+    maps = {name: Drive(name, straight(3), start=10 * k) for k, name in enumerate("abcd")}
+    for name, frame in zip("abc", "aac", strict=True):
+        columns = {"stamp_ns": maps[name].stamps_ns, **pose_columns(straight(3))}
+        path = tmp_path / "optimized" / f"{name}.parquet"
+        write_table(path, contracts.table("trajectory", columns), {"frame": frame})
+    # the optimisation refused the closure of c in a; d is new, and better linked with c
+    rows = [
+        closure(("c", 20), ("a", 0), np.eye(4), 0.999),
+        closure(("d", 30), ("c", 20), np.eye(4), 0.998),
+        closure(("d", 30), ("b", 10), np.eye(4), 0.99),
+    ]
+    placement = place_sessions(Workspace(tmp_path), maps, rows)
+    assert placement.groups == [["a", "b"], ["c", "d"]]
 
 
 def test_optimised_poses_of_an_earlier_log_are_not_used(tmp_path: Path) -> None:
@@ -104,7 +120,7 @@ def test_optimised_poses_of_an_earlier_log_are_not_used(tmp_path: Path) -> None:
     columns = {"stamp_ns": np.arange(3) * SECOND, **pose_columns(straight(3))}
     path = tmp_path / "optimized" / "a.parquet"
     write_table(path, contracts.table("trajectory", columns), {})
-    assert place_sessions(Workspace(tmp_path), maps, []).optimised == set()
+    assert place_sessions(Workspace(tmp_path), maps, []).optimised == {}
 
 
 def test_frames_without_poses_lie_where_their_closures_are(tmp_path: Path) -> None:

@@ -65,6 +65,7 @@ function closureDetails(k) {
       ["query from target: ahead, left, up", [x, y, z].map((m) => `${m.toFixed(2)} m`).join(", ")],
       ["yaw", degreesText(yaw)],
     ]),
+    k in rows.refused ? el("p", { class: "warn" }, `The optimised poses do not rest on it: ${rows.refused[k]}`) : null,
     ...pictures(k),
     el("h3", {}, "Position and its uncertainty"),
     ellipse(k, sigma),
@@ -82,7 +83,7 @@ function closureDetails(k) {
   }
   const command = `semloc show -w ${data.workspace} --closure ${k + 1} -o closure.png`;
   out.push(steps(), el("p", { class: "caption" }, "In full: ", el("code", {}, command)));
-  return out;
+  return out.filter(Boolean);
 }
 
 function rejectedDetails(k) {
