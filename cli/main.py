@@ -35,6 +35,7 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "index": ("index", "The index of the words: what it holds; up to date."),
     "evaluate": ("evaluate", "Closures against the truth."),
     "show": ("show", "Pictures of closures and of rejected hypotheses."),
+    "report": ("report", "One page with maps, closures and reasons."),
     "export": ("export", "Poses, pose graph or map for other programs."),
     "simulate": ("simulate", "Drive logs through a procedural town, with truth."),
     "train": ("train", "Learn the descriptor."),

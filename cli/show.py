@@ -45,7 +45,7 @@ from .options import (
     show_default=True,
     help="So many of the best closures.",
 )
-@path_option("-o", "--output", required=True, help="PNG file.")
+@path_option("-o", "--output", required=True, help="PNG, SVG or PDF file, by its ending.")
 @overwrite_option
 @json_option
 @console_options
@@ -78,8 +78,14 @@ def command(
         closure_view,
         drawn,
     )
+    from semloc_logs.pictures.sheet import FORMATS
+    from semloc_logs.pictures.times import time_text
     from semloc_logs.workspace import Workspace
 
+    if output.suffix.lower().removeprefix(".") not in FORMATS:
+        raise click.BadParameter(
+            f"'{output}' does not end in .png, .svg or .pdf", param_hint="--output"
+        )
     if closure is not None and (query is not None or at is not None):
         raise click.UsageError("--closure names a closure by itself: leave out --query and --at.")
     if output.exists() and not overwrite:
@@ -96,7 +102,7 @@ def command(
             row = view.choice.row
             verdict = "closure" if view.choice.accepted else f"rejected ({view.choice.reason})"
             ends = (
-                f"{row[f'{end}_session']} at {row[f'{end}_stamp_ns'] / 1e9:.1f} s"
+                f"{row[f'{end}_session']} at {time_text(row[f'{end}_stamp_ns'])}"
                 for end in ("query", "target")
             )
             console.result(f"{' in '.join(ends)}: {verdict}, probability {row['probability']:.4f}")

@@ -176,5 +176,9 @@ class Workspace:
         return self.path / "closures.png"
 
     @property
+    def report(self) -> Path:
+        return self.path / "report.html"
+
+    @property
     def summary(self) -> Path:
         return self.path / "run.json"

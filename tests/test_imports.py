@@ -33,6 +33,7 @@ ORDER = [
     "pose_graph",
     "pictures",
     "exports",
+    "report_page",
     "engines",
     "stages",
     "simulation",

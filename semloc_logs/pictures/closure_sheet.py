@@ -27,9 +27,10 @@ from semloc_logs.pictures.colours import (
     Legend,
     web_colour,
 )
-from semloc_logs.pictures.map_marks import draw_ellipse, draw_line
-from semloc_logs.pictures.sheet import Lettering, Panel, Sheet, below_each_other, write_png
+from semloc_logs.pictures.map_marks import draw_ellipse, draw_grid, draw_line
+from semloc_logs.pictures.sheet import Lettering, Panel, Sheet, write_sheets
 from semloc_logs.pictures.solids import View
+from semloc_logs.pictures.times import time_text
 from semloc_logs.subvolumes.cut import SIZE
 
 U8 = NDArray[np.uint8]
@@ -40,8 +41,11 @@ HEADING = 0.16  # length of the arrow that shows where the query looks, over the
 
 
 def draw_views(path: Path, views: Sequence[ClosureView]) -> None:
-    """PNG with a sheet for each view, one below the other."""
-    write_png(path, below_each_other([_sheet(view).image() for view in views]))
+    """A sheet for each view, one below the other; of a PDF each is a page.
+
+    The ending of ``path`` tells the format: PNG, SVG or PDF.
+    """
+    write_sheets(path, [_sheet(view) for view in views])
 
 
 def _sheet(view: ClosureView) -> Sheet:
@@ -67,7 +71,9 @@ def _sheet(view: ClosureView) -> Sheet:
     sheet = Sheet(rows, Lettering(_title(view), _facts(view), _legend(view, scene), scene.metres))
 
     over_before, over_aligned = sheet.axes[0][:2]
+    corner = (top.at[0] - scene.radius, top.at[1] - scene.radius)
     for axes, map_T_query in ((over_before, before), (over_aligned, aligned)):
+        draw_grid(axes, corner, scene.metres)
         _draw_drives(axes, scene, top, map_T_query)
     if view.choice.covariance is not None:
         rotation = view.map_R_target
@@ -79,7 +85,7 @@ def _sheet(view: ClosureView) -> Sheet:
 def _title(view: ClosureView) -> str:
     row = view.choice.row
     query, target = (
-        f"{row[f'{end}_session']} at {row[f'{end}_stamp_ns'] / 1e9:.1f} s"
+        f"{row[f'{end}_session']} at {time_text(row[f'{end}_stamp_ns'])}"
         for end in ("query", "target")
     )
     return f"{query} in {target}: {'closure' if view.choice.accepted else 'rejected'}"

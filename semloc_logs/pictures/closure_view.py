@@ -292,8 +292,10 @@ class _Aligned:
 
 def _matches(aligned: _Aligned, most: int) -> list[Match]:
     """Word matches that agree with the alignment, nearest first, none beside another."""
+    if not most:
+        return []
     places = allowed_words(aligned.visible, aligned.session)
-    if not places or not most:
+    if not places:
         return []
     # a single target session has one kind of words
     variant, allowed = next(iter(places.items()))

@@ -28,6 +28,18 @@ TARGET = (20, 90, 200)
 PALE = (205, 205, 210)  # to which a map fades under another one
 CLOSURE = (214, 39, 40)
 
+# of the drives and maps of several sessions, told apart also without red and green
+SESSIONS: tuple[Colour, ...] = (
+    (0, 114, 178),
+    (204, 110, 0),
+    (0, 140, 105),
+    (163, 65, 138),
+    (122, 106, 0),
+    (70, 150, 200),
+    (110, 60, 200),
+    (120, 70, 40),
+)
+
 # of a query's voxels, by the map that they are laid on
 ALIGNED = (34, 139, 84)
 IN_FREE_SPACE = (214, 39, 40)

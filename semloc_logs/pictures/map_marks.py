@@ -10,7 +10,7 @@ from matplotlib.patheffects import Normal, Stroke
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from semloc_logs.pictures.colours import INK, SOFT, WHITE, Colour, web_colour
+from semloc_logs.pictures.colours import GRID, INK, SOFT, WHITE, Colour, web_colour
 
 F64 = NDArray[np.float64]
 
@@ -18,6 +18,7 @@ DPI = 100  # of a sheet of ordinary size; lengths of pixels are at this resoluti
 TEXT, SMALL = 10.0, 9.0  # points
 ARROW_EVERY = 130  # pixels along a drive
 ARROW_TAIL = 9  # pixels over which an arrow takes its direction
+GRID_EVERY = 230  # pixels between lines of the grid, at most
 ENDS_APART = 30  # pixels between start and end, where both are marked
 SIGMAS = 2.0  # standard deviations that an ellipse shows
 LEAST_VARIANCE = 1e-12  # m^2, so that an ellipse has an extent
@@ -58,6 +59,35 @@ def scale_bar(
             color=web_colour(INK),
             fontsize=SMALL,
         )
+
+
+def draw_grid(axes: Axes, low: tuple[float, float], metres: float) -> None:
+    """Lines at round coordinates with their values along the left and the lower edge.
+
+    ``low`` is the place (x, y) at the lower left corner, a pixel is ``metres`` wide.
+    """
+    pixel = _pixel(axes)
+    width = axes.get_xlim()[1]
+    height = axes.get_ylim()[0]
+    step = round_length(GRID_EVERY * pixel * metres)
+    for axis, extent in enumerate((width, height)):
+        first = np.ceil(low[axis] / step) * step
+        for value in np.arange(first, low[axis] + extent * metres, step):
+            at = (value - low[axis]) / metres
+            text = f"{value / 1000:g} km" if step >= 1000 else f"{value + 0.0:.9g} m"
+            shared: dict[str, object] = {
+                "textcoords": "offset points",
+                "color": web_colour(SOFT),
+                "fontsize": SMALL,
+                "path_effects": [Stroke(linewidth=2.5, foreground="white"), Normal()],
+            }
+            style = {"color": web_colour(GRID), "linewidth": 0.6, "zorder": 0.5}
+            if axis == 0:
+                axes.axvline(at, **style)
+                axes.annotate(text, (at, height), (3, 3), **shared)
+            else:
+                axes.axhline(height - at, **style)
+                axes.annotate(text, (0, height - at), (3, 3), **shared)
 
 
 def draw_line(axes: Axes, line: F64, colour: Colour, width: float = 2.0) -> None:

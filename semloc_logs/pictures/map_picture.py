@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.pictures.canvas import Canvas
 from semloc_logs.pictures.colours import DRIVE, START, class_legend
-from semloc_logs.pictures.map_marks import draw_drive
+from semloc_logs.pictures.map_marks import draw_drive, draw_grid
 from semloc_logs.pictures.sheet import Lettering, Panel, Sheet
 from semloc_logs.tables.table import read_table
 from semloc_logs.voxels.keys import BLOCK
@@ -39,11 +39,12 @@ U8 = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Caption:
-    """The facts written beside a map; ``voxel_size`` in metres."""
+    """The facts written beside a map; ``voxel_size`` in metres, ``period`` of the recording."""
 
     session: str
     label_source: str
     voxel_size: float
+    period: str = ""
 
 
 def draw_map(voxels: Path, trajectory: NDArray[np.floating], caption: Caption, path: Path) -> None:
@@ -66,15 +67,27 @@ def draw_map(voxels: Path, trajectory: NDArray[np.floating], caption: Caption, p
     metres = caption.voxel_size * canvas.step / zoom
     sheet = Sheet([[Panel(picture)]], Lettering(caption.session, facts, legend, metres))
 
+    left, lower = (low * caption.voxel_size).tolist()
+    draw_grid(sheet.axes[0][0], (left, lower), metres)
     pixels = (drive[:, :2] - low) / canvas.step * zoom
     pixels[:, 1] = picture.shape[0] - pixels[:, 1]
     draw_drive(sheet.axes[0][0], pixels, DRIVE, START)
     sheet.save(path)
 
 
-def _canvas(voxels: Path, drive: F64, low: I64, high: I64) -> tuple[Canvas, bool]:
+def bare_map(voxels: Path, drive: F64, most: int) -> tuple[Canvas, bool]:
+    """The map without letters, at most ``most`` pixels along an edge; ``drive`` (n, 3) in voxels.
+
+    The second value tells whether it was cut because the drive is indoors.
+    """
+    return _canvas(voxels, drive, *_extent(voxels, drive), most)
+
+
+def _canvas(
+    voxels: Path, drive: F64, low: I64, high: I64, most: int = LARGE_MAP
+) -> tuple[Canvas, bool]:
     """The map from ``low`` to ``high``, and whether it was cut because the drive is indoors."""
-    step = max(1, -(-int((high - low).max()) // LARGE_MAP))
+    step = max(1, -(-int((high - low).max()) // most))
     canvas = Canvas.over(low, high, step)
     for ijk, label in _rows(voxels):
         canvas.add(ijk, label)
@@ -94,6 +107,7 @@ def _facts(drive: F64, extent: I64, caption: Caption) -> list[str]:
     length = float(np.linalg.norm(np.diff(drive, axis=0), axis=1).sum()) * size
     width, height = (extent * size).tolist()
     return [
+        *([caption.period] if caption.period else []),
         f"labels: {caption.label_source}",
         f"voxels: {size:g} m",
         f"area: {width:.4g} m x {height:.4g} m",
@@ -149,6 +163,20 @@ def _is_roofed(canvas: Canvas, drive: F64) -> bool:
     column = np.floor((drive[:, :2] - canvas.low) / canvas.step).astype(int)
     height = above[canvas.top.shape[0] - 1 - column[:, 1], column[:, 0]]
     return bool(np.mean(height > drive[:, 2] + HEADROOM) > 0.5)
+
+
+def below_ceiling(ijk: I32, drive: F64) -> NDArray[np.bool_]:
+    """Which voxels (n, 3) a picture from above shows: indoors none higher than the sensor.
+
+    ``drive`` (n, 3) in voxels. Indoors is where something hangs over most of the drive.
+    """
+    if not len(drive) or not len(ijk):
+        return np.ones(len(ijk), bool)
+    above = ijk[:, 2] > _nearest_height(cKDTree(drive[:, :2]), drive, ijk) + HEADROOM
+    if not above.any():
+        return ~above
+    off, _ = cKDTree(ijk[above, :2]).query(drive[:, :2], distance_upper_bound=ROOF_REACH)
+    return ~above if np.mean(np.isfinite(off)) > 0.5 else np.ones(len(ijk), bool)
 
 
 def _nearest_height(tree: cKDTree, drive: F64, ijk: I32) -> F64:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
@@ -16,9 +19,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.text import Text
-from matplotlib.transforms import IdentityTransform
+from matplotlib.transforms import Affine2D, Transform
 from numpy.typing import NDArray
 
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.pictures.colours import INK, SOFT, WHITE, Colour, Legend, web_colour
 from semloc_logs.pictures.fonts import written
 from semloc_logs.pictures.map_marks import DPI, SMALL, TEXT, scale_bar
@@ -38,6 +42,9 @@ AXIS_LENGTH = 34
 FOOT_HEIGHT = 58  # holds the scale bar and the axes of the map
 SWATCH = 46  # of a legend entry: the patch of colour, and the room around it
 SEPARATOR = "  |  "
+FORMATS = ("png", "svg", "pdf")
+VECTOR: dict[str, Any] = {"svg.hashsalt": "semloc", "pdf.fonttype": 42}  # TrueType in a PDF
+POINTS = re.compile(r'(width|height)="([\d.]+)pt"')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,19 +71,22 @@ class Lettering:
 class _Pixels(Artist):
     """RGB ``picture`` (height, width, 3) as it is, from pixel (left, low) of the figure.
 
-    Images of matplotlib are resampled by floats even then, which takes 100 bytes for each pixel.
+    ``to_canvas`` leads from these pixels to the units of a renderer. Images of matplotlib are
+    resampled by floats even then, which takes 100 bytes for each pixel.
     """
 
-    def __init__(self, picture: U8, left: int, low: int) -> None:
+    def __init__(self, picture: U8, left: int, low: int, to_canvas: Transform) -> None:
         super().__init__()
         self._picture = picture
         self._corner = (left, low)
+        self._to_canvas = to_canvas
         self.set_zorder(-1)  # below the axes
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw into ``renderer``, whose rows run upwards."""
         rows = cv2.cvtColor(self._picture, cv2.COLOR_RGB2RGBA)[::-1]
-        renderer.draw_image(renderer.new_gc(), *self._corner, np.ascontiguousarray(rows))
+        x, y = self._to_canvas.transform(self._corner)
+        renderer.draw_image(renderer.new_gc(), round(x, 3), round(y, 3), np.ascontiguousarray(rows))
 
 
 class Sheet:
@@ -89,6 +99,8 @@ class Sheet:
         self._scale: float = max(1.0, longest / ORDINARY)
         self._figure = Figure(dpi=DPI * self._scale, facecolor=web_colour(WHITE))
         FigureCanvasAgg(self._figure)
+        # of pixels of the sheet; SVG and PDF count in points
+        self._to_canvas = Affine2D().scale(1 / self._dpi) + self._figure.dpi_scale_trans
         gaps = [self._px(GAP) * max(len(row) - 1, 0) for row in rows]
         body = max([w + g for w, g in zip(widths, gaps, strict=True)], default=0)
         self._width = max(body, self._px(NARROWEST)) + 2 * self._px(PAD)
@@ -141,7 +153,7 @@ class Sheet:
             fontfamily=families,
             color=web_colour(colour),
             va="bottom",
-            transform=IdentityTransform(),
+            transform=self._to_canvas,
             parse_math=False,
         )
 
@@ -201,7 +213,7 @@ class Sheet:
             ],
             loc="lower left",
             bbox_to_anchor=(self._px(PAD), bottom),
-            bbox_transform=IdentityTransform(),
+            bbox_transform=self._to_canvas,
             borderaxespad=0,
             borderpad=0,
             frameon=False,
@@ -236,7 +248,7 @@ class Sheet:
         for panel in row:
             height, width = panel.picture.shape[:2]
             low = bottom + row_height - height
-            self._figure.add_artist(_Pixels(panel.picture, left, low))
+            self._figure.add_artist(_Pixels(panel.picture, left, low, self._to_canvas))
             axes = self._area(left, low, width, height)
             axes.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
             for number, line in enumerate(reversed(panel.caption.splitlines())):
@@ -281,6 +293,18 @@ class Sheet:
         """PNG."""
         write_png(path, self.image())
 
+    def write(self, file: BinaryIO, form: str) -> None:
+        """SVG or PDF, the same bytes each time; its letters are outlines or in the file."""
+        metadata: dict[str, Any] = {"Date": None} if form == "svg" else {"CreationDate": None}
+        with rc_context(VECTOR):
+            self._figure.savefig(file, format=form, metadata=metadata)
+
+    @property
+    def points(self) -> tuple[float, float]:
+        """Width and height in points, as a page has them."""
+        width, height = self._figure.get_size_inches()
+        return float(width) * 72, float(height) * 72
+
 
 def rendered(figure: Figure) -> U8:
     """The pixels (height, width, 3) of a figure with a canvas of Agg, RGB."""
@@ -302,3 +326,50 @@ def below_each_other(images: Sequence[U8]) -> U8:
     return np.vstack(
         [np.pad(i, ((0, 0), (0, width - i.shape[1]), (0, 0)), constant_values=255) for i in images]
     )
+
+
+def write_sheets(path: Path, sheets: Sequence[Sheet]) -> None:
+    """PNG, SVG or PDF by the ending of ``path``, which appears complete or not at all.
+
+    In a PNG and an SVG the sheets are in one column, in a PDF each is a page. WorkspaceError for
+    another ending.
+    """
+    form = path.suffix.lower().removeprefix(".")
+    if form not in FORMATS:
+        raise WorkspaceError(
+            f"{path} does not end in {', '.join(f'.{f}' for f in FORMATS)}: give a name that does."
+        )
+    if form == "png":
+        write_png(path, below_each_other([sheet.image() for sheet in sheets]))
+        return
+    with replacing_file(path) as temporary, temporary.open("wb") as file:
+        if form == "svg":
+            file.write(_svg_column(sheets).encode())
+        else:
+            from matplotlib.backends.backend_pdf import PdfPages
+
+            metadata: dict[str, Any] = {"CreationDate": None}
+            # fonts are written at the end
+            with rc_context(VECTOR), PdfPages(file, metadata=metadata) as pages:
+                for sheet in sheets:
+                    sheet.write(pages, form)
+
+
+def _svg_column(sheets: Sequence[Sheet]) -> str:
+    """One SVG with the sheets below each other."""
+    parts = []
+    top = 0.0
+    for sheet in sheets:
+        buffer = BytesIO()
+        sheet.write(buffer, "svg")
+        drawn = buffer.getvalue().decode()
+        _, _, after = drawn.partition("<svg ")
+        attributes, _, content = after.partition(">")
+        # the units of the column are points
+        attributes = POINTS.sub(r'\1="\2"', attributes)
+        parts.append(f'<svg x="0" y="{top:g}" {attributes}>{content}')
+        top += sheet.points[1]
+    width = max(sheet.points[0] for sheet in sheets)
+    size = f'width="{width:g}pt" height="{top:g}pt" viewBox="0 0 {width:g} {top:g}"'
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" version="1.1" {size}>'
+    return "\n".join(['<?xml version="1.0" encoding="utf-8"?>', head, *parts, "</svg>\n"])

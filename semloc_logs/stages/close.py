@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.alignment_tables import read_alignments
 from semloc_logs.closures.closure import Closure, Rejected
@@ -11,7 +13,7 @@ from semloc_logs.closures.closure_tables import (
     write_closures,
     write_rejected,
 )
-from semloc_logs.closures.pairs import known_pairs
+from semloc_logs.closures.pairs import Pair, known_pairs
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Resolved
@@ -67,11 +69,8 @@ def decide_all(work: Workspace, maps: Maps, settings: Resolved, *, overwrite: bo
     # matplotlib is loaded only where something is drawn
     from semloc_logs.pictures.closures_picture import draw_closures
 
-    misfits = misfits_of(maps, settings)
-    pairs = [p for p in sorted(known_pairs(work)) if not misfits.keys() & {p.query, p.target}]
-    paths = {pair: work.alignments(pair.query, pair.target) for pair in pairs}
-    alignments = [a for p in pairs for a in read_alignments(paths[p], p.query, p.target)]
-    decided = decide(alignments, maps, settings)
+    paths = _used_alignments(work, maps, settings)
+    decided = decided_alignments(work, maps, settings)
     road = {name: session_map.distance for name, session_map in maps.items()}
     accepted = [outcome for outcome in decided if isinstance(outcome, Closure)]
     rejected = [outcome for outcome in decided if isinstance(outcome, Rejected)]
@@ -89,6 +88,22 @@ def decide_all(work: Workspace, maps: Maps, settings: Resolved, *, overwrite: bo
     draw_closures(work, closures, maps)
     write_closures(work.closures, closures, metadata)
     return True
+
+
+def decided_alignments(work: Workspace, maps: Maps, settings: Resolved) -> list[Closure | Rejected]:
+    """What becomes of the alignments of all pairs, without sessions whose poses do not fit."""
+    paths = _used_alignments(work, maps, settings)
+    alignments = [
+        a for pair, path in paths.items() for a in read_alignments(path, pair.query, pair.target)
+    ]
+    return decide(alignments, maps, settings)
+
+
+def _used_alignments(work: Workspace, maps: Maps, settings: Resolved) -> dict[Pair, Path]:
+    """The tables of alignments of the pairs of sessions whose poses fit."""
+    misfits = misfits_of(maps, settings)
+    pairs = [p for p in sorted(known_pairs(work)) if not misfits.keys() & {p.query, p.target}]
+    return {pair: work.alignments(pair.query, pair.target) for pair in pairs}
 
 
 def _decided_from(work: Workspace, settings: Resolved) -> str:

@@ -208,10 +208,14 @@ def _fuse_one(task: FuseTask) -> FusedSession | SemlocError:
 def _draw(folder: SessionFolder, content: dict[str, Any]) -> None:
     # matplotlib is loaded only where something is drawn
     from semloc_logs.pictures.map_picture import Caption, draw_map
+    from semloc_logs.pictures.times import period_text
 
-    poses = poses_of(read_table(folder.frames))
+    frames = read_table(folder.frames)
+    poses = poses_of(frames)
+    stamps_ns = frames["stamp_ns"].to_pylist()
+    period = period_text(stamps_ns[0], stamps_ns[-1]) if stamps_ns else ""
     positions = poses[:, :3, 3] if content["posed"] else np.zeros((0, 3))
-    caption = Caption(folder.name, content["label_source"], content["voxel_size"])
+    caption = Caption(folder.name, content["label_source"], content["voxel_size"], period)
     draw_map(folder.voxels, positions, caption, folder.picture)
 
 

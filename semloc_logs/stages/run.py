@@ -17,6 +17,7 @@ from semloc_logs.stages.fuse import fuse
 from semloc_logs.stages.inputs import SessionInput, session_name
 from semloc_logs.stages.lock import one_writer
 from semloc_logs.stages.report import Report
+from semloc_logs.stages.report_page import write_report
 from semloc_logs.tables.table import write_json
 from semloc_logs.workspace import Workspace, checked_name
 
@@ -49,6 +50,8 @@ def run(
             _annotate_logs(session, work, settings, annotation)
         total.add("annotate", Report(closures=total.report.closures))
     _write_summary(work, total.report)
+    if work.closures.exists():
+        write_report(work, settings)
     return total.report
 
 

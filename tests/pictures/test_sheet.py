@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import warnings
+from hashlib import sha256
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.pictures.colours import INK, QUERY, Legend
-from semloc_logs.pictures.map_marks import draw_drive, draw_line, round_length
-from semloc_logs.pictures.sheet import Lettering, Panel, Sheet, below_each_other, write_png
+from semloc_logs.pictures.map_marks import draw_drive, draw_grid, draw_line, round_length
+from semloc_logs.pictures.sheet import (
+    Lettering,
+    Panel,
+    Sheet,
+    below_each_other,
+    write_png,
+    write_sheets,
+)
 
 RED, BLUE = (200, 10, 10), (10, 10, 200)
 
@@ -125,3 +135,50 @@ def test_images_below_each_other_and_written(tmp_path: Path) -> None:
     read = cv2.imread(str(tmp_path / "image.png"))
     assert read is not None
     np.testing.assert_array_equal(read[:, :, ::-1], whole)
+
+
+def two_sheets() -> list[Sheet]:
+    return [Sheet([[Panel(plain(200, 100, colour))]], Lettering("title")) for colour in (RED, BLUE)]
+
+
+@pytest.mark.parametrize(
+    ("ending", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")]
+)
+def test_the_ending_tells_the_format(tmp_path: Path, ending: str, start: bytes) -> None:
+    paths = [tmp_path / f"{name}.{ending}" for name in "ab"]
+    for path in paths:
+        write_sheets(path, two_sheets())
+    contents = [path.read_bytes() for path in paths]
+    assert contents[0].startswith(start)
+    assert sha256(contents[0]).digest() == sha256(contents[1]).digest()
+    assert sorted(tmp_path.iterdir()) == paths
+
+
+def test_an_svg_has_its_sheets_below_each_other(tmp_path: Path) -> None:
+    write_sheets(tmp_path / "a.svg", two_sheets())
+    root = ElementTree.parse(tmp_path / "a.svg").getroot()
+    inner = root.findall("{http://www.w3.org/2000/svg}svg")
+    heights = [float(i.attrib["height"]) for i in inner]
+    assert [float(i.attrib["viewBox"].split()[3]) for i in inner] == pytest.approx(heights)
+    assert [float(i.attrib["y"]) for i in inner] == pytest.approx([0, heights[0]], abs=0.01)
+    whole = float(root.attrib["height"].removesuffix("pt"))
+    assert whole == pytest.approx(sum(heights), abs=0.01)
+
+
+def test_another_ending_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match=r"does not end in \.png, \.svg, \.pdf"):
+        write_sheets(tmp_path / "a.jpg", two_sheets())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_grid_lies_at_round_coordinates() -> None:
+    sheet = Sheet([[Panel(plain(460, 400, (255, 255, 255)))]], Lettering("title", metres=0.1))
+    axes = sheet.axes[0][0]
+    draw_grid(axes, (-3.0, 98.0), 0.1)  # 46 m x 40 m
+    texts = [t.get_text() for t in axes.texts]
+    assert texts == ["0 m", "20 m", "40 m", "100 m", "120 m"]
+    verticals = [line.get_xdata()[0] for line in axes.lines[:3]]
+    assert verticals == pytest.approx([30, 230, 430])
+    # y counts pixels downwards
+    horizontals = [line.get_ydata()[0] for line in axes.lines[3:]]
+    assert horizontals == pytest.approx([380, 180])
