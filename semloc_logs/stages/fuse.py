@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from semloc_logs import progress
 from semloc_logs.engines import Engine
-from semloc_logs.errors import LogError, SemlocError, WorkspaceError
+from semloc_logs.errors import LogError, SemlocError, TemporaryError, WorkspaceError
 from semloc_logs.labels.segmentation import fingerprint as label_fingerprint
 from semloc_logs.logs.annotation.annotate import content_fingerprint, recover
 from semloc_logs.logs.poses.base_frame import BASE_LINK
@@ -34,60 +35,92 @@ from semloc_logs.workspace import SessionFolder, Workspace
 LOGGER = logging.getLogger(__name__)
 
 
+@dataclass(slots=True)
+class FusePlan:
+    """The sessions to fuse, and in ``report`` those that are done or failed before."""
+
+    tasks: list[FuseTask] = field(default_factory=list)
+    report: Report = field(default_factory=Report)
+
+
 def fuse(
     sessions: Sequence[SessionInput],
     work: Workspace,
     settings: Resolved,
     engine: Engine,
     *,
+    names: Sequence[str] = (),
     overwrite: bool = False,
     retry_failed: bool = False,
 ) -> Report:
-    """Fuse each session. One that fails is named in ``failed``; the others go on.
+    """Fuse each session, or those of ``names``. One that fails is named in ``failed``; the others
+    go on.
 
     The reason is kept, and the same log is not read again unless ``retry_failed`` or ``overwrite``.
     Raises LogError when all of them failed, WorkspaceError where another log has the name of a
     session, unless ``overwrite``.
     """
-    with writing(work, [session.name for session in sessions]):
-        return _fuse(sessions, work, settings, engine, overwrite, again=overwrite or retry_failed)
+    chosen = [session for session in sessions if not names or session.name in names]
+    with writing(work, [session.name for session in chosen]):
+        for session in chosen:
+            for log in session.logs:
+                recover(log)
+        plan = plan_fuse(
+            sessions, work, settings, names=names, overwrite=overwrite, retry_failed=retry_failed
+        )
+        keep(work, settings, overwrite=overwrite)
+        return _fuse(plan, work, engine)
 
 
-def _fuse(
+def plan_fuse(
     sessions: Sequence[SessionInput],
     work: Workspace,
     settings: Resolved,
-    engine: Engine,
-    overwrite: bool,
-    again: bool,
-) -> Report:
-    report = Report()
-    tasks: list[FuseTask] = []
+    *,
+    names: Sequence[str] = (),
+    overwrite: bool = False,
+    retry_failed: bool = False,
+) -> FusePlan:
+    """What :func:`fuse` would do. Nothing is written."""
+    plan = FusePlan()
+    again = overwrite or retry_failed
     logs = [log for session in sessions for log in session.logs]
     for session in sessions:
+        if names and session.name not in names:
+            continue
         others = [log for log in logs if log not in session.logs]
         folder = work.session(session.name)
         reading = settings if overwrite else _as_read_before(folder, settings)
         task = _task(session, folder, reading, others)
         if not overwrite and recorded_fingerprint(task.folder.session_json) == task.fingerprint:
-            report.kept.append(session.name)
-            report.skipped += read_json(task.folder.session_json)["skipped"]
+            plan.report.kept.append(session.name)
+            plan.report.skipped += read_json(task.folder.session_json)["skipped"]
             continue
         if not overwrite:
             _check_same_log(task)
         if not again and recorded_fingerprint(work.failure(session.name)) == task.fingerprint:
             reason = read_json(work.failure(session.name))["reason"]
-            report.failed.append(f"{reason} It failed before: --retry-failed reads it again.")
+            sentence = f"{reason} It failed before: --retry-failed reads it again."
+            plan.report.failed.append(sentence)
         else:
-            tasks.append(task)
-    keep(work, settings, overwrite=overwrite)
+            plan.tasks.append(task)
+    return plan
 
-    for task, outcome in zip(tasks, engine.map(_fuse_one, tasks), strict=True):
+
+def _fuse(plan: FusePlan, work: Workspace, engine: Engine) -> Report:
+    report = plan.report
+    tasks = plan.tasks
+    kinds: set[type[SemlocError]] = set()
+    for done, (task, outcome) in enumerate(
+        zip(tasks, engine.map(_fuse_one, tasks), strict=True), 1
+    ):
         failure = work.failure(task.folder.name)
         if isinstance(outcome, SemlocError):
             report.failed.append(str(outcome))
-            content = {"fingerprint": task.fingerprint, "reason": str(outcome)}
-            write_json(failure, content | {"logs": [str(log) for log in task.logs]})
+            kinds.add(type(outcome))
+            if not isinstance(outcome, TemporaryError):  # the log is not to blame
+                content = {"fingerprint": task.fingerprint, "reason": str(outcome)}
+                write_json(failure, content | {"logs": [str(log) for log in task.logs]})
             if len(tasks) > 1:  # the only one is raised below
                 LOGGER.info("%s: %s", task.folder.name, outcome)
         else:
@@ -95,8 +128,9 @@ def _fuse(
             report.done.append(task.folder.name)
             report.skipped += sentences(to_report(outcome.problems))
             _log_outcome(task.folder.name, outcome)
+        progress.report("fuse", "", done, len(tasks), "sessions")
     if report.failed and not report.done and not report.kept:
-        raise LogError(" ".join(report.failed))
+        raise (TemporaryError if kinds == {TemporaryError} else LogError)(" ".join(report.failed))
     return report
 
 
@@ -120,8 +154,6 @@ def _task(
 
     ``others``: the logs of the other sessions, which may have transforms that this one lacks.
     """
-    for log in session.logs:
-        recover(log)
     mountings = _mountings(session, settings, others)
     made_from = {
         "content": [content_fingerprint(log) for log in session.logs],
@@ -138,6 +170,7 @@ def _task(
     )
     logs = tuple(Path(log).absolute() for log in session.logs)
     topics = dict(session.topics)
+    folder = SessionFolder(folder.path.absolute())  # workers may have another current folder
     return FuseTask(
         logs, folder, settings, topics, fingerprint, made_from, session.poses, mountings
     )
