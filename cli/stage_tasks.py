@@ -63,9 +63,7 @@ def given_words(
         words += ["--manifest", str(logs.manifest.absolute())]
     for role, topic in topics.items():
         words += ["--topic", f"{role}={topic}"]
-    reading = {
-        k: v for k, v in settings.logs.model_dump(mode="json", exclude_defaults=True).items()
-    }
+    reading = settings.logs.model_dump(mode="json", exclude_defaults=True)
     for section, values in {"logs": reading, **settings.differences()}.items():
         for name, value in values.items():
             words += ["--set", f"{section}.{name}={json.dumps(value, ensure_ascii=False)}"]

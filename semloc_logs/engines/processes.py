@@ -20,7 +20,8 @@ from typing import NoReturn
 
 from semloc_logs import progress
 from semloc_logs.engines.base import Result, Task
-from semloc_logs.errors import SemlocError
+from semloc_logs.engines.memory import memory_limit
+from semloc_logs.errors import TemporaryError
 from semloc_logs.progress import Progress
 
 PACKAGE_LOGGER = "semloc_logs"
@@ -50,13 +51,15 @@ def single_threaded() -> None:
 
 
 class Processes:
-    """``jobs`` worker processes, one thread each.
+    """``jobs`` worker processes, one thread each; a task ends that needs more than
+    ``worker_memory`` bytes.
 
     They are spawned, so that threads of the parent cannot hurt them.
     """
 
-    def __init__(self, jobs: int) -> None:
+    def __init__(self, jobs: int, worker_memory: int | None = None) -> None:
         self.jobs = jobs
+        self._worker_memory = worker_memory
         self._context: SpawnContext = multiprocessing.get_context("spawn")
         self._pool: ProcessPoolExecutor | None = None
         self._events: _Events | None = None
@@ -67,7 +70,7 @@ class Processes:
         try:
             # a bounded number of tasks in flight: their results may be large
             for task in tasks:
-                waiting.append(pool.submit(_run, function, task))
+                waiting.append(pool.submit(_run, function, task, self._worker_memory))
                 if len(waiting) >= 2 * self.jobs:
                     yield waiting.popleft().result()
             while waiting:
@@ -75,7 +78,7 @@ class Processes:
         except BrokenProcessPool:
             self._end_events()
             self._pool = None
-            raise SemlocError(
+            raise TemporaryError(
                 "A worker process ended abruptly, most likely for lack of memory:"
                 " run again with fewer --jobs; finished work is kept."
             ) from None
@@ -184,9 +187,10 @@ def _leave_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _run(function: Callable[[Task], Result], task: Task) -> Result:
+def _run(function: Callable[[Task], Result], task: Task, max_memory: int | None) -> Result:
     """In a worker: the pool would hand SystemExit to the parent as a result and live on."""
     try:
-        return function(task)
+        with memory_limit(max_memory):
+            return function(task)
     except SystemExit as leaving:
         os._exit(leaving.code if isinstance(leaving.code, int) else 1)

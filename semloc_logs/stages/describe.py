@@ -91,9 +91,11 @@ def _describe(
             for folder in folders
             if folder.name in plan
         ]
+        progress.report_start("describe", len(coming), "sessions")
         counts = engine.map(index_submap, chain.from_iterable(one.tasks() for one in coming))
         for number, one in enumerate(coming, 1):
             words = one.take(counts)
+            report.amount += one.submaps
             report.done.append(one.folder.name)
             LOGGER.info("%s: %d words", one.folder.name, words)
             progress.report("describe", "", number, len(coming), "sessions")
@@ -146,6 +148,10 @@ class _Described:
         self._settings = settings
         self._end = outputs.enter_context(ExitStack())
         self._output: Path | None = None
+
+    @property
+    def submaps(self) -> int:
+        return len(self._submaps)
 
     def tasks(self) -> Iterator[DescribeTask]:
         """One for each submap."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -111,6 +111,7 @@ def _fuse(plan: FusePlan, work: Workspace, engine: Engine) -> Report:
     report = plan.report
     tasks = plan.tasks
     kinds: set[type[SemlocError]] = set()
+    progress.report_start("fuse", len(tasks), "sessions")
     for done, (task, outcome) in enumerate(
         zip(tasks, engine.map(_fuse_one, tasks), strict=True), 1
     ):
@@ -126,6 +127,7 @@ def _fuse(plan: FusePlan, work: Workspace, engine: Engine) -> Report:
         else:
             failure.unlink(missing_ok=True)
             report.done.append(task.folder.name)
+            report.amount += _seconds(outcome.content)
             report.skipped += sentences(to_report(outcome.problems))
             _log_outcome(task.folder.name, outcome)
         progress.report("fuse", "", done, len(tasks), "sessions")
@@ -223,6 +225,13 @@ def _fuse_one(task: FuseTask) -> FusedSession | SemlocError:
             return fuse_session(replace(task, folder=folder), on_tables=partial(_draw, folder))
     except SemlocError as problem:
         return problem
+
+
+def _seconds(content: Mapping[str, Any]) -> float:
+    """Of the logs of a session."""
+    ends = [(log["start_ns"], log["end_ns"]) for log in content["logs"]]
+    lengths_ns = (end - start for start, end in ends if start is not None and end is not None)
+    return float(sum(lengths_ns)) / 1e9
 
 
 def _draw(folder: SessionFolder, content: dict[str, Any]) -> None:

@@ -73,6 +73,8 @@ def writing(work: Workspace, sessions: Sequence[str] | None = None) -> Iterator[
             gate.close()
             _recover(work, sessions)
         yield
+        # a worker of an engine may have been killed over a task that another one has done since
+        _recover(work, _replaced_sessions(work) if sessions is None else sessions)
 
 
 @contextmanager

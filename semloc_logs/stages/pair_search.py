@@ -90,7 +90,8 @@ class PairSearch:
         if not fingerprints:
             raise WorkspaceError(
                 f"{pair.query} was recorded before {pair.target}, so that the search is"
-                f" '{pair.target}/{pair.query}': 'semloc tasks search -w {work.path}' lists all."
+                f" 'search/{pair.target}/{pair.query}': 'semloc tasks search -w {work.path}' lists"
+                " all."
             )
         known = known_pair(work, pair)
         is_missing = known.get(pair) != fingerprints[pair] and not misfits_of(maps, settings)
@@ -125,8 +126,10 @@ class PairSearch:
         _check_words(work, chosen, maps, settings)
         return cls(work, maps, settings, fingerprints, known, chosen)
 
-    def run(self, engine: Engine) -> None:
-        """Search the pairs; each session that is done gets its tables of alignments.
+    def run(self, engine: Engine) -> int:
+        """Search the pairs; how many searches of a query in a session that were.
+
+        Each session that is done gets its tables of alignments.
 
         A session whose search was interrupted goes on where it was. Alignments that belong to no
         present pair are removed.
@@ -139,16 +142,23 @@ class PairSearch:
         sessions = self._missing()
         tasks = [task for one in sessions for task in self._tasks(one)]
         results = zip(tasks, engine.map(search_queries, tasks), strict=True)
+        searches = sum(len(task.keyframes) for task in tasks)
+        searched = 0
+        progress.report_start("close", searches, "queries")
         for one in sessions:
-            total = sum(len(chunk) for chunk in one.chunks)
-            count = sum(task.session == one.session for task in tasks)
-            for number in range(1, count + 1):
+            of_session = [task for task in tasks if task.session == one.session]
+            total = sum(len(task.keyframes) for task in of_session)
+            done = 0
+            for task in of_session:
                 next(results)
-                done = total * number // count
+                done += len(task.keyframes)
                 progress.report("close", one.session, done, total, "queries")
+                progress.report("close", "", searched + done, searches, "queries")
+            searched += total
             finish(self.work, self._left(one), self._metadata(one))
         stale = [p for p, made_from in self.known.items() if made_from != self.fingerprints.get(p)]
         forget(self.work, [p for p in stale if p not in self.chosen])
+        return sum(len(task.keyframes) * len(task.targets) for task in tasks)
 
     def _missing(self) -> list[Missing]:
         """What is left to search of each session."""
