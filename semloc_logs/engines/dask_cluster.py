@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import tempfile
 import time
 import uuid
 from collections import deque
@@ -52,6 +53,7 @@ class Dask:
         self._scheduler = scheduler
         self._worker_memory = worker_memory
         self._cluster: Any = None
+        self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._client: Any = None
         self._topic = ""
 
@@ -88,6 +90,7 @@ class Dask:
             logging.getLogger(name).setLevel(logging.CRITICAL)
         if self._scheduler is None:
             config = import_module("dask").config
+            self._scratch = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
             with config.set({"distributed.scheduler.allowed-failures": LOCAL_FAILURES}):
                 self._cluster = distributed.LocalCluster(
                     n_workers=self.jobs,
@@ -97,6 +100,7 @@ class Dask:
                     dashboard_address=None,
                     memory_limit=self._worker_memory or 0,
                     silence_logs=logging.CRITICAL,
+                    local_directory=self._scratch.name,
                 )
         address = self._cluster or self._scheduler
         try:
@@ -141,6 +145,9 @@ class Dask:
                 if not gently:
                     _kill(cluster)
                 cluster.close(timeout=LEAVE_SECONDS)
+        if self._scratch is not None:
+            self._scratch.cleanup()
+            self._scratch = None
 
 
 def _distributed() -> Any:

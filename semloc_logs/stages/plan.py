@@ -75,10 +75,12 @@ class Plan:
         plan = plan_fuse(
             sessions, self._work, self._settings, overwrite=overwrite, retry_failed=retry_failed
         )
-        self._coming = {task.folder.name: _coming(task) for task in plan.tasks}
+        coming = {task.folder.name: _coming(task) for task in plan.tasks}
         self.known_failures = plan.report.failed
-        seconds = sum(one.seconds for one in self._coming.values())
-        self._add("fuse", list(self._coming), len(sessions), seconds)
+        seconds = sum(one.seconds for one in coming.values())
+        self._add("fuse", list(coming), len(sessions), seconds)
+        # a log that cannot be opened makes no session
+        self._coming = {name: one for name, one in coming.items() if one.seconds}
 
     def describe(self, names: Sequence[str] = (), *, overwrite: bool) -> None:
         """WorkspaceError where there are neither sessions nor logs to fuse."""
