@@ -145,7 +145,7 @@ class Workspace:
     def search_parts(self, query: str, target: str | None = None) -> Path:
         """Alignments of a session whose search is not over, a file for each task.
 
-        With a ``target``, those of a search in it alone.
+        With a ``target``, of a search in it alone.
         """
         folder = self.path / ".parts" / query
         return folder if target is None else folder / f"target={target}"

@@ -1,4 +1,4 @@
-"""The engine of Dask workers: those of a scheduler, or of a cluster on this machine.
+"""The engine of Dask workers: a scheduler has them, or a cluster on this machine.
 
 Tasks and results are small, tables go to the workspace: workers have to see it under the same path,
 and need the same version of this package.

@@ -60,8 +60,8 @@ def private_memory() -> int:
 def memory_limit(limit: int | None) -> Iterator[None]:
     """TemporaryError in the block once this process needs more than ``limit`` bytes.
 
-    The process ends if the block does not soon. Only the main thread can be interrupted: elsewhere
-    there is no limit.
+    The process ends if the block does not soon. Only the main thread can be interrupted:
+    elsewhere the block has no limit.
     """
     if limit is None or threading.current_thread() is not threading.main_thread():
         yield

@@ -53,7 +53,7 @@ def fuse(
     overwrite: bool = False,
     retry_failed: bool = False,
 ) -> Report:
-    """Fuse each session, or those of ``names``. One that fails is named in ``failed``; the others
+    """Fuse each session, or only ``names``. One that fails is named in ``failed``; the others
     go on.
 
     The reason is kept, and the same log is not read again unless ``retry_failed`` or ``overwrite``.

@@ -112,7 +112,7 @@ def _remove_lock(work: Workspace, path: Path) -> None:
 
 
 def _clear(work: Workspace, paths: Iterable[Path]) -> None:
-    """WorkspaceError where somebody has one of the locks; those of pairs are removed."""
+    """WorkspaceError where somebody has one of the locks; locks of pairs are removed."""
     for path in paths:
         with _locked(work, _name(work, path), 0.0):  # nobody has it
             if path.parent != work.locks:
