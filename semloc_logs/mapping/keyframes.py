@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,8 +87,16 @@ class Collected:
         return out
 
     def _save(self, keyframe: int, what: str, values: NDArray[Any] | None) -> None:
-        if values is not None:
-            np.save(self.scratch / f"{keyframe}-{what}.npy", values, allow_pickle=False)
+        if values is None:
+            return
+        path = self.scratch / f"{keyframe}-{what}.npy"
+        try:
+            np.save(path, values, allow_pickle=False)
+        except OSError as problem:
+            if problem.errno is None:  # numpy counts bytes where the disk is full
+                code = errno.ENOSPC
+                raise OSError(code, os.strerror(code), str(path)) from None
+            raise
 
     def _load(self, keyframe: int, what: str) -> NDArray[Any] | None:
         path = self.scratch / f"{keyframe}-{what}.npy"

@@ -125,6 +125,11 @@ def _fuse(plan: FusePlan, work: Workspace, engine: Engine) -> Report:
             if len(tasks) > 1:  # the only one is raised below
                 LOGGER.info("%s: %s", task.folder.name, outcome)
         else:
+            if not task.folder.session_json.exists():
+                raise WorkspaceError(
+                    f"A worker wrote {task.folder.path} on a disk of its own: all workers have to"
+                    " see the workspace under the same path."
+                )
             failure.unlink(missing_ok=True)
             report.done.append(task.folder.name)
             report.amount += _seconds(outcome.content)
