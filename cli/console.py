@@ -207,12 +207,12 @@ class Bars:
         self._tasks: dict[Key, TaskID] = {}
         self._bar = RichProgress(
             SpinnerColumn(),
-            text("description", 20 + spare // 2, left=True),
+            text("description", 18 + spare // 2, left=True),
             BarColumn(bar_width=8 + spare - spare // 2),
             text("fields[share]", 5),
             text("fields[count]", 22),
-            text("fields[rate]", 7),
-            text("fields[left]", 9),
+            text("fields[rate]", 8),
+            text("fields[left]", 11),
             console=screen,
             transient=True,
         )
@@ -234,7 +234,7 @@ class Bars:
         fields = {
             "share": "" if event.share is None else f"{100 * event.share:.0f} %",
             "count": amount(event),
-            "rate": "" if pace.rate is None else f"{pace.rate:.3g}/s",
+            "rate": "" if pace.rate is None else rate(pace.rate),
             "left": "" if pace.left_s is None else f"{duration(pace.left_s)} left",
         }
         if key not in self._tasks:
@@ -253,11 +253,21 @@ def amount(event: Progress) -> str:
     return f"{event.done}{of} {event.unit}"
 
 
+def rate(units_a_second: float, unit: str = "") -> str:
+    """Such as ``12/s``, ``2.1 queries/s``, or ``0.5/min`` where little is done a second."""
+    name = f" {unit}" if unit else ""
+    if units_a_second < 0.1:
+        return f"{60 * units_a_second:.2g}{name}/min"
+    return f"{units_a_second:.3g}{name}/s"
+
+
 def duration(seconds: float) -> str:
     """Such as ``44 s``, ``12 min`` or ``3.5 h``."""
     if seconds < 100:
         return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
+    if seconds < 100 * 60:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.{0 if seconds > 100 * 3600 else 1}f} h"
 
 
 def sentence(event: Progress, pace: Pace | None = None) -> str:
@@ -267,7 +277,7 @@ def sentence(event: Progress, pace: Pace | None = None) -> str:
         return text
     share = "" if event.share is None else f" ({100 * event.share:.0f} %)"
     left = "" if pace.left_s is None else f", {duration(pace.left_s)} left"
-    return f"{text}{share}, {pace.rate:.3g} {event.unit.split()[0]}/s{left}"
+    return f"{text}{share}, {rate(pace.rate, event.unit.split()[0])}{left}"
 
 
 def _finite(content: Any) -> Any:

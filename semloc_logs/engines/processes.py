@@ -26,6 +26,8 @@ from semloc_logs.progress import Progress
 
 PACKAGE_LOGGER = "semloc_logs"
 LEAVE_SECONDS = 3.0  # that workers have to leave: a cluster kills soon after it terminates
+EVENT_SECONDS = 0.05  # between two looks for events of the workers
+EVENTS_END_SECONDS = 1.0  # for the last events
 
 Event = Progress | LogRecord
 
@@ -128,30 +130,41 @@ class Processes:
 
 
 class _Events:
-    """Events of the workers, handed on by a thread of this process."""
+    """Events of the workers, handed on by a thread of this process.
+
+    Nothing is ever put into the queue here: a worker that was killed may have its lock.
+    """
 
     def __init__(self, context: SpawnContext) -> None:
-        self.queue: SimpleQueue[Event | None] = context.SimpleQueue()
+        self.queue: SimpleQueue[Event] = context.SimpleQueue()
+        self._over = threading.Event()
         self._thread = threading.Thread(target=self._hand_on, daemon=True)
         self._thread.start()
 
     def _hand_on(self) -> None:
-        while (event := self.queue.get()) is not None:
+        while True:
+            is_over = self._over.is_set()  # before the look: what came until then is handed on
+            if self.queue.empty():
+                if is_over:
+                    return
+                time.sleep(EVENT_SECONDS)
+                continue
+            event = self.queue.get()
             if isinstance(event, Progress):
                 progress.emit(event)
             else:
                 logging.getLogger(event.name).handle(event)
 
     def end(self) -> None:
-        """Hand on what has come, then stop."""
-        self.queue.put(None)
-        self._thread.join(timeout=5)
+        """Hand on what has come, then stop; half of an event that a killed worker left is lost."""
+        self._over.set()
+        self._thread.join(timeout=EVENTS_END_SECONDS)
 
 
 class _QueueHandler(QueueHandler):
     """Puts log records, formatted, into the queue of the parent."""
 
-    def __init__(self, queue: SimpleQueue[Event | None]) -> None:
+    def __init__(self, queue: SimpleQueue[Event]) -> None:
         super().__init__(queue)  # type: ignore[arg-type]
         self._events = queue
 
@@ -159,7 +172,7 @@ class _QueueHandler(QueueHandler):
         self._events.put(record)
 
 
-def _prepare_worker(queue: SimpleQueue[Event | None], level: int) -> None:
+def _prepare_worker(queue: SimpleQueue[Event], level: int) -> None:
     """A worker leaves when told to (SIGTERM) or when its parent is gone, and leaves Ctrl-C to the
     parent; its events go to the parent.
     """

@@ -19,7 +19,7 @@ from click.testing import CliRunner, Result
 from rich.console import Console as Screen
 
 from semloc_logs.cli import main as main_module
-from semloc_logs.cli.console import Bars, Pace, console, duration, sentence
+from semloc_logs.cli.console import Bars, Pace, console, duration, rate, sentence
 from semloc_logs.cli.main import COMMANDS, program
 from semloc_logs.cli.options import Command, EngineChoice, console_options
 from semloc_logs.errors import LogError, RoleError, SettingsError, WorkspaceError
@@ -213,6 +213,11 @@ def test_progress_tells_the_share_the_rate_and_the_time_left() -> None:
     assert sentence(Progress("close", "tuesday", 200, 200, "queries"), pace) == (
         "close tuesday: 200 of 200 queries"
     )
+    assert [rate(0.0083), rate(0.5), rate(123.4, "queries")] == [
+        "0.5/min",
+        "0.5/s",
+        "123 queries/s",
+    ]
     assert [duration(s) for s in (44, 720, 12600)] == ["44 s", "12 min", "3.5 h"]
 
 
