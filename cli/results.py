@@ -51,7 +51,7 @@ def show_sessions(sessions: Sequence[SessionSummary], shown: int | None = None) 
     rows = [
         (
             s.name,
-            time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(s.start_ns / 1e9)),
+            time.strftime("%Y-%m-%d %H:%M", time.gmtime(s.start_ns / 1e9)),
             f"{s.duration_s:.0f}",
             f"{s.road_m:.0f}",
             s.label_source,
