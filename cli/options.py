@@ -395,11 +395,10 @@ class EngineChoice:
         """
         from semloc_logs.engines import make_engine
 
-        engine = make_engine(
-            self._chosen(tasks), self.jobs, scheduler=self.scheduler, max_memory=self.max_memory
-        )
-        if self.jobs is not None and 1 < engine.jobs < self.jobs:
-            console.note(f"--max-memory is enough for {engine.jobs} workers.")
+        name = self._chosen(tasks)
+        engine = make_engine(name, self.jobs, scheduler=self.scheduler, max_memory=self.max_memory)
+        if name != "serial" and self.max_memory and engine.jobs < (self.jobs or 0):
+            console.note(f"--max-memory is enough for {engine.jobs} of {self.jobs} workers.")
         try:
             yield engine
         except BaseException:
