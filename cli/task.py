@@ -86,14 +86,14 @@ def command(
     if step is not None and (index is None or index >= step):
         raise click.UsageError("--of N needs an --index below N.")
     from semloc_logs.engines import Serial
-    from semloc_logs.stages.tasks import Stage, do_task, list_tasks
+    from semloc_logs.stages.tasks import Stage, do_task, task_ids
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     sessions = sessions_of(stage, logs, topics, poses)
     tasks = [task]
     if index is not None and task in STAGES:
-        listed = [t.id for t in list_tasks(Stage(task), sessions, workspace, settings)]
+        listed = task_ids(Stage(task), sessions, workspace, settings)
         tasks = listed[index::step] if step else listed[index : index + 1]
         if not step and not tasks:
             raise click.UsageError(f"{task} has {len(listed)} tasks; --index counts from 0.")

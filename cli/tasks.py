@@ -53,10 +53,13 @@ def command(
     \b
     Example:  semloc tasks search -w work --missing
     """
-    from semloc_logs.stages.tasks import Stage, list_tasks
+    from semloc_logs.stages.tasks import Stage, list_tasks, task_ids
     from semloc_logs.workspace import Workspace
 
     sessions = sessions_of(stage, logs, topics, poses)
+    if count and not missing:
+        console.result(str(len(task_ids(Stage(stage), sessions, Workspace(work), settings))))
+        return 0
     tasks = list_tasks(Stage(stage), sessions, Workspace(work), settings)
     tasks = [task for task in tasks if not (missing and task.done)]
     if count:

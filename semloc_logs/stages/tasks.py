@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from semloc_logs.closures.pairs import Pair, known_pairs
+from semloc_logs.closures.pairs import Pair, known_pairs, pairs_of_sessions
 from semloc_logs.engines import Engine
 from semloc_logs.errors import SettingsError, WorkspaceError, did_you_mean
 from semloc_logs.mapping.session_map import SessionMap
@@ -57,43 +57,56 @@ def list_tasks(
 ) -> list[StageTask]:
     """All tasks of a stage, also the done ones, in the order of their ids.
 
-    ``sessions`` are needed to fuse. Raises WorkspaceError where what the stage reads is missing.
+    ``sessions`` are needed to fuse. Raises WorkspaceError where the stage lacks its input.
     """
+    names = _task_names(stage, sessions, work, settings)
+    folder = work.path / "sessions"
     match stage:
         case Stage.FUSE:
             kept = plan_fuse(sessions, work, settings, retry_failed=True).report.kept
-            tasks = [
-                StageTask(stage, (s.name,), tuple(map(str, s.logs)), s.name in kept)
-                for s in sessions
-            ]
+            logs = {session.name: tuple(map(str, session.logs)) for session in sessions}
+            return [StageTask(stage, n, logs[n[0]], n[0] in kept) for n in names]
         case Stage.DESCRIBE:
-            folders = work.chosen(())
-            missing = plan_describe(work, folders, settings)
-            tasks = [
-                StageTask(stage, (f.name,), (str(f.path),), f.name not in missing) for f in folders
-            ]
+            missing = plan_describe(work, work.chosen(()), settings)
+            return [StageTask(stage, n, (str(folder / n[0]),), n[0] not in missing) for n in names]
         case Stage.SEARCH:
-            tasks = _search_tasks(work, settings)
+            maps = _maps(work)
+            known = known_pairs(work)
+            fingerprints = pair_fingerprints(maps, settings)
+            done = [known.get(Pair(*n)) == fingerprints[Pair(*n)] for n in names]
+            inputs = [tuple(str(folder / name) for name in n) for n in names]
+            return [StageTask(stage, *task) for task in zip(names, inputs, done, strict=True)]
         case Stage.DECIDE:
-            inputs = (str(work.path / "alignments"),)
-            tasks = [StageTask(stage, (), inputs, is_decided(work, settings))]
-    return sorted(tasks, key=lambda task: task.names)
+            is_done = is_decided(work, settings)
+            return [StageTask(stage, (), (str(work.path / "alignments"),), is_done)]
 
 
-def _search_tasks(work: Workspace, settings: Resolved) -> list[StageTask]:
-    maps = {folder.name: SessionMap(folder) for folder in work.chosen(())}
-    misfits = misfits_of(maps, settings)
-    known = known_pairs(work)
-    return [
-        StageTask(
-            Stage.SEARCH,
-            (pair.query, pair.target),
-            tuple(str(maps[name].folder.path) for name in (pair.query, pair.target)),
-            known.get(pair) == fingerprint,
-        )
-        for pair, fingerprint in pair_fingerprints(maps, settings).items()
-        if not misfits.keys() & {pair.query, pair.target}
-    ]
+def task_ids(
+    stage: Stage, sessions: Sequence[SessionInput], work: Workspace, settings: Resolved
+) -> list[str]:
+    """The ids alone: quick, since thousands of jobs of an array may need them."""
+    return ["/".join((stage, *n)) for n in _task_names(stage, sessions, work, settings)]
+
+
+def _task_names(
+    stage: Stage, sessions: Sequence[SessionInput], work: Workspace, settings: Resolved
+) -> list[tuple[str, ...]]:
+    match stage:
+        case Stage.FUSE:
+            return sorted((session.name,) for session in sessions)
+        case Stage.DESCRIBE:
+            return sorted((folder.name,) for folder in work.chosen(()))
+        case Stage.SEARCH:
+            maps = _maps(work)
+            misfits = misfits_of(maps, settings).keys()
+            pairs = pairs_of_sessions(maps)
+            return [(p.query, p.target) for p in pairs if not misfits & {p.query, p.target}]
+        case Stage.DECIDE:
+            return [()]
+
+
+def _maps(work: Workspace) -> dict[str, SessionMap]:
+    return {folder.name: SessionMap(folder) for folder in work.chosen(())}
 
 
 def parse_task(text: str) -> tuple[Stage, tuple[str, ...]]:
