@@ -9,8 +9,15 @@ import click
 
 from .completion import session_names
 from .console import console
-from .options import Command, EngineChoice, query_options, stage_options, work_option
-from .results import finish, report_json, show_closures
+from .options import (
+    Command,
+    EngineChoice,
+    dry_run_option,
+    query_options,
+    stage_options,
+    work_option,
+)
+from .results import finish, report_json, show_closures, show_plan
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Resolved
@@ -35,6 +42,7 @@ if TYPE_CHECKING:
     help="And of these the ones with this session; repeatable.",
 )
 @click.option("--no-self", is_flag=True, help="Do not look for revisits within a session.")
+@dry_run_option
 @query_options
 @stage_options
 def command(
@@ -42,6 +50,7 @@ def command(
     queries: tuple[str, ...],
     targets: tuple[str, ...],
     no_self: bool,
+    dry_run: bool,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -59,11 +68,16 @@ def command(
     from semloc_logs.closures.closure_tables import read_closures
     from semloc_logs.stages.close import close
     from semloc_logs.stages.pair_search import Selection
+    from semloc_logs.stages.plan import Plan
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(workspace.sessions())) as opened:
         selection = Selection(queries, targets, self_closures=not no_self)
+        if dry_run:
+            plan = Plan(workspace, settings)
+            plan.close(selection, overwrite=overwrite)
+            return show_plan(plan, opened.jobs, as_json=as_json)
         report = close(workspace, settings, opened, selection, overwrite=overwrite)
     if as_json:
         console.result_json(

@@ -16,10 +16,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from rich.console import Console as Screen
     from rich.progress import TaskID
 
     from semloc_logs.progress import Progress
 
+NARROW = 80  # columns of a terminal that bars fit into
+Key = tuple[str, str, str]  # stage, session and unit of some work
 PLAIN_SECONDS = 5.0  # between lines about one piece of work where nobody watches a bar
 
 
@@ -34,7 +37,8 @@ class Console:
         self.verbosity = 0
         self.log_format = "text"
         self._bars: Bars | None = None
-        self._shown: dict[tuple[str, str, str], float] = {}
+        self._shown: dict[Key, float] = {}
+        self._paces: dict[Key, Pace] = {}
         self._begun = time.monotonic()
 
     # -- stdout
@@ -52,7 +56,7 @@ class Console:
         right.
         """
         from rich.box import SIMPLE_HEAD
-        from rich.console import Console as Screen
+        from rich.console import Console as RichConsole
         from rich.table import Table
         from rich.text import Text
 
@@ -64,9 +68,9 @@ class Console:
             )
         for row in rows:
             drawn.add_row(*(Text("-" if x is None else str(x)) for x in row))
-        Screen(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False).print(
-            drawn
-        )
+        RichConsole(
+            file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False
+        ).print(drawn)
 
     # -- stderr
 
@@ -85,17 +89,22 @@ class Console:
 
     def show_progress(self, event: Progress) -> None:
         """A bar on a terminal; elsewhere a line every few seconds, and one at the end."""
-        if self.verbosity < 0:
+        is_alone = not event.session and event.total == 1
+        if self.verbosity < 0 or is_alone:
             return
-        if self._bars is not None:
-            self._bars.show(event)
-            return
-        now = time.monotonic()
         key = event.stage, event.session, event.unit
+        now = time.monotonic()
+        pace = self._paces.setdefault(key, Pace(event.done, now))
+        pace.move(event.done, event.total, now)
+        if self._bars is not None:
+            self._bars.show(event, pace)
+            return
         is_due = now - self._shown.get(key, self._begun) >= PLAIN_SECONDS
         if is_due or event.finished or self.verbosity > 0:
             self._shown[key] = now
-            self._say("info", sentence(event), **asdict(event))
+            figures = {"share": event.share, "rate": pace.rate, "left_s": pace.left_s}
+            rounded = {k: None if v is None else round(v, 3) for k, v in figures.items()}
+            self._say("info", sentence(event, pace), **asdict(event), **rounded)
 
     def _say(self, level: str, message: str, **fields: object) -> None:
         if self.log_format == "json":
@@ -116,6 +125,7 @@ class Console:
 
         self._begun = time.monotonic()
         self._shown.clear()
+        self._paces.clear()
         is_plain = self.verbosity < 0 or self.log_format == "json" or not sys.stderr.isatty()
         with self._notices(), listening(self.show_progress):
             if is_plain:
@@ -158,29 +168,52 @@ class _Notices(logging.Handler):
             self._console.note(message)
 
 
+class Pace:
+    """The rate of some work, from its first event on: a run that goes on where it was has done
+    some of it before.
+    """
+
+    def __init__(self, done: int, now: float) -> None:
+        self._first = done
+        self._begun = now
+        self.rate: float | None = None  # units a second
+        self.left_s: float | None = None
+
+    def move(self, done: int, total: int | None, now: float) -> None:
+        """``done`` units of ``total`` are done now."""
+        seconds = now - self._begun
+        if done <= self._first or seconds <= 0:
+            return
+        self.rate = (done - self._first) / seconds
+        self.left_s = None if total is None else max(0, total - done) / self.rate
+
+
 class Bars:
-    """A bar for each stage of each session that is being worked on."""
+    """A bar for each stage of each session that is being worked on, within 80 columns."""
 
-    def __init__(self) -> None:
-        from rich.console import Console as Screen
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            SpinnerColumn,
-            TextColumn,
-            TimeRemainingColumn,
-        )
+    def __init__(self, screen: Screen | None = None) -> None:
+        from rich.console import Console as RichConsole
+        from rich.progress import BarColumn, SpinnerColumn, TextColumn
         from rich.progress import Progress as RichProgress
+        from rich.table import Column
 
-        self._tasks: dict[tuple[str, str, str], TaskID] = {}
+        def text(field: str, width: int, *, left: bool = False) -> TextColumn:
+            side = "left" if left else "right"
+            column = Column(width=width, no_wrap=True, overflow="ellipsis", justify=side)
+            return TextColumn(f"{{task.{field}}}", markup=False, table_column=column)
+
+        screen = screen or RichConsole(stderr=True)
+        spare = max(0, min(40, screen.width - NARROW))
+        self._tasks: dict[Key, TaskID] = {}
         self._bar = RichProgress(
             SpinnerColumn(),
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=20),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[unit]}", markup=False),
-            TimeRemainingColumn(),
-            console=Screen(stderr=True),
+            text("description", 18 + spare // 2, left=True),
+            BarColumn(bar_width=8 + spare - spare // 2),
+            text("fields[share]", 5),
+            text("fields[count]", 22),
+            text("fields[rate]", 8),
+            text("fields[left]", 11),
+            console=screen,
             transient=True,
         )
 
@@ -191,29 +224,60 @@ class Bars:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def show(self, event: Progress) -> None:
+    def show(self, event: Progress, pace: Pace) -> None:
         """Move the bar of the event's work; a finished one disappears."""
         key = event.stage, event.session, event.unit
         if event.finished:
             if key in self._tasks:
                 self._bar.remove_task(self._tasks.pop(key))
             return
+        fields = {
+            "share": "" if event.share is None else f"{100 * event.share:.0f} %",
+            "count": amount(event),
+            "rate": "" if pace.rate is None else rate(pace.rate),
+            "left": "" if pace.left_s is None else f"{duration(pace.left_s)} left",
+        }
         if key not in self._tasks:
-            description = f"{event.stage} {event.session}".strip()
-            self._tasks[key] = self._bar.add_task(description, total=None, unit=event.unit)
-        task = self._tasks[key]
-        self._bar.update(task, completed=event.done, total=event.total, unit=event.unit)
+            name = f"{event.stage} {event.session or '(all)'}"
+            self._tasks[key] = self._bar.add_task(name, total=None, **fields)
+        self._bar.update(self._tasks[key], completed=event.done, total=event.total, **fields)
 
     def print(self, text: str) -> None:
         """A line above the bars."""
         self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def sentence(event: Progress) -> str:
-    """Such as ``fuse monday: 120 of 300 keyframes``."""
+def amount(event: Progress) -> str:
+    """Such as ``120 of 300 keyframes``."""
     of = "" if event.total is None else f" of {event.total}"
-    name = f"{event.stage} {event.session}".strip()
-    return f"{name}: {event.done}{of} {event.unit}"
+    return f"{event.done}{of} {event.unit}"
+
+
+def rate(units_a_second: float, unit: str = "") -> str:
+    """Such as ``12/s``, ``2.1 queries/s``, or ``0.5/min`` where little is done a second."""
+    name = f" {unit}" if unit else ""
+    if units_a_second < 0.1:
+        return f"{60 * units_a_second:.2g}{name}/min"
+    return f"{units_a_second:.3g}{name}/s"
+
+
+def duration(seconds: float) -> str:
+    """Such as ``44 s``, ``12 min`` or ``3.5 h``."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    if seconds < 100 * 60:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.{0 if seconds > 100 * 3600 else 1}f} h"
+
+
+def sentence(event: Progress, pace: Pace | None = None) -> str:
+    """Such as ``fuse monday: 120 of 300 keyframes (40 %), 12 keyframes/s, 15 s left``."""
+    text = f"{event.stage} {event.session}".strip() + f": {amount(event)}"
+    if event.finished or pace is None or pace.rate is None:
+        return text
+    share = "" if event.share is None else f" ({100 * event.share:.0f} %)"
+    left = "" if pace.left_s is None else f", {duration(pace.left_s)} left"
+    return f"{text}{share}, {rate(pace.rate, event.unit.split()[0])}{left}"
 
 
 def _finite(content: Any) -> Any:

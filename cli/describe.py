@@ -9,8 +9,8 @@ import click
 
 from .completion import session_names
 from .console import console
-from .options import Command, EngineChoice, stage_options, work_option
-from .results import finish, report_json, show_report
+from .options import Command, EngineChoice, dry_run_option, stage_options, work_option
+from .results import finish, report_json, show_plan, show_report
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Resolved
@@ -19,10 +19,12 @@ if TYPE_CHECKING:
 @click.command(cls=Command)
 @click.argument("sessions", metavar="[SESSION...]", nargs=-1, shell_complete=session_names)
 @work_option
+@dry_run_option
 @stage_options
 def command(
     sessions: tuple[str, ...],
     work: Path,
+    dry_run: bool,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -35,10 +37,15 @@ def command(
     Example:  semloc describe -w work monday tuesday
     """
     from semloc_logs.stages.describe import describe
+    from semloc_logs.stages.plan import Plan
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(sessions) or len(workspace.sessions())) as opened:
+        if dry_run:
+            plan = Plan(workspace, settings)
+            plan.describe(sessions, overwrite=overwrite)
+            return show_plan(plan, opened.jobs, as_json=as_json)
         report = describe(workspace, sessions, settings, opened, overwrite=overwrite)
     if as_json:
         console.result_json(report_json(report, work))

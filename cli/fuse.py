@@ -13,12 +13,13 @@ from .options import (
     Command,
     EngineChoice,
     PoseChoice,
+    dry_run_option,
     reading_options,
     retry_option,
     stage_options,
     work_option,
 )
-from .results import finish, report_json, show_report
+from .results import finish, report_json, show_plan, show_report
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Resolved
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     help="Name of the session; default: the first log's file stem or folder name.",
 )
 @retry_option
+@dry_run_option
 @reading_options
 @stage_options
 def command(
@@ -42,6 +44,7 @@ def command(
     topics: dict[str, str],
     poses: PoseChoice,
     retry_failed: bool,
+    dry_run: bool,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -58,10 +61,15 @@ def command(
     """
     sessions = session_inputs(logs.joined(session), topics, poses)
     from semloc_logs.stages.fuse import fuse
+    from semloc_logs.stages.plan import Plan
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     with console.progress(), engine.open(len(sessions)) as opened:
+        if dry_run:
+            plan = Plan(workspace, settings)
+            plan.fuse(sessions, overwrite=overwrite, retry_failed=retry_failed)
+            return show_plan(plan, opened.jobs, as_json=as_json)
         report = fuse(
             sessions,
             workspace,

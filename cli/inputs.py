@@ -48,7 +48,7 @@ class LogChoice:
 
     def each(self) -> list[Entry]:
         """Each log as a session, and the sessions of the manifest."""
-        return self._checked([*_given(self.logs), *self._listed()])
+        return self._checked([*_given(self.logs), *self.listed()])
 
     def joined(self, name: str | None) -> list[Entry]:
         """All LOG arguments as one session, called ``name`` if it is given, and the manifest's."""
@@ -61,9 +61,10 @@ class LogChoice:
             )
         logs = tuple(log for e in parts for log in e.logs)
         together = [Entry(next(iter(names), None), logs)] if logs else []
-        return self._checked([*together, *self._listed()])
+        return self._checked([*together, *self.listed()])
 
-    def _listed(self) -> Iterator[Entry]:
+    def listed(self) -> Iterator[Entry]:
+        """The sessions of the manifest."""
         return iter(()) if self.manifest is None else _listed(self.manifest)
 
     def _checked(self, entries: list[Entry]) -> list[Entry]:

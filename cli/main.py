@@ -31,6 +31,8 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "sessions": ("sessions", "What a workspace holds; rename and remove sessions."),
     "doctor": ("doctor", "Every file of a workspace checked, and what mends it."),
     "optimize": ("optimize", "Closures -> all sessions in one frame."),
+    "tasks": ("tasks", "The tasks of a stage as JSON lines, for a cluster."),
+    "task": ("task", "One of these tasks."),
     "annotate": ("annotate", "Closures -> channels of a log."),
     "index": ("index", "The index of the words: what it holds; up to date."),
     "evaluate": ("evaluate", "Closures against the truth."),

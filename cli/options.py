@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 Function = Callable[..., Any]
 
+LEAST_MEMORY = 500e6  # bytes: libraries and compiled loops alone are about 370 MB
+
 FLAGS = {  # options that are short for a setting
     "stamps": "logs.stamps",
     "odometry": "fusion.odometry",
@@ -73,6 +75,11 @@ overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Do finished work again; replace existing outputs."
 )
 
+dry_run_option = click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Print what would be done and about how long it takes; write nothing.",
+)
 retry_option = click.option(
     "--retry-failed",
     is_flag=True,
@@ -414,10 +421,12 @@ def reading_options(function: Function) -> Function:
 
 @dataclass(frozen=True, slots=True)
 class EngineChoice:
-    """Values of --engine and --jobs."""
+    """Values of --engine, --jobs, --scheduler and --max-memory."""
 
     name: str | None
     jobs: int | None
+    scheduler: str | None = None
+    max_memory: int | None = None
 
     @contextmanager
     def open(self, tasks: int) -> Iterator[Engine]:
@@ -425,10 +434,11 @@ class EngineChoice:
         block fails.
         """
         from semloc_logs.engines import make_engine
-        from semloc_logs.engines.processes import cores
 
-        is_parallel = (self.jobs or cores()) > 1 and (tasks > 1 or self.jobs is not None)
-        engine = make_engine(self.name or ("processes" if is_parallel else "serial"), self.jobs)
+        name = self._chosen(tasks)
+        engine = make_engine(name, self.jobs, scheduler=self.scheduler, max_memory=self.max_memory)
+        if name != "serial" and self.max_memory and engine.jobs < (self.jobs or 0):
+            console.note(f"--max-memory is enough for {engine.jobs} of {self.jobs} workers.")
         try:
             yield engine
         except BaseException:
@@ -436,25 +446,78 @@ class EngineChoice:
             raise
         engine.close()
 
+    def _chosen(self, tasks: int) -> str:
+        from semloc_logs.engines.processes import cores
+
+        if self.name is not None:
+            return self.name
+        if self.scheduler is not None:
+            return "dask"
+        is_parallel = (self.jobs or cores()) > 1 and (tasks > 1 or self.jobs is not None)
+        return "processes" if is_parallel else "serial"
+
+
+class Bytes(click.ParamType):
+    """A number of bytes, such as 8GB or 500M; a number alone is of gigabytes."""
+
+    name = "SIZE"
+
+    def convert(
+        self, value: Any, parameter: click.Parameter | None, context: click.Context | None
+    ) -> int:
+        if isinstance(value, int):
+            return value
+        text = str(value).strip().upper().removesuffix("B").removesuffix("I")
+        unit = {"K": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}.get(text[-1:], 0.0)
+        try:
+            size = float(text[:-1]) * unit if unit else float(text) * 1e9
+        except ValueError:
+            size = 0.0
+        if not LEAST_MEMORY <= size < 1e18:
+            self.fail(f"{value!r} is not a size of at least 500 MB, such as 8GB.")
+        return int(size)
+
 
 def engine_options(function: Function) -> Function:
-    """--engine and --jobs; the command gets ``engine``, an EngineChoice."""
+    """Where work runs; the command gets ``engine``, an EngineChoice."""
 
     @click.option(
         "--engine",
         "engine_name",
-        type=click.Choice(["serial", "processes"]),
-        help="Where work runs; default: processes for several sessions on several cores.",
+        type=click.Choice(["serial", "processes", "dask"]),
+        help="Where work runs; default: processes for several sessions on several cores. dask"
+        " needs the extra 'dask'.",
     )
     @click.option(
         "--jobs",
         type=click.IntRange(1, 1024),
         metavar="N",
-        help="Worker processes; default: the cores of this machine.",
+        help="Worker processes; default: the cores of this machine, as far as its memory is enough"
+        " for.",
+    )
+    @click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Use the workers of this Dask scheduler, such as tcp://head:8786; default: workers on"
+        " this machine.",
+    )
+    @click.option(
+        "--max-memory",
+        type=Bytes(),
+        help="Memory of all workers of this machine together, such as 8GB: fewer workers, and a"
+        " task that needs more than its share ends with a sentence.",
     )
     @functools.wraps(function)
-    def with_engine(*args: Any, engine_name: str | None, jobs: int | None, **options: Any) -> Any:
-        return function(*args, engine=EngineChoice(engine_name, jobs), **options)
+    def with_engine(
+        *args: Any,
+        engine_name: str | None,
+        jobs: int | None,
+        scheduler: str | None,
+        max_memory: int | None,
+        **options: Any,
+    ) -> Any:
+        engine = EngineChoice(engine_name, jobs, scheduler, max_memory)
+        return function(*args, engine=engine, **options)
 
     return with_engine
 

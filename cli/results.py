@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .console import console
+from .console import console, duration
 
 if TYPE_CHECKING:
+    from semloc_logs.stages.plan import Plan
     from semloc_logs.stages.report import Report
+    from semloc_logs.stages.sessions import SessionSummary
     from semloc_logs.workspace import Workspace
 
 SHOWN = 20  # rows of a table; files have them all
@@ -39,6 +44,60 @@ def show_report(verb: str, report: Report) -> None:
         console.result(f"{verb}: {', '.join(report.done)}")
     if report.kept:
         console.result(f"Done before: {', '.join(report.kept)} (--overwrite does it again)")
+
+
+def show_sessions(sessions: Sequence[SessionSummary], shown: int | None = None) -> None:
+    """Sessions of a workspace as a table, or the first of them."""
+    rows = [
+        (
+            s.name,
+            time.strftime("%Y-%m-%d %H:%M", time.gmtime(s.start_ns / 1e9)),
+            f"{s.duration_s:.0f}",
+            f"{s.road_m:.0f}",
+            s.label_source,
+            s.searched,
+            s.closures,
+        )
+        for s in sessions
+    ]
+    columns = ("session", "recorded", "time (s)", "road (m)", "labels", "pairs#", "closures#")
+    console.table("", columns, rows[:shown])
+    if shown is not None and len(rows) > shown:
+        console.result(f"... and {len(rows) - shown} more sessions.")
+
+
+def show_plan(plan: Plan, workers: int, *, as_json: bool) -> int:
+    """What a command would do."""
+    if as_json:
+        stages = [asdict(stage) for stage in plan.stages]
+        seconds = sum(stage.seconds for stage in plan.stages) / workers
+        failed = plan.known_failures
+        console.result_json(
+            {"stages": stages, "workers": workers, "seconds": seconds, "failed": failed}
+        )
+        return 0
+    ends = {"close": "pairs of sessions"}
+    rows = [
+        (
+            stage.stage,
+            f"{len(stage.todo)} of {stage.total} {ends.get(stage.stage, 'sessions')}",
+            f"{stage.amount:.0f} {stage.unit}" if stage.todo else None,
+            f"about {duration(stage.seconds / workers)}" if stage.todo else None,
+        )
+        for stage in plan.stages
+    ]
+    console.table("", ("stage", "to do", "work", "time"), rows)
+    for stage in plan.stages:
+        if stage.todo:
+            more = len(stage.todo) - SHOWN
+            listed = ", ".join(stage.todo[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+            console.result(f"{stage.stage}: {listed}")
+    for sentence in plan.known_failures:
+        console.warn(sentence)
+    seconds = sum(stage.seconds for stage in plan.stages) / workers
+    plural = "" if workers == 1 else "s"
+    console.result(f"About {duration(seconds)} with {workers} worker{plural}; nothing was written.")
+    return 0
 
 
 def show_closures(work: Workspace) -> None:

@@ -13,13 +13,14 @@ from .options import (
     Command,
     EngineChoice,
     PoseChoice,
+    dry_run_option,
     query_options,
     reading_options,
     retry_option,
     stage_options,
     work_option,
 )
-from .results import finish, report_json, show_closures
+from .results import SHOWN, finish, report_json, show_closures, show_plan, show_sessions
 
 if TYPE_CHECKING:
     from semloc_logs.settings import Resolved
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     help="Also write the closures as channels: to WORK/annotated (copy, sidecar) or into the logs.",
 )
 @retry_option
+@dry_run_option
 @reading_options
 @query_options
 @stage_options
@@ -47,6 +49,7 @@ def command(
     topics: dict[str, str],
     poses: PoseChoice,
     retry_failed: bool,
+    dry_run: bool,
     overwrite: bool,
     as_json: bool,
     engine: EngineChoice,
@@ -65,12 +68,20 @@ def command(
     """
     sessions = session_inputs(logs.each(), topics, poses)
     from semloc_logs.stages.annotate import AnnotationMode
+    from semloc_logs.stages.plan import Plan
     from semloc_logs.stages.run import run
+    from semloc_logs.stages.sessions import list_sessions
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     mode = AnnotationMode(annotation)
     with console.progress(), engine.open(len(sessions)) as opened:
+        if dry_run:
+            plan = Plan(workspace, settings)
+            plan.fuse(sessions, overwrite=overwrite, retry_failed=retry_failed)
+            plan.describe(overwrite=False)
+            plan.close(overwrite=overwrite)
+            return show_plan(plan, opened.jobs, as_json=as_json)
         report = run(
             sessions,
             workspace,
@@ -83,6 +94,7 @@ def command(
     if as_json:
         console.result_json(report_json(report, work))
     else:
+        show_sessions(list_sessions(workspace), SHOWN)
         show_closures(workspace)
         if annotation in ("copy", "sidecar"):
             console.result(f"Annotated logs: {workspace.annotated}")

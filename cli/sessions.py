@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from .completion import actions, session_names
 from .console import console
 from .inputs import checked_name
 from .options import Command, console_options, json_option, work_option
+from .results import show_sessions
 
 ACTIONS = {"show": 1, "rename": 2, "remove": 1}  # and the number of names
 
@@ -61,18 +61,5 @@ def command(action: str | None, names: tuple[str, ...], work: Path, as_json: boo
             value = ", ".join(value) if isinstance(value, tuple) else value
             console.result(f"{name.replace('_', ' '):14} {value}")
         return 0
-    columns = ("session", "recorded", "time (s)", "road (m)", "labels", "pairs#", "closures#")
-    rows = [
-        (
-            s.name,
-            time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(s.start_ns / 1e9)),
-            f"{s.duration_s:.0f}",
-            f"{s.road_m:.0f}",
-            s.label_source,
-            s.searched,
-            s.closures,
-        )
-        for s in summaries
-    ]
-    console.table("", columns, rows)
+    show_sessions(summaries)
     return 0

@@ -51,7 +51,7 @@ from semloc_logs.workspace import Workspace as Folder
 F64 = NDArray[np.float64]
 PathLike = str | Path
 Logs = Sequence[PathLike] | Mapping[str, PathLike | Sequence[PathLike]]
-EngineName = Literal["serial", "processes"]
+EngineName = Literal["serial", "processes", "dask"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,9 +168,10 @@ class Workspace:
     """A folder of sessions and of the closures between them; made when something is written to it.
 
     ``settings`` is a :class:`Settings`, a YAML file, or a mapping of key paths such as
-    ``{"fusion.voxel_size": 0.05}``. ``engine`` is ``"serial"``, ``"processes"`` or an engine, with
-    ``jobs`` workers (default: the cores this process may use). ``progress`` is called with a
-    :class:`semloc_logs.progress.Progress` now and then.
+    ``{"fusion.voxel_size": 0.05}``. ``engine`` is ``"serial"``, ``"processes"``, ``"dask"`` or an
+    engine (:func:`semloc_logs.engines.make_engine`), with ``jobs`` workers (default: the cores this
+    process may use). ``progress`` is called with a :class:`semloc_logs.progress.Progress` now and
+    then.
 
     Every stage skips work that is up to date, unless ``overwrite``. Errors are of the type
     :class:`semloc_logs.errors.SemlocError`, one sentence each.

@@ -46,6 +46,13 @@ class WorkspaceError(SemlocError):
     """A workspace lacks input of a stage, or another version or other settings wrote it."""
 
 
+class TemporaryError(WorkspaceError):
+    """Not the fault of the input: another writer, a full disk, too little memory.
+
+    The same command may succeed later.
+    """
+
+
 class ContractError(SemlocError):
     """A table or message does not have the columns that its contract in ``schemas/`` promises."""
 

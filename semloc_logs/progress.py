@@ -13,7 +13,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """``done`` of ``total`` units of a stage's work on a session; ``total`` is None if unknown."""
+    """``done`` of ``total`` units of a stage's work on a session; ``total`` is None if unknown.
+
+    Without a session it is about all sessions of the stage.
+    """
 
     stage: str
     session: str
@@ -24,6 +27,11 @@ class Progress:
     @property
     def finished(self) -> bool:
         return self.total is not None and self.done >= self.total
+
+    @property
+    def share(self) -> float | None:
+        """Of the work that is done, in [0, 1]; None if unknown."""
+        return self.done / self.total if self.total else None
 
 
 Listener = Callable[[Progress], None]
@@ -39,6 +47,12 @@ _listener: Listener = _ignore
 def report(stage: str, session: str, done: int, total: int | None, unit: str) -> None:
     """Tell the listener of this process."""
     _listener(Progress(stage, session, done, total, unit))
+
+
+def report_start(stage: str, total: int, unit: str) -> None:
+    """Tell it how much work a stage begins on all sessions, if there is any."""
+    if total:
+        report(stage, "", 0, total, unit)
 
 
 def emit(event: Progress) -> None:

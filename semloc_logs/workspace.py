@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -116,6 +117,15 @@ class Workspace:
     def session_lock(self, session: str) -> Path:
         return self.locks / f"session.{session}.lock"
 
+    def pair_lock(self, query: str, target: str) -> Path:
+        """Lock of the search of one session in another."""
+        return self.locks / f"query={query}" / f"target={target}.lock"
+
+    def pair_locks(self, query: str | None = None, target: str | None = None) -> list[Path]:
+        """Those of the pairs with a query session or a target session."""
+        ends = ["*" if name is None else glob.escape(name) for name in (query, target)]
+        return sorted(self.locks.glob(f"query={ends[0]}/target={ends[1]}.lock"))
+
     @property
     def settings(self) -> Path:
         return self.path / "workspace.json"
@@ -132,9 +142,13 @@ class Workspace:
         folder = self.path / "alignments" / f"query={query}" / f"target={target}"
         return folder / "alignments.parquet"
 
-    def search_parts(self, query: str) -> Path:
-        """Alignments of a session whose search is not over, a file for each task."""
-        return self.path / ".parts" / query
+    def search_parts(self, query: str, target: str | None = None) -> Path:
+        """Alignments of a session whose search is not over, a file for each task.
+
+        With a ``target``, of a search in it alone.
+        """
+        folder = self.path / ".parts" / query
+        return folder if target is None else folder / f"target={target}"
 
     @property
     def closures(self) -> Path:

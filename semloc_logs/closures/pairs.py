@@ -6,9 +6,12 @@ itself. So pairs do not depend on when sessions were added, and a new one leaves
 
 from __future__ import annotations
 
+import glob
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 from semloc_logs.closures.alignment_tables import Part, joined_parts, read_parts
 from semloc_logs.errors import WorkspaceError
@@ -45,11 +48,19 @@ def known_pairs(work: Workspace) -> dict[Pair, str]:
         query, target = (
             folder.name.partition("=")[2] for folder in (path.parent.parent, path.parent)
         )
-        try:
-            found[Pair(query, target)] = str(read_metadata(path).get("fingerprint"))
-        except WorkspaceError:  # damaged
-            found[Pair(query, target)] = ""
+        found |= known_pair(work, Pair(query, target))
     return found
+
+
+def known_pair(work: Workspace, pair: Pair) -> dict[Pair, str]:
+    """The same of one pair; empty where its alignments are missing."""
+    path = work.alignments(pair.query, pair.target)
+    if not path.exists():
+        return {}
+    try:
+        return {pair: str(read_metadata(path).get("fingerprint"))}
+    except WorkspaceError:  # damaged
+        return {pair: ""}
 
 
 def forget(work: Workspace, pairs: Iterable[Pair]) -> None:
@@ -64,9 +75,13 @@ def forget(work: Workspace, pairs: Iterable[Pair]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """Queries of a session, in chunks, and the targets that each has still to be searched in."""
+    """Queries of a session, in chunks, and the targets that each has still to be searched in.
+
+    New parts go to ``folder``.
+    """
 
     session: str
+    folder: Path
     fingerprints: Mapping[str, str]  # of the pairs, by target
     chunks: Sequence[tuple[int, ...]]
     parts: Sequence[Part]
@@ -93,9 +108,17 @@ def missing(
     session: str,
     fingerprints: Mapping[str, str],
     chunks: Sequence[tuple[int, ...]],
+    alone: str | None = None,
 ) -> Missing:
-    """What is left to search of a session, by the parts that are there."""
-    return Missing(session, fingerprints, chunks, read_parts(work.search_parts(session)))
+    """What is left to search of a session, by the parts that are there.
+
+    ``alone``: the only target that this process searches, while others search others.
+    """
+    common = work.search_parts(session)
+    own = "*" if alone is None else glob.escape(alone)
+    paths = sorted([*common.glob("*.parquet"), *common.glob(f"target={own}/*.parquet")])
+    folder = work.search_parts(session, alone)
+    return Missing(session, folder, fingerprints, chunks, read_parts(paths))
 
 
 def finish(work: Workspace, done: Missing, metadata: Mapping[str, Mapping[str, object]]) -> None:
@@ -105,4 +128,6 @@ def finish(work: Workspace, done: Missing, metadata: Mapping[str, Mapping[str, o
         content = {**metadata[target], "fingerprint": fingerprint, "queries": queries}
         table = joined_parts(done.of(target), target)
         write_table(work.alignments(done.session, target), table, content, ("query_keyframe",))
-    shutil.rmtree(work.search_parts(done.session), ignore_errors=True)
+    shutil.rmtree(done.folder, ignore_errors=True)
+    with suppress(OSError):  # other targets are searched still
+        done.folder.parent.rmdir()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol, TypeVar
 
+from semloc_logs.engines.memory import memory_limit
+
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -29,12 +31,20 @@ class Engine(Protocol):
 
 
 class Serial:
-    """Everything in this process, one task after the other."""
+    """Everything in this process, one task after the other; each ends where it needs more than
+    ``max_memory`` bytes.
+    """
 
     jobs = 1
 
+    def __init__(self, max_memory: int | None = None) -> None:
+        self._max_memory = max_memory
+
     def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
-        return map(function, tasks)
+        for task in tasks:
+            with memory_limit(self._max_memory):
+                result = function(task)
+            yield result
 
     def close(self) -> None:
         """Nothing to release."""

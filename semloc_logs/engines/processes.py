@@ -20,11 +20,14 @@ from typing import NoReturn
 
 from semloc_logs import progress
 from semloc_logs.engines.base import Result, Task
-from semloc_logs.errors import SemlocError
+from semloc_logs.engines.memory import memory_limit
+from semloc_logs.errors import TemporaryError
 from semloc_logs.progress import Progress
 
 PACKAGE_LOGGER = "semloc_logs"
 LEAVE_SECONDS = 3.0  # that workers have to leave: a cluster kills soon after it terminates
+EVENT_SECONDS = 0.05  # between two looks for events of the workers
+EVENTS_END_SECONDS = 1.0  # for the last events
 
 Event = Progress | LogRecord
 
@@ -50,13 +53,15 @@ def single_threaded() -> None:
 
 
 class Processes:
-    """``jobs`` worker processes, one thread each.
+    """``jobs`` worker processes, one thread each; a task ends that needs more than
+    ``worker_memory`` bytes.
 
     They are spawned, so that threads of the parent cannot hurt them.
     """
 
-    def __init__(self, jobs: int) -> None:
+    def __init__(self, jobs: int, worker_memory: int | None = None) -> None:
         self.jobs = jobs
+        self._worker_memory = worker_memory
         self._context: SpawnContext = multiprocessing.get_context("spawn")
         self._pool: ProcessPoolExecutor | None = None
         self._events: _Events | None = None
@@ -67,7 +72,7 @@ class Processes:
         try:
             # a bounded number of tasks in flight: their results may be large
             for task in tasks:
-                waiting.append(pool.submit(_run, function, task))
+                waiting.append(pool.submit(_run, function, task, self._worker_memory))
                 if len(waiting) >= 2 * self.jobs:
                     yield waiting.popleft().result()
             while waiting:
@@ -75,7 +80,7 @@ class Processes:
         except BrokenProcessPool:
             self._end_events()
             self._pool = None
-            raise SemlocError(
+            raise TemporaryError(
                 "A worker process ended abruptly, most likely for lack of memory:"
                 " run again with fewer --jobs; finished work is kept."
             ) from None
@@ -125,30 +130,41 @@ class Processes:
 
 
 class _Events:
-    """Events of the workers, handed on by a thread of this process."""
+    """Events of the workers, handed on by a thread of this process.
+
+    Nothing is ever put into the queue here: a worker that was killed may have its lock.
+    """
 
     def __init__(self, context: SpawnContext) -> None:
-        self.queue: SimpleQueue[Event | None] = context.SimpleQueue()
+        self.queue: SimpleQueue[Event] = context.SimpleQueue()
+        self._over = threading.Event()
         self._thread = threading.Thread(target=self._hand_on, daemon=True)
         self._thread.start()
 
     def _hand_on(self) -> None:
-        while (event := self.queue.get()) is not None:
+        while True:
+            is_over = self._over.is_set()  # before the look: what came until then is handed on
+            if self.queue.empty():
+                if is_over:
+                    return
+                time.sleep(EVENT_SECONDS)
+                continue
+            event = self.queue.get()
             if isinstance(event, Progress):
                 progress.emit(event)
             else:
                 logging.getLogger(event.name).handle(event)
 
     def end(self) -> None:
-        """Hand on what has come, then stop."""
-        self.queue.put(None)
-        self._thread.join(timeout=5)
+        """Hand on what has come, then stop; half of an event that a killed worker left is lost."""
+        self._over.set()
+        self._thread.join(timeout=EVENTS_END_SECONDS)
 
 
 class _QueueHandler(QueueHandler):
     """Puts log records, formatted, into the queue of the parent."""
 
-    def __init__(self, queue: SimpleQueue[Event | None]) -> None:
+    def __init__(self, queue: SimpleQueue[Event]) -> None:
         super().__init__(queue)  # type: ignore[arg-type]
         self._events = queue
 
@@ -156,7 +172,7 @@ class _QueueHandler(QueueHandler):
         self._events.put(record)
 
 
-def _prepare_worker(queue: SimpleQueue[Event | None], level: int) -> None:
+def _prepare_worker(queue: SimpleQueue[Event], level: int) -> None:
     """A worker leaves when told to (SIGTERM) or when its parent is gone, and leaves Ctrl-C to the
     parent; its events go to the parent.
     """
@@ -184,9 +200,10 @@ def _leave_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _run(function: Callable[[Task], Result], task: Task) -> Result:
+def _run(function: Callable[[Task], Result], task: Task, max_memory: int | None) -> Result:
     """In a worker: the pool would hand SystemExit to the parent as a result and live on."""
     try:
-        return function(task)
+        with memory_limit(max_memory):
+            return function(task)
     except SystemExit as leaving:
         os._exit(leaving.code if isinstance(leaving.code, int) else 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,8 +87,16 @@ class Collected:
         return out
 
     def _save(self, keyframe: int, what: str, values: NDArray[Any] | None) -> None:
-        if values is not None:
-            np.save(self.scratch / f"{keyframe}-{what}.npy", values, allow_pickle=False)
+        if values is None:
+            return
+        path = self.scratch / f"{keyframe}-{what}.npy"
+        try:
+            np.save(path, values, allow_pickle=False)
+        except OSError as problem:
+            if problem.errno is None:  # numpy counts bytes where the disk is full
+                code = errno.ENOSPC
+                raise OSError(code, os.strerror(code), str(path)) from None
+            raise
 
     def _load(self, keyframe: int, what: str) -> NDArray[Any] | None:
         path = self.scratch / f"{keyframe}-{what}.npy"
@@ -106,6 +116,7 @@ def collect(
     """
     collected = Collected(scratch, fusion.keyframe_resolution)
     selector = KeyframeSelector(fusion)
+    share = _ShareRead(session, name)
     clouds = session.clouds(labeller.on_image, labeller.images)
     # pictures come through the labeller in the same pass: they must not overtake the clouds that
     # they are painted on
@@ -113,9 +124,32 @@ def collect(
         prefetched(clouds) if labeller.on_image is None else (cloud for cloud in clouds)
     ) as coming:
         for cloud in coming:
+            share.reach(cloud.header.log_time_ns)
             if selector.wants(cloud.header.topic, cloud.header.stamp_ns, cloud.session_T_base):
                 kept = thin(cloud.points, collected.cell)
                 collected.add(cloud, kept, labeller.take(cloud, kept))
-                if len(collected) % 50 == 0:
-                    progress.report("fuse", name, len(collected), None, "keyframes read")
+    share.finish()
     return collected
+
+
+class _ShareRead:
+    """Reports how much of the logs is read, in whole seconds of their time."""
+
+    def __init__(self, session: Session, name: str) -> None:
+        starts = [log.start_ns for log in session.logs if log.start_ns is not None]
+        ends = [log.end_ns for log in session.logs if log.end_ns is not None]
+        self._name = name
+        self._start_ns = min(starts, default=0)
+        self._total = max(1, (max(ends) - self._start_ns) // 10**9) if starts and ends else None
+        self._done = 0
+
+    def reach(self, log_time_ns: int) -> None:
+        """A message of this time is read."""
+        done = (log_time_ns - self._start_ns) // 10**9
+        if self._total is not None and self._done < done < self._total:
+            self._done = done
+            progress.report("fuse", self._name, done, self._total, "s of log")
+
+    def finish(self) -> None:
+        if self._total is not None:
+            progress.report("fuse", self._name, self._total, self._total, "s of log")

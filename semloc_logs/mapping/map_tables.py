@@ -149,7 +149,7 @@ def labelled_keyframes(
         facts.points.append(int(keep.sum()))
         facts.views.append(_view(points[keep], collected.origins[i], VIEW * scale))
         if (i + 1) % PROGRESS_EVERY == 0 or i + 1 == count:
-            progress.report("fuse", session.name, i + 1, count, "keyframes labelled")
+            progress.report("fuse", session.name, i + 1, count, "keyframes")
         yield Keyframe(points[keep], label[keep], None if sigma is None else sigma[keep])
 
 

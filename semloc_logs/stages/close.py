@@ -51,9 +51,9 @@ def close(
     """
     search = PairSearch.of(work, settings, selection, overwrite=overwrite)
     keep(work, settings)
-    search.run(engine)
+    searches = search.run(engine)
     is_new = decide_all(work, search.maps, settings, overwrite=overwrite)
-    report = Report(closures=len(read_closures(work.closures)))
+    report = Report(closures=len(read_closures(work.closures)), amount=searches)
     report.skipped += misfits_of(search.maps, settings).values()
     (report.done if is_new else report.kept).append("closures")
     return report

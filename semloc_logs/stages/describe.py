@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from itertools import chain, islice
+from pathlib import Path
 from typing import Any
 
 from semloc_logs import progress
@@ -51,6 +54,27 @@ def describe(
         return _describe(work, folders, settings, engine, overwrite)
 
 
+def plan_describe(
+    work: Workspace,
+    folders: Sequence[SessionFolder],
+    settings: Resolved,
+    *,
+    overwrite: bool = False,
+) -> dict[str, tuple[str, ...]]:
+    """The sessions to describe, with the networks that do it. Nothing is written."""
+    # a session is comparable with all others, not only with those that are described now
+    sources = [str(read_json(f.session_json)["label_source"]) for f in work.sessions()]
+    plan = {}
+    for folder in folders:
+        check_settings(folder, settings)
+    for folder in folders:
+        source = str(read_json(folder.session_json)["label_source"])
+        variants = variants_for(source, sources, settings)
+        if overwrite or not is_described(folder, variants, settings):
+            plan[folder.name] = variants
+    return plan
+
+
 def _describe(
     work: Workspace,
     folders: Sequence[SessionFolder],
@@ -58,26 +82,23 @@ def _describe(
     engine: Engine,
     overwrite: bool,
 ) -> Report:
-    report = Report()
-    # a session is comparable with all others, not only with those that are described now
-    sources = [str(read_json(f.session_json)["label_source"]) for f in work.sessions()]
-    for folder in folders:
-        check_settings(folder, settings)
+    plan = plan_describe(work, folders, settings, overwrite=overwrite)
     keep(work, settings)
-    for folder in folders:
-        content = read_json(folder.session_json)
-        variants = variants_for(str(content["label_source"]), sources, settings)
-        if not overwrite and is_described(folder, variants, settings):
-            report.kept.append(folder.name)
-            continue
-
-        words = _describe_session(folder, content, variants, settings, engine)
-        used = settings.tables("descriptor")
-        fingerprint = words_fingerprint(folder, settings)
-        done = {"fingerprint": fingerprint, "words": words, "variants": list(variants)}
-        write_json(folder.words_json, {**done, "settings": used})
-        report.done.append(folder.name)
-        LOGGER.info("%s: %d words", folder.name, words)
+    report = Report(kept=[folder.name for folder in folders if folder.name not in plan])
+    with ExitStack() as outputs:
+        coming = [
+            _Described(folder, plan[folder.name], settings, outputs)
+            for folder in folders
+            if folder.name in plan
+        ]
+        progress.report_start("describe", len(coming), "sessions")
+        counts = engine.map(index_submap, chain.from_iterable(one.tasks() for one in coming))
+        for number, one in enumerate(coming, 1):
+            words = one.take(counts)
+            report.amount += one.submaps
+            report.done.append(one.folder.name)
+            LOGGER.info("%s: %d words", one.folder.name, words)
+            progress.report("describe", "", number, len(coming), "sessions")
     return report
 
 
@@ -106,39 +127,74 @@ def check_settings(folder: SessionFolder, settings: Resolved) -> None:
             )
 
 
-def _describe_session(
-    folder: SessionFolder,
-    content: dict[str, Any],
-    variants: tuple[str, ...],
-    settings: Resolved,
-    engine: Engine,
-) -> int:
-    """Write the words of all submaps; their number."""
-    metadata = {key: content[key] for key in KEPT_METADATA}
-    road = SessionMap(folder).road
-    submaps = content["submaps"]
-    words = 0
-    with replacing_folder(folder.words) as output:
-        tasks = [
-            DescribeTask(
-                folder,
+class _Described:
+    """The words of one session, which replace older ones when all submaps are described.
+
+    Several sessions can be on their way at once.
+    """
+
+    def __init__(
+        self,
+        folder: SessionFolder,
+        variants: tuple[str, ...],
+        settings: Resolved,
+        outputs: ExitStack,
+    ) -> None:
+        self.folder = SessionFolder(folder.path.absolute())  # workers may be in another folder
+        content = read_json(folder.session_json)
+        self._submaps: list[dict[str, Any]] = content["submaps"]
+        self._metadata = {key: content[key] for key in KEPT_METADATA}
+        self._variants = variants
+        self._settings = settings
+        self._end = outputs.enter_context(ExitStack())
+        self._output: Path | None = None
+
+    @property
+    def submaps(self) -> int:
+        return len(self._submaps)
+
+    def tasks(self) -> Iterator[DescribeTask]:
+        """One for each submap."""
+        road = SessionMap(self.folder).road
+        output = self._begun()
+        for submap in self._submaps:
+            yield DescribeTask(
+                self.folder,
                 submap["id"],
                 submap["ground_z"],
                 road(submap),
-                variants,
+                self._variants,
                 blocks_path(output, submap["id"]),
-                metadata,
-                settings,
+                self._metadata,
+                self._settings,
             )
-            for submap in submaps
-        ]
-        for done, count in enumerate(engine.map(index_submap, tasks), 1):
+
+    def take(self, counts: Iterator[int]) -> int:
+        """Take the results of the tasks, and put the words in their place; their number."""
+        words = 0
+        total = len(self._submaps)
+        for done, count in enumerate(islice(counts, total), 1):
             words += count
-            progress.report("describe", folder.name, done, len(tasks), "submaps")
-        if not tasks:
-            write_words(blocks_path(output, 0), 0, [], metadata)
-        folder.words_json.unlink(missing_ok=True)  # it must not vouch for other words
-    return words
+            progress.report("describe", self.folder.name, done, total, "submaps")
+        output = self._begun()
+        if not total:
+            write_words(blocks_path(output, 0), 0, [], self._metadata)
+        self.folder.words_json.unlink(missing_ok=True)  # it must not vouch for other words
+        self._end.close()
+        content = {
+            "fingerprint": words_fingerprint(self.folder, self._settings),
+            "words": words,
+            "variants": list(self._variants),
+            "settings": self._settings.tables("descriptor"),
+        }
+        write_json(self.folder.words_json, content)
+        return words
+
+    def _begun(self) -> Path:
+        """The folder that the words are written to."""
+        if self._output is None:
+            self._output = self._end.enter_context(replacing_folder(self.folder.words))
+        return self._output
 
 
 def _weights(settings: Resolved) -> str:

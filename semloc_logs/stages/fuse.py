@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from semloc_logs import progress
 from semloc_logs.engines import Engine
 from semloc_logs.errors import (
     LogError,
     RemoteError,
     SemlocError,
+    TemporaryError,
     TopicError,
     WorkspaceError,
 )
@@ -40,74 +42,111 @@ from semloc_logs.workspace import SessionFolder, Workspace
 LOGGER = logging.getLogger(__name__)
 
 
+@dataclass(slots=True)
+class FusePlan:
+    """The sessions to fuse, and in ``report`` those that are done or failed before."""
+
+    tasks: list[FuseTask] = field(default_factory=list)
+    report: Report = field(default_factory=Report)
+
+
 def fuse(
     sessions: Sequence[SessionInput],
     work: Workspace,
     settings: Resolved,
     engine: Engine,
     *,
+    names: Sequence[str] = (),
     overwrite: bool = False,
     retry_failed: bool = False,
 ) -> Report:
-    """Fuse each session. One that fails is named in ``failed``; the others go on.
+    """Fuse each session, or only ``names``. One that fails is named in ``failed``; the others
+    go on.
 
     The reason is kept, and the same log is not read again unless ``retry_failed`` or ``overwrite``.
     Raises LogError when all of them failed, WorkspaceError where another log has the name of a
     session, unless ``overwrite``.
     """
-    with writing(work, [session.name for session in sessions]):
-        return _fuse(sessions, work, settings, engine, overwrite, again=overwrite or retry_failed)
+    chosen = [session for session in sessions if not names or session.name in names]
+    with writing(work, [session.name for session in chosen]):
+        for session in chosen:
+            for log in session.logs:
+                recover(log)
+        plan = plan_fuse(
+            sessions, work, settings, names=names, overwrite=overwrite, retry_failed=retry_failed
+        )
+        keep(work, settings, overwrite=overwrite)
+        return _fuse(plan, work, engine)
 
 
-def _fuse(
+def plan_fuse(
     sessions: Sequence[SessionInput],
     work: Workspace,
     settings: Resolved,
-    engine: Engine,
-    overwrite: bool,
-    again: bool,
-) -> Report:
-    report = Report()
-    tasks: list[FuseTask] = []
-    is_usage = True
+    *,
+    names: Sequence[str] = (),
+    overwrite: bool = False,
+    retry_failed: bool = False,
+) -> FusePlan:
+    """What :func:`fuse` would do. Nothing is written."""
+    plan = FusePlan()
+    again = overwrite or retry_failed
     logs = [log for session in sessions for log in session.logs]
     for session in sessions:
+        if names and session.name not in names:
+            continue
         others = [log for log in logs if log not in session.logs]
         folder = work.session(session.name)
         present = {} if overwrite else _present(folder)
         reading = _as_read_before(present, settings)
         task = _task(session, folder, reading, others)
         if present.get("fingerprint") == task.fingerprint:
-            report.kept.append(session.name)
-            report.skipped += present["skipped"]
+            plan.report.kept.append(session.name)
+            plan.report.skipped += present["skipped"]
             continue
         _check_same_log(task, present)
         if not again and recorded_fingerprint(work.failure(session.name)) == task.fingerprint:
             reason = read_json(work.failure(session.name))["reason"]
-            report.failed.append(f"{reason} It failed before: --retry-failed reads it again.")
-            is_usage = False
+            sentence = f"{reason} It failed before: --retry-failed reads it again."
+            plan.report.failed.append(sentence)
         else:
-            tasks.append(task)
-    keep(work, settings, overwrite=overwrite)
+            plan.tasks.append(task)
+    return plan
 
-    for task, outcome in zip(tasks, engine.map(_fuse_one, tasks), strict=True):
+
+def _fuse(plan: FusePlan, work: Workspace, engine: Engine) -> Report:
+    report = plan.report
+    tasks = plan.tasks
+    kinds: set[type[SemlocError]] = {LogError} if report.failed else set()
+    progress.report_start("fuse", len(tasks), "sessions")
+    for done, (task, outcome) in enumerate(
+        zip(tasks, engine.map(_fuse_one, tasks), strict=True), 1
+    ):
         failure = work.failure(task.folder.name)
         if isinstance(outcome, SemlocError):
             report.failed.append(str(outcome))
-            is_usage = is_usage and isinstance(outcome, TopicError)
-            if not isinstance(outcome, RemoteError | TopicError):  # else the log may be good
+            kinds.add(type(outcome))
+            # else the log is not to blame
+            if not isinstance(outcome, RemoteError | TopicError | TemporaryError):
                 content = {"fingerprint": task.fingerprint, "reason": str(outcome)}
                 write_json(failure, content | {"logs": [str(log) for log in task.logs]})
             if len(tasks) > 1:  # the only one is raised below
                 LOGGER.info("%s: %s", task.folder.name, outcome)
         else:
+            if not task.folder.session_json.exists():
+                raise WorkspaceError(
+                    f"A worker wrote {task.folder.path} on a disk of its own: all workers have to"
+                    " see the workspace under the same path."
+                )
             failure.unlink(missing_ok=True)
             report.done.append(task.folder.name)
+            report.amount += _seconds(outcome.content)
             report.skipped += sentences(to_report(outcome.problems))
             _log_outcome(task.folder.name, outcome)
+        progress.report("fuse", "", done, len(tasks), "sessions")
     if report.failed and not report.done and not report.kept:
-        kind = TopicError if is_usage else LogError
-        raise kind(" ".join(report.failed))
+        kind = kinds.pop() if len(kinds) == 1 else LogError
+        raise (kind if kind in (TemporaryError, TopicError) else LogError)(" ".join(report.failed))
     return report
 
 
@@ -136,8 +175,6 @@ def _task(
 
     ``others``: the logs of the other sessions, which may have transforms that this one lacks.
     """
-    for log in session.logs:
-        recover(log)
     mountings = _mountings(session, settings, others)
     made_from = {
         "content": [content_fingerprint(log) for log in session.logs],
@@ -154,6 +191,7 @@ def _task(
     )
     logs = tuple(log.absolute() for log in session.logs)
     topics = dict(session.topics)
+    folder = SessionFolder(folder.path.absolute())  # workers may have another current folder
     return FuseTask(
         logs, folder, settings, topics, fingerprint, made_from, session.poses, mountings
     )
@@ -203,6 +241,13 @@ def _fuse_one(task: FuseTask) -> FusedSession | SemlocError:
             return fuse_session(replace(task, folder=folder), on_tables=partial(_draw, folder))
     except SemlocError as problem:
         return problem
+
+
+def _seconds(content: Mapping[str, Any]) -> float:
+    """Of the logs of a session."""
+    ends = [(log["start_ns"], log["end_ns"]) for log in content["logs"]]
+    lengths_ns = (end - start for start, end in ends if start is not None and end is not None)
+    return float(sum(lengths_ns)) / 1e9
 
 
 def _draw(folder: SessionFolder, content: dict[str, Any]) -> None:

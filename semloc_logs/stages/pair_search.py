@@ -17,6 +17,7 @@ from semloc_logs.closures.pairs import (
     Pair,
     finish,
     forget,
+    known_pair,
     known_pairs,
     missing,
     pairs_of_sessions,
@@ -66,7 +67,8 @@ class PairSearch:
     """The pairs of a workspace to search: all that are ``chosen`` and not up to date.
 
     ``fingerprints`` are of what the alignments of every pair depend on, ``known`` of the
-    alignments that are there.
+    alignments that are there. ``alone``: this process searches one pair, while others search
+    others.
     """
 
     work: Workspace
@@ -75,6 +77,27 @@ class PairSearch:
     fingerprints: Mapping[Pair, str]
     known: Mapping[Pair, str]
     chosen: Sequence[Pair]
+    alone: bool = False
+
+    @classmethod
+    def of_pair(cls, work: Workspace, settings: Resolved, pair: Pair) -> PairSearch:
+        """Of one pair, chosen where it is not up to date. WorkspaceError for another direction."""
+        sessions = work.chosen(sorted({pair.query, pair.target}))
+        maps = {folder.name: SessionMap(folder) for folder in sessions}
+        for session in maps.values():
+            check_settings(session.folder, settings)
+        fingerprints = {p: f for p, f in pair_fingerprints(maps, settings).items() if p == pair}
+        if not fingerprints:
+            raise WorkspaceError(
+                f"{pair.query} was recorded before {pair.target}, so that the search is"
+                f" 'search/{pair.target}/{pair.query}': 'semloc tasks search -w {work.path}' lists"
+                " all."
+            )
+        known = known_pair(work, pair)
+        is_missing = known.get(pair) != fingerprints[pair] and not misfits_of(maps, settings)
+        chosen = [pair] if is_missing else []
+        _check_words(work, chosen, maps, settings)
+        return cls(work, maps, settings, fingerprints, known, chosen, alone=True)
 
     @classmethod
     def of(
@@ -103,8 +126,10 @@ class PairSearch:
         _check_words(work, chosen, maps, settings)
         return cls(work, maps, settings, fingerprints, known, chosen)
 
-    def run(self, engine: Engine) -> None:
-        """Search the pairs; each session that is done gets its tables of alignments.
+    def run(self, engine: Engine) -> int:
+        """Search the pairs; how many searches of a query in a session that were.
+
+        Each session that is done gets its tables of alignments.
 
         A session whose search was interrupted goes on where it was. Alignments that belong to no
         present pair are removed.
@@ -112,19 +137,28 @@ class PairSearch:
         for pair in self.chosen:
             if self.known.get(pair) == self.fingerprints[pair]:  # to be overwritten
                 shutil.rmtree(self.work.search_parts(pair.query), ignore_errors=True)
+        if not self.alone:
+            self._remove_old_parts()
         sessions = self._missing()
         tasks = [task for one in sessions for task in self._tasks(one)]
         results = zip(tasks, engine.map(search_queries, tasks), strict=True)
+        searches = sum(len(task.keyframes) for task in tasks)
+        searched = 0
+        progress.report_start("close", searches, "queries")
         for one in sessions:
-            total = sum(len(chunk) for chunk in one.chunks)
-            count = sum(task.session == one.session for task in tasks)
-            for number in range(1, count + 1):
+            of_session = [task for task in tasks if task.session == one.session]
+            total = sum(len(task.keyframes) for task in of_session)
+            done = 0
+            for task in of_session:
                 next(results)
-                done = total * number // count
+                done += len(task.keyframes)
                 progress.report("close", one.session, done, total, "queries")
+                progress.report("close", "", searched + done, searches, "queries")
+            searched += total
             finish(self.work, self._left(one), self._metadata(one))
         stale = [p for p, made_from in self.known.items() if made_from != self.fingerprints.get(p)]
         forget(self.work, [p for p in stale if p not in self.chosen])
+        return sum(len(task.keyframes) * len(task.targets) for task in tasks)
 
     def _missing(self) -> list[Missing]:
         """What is left to search of each session."""
@@ -138,12 +172,23 @@ class PairSearch:
                 tuple(keyframes[first : first + QUERIES_A_TASK])
                 for first in range(0, len(keyframes), QUERIES_A_TASK)
             ]
-            out.append(missing(self.work, session, fingerprints, chunks))
+            alone = next(iter(fingerprints)) if self.alone else None
+            out.append(missing(self.work, session, fingerprints, chunks, alone))
         return out
 
     def _left(self, one: Missing) -> Missing:
         """The same after some tasks are done."""
-        return missing(self.work, one.session, one.fingerprints, one.chunks)
+        alone = next(iter(one.fingerprints)) if self.alone else None
+        return missing(self.work, one.session, one.fingerprints, one.chunks, alone)
+
+    def _remove_old_parts(self) -> None:
+        """Remove parts of searches that are over, or of sessions that are gone."""
+        open_searches = {
+            p.query for p, made_from in self.fingerprints.items() if self.known.get(p) != made_from
+        }
+        for folder in (self.work.path / ".parts").glob("*"):
+            if folder.name not in open_searches:
+                shutil.rmtree(folder, ignore_errors=True)
 
     def _tasks(self, one: Missing) -> list[SearchTask]:
         path = self.work.path.absolute()
@@ -152,7 +197,7 @@ class PairSearch:
             targets = one.targets(chunk)
             if targets:
                 name = f"{chunk[0]:06d}-{fingerprint_of(targets.values())}.parquet"
-                output = Workspace(path).search_parts(one.session) / name
+                output = one.folder.absolute() / name
                 task = SearchTask(path, one.session, chunk, targets, self.settings, output)
                 tasks.append(task)
         return tasks

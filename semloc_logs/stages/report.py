@@ -10,7 +10,8 @@ class Report:
     """The outcome of a stage, or of several.
 
     ``done`` and ``kept`` name the work that was done and the work that was up to date; ``skipped``
-    and ``failed`` are sentences about input that was left out; ``seconds`` are by stage.
+    and ``failed`` are sentences about input that was left out; ``seconds`` are by stage. ``amount``
+    of work is in the units of the stage (:mod:`semloc_logs.stages.plan`).
     """
 
     done: list[str] = field(default_factory=list)
@@ -19,3 +20,4 @@ class Report:
     failed: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     closures: int = 0
+    amount: float = 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import semloc_logs
@@ -16,6 +16,7 @@ from semloc_logs.stages.describe import describe
 from semloc_logs.stages.fuse import fuse
 from semloc_logs.stages.inputs import SessionInput, session_name
 from semloc_logs.stages.lock import one_writer
+from semloc_logs.stages.plan import measured_rates
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.report_page import write_report
 from semloc_logs.tables.table import write_json
@@ -36,7 +37,7 @@ def run(
     retry_failed: bool = False,
 ) -> Report:
     """All of it, resumable: sessions are fused, and all of the workspace described and closed."""
-    total = _Total()
+    total = _Total(engine.jobs)
     fused_now = fuse(
         sessions, work, settings, engine, overwrite=overwrite, retry_failed=retry_failed
     )
@@ -49,7 +50,7 @@ def run(
         for session in fused:
             _annotate_logs(session, work, settings, annotation)
         total.add("annotate", Report(closures=total.report.closures))
-    _write_summary(work, total.report)
+    _write_summary(work, total.report, {**measured_rates(work), **total.rates})
     if work.closures.exists():
         write_report(work, settings)
     return total.report
@@ -58,8 +59,10 @@ def run(
 class _Total:
     """One report of all stages."""
 
-    def __init__(self) -> None:
+    def __init__(self, workers: int) -> None:
         self.report = Report()
+        self.rates: dict[str, float] = {}
+        self._workers = workers
         self._begun = time.perf_counter()
 
     def add(self, stage: str, part: Report) -> None:
@@ -70,7 +73,10 @@ class _Total:
         self.report.failed += part.failed
         self.report.closures = part.closures
         now = time.perf_counter()
-        self.report.seconds[stage] = round(now - self._begun, 3)
+        seconds = now - self._begun
+        self.report.seconds[stage] = round(seconds, 3)
+        if part.amount:
+            self.rates[stage] = round(seconds * self._workers / part.amount, 4)
         self._begun = now
 
 
@@ -91,10 +97,11 @@ def _output(session: SessionInput, log: Path, work: Workspace, mode: AnnotationM
     return work.annotated / f"{name}{ending}"
 
 
-def _write_summary(work: Workspace, report: Report) -> None:
+def _write_summary(work: Workspace, report: Report, rates: Mapping[str, float]) -> None:
     content = {
         "version": semloc_logs.__version__,
         "seconds": report.seconds,
+        "rates": dict(rates),
         "skipped": report.skipped,
         "failed": report.failed,
         "closures": report.closures,

@@ -1,5 +1,6 @@
 """Exit codes, streams and start-up of the program, whatever the command."""
 
+import io
 import json
 import logging
 import os
@@ -15,9 +16,10 @@ from typing import Any
 import click
 import pytest
 from click.testing import CliRunner, Result
+from rich.console import Console as Screen
 
 from semloc_logs.cli import main as main_module
-from semloc_logs.cli.console import console
+from semloc_logs.cli.console import Bars, Pace, console, duration, rate, sentence
 from semloc_logs.cli.main import COMMANDS, program
 from semloc_logs.cli.options import Command, EngineChoice, console_options
 from semloc_logs.errors import (
@@ -210,6 +212,40 @@ def test_progress_lines_are_few_without_a_terminal(capsys: pytest.CaptureFixture
     assert len(lines) < 10
 
 
+def test_progress_tells_the_share_the_rate_and_the_time_left() -> None:
+    pace = Pace(40, now=100.0)  # a run that goes on has done some before
+    pace.move(50, 200, now=105.0)
+    event = Progress("close", "tuesday", 50, 200, "queries")
+    assert (
+        sentence(event, pace) == "close tuesday: 50 of 200 queries (25 %), 2 queries/s, 75 s left"
+    )
+    assert sentence(Progress("close", "tuesday", 200, 200, "queries"), pace) == (
+        "close tuesday: 200 of 200 queries"
+    )
+    assert [rate(0.0083), rate(0.5), rate(123.4, "queries")] == [
+        "0.5/min",
+        "0.5/s",
+        "123 queries/s",
+    ]
+    assert [duration(s) for s in (44, 720, 12600)] == ["44 s", "12 min", "3.5 h"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_bars_fit_a_terminal(width: int) -> None:
+    screen = Screen(file=io.StringIO(), width=width)
+    bars = Bars(screen)
+    for name in ("monday", "a_session_with_a_name_of_forty_characters"):
+        pace = Pace(0, now=0.0)
+        pace.move(1234, 5678, now=10.0)
+        bars.show(Progress("fuse", name, 1234, 5678, "keyframes"), pace)
+    screen.print(bars._bar.get_renderable())
+    lines = screen.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert len(lines) == 2
+    assert all(len(line) <= width for line in lines)
+    for figure in ("fuse monday ", " 22 % ", "1234 of 5678 keyframes", "123/s", "36 s left"):
+        assert figure in lines[0]
+
+
 def test_progress_has_the_same_fields_in_json(capsys: pytest.CaptureFixture[str]) -> None:
     console.reset()
     console.log_format = "json"
@@ -221,13 +257,18 @@ def test_progress_has_the_same_fields_in_json(capsys: pytest.CaptureFixture[str]
     del content["time"]
     assert content == {
         "level": "info",
-        "message": "fuse monday: 8 frames",
+        "message": content["message"],
         "stage": "fuse",
         "session": "monday",
         "done": 8,
         "total": None,
         "unit": "frames",
+        "share": None,
+        "rate": content["rate"],
+        "left_s": None,
     }
+    assert content["message"].startswith("fuse monday: 8 frames, ")
+    assert content["rate"] > 0
     console.reset()
 
 
@@ -269,6 +310,7 @@ def test_default_engine(
     kind: str,
 ) -> None:
     monkeypatch.setattr("semloc_logs.engines.processes.cores", lambda: cores)
+    monkeypatch.setattr("semloc_logs.engines.memory.machine_memory", lambda: 1 << 40)
     with EngineChoice(name, jobs).open(tasks) as engine:
         assert type(engine).__name__ == kind
         assert engine.jobs == (1 if kind == "Serial" else jobs or cores)

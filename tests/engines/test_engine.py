@@ -137,6 +137,18 @@ def test_a_worker_that_does_not_leave_is_killed(
     assert not any(worker.is_alive() for worker in workers)
 
 
+def test_a_worker_that_died_over_an_event_holds_nobody_up(tasks: ModuleType) -> None:
+    """It has the lock of the queue of events for ever."""
+    engine = processes.Processes(1)
+    assert list(engine.map(tasks.picky, [1])) == [1]
+    assert engine._events is not None
+    engine._events.queue._wlock.acquire()  # type: ignore[attr-defined]
+    thread = threading.Thread(target=engine.stop, daemon=True)
+    thread.start()
+    thread.join(timeout=60)
+    assert not thread.is_alive()
+
+
 def test_workers_share_the_cores(tasks: ModuleType) -> None:
     engine = make_engine("processes", cores() + 1)
     try:

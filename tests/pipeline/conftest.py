@@ -258,6 +258,7 @@ def tools() -> SimpleNamespace:
     return SimpleNamespace(
         quick_settings=quick_settings,
         coarse_settings=coarse_settings,
+        COARSE=QUICK | COARSE,
         files=files,
         write_times=write_times,
         renames=renames,
