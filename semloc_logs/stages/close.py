@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.alignment_tables import read_alignments
 from semloc_logs.closures.closure import Closure, Rejected
@@ -11,7 +13,7 @@ from semloc_logs.closures.closure_tables import (
     write_closures,
     write_rejected,
 )
-from semloc_logs.closures.pairs import known_pairs
+from semloc_logs.closures.pairs import Pair, known_pairs
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Resolved
@@ -49,26 +51,35 @@ def close(
     """
     search = PairSearch.of(work, settings, selection, overwrite=overwrite)
     keep(work, settings)
-    search.run(engine)
-    is_new = decide_all(work, search.maps, settings, overwrite=overwrite)
+    known = search.run(engine)
+    is_new = decide_all(work, search.maps, settings, known, overwrite=overwrite)
     report = Report(closures=len(read_closures(work.closures)))
     report.skipped += misfits_of(search.maps, settings).values()
     (report.done if is_new else report.kept).append("closures")
     return report
 
 
-def decide_all(work: Workspace, maps: Maps, settings: Resolved, *, overwrite: bool = False) -> bool:
+def decide_all(
+    work: Workspace,
+    maps: Maps,
+    settings: Resolved,
+    known: Mapping[Pair, str] | None = None,
+    *,
+    overwrite: bool = False,
+) -> bool:
     """Write the tables of closures and rejections, and the picture; whether they were not there.
 
-    They are of the alignments of all pairs, without sessions whose poses do not fit.
+    They are of the alignments of all pairs (``known``, where they are known already), without
+    sessions whose poses do not fit.
     """
-    if not overwrite and is_decided(work, settings):
+    known = known_pairs(work) if known is None else known
+    if not overwrite and is_decided(work, settings, known):
         return False
     # matplotlib is loaded only where something is drawn
     from semloc_logs.pictures.closures_picture import draw_closures
 
     misfits = misfits_of(maps, settings)
-    pairs = [p for p in sorted(known_pairs(work)) if not misfits.keys() & {p.query, p.target}]
+    pairs = [p for p in sorted(known) if not misfits.keys() & {p.query, p.target}]
     paths = {pair: work.alignments(pair.query, pair.target) for pair in pairs}
     alignments = [a for p in pairs for a in read_alignments(paths[p], p.query, p.target)]
     decided = decide(alignments, maps, settings)
@@ -77,11 +88,12 @@ def decide_all(work: Workspace, maps: Maps, settings: Resolved, *, overwrite: bo
     rejected = [outcome for outcome in decided if isinstance(outcome, Rejected)]
     closures = unique_closures(accepted, road, settings.query.every)
 
-    queries = {pair.query: int(read_metadata(path)["queries"]) for pair, path in paths.items()}
+    one_of_each = {pair.query: path for pair, path in paths.items()}
+    queries = [int(read_metadata(path)["queries"]) for path in one_of_each.values()]
     metadata = {
         **metadata_of(settings, maps.values()),
-        "queries": sum(queries.values()),
-        "fingerprint": _decided_from(work, settings),
+        "queries": sum(queries),
+        "fingerprint": _decided_from(known, settings),
         "settings": settings.tables(*SECTIONS),
     }
     # closures.parquet comes last: with its fingerprint it vouches for the other two
@@ -91,15 +103,17 @@ def decide_all(work: Workspace, maps: Maps, settings: Resolved, *, overwrite: bo
     return True
 
 
-def _decided_from(work: Workspace, settings: Resolved) -> str:
+def _decided_from(known: Mapping[Pair, str], settings: Resolved) -> str:
     """The fingerprint of all alignments, and of what the decision about them depends on."""
-    pairs = [f"{p.query}/{p.target} {f}" for p, f in sorted(known_pairs(work).items())]
+    pairs = [f"{p.query}/{p.target} {f}" for p, f in sorted(known.items())]
     return fingerprint_of((settings.fingerprint(*SECTIONS), *pairs))
 
 
-def is_decided(work: Workspace, settings: Resolved) -> bool:
+def is_decided(
+    work: Workspace, settings: Resolved, known: Mapping[Pair, str] | None = None
+) -> bool:
     """Whether the tables are there and were decided from the alignments that are there."""
-    fingerprint = _decided_from(work, settings)
+    fingerprint = _decided_from(known_pairs(work) if known is None else known, settings)
     try:
         tables = [read_metadata(path) for path in (work.closures, work.rejected)]
     except WorkspaceError:  # missing or damaged

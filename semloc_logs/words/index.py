@@ -29,6 +29,7 @@ from semloc_logs.words.segment import WORDS, Held, Segment, segment_in_memory
 from semloc_logs.words.vocabulary import BITS, Vocabulary, codes_of
 
 U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
 U64 = NDArray[np.uint64]
 U32 = NDArray[np.uint32]
 I32 = NDArray[np.int32]
@@ -103,6 +104,20 @@ def _word_distances(projected: F32, cell: int, children: F32, square: F32, out: 
         out[c] = np.int32(
             min(max((square[cell, c] - 2 * dot) * np.float32(UNIT), -(2.0**29)), 2.0**29)
         )
+
+
+@njit(cache=True, nogil=True)
+def _nearest_words(projected: F32, cell: I32, children: F32, square: F32) -> U16:
+    """The nearest word of its ``cell`` (n,) to each of the descriptors ``projected`` (n, 64).
+
+    Of equals the first.
+    """
+    out = np.empty(len(cell), np.uint16)
+    distance = np.empty(children.shape[1], np.int32)
+    for q in range(len(cell)):
+        _word_distances(projected[q], cell[q], children, square, distance)
+        out[q] = cell[q] * 256 + np.argmin(distance)
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -369,14 +384,21 @@ class Part:
 class LookUp:
     """Descriptors (n) as every index of a vocabulary looks them up.
 
-    Their nearest ``cells`` (n, p), ``codes`` (n, p) in each of them, ``margin`` (n, p, 64) of the
-    projections from the cells' thresholds, and ``projected`` (n, 64) descriptors.
+    Their nearest ``word`` (n,) and ``cells`` (n, p), ``codes`` (n, p) in each of the cells,
+    ``margin`` (n, p, 64) of the projections from the cells' thresholds, and ``projected`` (n, 64)
+    descriptors.
     """
 
+    word: U16
     cells: I32
     margin: F32
     codes: U64
     projected: F32
+
+
+def squares(vocabulary: Vocabulary) -> F32:
+    """The square (c, k) of each word's length."""
+    return np.asarray(np.square(vocabulary.children).sum(2))
 
 
 def look_ups(vocabulary: Vocabulary, descriptors: F32, probes: int) -> list[LookUp]:
@@ -387,7 +409,8 @@ def look_ups(vocabulary: Vocabulary, descriptors: F32, probes: int) -> list[Look
         cells = vocabulary.nearest_cells(batch, probes)
         margin = vocabulary.margins(batch, cells)
         projected = grid(vocabulary.projected(batch))
-        out.append(LookUp(cells, np.abs(margin), codes_of(margin), projected))
+        word = _nearest_words(projected, cells[:, 0], vocabulary.children, squares(vocabulary))
+        out.append(LookUp(word, cells, np.abs(margin), codes_of(margin), projected))
     return out
 
 
@@ -402,7 +425,7 @@ class Index:
         self.budget = budget
         self.shortlist = SHORTLIST
         self.parts = sorted((p for p in parts if len(p.segment)), key=lambda p: -len(p.segment))
-        self._square = np.square(vocabulary.children).sum(2)
+        self._square = squares(vocabulary)
         self._live = np.zeros(WORDS, np.int64)
         for p in self.parts:
             if (p.group >= 0).all():
