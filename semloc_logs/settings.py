@@ -281,6 +281,12 @@ class Closures(_Section):
     probes: int = Field(
         8, ge=1, description="nearest vocabulary cells searched for each query word"
     )
+    min_votes: float = Field(
+        3.0,
+        ge=0,
+        description="weight of a query's words that agree about a place in another session, below"
+        " which it is not searched there; 0: all queries are searched in all sessions",
+    )
     hypotheses: int = Field(
         32,
         ge=1,

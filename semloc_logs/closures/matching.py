@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,9 +18,8 @@ from semloc_logs.alignment.scores import Scores, structure_scores
 from semloc_logs.alignment.search import Candidate, search_hypotheses
 from semloc_logs.alignment.tau import tau
 from semloc_logs.closures.acceptance.calibration import MIN_RELATIVE_SCORE, MIN_SCORE, shipped
-from semloc_logs.closures.alignment_tables import write_part
 from semloc_logs.closures.closure import Alignment, Features
-from semloc_logs.closures.database import Database, open_database
+from semloc_logs.closures.database import Database
 from semloc_logs.closures.query import build_query
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import Visibility, visible_to
@@ -36,8 +34,8 @@ from semloc_logs.subvolumes.describe import (
     load_encoder,
     quarter_turns,
 )
-from semloc_logs.words.index import Allowed, Index, LookUp, Matches, look_ups
-from semloc_logs.workspace import Workspace
+from semloc_logs.words.index import Allowed, LookUp, Matches, look_ups
+from semloc_logs.words.vocabulary import load_vocabulary
 
 F64 = NDArray[np.float64]
 VOTE_CELL = 2.4  # m, at voxels of 0.30 m: edge of the cells that word matches vote in
@@ -46,6 +44,8 @@ FAR_WORD = 32.0
 LEAST_WEIGHT = 1e-3
 # voxels of road between two places of a target that may be one, driven again
 DRIVEN_AGAIN = 50
+# of the search, below which candidates are not fitted; right ones have 0.4 and more
+MIN_SEARCH_SCORE = 0.2
 LEAST_SCORE = 1e-3  # that a rival's score is divided by
 MOST_DISTINCT = 2.0  # a rival's score over an alignment's: more is not worse
 
@@ -77,11 +77,15 @@ class QueryContext:
     @property
     def ground_z(self) -> float:
         """Height of the ground under the query in its frame, metres."""
-        base_z = self.session.map_T_base[self.keyframe][2, 3]
-        return float(self.session.ground_z[self.keyframe] - base_z)
+        return ground_below(self.session, self.keyframe)
 
     def target_session(self, group: int) -> SessionMap:
         return self.visible.database.session(group)
+
+
+def ground_below(session: SessionMap, keyframe: int) -> float:
+    """Height of the ground under the query at ``keyframe`` in its frame, metres."""
+    return float(session.ground_z[keyframe] - session.map_T_base[keyframe][2, 3])
 
 
 # how hypotheses of a query are found, and how the words of a query whose ground is at a height are
@@ -103,38 +107,6 @@ class Fitted:
     view: F64
     fit: Fit
     scores: Scores
-
-
-@dataclass(frozen=True, slots=True)
-class SearchTask:
-    """Some queries of one session to search in others; picklable.
-
-    ``targets`` are fingerprints of the pairs by session. The alignments go to ``output``.
-    """
-
-    work: Path
-    session: str
-    keyframes: tuple[int, ...]
-    targets: dict[str, str]
-    settings: Resolved
-    output: Path
-
-
-def search_queries(task: SearchTask) -> int:
-    """Write the alignments of each keyframe of the task, best first; how many there are.
-
-    Each target is searched by itself, so its alignments do not depend on the others.
-    """
-    session = SessionMap(Workspace(task.work).session(task.session))
-    queries = {k: build_query(session, k, task.settings) for k in task.keyframes}
-    found: list[Alignment] = []
-    for target, fingerprint in task.targets.items():
-        database = open_database(task.work, target, fingerprint, task.settings)
-        for keyframe, query in queries.items():
-            found += search_query(database, session, keyframe, query)
-    found.sort(key=lambda a: (a.query_keyframe, a.target_session))
-    write_part(task.output, task.keyframes, task.targets, found)
-    return len(found)
 
 
 def close_query(
@@ -207,7 +179,7 @@ def match_words(
     The query's ground is at ``ground_z`` (m). The ``yaw`` of a match is of ``target_T_query``.
     """
     index = database.words(variant)
-    described, prepared = _prepared(query, variant, ground_z, database.settings, index)
+    described, prepared = prepare(query, variant, ground_z, database.settings)
     closures = database.settings.closures
     quarters = []
     for turns, batches in enumerate(prepared):
@@ -218,18 +190,17 @@ def match_words(
     return described, Matches(*columns)
 
 
-def _prepared(
-    query: Query, variant: str, ground_z: float, settings: Resolved, index: Index
-) -> Prepared:
+def prepare(query: Query, variant: str, ground_z: float, settings: Resolved) -> Prepared:
     """The subvolumes of a query and their look-ups in each quarter turn, once for all targets."""
     of_query = _PREPARED.setdefault(query, {})
     if variant not in of_query:
         described = _describe(query, variant, ground_z, settings)
         turned = (quarter_turns(described.descriptor, turns) for turns in range(4))
+        vocabulary = load_vocabulary(variant, settings.descriptor.vocabulary)
         probes = settings.closures.probes
         of_query[variant] = (
             described,
-            [look_ups(index.vocabulary, descriptors, probes) for descriptors in turned],
+            [look_ups(vocabulary, descriptors, probes) for descriptors in turned],
         )
     return of_query[variant]
 
@@ -309,8 +280,12 @@ def verify_hypotheses(context: QueryContext, hypotheses: list[Hypothesis]) -> li
 
 
 def align_candidates(context: QueryContext, candidates: list[Candidate]) -> list[Alignment]:
-    """Candidates in one target session, aligned on the points and compared with each other."""
-    coarse = _each_place_once([_coarse(context, c) for c in candidates], context.voxel_size)
+    """Candidates in one target session, aligned on the points and compared with each other.
+
+    Those of low scores are left out: no fit makes good alignments of them.
+    """
+    worth = [c for c in candidates if c.score >= MIN_SEARCH_SCORE]
+    coarse = _each_place_once([_coarse(context, c) for c in worth], context.voxel_size)
     fine: list[Fitted] = []
     for fitted in coarse[: max(1, context.settings.closures.rejected_per_query)]:
         best = max((f.scores.score for f in fine), default=0.0)

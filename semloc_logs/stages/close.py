@@ -14,6 +14,7 @@ from semloc_logs.closures.closure_tables import (
     write_rejected,
 )
 from semloc_logs.closures.pairs import Pair, known_pairs
+from semloc_logs.closures.query import query_keyframes
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Resolved
@@ -82,17 +83,17 @@ def decide_all(
     pairs = [p for p in sorted(known) if not misfits.keys() & {p.query, p.target}]
     paths = {pair: work.alignments(pair.query, pair.target) for pair in pairs}
     alignments = [a for p in pairs for a in read_alignments(paths[p], p.query, p.target)]
-    decided = decide(alignments, maps, settings)
+    # queries without alignments are neighbours too
+    searched = {p.query: query_keyframes(maps[p.query], settings) for p in pairs}
+    decided = decide(alignments, maps, settings, searched)
     road = {name: session_map.distance for name, session_map in maps.items()}
     accepted = [outcome for outcome in decided if isinstance(outcome, Closure)]
     rejected = [outcome for outcome in decided if isinstance(outcome, Rejected)]
     closures = unique_closures(accepted, road, settings.query.every)
 
-    one_of_each = {pair.query: path for pair, path in paths.items()}
-    queries = [int(read_metadata(path)["queries"]) for path in one_of_each.values()]
     metadata = {
         **metadata_of(settings, maps.values()),
-        "queries": sum(queries),
+        "queries": sum(len(keyframes) for keyframes in searched.values()),
         "fingerprint": _decided_from(known, settings),
         "settings": settings.tables(*SECTIONS),
     }

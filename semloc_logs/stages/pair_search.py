@@ -11,7 +11,6 @@ import numpy as np
 
 import semloc_logs
 from semloc_logs import progress
-from semloc_logs.closures.matching import SearchTask, search_queries
 from semloc_logs.closures.pairs import (
     Missing,
     Pair,
@@ -22,6 +21,7 @@ from semloc_logs.closures.pairs import (
     pairs_of_sessions,
 )
 from semloc_logs.closures.query import query_keyframes
+from semloc_logs.closures.tasks import BLOCK, SearchTask, search_queries
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
@@ -32,7 +32,7 @@ from semloc_logs.stages.state import OF_DECISION
 from semloc_logs.subvolumes.submap_descriptors import variants_for
 from semloc_logs.workspace import Workspace
 
-QUERIES_A_TASK = 8
+QUERIES_A_TASK = 2 * BLOCK
 Maps = Mapping[str, SessionMap]
 
 

@@ -29,7 +29,6 @@ from semloc_logs.words.segment import WORDS, Held, Segment, segment_in_memory
 from semloc_logs.words.vocabulary import BITS, Vocabulary, codes_of
 
 U8 = NDArray[np.uint8]
-U16 = NDArray[np.uint16]
 U64 = NDArray[np.uint64]
 U32 = NDArray[np.uint32]
 I32 = NDArray[np.int32]
@@ -45,6 +44,8 @@ BUDGET = 32_768  # codes that a look-up compares, and the codes of one word more
 # :mod:`semloc_logs.words.vocabulary`
 UNIT = 2.0**19
 QUERIES = 1024  # that are looked up together
+# of a query word, in its nearest cells, that a survey looks into
+NEAREST_WORDS, NEAREST_CELLS = 4, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,17 +108,31 @@ def _word_distances(projected: F32, cell: int, children: F32, square: F32, out: 
 
 
 @njit(cache=True, nogil=True)
-def _nearest_words(projected: F32, cell: I32, children: F32, square: F32) -> U16:
-    """The nearest word of its ``cell`` (n,) to each of the descriptors ``projected`` (n, 64).
+def _nearest_words(
+    projected: F32, cells: I32, codes: U64, children: F32, square: F32
+) -> tuple[I32, U64]:
+    """The nearest words (n, NEAREST_WORDS) of each query in its first cells, and its codes there.
 
-    Of equals the first.
+    Of equals the first; ``cells`` and ``codes`` are (n, p).
     """
-    out = np.empty(len(cell), np.uint16)
-    distance = np.empty(children.shape[1], np.int32)
-    for q in range(len(cell)):
-        _word_distances(projected[q], cell[q], children, square, distance)
-        out[q] = cell[q] * 256 + np.argmin(distance)
-    return out
+    n, p = cells.shape
+    p = min(p, NEAREST_CELLS)
+    k = children.shape[1]
+    words = np.empty((n, min(NEAREST_WORDS, p * k)), np.int32)
+    code = np.empty(words.shape, np.uint64)
+    distance = np.empty(p * k, np.int32)
+    for q in range(n):
+        for j in range(p):
+            _word_distances(
+                projected[q], cells[q, j], children, square, distance[j * k : j * k + k]
+            )
+        for i in range(words.shape[1]):
+            nearest = np.argmin(distance)
+            j = nearest // k
+            words[q, i] = cells[q, j] * 256 + nearest % k
+            code[q, i] = codes[q, j]
+            distance[nearest] = np.iinfo(np.int32).max
+    return words, code
 
 
 @njit(cache=True, nogil=True)
@@ -384,16 +399,17 @@ class Part:
 class LookUp:
     """Descriptors (n) as every index of a vocabulary looks them up.
 
-    Their nearest ``word`` (n,) and ``cells`` (n, p), ``codes`` (n, p) in each of the cells,
-    ``margin`` (n, p, 64) of the projections from the cells' thresholds, and ``projected`` (n, 64)
-    descriptors.
+    Their nearest ``cells`` (n, p), ``codes`` (n, p) in each of them, ``margin`` (n, p, 64) of the
+    projections from the cells' thresholds, ``projected`` (n, 64) descriptors, and their nearest
+    words ``word`` (n, w) with the codes ``word_codes`` (n, w) in the cells of these.
     """
 
-    word: U16
     cells: I32
     margin: F32
     codes: U64
     projected: F32
+    word: I32
+    word_codes: U64
 
 
 def squares(vocabulary: Vocabulary) -> F32:
@@ -404,13 +420,15 @@ def squares(vocabulary: Vocabulary) -> F32:
 def look_ups(vocabulary: Vocabulary, descriptors: F32, probes: int) -> list[LookUp]:
     """Descriptors (n, N) to be looked for in their ``probes`` nearest cells, in batches."""
     out = []
+    square = squares(vocabulary)
     for first in range(0, len(descriptors), QUERIES):
         batch = descriptors[first : first + QUERIES]
         cells = vocabulary.nearest_cells(batch, probes)
         margin = vocabulary.margins(batch, cells)
         projected = grid(vocabulary.projected(batch))
-        word = _nearest_words(projected, cells[:, 0], vocabulary.children, squares(vocabulary))
-        out.append(LookUp(word, cells, np.abs(margin), codes_of(margin), projected))
+        codes = codes_of(margin)
+        words = _nearest_words(projected, cells, codes, vocabulary.children, square)
+        out.append(LookUp(cells, np.abs(margin), codes, projected, *words))
     return out
 
 

@@ -13,11 +13,13 @@ from semloc_logs.closures.acceptance.calibration import (
 )
 from semloc_logs.closures.acceptance.consistency import count_votes, mode_shares
 from semloc_logs.closures.acceptance.placements import (
+    F64,
     Bools,
     Placed,
     contradicts_odometry,
     features_of,
     place,
+    query_roads,
 )
 from semloc_logs.closures.closure import (
     Alignment,
@@ -38,16 +40,23 @@ LOW_FIT = 0.5
 
 
 def decide(
-    alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], settings: Resolved
+    alignments: Sequence[Alignment],
+    maps: Mapping[str, SessionMap],
+    settings: Resolved,
+    queries: Mapping[str, Sequence[int]] | None = None,
 ) -> list[Closure | Rejected]:
     """What becomes of the alignments of all queries, best first for each query.
 
-    For each target session at most one alignment of a query is accepted.
+    For each target session at most one alignment of a query is accepted. ``queries`` are keyframes
+    of all queries by session, by default of those that have alignments.
     """
     placed = place(alignments, maps)
     plausible = is_plausible(features_of(alignments))
     refuted = contradicts_odometry(placed, settings.fusion.voxel_size)
-    decisions = _decisions(placed, plausible, refuted, settings)
+    roads = query_roads(placed)
+    for name, keyframes in (queries or {}).items():
+        roads[name] = maps[name].distance[np.asarray(keyframes, int)]
+    decisions = _decisions(placed, roads, plausible, refuted, settings)
     order = sorted(
         range(len(alignments)), key=lambda k: _order(alignments[k], decisions[k].probability)
     )
@@ -72,11 +81,15 @@ def decide(
 
 
 def _decisions(
-    placed: Placed, plausible: Bools, refuted: Bools, settings: Resolved
+    placed: Placed,
+    roads: Mapping[str, F64],
+    plausible: Bools,
+    refuted: Bools,
+    settings: Resolved,
 ) -> list[Decision]:
     """The probability of each alignment (n,): 0 if it is not ``plausible`` or is ``refuted``."""
     voxel_size = settings.fusion.voxel_size
-    votes = count_votes(placed, voxel_size)
+    votes = count_votes(placed, voxel_size, roads)
     of_place = np.where(plausible, shipped().decided(votes), 0.0)
     of_position = position_confidence(placed.sigma, voxel_size)
     of_mode = mode_shares(placed, voxel_size)
