@@ -44,8 +44,6 @@ FAR_WORD = 32.0
 LEAST_WEIGHT = 1e-3
 # voxels of road between two places of a target that may be one, driven again
 DRIVEN_AGAIN = 50
-# of the search, below which candidates are not fitted; right ones have 0.4 and more
-MIN_SEARCH_SCORE = 0.2
 LEAST_SCORE = 1e-3  # that a rival's score is divided by
 MOST_DISTINCT = 2.0  # a rival's score over an alignment's: more is not worse
 
@@ -280,12 +278,8 @@ def verify_hypotheses(context: QueryContext, hypotheses: list[Hypothesis]) -> li
 
 
 def align_candidates(context: QueryContext, candidates: list[Candidate]) -> list[Alignment]:
-    """Candidates in one target session, aligned on the points and compared with each other.
-
-    Those of low scores are left out: no fit makes good alignments of them.
-    """
-    worth = [c for c in candidates if c.score >= MIN_SEARCH_SCORE]
-    coarse = _each_place_once([_coarse(context, c) for c in worth], context.voxel_size)
+    """Candidates in one target session, aligned on the points and compared with each other."""
+    coarse = _each_place_once([_coarse(context, c) for c in candidates], context.voxel_size)
     fine: list[Fitted] = []
     for fitted in coarse[: max(1, context.settings.closures.rejected_per_query)]:
         best = max((f.scores.score for f in fine), default=0.0)
