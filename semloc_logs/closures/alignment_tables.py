@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
-from semloc_logs.closures.closure import FEATURES, Alignment, Features
+from semloc_logs.closures.closure import FEATURES, Alignment, Alignments, Features
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_metadata, read_table, write_table
@@ -46,28 +47,33 @@ def alignment_table(alignments: Sequence[Alignment]) -> pa.Table:
     return contracts.table("alignments", columns)
 
 
-def read_alignments(path: Path, query: str, target: str) -> list[Alignment]:
+def read_alignments(path: Path, query: str, target: str) -> Alignments:
     """The alignments of session ``query`` in ``target``."""
     table = read_table(path)
-    poses = poses_of(table)
-    return [
-        Alignment(
-            query_session=query,
-            target_session=target,
-            query_keyframe=row["query_keyframe"],
-            target_keyframe=row["target_keyframe"],
-            query_stamp_ns=row["query_stamp_ns"],
-            target_stamp_ns=row["target_stamp_ns"],
-            target_T_query=pose,
-            covariance=np.array(row["covariance"]).reshape(6, 6),
-            overlap=row["overlap"],
-            probability=row["alone"],
-            inliers=row["inliers"],
-            words=row["words"],
-            features=Features(*(row[name] for name in FEATURES)),
-        )
-        for row, pose in zip(table.to_pylist(), poses, strict=True)
-    ]
+    n = len(table)
+
+    def column(name: str, kind: type) -> NDArray[Any]:
+        return np.asarray(table[name].to_numpy(), kind)
+
+    whole = (
+        "query_keyframe",
+        "target_keyframe",
+        "query_stamp_ns",
+        "target_stamp_ns",
+        "inliers",
+        "words",
+    )
+    covariance = table["covariance"].combine_chunks().flatten().to_numpy()
+    return Alignments(
+        pairs=[(query, target)],
+        pair=np.zeros(n, np.int64),
+        target_T_query=poses_of(table),
+        covariance=np.asarray(covariance, float).reshape(n, 6, 6),
+        overlap=column("overlap", float),
+        probability=column("alone", float),
+        features=Features(*(column(name, float) for name in FEATURES)),
+        **{name: column(name, np.int64) for name in whole},
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.alignment_tables import read_alignments
-from semloc_logs.closures.closure import Closure, Rejected
+from semloc_logs.closures.closure import Alignments
 from semloc_logs.closures.closure_tables import (
     read_closures,
     unique_closures,
@@ -82,14 +82,12 @@ def decide_all(
     misfits = misfits_of(maps, settings)
     pairs = [p for p in sorted(known) if not misfits.keys() & {p.query, p.target}]
     paths = {pair: work.alignments(pair.query, pair.target) for pair in pairs}
-    alignments = [a for p in pairs for a in read_alignments(paths[p], p.query, p.target)]
+    alignments = Alignments.joined(read_alignments(paths[p], p.query, p.target) for p in pairs)
     # queries without alignments are neighbours too
     searched = {p.query: query_keyframes(maps[p.query], settings) for p in pairs}
     decided = decide(alignments, maps, settings, searched)
     road = {name: session_map.distance for name, session_map in maps.items()}
-    accepted = [outcome for outcome in decided if isinstance(outcome, Closure)]
-    rejected = [outcome for outcome in decided if isinstance(outcome, Rejected)]
-    closures = unique_closures(accepted, road, settings.query.every)
+    closures = unique_closures(decided.accepted(), road, settings.query.every)
 
     metadata = {
         **metadata_of(settings, maps.values()),
@@ -98,7 +96,7 @@ def decide_all(
         "settings": settings.tables(*SECTIONS),
     }
     # closures.parquet comes last: with its fingerprint it vouches for the other two
-    write_rejected(work.rejected, rejected, metadata)
+    write_rejected(work.rejected, decided.rejected(), metadata)
     draw_closures(work, closures, maps)
     write_closures(work.closures, closures, metadata)
     return True

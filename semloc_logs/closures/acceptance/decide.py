@@ -14,20 +14,24 @@ from semloc_logs.closures.acceptance.calibration import (
 from semloc_logs.closures.acceptance.consistency import count_votes, mode_shares
 from semloc_logs.closures.acceptance.placements import (
     F64,
+    I64,
     Bools,
     Placed,
     contradicts_odometry,
-    features_of,
     place,
     query_roads,
 )
 from semloc_logs.closures.closure import (
+    ACCEPTED,
+    REASONS,
+    Agreement,
     Alignment,
-    Closure,
+    Alignments,
     Decision,
+    Decisions,
     Features,
+    Outcomes,
     Reason,
-    Rejected,
 )
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
@@ -44,67 +48,59 @@ def decide(
     maps: Mapping[str, SessionMap],
     settings: Resolved,
     queries: Mapping[str, Sequence[int]] | None = None,
-) -> list[Closure | Rejected]:
+) -> Outcomes:
     """What becomes of the alignments of all queries, best first for each query.
 
     For each target session at most one alignment of a query is accepted. ``queries`` are keyframes
     of all queries by session, by default of those that have alignments.
     """
-    placed = place(alignments, maps)
-    plausible = is_plausible(features_of(alignments))
+    rows = Alignments.of(alignments)
+    placed = place(rows, maps)
+    plausible = is_plausible(rows.features)
     refuted = contradicts_odometry(placed, settings.fusion.voxel_size)
     roads = query_roads(placed)
     for name, keyframes in (queries or {}).items():
         roads[name] = maps[name].distance[np.asarray(keyframes, int)]
-    decisions = _decisions(placed, roads, plausible, refuted, settings)
-    order = sorted(
-        range(len(alignments)), key=lambda k: _order(alignments[k], decisions[k].probability)
+    agreement = count_votes(placed, settings.fusion.voxel_size, roads)
+    decisions = _decisions(placed, agreement, plausible, refuted, settings)
+    outcomes = Outcomes(
+        rows,
+        decisions,
+        agreement,
+        settings.closures.min_probability,
+        _order(rows, decisions.probability),
+        np.full(len(rows), ACCEPTED, np.int8),
     )
-
-    answered: set[tuple[str, int, str]] = set()
-    outcomes: list[Closure | Rejected] = []
-    for k in order:
-        a = alignments[k]
-        decision = decisions[k]
-        query = (a.query_session, a.query_keyframe, a.target_session)
-        reason = None
-        if refuted[k]:
-            reason = Reason.CONTRADICTS_ODOMETRY
-        elif not decision.probability >= decision.min_probability:  # nor a NaN
-            weakest = weakest_evidence(a.features)
-            reason = weakest if not plausible[k] else low_probability(weakest, decision)
-        elif query in answered:
-            reason = Reason.SECOND_CHOICE
-        answered.add(query)
-        outcomes.append(Closure(a, decision) if reason is None else Rejected(a, decision, reason))
+    reason = outcomes.reason
+    probable = decisions.probability >= outcomes.min_probability  # a NaN is not
+    reason[probable & ~_is_first(rows, outcomes.order)] = REASONS.index(Reason.SECOND_CHOICE)
+    for k in np.flatnonzero(~probable).tolist():
+        weakest = weakest_evidence(rows[k].features)
+        if plausible[k]:
+            weakest = low_probability(weakest, outcomes.decision(k))
+        reason[k] = REASONS.index(weakest)
+    reason[refuted] = REASONS.index(Reason.CONTRADICTS_ODOMETRY)
     return outcomes
 
 
+def _is_first(rows: Alignments, order: I64) -> Bools:
+    """Which alignments (n,) are the first of their query in their target session."""
+    query = rows.pair * (rows.query_keyframe.max(initial=0) + 1) + rows.query_keyframe
+    out = np.zeros(len(rows), bool)
+    out[order[np.unique(query[order], return_index=True)[1]]] = True
+    return out
+
+
 def _decisions(
-    placed: Placed,
-    roads: Mapping[str, F64],
-    plausible: Bools,
-    refuted: Bools,
-    settings: Resolved,
-) -> list[Decision]:
+    placed: Placed, agreement: Agreement[F64], plausible: Bools, refuted: Bools, settings: Resolved
+) -> Decisions:
     """The probability of each alignment (n,): 0 if it is not ``plausible`` or is ``refuted``."""
     voxel_size = settings.fusion.voxel_size
-    votes = count_votes(placed, voxel_size, roads)
-    of_place = np.where(plausible, shipped().decided(votes), 0.0)
+    of_place = np.where(plausible, shipped().decided(agreement), 0.0)
     of_position = position_confidence(placed.sigma, voxel_size)
     of_mode = mode_shares(placed, voxel_size)
     probability = np.where(refuted | ~plausible, 0.0, of_place * of_position * of_mode)
-    return [
-        Decision(
-            probability=float(probability[k]),
-            agreement=votes.row(k),
-            place_probability=float(of_place[k]),
-            position_confidence=float(of_position[k]),
-            mode_share=float(of_mode[k]),
-            min_probability=settings.closures.min_probability,
-        )
-        for k in range(len(placed))
-    ]
+    return Decisions(probability, of_place, of_position, of_mode)
 
 
 def low_probability(weakest: Reason, decision: Decision) -> Reason:
@@ -139,13 +135,19 @@ def weakest_evidence(features: Features[float]) -> Reason:
     return Reason.WEAK_EVIDENCE
 
 
-def _order(a: Alignment, probability: float) -> tuple[str, int, float, float, str, int]:
-    """By query, then the most probable first."""
-    return (
-        a.query_session,
-        a.query_stamp_ns,
-        -probability,
-        -a.features.structure,
-        a.target_session,
-        a.target_stamp_ns,
+def _order(rows: Alignments, probability: F64) -> I64:
+    """Numbers (n,) by query, then the most probable first."""
+    names = sorted({name for pair in rows.pairs for name in pair})
+    rank = {name: number for number, name in enumerate(names)}
+    ranks = np.array([[rank[name] for name in pair] for pair in rows.pairs], np.int64)
+    query_session, target_session = ranks.reshape(-1, 2)[rows.pair].T
+    return np.lexsort(
+        (
+            rows.target_stamp_ns,
+            target_session,
+            -rows.features.structure,
+            -probability,
+            rows.query_stamp_ns,
+            query_session,
+        )
     )

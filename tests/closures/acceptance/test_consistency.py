@@ -436,7 +436,7 @@ def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
 
 
 def test_of_none() -> None:
-    assert decide([], MAPS, SETTINGS) == []
+    assert list(decide([], MAPS, SETTINGS)) == []
     nothing = place([], {})
     assert len(count_votes(nothing, 0.3)) == 0
     assert not contradicts_odometry(nothing, 0.3).any()
