@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from semloc_logs.closures.closure import FEATURES, Alignment, Alignments, Features
@@ -110,10 +109,15 @@ def read_parts(folder: Path) -> list[Part]:
     return parts
 
 
-def joined_parts(parts: Iterable[Part], target: str) -> pa.Table:
-    """The alignments with one target, in the order of the parts."""
-    tables = [contracts.schema("alignments").empty_table()]
-    for part in parts:
-        table = read_table(part.path)
-        tables.append(table.filter(pc.equal(table[TARGET], target)).drop_columns([TARGET]))
-    return pa.concat_tables([t.replace_schema_metadata(None) for t in tables])
+def by_target(path: Path) -> dict[str, pa.Table]:
+    """The alignments of a part with each of its targets that have some."""
+    table = read_table(path).replace_schema_metadata(None)
+    names = table[TARGET].to_numpy(zero_copy_only=False)
+    alignments = table.drop_columns([TARGET])
+    return {str(name): alignments.take(np.flatnonzero(names == name)) for name in np.unique(names)}
+
+
+def joined(tables: Iterable[pa.Table]) -> pa.Table:
+    """The alignments of all ``tables`` with one target, in their order."""
+    empty = contracts.schema("alignments").empty_table().replace_schema_metadata(None)
+    return pa.concat_tables([empty, *tables])

@@ -29,7 +29,6 @@ from semloc_logs.words.catalogue import segments
 from semloc_logs.words.survey import NO_VOTES, Survey, Votes
 from semloc_logs.workspace import Workspace
 
-BLOCK = 4  # consecutive queries that are searched together; tasks hold whole blocks
 SURVEY_CELL = 4.8  # m, at voxels of 0.30 m: edge of the cells that a survey votes in
 OPEN_SURVEYS = 4
 MIN_SHARE = 0.1  # of the votes in a session: small maps and small queries have few
@@ -74,16 +73,21 @@ def search_queries(task: SearchTask) -> int:
             found += [a for keyframe in queries for a in search(keyframe)]
             continue
         of_target = {k: votes[k].get(target, NO_VOTES) for k in queries}
-        for block in _blocks(task.keyframes):
+        for block in _blocks(task.keyframes, block_size(task.settings)):
             found += _search_block(block, of_target, task.settings.closures.min_votes, search)
     found.sort(key=lambda a: (a.query_keyframe, a.target_session))
     write_part(task.output, task.keyframes, task.targets, found)
     return len(found)
 
 
-def _blocks(keyframes: Sequence[int]) -> Iterator[Sequence[int]]:
-    for first in range(0, len(keyframes), BLOCK):
-        yield keyframes[first : first + BLOCK]
+def block_size(settings: Resolved) -> int:
+    """How many consecutive queries are searched together; tasks hold whole blocks."""
+    return max(1, round(settings.closures.every / settings.query.every))
+
+
+def _blocks(keyframes: Sequence[int], size: int) -> Iterator[Sequence[int]]:
+    for first in range(0, len(keyframes), size):
+        yield keyframes[first : first + size]
 
 
 def _search_block(
@@ -120,44 +124,40 @@ def _may_be_right(alignment: Alignment) -> bool:
 def survey_queries(task: SearchTask, session: SessionMap, queries: Mapping[int, Built]) -> Surveyed:
     """How many words of each query agree about a place in each target, other than the session."""
     settings = task.settings
-    names = [name for name in task.targets if name != task.session]
-    votes: dict[int, dict[str, Votes]] = {k: dict.fromkeys(names, NO_VOTES) for k in queries}
-    if settings.closures.min_votes <= 0 or not names:
+    votes: dict[int, dict[str, Votes]] = {keyframe: {} for keyframe in queries}
+    targets = tuple((n, made_from) for n, made_from in task.targets.items() if n != task.session)
+    if settings.closures.min_votes <= 0 or not targets:
         return votes
-    for variant, chosen in _by_variant(task, session, names).items():
-        survey = _survey(task.work, variant, chosen, settings)
+    for variant, survey in _surveys(task.work, targets, session.has_classes, settings).items():
         for keyframe, (query, _) in queries.items():
             if len(query.structure[0]):
-                described, turned = prepare(
-                    query, variant, ground_below(session, keyframe), settings
-                )
+                ground_z = ground_below(session, keyframe)
+                described, turned = prepare(query, variant, ground_z, settings)
                 centre = described.centre.astype(float) * settings.fusion.voxel_size
                 votes[keyframe] |= survey.votes(turned, centre)
     return votes
 
 
-def _by_variant(
-    task: SearchTask, session: SessionMap, names: Sequence[str]
-) -> dict[str, tuple[tuple[str, str], ...]]:
-    """The targets, with the fingerprints of their pairs, by the words that they are searched by."""
-    work = Workspace(task.work)
-    forced = task.settings.descriptor.variant
-    out: dict[str, list[tuple[str, str]]] = {}
-    for name in names:
+@lru_cache(maxsize=OPEN_SURVEYS)
+def _surveys(
+    work: Path, targets: tuple[tuple[str, str], ...], has_classes: bool, settings: Resolved
+) -> dict[str, Survey]:
+    """Surveys of the targets of a session, by the words that they are searched by.
+
+    They are kept between the tasks of a process; ``targets`` come with fingerprints of all that
+    they depend on. ``has_classes``: whether the session's labels come from a log or a model.
+    """
+    forced = settings.descriptor.variant
+    names: dict[str, list[str]] = {}
+    for name, _ in targets:
         variant: str = forced
         if forced == "auto":
-            known = session.has_classes and SessionMap(work.session(name)).has_classes
+            known = has_classes and SessionMap(Workspace(work).session(name)).has_classes
             variant = "semantic" if known else "geometric"
-        out.setdefault(variant, []).append((name, task.targets[name]))
-    return {variant: tuple(targets) for variant, targets in out.items()}
-
-
-@lru_cache(maxsize=OPEN_SURVEYS)
-def _survey(
-    work: Path, variant: str, targets: tuple[tuple[str, str], ...], settings: Resolved
-) -> Survey:
-    """The survey of targets, kept between the tasks of a process, with all that it depends on."""
-    names = [name for name, _ in targets]
+        names.setdefault(variant, []).append(name)
     cell = SURVEY_CELL * settings.fusion.voxel_size / STREET_VOXEL
-    held = segments(Workspace(work), variant, names)
-    return Survey(held, names, settings.descriptor.headings, cell)
+    headings = settings.descriptor.headings
+    return {
+        variant: Survey(segments(Workspace(work), variant, chosen), chosen, headings, cell)
+        for variant, chosen in names.items()
+    }

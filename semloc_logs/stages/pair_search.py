@@ -21,7 +21,7 @@ from semloc_logs.closures.pairs import (
     pairs_of_sessions,
 )
 from semloc_logs.closures.query import query_keyframes
-from semloc_logs.closures.tasks import BLOCK, SearchTask, search_queries
+from semloc_logs.closures.tasks import SearchTask, block_size, search_queries
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
@@ -32,7 +32,7 @@ from semloc_logs.stages.state import OF_DECISION
 from semloc_logs.subvolumes.submap_descriptors import variants_for
 from semloc_logs.workspace import Workspace
 
-QUERIES_A_TASK = 2 * BLOCK
+QUERIES_A_TASK = 8  # or more, as tasks hold whole blocks
 Maps = Mapping[str, SessionMap]
 
 
@@ -132,6 +132,8 @@ class PairSearch:
 
     def _missing(self) -> list[Missing]:
         """What is left to search of each session."""
+        block = block_size(self.settings)
+        size = block * -(-QUERIES_A_TASK // block)
         of_targets: dict[str, dict[str, str]] = {}
         for pair in self.chosen:
             of_targets.setdefault(pair.query, {})[pair.target] = self.fingerprints[pair]
@@ -139,8 +141,7 @@ class PairSearch:
         for session, fingerprints in of_targets.items():
             keyframes = query_keyframes(self.maps[session], self.settings)
             chunks = [
-                tuple(keyframes[first : first + QUERIES_A_TASK])
-                for first in range(0, len(keyframes), QUERIES_A_TASK)
+                tuple(keyframes[first : first + size]) for first in range(0, len(keyframes), size)
             ]
             out.append(missing(self.work, session, fingerprints, chunks))
         return out

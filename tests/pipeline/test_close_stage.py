@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import semloc_logs
-from semloc_logs.closures.tasks import BLOCK, search_queries
+from semloc_logs.closures.tasks import search_queries
 from semloc_logs.engines import Serial
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import inverse, rotation_angle, transform
@@ -240,7 +240,7 @@ def test_a_search_goes_on_at_the_task_it_was_at(
     """Killed in every task once: each task is done once, and the tables are the same."""
     before = tools.files(coarse.path)
     shutil.rmtree(coarse.path / "alignments")
-    monkeypatch.setattr(pair_search, "QUERIES_A_TASK", BLOCK)
+    monkeypatch.setattr(pair_search, "QUERIES_A_TASK", 1)
     search = search_queries
     tasks: list[Any] = []
 
