@@ -33,15 +33,13 @@ NONE = -2.0  # less than any score
 class SearchStep:
     """A search of ``reach`` times half the heading step to both sides, in steps of ``step`` cells.
 
-    ``voxels`` of the query are looked up; poses within ``distance`` voxels are one, and those that
-    score less than ``least`` are dropped: no fit makes good alignments of them.
+    ``voxels`` of the query are looked up; poses within ``distance`` voxels are one.
     """
 
     reach: float
     step: int
     voxels: int
     distance: float
-    least: float
 
     def yaws(self, headings: int) -> F64:
         """Turns (5,) about the start, radians."""
@@ -49,10 +47,9 @@ class SearchStep:
 
 
 BEGUN = 2.0  # voxels between hypotheses that are one before and after the first search
-# right candidates have 0.4 and more after the second search
-FIRST = SearchStep(0.8, 2, 200, BEGUN, 0.1)
+FIRST = SearchStep(0.8, 2, 200, BEGUN)
 FIRST_KEPT = 16  # hypotheses after the first search
-SECOND = SearchStep(0.3, 1, SEARCH_VOXELS, SAME_PLACE_VOXELS, 0.2)
+SECOND = SearchStep(0.3, 1, SEARCH_VOXELS, SAME_PLACE_VOXELS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +78,7 @@ def search_hypotheses(
     headings: int,
     most: int,
 ) -> list[Candidate]:
-    """The ``most`` best candidates worth a fit, best first, after two searches around each.
+    """The ``most`` best candidates, best first, after two searches around each hypothesis.
 
     The first is in steps of two voxels with few of the query's voxels; the second, for the best, in
     steps of one with more.
@@ -95,8 +92,7 @@ def search_hypotheses(
         for s in searched:
             grid = targets[s.hypothesis.group].mask_grid
             score, pose = search(grid, evidence, s.pose, yaws, step.step)
-            if score >= step.least:
-                better.append(_Searched(s.hypothesis, pose, score))
+            better.append(_Searched(s.hypothesis, pose, score))
         better.sort(key=lambda s: (-s.score, s.hypothesis.group, tuple(s.pose)))
         searched = _suppressed(better, step.distance * query.voxel_size, kept)
     return [

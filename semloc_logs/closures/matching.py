@@ -44,6 +44,8 @@ FAR_WORD = 32.0
 LEAST_WEIGHT = 1e-3
 # voxels of road between two places of a target that may be one, driven again
 DRIVEN_AGAIN = 50
+# of the best candidate of a search; right ones have 0.4 and more
+MIN_SEARCH_SCORE = 0.2
 LEAST_SCORE = 1e-3  # that a rival's score is divided by
 MOST_DISTINCT = 2.0  # a rival's score over an alignment's: more is not worse
 
@@ -278,7 +280,13 @@ def verify_hypotheses(context: QueryContext, hypotheses: list[Hypothesis]) -> li
 
 
 def align_candidates(context: QueryContext, candidates: list[Candidate]) -> list[Alignment]:
-    """Candidates in one target session, aligned on the points and compared with each other."""
+    """Candidates in one target session, aligned on the points and compared with each other.
+
+    None where the best of them scores so little that no fit makes a good alignment of it; otherwise
+    all, as rivals tell how distinct it is.
+    """
+    if max((c.score for c in candidates), default=0.0) < MIN_SEARCH_SCORE:
+        return []
     coarse = _each_place_once([_coarse(context, c) for c in candidates], context.voxel_size)
     fine: list[Fitted] = []
     for fitted in coarse[: max(1, context.settings.closures.rejected_per_query)]:

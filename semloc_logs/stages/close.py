@@ -52,8 +52,8 @@ def close(
     """
     search = PairSearch.of(work, settings, selection, overwrite=overwrite)
     keep(work, settings)
-    known = search.run(engine)
-    is_new = decide_all(work, search.maps, settings, known, overwrite=overwrite)
+    search.run(engine)
+    is_new = decide_all(work, search.maps, settings, search.searched(), overwrite=overwrite)
     report = Report(closures=len(read_closures(work.closures)))
     report.skipped += misfits_of(search.maps, settings).values()
     (report.done if is_new else report.kept).append("closures")

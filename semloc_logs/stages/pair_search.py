@@ -103,32 +103,33 @@ class PairSearch:
         _check_words(work, chosen, maps, settings)
         return cls(work, maps, settings, fingerprints, known, chosen)
 
-    def run(self, engine: Engine) -> dict[Pair, str]:
+    def run(self, engine: Engine) -> None:
         """Search the pairs; each session that is done gets its tables of alignments.
 
         A session whose search was interrupted goes on where it was. Alignments that belong to no
-        present pair are removed. Returns the pairs that are there now, with their fingerprints.
+        present pair are removed.
         """
         for pair in self.chosen:
             if self.known.get(pair) == self.fingerprints[pair]:  # to be overwritten
                 shutil.rmtree(self.work.search_parts(pair.query), ignore_errors=True)
         sessions = self._missing()
-        tasks_of = [self._tasks(one) for one in sessions]
-        results = engine.map(search_queries, [task for tasks in tasks_of for task in tasks])
-        for one, tasks in zip(sessions, tasks_of, strict=True):
+        tasks = [task for one in sessions for task in self._tasks(one)]
+        results = zip(tasks, engine.map(search_queries, tasks), strict=True)
+        for one in sessions:
             total = sum(len(chunk) for chunk in one.chunks)
-            for number in range(1, len(tasks) + 1):
+            count = sum(task.session == one.session for task in tasks)
+            for number in range(1, count + 1):
                 next(results)
-                done = total * number // len(tasks)
+                done = total * number // count
                 progress.report("close", one.session, done, total, "queries")
             finish(self.work, self._left(one), self._metadata(one))
-        present = {p: made_from for p, made_from in self.known.items() if self._is_present(p)}
-        chosen = {pair: self.fingerprints[pair] for pair in self.chosen}
-        forget(self.work, self.known.keys() - present.keys() - chosen.keys())
-        return present | chosen
+        stale = [p for p, made_from in self.known.items() if made_from != self.fingerprints.get(p)]
+        forget(self.work, [p for p in stale if p not in self.chosen])
 
-    def _is_present(self, pair: Pair) -> bool:
-        return self.known[pair] == self.fingerprints.get(pair)
+    def searched(self) -> dict[Pair, str]:
+        """The pairs whose alignments are there after a run, with their fingerprints."""
+        present = {p: f for p, f in self.known.items() if f == self.fingerprints.get(p)}
+        return present | {pair: self.fingerprints[pair] for pair in self.chosen}
 
     def _missing(self) -> list[Missing]:
         """What is left to search of each session."""
