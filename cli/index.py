@@ -16,7 +16,7 @@ from .options import Command, console_options, json_option, work_option
 @console_options
 def command(work: Path, as_json: bool) -> int:
     """Bring the index of the words of all sessions up to date and say what it holds. 'semloc close'
-    searches each session by itself and does not need it.
+    does so itself: the index tells it which sessions a query may meet.
 
     Files are read in full and damaged ones are built again.
 

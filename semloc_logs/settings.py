@@ -281,6 +281,18 @@ class Closures(_Section):
     probes: int = Field(
         8, ge=1, description="nearest vocabulary cells searched for each query word"
     )
+    every: float | None = Field(
+        None,
+        gt=0,
+        description="length of road that is searched in another session by its best query first,"
+        " and by the others where that one finds a place (m); default four queries",
+    )
+    min_votes: float = Field(
+        3.0,
+        ge=0,
+        description="weight of a query's words that agree about a place in another session, below"
+        " which it is not searched there; 0: all queries are searched in all sessions",
+    )
     hypotheses: int = Field(
         32,
         ge=1,
@@ -420,6 +432,7 @@ class ResolvedQuery(Query):
 class ResolvedClosures(Closures):
     """The same with every length."""
 
+    every: float
     exclude_distance: float
 
 
@@ -458,6 +471,7 @@ class Settings(_Section):
                 f" in submaps of {submap_length:g} m, and may be twice as long; make"
                 " fusion.submap_length larger, too."
             )
+        query_every = _given(self.query.every, 2 * scale)
         lengths: dict[str, dict[str, float]] = {
             "fusion": {
                 "min_range": 3 * v,
@@ -467,8 +481,8 @@ class Settings(_Section):
                 "submap_length": 100 * scale,
             },
             "descriptor": {"reach": 30 * scale},
-            "query": {"every": 2 * scale, "radius": 24 * scale},
-            "closures": {"exclude_distance": 50 * scale},
+            "query": {"every": query_every, "radius": 24 * scale},
+            "closures": {"exclude_distance": 50 * scale, "every": 4 * query_every},
             "optimize": {"closure_sigma": v / 3, "vertex_spacing": 5 * scale},
         }
         content = self.model_dump()

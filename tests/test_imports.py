@@ -105,6 +105,7 @@ INNER_ORDER = {
         "visibility",
         "target_surface",
         "matching",
+        "tasks",
     ],
 }
 SOURCES = sorted((ROOT / "semloc_logs").rglob("*.py"))

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
+from numpy.typing import NDArray
 
-from semloc_logs.closures.closure import FEATURES, Alignment, Features
+from semloc_logs.closures.closure import FEATURES, Alignment, Alignments, Features
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_metadata, read_table, write_table
@@ -45,27 +45,33 @@ def alignment_table(alignments: Sequence[Alignment]) -> pa.Table:
     return contracts.table("alignments", columns)
 
 
-def read_alignments(path: Path, query: str, target: str) -> list[Alignment]:
+def read_alignments(path: Path, query: str, target: str) -> Alignments:
     """The alignments of session ``query`` in ``target``."""
     table = read_table(path)
-    poses = poses_of(table)
-    return [
-        Alignment(
-            query_session=query,
-            target_session=target,
-            query_keyframe=row["query_keyframe"],
-            target_keyframe=row["target_keyframe"],
-            query_stamp_ns=row["query_stamp_ns"],
-            target_stamp_ns=row["target_stamp_ns"],
-            target_T_query=pose,
-            covariance=np.array(row["covariance"]).reshape(6, 6),
-            overlap=row["overlap"],
-            inliers=row["inliers"],
-            words=row["words"],
-            features=Features(*(row[name] for name in FEATURES)),
-        )
-        for row, pose in zip(table.to_pylist(), poses, strict=True)
-    ]
+    n = len(table)
+
+    def column(name: str, kind: type) -> NDArray[Any]:
+        return np.asarray(table[name].to_numpy(), kind)
+
+    whole = (
+        "query_keyframe",
+        "target_keyframe",
+        "query_stamp_ns",
+        "target_stamp_ns",
+        "inliers",
+        "words",
+    )
+    numbers: dict[str, Any] = {name: column(name, np.int64) for name in whole}
+    covariance = table["covariance"].combine_chunks().flatten().to_numpy()
+    return Alignments(
+        pairs=[(query, target)],
+        pair=np.zeros(n, np.int64),
+        target_T_query=poses_of(table),
+        covariance=np.asarray(covariance, float).reshape(n, 6, 6),
+        overlap=column("overlap", float),
+        features=Features(*(column(name, float) for name in FEATURES)),
+        **numbers,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +108,15 @@ def read_parts(paths: Iterable[Path]) -> list[Part]:
     return parts
 
 
-def joined_parts(parts: Iterable[Part], target: str) -> pa.Table:
-    """The alignments with one target, in the order of the parts."""
-    tables = [contracts.schema("alignments").empty_table()]
-    for part in parts:
-        table = read_table(part.path)
-        tables.append(table.filter(pc.equal(table[TARGET], target)).drop_columns([TARGET]))
-    return pa.concat_tables([t.replace_schema_metadata(None) for t in tables])
+def by_target(path: Path) -> dict[str, pa.Table]:
+    """The alignments of a part with each of its targets that have some."""
+    table = read_table(path).replace_schema_metadata(None)
+    names = table[TARGET].to_numpy(zero_copy_only=False)
+    alignments = table.drop_columns([TARGET])
+    return {str(name): alignments.take(np.flatnonzero(names == name)) for name in np.unique(names)}
+
+
+def joined(tables: Iterable[pa.Table]) -> pa.Table:
+    """The alignments of all ``tables`` with one target, in their order."""
+    empty = contracts.schema("alignments").empty_table().replace_schema_metadata(None)
+    return pa.concat_tables([empty, *tables])

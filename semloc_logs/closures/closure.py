@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import Enum
-from typing import Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
-Rows = NDArray[np.int64] | NDArray[np.bool_]
+I64 = NDArray[np.int64]
+Chosen = I64 | NDArray[np.bool_]
+Row = TypeVar("Row")
 Value = TypeVar("Value", float, F64)  # of one alignment, or the values (n,) of several
 
 
@@ -21,7 +24,7 @@ class Columns:
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))
 
-    def part(self, rows: Rows) -> Self:
+    def part(self, rows: Chosen) -> Self:
         """Some of the rows."""
         return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
@@ -98,6 +101,146 @@ class Alignment:
     def sigma(self) -> float:
         """Standard deviation of the position in its worst direction, metres."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+
+class Rows(Sequence[Row]):
+    """Base of sequences that hold columns and make a row when it is looked at."""
+
+    def row(self, k: int) -> Row:
+        """Row ``k``, from 0 on."""
+        raise NotImplementedError
+
+    @overload
+    def __getitem__(self, k: int) -> Row: ...
+
+    @overload
+    def __getitem__(self, k: slice) -> list[Row]: ...
+
+    def __getitem__(self, k: int | slice) -> Row | list[Row]:
+        if isinstance(k, slice):
+            return [self.row(i) for i in range(*k.indices(len(self)))]
+        if not -len(self) <= k < len(self):
+            raise IndexError(k)
+        return self.row(k % len(self))
+
+    def __iter__(self) -> Iterator[Row]:
+        return (self.row(k) for k in range(len(self)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignments(Rows[Alignment]):
+    """Alignments (n) as columns, a third of the memory of their objects.
+
+    ``pair`` (n,) is the number of each one's query and target session among ``pairs``; ``given``
+    are the objects that the columns were made of, if any.
+    """
+
+    pairs: Sequence[tuple[str, str]]
+    pair: I64
+    query_keyframe: I64
+    target_keyframe: I64
+    query_stamp_ns: I64
+    target_stamp_ns: I64
+    target_T_query: F64
+    covariance: F64
+    overlap: F64
+    inliers: I64
+    words: I64
+    features: Features[F64]
+    given: Sequence[Alignment] | None = None
+
+    def __len__(self) -> int:
+        return len(self.pair)
+
+    @classmethod
+    def of(cls, alignments: Sequence[Alignment]) -> Alignments:
+        """The columns of alignments."""
+        if isinstance(alignments, Alignments):
+            return alignments
+        numbers: dict[tuple[str, str], int] = {}
+        pair = [
+            numbers.setdefault((a.query_session, a.target_session), len(numbers))
+            for a in alignments
+        ]
+
+        def column(name: str, kind: type) -> NDArray[Any]:
+            return np.array([getattr(a, name) for a in alignments], kind)
+
+        return cls(
+            pairs=list(numbers),
+            pair=np.array(pair, np.int64),
+            query_keyframe=column("query_keyframe", np.int64),
+            target_keyframe=column("target_keyframe", np.int64),
+            query_stamp_ns=column("query_stamp_ns", np.int64),
+            target_stamp_ns=column("target_stamp_ns", np.int64),
+            target_T_query=column("target_T_query", float).reshape(-1, 4, 4),
+            covariance=column("covariance", float).reshape(-1, 6, 6),
+            overlap=column("overlap", float),
+            inliers=column("inliers", np.int64),
+            words=column("words", np.int64),
+            features=Features(
+                *(np.array([getattr(a.features, n) for a in alignments], float) for n in FEATURES)
+            ),
+            given=alignments,
+        )
+
+    @classmethod
+    def joined(cls, parts: Iterable[Alignments]) -> Alignments:
+        """The alignments of all parts, each of pairs that no other has."""
+        held = [part for part in parts if len(part)] or [cls.of([])]
+        offsets = np.cumsum([0, *(len(part.pairs) for part in held)])
+
+        def column(name: str) -> NDArray[Any]:
+            return np.concatenate([getattr(part, name) for part in held])
+
+        columns: dict[str, Any] = {f.name: column(f.name) for f in fields(cls)[2:-2]}
+        features = (
+            np.concatenate([getattr(part.features, name) for part in held]) for name in FEATURES
+        )
+        return cls(
+            pairs=[pair for part in held for pair in part.pairs],
+            pair=np.concatenate([p.pair + o for p, o in zip(held, offsets[:-1], strict=True)]),
+            **columns,
+            features=Features(*features),
+        )
+
+    def row(self, k: int) -> Alignment:
+        """Alignment ``k``."""
+        if self.given is not None:
+            return self.given[k]
+        query, target = self.pairs[self.pair[k]]
+        return Alignment(
+            query_session=query,
+            target_session=target,
+            query_keyframe=int(self.query_keyframe[k]),
+            target_keyframe=int(self.target_keyframe[k]),
+            query_stamp_ns=int(self.query_stamp_ns[k]),
+            target_stamp_ns=int(self.target_stamp_ns[k]),
+            target_T_query=self.target_T_query[k],
+            covariance=self.covariance[k],
+            overlap=float(self.overlap[k]),
+            inliers=int(self.inliers[k]),
+            words=int(self.words[k]),
+            features=Features(*(float(getattr(self.features, name)[k]) for name in FEATURES)),
+        )
+
+    def by_pair(self) -> Iterator[tuple[tuple[str, str], I64]]:
+        """Each pair of sessions with the numbers of its alignments."""
+        order = np.argsort(self.pair, kind="stable")
+        cuts = np.searchsorted(self.pair[order], np.arange(1, len(self.pairs)))
+        if self.pairs:
+            yield from zip(self.pairs, np.split(order, cuts), strict=True)
+
+    def sessions(self) -> tuple[NDArray[np.object_], NDArray[np.object_]]:
+        """Names (n,) of the query sessions and of the target sessions."""
+        names = np.array(self.pairs, object).reshape(-1, 2)[self.pair]
+        return names[:, 0], names[:, 1]
+
+    def sigma(self) -> F64:
+        """Standard deviations (n,) of the positions in their worst directions, metres."""
+        if not len(self):
+            return np.zeros(0)
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(self.covariance[:, :3, :3])[:, -1]))
 
 
 class Veto(Enum):
@@ -191,3 +334,95 @@ class Rejected:
             "fit": 100 * features.fit,
             "range_sigma": features.range_sigma,
         }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decisions(Columns):
+    """Decisions about alignments (n), as columns: see :class:`Decision`.
+
+    ``vetoes`` (n, vetoes) are in the order of :class:`Veto`.
+    """
+
+    place_probability: F64
+    mode_share: F64
+    position_confidence: F64
+    vetoes: NDArray[np.bool_]
+
+    @property
+    def probability(self) -> F64:
+        """The products (n,) of the factors."""
+        return self.place_probability * self.mode_share * self.position_confidence
+
+    def of(self, k: int, agreement: Agreement[F64], min_probability: float) -> Decision:
+        """The decision about alignment ``k``."""
+        return Decision(
+            vetoes=frozenset(v for v, held in zip(Veto, self.vetoes[k], strict=True) if held),
+            place_probability=float(self.place_probability[k]),
+            mode_share=float(self.mode_share[k]),
+            position_confidence=float(self.position_confidence[k]),
+            agreement=agreement.row(k),
+            min_probability=min_probability,
+        )
+
+
+REASONS = tuple(Reason)
+ACCEPTED = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcomes(Rows[Closure | Rejected]):
+    """What becomes of ``alignments``: the numbers of some in ``order`` (m,), and their fates.
+
+    ``reason`` (n,) of each alignment is a number among :data:`REASONS`, or :data:`ACCEPTED`.
+    """
+
+    alignments: Alignments
+    decisions: Decisions
+    agreement: Agreement[F64]
+    min_probability: float
+    order: I64
+    reason: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    def decision(self, k: int) -> Decision:
+        """The decision about alignment ``k``."""
+        return self.decisions.of(k, self.agreement, self.min_probability)
+
+    def row(self, k: int) -> Closure | Rejected:
+        """Outcome ``k`` of the order."""
+        number = int(self.order[k])
+        alignment = self.alignments[number]
+        decision = self.decision(number)
+        if self.reason[number] == ACCEPTED:
+            return Closure(alignment, decision)
+        return Rejected(alignment, decision, REASONS[self.reason[number]])
+
+    def accepted(self) -> list[Closure]:
+        """The accepted ones, in their order."""
+        numbers = np.flatnonzero(self.reason[self.order] == ACCEPTED)
+        rows = (self.row(k) for k in numbers.tolist())
+        return [row for row in rows if isinstance(row, Closure)]
+
+    def rejected(self) -> RejectedRows:
+        """The rejected ones."""
+        order = self.order[self.reason[self.order] != ACCEPTED]
+        return RejectedRows(replace(self, order=order))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RejectedRows(Rows[Rejected]):
+    """The rejected ones of some outcomes."""
+
+    outcomes: Outcomes
+
+    def __len__(self) -> int:
+        return len(self.outcomes)
+
+    def row(self, k: int) -> Rejected:
+        """Rejected alignment ``k``."""
+        row = self.outcomes.row(k)
+        if isinstance(row, Closure):
+            raise TypeError(f"outcome {k} is a closure")
+        return row

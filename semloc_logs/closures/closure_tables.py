@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.closures.closure import FEATURES, Closure, Rejected
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.store import pose_columns
 
+ROWS_AT_ONCE = 65_536  # that are made into objects when a table is written
 # columns of rejected.parquet and the fields of Agreement that they hold
 AGREEMENT_COLUMNS = {
     "alone": "own_probability",
@@ -82,7 +85,7 @@ def _columns(rows: Sequence[Closure] | Sequence[Rejected]) -> dict[str, Any]:
         "target_session": [a.target_session for a in alignments],
         "query_stamp_ns": [a.query_stamp_ns for a in alignments],
         "target_stamp_ns": [a.target_stamp_ns for a in alignments],
-        **pose_columns(np.array([a.target_T_query for a in alignments])),
+        **pose_columns(np.array([a.target_T_query for a in alignments]).reshape(-1, 4, 4)),
         "overlap": [a.overlap for a in alignments],
         "probability": [row.decision.probability for row in rows],
         "inliers": [a.inliers for a in alignments],
@@ -101,28 +104,45 @@ def write_closures(path: Path, rows: Sequence[Closure], metadata: dict[str, Any]
 
 def write_rejected(path: Path, rows: Sequence[Rejected], metadata: dict[str, Any]) -> None:
     """rejected.parquet: also the reason and the features that acceptance looks at."""
-    ordered = sorted(rows, key=_query_then_best)
-    alignments = [row.alignment for row in ordered]
-    agreements = [row.decision.agreement for row in ordered]
+    order = _query_then_best(rows)
+    tables = [contracts.table("rejected", _rejected_columns([]))]
+    for first in range(0, len(order), ROWS_AT_ONCE):
+        some = [rows[k] for k in order[first : first + ROWS_AT_ONCE].tolist()]
+        tables.append(contracts.table("rejected", _rejected_columns(some)))
+    write_table(path, pa.concat_tables(tables), metadata, ("query_session", "query_stamp_ns"))
 
-    columns = _columns(ordered)
+
+def _rejected_columns(rows: Sequence[Rejected]) -> dict[str, Any]:
+    alignments = [row.alignment for row in rows]
+    agreements = [row.decision.agreement for row in rows]
+    columns = _columns(rows)
     columns["sigma"] = [a.sigma for a in alignments]
-    columns["reason"] = [row.sentence for row in ordered]
+    columns["reason"] = [row.sentence for row in rows]
     columns |= {name: [getattr(a.features, name) for a in alignments] for name in FEATURES}
     columns |= {
         column: [getattr(agreement, name) for agreement in agreements]
         for column, name in AGREEMENT_COLUMNS.items()
     }
     columns["neighbours"] = [int(agreement.neighbours) for agreement in agreements]
-    write_table(
-        path, contracts.table("rejected", columns), metadata, ("query_session", "query_stamp_ns")
-    )
+    return columns
 
 
-def _query_then_best(row: Rejected) -> tuple[str, int, float, str, int]:
-    a = row.alignment
-    probability = row.decision.probability
-    return a.query_session, a.query_stamp_ns, -probability, a.target_session, a.target_stamp_ns
+def _query_then_best(rows: Sequence[Rejected]) -> NDArray[np.int64]:
+    """Numbers (n,) of the rows by query, then the most probable first."""
+    numbers: dict[str, int] = {}
+    keys = np.zeros((len(rows), 4), np.int64)
+    probability = np.zeros(len(rows))
+    for k, row in enumerate(rows):
+        a = row.alignment
+        query, target = (
+            numbers.setdefault(name, len(numbers)) for name in (a.query_session, a.target_session)
+        )
+        keys[k] = (query, a.query_stamp_ns, target, a.target_stamp_ns)
+        probability[k] = row.decision.probability
+    rank = np.zeros(len(numbers), np.int64)
+    rank[[numbers[name] for name in sorted(numbers)]] = np.arange(len(numbers))
+    columns = keys.T
+    return np.lexsort((columns[3], rank[columns[2]], -probability, columns[1], rank[columns[0]]))
 
 
 def read_closures(path: Path) -> list[dict[str, Any]]:

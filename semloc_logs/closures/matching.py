@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,9 +18,8 @@ from semloc_logs.alignment.scores import Scores, mutual_shares, reverse_scores, 
 from semloc_logs.alignment.search import Candidate, search_hypotheses
 from semloc_logs.alignment.target_map import is_uncertain
 from semloc_logs.alignment.tau import tau
-from semloc_logs.closures.alignment_tables import write_part
 from semloc_logs.closures.closure import Alignment, Features
-from semloc_logs.closures.database import Database, open_database
+from semloc_logs.closures.database import Database
 from semloc_logs.closures.query import build_query, query_members, road_along, road_of
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import Visibility, visible_to
@@ -36,8 +34,8 @@ from semloc_logs.subvolumes.describe import (
     load_encoder,
     quarter_turns,
 )
-from semloc_logs.words.index import Allowed, Index, LookUp, Matches, look_ups
-from semloc_logs.workspace import Workspace
+from semloc_logs.words.index import Allowed, LookUp, Matches, look_ups
+from semloc_logs.words.vocabulary import load_vocabulary
 
 F64 = NDArray[np.float64]
 VOTE_CELL = 2.4  # m, at voxels of 0.30 m: edge of the cells that word matches vote in
@@ -47,6 +45,8 @@ LEAST_WEIGHT = 1e-3
 # of the best score, and a score: no right alignment has less
 MIN_RELATIVE_SCORE = 0.8
 MIN_SCORE = 0.3
+# of the best candidate of a search; right ones have 0.4 and more
+MIN_SEARCH_SCORE = 0.2
 
 Prepared = tuple[Described, list[list[LookUp]]]
 _PREPARED: WeakKeyDictionary[Query, dict[str, Prepared]] = WeakKeyDictionary()
@@ -76,11 +76,15 @@ class QueryContext:
     @property
     def ground_z(self) -> float:
         """Height of the ground under the query in its frame, metres."""
-        base_z = self.session.map_T_base[self.keyframe][2, 3]
-        return float(self.session.ground_z[self.keyframe] - base_z)
+        return ground_below(self.session, self.keyframe)
 
     def target_session(self, group: int) -> SessionMap:
         return self.visible.database.session(group)
+
+
+def ground_below(session: SessionMap, keyframe: int) -> float:
+    """Height of the ground under the query at ``keyframe`` in its frame, metres."""
+    return float(session.ground_z[keyframe] - session.map_T_base[keyframe][2, 3])
 
 
 # how hypotheses of a query are found, and how the words of a query whose ground is at a height are
@@ -104,38 +108,6 @@ class Fitted:
     fit: Fit
     scores: Scores
     range_sigma: float
-
-
-@dataclass(frozen=True, slots=True)
-class SearchTask:
-    """Some queries of one session to search in others; picklable.
-
-    ``targets`` are fingerprints of the pairs by session. The alignments go to ``output``.
-    """
-
-    work: Path
-    session: str
-    keyframes: tuple[int, ...]
-    targets: dict[str, str]
-    settings: Resolved
-    output: Path
-
-
-def search_queries(task: SearchTask) -> int:
-    """Write the alignments of each keyframe of the task, best first; how many there are.
-
-    Each target is searched by itself, so its alignments do not depend on the others.
-    """
-    session = SessionMap(Workspace(task.work).session(task.session))
-    queries = {k: build_query(session, k, task.settings) for k in task.keyframes}
-    found: list[Alignment] = []
-    for target, fingerprint in task.targets.items():
-        database = open_database(task.work, target, fingerprint, task.settings)
-        for keyframe, query in queries.items():
-            found += search_query(database, session, keyframe, query)
-    found.sort(key=lambda a: (a.query_keyframe, a.target_session))
-    write_part(task.output, task.keyframes, task.targets, found)
-    return len(found)
 
 
 def close_query(
@@ -212,7 +184,7 @@ def match_words(
     The query's ground is at ``ground_z`` (m). The ``yaw`` of a match is of ``target_T_query``.
     """
     index = database.words(variant)
-    described, prepared = _prepared(query, variant, ground_z, database.settings, index)
+    described, prepared = prepare(query, variant, ground_z, database.settings)
     closures = database.settings.closures
     quarters = []
     for turns, batches in enumerate(prepared):
@@ -223,18 +195,17 @@ def match_words(
     return described, Matches(*columns)
 
 
-def _prepared(
-    query: Query, variant: str, ground_z: float, settings: Resolved, index: Index
-) -> Prepared:
+def prepare(query: Query, variant: str, ground_z: float, settings: Resolved) -> Prepared:
     """The subvolumes of a query and their look-ups in each quarter turn, once for all targets."""
     of_query = _PREPARED.setdefault(query, {})
     if variant not in of_query:
         described = _describe(query, variant, ground_z, settings)
         turned = (quarter_turns(described.descriptor, turns) for turns in range(4))
+        vocabulary = load_vocabulary(variant, settings.descriptor.vocabulary)
         probes = settings.closures.probes
         of_query[variant] = (
             described,
-            [look_ups(index.vocabulary, descriptors, probes) for descriptors in turned],
+            [look_ups(vocabulary, descriptors, probes) for descriptors in turned],
         )
     return of_query[variant]
 
@@ -314,7 +285,13 @@ def verify_hypotheses(context: QueryContext, hypotheses: list[Hypothesis]) -> li
 
 
 def align_candidates(context: QueryContext, candidates: list[Candidate]) -> list[Alignment]:
-    """Candidates in one target session, aligned on the points and compared with each other."""
+    """Candidates in one target session, aligned on the points and compared with each other.
+
+    None where the best of them scores so little that no fit makes a good alignment of it; otherwise
+    all, as rivals tell how distinct it is.
+    """
+    if max((c.score for c in candidates), default=0.0) < MIN_SEARCH_SCORE:
+        return []
     coarse = _each_place_once([_coarse(context, c) for c in candidates], context.voxel_size)
     fine: list[Fitted] = []
     for fitted in coarse[: max(1, context.settings.closures.rejected_per_query)]:

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from semloc_logs.closures.alignment_tables import Part, joined_parts, read_parts
+from semloc_logs.closures.alignment_tables import Part, by_target, joined, read_parts
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.tables.atomic_files import remove_file
@@ -124,9 +124,11 @@ def missing(
 def finish(work: Workspace, done: Missing, metadata: Mapping[str, Mapping[str, object]]) -> None:
     """Parts of all chunks -> a table for each target, with its metadata; the parts are removed."""
     queries = sum(len(chunk) for chunk in done.chunks)
+    found = {part.path: by_target(part.path) for part in done.parts}
     for target, fingerprint in done.fingerprints.items():
         content = {**metadata[target], "fingerprint": fingerprint, "queries": queries}
-        table = joined_parts(done.of(target), target)
+        of_parts = (found[part.path].get(target) for part in done.of(target))
+        table = joined(t for t in of_parts if t is not None)
         write_table(work.alignments(done.session, target), table, content, ("query_keyframe",))
     shutil.rmtree(done.folder, ignore_errors=True)
     with suppress(OSError):  # other targets are searched still

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from semloc_logs.closures.acceptance.decide import decide
 from semloc_logs.closures.alignment_tables import read_alignments
-from semloc_logs.closures.closure import Closure, Rejected
+from semloc_logs.closures.closure import Alignments, Outcomes
 from semloc_logs.closures.closure_tables import (
     read_closures,
     unique_closures,
@@ -14,6 +15,7 @@ from semloc_logs.closures.closure_tables import (
     write_rejected,
 )
 from semloc_logs.closures.pairs import Pair, known_pairs
+from semloc_logs.closures.query import query_keyframes
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Resolved
@@ -52,69 +54,86 @@ def close(
     search = PairSearch.of(work, settings, selection, overwrite=overwrite)
     keep(work, settings)
     searches = search.run(engine)
-    is_new = decide_all(work, search.maps, settings, overwrite=overwrite)
+    is_new = decide_all(work, search.maps, settings, search.searched(), overwrite=overwrite)
     report = Report(closures=len(read_closures(work.closures)), amount=searches)
     report.skipped += misfits_of(search.maps, settings).values()
     (report.done if is_new else report.kept).append("closures")
     return report
 
 
-def decide_all(work: Workspace, maps: Maps, settings: Resolved, *, overwrite: bool = False) -> bool:
+def decide_all(
+    work: Workspace,
+    maps: Maps,
+    settings: Resolved,
+    known: Mapping[Pair, str] | None = None,
+    *,
+    overwrite: bool = False,
+) -> bool:
     """Write the tables of closures and rejections, and the picture; whether they were not there.
 
-    They are of the alignments of all pairs, without sessions whose poses do not fit.
+    They are of the alignments of all pairs (``known``, where they are known already), without
+    sessions whose poses do not fit.
     """
-    if not overwrite and is_decided(work, settings):
+    known = known_pairs(work) if known is None else known
+    if not overwrite and is_decided(work, settings, known):
         return False
     # matplotlib is loaded only where something is drawn
     from semloc_logs.pictures.closures_picture import draw_closures
 
-    paths = _used_alignments(work, maps, settings)
-    decided = decided_alignments(work, maps, settings)
+    paths = _used_alignments(work, maps, settings, known)
+    decided = _decided(paths, maps, settings)
     road = {name: session_map.distance for name, session_map in maps.items()}
-    accepted = [outcome for outcome in decided if isinstance(outcome, Closure)]
-    rejected = [outcome for outcome in decided if isinstance(outcome, Rejected)]
-    closures = unique_closures(accepted, road, settings.query.every)
+    closures = unique_closures(decided.accepted(), road, settings.query.every)
 
-    queries = {pair.query: int(read_metadata(path)["queries"]) for pair, path in paths.items()}
     metadata = {
         **metadata_of(settings, maps.values()),
-        "queries": sum(queries.values()),
-        "fingerprint": _decided_from(work, settings),
+        "queries": sum(len(keyframes) for keyframes in _searched(paths, maps, settings).values()),
+        "fingerprint": _decided_from(known, settings),
         "settings": settings.tables(*SECTIONS),
     }
     # closures.parquet comes last: with its fingerprint it vouches for the other two
-    write_rejected(work.rejected, rejected, metadata)
+    write_rejected(work.rejected, decided.rejected(), metadata)
     draw_closures(work, closures, maps)
     write_closures(work.closures, closures, metadata)
     return True
 
 
-def decided_alignments(work: Workspace, maps: Maps, settings: Resolved) -> list[Closure | Rejected]:
+def decided_alignments(work: Workspace, maps: Maps, settings: Resolved) -> Outcomes:
     """What becomes of the alignments of all pairs, without sessions whose poses do not fit."""
-    paths = _used_alignments(work, maps, settings)
-    alignments = [
-        a for pair, path in paths.items() for a in read_alignments(path, pair.query, pair.target)
-    ]
-    return decide(alignments, maps, settings)
+    return _decided(_used_alignments(work, maps, settings, known_pairs(work)), maps, settings)
 
 
-def _used_alignments(work: Workspace, maps: Maps, settings: Resolved) -> dict[Pair, Path]:
+def _decided(paths: Mapping[Pair, Path], maps: Maps, settings: Resolved) -> Outcomes:
+    alignments = Alignments.joined(read_alignments(paths[p], p.query, p.target) for p in paths)
+    # queries without alignments are neighbours too
+    return decide(alignments, maps, settings, _searched(paths, maps, settings))
+
+
+def _searched(pairs: Iterable[Pair], maps: Maps, settings: Resolved) -> dict[str, list[int]]:
+    """The keyframes of all queries by session."""
+    return {p.query: query_keyframes(maps[p.query], settings) for p in pairs}
+
+
+def _used_alignments(
+    work: Workspace, maps: Maps, settings: Resolved, known: Mapping[Pair, str]
+) -> dict[Pair, Path]:
     """The tables of alignments of the pairs of sessions whose poses fit."""
     misfits = misfits_of(maps, settings)
-    pairs = [p for p in sorted(known_pairs(work)) if not misfits.keys() & {p.query, p.target}]
+    pairs = [p for p in sorted(known) if not misfits.keys() & {p.query, p.target}]
     return {pair: work.alignments(pair.query, pair.target) for pair in pairs}
 
 
-def _decided_from(work: Workspace, settings: Resolved) -> str:
+def _decided_from(known: Mapping[Pair, str], settings: Resolved) -> str:
     """The fingerprint of all alignments, and of what the decision about them depends on."""
-    pairs = [f"{p.query}/{p.target} {f}" for p, f in sorted(known_pairs(work).items())]
+    pairs = [f"{p.query}/{p.target} {f}" for p, f in sorted(known.items())]
     return fingerprint_of((settings.fingerprint(*SECTIONS), *pairs))
 
 
-def is_decided(work: Workspace, settings: Resolved) -> bool:
+def is_decided(
+    work: Workspace, settings: Resolved, known: Mapping[Pair, str] | None = None
+) -> bool:
     """Whether the tables are there and were decided from the alignments that are there."""
-    fingerprint = _decided_from(work, settings)
+    fingerprint = _decided_from(known_pairs(work) if known is None else known, settings)
     try:
         tables = [read_metadata(path) for path in (work.closures, work.rejected)]
     except WorkspaceError:  # missing or damaged

@@ -11,7 +11,6 @@ import numpy as np
 
 import semloc_logs
 from semloc_logs import progress
-from semloc_logs.closures.matching import SearchTask, search_queries
 from semloc_logs.closures.pairs import (
     Missing,
     Pair,
@@ -23,6 +22,7 @@ from semloc_logs.closures.pairs import (
     pairs_of_sessions,
 )
 from semloc_logs.closures.query import query_keyframes
+from semloc_logs.closures.tasks import SearchTask, block_size, search_queries
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
@@ -33,7 +33,7 @@ from semloc_logs.stages.state import OF_DECISION
 from semloc_logs.subvolumes.submap_descriptors import variants_for
 from semloc_logs.workspace import Workspace
 
-QUERIES_A_TASK = 8
+QUERIES_A_TASK = 8  # or more, as tasks hold whole blocks
 Maps = Mapping[str, SessionMap]
 
 
@@ -160,8 +160,15 @@ class PairSearch:
         forget(self.work, [p for p in stale if p not in self.chosen])
         return sum(len(task.keyframes) * len(task.targets) for task in tasks)
 
+    def searched(self) -> dict[Pair, str]:
+        """The pairs whose alignments are there after a run, with their fingerprints."""
+        present = {p: f for p, f in self.known.items() if f == self.fingerprints.get(p)}
+        return present | {pair: self.fingerprints[pair] for pair in self.chosen}
+
     def _missing(self) -> list[Missing]:
         """What is left to search of each session."""
+        block = block_size(self.settings)
+        size = block * -(-QUERIES_A_TASK // block)
         of_targets: dict[str, dict[str, str]] = {}
         for pair in self.chosen:
             of_targets.setdefault(pair.query, {})[pair.target] = self.fingerprints[pair]
@@ -169,8 +176,7 @@ class PairSearch:
         for session, fingerprints in of_targets.items():
             keyframes = query_keyframes(self.maps[session], self.settings)
             chunks = [
-                tuple(keyframes[first : first + QUERIES_A_TASK])
-                for first in range(0, len(keyframes), QUERIES_A_TASK)
+                tuple(keyframes[first : first + size]) for first in range(0, len(keyframes), size)
             ]
             alone = next(iter(fingerprints)) if self.alone else None
             out.append(missing(self.work, session, fingerprints, chunks, alone))

@@ -44,6 +44,8 @@ BUDGET = 32_768  # codes that a look-up compares, and the codes of one word more
 # :mod:`semloc_logs.words.vocabulary`
 UNIT = 2.0**19
 QUERIES = 1024  # that are looked up together
+# of a query word, in its nearest cells, that a survey looks into
+NEAREST_WORDS, NEAREST_CELLS = 4, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +105,34 @@ def _word_distances(projected: F32, cell: int, children: F32, square: F32, out: 
         out[c] = np.int32(
             min(max((square[cell, c] - 2 * dot) * np.float32(UNIT), -(2.0**29)), 2.0**29)
         )
+
+
+@njit(cache=True, nogil=True)
+def _nearest_words(
+    projected: F32, cells: I32, codes: U64, children: F32, square: F32
+) -> tuple[I32, U64]:
+    """The nearest words (n, NEAREST_WORDS) of each query in its first cells, and its codes there.
+
+    Of equals the first; ``cells`` and ``codes`` are (n, p).
+    """
+    n, p = cells.shape
+    p = min(p, NEAREST_CELLS)
+    k = children.shape[1]
+    words = np.empty((n, min(NEAREST_WORDS, p * k)), np.int32)
+    code = np.empty(words.shape, np.uint64)
+    distance = np.empty(p * k, np.int32)
+    for q in range(n):
+        for j in range(p):
+            _word_distances(
+                projected[q], cells[q, j], children, square, distance[j * k : j * k + k]
+            )
+        for i in range(words.shape[1]):
+            nearest = np.argmin(distance)
+            j = nearest // k
+            words[q, i] = cells[q, j] * 256 + nearest % k
+            code[q, i] = codes[q, j]
+            distance[nearest] = np.iinfo(np.int32).max
+    return words, code
 
 
 @njit(cache=True, nogil=True)
@@ -370,24 +400,35 @@ class LookUp:
     """Descriptors (n) as every index of a vocabulary looks them up.
 
     Their nearest ``cells`` (n, p), ``codes`` (n, p) in each of them, ``margin`` (n, p, 64) of the
-    projections from the cells' thresholds, and ``projected`` (n, 64) descriptors.
+    projections from the cells' thresholds, ``projected`` (n, 64) descriptors, and their nearest
+    words ``word`` (n, w) with the codes ``word_codes`` (n, w) in the cells of these.
     """
 
     cells: I32
     margin: F32
     codes: U64
     projected: F32
+    word: I32
+    word_codes: U64
+
+
+def squares(vocabulary: Vocabulary) -> F32:
+    """The square (c, k) of each word's length."""
+    return np.asarray(np.square(vocabulary.children).sum(2))
 
 
 def look_ups(vocabulary: Vocabulary, descriptors: F32, probes: int) -> list[LookUp]:
     """Descriptors (n, N) to be looked for in their ``probes`` nearest cells, in batches."""
     out = []
+    square = squares(vocabulary)
     for first in range(0, len(descriptors), QUERIES):
         batch = descriptors[first : first + QUERIES]
         cells = vocabulary.nearest_cells(batch, probes)
         margin = vocabulary.margins(batch, cells)
         projected = grid(vocabulary.projected(batch))
-        out.append(LookUp(cells, np.abs(margin), codes_of(margin), projected))
+        codes = codes_of(margin)
+        words = _nearest_words(projected, cells, codes, vocabulary.children, square)
+        out.append(LookUp(cells, np.abs(margin), codes, projected, *words))
     return out
 
 
@@ -402,7 +443,7 @@ class Index:
         self.budget = budget
         self.shortlist = SHORTLIST
         self.parts = sorted((p for p in parts if len(p.segment)), key=lambda p: -len(p.segment))
-        self._square = np.square(vocabulary.children).sum(2)
+        self._square = squares(vocabulary)
         self._live = np.zeros(WORDS, np.int64)
         for p in self.parts:
             if (p.group >= 0).all():

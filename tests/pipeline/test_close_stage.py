@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import semloc_logs
-from semloc_logs.closures.matching import search_queries
+from semloc_logs.closures.tasks import search_queries
 from semloc_logs.engines import Serial
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import inverse, rotation_angle, transform

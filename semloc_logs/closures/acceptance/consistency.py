@@ -8,7 +8,7 @@ road instead of all pairs).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,14 +38,19 @@ DRIVEN_AGAIN = 50
 MIN_VOTE = 0.02  # alignments less probable than this do not vote
 
 
-def count_votes(placed: Placed, voxel_size: float) -> Agreement[F64]:
-    """The votes on each alignment (n,); the order of the alignments does not matter."""
+def count_votes(
+    placed: Placed, voxel_size: float, roads: Mapping[str, F64] | None = None
+) -> Agreement[F64]:
+    """The votes on each alignment (n,); the order of the alignments does not matter.
+
+    ``roads`` are of each session's queries, by default of those that have alignments.
+    """
     n = len(placed)
     own_probability = place_odds(placed, placed.log_odds, voxel_size).share
     votes = Agreement(own_probability, *np.zeros((6, n)))
     support = np.zeros(n)
     pairs = pairs_of(placed)
-    roads = query_roads(placed)
+    roads = query_roads(placed) if roads is None else roads
     for (query, _), rows in pairs.items():
         group = placed.part(rows)
         road = roads[query]

@@ -17,17 +17,25 @@ from semloc_logs.closures.acceptance.calibration import (
 )
 from semloc_logs.closures.acceptance.consistency import count_votes, place_odds
 from semloc_logs.closures.acceptance.placements import (
+    F64,
+    I64,
+    Bools,
+    Placed,
     contradicts_odometry,
-    features_of,
     place,
+    query_roads,
 )
 from semloc_logs.closures.closure import (
+    ACCEPTED,
+    REASONS,
+    Agreement,
     Alignment,
-    Closure,
+    Alignments,
     Decision,
+    Decisions,
     Features,
+    Outcomes,
     Reason,
-    Rejected,
     Veto,
 )
 from semloc_logs.mapping.session_map import SessionMap
@@ -49,73 +57,74 @@ def decide(
     alignments: Sequence[Alignment],
     maps: Mapping[str, SessionMap],
     settings: Resolved,
+    queries: Mapping[str, Sequence[int]] | None = None,
     model: Model | None = None,
-) -> list[Closure | Rejected]:
+) -> Outcomes:
     """What becomes of the alignments of all queries, best first for each query.
 
-    For each target session at most one alignment of a query is accepted. Without a ``model``
-    the one of the package decides.
+    For each target session at most one alignment of a query is accepted. ``queries`` are keyframes
+    of all queries by session, by default of those that have alignments. Without a ``model`` the one
+    of the package decides.
     """
     model = model or shipped()
-    decisions = _decisions(alignments, maps, settings, model)
-    order = sorted(
-        range(len(alignments)), key=lambda k: _order(alignments[k], decisions[k].probability)
+    rows = Alignments.of(alignments)
+    placed = place(rows, maps, model)
+    roads = query_roads(placed)
+    for name, keyframes in (queries or {}).items():
+        roads[name] = maps[name].distance[np.asarray(keyframes, int)]
+    agreement = count_votes(placed, settings.fusion.voxel_size, roads)
+    decisions = _decisions(rows, placed, agreement, model, settings.fusion.voxel_size)
+    outcomes = Outcomes(
+        rows,
+        decisions,
+        agreement,
+        settings.closures.min_probability,
+        _order(rows, decisions.probability),
+        np.full(len(rows), ACCEPTED, np.int8),
     )
-
-    answered: set[tuple[str, int, str]] = set()
-    outcomes: list[Closure | Rejected] = []
-    for k in order:
-        a = alignments[k]
-        decision = decisions[k]
-        query = (a.query_session, a.query_keyframe, a.target_session)
-        reason = why_rejected(decision, a.features, model)
-        if reason is None and query in answered:
-            reason = Reason.SECOND_CHOICE
-        answered.add(query)
-        outcomes.append(Closure(a, decision) if reason is None else Rejected(a, decision, reason))
+    reason = outcomes.reason
+    good = (decisions.probability >= outcomes.min_probability) & ~decisions.vetoes.any(axis=1)
+    reason[good & ~_is_first(rows, outcomes.order)] = REASONS.index(Reason.SECOND_CHOICE)
+    for k in np.flatnonzero(~good).tolist():  # a NaN is not good
+        why = why_rejected(outcomes.decision(k), rows[k].features, model)
+        reason[k] = REASONS.index(why)
     return outcomes
 
 
+def _is_first(rows: Alignments, order: I64) -> Bools:
+    """Which alignments (n,) are the first of their query in their target session."""
+    query = rows.pair * (rows.query_keyframe.max(initial=0) + 1) + rows.query_keyframe
+    out = np.zeros(len(rows), bool)
+    out[order[np.unique(query[order], return_index=True)[1]]] = True
+    return out
+
+
 def _decisions(
-    alignments: Sequence[Alignment],
-    maps: Mapping[str, SessionMap],
-    settings: Resolved,
-    model: Model,
-) -> list[Decision]:
-    """The decision about each alignment (n,)."""
-    placed = place(alignments, maps, model)
-    voxel_size = settings.fusion.voxel_size
-    votes = count_votes(placed, voxel_size)
-    with_votes = model.log_odds(placed.log_odds, votes)
-    of_place = place_odds(placed, with_votes, voxel_size).place_probability
-    # neighbours tell which place is right, and share its errors: not which pose in it
-    of_mode = place_odds(placed, placed.log_odds, voxel_size).mode_share
-    of_position = position_confidence(placed.sigma, voxel_size)
+    rows: Alignments, placed: Placed, agreement: Agreement[F64], model: Model, voxel_size: float
+) -> Decisions:
+    """The factors and the vetoes of each alignment (n,)."""
+    with_votes = model.log_odds(placed.log_odds, agreement)
     vetoes = {
         Veto.CONTRADICTS_ODOMETRY: contradicts_odometry(placed, voxel_size),
-        Veto.AMBIGUOUS_PLACE: model.is_ambiguous(votes),
-        Veto.LOOSE_FIT: is_loose(features_of(alignments)),
+        Veto.AMBIGUOUS_PLACE: model.is_ambiguous(agreement),
+        Veto.LOOSE_FIT: is_loose(rows.features),
     }
-    return [
-        Decision(
-            vetoes=frozenset(veto for veto, which in vetoes.items() if which[k]),
-            place_probability=float(of_place[k]),
-            mode_share=float(of_mode[k]),
-            position_confidence=float(of_position[k]),
-            agreement=votes.row(k),
-            min_probability=settings.closures.min_probability,
-        )
-        for k in range(len(placed))
-    ]
+    return Decisions(
+        place_odds(placed, with_votes, voxel_size).place_probability,
+        # neighbours tell which place is right, and share its errors: not which pose in it
+        place_odds(placed, placed.log_odds, voxel_size).mode_share,
+        position_confidence(placed.sigma, voxel_size),
+        np.stack([vetoes[veto] for veto in Veto], axis=1),
+    )
 
 
-def why_rejected(decision: Decision, features: Features[float], model: Model) -> Reason | None:
-    """The veto or the factor that rejects an alignment, None where it is accepted."""
+def why_rejected(decision: Decision, features: Features[float], model: Model) -> Reason:
+    """The veto or the factor that rejects an alignment."""
     required = decision.min_probability
     if Veto.CONTRADICTS_ODOMETRY in decision.vetoes:
         return Reason.CONTRADICTS_ODOMETRY
     if decision.probability >= required:
-        return next((REASON_OF_VETO[veto] for veto in Veto if veto in decision.vetoes), None)
+        return next(REASON_OF_VETO[veto] for veto in Veto if veto in decision.vetoes)
     if decision.place_probability >= required:
         uncertain = decision.position_confidence <= decision.mode_share
         return Reason.UNCERTAIN_POSITION if uncertain else Reason.POSE_MODES
@@ -134,13 +143,19 @@ def weakest(features: Features[float], model: Model) -> Reason:
     return REASON_OF_EVIDENCE[EVIDENCE[int(np.argmin(terms))]]
 
 
-def _order(a: Alignment, probability: float) -> tuple[str, int, float, float, str, int]:
-    """By query, then the most probable first."""
-    return (
-        a.query_session,
-        a.query_stamp_ns,
-        -probability,
-        -a.features.structure,
-        a.target_session,
-        a.target_stamp_ns,
+def _order(rows: Alignments, probability: F64) -> I64:
+    """Numbers (n,) by query, then the most probable first."""
+    names = sorted({name for pair in rows.pairs for name in pair})
+    rank = {name: number for number, name in enumerate(names)}
+    ranks = np.array([[rank[name] for name in pair] for pair in rows.pairs], np.int64)
+    query_session, target_session = ranks.reshape(-1, 2)[rows.pair].T
+    return np.lexsort(
+        (
+            rows.target_stamp_ns,
+            target_session,
+            -rows.features.structure,
+            -probability,
+            rows.query_stamp_ns,
+            query_session,
+        )
     )

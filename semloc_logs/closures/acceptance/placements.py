@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.closures.acceptance.calibration import Model, probability_of
-from semloc_logs.closures.closure import FEATURES, Alignment, Columns, Features
+from semloc_logs.closures.closure import Alignment, Alignments, Columns
 from semloc_logs.mapping.session_map import SessionMap
 
 F64 = NDArray[np.float64]
@@ -50,39 +50,31 @@ class Placed(Columns):
         return probability_of(self.log_odds)
 
 
-def features_of(alignments: Sequence[Alignment]) -> Features[F64]:
-    """The features of alignments as columns (n,)."""
-    return Features(
-        *(np.array([getattr(a.features, name) for a in alignments], float) for name in FEATURES)
-    )
-
-
 def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], model: Model) -> Placed:
     """Where alignments put their queries, and the log-odds that the ``model`` gives them."""
-    ends = [
-        (maps[a.query_session], a.query_keyframe, maps[a.target_session], a.target_keyframe)
-        for a in alignments
-    ]
-
-    def stack(poses: list[F64]) -> F64:
-        return np.array(poses).reshape(-1, 4, 4)
-
+    rows = Alignments.of(alignments)
+    n = len(rows)
+    road, target_road = np.zeros((2, n))
+    map_T_query, target_T_query = np.zeros((2, n, 4, 4))
+    posed = np.zeros(n, bool)
+    for (query_session, target_session), mine in rows.by_pair():
+        query, target = (rows.query_keyframe[mine], rows.target_keyframe[mine])
+        session, other = (maps[query_session], maps[target_session])
+        road[mine] = session.distance[query]
+        target_road[mine] = other.distance[target]
+        map_T_query[mine] = session.map_T_base[query]
+        target_T_query[mine] = other.map_T_base[target] @ rows.target_T_query[mine]
+        posed[mine] = session.posed
     return Placed(
-        np.array([a.query_session for a in alignments], object),
-        np.array([a.target_session for a in alignments], object),
-        np.array([a.query_keyframe for a in alignments], np.int64),
-        np.array([q.distance[k] for q, k, _, _ in ends], float),
-        np.array([t.distance[k] for _, _, t, k in ends], float),
-        stack([q.map_T_base[k] for q, k, _, _ in ends]),
-        stack(
-            [
-                t.map_T_base[k] @ a.target_T_query
-                for a, (_, _, t, k) in zip(alignments, ends, strict=True)
-            ]
-        ),
-        np.array([a.sigma for a in alignments], float),
-        model.own_log_odds(features_of(alignments)),
-        np.array([q.posed for q, _, _, _ in ends], bool),
+        *rows.sessions(),
+        rows.query_keyframe,
+        road,
+        target_road,
+        map_T_query,
+        target_T_query,
+        rows.sigma(),
+        model.own_log_odds(rows.features),
+        posed,
     )
 
 

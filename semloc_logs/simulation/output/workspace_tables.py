@@ -291,19 +291,19 @@ def _closure(query: _Drive, k: int, target: _Drive, near: int, rng: np.random.Ge
     noise = exp_se3(rng.normal(0, SIGMA[0], 3), rng.normal(0, SIGMA[1], 3))
     pose = inverse(target.world_T_base[near]) @ query.world_T_base[k] @ noise
     probability = float(1 - 10 ** -rng.uniform(2, 5))
-    features = Features(*map(float, (rng.uniform(0.6, 0.98), 0.9, 0.03, 0.7, 0.1, 0.4, 3.6, 4.2)))
-    alignment = _alignment((query, k), (target, near), pose, features, probability, rng)
+    features = Features(*map(float, (rng.uniform(0.6, 0.98), 0.9, 0.03, 0.7, 3.6, 2.2, 0.0)))
+    alignment = _alignment((query, k), (target, near), pose, features, rng)
     return Closure(alignment, _decision(probability, rng))
 
 
 def _rejected(query: _Drive, k: int, target: _Drive, rng: np.random.Generator) -> Rejected:
     near = int(rng.integers(len(target.places)))
     features = Features(
-        *map(float, (rng.uniform(0.1, 0.6), 0.5, 0.2, 0.3, 0.3, 0.9, 2.1, rng.uniform(1, 3)))
+        *map(float, (rng.uniform(0.1, 0.6), 0.5, 0.2, 0.3, 2.1, rng.uniform(0, 2), 0.0))
     )
     probability = float(rng.uniform(0, 0.6))
-    alignment = _alignment((query, k), (target, near), np.eye(4), features, probability, rng)
-    reasons = (Reason.STRUCTURE_MISMATCH, Reason.RIVAL_PLACE, Reason.AMBIGUOUS_PLACE)
+    alignment = _alignment((query, k), (target, near), np.eye(4), features, rng)
+    reasons = (Reason.FREE_SPACE, Reason.RIVAL_PLACE, Reason.AMBIGUOUS_PLACE)
     reason = reasons[int(rng.integers(len(reasons)))]
     return Rejected(alignment, _decision(probability, rng), reason)
 
@@ -313,7 +313,6 @@ def _alignment(
     target: tuple[_Drive, int],
     pose: F64,
     features: Features[float],
-    probability: float,
     rng: np.random.Generator,
 ) -> Alignment:
     sigma = np.r_[SIGMA[0] * rng.uniform(0.5, 3, 3), np.full(3, SIGMA[1])]
@@ -328,7 +327,6 @@ def _alignment(
         target_T_query=pose,
         covariance=np.diag(sigma**2),
         overlap=float(rng.uniform(0.4, 0.9)),
-        probability=probability,
         inliers=int(rng.integers(500, 9000)),
         words=int(rng.integers(3, 200)),
         features=features,
@@ -338,7 +336,7 @@ def _alignment(
 def _decision(probability: float, rng: np.random.Generator) -> Decision:
     votes = [probability, *rng.uniform(0, 5, 5), rng.uniform(0, 0.3)]
     agreement = Agreement(*(float(v) for v in votes))
-    return Decision(probability, agreement, probability, 1.0, 1.0, 0.99)
+    return Decision(frozenset(), probability, 1.0, 1.0, agreement, 0.99)
 
 
 def _write_alignments(work: Workspace, closures: list[Closure], rejected: list[Rejected]) -> None:

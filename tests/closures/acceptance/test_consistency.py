@@ -116,7 +116,7 @@ def alignment(
 def decided(
     rows: list[Alignment], maps: dict[str, SessionMap] | None = None
 ) -> dict[tuple[int, int], Outcome]:
-    out = decide(rows, maps or MAPS, SETTINGS, MODEL)
+    out = decide(rows, maps or MAPS, SETTINGS, model=MODEL)
     assert len(out) == len(rows)
     return {(o.alignment.query_keyframe, o.alignment.target_keyframe): o for o in out}
 
@@ -172,7 +172,7 @@ def test_neighbours_rescue_a_right_one_and_a_second_choice_that_agrees_is_promot
         alignment(25, 0.95, at=50),
     ]
     first, second = (
-        o for o in decide(rows, MAPS, SETTINGS, MODEL) if o.alignment.query_keyframe == 25
+        o for o in decide(rows, MAPS, SETTINGS, model=MODEL) if o.alignment.query_keyframe == 25
     )
     # odds of 9 and 19 and 1 for neither
     assert first.alignment.target_keyframe == 25
@@ -264,7 +264,7 @@ def test_neighbours_do_not_choose_among_the_poses_of_a_place() -> None:
     both.
     """
     sure = [alignment(k, 0.999) for k in range(20, 31) if k != 25]
-    alone = decide([*sure, alignment(25, 0.96)], MAPS, SETTINGS, MODEL)
+    alone = decide([*sure, alignment(25, 0.96)], MAPS, SETTINGS, model=MODEL)
     assert [accepted(o) for o in alone if o.alignment.query_keyframe == 25] == [True]
     both = decide(
         [
@@ -274,7 +274,7 @@ def test_neighbours_do_not_choose_among_the_poses_of_a_place() -> None:
         ],
         MAPS,
         SETTINGS,
-        MODEL,
+        model=MODEL,
     )
     reasons = [sentence(o) for o in both if o.alignment.query_keyframe == 25]
     assert len(reasons) == 2
@@ -286,7 +286,7 @@ def test_sessions_that_overlap_each_other_do_not_contradict() -> None:
     maps = {**MAPS, "c": session(yaw_transform(2.0, (500.0, 0.0, 0.0)) @ MAP @ ROAD)}
     rows = [alignment(k, 0.99) for k in range(20, 31)]
     both = rows + [dataclasses.replace(a, target_session="c") for a in rows]
-    for a in decide(both, maps, SETTINGS, MODEL):
+    for a in decide(both, maps, SETTINGS, model=MODEL):
         assert (a.decision.agreement.neighbours, a.decision.agreement.conflict) == (10, 0.0)
 
 
@@ -308,7 +308,7 @@ def in_street(k: int, at: int, query: str = "a", target: str = "b") -> Alignment
 
 def test_its_own_odometry_refutes_a_closure_of_a_session_with_itself() -> None:
     refuted, right = sorted(
-        decide([in_street(5, 50, target="a"), in_street(5, 5)], STREETS, SETTINGS, MODEL),
+        decide([in_street(5, 50, target="a"), in_street(5, 5)], STREETS, SETTINGS, model=MODEL),
         key=lambda o: o.alignment.target_session,
     )
     assert refuted.decision.vetoes == {Veto.CONTRADICTS_ODOMETRY}
@@ -382,7 +382,7 @@ def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_els
     once = [in_street(k, k, target="c") for k in COPIED]
     assert all(
         accepted(a) and a.decision.agreement.ambiguity == 0
-        for a in decide(once, STREETS, SETTINGS, MODEL)
+        for a in decide(once, STREETS, SETTINGS, model=MODEL)
     )
     # the second place of each fits less well, so that of rivals alone they would be accepted
     twice = [
@@ -394,7 +394,7 @@ def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_els
     ]
     there = [in_street(k, k, "c", "a") for k in COPIED]
     back = [in_street(k, k, "b", "c") for k in COPIED]
-    found = decide(once + twice + there + back, STREETS, SETTINGS, MODEL)
+    found = decide(once + twice + there + back, STREETS, SETTINGS, model=MODEL)
     assert all(a.decision.agreement.ambiguity > 0.9 for a in found)
     assert not any(accepted(a) for a in found)
     assert sum("ambiguous place" in sentence(a) for a in found) == len(found) - len(COPIED)
@@ -405,7 +405,7 @@ def test_two_queries_of_a_street_do_not_make_all_of_it_look_like_others() -> Non
     twice = [in_street(k, at) for k in (30, 31) for at in (k - 25, k + 15)]
     found = [
         a
-        for a in decide(right + twice, STREETS, SETTINGS, MODEL)
+        for a in decide(right + twice, STREETS, SETTINGS, model=MODEL)
         if a.alignment.target_session == "c"
     ]
     assert all(accepted(a) and a.decision.agreement.ambiguity < 0.05 for a in found)
@@ -421,7 +421,7 @@ def test_a_second_place_as_far_off_as_the_target_may_have_drifted_is_the_same(
         distance=np.r_[STREETS["b"].distance, road + STREETS["b"].distance],
     )
     rows = [in_street(k, at) for k in COPIED for at in (k, 100 + k + 12)]
-    found = decide(rows, {**STREETS, "b": cast(SessionMap, twice)}, SETTINGS, MODEL)
+    found = decide(rows, {**STREETS, "b": cast(SessionMap, twice)}, SETTINGS, model=MODEL)
     assert all((a.decision.agreement.ambiguity > 0.9) == alike for a in found)
 
 
@@ -429,11 +429,11 @@ def test_three_sessions_that_contradict_each_other_look_like_others() -> None:
     """Of b and c, which lie on each other, a is in b where it is, and in c one block on."""
     rows = [in_street(k, k) for k in COPIED] + [in_street(k, k, "b", "c") for k in COPIED]
     consistent = decide(
-        rows + [in_street(k, k, target="c") for k in COPIED], STREETS, SETTINGS, MODEL
+        rows + [in_street(k, k, target="c") for k in COPIED], STREETS, SETTINGS, model=MODEL
     )
     assert all(accepted(a) and a.decision.agreement.ambiguity == 0 for a in consistent)
     for a in decide(
-        rows + [in_street(k, k + 40, target="c") for k in COPIED], STREETS, SETTINGS, MODEL
+        rows + [in_street(k, k + 40, target="c") for k in COPIED], STREETS, SETTINGS, model=MODEL
     ):
         if "a" in (a.alignment.query_session, a.alignment.target_session):
             assert a.decision.agreement.ambiguity > 0.9
@@ -442,7 +442,7 @@ def test_three_sessions_that_contradict_each_other_look_like_others() -> None:
 
 def test_streets_that_a_session_itself_has_twice_are_ambiguous() -> None:
     rows = [in_street(k, k) for k in COPIED] + [in_street(k, k + 40, target="a") for k in COPIED]
-    for a in decide(rows, STREETS, SETTINGS, MODEL):
+    for a in decide(rows, STREETS, SETTINGS, model=MODEL):
         assert a.decision.agreement.ambiguity > 0.9
         assert not accepted(a)
 
@@ -451,7 +451,7 @@ def test_streets_that_a_session_itself_has_twice_are_ambiguous() -> None:
 def test_second_places_that_do_not_agree_or_lie_in_the_same_view_are_no_copies(at: Any) -> None:
     rows = [in_street(k, where) for k in COPIED for where in (k, at(k))]
     assert all(
-        a.decision.agreement.ambiguity < 0.02 for a in decide(rows, STREETS, SETTINGS, MODEL)
+        a.decision.agreement.ambiguity < 0.02 for a in decide(rows, STREETS, SETTINGS, model=MODEL)
     )
 
 
@@ -461,7 +461,7 @@ def test_a_second_place_that_fits_much_worse_is_no_copy() -> None:
         dataclasses.replace(in_street(k, k + 30), features=worse) for k in COPIED
     ]
     assert all(
-        a.decision.agreement.ambiguity < 0.01 for a in decide(rows, STREETS, SETTINGS, MODEL)
+        a.decision.agreement.ambiguity < 0.01 for a in decide(rows, STREETS, SETTINGS, model=MODEL)
     )
 
 
@@ -472,7 +472,7 @@ def test_without_other_alignments_all_votes_are_zero() -> None:
 
 def test_without_odometry_nobody_is_a_neighbour() -> None:
     maps = {"a": session(ROAD, posed=False), "b": MAPS["b"]}
-    for a in decide([alignment(k, 0.992) for k in range(20, 24)], maps, SETTINGS, MODEL):
+    for a in decide([alignment(k, 0.992) for k in range(20, 24)], maps, SETTINGS, model=MODEL):
         assert a.decision.agreement == Agreement(0.992, 0, 0, 0, 0, 0, 0)
         assert accepted(a)
 
@@ -492,7 +492,7 @@ def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
     ]
     shuffled = [rows[k] for k in rng.permutation(len(rows))]
 
-    def keys(found: list[Outcome]) -> list[Any]:
+    def keys(found: Sequence[Outcome]) -> list[Any]:
         return [
             (
                 o.alignment.query_keyframe,
@@ -504,13 +504,13 @@ def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
         ]
 
     maps = {**STREETS, **MAPS, "b": STREETS["b"]}
-    assert keys(decide(rows, maps, SETTINGS, MODEL)) == keys(
-        decide(shuffled, maps, SETTINGS, MODEL)
+    assert keys(decide(rows, maps, SETTINGS, model=MODEL)) == keys(
+        decide(shuffled, maps, SETTINGS, model=MODEL)
     )
 
 
 def test_of_none() -> None:
-    assert decide([], MAPS, SETTINGS, MODEL) == []
+    assert list(decide([], MAPS, SETTINGS, model=MODEL)) == []
     nothing = place([], {}, MODEL)
     assert len(count_votes(nothing, 0.3)) == 0
     assert not contradicts_odometry(nothing, 0.3).any()

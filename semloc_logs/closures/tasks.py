@@ -1,0 +1,163 @@
+"""Tasks of a search: some queries of one session, in the sessions that they may meet.
+
+What a pair of sessions gets does not depend on the other sessions. Most pairs never meet, so cheap
+looks come first: a survey of the words of all sessions at once, which tells for each of them
+whether a block of consecutive queries is worth a search; a search of the block's query with the
+most votes; and where that one finds a place that may be right, a search of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.query_map import Query
+from semloc_logs.closures.acceptance.calibration import probability_of, shipped
+from semloc_logs.closures.alignment_tables import write_part
+from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.database import open_database
+from semloc_logs.closures.matching import ground_below, prepare, search_query
+from semloc_logs.closures.query import build_query
+from semloc_logs.mapping.session_map import SessionMap
+from semloc_logs.settings import STREET_VOXEL, Resolved
+from semloc_logs.words.catalogue import segments
+from semloc_logs.words.survey import NO_VOTES, Survey, Votes
+from semloc_logs.workspace import Workspace
+
+SURVEY_CELL = 4.8  # m, at voxels of 0.30 m: edge of the cells that a survey votes in
+OPEN_SURVEYS = 4
+MIN_SHARE = 0.1  # of the votes in a session: small maps and small queries have few
+# of an alignment's own features, below which it tells nothing about neighbouring queries
+MIN_PROBABILITY = 0.02
+
+Built = tuple[Query, NDArray[np.float64]]
+Surveyed = Mapping[int, Mapping[str, Votes]]  # of queries, by keyframe and session
+
+
+@dataclass(frozen=True, slots=True)
+class SearchTask:
+    """Some queries of one session to search in others; picklable.
+
+    ``targets`` are fingerprints of the pairs by session. The alignments go to ``output``.
+    """
+
+    work: Path
+    session: str
+    keyframes: tuple[int, ...]
+    targets: dict[str, str]
+    settings: Resolved
+    output: Path
+
+
+def search_queries(task: SearchTask) -> int:
+    """Write the alignments of each keyframe of the task, best first; how many there are.
+
+    Each target is searched by itself, so its alignments do not depend on the others.
+    """
+    session = SessionMap(Workspace(task.work).session(task.session))
+    queries = {k: build_query(session, k, task.settings) for k in task.keyframes}
+    votes = survey_queries(task, session, queries)
+    found: list[Alignment] = []
+    for target, fingerprint in task.targets.items():
+
+        def search(keyframe: int, target: str = target, key: str = fingerprint) -> list[Alignment]:
+            database = open_database(task.work, target, key, task.settings)
+            return search_query(database, session, keyframe, queries[keyframe])
+
+        if target == task.session:
+            found += [a for keyframe in queries for a in search(keyframe)]
+            continue
+        of_target = {k: votes[k].get(target, NO_VOTES) for k in queries}
+        for block in _blocks(task.keyframes, block_size(task.settings)):
+            found += _search_block(block, of_target, task.settings.closures.min_votes, search)
+    found.sort(key=lambda a: (a.query_keyframe, a.target_session))
+    write_part(task.output, task.keyframes, task.targets, found)
+    return len(found)
+
+
+def block_size(settings: Resolved) -> int:
+    """How many consecutive queries are searched together; tasks hold whole blocks."""
+    return max(1, round(settings.closures.every / settings.query.every))
+
+
+def _blocks(keyframes: Sequence[int], size: int) -> Iterator[Sequence[int]]:
+    for first in range(0, len(keyframes), size):
+        yield keyframes[first : first + size]
+
+
+def _search_block(
+    block: Sequence[int],
+    votes: Mapping[int, Votes],
+    min_votes: float,
+    search: Callable[[int], list[Alignment]],
+) -> list[Alignment]:
+    """The alignments of the queries of a block in one target, as far as these are worth a search.
+
+    With a ``min_votes`` of 0 all are searched.
+    """
+    if min_votes <= 0:
+        return [a for keyframe in block for a in search(keyframe)]
+    first = max(block, key=lambda keyframe: (votes[keyframe].place, -keyframe))
+    enough = min(min_votes, MIN_SHARE * votes[first].everywhere)
+    if votes[first].place <= 0 or votes[first].place < enough:
+        return []
+    found = search(first)
+    if any(_may_be_right(alignment) for alignment in found):
+        for keyframe in block:
+            if keyframe != first:
+                found += search(keyframe)
+    return found
+
+
+def _may_be_right(alignment: Alignment) -> bool:
+    return float(probability_of(shipped().own_log_odds(alignment.features))) >= MIN_PROBABILITY
+
+
+# -- surveys
+
+
+def survey_queries(task: SearchTask, session: SessionMap, queries: Mapping[int, Built]) -> Surveyed:
+    """How many words of each query agree about a place in each target, other than the session."""
+    settings = task.settings
+    votes: dict[int, dict[str, Votes]] = {keyframe: {} for keyframe in queries}
+    targets = tuple((n, made_from) for n, made_from in task.targets.items() if n != task.session)
+    if settings.closures.min_votes <= 0 or not targets:
+        return votes
+    for variant, survey in _surveys(task.work, targets, session.has_classes, settings).items():
+        for keyframe, (query, _) in queries.items():
+            if len(query.structure[0]):
+                ground_z = ground_below(session, keyframe)
+                described, turned = prepare(query, variant, ground_z, settings)
+                centre = described.centre.astype(float) * settings.fusion.voxel_size
+                votes[keyframe] |= survey.votes(turned, centre)
+    return votes
+
+
+@lru_cache(maxsize=OPEN_SURVEYS)
+def _surveys(
+    work: Path, targets: tuple[tuple[str, str], ...], has_classes: bool, settings: Resolved
+) -> dict[str, Survey]:
+    """Surveys of the targets of a session, by the words that they are searched by.
+
+    They are kept between the tasks of a process; ``targets`` come with fingerprints of all that
+    they depend on. ``has_classes``: whether the session's labels come from a log or a model.
+    """
+    forced = settings.descriptor.variant
+    names: dict[str, list[str]] = {}
+    for name, _ in targets:
+        variant: str = forced
+        if forced == "auto":
+            known = has_classes and SessionMap(Workspace(work).session(name)).has_classes
+            variant = "semantic" if known else "geometric"
+        names.setdefault(variant, []).append(name)
+    cell = SURVEY_CELL * settings.fusion.voxel_size / STREET_VOXEL
+    headings = settings.descriptor.headings
+    return {
+        variant: Survey(segments(Workspace(work), variant, chosen), chosen, headings, cell)
+        for variant, chosen in names.items()
+    }

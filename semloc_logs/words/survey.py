@@ -1,0 +1,193 @@
+"""Which sessions may hold a query's place: votes of its words, counted in all sessions at once.
+
+A search compares each query word with thousands of a session's words. A survey looks only at those
+that fall into its nearest few words of the vocabulary and have nearly its code, and finds how many
+of them agree where the query lies. That takes microseconds a session. The votes in a session do not
+depend on the other sessions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from semloc_logs.numerics.bits import popcount
+from semloc_logs.words.index import LookUp
+from semloc_logs.words.segment import Segment
+
+I32 = NDArray[np.int32]
+U32 = NDArray[np.uint32]
+U64 = NDArray[np.uint64]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+NEAR_CODE = 14  # bits between codes that vote
+# of a vote with equal codes; other votes weigh (1 - bits / FAR_CODE)^2 of it, in whole numbers:
+# their sums do not depend on their order
+FULL_VOTE = 1024
+FAR_CODE = 32
+# of the numbers of cells: place | heading | x | y | weight
+HEADING_BITS = 8
+CELL_BITS = 14
+WEIGHT_BITS = 11
+
+
+class _Lists(NamedTuple):
+    """The lists of a segment; ``session`` (places,) is the number of each place's, -1 for none."""
+
+    starts: U32
+    code: U64
+    place: U32
+    centre: F32
+    yaw: F32
+    session: I64
+
+
+class _Asked(NamedTuple):
+    """Words of a query: each (n, w) of its nearest ones, with its code, quarter turns and
+    centre (n, 2), metres."""
+
+    word: I32
+    code: U64
+    turns: I64
+    centre: F64
+
+
+class Votes(NamedTuple):
+    """The weight of the votes in a session: for the best ``place``, and ``everywhere``.
+
+    Equal codes have weight 1.
+    """
+
+    place: float
+    everywhere: float
+
+
+NO_VOTES = Votes(0.0, 0.0)
+
+
+class Survey:
+    """The words of the sessions ``names`` in ``segments``, each with the sessions that it serves.
+
+    Votes are counted in cells of ``cell`` metres and of ``headings`` headings.
+    """
+
+    def __init__(
+        self,
+        segments: Iterable[tuple[Segment, frozenset[str]]],
+        names: Sequence[str],
+        headings: int,
+        cell: float,
+    ) -> None:
+        self.names = tuple(names)
+        self._headings = headings
+        self._cell = cell
+        numbers = {name: number for number, name in enumerate(self.names)}
+        self._lists = [
+            _Lists(
+                s.starts,
+                s.code,
+                s.place,
+                s.centre,
+                s.yaw,
+                np.array([numbers[n] if n in served else -1 for n, _ in s.places], np.int64),
+            )
+            for s, served in segments
+        ]
+
+    def votes(self, turned: Sequence[Sequence[LookUp]], centre: F64) -> Mapping[str, Votes]:
+        """The votes in each session.
+
+        ``turned`` are the look-ups of a query's words at ``centre`` (n, 3), metres, in each quarter
+        turn.
+        """
+        weights = np.zeros((2, len(self.names)), np.int64)
+        if len(centre):
+            asked = _asked(turned, centre)
+            for lists in self._lists:
+                for votes in _votes(asked, lists, self._headings, self._cell):
+                    votes.sort()
+                    _count(votes, lists.session, *weights)
+        place, everywhere = weights / FULL_VOTE
+        # both grids have all votes
+        counted = zip(place.tolist(), (everywhere / 2).tolist(), strict=True)
+        return {name: Votes(*of_name) for name, of_name in zip(self.names, counted, strict=True)}
+
+
+def _asked(turned: Sequence[Sequence[LookUp]], centre: F64) -> _Asked:
+    batches = [batch for batches in turned for batch in batches]
+    return _Asked(
+        np.concatenate([batch.word for batch in batches]),
+        np.concatenate([batch.word_codes for batch in batches]),
+        np.repeat(np.arange(len(turned)), len(centre)),
+        np.tile(np.asarray(centre, float)[:, :2], (len(turned), 1)),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _votes(asked: _Asked, lists: _Lists, headings: int, cell: float) -> tuple[I64, I64]:
+    """The votes of all pairs of near words: numbers of cells with a weight in their last bits.
+
+    Of cells as they lie, and of cells moved by half their edge, so that no place is split at a
+    border in both.
+    """
+    step = 2 * np.pi / headings
+    quarter = headings // 4
+    cells = 1 << CELL_BITS
+    weights = np.empty(NEAR_CODE + 1, np.int64)
+    for bits in range(NEAR_CODE + 1):
+        weights[bits] = np.int64(FULL_VOTE * (1 - bits / FAR_CODE) ** 2)
+    cosine = np.cos(np.arange(headings) * step)
+    sine = np.sin(np.arange(headings) * step)
+    votes = np.empty((2, 4096), np.int64)
+    count = 0
+    for q in range(len(asked.word)):
+        for n in range(asked.word.shape[1]):
+            word = np.int64(asked.word[q, n])
+            code = asked.code[q, n]
+            for i in range(np.int64(lists.starts[word]), np.int64(lists.starts[word + 1])):
+                bits = popcount(code ^ lists.code[i])
+                if bits > NEAR_CODE:
+                    continue
+                place = np.int64(lists.place[i])
+                # a file may be damaged
+                if place >= len(lists.session) or lists.session[place] < 0:
+                    continue
+                own = np.int64(np.rint(lists.yaw[i] / step))
+                heading = (own + asked.turns[q] * quarter) % headings
+                c = cosine[heading]
+                s = sine[heading]
+                x = (lists.centre[i, 0] - c * asked.centre[q, 0] + s * asked.centre[q, 1]) / cell
+                y = (lists.centre[i, 1] - s * asked.centre[q, 0] - c * asked.centre[q, 1]) / cell
+                if count == votes.shape[1]:
+                    more = np.empty((2, 2 * count), np.int64)
+                    more[:, :count] = votes
+                    votes = more
+                for grid in range(2):
+                    column = np.int64(np.floor(x + 0.5 * grid)) & (cells - 1)
+                    row = np.int64(np.floor(y + 0.5 * grid)) & (cells - 1)
+                    number = ((place << HEADING_BITS | heading) << CELL_BITS | column) << CELL_BITS
+                    votes[grid, count] = (number | row) << WEIGHT_BITS | weights[bits]
+                count += 1
+    return votes[0, :count].copy(), votes[1, :count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _count(votes: I64, session: I64, place: I64, everywhere: I64) -> None:
+    """Weights in each session: the greatest in a cell into ``place``, the sum to ``everywhere``.
+
+    ``votes`` (n,) are ascending.
+    """
+    weight = np.int64(0)
+    for i in range(len(votes)):
+        cell = votes[i] >> WEIGHT_BITS
+        weight += votes[i] & ((1 << WEIGHT_BITS) - 1)
+        if i + 1 == len(votes) or votes[i + 1] >> WEIGHT_BITS != cell:
+            number = session[cell >> (HEADING_BITS + 2 * CELL_BITS)]
+            place[number] = max(place[number], weight)
+            everywhere[number] += weight
+            weight = np.int64(0)
