@@ -509,6 +509,13 @@ def test_the_order_of_the_alignments_does_not_matter(seed: int) -> None:
     )
 
 
+@pytest.mark.parametrize(("alone", "expected"), [(0.9901, True), (0.9899, False), (np.nan, False)])
+def test_what_is_as_probable_as_the_settings_require_is_accepted(
+    alone: float, expected: bool
+) -> None:
+    assert accepted(decided([alignment(25, alone)])[25, 25]) is expected
+
+
 def test_of_none() -> None:
     assert list(decide([], MAPS, SETTINGS, model=MODEL)) == []
     nothing = place([], {}, MODEL)
