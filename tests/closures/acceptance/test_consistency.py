@@ -290,6 +290,40 @@ def test_sessions_that_overlap_each_other_do_not_contradict() -> None:
         assert (a.decision.agreement.neighbours, a.decision.agreement.conflict) == (10, 0.0)
 
 
+@given(st.integers(0, 10_000), st.integers(1, 4))
+@settings(max_examples=25, deadline=None)
+def test_sessions_that_do_not_meet_a_pair_change_nothing_of_it(seed: int, others: int) -> None:
+    """Sessions elsewhere, and improbable alignments of the pair's queries in them."""
+    rng = np.random.default_rng(seed)
+    rows = [alignment(k, float(rng.uniform(0.5, 0.9999))) for k in range(10, 40)]
+    names = [f"other_{n}" for n in range(others)]
+    maps = MAPS | {name: session(ROAD) for name in names}
+    more = [
+        dataclasses.replace(
+            alignment(k, float(rng.uniform(1e-6, 1e-3)), at=int(rng.integers(60))),
+            target_session=name,
+        )
+        for name in names
+        for k in range(10, 40)
+    ]
+    among_themselves = [
+        dataclasses.replace(alignment(k, 0.999), query_session=name, target_session=names[0])
+        for name in names[1:]
+        for k in range(50)
+    ]
+
+    def of_pair(found: Sequence[Outcome]) -> list[tuple[int, Any, bool]]:
+        pair = [o for o in found if o.alignment.target_session == "b"]
+        return [(o.alignment.query_keyframe, o.decision, accepted(o)) for o in pair]
+
+    queries = {"a": range(10, 40)}
+    alone, together = (
+        decide(some, maps, SETTINGS, queries, MODEL)
+        for some in (rows, rows + more + among_themselves)
+    )
+    assert of_pair(together) == of_pair(alone)
+
+
 STRAIGHT = np.array([yaw_transform(0.0, (2.0 * i, 0.0, 0.0)) for i in range(100)])
 STREETS = {"a": session(STRAIGHT), "b": session(STRAIGHT), "c": session(STRAIGHT)}
 COPIED = range(20, 40)

@@ -64,9 +64,7 @@ def sentence(
     return Rejected(alignment, made, reason).sentence
 
 
-def why(
-    made: Decision, votes: Agreement[float] = SURE, features: Features[float] = GOOD
-) -> Reason:
+def why(made: Decision, votes: Agreement[float] = SURE, features: Features[float] = GOOD) -> Reason:
     return why_rejected(dataclasses.replace(made, agreement=votes), features, MODEL)
 
 
