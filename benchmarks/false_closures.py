@@ -7,9 +7,9 @@
 copies of one another. Then come towns of cameras, most of them driven there and back along recorded
 drives, where these are in FOLDER. Their tables DIR/TOWN/judged.parquet hold features, so after a
 new calibration the same command counts again without new queries. LOGS is a folder of logs, with
-*_truth.json for logs whose truth is known (the logs of one file are of one place; a closure between
-logs of different places is false). Each pair is searched with the labels of the log, with labels
-from geometry and without any.
+*_truth.json for logs whose truth is known (the logs of one file, and of files that share a log, are
+of one place; a closure between logs of different places is false). Each pair is searched with the
+labels of the log, with labels from geometry and without any.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from semloc_logs.engines.processes import single_threaded
 from semloc_logs.evaluation.calibration import SURE, answers, decided_by, read_judged, recall_at
 from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
 from semloc_logs.mapping.session_map import SessionMap
+from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import load
 from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe
@@ -196,7 +197,10 @@ def count_pairs(work: Workspace, logs: Path, title: str) -> int:
 def places(
     logs: Path, sessions: Mapping[str, SessionMap]
 ) -> tuple[dict[str, Path], dict[str, TrueTrack]]:
-    """The truth file that knows each session, which stands for its place, and the true tracks."""
+    """The truth file that knows each session, which stands for its place, and the true tracks.
+
+    Files that share a session are of one place, in the frame of the first one.
+    """
     place: dict[str, Path] = {}
     tracks: dict[str, TrueTrack] = {}
     for truth in sorted(logs.glob("*_truth.json")):
@@ -205,8 +209,16 @@ def places(
             for name in json.loads(truth.read_text())
         ):
             found = read_truth(truth, sessions)
-            place |= dict.fromkeys(found, truth)
-            tracks |= found
+            shared = next((name for name in found if name in tracks), None)
+            if shared is None:
+                place |= dict.fromkeys(found, truth)
+                tracks |= found
+                continue
+            first_T_this = tracks[shared].common_T_base[0] @ inverse(found[shared].common_T_base[0])
+            for name in found.keys() - tracks.keys():
+                place[name] = place[shared]
+                track = found[name]
+                tracks[name] = TrueTrack(track.stamps_ns, first_T_this @ track.common_T_base)
     return place, tracks
 
 
