@@ -196,7 +196,7 @@ class Alignments(Rows[Alignment]):
         def column(name: str) -> NDArray[Any]:
             return np.concatenate([getattr(part, name) for part in held])
 
-        columns = {f.name: column(f.name) for f in fields(cls)[2:-2]}
+        columns: dict[str, Any] = {f.name: column(f.name) for f in fields(cls)[2:-2]}
         features = (
             np.concatenate([getattr(part.features, name) for part in held]) for name in FEATURES
         )
