@@ -17,7 +17,7 @@ from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_table
 from semloc_logs.voxels.store import pose_columns
 
-ROWS_AT_ONCE = 65_536  # that are made into objects when a table is written
+ROWS_AT_ONCE = 8192  # that are made into objects when a table is written
 # columns of rejected.parquet and the fields of Agreement that they hold
 AGREEMENT_COLUMNS = {
     "alone": "own_probability",
