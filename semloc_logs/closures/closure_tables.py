@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.closures.closure import FEATURES, Closure, Rejected
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import read_table, write_table
