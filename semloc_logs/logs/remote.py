@@ -15,7 +15,7 @@ import re
 import stat
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path, PosixPath
@@ -145,12 +145,12 @@ class RemotePath(PosixPath):
         size = self.info().get("size") or 0
         return os.stat_result((kind, 0, 0, 1, 0, 0, size, 0, 0, 0))
 
-    def iterdir(self) -> Iterator[RemotePath]:
+    def iterdir(self) -> Generator[RemotePath, None, None]:
         """The files and folders in it."""
         found = _requested(self, lambda system: system.ls(self._listed(), detail=False))
         for name in sorted({str(f).rstrip("/").rpartition("/")[2] for f in found}):
             if name != self.name:
-                yield cast(RemotePath, self / name)
+                yield self / name
 
     def _listed(self) -> str:
         return f"{self._address()}/" if EXTRAS[self.scheme] == "http" else self._address()
@@ -340,7 +340,8 @@ class _Upload(io.BufferedIOBase):
             self._send(len(self._held) - _HELD)
         return len(content)
 
-    def read(self, size: int = -1) -> bytes:
+    def read(self, size: int | None = -1) -> bytes:
+        size = -1 if size is None else size
         at = self._position - self._sent
         if at < 0:
             if size < 0 or self._position + size > len(self._head):
@@ -357,7 +358,7 @@ class _Upload(io.BufferedIOBase):
         return end
 
     def send_all(self) -> None:
-        """Send what is left."""
+        """Send the rest."""
         self._send(len(self._held))
 
     def _send(self, count: int) -> None:
@@ -434,7 +435,7 @@ def _raise_answer(path: RemotePath, error: Exception) -> None:
     names = {type(e).__name__ for e in chain}
     if names & {"NoCredentialsError", "PartialCredentialsError", "ProfileNotFound"}:
         raise RemoteError(
-            f"{path} cannot be read: there are no credentials for it; set AWS_PROFILE, or"
+            f"{path} cannot be read: credentials for it are missing; set AWS_PROFILE, or"
             " FSSPEC_S3_ANON=true where anyone may read it."
         ) from error
     if names & {"InvalidURL", "InvalidUrlClientError", "ParamValidationError"}:

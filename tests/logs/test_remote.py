@@ -101,6 +101,9 @@ def content(log: Path | str) -> list[tuple[str, int, bytes]]:
     return messages
 
 
+NAMES: dict[Callable[[Path], Path], str] = {mcap: "x.mcap", bag: "x.bag", folder: "x"}
+
+
 # -- addresses
 
 
@@ -243,7 +246,7 @@ def test_dropped_connections_are_tried_again(tmp_path: Path, web: WebServer) -> 
 def test_a_connection_lost_for_good_is_no_damage_of_the_log(
     kind: Callable[[Path], Path], tmp_path: Path, web: WebServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log = kind(tmp_path / {mcap: "x.mcap", bag: "x.bag"}.get(kind, "x"))
+    log = kind(tmp_path / NAMES[kind])
     if log.is_dir():
         log = next(log.glob("*.db3"))
     web.files[log.name] = log.read_bytes()
@@ -313,7 +316,7 @@ def topics(data: bytes, tmp_path: Path) -> set[str]:
 def test_copies_and_sidecars_go_back_to_the_server(
     kind: Callable[[Path], Path], tmp_path: Path, bucket: Bucket
 ) -> None:
-    log = kind(tmp_path / {mcap: "x.mcap", bag: "x.bag"}.get(kind, "x"))
+    log = kind(tmp_path / NAMES[kind])
     for file in [log] if log.is_file() else log.iterdir():
         bucket.put(str(file.relative_to(tmp_path)), file)
     source = log_path(f"{bucket.url}/{log.name}")
@@ -351,6 +354,13 @@ def test_a_log_on_a_server_stays_as_it_is(tmp_path: Path, bucket: Bucket, web: W
         annotate_copy(log, log_path(f"{web.url}/out.mcap"), RESULTS)
 
 
+def interrupted(path: RemotePath, block: bytes) -> None:
+    with uploading(path) as file:
+        for _ in range(20):
+            file.write(block)
+        raise KeyboardInterrupt
+
+
 def test_an_upload_appears_whole_or_not_at_all(
     bucket: Bucket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -370,10 +380,8 @@ def test_an_upload_appears_whole_or_not_at_all(
         file.write(b"end")
         file.truncate()
     assert bucket.get("large.bin") == data[:-100] + b"end"
-    with pytest.raises(KeyboardInterrupt), uploading(path) as file:
-        for _ in range(20):
-            file.write(data[: 1 << 20])
-        raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(path, data[: 1 << 20])
     assert bucket.get("large.bin") == data[:-100] + b"end", "the earlier one is kept"
     assert bucket.unfinished() == []
     missing = log_path("s3://nobucket/x.bin")
