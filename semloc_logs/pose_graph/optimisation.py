@@ -17,7 +17,7 @@ from semloc_logs.pose_graph.carried_poses import SolvedPoses
 from semloc_logs.pose_graph.consistent_sets import ConsistentSet, consistent_sets
 from semloc_logs.pose_graph.graph import PoseGraph, turned_covariance
 from semloc_logs.pose_graph.initial_poses import place_sessions
-from semloc_logs.pose_graph.problem import Problem, problem_of
+from semloc_logs.pose_graph.problem import Problem, coarse_problem, fine_problem
 from semloc_logs.pose_graph.solver import BOUND, Method, Solution, Solver
 from semloc_logs.settings import ResolvedOptimize
 
@@ -77,11 +77,11 @@ def optimise_graph(
     placed = placement.common_T_map[graph.chain_of] @ graph.map_T_base
 
     # a coarse graph tells closures apart, a fine one has the poses
-    coarse = problem_of(graph, settings, coarse=True)
+    coarse = coarse_problem(graph, settings)
     solver = Solver(coarse, _anchors(coarse, placement.component), placed[coarse.kept])
     rough = solver.solve(placed[coarse.kept], consistent.astype(float), settings.seconds)
     carried = _all_poses(graph, coarse, rough.common_T_base)
-    problem = problem_of(graph, settings)
+    problem = fine_problem(graph, settings)
     solver = Solver(problem, _anchors(problem, placement.component), carried[problem.kept])
     solution = solver.refined(carried[problem.kept], rough.weight)
     solution = _readmitted(solver, solution)

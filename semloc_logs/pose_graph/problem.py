@@ -18,6 +18,7 @@ from semloc_logs.settings import ResolvedOptimize
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 COARSE = 4
+MOST_COARSE = 10_000  # vertices of a coarse problem, but for the ends of sessions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,37 +65,48 @@ class Problem:
     up: Directions
 
 
-def problem_of(graph: PoseGraph, settings: ResolvedOptimize, *, coarse: bool = False) -> Problem:
+def coarse_problem(graph: PoseGraph, settings: ResolvedOptimize) -> Problem:
+    """Thin ``graph`` to vertices that are COARSE times the vertex spacing apart, or farther.
+
+    It is small enough for many solutions.
+    """
+    road = sum(float(chain.distance[-1]) for chain in graph.chains if len(chain))
+    spacing = max(COARSE * settings.vertex_spacing, road / MOST_COARSE)
+    return _problem(graph, settings, _kept(graph, spacing))
+
+
+def fine_problem(graph: PoseGraph, settings: ResolvedOptimize) -> Problem:
     """Thin ``graph`` to a vertex where closures end, at most one in ``vertex_spacing`` metres.
 
-    Elsewhere, and everywhere in a ``coarse`` problem, there is one in COARSE times as much road.
+    Elsewhere there is one in COARSE times as much road.
     """
+    kept = _kept(graph, COARSE * settings.vertex_spacing)
+    narrow = _starts(graph, settings.vertex_spacing)
+    ends = np.concatenate([graph.loops.target, graph.loops.query])
+    return _problem(
+        graph, settings, np.union1d(kept, narrow[np.searchsorted(narrow, ends, "right") - 1])
+    )
+
+
+def _problem(graph: PoseGraph, settings: ResolvedOptimize, kept: I64) -> Problem:
     noise = OdometryNoise.of(settings)
-    kept = _kept(graph, settings.vertex_spacing, coarse=coarse)
     odometry = _odometry(graph, kept, noise)
     loops = _moved_loops(graph, kept, noise, settings)
     return Problem(kept, graph.chain_of[kept], odometry, loops, _up(graph, kept, settings))
 
 
-def _kept(graph: PoseGraph, spacing: float, *, coarse: bool) -> I64:
-    """The first vertex of each stretch of road, of each with a closure's end, and the last one."""
-    wide = _starts(graph, np.floor(graph.distance / (COARSE * spacing)))
+def _kept(graph: PoseGraph, spacing: float) -> I64:
+    """The first vertex of each ``spacing`` metres of road, and the last one of each session."""
     last = graph.first + np.array([len(chain) for chain in graph.chains], np.int64) - 1
-    kept = np.zeros(graph.vertices, bool)
-    kept[wide] = True
-    kept[last] = True
-    if not coarse:
-        narrow = _starts(graph, np.floor(graph.distance / spacing))
-        ends = np.concatenate([graph.loops.target, graph.loops.query])
-        kept[narrow[np.searchsorted(narrow, ends, "right") - 1]] = True
-    return np.flatnonzero(kept)
+    return np.union1d(_starts(graph, spacing), last)
 
 
-def _starts(graph: PoseGraph, stretch: F64) -> I64:
-    """The first vertex of each ``stretch`` (n,) of road of each session."""
-    chain = graph.chain_of
-    is_start = (np.diff(stretch, prepend=-1) != 0) | (np.diff(chain, prepend=-1) != 0)
-    return np.flatnonzero(is_start)
+def _starts(graph: PoseGraph, spacing: float) -> I64:
+    """The first vertex of each ``spacing`` metres of road of each session."""
+    stretch = np.floor(graph.distance / spacing)
+    is_new = np.diff(stretch, prepend=-1) != 0
+    is_first = np.diff(graph.chain_of, prepend=-1) != 0
+    return np.flatnonzero(is_new | is_first)
 
 
 def _odometry(graph: PoseGraph, kept: I64, noise: OdometryNoise) -> Edges:

@@ -31,14 +31,18 @@ Mask = NDArray[np.bool_]
 INLIER_SHARE = 0.999
 BOUND = float(chi2.ppf(INLIER_SHARE, 6))  # squared and whitened error of a right closure
 SCHEDULE_STEP = 2.0  # mu grows by so much; the paper takes 1.4 and solves each step to the end
-STEP_ITERATIONS = 2  # of Levenberg-Marquardt in each step of the schedule
+FIRST_ITERATIONS = 6  # of Levenberg-Marquardt before the schedule
+STEP_ITERATIONS = 1  # of Levenberg-Marquardt in each step of the schedule
 LAST_ITERATIONS = 20  # in the solution that follows
 TOLERANCE = 1e-6  # relative decrease of the error that ends it
 MOST_STEPS = 100
+# vertices that are solved together; beyond, one session after the other, the others held
+MOST_TOGETHER = 20_000
+SWEEPS = 4  # over all sessions
+TURN_ITERATIONS = 5  # for a session in a sweep
 BINARY = 1e-3  # a weight that is nearer to 0 or 1 counts as that
 # a chain whose closures are all refused stays where it is, to the width of a continent
-LOOSE_M = 1e3
-LOOSE_RAD = 3.0
+LOOSE = [1e3, 1e3, 1e3, 3.0, 3.0, 3.0]  # m and rad
 ANCHOR_SIGMA = 1e-4  # the first vertex of a component, m and rad
 UP_HUBER = 1.345  # Huber's constant for 95 % efficiency: gravity may be wrong in places
 
@@ -80,7 +84,9 @@ class Solver:
     def __init__(self, problem: Problem, anchors: NDArray[np.int64], initial: F64) -> None:
         self._gtsam = gtsam_library()
         self._problem = problem
-        self._fixed = self._fixed_factors(anchors, initial)
+        self._anchors = set(anchors.tolist())
+        self._initial = initial
+        self._fixed = self._fixed_factors()
         self._ordering: Any = None
 
     def solve(self, initial: F64, start: F64, seconds: float) -> Solution:
@@ -90,7 +96,7 @@ class Solver:
         """
         deadline = time.monotonic() + seconds
         loops = self._problem.loops
-        poses = self._solved(initial, start, LAST_ITERATIONS)
+        poses = self._solved(initial, start, FIRST_ITERATIONS)
         squared = squared_errors(loops, poses)
         weight = start
         largest = float(squared[start > 0].max(initial=0.0))
@@ -115,7 +121,10 @@ class Solver:
 
     def refined(self, initial: F64, weight: F64) -> Solution:
         """Least squares from ``initial`` (v, 4, 4) with given weights of the closures."""
-        poses = self._solved(initial, weight, LAST_ITERATIONS)
+        if len(initial) > MOST_TOGETHER:
+            poses = self._solved_in_turn(initial, weight)
+        else:
+            poses = self._solved(initial, weight, LAST_ITERATIONS)
         return Solution(poses, weight, squared_errors(self._problem.loops, poses), Method.GNC)
 
     def cauchy(self, initial: F64, start: F64) -> Solution:
@@ -134,7 +143,9 @@ class Solver:
 
         Increments are in the axes of the frame, x y z rotation-x rotation-y rotation-z.
         """
-        marginals = self._gtsam.Marginals(self._weighted(weight), self._values(poses))
+        marginals = self._gtsam.Marginals(
+            self._weighted(weight), self._values(poses, slice(0, len(poses)))
+        )
         local = np.array([marginals.marginalCovariance(k) for k in range(len(poses))])
         # GTSAM orders a pose's error as rotation, position, in the axes of the pose
         local = np.roll(np.roll(local.reshape(-1, 6, 6), 3, axis=1), 3, axis=2)
@@ -149,56 +160,128 @@ class Solver:
             graph.add(_between(self._gtsam, loops, row, root))
         return graph
 
-    def _values(self, poses: F64) -> Any:
+    def _values(self, poses: F64, rows: slice) -> Any:
         values = self._gtsam.Values()
-        for vertex, pose in enumerate(poses):
-            values.insert(vertex, self._gtsam.Pose3(pose))
+        for vertex in range(rows.start, rows.stop):
+            values.insert(vertex, self._gtsam.Pose3(poses[vertex]))
         return values
 
     def _solved(self, initial: F64, weight: F64, iterations: int) -> F64:
         """Least squares with these weights of the closures, at most so many iterations."""
         gtsam = self._gtsam
         graph = self._weighted(weight)
-        parameters = gtsam.LevenbergMarquardtParams()
         if self._ordering is None:
             self._ordering = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
-        parameters.setOrdering(self._ordering)
+        every = slice(0, len(initial))
+        return self._optimised(graph, initial, every, iterations, self._ordering)
+
+    def _optimised(
+        self, graph: Any, poses: F64, rows: slice, iterations: int, ordering: Any = None
+    ) -> F64:
+        """Poses of the vertices ``rows`` by Levenberg-Marquardt from ``poses`` (v, 4, 4)."""
+        gtsam = self._gtsam
+        parameters = gtsam.LevenbergMarquardtParams()
+        if ordering is not None:
+            parameters.setOrdering(ordering)
         parameters.setMaxIterations(iterations)
         parameters.setRelativeErrorTol(TOLERANCE)
-        values = self._values(initial)
+        values = self._values(poses, rows)
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        return np.array([solved.atPose3(k).matrix() for k in range(len(initial))])
+        return np.array([solved.atPose3(k).matrix() for k in range(rows.start, rows.stop)])
 
-    def _fixed_factors(self, anchors: NDArray[np.int64], initial: F64) -> Any:
+    def _solved_in_turn(self, initial: F64, weight: F64) -> F64:
+        """The same by Gauss-Seidel sweeps over the sessions, for a start that is nearly right.
+
+        With the other sessions held, a session is a chain, so time and memory grow with its length
+        only; many sessions of the same road would fill the matrix of a common solution.
+        """
+        poses = initial.copy()
+        chain = self._problem.chain
+        bounds = np.searchsorted(chain, np.arange(chain[-1] + 2))
+        fixed = [self._fixed_factors_of(k) for k in range(len(bounds) - 1)]
+        for _ in range(SWEEPS):
+            for k, factors in enumerate(fixed):
+                graph = self._gtsam.NonlinearFactorGraph(factors)
+                self._add_loops_of(k, graph, poses, weight)
+                rows = slice(int(bounds[k]), int(bounds[k + 1]))
+                poses[rows] = self._optimised(graph, poses, rows, TURN_ITERATIONS)
+        return poses
+
+    def _add_loops_of(self, chain: int, graph: Any, poses: F64, weight: F64) -> None:
+        """Closures of a session: with itself between vertices, with others as where they put it."""
+        loops = self._problem.loops
+        a_is_own = self._problem.chain[loops.a] == chain
+        b_is_own = self._problem.chain[loops.b] == chain
+        for row in np.flatnonzero((a_is_own | b_is_own) & (weight > 0.5)).tolist():
+            root = loops.root[row]
+            if a_is_own[row] and b_is_own[row]:
+                graph.add(_between(self._gtsam, loops, row, root))
+            elif b_is_own[row]:
+                placed = poses[loops.a[row]] @ loops.a_T_b[row]
+                graph.add(_prior(self._gtsam, int(loops.b[row]), placed, root))
+            else:
+                b_T_a = inverse(loops.a_T_b[row])
+                placed = poses[loops.b[row]] @ b_T_a
+                graph.add(_prior(self._gtsam, int(loops.a[row]), placed, root @ _adjoint(b_T_a)))
+
+    def _fixed_factors(self) -> Any:
         """Odometry, gravity, and what holds the frames."""
+        graph = self._gtsam.NonlinearFactorGraph()
+        for chain in range(int(self._problem.chain[-1]) + 1 if len(self._problem.chain) else 0):
+            graph.push_back(self._fixed_factors_of(chain))
+        return graph
+
+    def _fixed_factors_of(self, chain: int) -> Any:
         gtsam = self._gtsam
         problem = self._problem
         graph = gtsam.NonlinearFactorGraph()
-        for row in range(len(problem.odometry)):
+        first, end = np.searchsorted(problem.chain, [chain, chain + 1]).tolist()
+        begun, done = np.searchsorted(problem.odometry.a, [first, end]).tolist()
+        for row in range(begun, done):
             graph.add(_between(gtsam, problem.odometry, row, problem.odometry.root[row]))
         up = gtsam.Unit3(0.0, 0.0, 1.0)
         tilt = gtsam.noiseModel.Robust.Create(
             gtsam.noiseModel.mEstimator.Huber.Create(UP_HUBER),
             gtsam.noiseModel.Isotropic.Sigma(2, problem.up.sigma),
         )
-        for vertex, direction in zip(problem.up.vertices, problem.up.up, strict=True):
-            graph.add(gtsam.AttitudeFactorPose3(int(vertex), up, tilt, gtsam.Unit3(*direction)))
-        held = set(anchors.tolist())
-        tight = gtsam.noiseModel.Isotropic.Sigma(6, ANCHOR_SIGMA)
-        loose = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([LOOSE_RAD, LOOSE_M], 3))
-        starts = np.flatnonzero(np.diff(problem.chain, prepend=-1))
-        for vertex in sorted({*held, *starts.tolist()}):
-            pose = gtsam.Pose3(initial[vertex])
-            graph.add(gtsam.PriorFactorPose3(vertex, pose, tight if vertex in held else loose))
+        begun, done = np.searchsorted(problem.up.vertices, [first, end]).tolist()
+        for row in range(begun, done):
+            direction = gtsam.Unit3(*problem.up.up[row])
+            vertex = int(problem.up.vertices[row])
+            graph.add(gtsam.AttitudeFactorPose3(vertex, up, tilt, direction))
+        if first < end:
+            sigma = [ANCHOR_SIGMA] * 6 if first in self._anchors else LOOSE
+            root = np.diag(1.0 / np.array(sigma))
+            graph.add(_prior(gtsam, first, self._initial[first], root))
         return graph
 
 
 def _between(gtsam: Any, edges: Edges, row: int, root: F64) -> Any:
+    pose = gtsam.Pose3(edges.a_T_b[row])
+    model = _model(gtsam, root)
+    return gtsam.BetweenFactorPose3(int(edges.a[row]), int(edges.b[row]), pose, model)
+
+
+def _prior(gtsam: Any, vertex: int, pose: F64, root: F64) -> Any:
+    return gtsam.PriorFactorPose3(vertex, gtsam.Pose3(pose), _model(gtsam, root))
+
+
+def _model(gtsam: Any, root: F64) -> Any:
     # GTSAM orders a pose's error as rotation, position
     swapped = np.roll(np.roll(root, 3, axis=0), 3, axis=1)
-    model = gtsam.noiseModel.Gaussian.SqrtInformation(swapped)
-    pose = gtsam.Pose3(edges.a_T_b[row])
-    return gtsam.BetweenFactorPose3(int(edges.a[row]), int(edges.b[row]), pose, model)
+    return gtsam.noiseModel.Gaussian.SqrtInformation(swapped)
+
+
+def _adjoint(b_T_a: F64) -> F64:
+    """Errors (x y z rotation-x rotation-y rotation-z) in the axes of ``a`` -> in those of ``b``."""
+    rotation = b_T_a[:3, :3]
+    x, y, z = b_T_a[:3, 3]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    out = np.zeros((6, 6))
+    out[:3, :3] = rotation
+    out[3:, 3:] = rotation
+    out[:3, 3:] = cross @ rotation
+    return out
 
 
 def squared_errors(edges: Edges, poses: F64) -> F64:

@@ -25,7 +25,7 @@ from semloc_logs.pose_graph.optimized_tables import (
     write_graph,
     write_trajectories,
 )
-from semloc_logs.pose_graph.problem import problem_of
+from semloc_logs.pose_graph.problem import fine_problem
 from semloc_logs.progress import report as report_progress
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import fingerprint_of, recorded_fingerprint
@@ -85,7 +85,7 @@ def optimise(
     for k, group in enumerate(groups):
         if earlier is not None and _is_up_to_date(work, group, earlier):
             graph = pose_graph_of(group.sessions, group.closures)
-            tables.append(earlier.rows_of(graph, problem_of(graph, settings.optimize)))
+            tables.append(earlier.rows_of(graph, fine_problem(graph, settings.optimize)))
         else:
             tables.append(_solve(work, group, settings, metadata, covariances=covariances))
             solved += group.sessions
