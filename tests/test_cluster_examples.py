@@ -144,7 +144,7 @@ def exits(tmp_path: Path) -> list[str]:
     return re.findall(r"^exit (\d+)$", (tmp_path / "record").read_text(), re.MULTILINE)
 
 
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)  # dozens of programs that import much
 def test_slurm_arrays(logs: Path, expected: dict[str, str], tmp_path: Path) -> None:
     environment = programs(tmp_path / "bin", sbatch=SBATCH) | {"JOBS": "2"}
     work = tmp_path / "work"
@@ -153,7 +153,7 @@ def test_slurm_arrays(logs: Path, expected: dict[str, str], tmp_path: Path) -> N
     assert sorted(exits(tmp_path)) == ["0"] * 6 + ["1"]  # 2 + 2 + 2 + 1 jobs; one has the bad log
 
 
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)  # dozens of programs that import much
 def test_kubernetes_jobs(logs: Path, expected: dict[str, str], tmp_path: Path) -> None:
     environment = programs(tmp_path / "bin", kubectl=KUBECTL)
     data = tmp_path / "data"
@@ -181,7 +181,7 @@ def test_the_failure_policy_knows_our_exit_codes() -> None:
     assert spec["template"]["spec"]["restartPolicy"] == "Never"  # the policy needs it
 
 
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)  # dozens of programs that import much
 def test_hyperqueue_arrays(logs: Path, expected: dict[str, str], tmp_path: Path) -> None:
     environment = programs(tmp_path / "bin", hq=HQ)
     work = tmp_path / "work"
