@@ -6,6 +6,7 @@ interrupted.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import socket
@@ -178,6 +179,8 @@ def _leave_in_time(waiting: socket.socket) -> None:
             number = waiting.recv(1)
     if number:
         time.sleep(LEAVE_SECONDS)
+        for worker in multiprocessing.active_children():
+            worker.kill()
         os.write(2, f"Error: {TERMINATED}\n".encode())
         os._exit(128 + signal.SIGTERM)
 
