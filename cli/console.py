@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -197,17 +197,16 @@ class Bars:
         from rich.progress import Progress as RichProgress
         from rich.table import Column
 
-        def text(field: str, width: int, *, left: bool = False) -> TextColumn:
-            side = "left" if left else "right"
+        def text(field: str, width: int, side: Literal["left", "right"] = "right") -> TextColumn:
             column = Column(width=width, no_wrap=True, overflow="ellipsis", justify=side)
-            return TextColumn(f"{{task.{field}}}", markup=False, table_column=column)
+            return TextColumn(f"{{task.{field}}}", justify=side, markup=False, table_column=column)
 
         screen = screen or RichConsole(stderr=True)
         spare = max(0, min(40, screen.width - NARROW))
         self._tasks: dict[Key, TaskID] = {}
         self._bar = RichProgress(
             SpinnerColumn(),
-            text("description", 18 + spare // 2, left=True),
+            text("description", 18 + spare // 2, "left"),
             BarColumn(bar_width=8 + spare - spare // 2),
             text("fields[share]", 5),
             text("fields[count]", 22),
@@ -231,7 +230,7 @@ class Bars:
             if key in self._tasks:
                 self._bar.remove_task(self._tasks.pop(key))
             return
-        fields = {
+        fields: dict[str, Any] = {
             "share": "" if event.share is None else f"{100 * event.share:.0f} %",
             "count": amount(event),
             "rate": "" if pace.rate is None else rate(pace.rate),

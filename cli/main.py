@@ -6,12 +6,17 @@ interrupted.
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
+import socket
 import sys
+import threading
+import time
 import traceback
 import warnings
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -45,6 +50,10 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "demo": ("demo", "Everything once, on two simulated sessions."),
     "benchmark": ("benchmark", "Figures of speed, measured here and now."),
 }
+
+
+LEAVE_SECONDS = 4.5  # after SIGTERM: a cluster kills soon after it terminates
+TERMINATED = "Terminated; finished work is kept, run the same command again to go on."
 
 
 class Terminated(BaseException):
@@ -86,14 +95,8 @@ class Program(click.Group):
         console.reset()
         single_threaded()
         warnings.simplefilter("ignore")  # remarks of numerical libraries are not for users
-        before = None
-        with suppress(ValueError):  # not in the main thread of an embedding program
-            before = signal.signal(signal.SIGTERM, _terminate)
-        try:
+        with _terminating():
             code = self._guarded(args, prog_name)
-        finally:
-            if before is not None:
-                signal.signal(signal.SIGTERM, before)
         sys.exit(code)
 
     def _guarded(self, args: Sequence[str] | None, prog_name: str | None) -> int:
@@ -106,7 +109,7 @@ class Program(click.Group):
             )
             return 128 + signal.SIGINT
         except Terminated:
-            console.error("Terminated; finished work is kept, run the same command again to go on.")
+            console.error(TERMINATED)
             return 128 + signal.SIGTERM
         except click.ClickException as problem:
             if console.log_format == "json":
@@ -147,6 +150,41 @@ class Program(click.Group):
 def _explain(problem: BaseException) -> None:
     if console.verbosity > 0:
         click.echo("".join(traceback.format_exception(problem)), err=True, nl=False)
+
+
+@contextmanager
+def _terminating() -> Iterator[None]:
+    """SIGTERM raises Terminated in the block. The process ends LEAVE_SECONDS later at the latest,
+    also where the main thread is in a long call of a library: files are whole at any time.
+    """
+    if threading.current_thread() is not threading.main_thread():  # of an embedding program
+        yield
+        return
+    waiting, waking = socket.socketpair()
+    waking.setblocking(False)
+    before = signal.signal(signal.SIGTERM, _terminate)
+    wakeup = signal.set_wakeup_fd(waking.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=_leave_in_time, args=(waiting,), daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(wakeup)
+        signal.signal(signal.SIGTERM, before)
+        waking.close()
+
+
+def _leave_in_time(waiting: socket.socket) -> None:
+    """Gets a byte for each signal, whatever the main thread does; none when the block is over."""
+    with waiting:
+        number = waiting.recv(1)
+        while number and number[0] != signal.SIGTERM:
+            number = waiting.recv(1)
+    if number:
+        time.sleep(LEAVE_SECONDS)
+        for worker in multiprocessing.active_children():
+            worker.kill()
+        os.write(2, f"Error: {TERMINATED}\n".encode())
+        os._exit(128 + signal.SIGTERM)
 
 
 def _terminate(number: int, _: object) -> NoReturn:

@@ -457,7 +457,7 @@ class EngineChoice:
         return "processes" if is_parallel else "serial"
 
 
-class Bytes(click.ParamType):
+class Bytes(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.4 on
     """A number of bytes, such as 8GB or 500M; a number alone is of gigabytes."""
 
     name = "SIZE"

@@ -13,7 +13,7 @@ from types import FrameType
 
 from semloc_logs.errors import TemporaryError
 
-WORKER_BYTES = 1_500_000_000  # a worker of any stage, with maps of a few kilometres: measured
+WORKER_BYTES = 2_000_000_000  # a worker of the search, with maps of a few kilometres: measured
 LOOK_SECONDS = 0.2  # between two looks at the memory
 LEAVE_SECONDS = 3.0  # that a task has to unwind: it may be in a long call of a library
 CGROUP_LIMITS = (

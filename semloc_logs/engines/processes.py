@@ -25,9 +25,9 @@ from semloc_logs.errors import TemporaryError
 from semloc_logs.progress import Progress
 
 PACKAGE_LOGGER = "semloc_logs"
-LEAVE_SECONDS = 3.0  # that workers have to leave: a cluster kills soon after it terminates
+LEAVE_SECONDS = 2.5  # that workers have to leave: a cluster kills soon after it terminates
 EVENT_SECONDS = 0.05  # between two looks for events of the workers
-EVENTS_END_SECONDS = 1.0  # for the last events
+EVENTS_END_SECONDS = 0.5  # for the last events
 
 Event = Progress | LogRecord
 

@@ -382,6 +382,37 @@ def test_an_interrupted_program_cleans_up(
         assert list((tmp_path / "busy").iterdir()) == []
 
 
+DEAF = """
+import hashlib, os, sys
+import click
+from semloc_logs.cli.main import Program, program
+
+@click.command()
+def nap():
+    os.write(1, b"asleep\\n")
+    hashlib.pbkdf2_hmac("sha256", b"x", b"y", 10**10)  # hours, without a look at signals
+
+Program.get_command = lambda *_: nap
+program.main(["nap"])
+"""
+
+
+@pytest.mark.timeout(240)
+def test_a_program_in_a_long_call_of_a_library_leaves_too() -> None:
+    pipe = subprocess.PIPE
+    command = [sys.executable, "-c", DEAF]
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as started:
+        try:
+            assert started.stdout is not None
+            assert started.stdout.readline() == "asleep\n", started.communicate()
+            started.terminate()
+            _, told = started.communicate()
+        finally:
+            started.kill()
+    assert started.returncode == 143
+    assert told.startswith("Error: Terminated; finished work is kept")
+
+
 @pytest.mark.timeout(240)
 def test_workers_leave_with_a_killed_parent(tmp_path: Path) -> None:
     with _sleeping(tmp_path, "processes", 2) as started:
