@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from semloc_logs.exports.foxglove_layout import foxglove_layout
 from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
@@ -27,7 +28,8 @@ WRITERS: dict[str, Callable[[Path, SessionPoints], None]] = {
     "xyz": write_xyz,
 }
 POINT_FORMATS = tuple(WRITERS)
-FORMATS = ("tum", "kitti", "g2o", *POINT_FORMATS)
+LAYOUT = "foxglove-layout"
+FORMATS = ("tum", "kitti", "g2o", LAYOUT, *POINT_FORMATS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +53,7 @@ def export(
     """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
 
     ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``:
-    one pose graph of all; the point formats: ``selection``, by default the centres of all occupied
+    one pose graph of all; ``foxglove-layout``: a layout for annotated logs; the point formats: ``selection``, by default the centres of all occupied
     voxels in the session frame. Raises WorkspaceError when a session is not there or does not fit
     the format, SemlocError when a library is missing.
     """
@@ -65,6 +67,10 @@ def export(
         if form in ("tum", "kitti"):
             paths.append(output / f"{name}.{'txt' if form == 'kitti' else form}")
             _write(paths[-1], (tum if form == "tum" else kitti)(session))
+            continue
+        if form == LAYOUT:
+            paths.append(output / f"{name}.{LAYOUT}.json")
+            _write(paths[-1], foxglove_layout(session).encode())
             continue
         chosen = selection or Selection()
         points = SessionPoints(session, chosen.what, chosen.frame, chosen.bounds)

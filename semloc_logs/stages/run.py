@@ -50,7 +50,7 @@ def run(
             _annotate_logs(session, work, settings, annotation)
         total.add("annotate", Report(closures=total.report.closures))
     _write_summary(work, total.report)
-    if work.closures.exists():
+    if total.report.done or not work.report.exists():
         write_report(work, settings)
     return total.report
 

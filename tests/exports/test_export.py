@@ -166,3 +166,29 @@ def test_files_of_the_workspace_are_not_touched(work: Workspace, tmp_path: Path)
     export(work, [], "tum", tmp_path / "out")
     assert {p: p.read_bytes() for p in work.path.rglob("*") if p.is_file()} == before
     assert json.loads(work.session("a").session_json.read_text())["voxel_size"] == 0.5
+
+
+def test_a_layout_shows_the_closures_where_the_drive_is(work: Workspace, tmp_path: Path) -> None:
+    path = work.session("a").session_json
+    streams = [
+        {"role": "lidar", "topic": "/points"},
+        {"role": "image", "topic": "/camera"},
+        {"role": "imu", "topic": "/imu"},
+    ]
+    write_json(path, json.loads(path.read_text()) | {"session_frame": "odom", "streams": streams})
+    (written,) = export(work, ["a"], "foxglove-layout", tmp_path)
+    assert written.name == "a.foxglove-layout.json"
+    content = json.loads(written.read_text())
+    scene = content["configById"]["3D!closures"]
+    assert scene["followTf"] == "odom"
+    assert scene["cameraState"]["targetOffset"] == [101.5, 0, 0]  # of 100 and 103
+    assert {t for t, c in scene["topics"].items() if c["visible"]} == {
+        "/semloc/markers",
+        "/semloc/pose",
+        "/points",
+    }
+
+    def named(place: Any) -> set[str]:
+        return {place} if isinstance(place, str) else named(place["first"]) | named(place["second"])
+
+    assert named(content["layout"]) == set(content["configById"])
