@@ -53,8 +53,8 @@ def export(
     """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
 
     ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``:
-    one pose graph of all; ``foxglove-layout``: a layout for annotated logs; the point formats: ``selection``, by default the centres of all occupied
-    voxels in the session frame. Raises WorkspaceError when a session is not there or does not fit
+    one pose graph of all; ``foxglove-layout``: a layout for annotated logs; the point formats:
+    ``selection``, by default the centres of all occupied voxels in the session frame. Raises WorkspaceError when a session is not there or does not fit
     the format, SemlocError when a library is missing.
     """
     sessions = {folder.name: SessionMap(folder) for folder in work.chosen(names)}
