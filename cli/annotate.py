@@ -59,8 +59,8 @@ def command(
     as_json: bool,
     settings: Resolved,
 ) -> int:
-    """Closures -> channels of the log, in its own encoding: /semloc/loop_closures, /semloc/pose and
-    /semloc/markers.
+    """Closures -> channels of the log, in its own encoding: /semloc/loop_closures, /semloc/pose,
+    /semloc/markers, and transforms that place their frames.
 
     Give exactly one of -o, --in-place and --sidecar. The recorded messages stay as they are; a
     second run replaces the earlier results.

@@ -27,9 +27,9 @@ POINTS = ("ply", "pcd", "las", "laz", "xyz")
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["tum", "kitti", "g2o", *POINTS]),
+    type=click.Choice(["tum", "kitti", "g2o", "foxglove-layout", *POINTS]),
     required=True,
-    help="Poses, a pose graph with closures, or points.",
+    help="Poses, a pose graph with closures, a layout of a viewer, or points.",
 )
 @click.option(
     "--what",
@@ -65,7 +65,8 @@ def command(
     as_json: bool,
 ) -> int:
     """Sessions for other programs: poses of the base frame (tum, kitti), a pose graph with the
-    closures (g2o), points (ply, pcd, las, laz, xyz) with their classes.
+    closures (g2o), a layout that shows annotated logs in Foxglove (foxglove-layout), points (ply,
+    pcd, las, laz, xyz) with their classes.
 
     Poses and points are in the session frame of the log's pose stream, metres; points also in the
     level map frame.

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.exports.foxglove_layout import foxglove_layout
 from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
@@ -28,7 +29,8 @@ WRITERS: dict[str, Callable[[Path, SessionPoints], None]] = {
     "xyz": write_xyz,
 }
 POINT_FORMATS = tuple(WRITERS)
-FORMATS = ("tum", "kitti", "g2o", *POINT_FORMATS)
+LAYOUT = "foxglove-layout"
+FORMATS = ("tum", "kitti", "g2o", LAYOUT, *POINT_FORMATS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +56,10 @@ def export(
     """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
 
     ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``:
-    one pose graph of all; the point formats: ``selection``, by default the centres of all occupied
-    voxels in the session frame. Raises WorkspaceError when a session is not there or does not fit
-    the format, or a file exists and ``overwrite`` is not set; SemlocError when a library is
-    missing.
+    one pose graph of all; ``foxglove-layout``: a layout for annotated logs; the point formats:
+    ``selection``, by default the centres of all occupied voxels in the session frame. Raises
+    WorkspaceError when a session is not there or does not fit the format, or a file exists and
+    ``overwrite`` is not set; SemlocError when a library is missing.
     """
     sessions = {folder.name: SessionMap(folder) for folder in work.chosen(names)}
     chosen = selection or Selection()
@@ -70,6 +72,9 @@ def export(
         if form in ("tum", "kitti"):
             _write(paths[name], (tum if form == "tum" else kitti)(session))
             continue
+        if form == LAYOUT:
+            _write(paths[name], foxglove_layout(session).encode())
+            continue
         points = SessionPoints(session, chosen.what, chosen.frame, chosen.bounds)
         with replacing_file(paths[name], suffix=f".{form}") as temporary:
             WRITERS[form](temporary, points)
@@ -79,6 +84,8 @@ def export(
 def _file_name(session: str, form: str, chosen: Selection) -> str:
     if form == "kitti":
         return f"{session}.txt"
+    if form == LAYOUT:
+        return f"{session}.{LAYOUT}.json"
     is_of_keyframes = form != "tum" and chosen.what == "keyframes"
     return f"{session}{'-keyframes' if is_of_keyframes else ''}.{form}"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.markers import MarkerStyle
@@ -75,13 +77,13 @@ def draw_grid(axes: Axes, low: tuple[float, float], metres: float) -> None:
         for value in np.arange(first, low[axis] + extent * metres, step):
             at = (value - low[axis]) / metres
             text = f"{value / 1000:g} km" if step >= 1000 else f"{value + 0.0:.9g} m"
-            shared: dict[str, object] = {
+            shared: dict[str, Any] = {
                 "textcoords": "offset points",
                 "color": web_colour(SOFT),
                 "fontsize": SMALL,
                 "path_effects": [Stroke(linewidth=2.5, foreground="white"), Normal()],
             }
-            style = {"color": web_colour(GRID), "linewidth": 0.6, "zorder": 0.5}
+            style: dict[str, Any] = {"color": web_colour(GRID), "linewidth": 0.6, "zorder": 0.5}
             if axis == 0:
                 axes.axvline(at, **style)
                 axes.annotate(text, (at, height), (3, 3), **shared)

@@ -43,7 +43,7 @@ FOOT_HEIGHT = 58  # holds the scale bar and the axes of the map
 SWATCH = 46  # of a legend entry: the patch of colour, and the room around it
 SEPARATOR = "  |  "
 FORMATS = ("png", "svg", "pdf")
-VECTOR: dict[str, Any] = {"svg.hashsalt": "semloc", "pdf.fonttype": 42}  # TrueType in a PDF
+VECTOR: Any = {"svg.hashsalt": "semloc", "pdf.fonttype": 42}  # TrueType in a PDF
 POINTS = re.compile(r'(width|height)="([\d.]+)pt"')
 
 

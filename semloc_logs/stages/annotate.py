@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import semloc_logs
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
@@ -22,13 +23,15 @@ from semloc_logs.logs.annotation.annotate import (
     annotate_sidecar,
     recover,
 )
+from semloc_logs.logs.annotation.channels import Frames, Transform
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.mapping.session_map import SessionMap
-from semloc_logs.numerics.transforms import transform
+from semloc_logs.numerics.transforms import inverse, transform
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import session_name
 from semloc_logs.workspace import Workspace
 
+F64 = NDArray[np.float64]
 SECTIONS = ("fusion", "labels", "descriptor", "query", "closures")
 
 
@@ -96,7 +99,8 @@ def _results(work: Workspace, own: SessionMap, name: str, settings: Resolved) ->
         for row in read_closures(work.closures)
         if name in (row["query_session"], row["target_session"])
     ]
-    records = [_record(work, own, name, row) for row in rows]
+    others = _Sessions(work)
+    records = [_record(others, own, name, row) for row in rows]
     log_times = own.frames["log_time_ns"].to_pylist()
     times = dict(zip(own.stamps_ns.tolist(), log_times, strict=True))
     notes = {
@@ -106,25 +110,81 @@ def _results(work: Workspace, own: SessionMap, name: str, settings: Resolved) ->
     }
     frame_id = str(own.json.get("session_frame") or "") or None
     memory = settings.logs.memory
-    return Results(records, name, notes, times, frame_id=frame_id, memory=memory)
+    frames = _frames(others, own, name, rows) if frame_id else Frames()
+    return Results(records, name, notes, times, frame_id=frame_id, memory=memory, frames=frames)
 
 
-def _record(work: Workspace, own: SessionMap, name: str, row: dict[str, Any]) -> ClosureRecord:
+class _Sessions:
+    """The sessions of a workspace, each read once."""
+
+    def __init__(self, work: Workspace) -> None:
+        self._work = work
+        self._maps: dict[str, SessionMap] = {}
+
+    def __getitem__(self, name: str) -> SessionMap:
+        if name not in self._maps:
+            self._maps[name] = SessionMap(self._work.session(name))
+        return self._maps[name]
+
+    def session_T_base(self, row: dict[str, Any], end: str) -> F64:
+        """Pose (4, 4) of an end of a closure in the session frame of its log's poses."""
+        session = self[row[f"{end}_session"]]
+        keyframe = keyframe_at(session, row[f"{end}_stamp_ns"])
+        session_T_map = np.array(session.json["session_T_map"])
+        return np.asarray(session_T_map @ session.map_T_base[keyframe])
+
+
+def _pose_of(row: dict[str, Any]) -> F64:
+    """``target_T_query`` (4, 4)."""
+    translation = np.array([row[f"t_{c}"] for c in "xyz"])
+    return transform(translation, np.array([row[f"q_{c}"] for c in "xyzw"]))
+
+
+def _record(sessions: _Sessions, own: SessionMap, name: str, row: dict[str, Any]) -> ClosureRecord:
     """A closure as the channels need it: with poses in the frames of the pose streams."""
-    target = SessionMap(work.session(row["target_session"]))
-    target_end = keyframe_at(target, row["target_stamp_ns"])
-    translation = np.array([row["t_x"], row["t_y"], row["t_z"]])
-    target_T_query = transform(
-        translation, np.array([row["q_x"], row["q_y"], row["q_z"], row["q_w"]])
-    )
-    session_T_map = np.array(target.json["session_T_map"])
-    session_T_query = session_T_map @ target.map_T_base[target_end] @ target_T_query
-
+    target_T_query = _pose_of(row)
     is_query = row["query_session"] == name
-    own_end = keyframe_at(own, row["query_stamp_ns"] if is_query else row["target_stamp_ns"])
-    position = (np.array(own.json["session_T_map"]) @ own.map_T_base[own_end])[:3, 3]
+    session_T_own = sessions.session_T_base(row, "query" if is_query else "target")
+    own_T_other = inverse(target_T_query) if is_query else target_T_query
     return ClosureRecord.from_row(
         row,
-        session_T_query=session_T_query if is_query else None,
-        session_position=position,
+        session_T_query=sessions.session_T_base(row, "target") @ target_T_query
+        if is_query
+        else None,
+        session_position=session_T_own[:3, 3],
+        session_other=(session_T_own @ own_T_other)[:3, 3],
     )
+
+
+def _frames(sessions: _Sessions, own: SessionMap, name: str, rows: list[dict[str, Any]]) -> Frames:
+    """Transforms by which a viewer places our frames.
+
+    ``semloc/SESSION`` is the session frame of each session that closures connect with the log, laid
+    by the most probable one. The vehicle's own poses are given where the log has no transforms.
+    """
+    frame_id = str(own.json["session_frame"])
+    start_ns = int(own.stamps_ns[0])
+    placed = {name: np.eye(4)}
+    for row in sorted(rows, key=lambda r: (-r["probability"], r["query_stamp_ns"])):
+        ends = ("query", "target") if row["query_session"] == name else ("target", "query")
+        other = row[f"{ends[1]}_session"]
+        if other in placed or not own.posed or not sessions[other].posed:
+            continue
+        target_T_query = _pose_of(row)
+        own_T_other = inverse(target_T_query) if ends[0] == "query" else target_T_query
+        session_T_own, other_session_T_other = (sessions.session_T_base(row, end) for end in ends)
+        placed[other] = session_T_own @ own_T_other @ inverse(other_session_T_other)
+    fixed = [
+        Transform(start_ns, frame_id, f"semloc/{session}", pose)
+        for session, pose in sorted(placed.items())
+    ]
+    base_frame = str(own.json.get("base_frame") or "")
+    has_transforms = "tf" in own.json.get("roles", {})
+    if not own.posed or has_transforms or base_frame in ("", frame_id):
+        return Frames(fixed=fixed)
+    session_T_map = np.array(own.json["session_T_map"])
+    moving = [
+        Transform(int(stamp_ns), frame_id, base_frame, session_T_map @ pose)
+        for stamp_ns, pose in zip(own.stamps_ns, own.map_T_base, strict=True)
+    ]
+    return Frames(moving, fixed)

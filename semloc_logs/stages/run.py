@@ -51,7 +51,7 @@ def run(
             _annotate_logs(session, work, settings, annotation)
         total.add("annotate", Report(closures=total.report.closures))
     _write_summary(work, total.report, {**measured_rates(work), **total.rates})
-    if work.closures.exists():
+    if total.report.done or not work.report.exists():
         write_report(work, settings)
     return total.report
 

@@ -182,3 +182,29 @@ def test_a_file_is_replaced_only_when_told(work: Workspace, tmp_path: Path, form
         assert not paths[0].exists(), "nothing is written where one file is in the way"
     assert export(work, [], form, tmp_path / "out", overwrite=True) == paths
     assert paths[-1].read_bytes() != b"mine"
+
+
+def test_a_layout_shows_the_closures_where_the_drive_is(work: Workspace, tmp_path: Path) -> None:
+    path = work.session("a").session_json
+    streams = [
+        {"role": "lidar", "topic": "/points"},
+        {"role": "image", "topic": "/camera"},
+        {"role": "imu", "topic": "/imu"},
+    ]
+    write_json(path, json.loads(path.read_text()) | {"session_frame": "odom", "streams": streams})
+    (written,) = export(work, ["a"], "foxglove-layout", tmp_path)
+    assert written.name == "a.foxglove-layout.json"
+    content = json.loads(written.read_text())
+    scene = content["configById"]["3D!closures"]
+    assert scene["followTf"] == "odom"
+    assert scene["cameraState"]["targetOffset"] == [101.5, 0, 0]  # of 100 and 103
+    assert {t for t, c in scene["topics"].items() if c["visible"]} == {
+        "/semloc/markers",
+        "/semloc/pose",
+        "/points",
+    }
+
+    def named(place: Any) -> set[str]:
+        return {place} if isinstance(place, str) else named(place["first"]) | named(place["second"])
+
+    assert named(content["layout"]) == set(content["configById"])

@@ -177,8 +177,8 @@ def test_a_grid_lies_at_round_coordinates() -> None:
     draw_grid(axes, (-3.0, 98.0), 0.1)  # 46 m x 40 m
     texts = [t.get_text() for t in axes.texts]
     assert texts == ["0 m", "20 m", "40 m", "100 m", "120 m"]
-    verticals = [line.get_xdata()[0] for line in axes.lines[:3]]
+    verticals = [np.asarray(line.get_xdata())[0] for line in axes.lines[:3]]
     assert verticals == pytest.approx([30, 230, 430])
     # y counts pixels downwards
-    horizontals = [line.get_ydata()[0] for line in axes.lines[3:]]
+    horizontals = [np.asarray(line.get_ydata())[0] for line in axes.lines[3:]]
     assert horizontals == pytest.approx([380, 180])

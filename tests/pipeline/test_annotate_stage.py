@@ -93,7 +93,9 @@ def annotated(
     by_topic: dict[str, list[Read]] = {}
     for read in READERS[name](output):
         by_topic.setdefault(read.topic, []).append(read)
-    own = {"/semloc/loop_closures", "/semloc/markers"}
+    own = {"/semloc/loop_closures", "/semloc/markers", "/semloc/tf_static"}
+    if name != "wednesday":  # whose log has transforms of the vehicle
+        own.add("/semloc/tf")
     if name != "monday":  # the first drive is never localised in another
         own.add("/semloc/pose")
     assert own == {topic for topic in by_topic if topic.startswith("/semloc")}
@@ -219,8 +221,10 @@ def test_markers_are_at_this_drives_end_of_every_closure(annotated: Any, drives:
             stamp, frame_id = header(entity)
             sphere = entity.spheres[0]
             text = entity.texts[0].text
+            assert len(entity.lines) == 1
         else:
-            sphere, words = read.message.markers
+            sphere, line, words = read.message.markers
+            assert line.type == 5  # LINE_LIST, to the other end
             stamp, frame_id = header(sphere)
             assert (sphere.type, words.type) == (2, 9)  # SPHERE, TEXT_VIEW_FACING
             text = words.text
@@ -228,6 +232,44 @@ def test_markers_are_at_this_drives_end_of_every_closure(annotated: Any, drives:
         assert text.split()[0] in set(NAMES) - {name}
         truth = drive.session_T_world @ drive.world_T_base(stamp)
         np.testing.assert_allclose(pose_of(sphere.pose)[:3, 3], truth[:3, 3], atol=0.01)
+
+
+def test_frames_of_other_sessions_are_placed(annotated: Any, drives: Any) -> None:
+    """The session frames of the drives are known from the simulation."""
+    name, topics = annotated
+    (read,) = topics["/semloc/tf_static"]
+    placed = {}
+    for edge in read.message.transforms:
+        in_ros = hasattr(edge, "header")
+        parent, child = (
+            (edge.header.frame_id, edge.child_frame_id)
+            if in_ros
+            else (edge.parent_frame_id, edge.child_frame_id)
+        )
+        assert parent == "odom"
+        inner = edge.transform if in_ros else edge
+        t, q = inner.translation, inner.rotation
+        placed[child] = transform(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
+    assert set(placed) == {f"semloc/{other}" for other in NAMES}
+    np.testing.assert_allclose(placed[f"semloc/{name}"], np.eye(4), atol=1e-12)
+    world = drives[name].world_T_base(int(drives[name].trajectory.stamps_ns[0]))
+    for other in NAMES:
+        truth = drives[name].session_T_world @ np.linalg.inv(drives[other].session_T_world)
+        place = (drives[other].session_T_world @ world)[:3, 3]  # on the road, not far off
+        found = placed[f"semloc/{other}"][:3, :3] @ place + placed[f"semloc/{other}"][:3, 3]
+        np.testing.assert_allclose(found, truth[:3, :3] @ place + truth[:3, 3], atol=0.15)
+
+
+def test_the_vehicle_moves_in_logs_without_transforms(annotated: Any, drives: Any) -> None:
+    name, topics = annotated
+    for read in topics.get("/semloc/tf", []):
+        (edge,) = read.message.transforms
+        assert (edge.header.frame_id, edge.child_frame_id) == ("odom", "base_link")
+        stamp, _ = header(edge)
+        assert read.log_time_ns == stamp + RECEIVED_NS
+        truth = drives[name].session_T_world @ drives[name].world_T_base(stamp)
+        t = edge.transform.translation
+        np.testing.assert_allclose([t.x, t.y, t.z], truth[:3, 3], atol=0.01)
 
 
 def test_annotating_under_another_name_takes_the_closures_of_that_session(

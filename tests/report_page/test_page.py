@@ -147,8 +147,8 @@ def test_pictures_are_of_the_least_probable_closures_of_each_pair() -> None:
     pairs = ["ab", "ab", "ab", "ac", "bc"]
     probabilities = [0.999, 0.99, 0.995, 0.9999, 0.991]
     rows = [
-        {"query_session": q, "target_session": t, "probability": p}
-        for (q, t), p in zip(pairs, probabilities, strict=True)
+        {"query_session": pair[0], "target_session": pair[1], "probability": probability}
+        for pair, probability in zip(pairs, probabilities, strict=True)
     ]
     assert chosen(rows, 3) == [1, 3, 4]
     assert chosen(rows, 4) == [1, 2, 3, 4]

@@ -14,9 +14,11 @@ from typing import BinaryIO
 from semloc_logs import __version__
 from semloc_logs.errors import LogError
 from semloc_logs.logs.annotation.channels import (
+    NO_FRAMES,
     ClosureRecord,
     Encoder,
     Encoding,
+    Frames,
     LogContext,
     LogFacts,
     channel_metadata,
@@ -95,7 +97,8 @@ class Results:
     The ``closures`` in which ``session`` takes part, and the ``settings`` behind them.
     ``log_times`` maps the stamp (ns) of an end in this log to the receive time (ns) of the frame
     there; ``frame_id`` is the frame of the log's pose stream, for the markers; None:
-    semloc/SESSION. ``memory``: bytes of the log that may be in memory at once.
+    semloc/SESSION. ``frames`` place these frames and those of other sessions. ``memory``: bytes of
+    the log that may be in memory at once.
     """
 
     closures: Sequence[ClosureRecord]
@@ -104,13 +107,14 @@ class Results:
     log_times: Mapping[int, int]
     frame_id: str | None = None
     memory: int = DEFAULT
+    frames: Frames = NO_FRAMES
 
     def plan(self, output: Path, end: LogEnd, facts: LogFacts) -> tuple[AppendPlan, AnnotateReport]:
         """How a file that ends with ``end`` takes the results."""
         run = run_id(self.closures, self.session, self.settings, __version__)
         frame_id = f"semloc/{self.session}" if self.frame_id is None else self.frame_id
         size = _marker_size(self.settings)
-        context = LogContext(self.session, facts, self.log_times, frame_id, size)
+        context = LogContext(self.session, facts, self.log_times, frame_id, size, self.frames)
         metadata = channel_metadata(run, __version__)
         channels, messages = encode(self.closures, context, encoder_for(facts), metadata)
 

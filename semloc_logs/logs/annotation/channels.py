@@ -20,7 +20,13 @@ from semloc_logs.numerics.transforms import inverse, transform
 
 F64 = NDArray[np.float64]
 Encoding = Literal["ros2", "ros1", "protobuf", "json"]
-TOPICS = ("/semloc/loop_closures", "/semloc/pose", "/semloc/markers")
+TOPICS = (
+    "/semloc/loop_closures",
+    "/semloc/pose",
+    "/semloc/markers",
+    "/semloc/tf",
+    "/semloc/tf_static",
+)
 RUN_KEY = "semloc.run_id"  # in the metadata of each of our channels
 
 
@@ -49,12 +55,37 @@ class NewMessage:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Transform:
+    """Pose (4, 4) of the frame ``child`` in the frame ``parent`` at a time."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    parent_T_child: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Transforms that place the frames of our messages for viewers.
+
+    ``moving`` are of the vehicle, where the log has none; ``fixed`` hold for the whole log.
+    """
+
+    moving: Sequence[Transform] = ()
+    fixed: Sequence[Transform] = ()
+
+
+NO_FRAMES = Frames()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ClosureRecord:
     """A row of closures.parquet, and where it lies for those who look at the log.
 
     ``covariance`` has 36 numbers. ``session_T_query`` (4, 4) is the pose of the query's base frame
     in the *target's* session frame, None when the target has no poses. ``session_position`` (3,) is
-    the place of this log's end in this log's session frame, None without poses.
+    the place of this log's end in this log's session frame, None without poses; ``session_other``
+    (3,) the place of the other end there, as the closure gives it.
     """
 
     query_session: str
@@ -75,6 +106,7 @@ class ClosureRecord:
     words: int
     session_T_query: F64 | None = None
     session_position: F64 | None = None
+    session_other: F64 | None = None
 
     @classmethod
     def from_row(
@@ -83,6 +115,7 @@ class ClosureRecord:
         *,
         session_T_query: F64 | None = None,
         session_position: F64 | None = None,
+        session_other: F64 | None = None,
     ) -> ClosureRecord:
         """From a row of the table as plain Python values.
 
@@ -106,7 +139,11 @@ class ClosureRecord:
                 "The covariance of a row of closures.parquet has not 36 numbers; "
                 "write the table again with `semloc close`."
             )
-        values |= {"session_T_query": session_T_query, "session_position": session_position}
+        values |= {
+            "session_T_query": session_T_query,
+            "session_position": session_position,
+            "session_other": session_other,
+        }
         return cls(**values)  # type: ignore[arg-type]
 
     def columns(self) -> dict[str, object]:
@@ -146,14 +183,14 @@ _TYPES: dict[str, type] = {
 class Mark:
     """Drawing at this log's end of a closure, in the frame ``frame_id``.
 
-    A sphere, a text and, within one session, a line.
+    A sphere, a text and a line to the other end.
     """
 
     stamp_ns: int
     frame_id: str
     key: int  # number of the closure in this log
     position: F64
-    other: F64 | None  # position of the other end, known when it lies in the same session
+    other: F64 | None  # position of the other end
     size: float  # diameter of the sphere, m
     text: str
     color: tuple[float, float, float, float]
@@ -170,6 +207,7 @@ class Encoder(Protocol):
     def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes: ...
     def pose(self, closure: ClosureRecord, frame_id: str) -> bytes: ...
     def mark(self, mark: Mark) -> bytes: ...
+    def transforms(self, transforms: Sequence[Transform]) -> bytes: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +233,8 @@ class LogContext:
     """What the messages of one log share.
 
     ``log_times`` maps the stamp (ns) of an end to the receive time (ns) of the log at that frame.
-    ``frame_id`` is the frame of the markers, ``marker_size`` their diameter in metres.
+    ``frame_id`` is the frame of the markers, ``marker_size`` their diameter in metres. ``frames``
+    are published if the log takes part in a closure.
     """
 
     session: str
@@ -203,6 +242,7 @@ class LogContext:
     log_times: Mapping[int, int]
     frame_id: str
     marker_size: float
+    frames: Frames = NO_FRAMES
 
     def log_time(self, stamp_ns: int) -> int:
         """The receive time at a stamp; without one, the stamp within the log's time range."""
@@ -258,9 +298,26 @@ def encode(
         if closure.session_position is not None:
             mark = _mark(closure, stamp, key, context)
             messages.append(NewMessage(2, log_time, encoder.mark(mark)))
+    if mine:
+        messages += _transforms(context, encoder)
     messages.sort(key=lambda m: m.log_time_ns)  # stable: closures of one frame stay in their order
     channels = encoder.channels({**context.facts.channel_metadata, **metadata})
     return _used(channels, messages)
+
+
+def _transforms(context: LogContext, encoder: Encoder) -> list[NewMessage]:
+    """One message for each transform of the vehicle, and one, at the start, for all fixed ones."""
+    facts = context.facts
+    times = [context.log_time(t.stamp_ns) for t in context.frames.moving]
+    messages = [  # a session may have other logs, too
+        NewMessage(3, time, encoder.transforms([transform]))
+        for time, transform in zip(times, context.frames.moving, strict=True)
+        if facts.start_ns <= time <= facts.end_ns
+    ]
+    if context.frames.fixed:
+        start_ns = max(0, facts.start_ns)
+        messages.append(NewMessage(4, start_ns, encoder.transforms(context.frames.fixed)))
+    return messages
 
 
 def channel_metadata(run: str, version: str) -> dict[str, str]:
@@ -284,7 +341,7 @@ def _order(closure: ClosureRecord) -> tuple[str, int, str, int]:
 
 def _mark(closure: ClosureRecord, stamp_ns: int, key: int, context: LogContext) -> Mark:
     position = np.asarray(closure.session_position, float)
-    other = None
+    other = closure.session_other
     name = closure.target_session
     if closure.query_session == closure.target_session:
         earlier = closure.target_stamp_ns <= closure.query_stamp_ns

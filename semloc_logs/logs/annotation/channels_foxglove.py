@@ -1,14 +1,15 @@
-"""Our three messages as protobuf, or as the JSON that Foxglove defines for the same schemas."""
+"""Our messages as protobuf, or as the JSON that Foxglove defines for the same schemas."""
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Literal
 
 import numpy as np
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
@@ -19,7 +20,14 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import Message
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from semloc_logs.logs.annotation.channels import F64, TOPICS, ClosureRecord, Mark, NewChannel
+from semloc_logs.logs.annotation.channels import (
+    F64,
+    TOPICS,
+    ClosureRecord,
+    Mark,
+    NewChannel,
+    Transform,
+)
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 
@@ -61,9 +69,14 @@ class FoxgloveEncoder:
 
     def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]:
         out = []
-        for topic, kind in zip(
-            TOPICS, (loop_closure_class(), PoseInFrame, SceneUpdate), strict=True
-        ):
+        kinds = (
+            loop_closure_class(),
+            PoseInFrame,
+            SceneUpdate,
+            FrameTransforms,
+            FrameTransforms,
+        )
+        for topic, kind in zip(TOPICS, kinds, strict=True):
             name = kind.DESCRIPTOR.full_name
             if self.encoding == "protobuf":
                 data = build_file_descriptor_set(kind).SerializeToString(deterministic=True)
@@ -107,6 +120,19 @@ class FoxgloveEncoder:
             )
             _set_pose(line.pose, np.zeros(3))
         return self._bytes(update)
+
+    def transforms(self, transforms: Sequence[Transform]) -> bytes:
+        message = FrameTransforms()
+        for transform in transforms:
+            (x, y, z), (qx, qy, qz, qw) = translation_quaternion(transform.parent_T_child)
+            message.transforms.add(
+                timestamp=_time(transform.stamp_ns),
+                parent_frame_id=transform.parent,
+                child_frame_id=transform.child,
+                translation={"x": float(x), "y": float(y), "z": float(z)},
+                rotation={"x": float(qx), "y": float(qy), "z": float(qz), "w": float(qw)},
+            )
+        return self._bytes(message)
 
     def _bytes(self, message: Message) -> bytes:
         if self.encoding == "protobuf":

@@ -1,8 +1,8 @@
-"""Our three messages as ROS 1 or ROS 2 messages with embedded definitions."""
+"""Our messages as ROS 1 or ROS 2 messages with embedded definitions."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -10,13 +10,21 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from semloc_logs.logs.annotation.channels import F64, TOPICS, ClosureRecord, Mark, NewChannel
+from semloc_logs.logs.annotation.channels import (
+    F64,
+    TOPICS,
+    ClosureRecord,
+    Mark,
+    NewChannel,
+    Transform,
+)
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.schemas import read_text
 
 CLOSURE = "semloc_msgs/msg/LoopClosure"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 MARKERS = "visualization_msgs/msg/MarkerArray"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _SPHERE, _LINE_LIST, _TEXT = (
     2,
     5,
@@ -35,7 +43,9 @@ class RosEncoder:
     def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]:
         encoding, schema_encoding = ("ros1", "ros1msg") if self.version == 1 else ("cdr", "ros2msg")
         out = []
-        for topic, name in zip(TOPICS, (CLOSURE, POSE, MARKERS), strict=True):
+        for topic, name in zip(
+            TOPICS, (CLOSURE, POSE, MARKERS, TRANSFORMS, TRANSFORMS), strict=True
+        ):
             shown = name if self.version == 2 else name.replace("/msg/", "/")
             out.append(
                 NewChannel(
@@ -89,6 +99,26 @@ class RosEncoder:
             )
         )
         return self._bytes(self._new(MARKERS, markers=markers))
+
+    def transforms(self, transforms: Sequence[Transform]) -> bytes:
+        return self._bytes(
+            self._new(TRANSFORMS, transforms=[self._transform(t) for t in transforms])
+        )
+
+    def _transform(self, transform: Transform) -> Any:
+        position, quaternion = translation_quaternion(transform.parent_T_child)
+        pose = self._pose(position, quaternion)
+        moved = self._new(
+            "geometry_msgs/msg/Vector3", x=pose.position.x, y=pose.position.y, z=pose.position.z
+        )
+        return self._new(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(transform.stamp_ns, transform.parent),
+            child_frame_id=transform.child,
+            transform=self._new(
+                "geometry_msgs/msg/Transform", translation=moved, rotation=pose.orientation
+            ),
+        )
 
     def _marker(
         self,
@@ -174,4 +204,7 @@ class RosEncoder:
 def _store(distribution: Stores) -> Any:
     store = get_typestore(distribution)
     store.register(get_types_from_msg(read_text("messages/LoopClosure.msg"), CLOSURE))
+    if TRANSFORMS not in store.types:  # as in ROS 1
+        edges = "geometry_msgs/TransformStamped[] transforms"
+        store.register(get_types_from_msg(edges, TRANSFORMS))
     return store

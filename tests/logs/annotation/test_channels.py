@@ -186,7 +186,7 @@ def test_markers_show_the_place_and_the_other_end() -> None:
         session_position=np.array([5.0, 0.0, 0.0]),
     )
     found = decoded([closure], "wet_monday", "ros2")
-    assert [len(found[t]) for t in TOPICS] == [1, 1, 1]  # one message, at the query's end
+    assert [len(found[t]) for t in TOPICS] == [1, 1, 1, 0, 0]  # one message, at the query's end
     sphere, line, text = found["/semloc/markers"][0][1].markers
     assert (sphere.type, line.type, text.type) == (2, 5, 9)
     assert {m.header.frame_id for m in (sphere, line, text)} == {"odom"}
