@@ -48,9 +48,12 @@ Bools = NDArray[np.bool_]
 SIGNS = (-1, 1, -1)  # of ``EVIDENCE``
 VOTE_SIGNS = (1, -1, 1, -1)  # of ``VOTES``
 COPIES = "repeating"  # in the names of towns of copied blocks
+# weight of opposing votes beside agreeing ones: copies of a street agree with each other as right
+# alignments do, and where two groups contradict each other one of them is wrong
+AGAINST = 2.0
 SURE = 0.99  # what would be accepted
 # how much streets look like others by chance, in however few towns it was not seen
-BY_CHANCE = 0.001
+BY_CHANCE = 0.01
 EXTREMES = 0.05  # of a town's lookalikes count as outliers
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
 THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
@@ -246,11 +249,16 @@ def fit_alone(judged: Judged, rows: Bools) -> Calibration:
 def fit_votes(judged: Judged, agreement: Agreement[F64], rows: Bools, own: F64) -> Calibration:
     """The model of what the ``agreement`` (n,) adds to log-odds ``own`` (n,), from clear ``rows``.
 
-    Neighbours in the same copy of a block agree about any copy, so it is of ordinary towns.
+    Neighbours in the same copy of a block agree about any copy, so it is of ordinary towns. There,
+    neighbours hardly ever oppose, so their votes weigh at least :data:`AGAINST` times as much as
+    agreeing ones.
     """
     rows = rows & judged.clear & (agreement.neighbours > 0) & ~judged.copies
     values = Votes.of(agreement).vector()[rows]
-    return fit_signed(values, judged.right[rows], VOTE_SIGNS, offset=own[rows])
+    fitted = fit_signed(values, judged.right[rows], VOTE_SIGNS, offset=own[rows])
+    near, against, far, far_against = fitted.weights
+    weights = (near, min(against, -AGAINST * near), far, min(far_against, -AGAINST * far))
+    return replace(fitted, weights=weights)
 
 
 def max_ambiguity(judged: Judged, agreement: Agreement[F64], p: F64) -> float:
@@ -271,6 +279,7 @@ def max_ambiguity(judged: Judged, agreement: Agreement[F64], p: F64) -> float:
         np.quantile(agreement.ambiguity[fooled & (judged.town == town)], EXTREMES)
         for town in sorted(set(judged.town[fooled]))
     ]
+    least = [share for share in least if share > 0]  # else nothing there could show it
     if not least:
         return 1.0
     return float(np.sqrt(max([BY_CHANCE, *(m for m in most if m < min(least))]) * min(least)))

@@ -180,6 +180,7 @@ COARSE = {  # few keyframes, near points, few queries
     "query.every": "8",
     "closures.hypotheses": "4",
     "closures.places": "2",
+    "closures.every": "8",  # each query by itself
 }
 
 

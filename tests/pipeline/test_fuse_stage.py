@@ -64,12 +64,17 @@ def test_nothing_is_done_twice(fuse: Fuse, coarse: Workspace, tools: SimpleNames
     assert tools.write_times(coarse.path) == before
 
 
-@pytest.mark.parametrize("changes", [{}, {"fusion.carve": "false"}])
+@pytest.mark.parametrize("changes", [{}, {"fusion.keyframe_resolution": "0.2"}])
 def test_session_json_is_read_once(
     fuse: Fuse, tools: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, changes: dict[str, str]
 ) -> None:
     read: list[Path] = []
-    monkeypatch.setattr(fuse_stage, "read_json", lambda path: read.append(path) or read_json(path))
+
+    def recorded(path: Path) -> Any:
+        read.append(path)
+        return read_json(path)
+
+    monkeypatch.setattr(fuse_stage, "read_json", recorded)
     done = was_done(fuse(settings=tools.coarse_settings(**changes)))
     assert done == bool(changes)
     assert [path.name for path in read] == ["session.json"]
@@ -244,6 +249,7 @@ def test_the_files_of_a_label_model_are_inputs(
             "keyframes": 0,
             "submaps": [],
             "voxels": 0,
+            "logs": [],
         }
         task.folder.session_json.write_text(json.dumps(content))
         return FusedSession({**content, "label_source": "onnx"}, ())

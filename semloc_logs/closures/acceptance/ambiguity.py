@@ -29,6 +29,7 @@ I64 = NDArray[np.int64]
 # m between a place and its copy, at voxels of 0.30 m: nearer ones lie in one view, whose free space
 # tells them apart
 APART = 20.0
+LEAST_SUPPORT = 0.1  # of a second place: less is chance
 BEYOND_DOUBT = 0.7  # support of alignments that may contradict others
 
 
@@ -104,14 +105,13 @@ def _second_places(
         road = placed.target_road[places]
         mine = support[places]
         off = np.linalg.norm(at[:, None] - at, axis=2)
-        lesser = np.where(
-            off > apart + ODOMETRY_DRIFT * np.abs(road[:, None] - road),
-            np.minimum(mine[:, None], mine),
-            0.0,
-        )
+        both = np.minimum(mine[:, None], mine)
+        is_second = off > apart + ODOMETRY_DRIFT * np.abs(road[:, None] - road)
+        lesser = np.where(is_second & (both >= LEAST_SUPPORT), both, 0.0)
         a, b = np.unravel_index(int(np.argmax(lesser)), lesser.shape)
         best = int(np.argmax(mine))
-        much = max(float(lesser[a, b]), float(mine[wrong].max(initial=0.0)))
+        elsewhere = float(mine[wrong].max(initial=0.0))
+        much = max(float(lesser[a, b]), elsewhere if elsewhere >= LEAST_SUPPORT else 0.0)
         found.append(
             (places[a], places[b], much) if lesser[a, b] > 0 else (places[best], places[best], much)
         )
