@@ -54,7 +54,7 @@ def read_alignments(path: Path, query: str, target: str) -> Alignments:
     def column(name: str, kind: type) -> NDArray[Any]:
         return np.asarray(table[name].to_numpy(), kind)
 
-    whole = (
+    names = (
         "query_keyframe",
         "target_keyframe",
         "query_stamp_ns",
@@ -62,6 +62,7 @@ def read_alignments(path: Path, query: str, target: str) -> Alignments:
         "inliers",
         "words",
     )
+    whole: dict[str, Any] = {name: column(name, np.int64) for name in names}
     covariance = table["covariance"].combine_chunks().flatten().to_numpy()
     return Alignments(
         pairs=[(query, target)],
@@ -71,7 +72,7 @@ def read_alignments(path: Path, query: str, target: str) -> Alignments:
         overlap=column("overlap", float),
         probability=column("alone", float),
         features=Features(*(column(name, float) for name in FEATURES)),
-        **{name: column(name, np.int64) for name in whole},
+        **whole,
     )
 
 

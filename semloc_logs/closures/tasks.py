@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.closures.acceptance.calibration import is_plausible
 from semloc_logs.closures.alignment_tables import write_part
-from semloc_logs.closures.closure import Alignment
+from semloc_logs.closures.closure import FEATURES, Alignment, Features
 from semloc_logs.closures.database import open_database
 from semloc_logs.closures.matching import ground_below, prepare, search_query
 from semloc_logs.closures.query import build_query
@@ -107,15 +107,18 @@ def _search_block(
     if votes[first].place <= 0 or votes[first].place < enough:
         return []
     found = search(first)
-    if any(_may_be_right(alignment) for alignment in found):
+    if _may_be_right(found):
         for keyframe in block:
             if keyframe != first:
                 found += search(keyframe)
     return found
 
 
-def _may_be_right(alignment: Alignment) -> bool:
-    return alignment.probability >= MIN_PROBABILITY and bool(is_plausible(alignment.features))
+def _may_be_right(found: Sequence[Alignment]) -> bool:
+    """Whether some alignment is worth the vote of a neighbour."""
+    features = Features(*(np.array([getattr(a.features, n) for a in found]) for n in FEATURES))
+    probable = np.array([a.probability >= MIN_PROBABILITY for a in found], bool)
+    return bool((probable & is_plausible(features)).any())
 
 
 # -- surveys
