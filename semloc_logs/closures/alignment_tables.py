@@ -53,7 +53,7 @@ def read_alignments(path: Path, query: str, target: str) -> Alignments:
     def column(name: str, kind: type) -> NDArray[Any]:
         return np.asarray(table[name].to_numpy(), kind)
 
-    whole = (
+    names = (
         "query_keyframe",
         "target_keyframe",
         "query_stamp_ns",
@@ -61,7 +61,7 @@ def read_alignments(path: Path, query: str, target: str) -> Alignments:
         "inliers",
         "words",
     )
-    numbers: dict[str, Any] = {name: column(name, np.int64) for name in whole}
+    whole: dict[str, Any] = {name: column(name, np.int64) for name in names}
     covariance = table["covariance"].combine_chunks().flatten().to_numpy()
     return Alignments(
         pairs=[(query, target)],
@@ -70,7 +70,7 @@ def read_alignments(path: Path, query: str, target: str) -> Alignments:
         covariance=np.asarray(covariance, float).reshape(n, 6, 6),
         overlap=column("overlap", float),
         features=Features(*(column(name, float) for name in FEATURES)),
-        **numbers,
+        **whole,
     )
 
 

@@ -134,10 +134,10 @@ def _query_then_best(rows: Sequence[Rejected]) -> NDArray[np.int64]:
     probability = np.zeros(len(rows))
     for k, row in enumerate(rows):
         a = row.alignment
-        query, target = (
+        session, other = (
             numbers.setdefault(name, len(numbers)) for name in (a.query_session, a.target_session)
         )
-        keys[k] = (query, a.query_stamp_ns, target, a.target_stamp_ns)
+        keys[k] = (session, a.query_stamp_ns, other, a.target_stamp_ns)
         probability[k] = row.decision.probability
     rank = np.zeros(len(numbers), np.int64)
     rank[[numbers[name] for name in sorted(numbers)]] = np.arange(len(numbers))

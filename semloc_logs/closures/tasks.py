@@ -107,15 +107,17 @@ def _search_block(
     if votes[first].place <= 0 or votes[first].place < enough:
         return []
     found = search(first)
-    if any(_may_be_right(alignment) for alignment in found):
+    if _may_be_right(found):
         for keyframe in block:
             if keyframe != first:
                 found += search(keyframe)
     return found
 
 
-def _may_be_right(alignment: Alignment) -> bool:
-    return float(probability_of(shipped().own_log_odds(alignment.features))) >= MIN_PROBABILITY
+def _may_be_right(found: Sequence[Alignment]) -> bool:
+    """Whether some alignment is worth the vote of a neighbour."""
+    probabilities = (probability_of(shipped().own_log_odds(a.features)) for a in found)
+    return any(float(p) >= MIN_PROBABILITY for p in probabilities)
 
 
 # -- surveys

@@ -24,7 +24,7 @@ def segment(*sessions: tuple[str, int, int]) -> Segment:
     columns: dict[str, list[NDArray[Any]]] = {}
     for number, (_, seed, n) in enumerate(sessions):
         rng = np.random.default_rng(seed)
-        of_session = {
+        of_session: dict[str, NDArray[Any]] = {
             "word": rng.integers(0, WORDS, n),
             "code": codes(rng, n),
             "place": 2 * number + rng.integers(0, 2, n),
@@ -40,7 +40,8 @@ def segment(*sessions: tuple[str, int, int]) -> Segment:
 
 def codes(rng: np.random.Generator, n: int) -> NDArray[np.uint64]:
     """Codes that differ in a few of the lowest 32 bits."""
-    return rng.integers(0, 2**32, n, np.uint64) & rng.integers(0, 2**32, n, np.uint64)
+    some, others = rng.integers(0, 2**32, (2, n), np.uint64)
+    return np.asarray(some & others)
 
 
 def query(seed: int, n: int) -> tuple[list[list[LookUp]], NDArray[np.float64]]:
@@ -68,7 +69,7 @@ def by_hand(
                 bits = int(code ^ held.code[i]).bit_count()
                 if held.places[held.place[i]][0] != name or asked != word or bits > NEAR_CODE:
                     continue
-                heading = round(held.yaw[i] * HEADINGS / (2 * np.pi)) + turns * HEADINGS // 4
+                heading = round(float(held.yaw[i]) * HEADINGS / (2 * np.pi)) + turns * HEADINGS // 4
                 yaw = heading * 2 * np.pi / HEADINGS
                 turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
                 x, y = (held.centre[i, :2] - turn @ centre[q, :2]) / CELL
