@@ -209,6 +209,21 @@ def test_a_database_with_a_write_ahead_log_beside_it(tmp_path: Path, bucket: Buc
     database.close()
 
 
+def test_a_folder_of_a_web_server_that_lists_none(tmp_path: Path, web: WebServer) -> None:
+    local = folder(tmp_path / "bag")
+    for file in local.iterdir():
+        web.files[f"bag/{file.name}"] = file.read_bytes()
+    address = log_path(f"{web.url}/bag/metadata.yaml")
+    assert content(f"{web.url}/bag/metadata.yaml") == content(local)
+    assert session_name(address) == "bag"
+    fingerprint = content_fingerprint(address)
+    assert content_fingerprint(address) == fingerprint
+    web.files["bag/bag.db3"] += b"x"
+    assert content_fingerprint(address) != fingerprint
+    with pytest.raises(LogError, match="does not exist"):
+        open_log(f"{web.url}/bag")
+
+
 def test_a_pattern_of_addresses(bucket: Bucket) -> None:
     from semloc_logs.cli.inputs import LogChoice, session_inputs
 

@@ -48,6 +48,7 @@ from semloc_logs.logs.annotation.tail_swap import (
 )
 from semloc_logs.logs.containers.mcap_records import MAGIC
 from semloc_logs.logs.containers.memory import DEFAULT, Memory
+from semloc_logs.logs.containers.rosbag2 import Rosbag2Log
 from semloc_logs.logs.containers.sqlite_file import side_files
 from semloc_logs.logs.remote import RemotePath, is_remote, uploading
 from semloc_logs.tables.atomic_files import replacing_file
@@ -222,7 +223,12 @@ def content_fingerprint(log: Path) -> str:
     folder = log.parent if log.name == "metadata.yaml" else log
     try:
         if not folder.is_dir():
-            return _file_fingerprint(log)
+            if folder == log:
+                return _file_fingerprint(log)
+            # of a web server that does not list folders
+            with contextlib.closing(Rosbag2Log(folder)) as bag:
+                parts = [_file_fingerprint(path) for path in (log, *bag.files)]
+            return hashlib.sha256("".join(parts).encode()).hexdigest()
         digest = hashlib.sha256()
         for path in sorted(
             p

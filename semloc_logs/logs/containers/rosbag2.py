@@ -28,6 +28,7 @@ from semloc_logs.logs.containers.mcap import McapLog
 from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.containers.sqlite import SqliteLog
 from semloc_logs.logs.log import Log, Message, Section
+from semloc_logs.logs.remote import is_remote
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".db3", ".mcap")
@@ -42,6 +43,7 @@ class Rosbag2Log(BaseLog):
 
     def __init__(self, path: Path, memory: Memory | None = None) -> None:
         super().__init__(path, "rosbag2", memory=memory)
+        self.files: list[Path] = []  # as they lie in the directory
         self._files: list[Log] = []
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         try:
@@ -73,7 +75,8 @@ class Rosbag2Log(BaseLog):
 
     def _open(self) -> None:
         metadata = self._metadata()
-        self._open_files(self._listed(metadata) if metadata else self._found())
+        self.files = self._listed(metadata) if metadata else self._found()
+        self._open_files(self.files)
         if not (self.path / "metadata.yaml").exists():
             self._check_splits()
         self.streams = merged_streams(self._files)
@@ -164,7 +167,12 @@ class Rosbag2Log(BaseLog):
             if isinstance(listed, list)
             else []
         )
-        existing = self._found()
+        try:
+            existing = self._found()
+        except LogError:  # a web server need not list folders
+            if not names or not is_remote(self.path):
+                raise
+            existing = []
         if not names:
             return existing
         paths = []
