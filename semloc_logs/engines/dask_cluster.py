@@ -52,6 +52,8 @@ class Dask:
         self.jobs = jobs
         self._scheduler = scheduler
         self._worker_memory = worker_memory
+        # a worker of a cluster of our own dies of the limit that it was given
+        self._resubmissions = RESUBMISSIONS if worker_memory is None else 0
         self._cluster: Any = None
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._client: Any = None
@@ -62,7 +64,8 @@ class Dask:
         waiting: deque[_Running[Task, Result]] = deque()
         try:
             for task in tasks:
-                waiting.append(_Running(client, self._call(function), task))
+                call = self._call(function)
+                waiting.append(_Running(client, call, task, self._resubmissions))
                 if len(waiting) >= 2 * self._workers():
                     yield waiting.popleft().result()
             while waiting:
@@ -173,8 +176,11 @@ class _Running(Generic[Task, Result]):
     with the worker while earlier tasks go on.
     """
 
-    def __init__(self, client: Any, call: _Call[Task, Result], task: Task) -> None:
+    def __init__(
+        self, client: Any, call: _Call[Task, Result], task: Task, resubmissions: int
+    ) -> None:
         self._client = client
+        self._resubmissions = resubmissions
         self._call = call
         self._task = task
         self._submissions = 0
@@ -202,7 +208,7 @@ class _Running(Generic[Task, Result]):
             try:
                 return self._outcome.result()
             except distributed.KilledWorker as death:
-                if self._submissions > RESUBMISSIONS:
+                if self._submissions > self._resubmissions:
                     deaths = self._submissions * (death.allowed_failures + 1)
                     raise TemporaryError(
                         f"{deaths} Dask workers died over one task, most likely for lack of memory:"
