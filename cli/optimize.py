@@ -18,9 +18,9 @@ from .options import (
     tables_settings_options,
     work_option,
 )
+from .results import show_trajectory_errors
 
 if TYPE_CHECKING:
-    from semloc_logs.evaluation.trajectory_errors import TrajectoryErrors
     from semloc_logs.settings import Resolved
 
 
@@ -69,23 +69,3 @@ def command(
     if errors is not None:
         show_trajectory_errors(errors)
     return 0
-
-
-def show_trajectory_errors(errors: TrajectoryErrors) -> None:
-    """Errors of each session before and after, and of all together."""
-    rows = [
-        (
-            row.session,
-            row.frame,
-            *(
-                "-" if value is None else f"{value:.3f}"
-                for value in (row.ate_before_m, row.ate_after_m, row.rpe_before_m, row.rpe_after_m)
-            ),
-        )
-        for row in errors.trajectories
-    ]
-    columns = ("session", "frame", "ATE before (m)", "after (m)", "RPE before (m)", "after (m)")
-    console.table("Trajectories against the truth, each aligned alone", columns, rows)
-    if errors.ate_after_m is not None:
-        before = "-" if errors.ate_before_m is None else f"{errors.ate_before_m:.3f} m"
-        console.result(f"ATE {before} before, {errors.ate_after_m:.3f} m after")

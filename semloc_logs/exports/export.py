@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import pyarrow as pa
+
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
@@ -37,7 +40,7 @@ class Selection:
     """
 
     what: Literal["voxels", "keyframes"] = "voxels"
-    frame: Literal["session", "map"] = "session"
+    frame: Literal["session", "map", "common"] = "session"
     bounds: Bounds | None = None
 
 
@@ -50,10 +53,10 @@ def export(
 ) -> list[Path]:
     """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
 
-    ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``:
-    one pose graph of all; the point formats: ``selection``, by default the centres of all occupied
-    voxels in the session frame. Raises WorkspaceError when a session is not there or does not fit
-    the format, SemlocError when a library is missing.
+    ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame or the
+    common one; ``g2o``: one pose graph of all; the point formats: ``selection``, by default the
+    centres of all occupied voxels in the session frame. Raises WorkspaceError when a session is not
+    there or does not fit the format, SemlocError when a library is missing.
     """
     sessions = {folder.name: SessionMap(folder) for folder in work.chosen(names)}
     if form == "g2o":
@@ -61,12 +64,13 @@ def export(
         _write(path, pose_graph(sessions, work).encode())
         return [path]
     paths = []
+    chosen = selection or Selection()
     for name, session in sessions.items():
         if form in ("tum", "kitti"):
             paths.append(output / f"{name}.{'txt' if form == 'kitti' else form}")
-            _write(paths[-1], (tum if form == "tum" else kitti)(session))
+            table = poses_table(work, session, chosen.frame)
+            _write(paths[-1], (tum if form == "tum" else kitti)(table))
             continue
-        chosen = selection or Selection()
         points = SessionPoints(session, chosen.what, chosen.frame, chosen.bounds)
         paths.append(output / f"{name}{'-keyframes' if chosen.what == 'keyframes' else ''}.{form}")
         with replacing_file(paths[-1], suffix=f".{form}") as temporary:
@@ -79,11 +83,21 @@ def _write(path: Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
-def tum(session: SessionMap) -> bytes:
-    """Seconds, position (m), quaternion xyzw of the base frame in the session frame: the whole
-    trajectory.
-    """
-    table = read_table(session.folder.trajectory)
+def poses_table(work: Workspace, session: SessionMap, frame: str) -> pa.Table:
+    """The trajectory in the ``session`` frame, or in the ``common`` one of ``semloc optimize``."""
+    if frame != "common":
+        return read_table(session.folder.trajectory)
+    path = work.optimized_trajectory(session.folder.name)
+    if not path.exists():
+        raise WorkspaceError(
+            f"Session {session.folder.name} has no poses in a common frame: run 'semloc optimize"
+            f" -w {work.path}' first."
+        )
+    return read_table(path)
+
+
+def tum(table: pa.Table) -> bytes:
+    """Seconds, position (m), quaternion xyzw of the base frame: the whole trajectory."""
     t, q = translation_quaternion(poses_of(table))
     lines = [
         f"{stamp // 10**9}.{stamp % 10**9:09d} "
@@ -93,11 +107,8 @@ def tum(session: SessionMap) -> bytes:
     return "".join(f"{line}\n" for line in lines).encode()
 
 
-def kitti(session: SessionMap) -> bytes:
-    """Twelve numbers a line: the upper 3 x 4 of ``session_T_base`` of each pose of the trajectory,
-    row-major.
-    """
-    poses = poses_of(read_table(session.folder.trajectory))
+def kitti(table: pa.Table) -> bytes:
+    """Twelve numbers a line: the upper 3 x 4 of each pose of the base frame, row-major."""
     return "".join(
-        " ".join(f"{x:.12g}" for x in pose[:3].ravel()) + "\n" for pose in poses
+        " ".join(f"{x:.12g}" for x in pose[:3].ravel()) + "\n" for pose in poses_of(table)
     ).encode()
