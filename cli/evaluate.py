@@ -17,7 +17,7 @@ from .options import (
     tables_settings_options,
     work_option,
 )
-from .results import SHOWN
+from .results import SHOWN, show_trajectory_errors
 
 if TYPE_CHECKING:
     from semloc_logs.evaluation.truth import Evaluation
@@ -40,18 +40,25 @@ def command(work: Path, truth: Path, no_self: bool, as_json: bool, settings: Res
     """Closures against the truth: a closure is correct within 1 m and 5 degrees.
 
     Recall is the share of the queries near a database keyframe (5 m) that have a correct closure.
+    After semloc optimize also the errors of the trajectories before and after: ATE and RPE of 10 m,
+    root mean squares, as evo defines them.
 
     \b
     Example:  semloc evaluate -w work --truth truth.json
     """
+    from semloc_logs.evaluation.trajectory_errors import trajectory_errors
     from semloc_logs.evaluation.truth import evaluate_closures
     from semloc_logs.workspace import Workspace
 
-    result = evaluate_closures(Workspace(work), truth, settings, self_closures=not no_self)
+    workspace = Workspace(work)
+    result = evaluate_closures(workspace, truth, settings, self_closures=not no_self)
+    errors = trajectory_errors(workspace, truth) if workspace.graph_closures.exists() else None
     if as_json:
-        console.result_json(result.to_json())
+        console.result_json(result.to_json() | ({} if errors is None else errors.to_json()))
     else:
         show_evaluation(result)
+        if errors is not None:
+            show_trajectory_errors(errors)
     if result.unjudged:
         console.warn(
             f"{result.unjudged} closures have an end whose true pose {truth} does not say: they"

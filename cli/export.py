@@ -38,9 +38,10 @@ POINTS = ("ply", "pcd", "las", "laz", "xyz")
 )
 @click.option(
     "--frame",
-    type=click.Choice(["session", "map"]),
-    help="Points are in the session frame of the log's poses (default), or in the level map frame"
-    " that starts at the first keyframe.",
+    type=click.Choice(["session", "map", "common"]),
+    help="Poses and points are in the session frame of the log's poses (default), points in the"
+    " level map frame that starts at the first keyframe, poses in the common frame of"
+    " semloc optimize.",
 )
 @click.option(
     "--bounds",
@@ -58,7 +59,7 @@ def command(
     work: Path,
     form: str,
     what: Literal["voxels", "keyframes"] | None,
-    frame: Literal["session", "map"] | None,
+    frame: Literal["session", "map", "common"] | None,
     bounds: tuple[float, float, float, float] | None,
     output: Path | None,
     overwrite: bool,
@@ -74,7 +75,8 @@ def command(
     \b
     Example:  semloc export -w work --format las --bounds -50 -50 50 50
     """
-    if form not in POINTS and (what or frame or bounds):
+    is_of_points = what or bounds or (frame and (frame != "common" or form == "g2o"))
+    if form not in POINTS and is_of_points:
         raise click.UsageError(
             f"--what, --frame and --bounds choose points; {form} has none. Formats with points:"
             f" {', '.join(POINTS)}."

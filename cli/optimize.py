@@ -18,9 +18,9 @@ from .options import (
     tables_settings_options,
     work_option,
 )
+from .results import show_trajectory_errors
 
 if TYPE_CHECKING:
-    from semloc_logs.evaluation.trajectory_errors import TrajectoryErrors
     from semloc_logs.settings import Resolved
 
 
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 @click.option(
     "--covariances", is_flag=True, help="Also write how uncertain the pose of each vertex is."
 )
+@click.option(
+    "--map", "with_map", is_flag=True, help="Also merge the voxels of all sessions, with changes."
+)
 @overwrite_option
 @json_option
 @tables_settings_options
@@ -38,6 +41,7 @@ def command(
     work: Path,
     truth: Path | None,
     covariances: bool,
+    with_map: bool,
     overwrite: bool,
     as_json: bool,
     settings: Resolved,
@@ -51,41 +55,28 @@ def command(
     Example:  semloc optimize -w work
     """
     from semloc_logs.evaluation.trajectory_errors import trajectory_errors
-    from semloc_logs.stages.optimise import optimise
+    from semloc_logs.stages.optimise import merge_maps, optimise
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
     with console.progress():
         report = optimise(workspace, settings, covariances=covariances, overwrite=overwrite)
+        maps = merge_maps(workspace) if with_map else []
     errors = None if truth is None else trajectory_errors(workspace, truth)
     if as_json:
-        console.result_json(asdict(report) | ({} if errors is None else errors.to_json()))
+        merged = {"maps": [asdict(one) for one in maps]} if with_map else {}
+        console.result_json(asdict(report) | merged | ({} if errors is None else errors.to_json()))
         return 0
     frames = "1 frame" if report.frames == 1 else f"{report.frames} frames"
     console.result(
         f"{report.sessions} sessions in {frames} by {report.closures} closures,"
         f" {report.rejected} of them refused: {workspace.optimized}"
     )
+    for one in maps:
+        console.result(
+            f"Map in the frame of {one.frame}: {one.voxels} voxels, {one.changed} changed,"
+            f" in {workspace.merged_map(one.frame)}"
+        )
     if errors is not None:
         show_trajectory_errors(errors)
     return 0
-
-
-def show_trajectory_errors(errors: TrajectoryErrors) -> None:
-    """Errors of each session before and after, and of all together."""
-    rows = [
-        (
-            row.session,
-            row.frame,
-            *(
-                "-" if value is None else f"{value:.3f}"
-                for value in (row.ate_before_m, row.ate_after_m, row.rpe_before_m, row.rpe_after_m)
-            ),
-        )
-        for row in errors.trajectories
-    ]
-    columns = ("session", "frame", "ATE before (m)", "after (m)", "RPE before (m)", "after (m)")
-    console.table("Trajectories against the truth, each aligned alone", columns, rows)
-    if errors.ate_after_m is not None:
-        before = "-" if errors.ate_before_m is None else f"{errors.ate_before_m:.3f} m"
-        console.result(f"ATE {before} before, {errors.ate_after_m:.3f} m after")

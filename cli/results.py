@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from .console import console, duration
 
 if TYPE_CHECKING:
+    from semloc_logs.evaluation.trajectory_errors import TrajectoryErrors
     from semloc_logs.stages.plan import Plan
     from semloc_logs.stages.report import Report
     from semloc_logs.stages.sessions import SessionSummary
@@ -146,3 +147,23 @@ def _seconds(rows: list[dict[str, Any]], end: str) -> str:
     """The time from the first to the last closure."""
     stamps_ns = [row[f"{end}_stamp_ns"] for row in rows]
     return f"{(max(stamps_ns) - min(stamps_ns)) / 1e9:.0f}"
+
+
+def show_trajectory_errors(errors: TrajectoryErrors) -> None:
+    """Errors of each session before and after, and of all together."""
+    rows = [
+        (
+            row.session,
+            row.frame,
+            *(
+                "-" if value is None else f"{value:.3f}"
+                for value in (row.ate_before_m, row.ate_after_m, row.rpe_before_m, row.rpe_after_m)
+            ),
+        )
+        for row in errors.trajectories
+    ]
+    columns = ("session", "frame", "ATE before (m)", "after (m)", "RPE before (m)", "after (m)")
+    console.table("Trajectories against the truth, each aligned alone", columns, rows)
+    if errors.ate_after_m is not None:
+        before = "-" if errors.ate_before_m is None else f"{errors.ate_before_m:.3f} m"
+        console.result(f"ATE {before} before, {errors.ate_after_m:.3f} m after")

@@ -30,6 +30,8 @@ FILES_OF_TABLES = {  # table -> where it lies in a workspace
     "optimized": "optimized/NAME.parquet",
     "graph_closures": "optimized/graph/closures.parquet",
     "vertices": "optimized/graph/vertices.parquet",
+    "merged_voxels": "optimized/map/NAME/",
+    "changed_voxels": "optimized/changes/NAME.parquet",
     "alignments": "alignments/query=NAME/target=NAME/alignments.parquet",
     "trajectory": "sessions/NAME/trajectory.parquet",
     "frames": "sessions/NAME/frames.parquet",

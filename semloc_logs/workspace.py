@@ -181,6 +181,14 @@ class Workspace:
         """The graph as g2o text."""
         return self.optimized / "graph.g2o"
 
+    def merged_map(self, frame: str) -> Path:
+        """Voxels of all sessions in the map frame of the session ``frame``."""
+        return self.optimized / "map" / checked_name(frame)
+
+    def changed_voxels(self, frame: str) -> Path:
+        """Voxels of that frame that sessions disagree about."""
+        return self.optimized / "changes" / f"{checked_name(frame)}.parquet"
+
     @property
     def annotated(self) -> Path:
         return self.path / "annotated"

@@ -112,12 +112,15 @@ def rms(values: F64) -> float | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Compared:
-    """True poses of a session at the stamps where all are known, and the two estimates."""
+    """True poses of a session at the stamps where they are known, and the two estimates.
+
+    Without odometry there is nothing before.
+    """
 
     session: str
     frame: str
     truth: F64
-    before: F64
+    before: F64 | None
     after: F64
 
 
@@ -128,28 +131,21 @@ def trajectory_errors(work: Workspace, truth: Path) -> TrajectoryErrors:
     """
     sessions = {folder.name: SessionMap(folder) for folder in work.chosen(())}
     tracks = read_truth(truth, sessions)
-    compared = [
-        _compared(work, session, tracks[name])
-        for name, session in sessions.items()
-        if name in tracks
-    ]
-    compared = [c for c in compared if len(c.truth)]
-    rows = [_session_errors(c) for c in compared]
-    alone_before = [aligned_distances(c.truth, c.before) for c in compared]
-    alone_after = [aligned_distances(c.truth, c.after) for c in compared]
-    together = _together(compared)
-    before = [relative_errors(c.truth, c.before, RPE_ROAD_M) for c in compared]
+    every = [_compared(work, sessions[name], track) for name, track in tracks.items()]
+    compared = [part for part in every if len(part.truth)]
+    posed = [(c.truth, c.before) for c in compared if c.before is not None]
+    before = [relative_errors(true, estimate, RPE_ROAD_M) for true, estimate in posed]
     after = [relative_errors(c.truth, c.after, RPE_ROAD_M) for c in compared]
     return TrajectoryErrors(
-        _pooled(alone_before),
-        _pooled(together),
-        _pooled(alone_after),
+        _pooled([aligned_distances(true, estimate) for true, estimate in posed]),
+        _pooled(_together(compared)),
+        _pooled([aligned_distances(c.truth, c.after) for c in compared]),
         _pooled([m for m, _ in before]),
         _pooled([m for m, _ in after]),
         _pooled([deg for _, deg in before]),
         _pooled([deg for _, deg in after]),
         RPE_ROAD_M,
-        rows,
+        [_session_errors(c) for c in compared],
     )
 
 
@@ -171,19 +167,27 @@ def _together(compared: list[_Compared]) -> list[F64]:
 
 
 def _session_errors(part: _Compared) -> SessionErrors:
-    before_m, before_deg = relative_errors(part.truth, part.before, RPE_ROAD_M)
-    after_m, after_deg = relative_errors(part.truth, part.after, RPE_ROAD_M)
+    ate_before, rpe_before_m, rpe_before_deg = _figures(part.truth, part.before)
+    ate_after, rpe_after_m, rpe_after_deg = _figures(part.truth, part.after)
     return SessionErrors(
         part.session,
         part.frame,
         len(part.truth),
-        rms(aligned_distances(part.truth, part.before)),
-        rms(aligned_distances(part.truth, part.after)),
-        rms(before_m),
-        rms(after_m),
-        rms(before_deg),
-        rms(after_deg),
+        ate_before,
+        ate_after,
+        rpe_before_m,
+        rpe_after_m,
+        rpe_before_deg,
+        rpe_after_deg,
     )
+
+
+def _figures(truth: F64, estimate: F64 | None) -> tuple[float | None, float | None, float | None]:
+    """ATE (m), and RPE in metres and in degrees."""
+    if estimate is None:
+        return None, None, None
+    metres, degrees = relative_errors(truth, estimate, RPE_ROAD_M)
+    return rms(aligned_distances(truth, estimate)), rms(metres), rms(degrees)
 
 
 def _compared(work: Workspace, session: SessionMap, track: TrueTrack) -> _Compared:
@@ -196,10 +200,12 @@ def _compared(work: Workspace, session: SessionMap, track: TrueTrack) -> _Compar
     optimized = read_table(path)
     stamps_ns = np.asarray(optimized["stamp_ns"].to_numpy())
     recorded = read_table(session.folder.trajectory)
-    # a session without poses has none before
     same = np.array_equal(stamps_ns, recorded["stamp_ns"].to_numpy())
-    after = poses_of(optimized)
-    before = poses_of(recorded) if same else after
+    if session.posed and not same:
+        raise WorkspaceError(
+            f"{path} is of an earlier log of session {name}: run 'semloc optimize -w {work.path}'."
+        )
     true_poses, known = track.at(stamps_ns)
+    before = poses_of(recorded)[known] if session.posed else None
     frame = str(read_metadata(path)["frame"])
-    return _Compared(name, frame, true_poses[known], before[known], after[known])
+    return _Compared(name, frame, true_poses[known], before, poses_of(optimized)[known])

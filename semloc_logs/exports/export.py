@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import pyarrow as pa
+
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports.foxglove_layout import foxglove_layout
 from semloc_logs.exports.map_points import Bounds, SessionPoints
@@ -40,7 +42,7 @@ class Selection:
     """
 
     what: Literal["voxels", "keyframes"] = "voxels"
-    frame: Literal["session", "map"] = "session"
+    frame: Literal["session", "map", "common"] = "session"
     bounds: Bounds | None = None
 
 
@@ -55,11 +57,11 @@ def export(
 ) -> list[Path]:
     """Write the sessions ``names`` (all if empty) to the folder ``output``; the files written.
 
-    ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame; ``g2o``:
-    one pose graph of all; ``foxglove-layout``: a layout for annotated logs; the point formats:
-    ``selection``, by default the centres of all occupied voxels in the session frame. Raises
-    WorkspaceError when a session is not there or does not fit the format, or a file exists and
-    ``overwrite`` is not set; SemlocError when a library is missing.
+    ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame or the
+    common one; ``g2o``: one pose graph of all; ``foxglove-layout``: a layout for annotated logs;
+    the point formats: ``selection``, by default the centres of all occupied voxels in the session
+    frame. Raises WorkspaceError when a session is not there or does not fit the format, or a file
+    exists and ``overwrite`` is not set; SemlocError when a library is missing.
     """
     sessions = {folder.name: SessionMap(folder) for folder in work.chosen(names)}
     chosen = selection or Selection()
@@ -70,7 +72,8 @@ def export(
     paths = {name: _free(output / _file_name(name, form, chosen), overwrite) for name in sessions}
     for name, session in sessions.items():
         if form in ("tum", "kitti"):
-            _write(paths[name], (tum if form == "tum" else kitti)(session))
+            table = poses_table(work, session, chosen.frame)
+            _write(paths[name], (tum if form == "tum" else kitti)(table))
             continue
         if form == LAYOUT:
             _write(paths[name], foxglove_layout(session).encode())
@@ -102,11 +105,21 @@ def _write(path: Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
-def tum(session: SessionMap) -> bytes:
-    """Seconds, position (m), quaternion xyzw of the base frame in the session frame: the whole
-    trajectory.
-    """
-    table = read_table(session.folder.trajectory)
+def poses_table(work: Workspace, session: SessionMap, frame: str) -> pa.Table:
+    """The trajectory in the ``session`` frame, or in the ``common`` one of ``semloc optimize``."""
+    if frame != "common":
+        return read_table(session.folder.trajectory)
+    path = work.optimized_trajectory(session.folder.name)
+    if not path.exists():
+        raise WorkspaceError(
+            f"Session {session.folder.name} has no poses in a common frame: run 'semloc optimize"
+            f" -w {work.path}' first."
+        )
+    return read_table(path)
+
+
+def tum(table: pa.Table) -> bytes:
+    """Seconds, position (m), quaternion xyzw of the base frame: the whole trajectory."""
     t, q = translation_quaternion(poses_of(table))
     lines = [
         f"{stamp // 10**9}.{stamp % 10**9:09d} "
@@ -116,11 +129,8 @@ def tum(session: SessionMap) -> bytes:
     return "".join(f"{line}\n" for line in lines).encode()
 
 
-def kitti(session: SessionMap) -> bytes:
-    """Twelve numbers a line: the upper 3 x 4 of ``session_T_base`` of each pose of the trajectory,
-    row-major.
-    """
-    poses = poses_of(read_table(session.folder.trajectory))
+def kitti(table: pa.Table) -> bytes:
+    """Twelve numbers a line: the upper 3 x 4 of each pose of the base frame, row-major."""
     return "".join(
-        " ".join(f"{x:.12g}" for x in pose[:3].ravel()) + "\n" for pose in poses
+        " ".join(f"{x:.12g}" for x in pose[:3].ravel()) + "\n" for pose in poses_of(table)
     ).encode()

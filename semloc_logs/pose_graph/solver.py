@@ -273,7 +273,7 @@ def _model(gtsam: Any, root: F64) -> Any:
 
 
 def _adjoint(b_T_a: F64) -> F64:
-    """Errors (x y z rotation-x rotation-y rotation-z) in the axes of ``a`` -> in those of ``b``."""
+    """From errors (position, rotation) in the axes of ``a`` to ones in the axes of ``b``."""
     rotation = b_T_a[:3, :3]
     x, y, z = b_T_a[:3, 3]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

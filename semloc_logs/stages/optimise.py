@@ -16,6 +16,7 @@ import semloc_logs
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.pose_graph.assembly import pose_graph_of
+from semloc_logs.pose_graph.merged_map import write_merged_map
 from semloc_logs.pose_graph.optimisation import optimise_graph
 from semloc_logs.pose_graph.optimized_tables import (
     EarlierTables,
@@ -49,6 +50,15 @@ class OptimiseReport:
     rejected: int
     frames: int
     solved: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class MergedFrame:
+    """A map of several sessions: the frame, and how many voxels it has and changed."""
+
+    frame: str
+    voxels: int
+    changed: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +110,39 @@ def optimise(
     return OptimiseReport(
         len(sessions), closures.num_rows, closures.num_rows - kept, len(frames), solved
     )
+
+
+@one_writer
+def merge_maps(work: Workspace) -> list[MergedFrame]:
+    """Write the map of each frame and its changes. WorkspaceError before ``optimise``."""
+    frames: dict[str, list[SessionMap]] = {}
+    for folder in work.chosen(()):
+        frame = str(read_metadata(work.optimized_trajectory(folder.name))["frame"])
+        frames.setdefault(frame, []).append(SessionMap(folder))
+    merged = []
+    for done, (frame, sessions) in enumerate(sorted(frames.items())):
+        _check_one_voxel_size(sessions)
+        metadata = {
+            "schema_version": 1,
+            "version": semloc_logs.__version__,
+            "voxel_size": sessions[0].json["voxel_size"],
+            "frame": frame,
+            "sessions": [session.folder.name for session in sessions],
+        }
+        voxels, changed = write_merged_map(work, frame, sessions, metadata)
+        merged.append(MergedFrame(frame, voxels, changed))
+        report_progress("optimize", frame, done + 1, len(frames), "maps")
+    return merged
+
+
+def _check_one_voxel_size(sessions: Sequence[SessionMap]) -> None:
+    sizes = {float(session.json["voxel_size"]) for session in sessions}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{size:g}" for size in sorted(sizes))
+        raise WorkspaceError(
+            f"Sessions have voxels of {listed} m, which do not make one map: fuse them again with"
+            " one fusion.voxel_size."
+        )
 
 
 def _solve(

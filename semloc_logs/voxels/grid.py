@@ -61,6 +61,19 @@ class BlockMap:
         b = unpack(self.keys)
         return b.min(0) * BLOCK, (b.max(0) + 1) * BLOCK
 
+    def at(self, ijk: I64) -> U8:
+        """State (n,) of voxels (n, 3), unobserved without a block."""
+        out = np.full(len(ijk), UNOBSERVED_STATE, np.uint8)
+        if not len(self.keys):
+            return out
+        keys = pack(ijk // BLOCK)
+        row = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        is_known = self.keys[row] == keys
+        inner = ijk[is_known] % BLOCK
+        cell = (inner[:, 0] * BLOCK + inner[:, 1]) * BLOCK + inner[:, 2]
+        out[is_known] = self.state[row[is_known], cell]
+        return out
+
     def dense(self, low: NDArray[np.integer], shape: tuple[int, int, int]) -> U8:
         """State of ``shape`` voxels from voxel ``low`` on, unobserved without a block."""
         out = np.full(shape, UNOBSERVED_STATE, np.uint8)
