@@ -98,8 +98,8 @@ class Results:
     The ``closures`` in which ``session`` takes part, and the ``settings`` behind them.
     ``log_times`` maps the stamp (ns) of an end in this log to the receive time (ns) of the frame
     there; ``frame_id`` is the frame of the log's pose stream, for the markers; None:
-    semloc/SESSION. ``frames`` place these frames and those of other sessions. ``memory``: bytes of
-    the log that may be in memory at once.
+    semloc/SESSION. ``frames`` place these frames, and the ones of other sessions. ``memory``: bytes
+    of the log that may be in memory at once.
     """
 
     closures: Sequence[ClosureRecord]

@@ -112,7 +112,7 @@ function rejectedDetails(k) {
 
 // -- evidence
 
-const SHARES = new Set(["structure", "coverage", "contradiction", "fit", "distinct"]);
+const SHARES = new Set(["structure", "coverage", "contradiction", "fit"]);
 
 function featureTable(values) {
   return facts(data.features.map((name, i) => {
@@ -121,7 +121,7 @@ function featureTable(values) {
     const share = Math.min(1, Math.max(0, value));
     const bar = el("span", { class: "bar", "aria-hidden": "true" }, el("span"));
     bar.firstChild.style.width = `${(100 * share).toFixed(0)}%`;
-    const text = name === "distinct" || !isShare ? value.toFixed(2) : `${(100 * value).toFixed(0)} %`;
+    const text = isShare ? `${(100 * value).toFixed(0)} %` : value.toFixed(2);
     return [name, el("span", {}, isShare ? bar : null, Number.isFinite(value) ? text : "-"), data.meanings[name]];
   }));
 }
