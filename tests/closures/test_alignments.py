@@ -48,7 +48,8 @@ def content(a: Alignment) -> list[Any]:
 
 
 def test_the_columns_of_several_pairs_give_the_alignments_back() -> None:
-    rows = [alignment(k, query, target) for k, (query, target) in enumerate(["ba", "cb", "ba"])]
+    pairs = (("b", "a"), ("c", "b"), ("b", "a"))
+    rows = [alignment(k, query, target) for k, (query, target) in enumerate(pairs)]
     others = [alignment(9, "c", "a")]
     held = Alignments.joined([Alignments.of(rows), Alignments.of([]), Alignments.of(others)])
     assert held.given is None
@@ -69,7 +70,9 @@ def test_the_columns_of_several_pairs_give_the_alignments_back() -> None:
 
 def test_no_alignments_have_columns_too() -> None:
     held = Alignments.joined([])
-    assert list(held) == list(held.by_pair()) == held.sigma().tolist() == []
+    assert list(held) == []
+    assert list(held.by_pair()) == []
+    assert held.sigma().tolist() == []
 
 
 def test_tables_keep_alignments(tmp_path: Path) -> None:
