@@ -66,6 +66,8 @@ def called(
         module = importlib.import_module(f"semloc_logs.stages.{stage}")
         signature = inspect.signature(getattr(module, stage))
         monkeypatch.setattr(module, stage, stand_in)
+        # no stage has made sessions that a table could show
+        monkeypatch.setattr("semloc_logs.stages.sessions.list_sessions", lambda work: [])
         return seen
 
     _write_closures(Workspace(tmp_path / "work"))
