@@ -48,7 +48,7 @@ Bools = NDArray[np.bool_]
 SIGNS = (-1, 1, -1)  # of ``EVIDENCE``
 VOTE_SIGNS = (1, -1, 1, -1)  # of ``VOTES``
 COPIES = "repeating"  # in the names of towns of copied blocks
-# weight of opposing votes beside agreeing ones: copies of a street agree with each other as right
+# weight of far opposing votes beside agreeing ones: copies of a street agree with each other as right
 # alignments do, and where two groups contradict each other one of them is wrong
 AGAINST = 2.0
 SURE = 0.99  # what would be accepted
@@ -250,15 +250,14 @@ def fit_votes(judged: Judged, agreement: Agreement[F64], rows: Bools, own: F64) 
     """The model of what the ``agreement`` (n,) adds to log-odds ``own`` (n,), from clear ``rows``.
 
     Neighbours in the same copy of a block agree about any copy, so it is of ordinary towns. There,
-    neighbours hardly ever oppose, so their votes weigh at least :data:`AGAINST` times as much as
+    far ones hardly ever oppose, so their votes weigh at least :data:`AGAINST` times as much as
     agreeing ones.
     """
     rows = rows & judged.clear & (agreement.neighbours > 0) & ~judged.copies
     values = Votes.of(agreement).vector()[rows]
     fitted = fit_signed(values, judged.right[rows], VOTE_SIGNS, offset=own[rows])
     near, against, far, far_against = fitted.weights
-    weights = (near, min(against, -AGAINST * near), far, min(far_against, -AGAINST * far))
-    return replace(fitted, weights=weights)
+    return replace(fitted, weights=(near, against, far, min(far_against, -AGAINST * far)))
 
 
 def max_ambiguity(judged: Judged, agreement: Agreement[F64], p: F64) -> float:

@@ -37,7 +37,7 @@ def judged(n: int = 1500, seed: int = 0, towns: int = 3) -> Judged:
     anywhere; features tell a little.
     """
     rng = np.random.default_rng(seed)
-    right = rng.random(n) < 0.4
+    right = rng.random(n) < 0.7
     features = np.tile([0.8, 0.8, 0.1, 0.5, 3.0, 2.0, 0.0], (n, 1))
     features[:, 2] *= np.exp(np.where(right, -0.5, 0.5) + rng.normal(0, 0.4, n))
     features[:, 5] += rng.normal(0, 0.2, n)

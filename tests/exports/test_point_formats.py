@@ -303,7 +303,7 @@ def test_a_failed_export_leaves_the_older_file(
     before = path.read_bytes()
     monkeypatch.setattr(SessionPoints, "count", lambda _: 7)
     with pytest.raises(WorkspaceError, match="changed while it was exported"):
-        export(Workspace(tmp_path), [], "pcd", tmp_path / "out")
+        export(Workspace(tmp_path), [], "pcd", tmp_path / "out", overwrite=True)
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == ["town.pcd"]
 

@@ -18,7 +18,7 @@ from semloc_logs.pictures.closure_sheet import draw_views
 from semloc_logs.pictures.closure_view import Choice, ClosureView, Match, Wanted, choose, drawn
 from semloc_logs.settings import Settings
 from semloc_logs.tables import contracts
-from semloc_logs.tables.table import write_table
+from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.voxels.grid import Fuser
 from semloc_logs.voxels.store import pose_columns
 from semloc_logs.workspace import Workspace
@@ -63,6 +63,7 @@ def tables(folder: Path, accepted: list[Row], rejected: list[Row]) -> Workspace:
             "topic": ["/points"],
         }
         write_table(work.session(session).frames, contracts.table("frames", frames), {})
+        write_json(work.session(session).session_json, {})
     return work
 
 
@@ -118,7 +119,7 @@ def test_a_closure_by_its_number(work: Workspace) -> None:
 def test_nothing_to_show(work: Workspace, tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="'z'"):
         choose(work, Wanted(session="z"))
-    with pytest.raises(WorkspaceError, match="semloc close"):
+    with pytest.raises(WorkspaceError, match="semloc fuse"):
         choose(Workspace(tmp_path / "none"), Wanted())
 
 
@@ -200,6 +201,6 @@ def test_the_command_refuses_what_cannot_be_shown(tmp_path: Path) -> None:
     assert show("--closure", 1, "--at", 3)[0] == 2
     code, said = show()
     assert code == 1
-    assert "semloc close" in said
+    assert "semloc fuse" in said
     (tmp_path / "o.png").write_bytes(b"")
     assert "--overwrite" in show()[1]
