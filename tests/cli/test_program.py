@@ -383,14 +383,14 @@ def test_an_interrupted_program_cleans_up(
 
 
 DEAF = """
-import hashlib, os, sys
+import hashlib, os, threading
 import click
 from semloc_logs.cli.main import Program, program
 
 @click.command()
 def nap():
-    os.write(1, b"asleep\\n")
-    hashlib.pbkdf2_hmac("sha256", b"x", b"y", 10**10)  # hours, without a look at signals
+    threading.Timer(1.0, os.write, (1, b"asleep\\n")).start()
+    hashlib.pbkdf2_hmac("sha256", b"x", b"y", 2 * 10**9)  # minutes, without a look at signals
 
 Program.get_command = lambda *_: nap
 program.main(["nap"])
