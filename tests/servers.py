@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import socket
 import threading
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ class WebServer(ThreadingHTTPServer):
     """Serves ``files`` by their names.
 
     The next ``drops`` answers to GET are cut off after half of their bytes. ``requests``: method,
-    name and range of all requests.
+    name and range of all requests; ``queries`` are the ends of their addresses.
     """
 
     daemon_threads = True
@@ -28,6 +29,8 @@ class WebServer(ThreadingHTTPServer):
         self.drops = 0
         self.has_ranges = True
         self.has_etags = True
+        self.queries: list[str] = []
+        self.password = ""  # USER:PASSWORD
 
     @property
     def url(self) -> str:
@@ -51,7 +54,14 @@ class _Handler(BaseHTTPRequestHandler):
         name = self.path.partition("?")[0].lstrip("/")
         wanted = self.headers.get("Range", "")
         self.server.requests.append((self.command, name, wanted))
+        self.server.queries.append(self.path.partition("?")[2])
         content = self.server.files.get(name)
+        basic = base64.b64encode(self.server.password.encode()).decode()
+        if self.server.password and self.headers.get("Authorization") != f"Basic {basic}":
+            self.send_response(401)
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
         if content is None:
             self.send_response(404)
             self.send_header("Content-Length", "0")

@@ -20,12 +20,13 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path, PosixPath
 from typing import IO, Any, BinaryIO, TypeVar, cast
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 from semloc_logs.errors import RemoteError
 
 EXTRAS = {"s3": "s3", "gs": "gs", "http": "http", "https": "http"}  # the extra of a scheme
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
+_IN_URLS = "%/:?#[]@!$&'()*+,;=~"  # characters that need no quoting, or are quotes
 TRIES = 5
 _PAUSE_S = 0.25  # before the second try; twice as long before each further one
 _SILENCE_S = 60.0  # a server that sends nothing for so long is tried again
@@ -72,6 +73,7 @@ class RemotePath(PosixPath):
         host, _, names = rest.partition("/")
         if is_web:  # keys of other servers may have any letters
             parts = urlsplit(url)
+            url = quote(url, _IN_URLS)  # apart from that it is sent as it is
             host, names = parts.netloc.rpartition("@")[2], parts.path
         names = names.strip("/") if is_web else names.rstrip("/")
         if not host or "//" in f"/{names}":
@@ -390,7 +392,7 @@ def _system(scheme: str, process: int) -> Any:
     else:
         aiohttp = importlib.import_module("aiohttp")
         silent = aiohttp.ClientTimeout(total=None, sock_connect=10, sock_read=_SILENCE_S)
-        options["client_kwargs"] = {"timeout": silent}
+        options |= {"client_kwargs": {"timeout": silent}, "encoded": True}
     return fsspec.filesystem(scheme, **options)
 
 

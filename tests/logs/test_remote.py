@@ -224,6 +224,19 @@ def test_a_folder_of_a_web_server_that_lists_none(tmp_path: Path, web: WebServer
         open_log(f"{web.url}/bag")
 
 
+def test_an_address_is_sent_as_given_and_a_refusal_is_told(tmp_path: Path, web: WebServer) -> None:
+    web.files["a b.mcap"] = web.files["a%20b.mcap"] = mcap(tmp_path / "x.mcap").read_bytes()
+    for url in ("a b.mcap?sig=a%2Fb/c", "a%20b.mcap?sig=a%2Fb/c"):
+        web.queries.clear()
+        assert len(content(f"{web.url}/{url}")) == COUNT
+        assert set(web.queries) == {"sig=a%2Fb/c"}
+    web.password = "me:secret"
+    with pytest.raises(LogError, match=r"x\.mcap cannot be opened: Permission denied\."):
+        open_log(f"{web.url}/x.mcap")
+    own = web.url.replace("://", "://me:secret@")
+    assert len(content(f"{own}/a%20b.mcap")) == COUNT
+
+
 def test_a_pattern_of_addresses(bucket: Bucket) -> None:
     from semloc_logs.cli.inputs import LogChoice, session_inputs
 

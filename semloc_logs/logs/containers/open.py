@@ -27,17 +27,20 @@ def open_log(path: str | Path, memory: int = DEFAULT) -> Log:
     """
     path = log_path(path)
     limit = Memory(memory)
-    if path.is_dir():
-        return Rosbag2Log(path, limit)
+    head = b""
     try:
-        with path.open("rb") as file:
-            head = file.read(512)
+        is_folder = path.is_dir()
+        if not is_folder:
+            with path.open("rb") as file:
+                head = file.read(512)
     except FileNotFoundError as error:
         raise LogError(f"{path} does not exist.") from error
     except (OSError, ValueError) as error:
         raise LogError(
             f"{path} cannot be opened: {getattr(error, 'strerror', None) or error}."
         ) from error
+    if is_folder:
+        return Rosbag2Log(path, limit)
     if path.name == "metadata.yaml":
         return Rosbag2Log(path.parent, limit)
     if head.startswith(MAGIC):
