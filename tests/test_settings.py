@@ -78,7 +78,7 @@ def test_unknown_keys_are_refused_by_name_from_the_environment() -> None:
 
 def test_every_section_refuses_unknown_keys() -> None:
     sections = [name for name, value in Settings() if isinstance(value, BaseModel)]
-    assert len(sections) == 7
+    assert len(sections) == 8
     for section in sections:
         with pytest.raises(SettingsError, match=rf"{section}\.no_such_key"):
             load(assignments={f"{section}.no_such_key": "1"})
