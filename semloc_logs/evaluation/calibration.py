@@ -48,8 +48,8 @@ Bools = NDArray[np.bool_]
 SIGNS = (-1, 1, -1)  # of ``EVIDENCE``
 VOTE_SIGNS = (1, -1, 1, -1)  # of ``VOTES``
 COPIES = "repeating"  # in the names of towns of copied blocks
-# weight of far opposing votes beside agreeing ones: copies of a street agree with each other as right
-# alignments do, and where two groups contradict each other one of them is wrong
+# weight of far opposing votes beside agreeing ones: copies of a street agree with each other as
+# right alignments do, and where two groups contradict each other one of them is wrong
 AGAINST = 2.0
 SURE = 0.99  # what would be accepted
 # how much streets look like others by chance, in however few towns it was not seen

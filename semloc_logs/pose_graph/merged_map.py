@@ -107,9 +107,7 @@ def write_merged_map(
 
 def _placed(work: Workspace, session: SessionMap) -> list[PlacedSubmap]:
     poses = keyframe_poses(work, session)
-    return [
-        PlacedSubmap(session, s["number"], s["first"], s["last"], poses) for s in session.submaps
-    ]
+    return [PlacedSubmap(session, s["id"], s["first"], s["last"], poses) for s in session.submaps]
 
 
 # -- occupied voxels of a session by tile

@@ -44,7 +44,7 @@ def _write_submap(drives: Any, name: str, classes: dict[tuple[int, int, int], in
     folder = drives.work.session(name)
     write_blocks(blocks_path(folder.blocks, 0), blocks, {"schema_version": 1})
     last = len(drives.true[name]) - 1
-    submaps = [{"number": 0, "first": 0, "last": last}]
+    submaps = [{"id": 0, "first": 0, "last": last}]
     write_json(folder.session_json, read_json(folder.session_json) | {"submaps": submaps})
 
 
