@@ -226,7 +226,7 @@ def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
     # poses from which registration hardly moves are not far off
     if float(np.nanmedian(squares)) > DOUBTFUL:
         doubted = Doubted.of(clouds, given, squares)
-        for start in (doubted.motion(), doubted.clock_or_mirror(poses_at)):
+        for start in (doubted.motion(), doubted.other_poses(poses_at)):
             if start is not None:
                 found = registered(clouds, numbers, start)
                 stream = _judged(topic, clouds, poses_at, found)
