@@ -64,7 +64,7 @@ def seen_by_camera(points: F64, rng: np.random.Generator) -> F64:
     ranges = ranges[seen]
     noisy = ranges * (1.0 + rng.normal(0, 0.003, len(ranges)))
     step = 0.01 * ranges
-    return points * (np.round(noisy / step) * step / ranges)[:, None]
+    return np.asarray(points * (np.round(noisy / step) * step / ranges)[:, None])
 
 
 def drive(
