@@ -6,9 +6,10 @@ Memory holds overlapping chunks only, within its limit.
 from __future__ import annotations
 
 import struct
+import threading
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +26,7 @@ from semloc_logs.logs.containers.base import (
     encoding_of,
     in_log_time_order,
     open_file,
+    read_at,
     read_exactly,
     read_into,
 )
@@ -54,6 +56,7 @@ from semloc_logs.logs.containers.mcap_records import (
     walk,
 )
 from semloc_logs.logs.containers.memory import Memory
+from semloc_logs.logs.containers.read_ahead import ReadAhead
 from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
 from semloc_logs.logs.problems import Problems
@@ -92,7 +95,7 @@ class McapLog(BaseLog):
         self._publishers: dict[int, str] = {}  # of channels that share their topic
         self._parts: list[Part] = []
         self._definition_bytes = 0
-        self._buffer = bytearray()  # for compressed chunks
+        self._buffers = threading.local()  # of each thread, for compressed chunks
         self._file = open_file(path)
         with closed_on_error(self._file, path):
             self._size = self._file.seek(0, 2)
@@ -104,12 +107,16 @@ class McapLog(BaseLog):
         A damaged chunk is skipped and named in ``problems``.
         """
         wanted = None if topics is None else frozenset(topics)
-        parts = (
+        parts = [
             p
             for p in self._parts
             if wanted is None or not p.channels or any(self._topic(c) in wanted for c in p.channels)
-        )
-        return in_log_time_order((p.start_ns, partial(self._load, p, wanted)) for p in parts)
+        ]
+        parts.sort(key=lambda p: p.start_ns)  # stable, as the merge is
+        with ReadAhead(parts, self._claimed_size, self._unpack, self._memory) as ahead:
+            yield from in_log_time_order(
+                (p.start_ns, partial(self._load, p, wanted, partial(ahead.take, p))) for p in parts
+            )
 
     def sections(self) -> list[Section]:
         """The chunks and runs of messages outside chunks, by their first log time."""
@@ -312,15 +319,17 @@ class McapLog(BaseLog):
 
     def _load_topics(self, part: Part, topics: Collection[str] | None) -> Iterator[Message]:
         wanted = None if topics is None else frozenset(topics)
-        return in_log_time_order([(part.start_ns, partial(self._load, part, wanted))])
+        load = partial(self._load, part, wanted, partial(self._unpack, part))
+        return in_log_time_order([(part.start_ns, load)])
 
-    def _load(self, part: Part, wanted: frozenset[str] | None) -> Iterator[MessageOrTime]:
+    def _load(
+        self, part: Part, wanted: frozenset[str] | None, unpack: Callable[[], Bytes]
+    ) -> Iterator[MessageOrTime]:
         """The messages of one part in log-time order."""
-        whole = self._unpack_chunk if part.chunk else self._read
         chunk = Chunk(
             start_ns=part.start_ns,
             claimed_size=partial(self._claimed_size, part),
-            unpack=partial(whole, part.offset, part.size),
+            unpack=unpack,
             walk=partial(self._walk, part.offset),
             kind=partial(self._wanted_kind, wanted),
         )
@@ -346,13 +355,19 @@ class McapLog(BaseLog):
 
     def _read(self, offset: int, size: int) -> bytes:
         self._memory.check(size)
-        return read_exactly(self._file, offset, size, self._size)
+        return read_at(self._file, offset, size, self._size)
 
     def _claimed_size(self, part: Part) -> int:
         """Bytes of a part in memory."""
         if not part.chunk:
             return part.size
         return claimed_size(self._read(part.offset, min(part.size, CHUNK_HEAD)))
+
+    def _unpack(self, part: Part) -> Bytes:
+        """The records of a part; called from several threads."""
+        if part.chunk:
+            return self._unpack_chunk(part.offset, part.size)
+        return self._read(part.offset, part.size)
 
     def _unpack_chunk(self, offset: int, size: int) -> Bytes:
         record = self._chunk_record(offset, size)
@@ -364,13 +379,13 @@ class McapLog(BaseLog):
         A buffer that is used again spares the pages of a new one.
         """
         self._memory.check(size)
-        start = read_exactly(self._file, offset, min(size, COMPRESSION_END), self._size)
+        start = self._read(offset, min(size, COMPRESSION_END))
         if size > LARGE or not is_compressed(start):
-            self._buffer = bytearray()
             return self._read(offset, size)
-        if len(self._buffer) < size:
-            self._buffer = bytearray(size)
-        record = memoryview(self._buffer)[:size]
+        buffer: bytearray = getattr(self._buffers, "record", bytearray())
+        if len(buffer) < size:
+            buffer = self._buffers.record = bytearray(size)
+        record = memoryview(buffer)[:size]
         read_into(self._file, offset, record, self._size)
         return record
 

@@ -27,10 +27,12 @@ from semloc_logs.mapping.fit.model import (
     PARAMETERS,
     ROTATION,
     SCALE,
+    Bools,
     Estimate,
     Fault,
     Pairs,
     PosesAt,
+    cost_of,
     difference,
     fit,
     pose_motion,
@@ -224,7 +226,7 @@ def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
     # poses from which registration hardly moves are not far off
     if float(np.nanmedian(squares)) > DOUBTFUL:
         doubted = Doubted.of(clouds, given, squares)
-        for start in (doubted.motion(), doubted.clock(poses_at)):
+        for start in (doubted.motion(), doubted.other_poses(poses_at)):
             if start is not None:
                 found = registered(clouds, numbers, start)
                 stream = _judged(topic, clouds, poses_at, found)
@@ -259,6 +261,9 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
         pairs = refined.pairs
         none = fit(pairs, poses_at, np.zeros(0, np.int64), zero)
         estimate, faults = _explained(pairs, poses_at, none)
+    if reading := _mirrored(pairs, poses_at, none, estimate.cost):
+        stream.findings.append(reading)
+        return stream
     rest = float(np.nanmedian(estimate.squares))
     if rest < FAR_OFF or rest < FAR_OFF * noise(clouds, found):
         _describe(stream, estimate, faults, clouds)
@@ -288,7 +293,7 @@ def _other_reading(pairs: Pairs, poses_at: PosesAt, given: Estimate) -> Finding 
     poses, known = pairs.poses(poses_at)
     fixed = np.tile(np.eye(4), (len(pairs), 1, 1))
     inverted = poses[:, 0] @ inverse(poses[:, 1])
-    for predicted, text in (
+    readings = (
         (
             fixed,
             "its clouds do not move although the vehicle does: they are in the fixed frame already,"
@@ -300,12 +305,36 @@ def _other_reading(pairs: Pairs, poses_at: PosesAt, given: Estimate) -> Finding 
             "the poses fit when they are inverted: they are of the fixed frame in the frame of the"
             " vehicle; record or give the poses of the vehicle",
         ),
-    ):
-        predicted = predicted.copy()
-        predicted[~known] = np.nan
-        near = float(np.nanmedian(pairs.squares(predicted)))
-        if near < FAR_OFF and near < MUCH_NEARER * far:
-            return Finding(Severity.WRONG, text)
+    )
+    nears = [float(np.nanmedian(pairs.squares(_where(known, motion)))) for motion, _ in readings]
+    best = int(np.argmin(nears))
+    if nears[best] < FAR_OFF and nears[best] < MUCH_NEARER * far:
+        return Finding(Severity.WRONG, readings[best][1])
+    return None
+
+
+def _where(known: Bools, motion: F64) -> F64:
+    """Motions (n, 4, 4), nan where the poses are not known."""
+    return np.where(known[:, None, None], motion, np.nan)
+
+
+def _mirrored(pairs: Pairs, poses_at: PosesAt, none: Estimate, most: float) -> Finding | None:
+    """An axis of the clouds that points the other way, where this explains more than faults do.
+
+    ``most``: the cost of what faults leave. Only turns show it, to the side or up and down.
+    """
+    motion, known = pairs.motion(poses_at, 0)
+    for axis, name in enumerate("xyz"):
+        flip = np.diag([-1.0 if k == axis else 1.0 for k in range(4)])
+        predicted = _where(known, flip @ motion @ flip)
+        cost = cost_of(pairs.residuals(predicted))
+        excess = max(1.0, float(np.nanmedian(pairs.squares(predicted))) / MEDIAN_OF_6)
+        if cost <= most and (none.cost - cost) / excess >= LEAST_GAIN:
+            return Finding(
+                Severity.WRONG,
+                f"its clouds are mirrored along {name} of the base frame: they turn the other way"
+                " than the vehicle; correct the sign of the coordinate",
+            )
     return None
 
 

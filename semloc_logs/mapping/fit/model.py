@@ -161,13 +161,13 @@ def fit(pairs: Pairs, poses_at: PosesAt, free: I64, start: F64) -> Estimate:
         return pairs.residuals(pose_motion(pairs, poses_at, parameters))
 
     parameters = start.copy()
-    best = _cost(residuals(parameters)) + _prior(parameters, free)
+    best = cost_of(residuals(parameters)) + _prior(parameters, free)
     damping = 1e-3
     for _ in range(ITERATIONS if len(free) else 0):
         hessian, gradient = _equations(residuals, parameters, free)
         step = np.zeros(PARAMETERS)
         step[free] = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
-        cost = _cost(residuals(parameters + step)) + _prior(parameters + step, free)
+        cost = cost_of(residuals(parameters + step)) + _prior(parameters + step, free)
         if cost < best:
             is_small = best - cost < 1e-3
             parameters = parameters + step
@@ -207,8 +207,8 @@ def _equations(residuals: Callable[[F64], F64], parameters: F64, free: I64) -> t
     return hessian + np.diag(prior), gradient + prior * parameters[free]
 
 
-def _cost(r: F64) -> float:
-    """Cauchy's cost; a pair without a pose costs as much as one that is an outlier."""
+def cost_of(r: F64) -> float:
+    """Cauchy's cost of residuals (n, 6); a pair without a pose costs as much as an outlier."""
     squares = np.where(np.isfinite(r).all(1), (np.nan_to_num(r) ** 2).sum(1), OUTLIER**2)
     return float(0.5 * OUTLIER**2 * np.log1p(squares / OUTLIER**2).sum())
 
@@ -235,7 +235,7 @@ def _best_offset(pairs: Pairs, poses_at: PosesAt, given: F64) -> float:
     for offset in offsets:
         parameters = given.copy()
         parameters[CLOCK] = offset
-        costs.append(_cost(pairs.residuals(pose_motion(pairs, poses_at, parameters))))
+        costs.append(cost_of(pairs.residuals(pose_motion(pairs, poses_at, parameters))))
     return float(offsets[int(np.argmin(costs))])
 
 
@@ -261,7 +261,7 @@ def _best_rotation(pairs: Pairs, poses_at: PosesAt, given: F64) -> F64:
     for candidate in turns:
         parameters = given.copy()
         parameters[ROTATION] = (Rotation.from_rotvec(given[ROTATION]) * candidate).as_rotvec()
-        cost = _cost(pairs.residuals(pose_motion(pairs, poses_at, parameters)))
+        cost = cost_of(pairs.residuals(pose_motion(pairs, poses_at, parameters)))
         if cost < least:
             least = cost
             best = parameters[ROTATION]

@@ -23,8 +23,9 @@ I64 = NDArray[np.int64]
 TRIED = 4  # pairs that show whether another start is better
 # a motion is better when so many times the points lie on planes as where registration ended
 BETTER = 1.15
-# another clock is better when they are so many times as many as by the poses, and hardly fewer than
-# where registration ended: it may end at a motion that the sensor cannot tell from the right one
+# another reading of the poses is better when they are so many times as many as by the poses, and
+# hardly fewer than where registration ended, which may be a motion that the sensor cannot tell from
+# the right one
 BETTER_THAN_POSES, AS_GOOD = 1.15, 0.8
 
 
@@ -55,9 +56,14 @@ class Doubted:
         start, share = self._best(_of_motion(self.clouds))
         return start if share > max(BETTER * self.share, 1e-9) else None
 
-    def clock(self, poses_at: PosesAt) -> Start | None:
-        """The poses at other times, where they bring far more points onto planes."""
-        start, share = self._best(list(_of_clocks(self.clouds, poses_at)))
+    def other_poses(self, poses_at: PosesAt) -> Start | None:
+        """The poses at other times, mirrored or inverted, where far more points lie on planes."""
+        starts = [
+            _of_inverted(self.clouds),
+            *_of_clocks(self.clouds, poses_at),
+            *_of_mirrors(self.clouds),
+        ]
+        start, share = self._best(starts)
         least = max(BETTER_THAN_POSES * self.given_share, AS_GOOD * self.share, 1e-9)
         return start if share > least else None
 
@@ -99,6 +105,30 @@ def _turned(rotation: F64) -> Callable[[F64], F64]:
     mounting = np.eye(4)
     mounting[:3, :3] = rotation
     return lambda motion: inverse(mounting) @ motion @ mounting
+
+
+def _of_inverted(clouds: Clouds) -> Start:
+    """The motion by poses that are of the fixed frame in the frame of the vehicle."""
+
+    def start(target: int, source: int) -> F64:
+        from_pose = clouds.pose(target)
+        to_pose = clouds.pose(source)
+        assert from_pose is not None, "a chosen pair has poses"
+        assert to_pose is not None, "a chosen pair has poses"
+        return np.asarray(from_pose @ inverse(to_pose))
+
+    return start
+
+
+def _of_mirrors(clouds: Clouds) -> Iterator[Start]:
+    """Motions of clouds with an axis that points the other way."""
+    for axis in range(3):
+        flip = np.diag([-1.0 if k == axis else 1.0 for k in range(4)])
+
+        def start(target: int, source: int, flip: F64 = flip) -> F64:
+            return np.asarray(flip @ motion(clouds, target, source) @ flip)
+
+        yield start
 
 
 def _of_clocks(clouds: Clouds, poses_at: PosesAt) -> Iterator[Start]:

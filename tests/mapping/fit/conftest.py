@@ -64,7 +64,7 @@ def seen_by_camera(points: F64, rng: np.random.Generator) -> F64:
     ranges = ranges[seen]
     noisy = ranges * (1.0 + rng.normal(0, 0.003, len(ranges)))
     step = 0.01 * ranges
-    return points * (np.round(noisy / step) * step / ranges)[:, None]
+    return np.asarray(points * (np.round(noisy / step) * step / ranges)[:, None])
 
 
 def drive(
@@ -77,12 +77,13 @@ def drive(
     scale: float = 1.0,
     is_fixed: bool = False,
     is_camera: bool = False,
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> tuple[Clouds, PoseTrack]:
     """Keyframes three times a second, and the poses twenty times a second.
 
     The clouds are stamped ``clock`` seconds late; their mounting is wrong by ``base_T_assumed``
     (true base frame from the one of the clouds); ``scale`` times as large; or in the session frame.
-    A LIDAR sees all around, a camera ahead.
+    A LIDAR sees all around, a camera ahead. ``signs``: an axis of the clouds may be mirrored.
     """
     world = street()
     rng = np.random.default_rng(5)
@@ -105,7 +106,7 @@ def drive(
         header = Header(TOPIC, stamp_ns, stamp_ns, "lidar")
         cloud = PosedCloud(
             header,
-            (scale * points).astype(np.float32),
+            (scale * points * signs).astype(np.float32),
             np.zeros(3, np.float32),
             track.at(stamp_ns),
             None,

@@ -149,6 +149,28 @@ def test_another_unit_is_found(check: Check, scale: float) -> None:
     assert np.exp(fit.parameters["scale_log"][0]) == pytest.approx(scale, rel=0.05)
 
 
+@pytest.mark.parametrize(("axis", "signs"), [("y", (1, -1, 1)), ("x", (-1, 1, 1))])
+def test_a_mirrored_axis_is_found_where_the_vehicle_turns(
+    check: Check, axis: str, signs: tuple[float, float, float]
+) -> None:
+    assert f"mirrored along {axis} of the base frame" in _only(check(signs=signs))
+
+
+def test_poses_that_are_inverted_are_not_taken_for_clouds_in_the_fixed_frame(
+    tmp_path: Path, streets: SimpleNamespace
+) -> None:
+    def inverted(seconds: np.ndarray) -> np.ndarray:
+        poses: np.ndarray = inverse(streets.winding(seconds))
+        return poses
+
+    clouds, _ = streets.drive(tmp_path)
+    (tmp_path / "other").mkdir()
+    _, track = streets.drive(tmp_path / "other", inverted)
+    clouds.collected.poses[:] = list(track.at_many(clouds.stamps_ns())[0])
+    text = _only(check_stream(TOPIC, clouds, track.at_many))
+    assert "the poses fit when they are inverted" in text
+
+
 def test_clouds_in_the_fixed_frame_are_found(check: Check) -> None:
     assert "they are in the fixed frame already" in _only(check(is_fixed=True))
 
