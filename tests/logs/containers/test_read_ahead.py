@@ -1,4 +1,6 @@
-"""Chunks that threads make ready come in order, within memory, and fail when their turn has come."""
+"""Chunks that threads make ready come in order, within memory, and fail when their turn has
+come.
+"""
 
 from __future__ import annotations
 
