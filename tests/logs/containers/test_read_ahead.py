@@ -1,4 +1,4 @@
-"""Chunks that threads make ready come in order, within memory, and fail when their turn has come."""
+"""Chunks made ready by threads come in order, within memory, and fail when their turn has come."""
 
 from __future__ import annotations
 
