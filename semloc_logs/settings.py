@@ -346,7 +346,7 @@ class Optimize(_Section):
         0.01, gt=0, le=1, description="share of the road that odometry is off after 100 m"
     )
     odometry_turn_deg: float = Field(
-        1.0, gt=0, le=180, description="degrees that odometry turns too much after 100 m"
+        0.5, gt=0, le=180, description="degrees that odometry turns too much after 100 m"
     )
     closure_sigma: float | None = Field(
         None,

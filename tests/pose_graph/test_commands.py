@@ -21,8 +21,8 @@ def semloc(*args: object) -> Result:
 @pytest.fixture
 def work(drives: Any, square_of: Any) -> Any:
     """Drives a and b that drift in opposite ways, c apart from them; one false closure."""
-    drives.add("a", square_of(2), 0.008, 1.005)
-    drives.add("b", square_of(2), -0.008, 0.995)
+    drives.add("a", square_of(2), 0.004, 1.005)
+    drives.add("b", square_of(2), -0.004, 0.995)
     drives.add("c", square_of(1), 0.0, 1.0)
     right = [("b", k, "a", k, None) for k in range(0, 801, 20)]
     drives.close([*right, ("b", 100, "a", 200, yaw_transform(0.0, (30.0, 0.0, 0.0)))])
