@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from semloc_logs.logs.messages.stamps import time_range
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import Problem, ProblemKind
 
@@ -80,6 +81,17 @@ def smeared(topic: str, shift: float) -> Problem:
         f"or more: its poses, and the map that is built with them, are wrong; "
         f"use --odometry lidar, give poses with --poses FILE, or name a topic with "
         f"--topic pose=TOPIC."
+    )
+    return Problem(topic, ProblemKind.POSE, text, lost=True)
+
+
+def froze(topic: str, shift: float, start_ns: int, end_ns: int) -> Problem:
+    """Poses that stand still for a while, in which the surroundings move by ``shift`` metres."""
+    text = (
+        f"{topic} gives the same pose from {time_range(start_ns, end_ns)}, but the surroundings"
+        f" move by {shift:.1f} m or more: its poses froze, and the map is wrong there; use"
+        " --odometry lidar, give poses with --poses FILE, or name a topic with --topic"
+        " pose=TOPIC."
     )
     return Problem(topic, ProblemKind.POSE, text, lost=True)
 

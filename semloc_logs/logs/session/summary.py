@@ -7,6 +7,7 @@ from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.pose_problems import (
     clouds_in_fixed_frame,
+    froze,
     invalid_poses,
     looks_up,
     never_moves,
@@ -43,8 +44,11 @@ def conclude(done: CloudPass, roles: Roles) -> list[Problem]:
     is_lost = name != "TF" or track.backwards + track.ahead > 0
     problems += refused_poses(name, track, lost=is_lost)
 
-    if builder.standstill.shift and not track.moves:
-        problems.append(smeared(name, builder.standstill.shift))
+    frozen = builder.standstill.worst
+    if frozen is not None and not track.moves:
+        problems.append(smeared(name, frozen.shift))
+    elif frozen is not None:
+        problems.append(froze(name, frozen.shift, frozen.start_ns, frozen.end_ns))
     else:
         problems += never_moves(name, track)
     if poses.base is not None and poses.base.pose_frame is None:

@@ -43,10 +43,15 @@ def test_whether_a_track_moves() -> None:
     assert made.moves
 
 
-@pytest.mark.parametrize(("speed", "moves"), [(0.0, False), (0.2, True)])
-def test_surroundings_that_move_while_the_poses_stand(speed: float, moves: bool) -> None:
+@pytest.mark.parametrize("still", [slice(0, 20), slice(0, 10), slice(10, 20)])
+@pytest.mark.parametrize(("speed", "moves"), [(0.0, False), (0.2, True), (3.0, True)])
+def test_surroundings_that_move_while_the_poses_stand(
+    speed: float, moves: bool, still: slice
+) -> None:
+    """The poses stand still all the time, or for half of it; else they are right."""
     rng = np.random.default_rng(2)
     watch = Standstill()
+    frozen = range(20)[still]
     for k in range(20):
         street = np.c_[
             rng.uniform(-20, 20, 5000), rng.choice([-6.0, 6.0], 5000), rng.uniform(0, 4, 5000)
@@ -55,8 +60,13 @@ def test_surroundings_that_move_while_the_poses_stand(speed: float, moves: bool)
             street, np.c_[np.full(5000, 25.0), rng.uniform(-6, 6, 5000), rng.uniform(0, 4, 5000)]
         ]
         street += rng.normal(0, 0.02, street.shape)
-        watch.add((street - [speed * k, 0, 0]).astype(np.float32), yaw_transform(0.0, (7.0, 0, 0)))
+        at = speed * (frozen[0] if k in frozen else k)
+        cloud = (street - [speed * k, 0, 0]).astype(np.float32)
+        watch.add(cloud, yaw_transform(0.0, (at, 0, 0)), k * S)
     assert (watch.shift > 0) == moves
+    if watch.worst is not None:
+        assert watch.worst.start_ns == frozen[0] * S
+        assert watch.worst.end_ns == frozen[-1] * S
 
 
 def test_times_for_people() -> None:
