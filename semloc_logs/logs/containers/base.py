@@ -31,6 +31,7 @@ MessageOrTime = Message | int
 _STEP = 1 << 22
 _PLAUSIBLE_GROWTH = 64  # point clouds and pictures shrink by less
 _engines = threading.local()
+_ONE_READER = threading.Lock()  # of files without a descriptor
 
 
 class BaseLog(ABC):
@@ -201,6 +202,9 @@ def read_exactly(file: SizedFile, offset: int, size: int, file_size: int) -> byt
 
 def read_at(file: BufferedReader, offset: int, size: int, file_size: int) -> bytes:
     """As :func:`read_exactly`, by several threads at once."""
+    if not _has_descriptor(file):  # of a server: one after the other
+        with _ONE_READER:
+            return read_exactly(file, offset, size, file_size)
     _check_claim(offset, size, file_size)
     data = os.pread(file.fileno(), size, offset)
     # the system gives at most 2 GiB at once
@@ -214,10 +218,21 @@ def read_at(file: BufferedReader, offset: int, size: int, file_size: int) -> byt
 def read_into(file: BufferedReader, offset: int, buffer: memoryview, file_size: int) -> None:
     """As :func:`read_at`, into a ``buffer`` of the size that is wanted."""
     size = len(buffer)
+    if not _has_descriptor(file):
+        buffer[:] = read_at(file, offset, size, file_size)
+        return
     _check_claim(offset, size, file_size)
     count = os.preadv(file.fileno(), [buffer], offset)
     if count != size:
         raise LogError(f"only {count} of {size} bytes could be read at byte {offset}")
+
+
+def _has_descriptor(file: BufferedReader) -> bool:
+    try:
+        file.fileno()
+    except OSError:
+        return False
+    return True
 
 
 def _check_claim(offset: int, size: int, file_size: int) -> None:

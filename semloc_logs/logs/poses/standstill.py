@@ -20,6 +20,7 @@ _TIMES, _MARGIN = 1.5, 0.1
 # of its points' distances: along a street most surfaces slide over themselves, and a fifth may be
 # traffic
 _QUANTILE = 0.8
+_FEWEST = 100  # points of a cloud that tells anything
 _LEAST = 4  # clouds that tell whether the sensor moved
 
 
@@ -71,6 +72,8 @@ class Standstill:
 
     def add(self, points: F32, session_T_base: Array, stamp_ns: int = 0) -> None:
         """Takes the points (n, 3) of a cloud in the base frame."""
+        if len(points) < _FEWEST:
+            return
         stop = self._stop
         is_still = stop is not None and _is_still(stop.pose, session_T_base)
         if stop is None or not is_still:

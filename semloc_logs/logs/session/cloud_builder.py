@@ -103,7 +103,7 @@ class CloudBuilder:
             self.sensors[header.frame_id] = place.base_T_sensor
         pose = place.session_T_base
         is_main = header.topic == self._roles.ranging[0]
-        if pose is not None and is_main and len(cloud.points):
+        if pose is not None and is_main:
             self.standstill.add(cloud.points, pose, header.stamp_ns)
         # the pose at the time of a frame that is set back belongs to an earlier frame
         return NoCloud.BACK_IN_TIME if is_set_back and pose is not None else cloud
