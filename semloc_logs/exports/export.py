@@ -69,6 +69,11 @@ def export(
         path = _free(output / "closures.g2o", overwrite)
         _write(path, pose_graph(sessions, work).encode())
         return [path]
+    if form in POINT_FORMATS and chosen.frame == "common":
+        raise WorkspaceError(
+            f"Points in the common frame are not written as {form}: 'semloc optimize -w"
+            f" {work.path} --map' writes the merged map as Parquet."
+        )
     paths = {name: _free(output / _file_name(name, form, chosen), overwrite) for name in sessions}
     for name, session in sessions.items():
         if form in ("tum", "kitti"):

@@ -208,3 +208,9 @@ def test_a_layout_shows_the_closures_where_the_drive_is(work: Workspace, tmp_pat
         return {place} if isinstance(place, str) else named(place["first"]) | named(place["second"])
 
     assert named(content["layout"]) == set(content["configById"])
+
+
+def test_points_are_not_said_to_be_in_the_common_frame(work: Workspace, tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="semloc optimize"):
+        export(work, ["a"], "ply", tmp_path / "out", Selection(frame="common"))
+    assert not (tmp_path / "out").exists()
