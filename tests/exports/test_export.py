@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from semloc_logs.errors import WorkspaceError
-from semloc_logs.exports import export
+from semloc_logs.exports import Selection, export
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
