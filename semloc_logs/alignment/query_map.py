@@ -51,12 +51,16 @@ def structure_mask(label: U8) -> NDArray[np.bool_]:
     return ~dynamic[label]
 
 
-def structure_of(blocks: BlockMap, voxel_size: float) -> tuple[F64, U8]:
-    """Centres (n, 3) in metres and class bits (n,) of the structure voxels of a map."""
-    ijk, label = blocks.occupied()
+def structure_of(occupied: tuple[NDArray[np.int32], U8], voxel_size: float) -> tuple[F64, U8]:
+    """Centres (n, 3) in metres and class bits (n,) of the structure among ``occupied`` voxels."""
+    ijk, label = occupied
     keep = structure_mask(label)
-    centres = (ijk[keep].astype(float) + 0.5) * voxel_size
-    return centres, wanted_bits(label[keep], cityscapes().coarse)
+    return voxel_centres(ijk[keep], voxel_size), wanted_bits(label[keep], cityscapes().coarse)
+
+
+def voxel_centres(ijk: NDArray[np.int32], voxel_size: float) -> F64:
+    """Centres (n, 3) in metres of the voxels ``ijk`` (n, 3)."""
+    return np.asarray((ijk.astype(float) + 0.5) * voxel_size)
 
 
 def view_centres(position: F64, mean: F64, voxel_size: float) -> F64:
@@ -119,7 +123,7 @@ class Query:
             picked.append(rng.permutation(np.flatnonzero(mask))[: int(share * SEARCH_VOXELS)])
         index = np.concatenate(picked)
         return Evidence(
-            self._centres(ijk[index]),
+            voxel_centres(ijk[index], self.voxel_size),
             wanted_bits(label, cityscapes().coarse)[index],
             len(picked[0]),
         )
@@ -127,12 +131,9 @@ class Query:
     @cached_property
     def structure(self) -> tuple[F64, U8]:
         """Centres (n, 3) in metres and class bits (n,) of all structure voxels."""
-        return structure_of(self.blocks, self.voxel_size)
+        return structure_of(self.occupied, self.voxel_size)
 
     @cached_property
     def mask_grid(self) -> MaskGrid:
         """Bit masks to look a target's voxels up in."""
         return build_mask_grid(self.blocks, self.voxel_size, cityscapes().coarse)
-
-    def _centres(self, ijk: NDArray[np.int32]) -> F64:
-        return np.asarray((ijk.astype(float) + 0.5) * self.voxel_size)

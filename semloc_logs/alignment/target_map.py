@@ -42,7 +42,7 @@ class Target:
     @cached_property
     def structure(self) -> tuple[F64, U8]:
         """Centres (n, 3) in metres and class bits (n,) of all structure voxels."""
-        return structure_of(self.blocks, self.voxel_size)
+        return structure_of(self.blocks.occupied(), self.voxel_size)
 
     @cached_property
     def surface(self) -> Surface:

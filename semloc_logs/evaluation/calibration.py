@@ -300,6 +300,14 @@ def _towns(judged: Judged) -> list[NDArray[np.int64]]:
     return [np.flatnonzero(judged.town == town) for town in sorted(set(judged.town))]
 
 
+def _held_out(judged: Judged) -> Iterator[tuple[NDArray[np.int64], Bools]]:
+    """The rows of each town, and which (n,) are of the others."""
+    for mine in _towns(judged):
+        others = np.ones(len(judged), bool)
+        others[mine] = False
+        yield mine, others
+
+
 def decided_by(model: Model, judged: Judged) -> F64:
     """The probabilities (n,) that the acceptance gives with ``model``, 0 where there is a veto."""
     own = model.own_log_odds(judged.features)
@@ -345,29 +353,25 @@ def fit(judged: Judged) -> Fitted:
     """
     kept = possible(judged)
     own = np.zeros(len(judged))
-    for mine in _towns(judged):
-        others = np.ones(len(judged), bool)
-        others[mine] = False
+    for mine, others in _held_out(judged):
         unseen = Evidence.of(judged.features.part(mine)).vector()
         own[mine] = fit_alone(judged, others & kept).log_odds(unseen)
     whole = fit_alone(judged, kept)
     scale, shift = _temper(own, judged, kept)
-    own = np.minimum(scale * own + shift, np.log(judged.clear.sum()))
+    most = float(np.log(judged.clear.sum()))
+    own = np.minimum(scale * own + shift, most)
     model = replace(
         whole, weights=tuple(scale * w for w in whole.weights), bias=scale * whole.bias + shift
     )
 
     agreement = agreement_of(judged, own)
     total = np.zeros(len(judged))
-    for mine in _towns(judged):
-        others = np.ones(len(judged), bool)
-        others[mine] = False
+    for mine, others in _held_out(judged):
         votes = fit_votes(judged, agreement, others & kept, own)
         total[mine] = own[mine] + votes.log_odds(Votes.of(agreement.part(mine)).vector())
-    total = np.minimum(total, np.log(judged.clear.sum()))
+    total = np.minimum(total, most)
     p = np.where(kept, probability(judged, own, total), 0.0)
     most_alike = max_ambiguity(judged, agreement, np.where(kept, probability_of(total), 0.0))
-    most = float(np.log(judged.clear.sum()))
     fitted = Model(model, fit_votes(judged, agreement, kept, own), most, most_alike)
     p = np.where(fitted.is_ambiguous(agreement), 0.0, p)
     return Fitted(fitted, probability_of(own), p)

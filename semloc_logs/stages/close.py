@@ -81,13 +81,14 @@ def decide_all(
     from semloc_logs.pictures.closures_picture import draw_closures
 
     paths = _used_alignments(work, maps, settings, known)
-    decided = _decided(paths, maps, settings)
+    searched = _searched(paths, maps, settings)
+    decided = _decided(paths, maps, settings, searched)
     road = {name: session_map.distance for name, session_map in maps.items()}
     closures = unique_closures(decided.accepted(), road, settings.query.every)
 
     metadata = {
         **metadata_of(settings, maps.values()),
-        "queries": sum(len(keyframes) for keyframes in _searched(paths, maps, settings).values()),
+        "queries": sum(map(len, searched.values())),
         "fingerprint": _decided_from(known, settings),
         "settings": settings.tables(*SECTIONS),
     }
@@ -100,18 +101,22 @@ def decide_all(
 
 def decided_alignments(work: Workspace, maps: Maps, settings: Resolved) -> Outcomes:
     """What becomes of the alignments of all pairs, without sessions whose poses do not fit."""
-    return _decided(_used_alignments(work, maps, settings, known_pairs(work)), maps, settings)
+    paths = _used_alignments(work, maps, settings, known_pairs(work))
+    return _decided(paths, maps, settings, _searched(paths, maps, settings))
 
 
-def _decided(paths: Mapping[Pair, Path], maps: Maps, settings: Resolved) -> Outcomes:
+def _decided(
+    paths: Mapping[Pair, Path], maps: Maps, settings: Resolved, searched: Mapping[str, list[int]]
+) -> Outcomes:
+    """The outcomes; ``searched`` queries without alignments are neighbours, too."""
     alignments = Alignments.joined(read_alignments(paths[p], p.query, p.target) for p in paths)
-    # queries without alignments are neighbours too
-    return decide(alignments, maps, settings, _searched(paths, maps, settings))
+    return decide(alignments, maps, settings, searched)
 
 
 def _searched(pairs: Iterable[Pair], maps: Maps, settings: Resolved) -> dict[str, list[int]]:
     """The keyframes of all queries by session."""
-    return {p.query: query_keyframes(maps[p.query], settings) for p in pairs}
+    sessions = sorted({pair.query for pair in pairs})
+    return {name: query_keyframes(maps[name], settings) for name in sessions}
 
 
 def _used_alignments(

@@ -28,7 +28,7 @@ def test_the_later_one_is_searched_in_the_earlier_one(names: str) -> None:
         Pair("b", "b"),
         Pair("c", "b"),  # as late: by name
         Pair("c", "c"),
-        Pair("frames", "a"),  # without poses there is no map to be searched in
+        Pair("frames", "a"),  # without poses a session has no map to search
         Pair("frames", "b"),
         Pair("frames", "c"),
         Pair("frames", "frames"),

@@ -105,13 +105,12 @@ def _second_places(
         road = placed.target_road[places]
         mine = support[places]
         off = np.linalg.norm(at[:, None] - at, axis=2)
-        both = np.minimum(mine[:, None], mine)
+        held = np.where(mine >= LEAST_SUPPORT, mine, 0.0)
         is_second = off > apart + ODOMETRY_DRIFT * np.abs(road[:, None] - road)
-        lesser = np.where(is_second & (both >= LEAST_SUPPORT), both, 0.0)
+        lesser = np.where(is_second, np.minimum(held[:, None], held), 0.0)
         a, b = np.unravel_index(int(np.argmax(lesser)), lesser.shape)
         best = int(np.argmax(mine))
-        elsewhere = float(mine[wrong].max(initial=0.0))
-        much = max(float(lesser[a, b]), elsewhere if elsewhere >= LEAST_SUPPORT else 0.0)
+        much = max(float(lesser[a, b]), float(held[wrong].max(initial=0.0)))
         found.append(
             (places[a], places[b], much) if lesser[a, b] > 0 else (places[best], places[best], much)
         )

@@ -26,7 +26,10 @@ _LEAST = 4  # clouds that tell whether the sensor moved
 
 @dataclass(slots=True)
 class Stop:
-    """Clouds while the poses stood still: the first one, and how far others lie from it."""
+    """Clouds while the poses stood still: the first one, and how far others lie from it.
+
+    ``pose`` is session_T_base, ``first`` (n, 3) are points in the base frame.
+    """
 
     pose: Array
     first: F32
@@ -37,11 +40,12 @@ class Stop:
     noise: float = 0.0
     distances: list[float] = field(default_factory=list)
 
-    def compare(self, points: F32) -> None:
+    def compare(self, points: Array) -> None:
         """Take a later cloud (n, 3), in the session frame."""
         if self.tree is None:
-            self.tree = cKDTree(self.first)
-            self.noise = _distance(cKDTree(self.first[::2]), self.first[1::2])
+            first = apply(self.pose, self.first)
+            self.tree = cKDTree(first)
+            self.noise = _distance(cKDTree(first[::2]), first[1::2])
         self.distances.append(_distance(self.tree, points))
 
     @property
@@ -78,20 +82,20 @@ class Standstill:
         is_still = stop is not None and _is_still(stop.pose, session_T_base)
         if stop is None or not is_still:
             self._worst = self.worst
-            first = apply(session_T_base, _some(points, _KEPT)).astype(np.float32)
+            first = _some(points, _KEPT).copy()
             self._stop = Stop(np.array(session_T_base), first, stamp_ns, stamp_ns)
             return
         stop.seen += 1
         stop.end_ns = stamp_ns
         if stop.seen % _EVERY == 2:
-            stop.compare(apply(session_T_base, _some(points, _COMPARED)).astype(np.float32))
+            stop.compare(apply(session_T_base, _some(points, _COMPARED)))
 
 
 def _is_still(pose: Array, other: Array) -> bool:
     return bool(np.abs(other[:3] - pose[:3]).max() < _STILL)
 
 
-def _distance(tree: cKDTree, points: F32) -> float:
+def _distance(tree: cKDTree, points: Array) -> float:
     distances, _ = tree.query(points)
     return float(np.quantile(distances, _QUANTILE))
 

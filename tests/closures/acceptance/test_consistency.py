@@ -197,7 +197,7 @@ def test_two_places_that_fit_alike_leave_each_other_no_certainty() -> None:
 
 
 def test_of_a_street_that_the_target_drove_twice_one_place_is_accepted() -> None:
-    """500 m of road lie between both, after which odometry may be 5 m off: they are no rivals."""
+    """500 m of road lie between both, after which odometry may be 5 m off: they are not rivals."""
     twice = SimpleNamespace(
         map_T_base=np.tile(MAPS["b"].map_T_base, (2, 1, 1)),
         distance=np.r_[MAPS["b"].distance, 500.0 + MAPS["b"].distance],
@@ -418,7 +418,7 @@ def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_els
         accepted(a) and a.decision.agreement.ambiguity == 0
         for a in decide(once, STREETS, SETTINGS, model=MODEL)
     )
-    # the second place of each fits less well, so that of rivals alone they would be accepted
+    # the second place of each fits less well, so the veto alone rejects them
     twice = [
         dataclasses.replace(
             in_street(k, k + off), features=dataclasses.replace(GOOD, stiffness=fits)
