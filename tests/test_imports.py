@@ -40,6 +40,7 @@ ORDER = [
     "training",
     "evaluation",
     "benchmarks",
+    "experiments",
     "api",
 ]
 # sub-rooms and modules of a room that stands in an order of its own; what is not named stands last

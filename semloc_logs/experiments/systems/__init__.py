@@ -1,0 +1,1 @@
+"""The systems that the experiments compare, one module each."""
