@@ -1,5 +1,5 @@
-"""The protocol of a localisation system: it learns a database of views with known poses, and answers
-a query with ranked poses (section 4.1 of the paper).
+"""The protocol of a localisation system: it learns a database of views with known poses, and
+answers a query with ranked poses (section 4.1 of the paper).
 """
 
 from __future__ import annotations
