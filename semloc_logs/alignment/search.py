@@ -17,6 +17,7 @@ from semloc_logs.alignment.hypotheses import (
 )
 from semloc_logs.alignment.mask_grid import FREE_BIT, REACH, Arrays, MaskGrid
 from semloc_logs.alignment.query_map import SEARCH_VOXELS, STRUCTURE_SHARE, Evidence, Query
+from semloc_logs.alignment.scores import mutual_shares, reverse_scores, structure_scores
 from semloc_logs.alignment.target_map import Target
 
 U8 = NDArray[np.uint8]
@@ -48,8 +49,11 @@ class SearchStep:
 
 BEGUN = 2.0  # voxels between hypotheses that are one before and after the first search
 FIRST = SearchStep(0.8, 2, 200, BEGUN)
-FIRST_KEPT = 16  # hypotheses after the first search
+KEPT = 16  # hypotheses after a search
 SECOND = SearchStep(0.3, 1, SEARCH_VOXELS, SAME_PLACE_VOXELS)
+BY_SEARCH = 2  # candidates by their score in the search; the others by what both sides observed
+# of the best candidate of a search; right ones have 0.4 and more
+MIN_SEARCH_SCORE = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,14 +82,15 @@ def search_hypotheses(
     headings: int,
     most: int,
 ) -> list[Candidate]:
-    """The ``most`` best candidates, best first, after two searches around each hypothesis.
+    """The ``most`` best candidates after two searches around each hypothesis.
 
     The first is in steps of two voxels with few of the query's voxels; the second, for the best, in
-    steps of one with more.
+    steps of one with more. None if the best one scores so little that no fit makes a good alignment
+    of it.
     """
     searched = [_Searched(h, np.array(h.pose), 0.0) for h in hypotheses]
     searched = _suppressed(searched, BEGUN * query.voxel_size, len(searched))
-    for step, kept in ((FIRST, FIRST_KEPT), (SECOND, most)):
+    for step in (FIRST, SECOND):
         evidence = query.evidence.first(step.voxels)
         yaws = step.yaws(headings)
         better = []
@@ -94,11 +99,36 @@ def search_hypotheses(
             score, pose = search(grid, evidence, s.pose, yaws, step.step)
             better.append(_Searched(s.hypothesis, pose, score))
         better.sort(key=lambda s: (-s.score, s.hypothesis.group, tuple(s.pose)))
-        searched = _suppressed(better, step.distance * query.voxel_size, kept)
-    return [
+        searched = _suppressed(better, step.distance * query.voxel_size, KEPT)
+    if not searched or searched[0].score < MIN_SEARCH_SCORE:
+        return []
+    candidates = [
         Candidate(s.hypothesis.group, pose_matrix(s.pose), s.score, s.hypothesis.votes)
         for s in searched
     ]
+    return _chosen(candidates, targets, query, most)
+
+
+def _chosen(
+    candidates: list[Candidate], targets: dict[int, Target], query: Query, most: int
+) -> list[Candidate]:
+    """The first of ``candidates``, best first, and then those whose structure fits best where both
+    sides saw.
+
+    The search counts whatever lies outside the target's view against a pose. So it prefers poses
+    from which both sensors saw the same part of the road to a right one 30 m away.
+    """
+    first = min(BY_SEARCH, most)
+
+    def misfit(candidate: Candidate) -> float:
+        target = targets[candidate.group]
+        pose = candidate.target_T_query
+        aligned, free = mutual_shares(
+            structure_scores(query, target, pose), reverse_scores(query, target, pose)
+        )
+        return free - aligned
+
+    return candidates[:first] + sorted(candidates[first:], key=misfit)[: most - first]
 
 
 def _suppressed(searched: Sequence[_Searched], distance: float, most: int) -> list[_Searched]:

@@ -45,8 +45,6 @@ LEAST_WEIGHT = 1e-3
 # of the best score, and a score: no right alignment has less
 MIN_RELATIVE_SCORE = 0.8
 MIN_SCORE = 0.3
-# of the best candidate of a search; right ones have 0.4 and more
-MIN_SEARCH_SCORE = 0.2
 
 Prepared = tuple[Described, list[list[LookUp]]]
 _PREPARED: WeakKeyDictionary[Query, dict[str, Prepared]] = WeakKeyDictionary()
@@ -269,7 +267,7 @@ def _votes(
 
 
 def verify_hypotheses(context: QueryContext, hypotheses: list[Hypothesis]) -> list[list[Candidate]]:
-    """The best candidates in each target session after the search over their voxels, best first."""
+    """The best candidates in each target session after the search over their voxels."""
     database = context.visible.database
     headings = context.settings.descriptor.headings
     most = context.settings.closures.candidates
@@ -287,11 +285,8 @@ def verify_hypotheses(context: QueryContext, hypotheses: list[Hypothesis]) -> li
 def align_candidates(context: QueryContext, candidates: list[Candidate]) -> list[Alignment]:
     """Candidates in one target session, aligned on the points and compared with each other.
 
-    None where the best of them scores so little that no fit makes a good alignment of it; otherwise
-    all, as rivals tell how distinct it is.
+    All of them, as rivals tell how distinct the best one is.
     """
-    if max((c.score for c in candidates), default=0.0) < MIN_SEARCH_SCORE:
-        return []
     coarse = _each_place_once([_coarse(context, c) for c in candidates], context.voxel_size)
     fine: list[Fitted] = []
     for fitted in coarse[: max(1, context.settings.closures.rejected_per_query)]:

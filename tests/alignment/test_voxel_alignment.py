@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from semloc_logs.alignment import search as search_module
 from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix, same_place, yaw_between
 from semloc_logs.alignment.icp import Step, Weighting, align
 from semloc_logs.alignment.mask_grid import (
@@ -251,8 +252,10 @@ def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
     found = pose_matrix(pose)
     assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 2.5 * V
     assert yaw_between(found, truth) < np.radians(5)
-    away, _ = search(target.mask_grid, query.evidence, start + np.array([0.5, 6, 6, 2]), (0.0,), 1)
-    assert away < 0.7 * score
+    beside, _ = search(
+        target.mask_grid, query.evidence, start + np.array([0.5, 6, 6, 2]), (0.0,), 1
+    )
+    assert beside < 0.7 * score
 
     wrong = [Hypothesis(0, (yaw + 1.2 * k, 9.0 - k, 6.0 * k, 0.0), 3, 1.0) for k in (1, 2, 3)]
     near = Hypothesis(0, (yaw + 0.15, 4.2, -3.0, 0.5), 2, 0.5)
@@ -260,10 +263,35 @@ def test_a_search_finds_the_transform_that_was_put_in(yaw: float) -> None:
     best = candidates[0]
     assert same_place(best.target_T_query, truth, V)
     assert best.votes == 2
-    assert [c.score for c in candidates] == sorted((c.score for c in candidates), reverse=True)
+    assert candidates[0].score == max(c.score for c in candidates)
     assert len(candidates) <= 24
     twice = search_hypotheses([near, near], {0: target}, query, 18, 24)
     assert len(twice) == 1  # hypotheses at the same pose are merged
+    away = Hypothesis(0, (yaw, 60.0, 0.0, 0.0), 3, 1.0)
+    assert search_hypotheses([away], {0: target}, query, 18, 24) == []  # too bad to be fitted
+
+
+def test_a_candidate_that_both_sides_hold_for_right_is_kept_though_few_voxels_overlap(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Poses at 0 to 5 m, best first by the search. At 4 m a tenth of the voxels is in observed
+    space, and none of them contradicts; elsewhere a third of many does.
+    """
+    far = Scores(5000, 500, 450, 0)
+    near = Scores(5000, 4000, 2000, 1300)
+
+    def scores(query: object, target: object, pose: np.ndarray) -> Scores:
+        return far if pose[0, 3] == 4.0 else near
+
+    monkeypatch.setattr(search_module, "structure_scores", scores)
+    monkeypatch.setattr(search_module, "reverse_scores", scores)
+    rows = [Candidate(0, yaw_transform(0.0, (x, 0, 0)), 0.9 - 0.1 * x, 3) for x in np.arange(6.0)]
+    target = Target(block_map(town()), V)
+    query = Query(block_map(town()), points_of(town()), V)
+    chosen = search_module._chosen(rows, {0: target}, query, 4)
+    assert [c.target_T_query[0, 3] for c in chosen] == [0.0, 1.0, 4.0, 2.0]
+    assert search_module._chosen(rows[:1], {0: target}, query, 4) == rows[:1]
+    assert search_module._chosen(rows, {0: target}, query, 1) == rows[:1]
 
 
 def evidence_of(cells: dict[Cell, int], structure: int) -> Evidence:
