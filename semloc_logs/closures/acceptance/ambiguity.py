@@ -2,7 +2,8 @@
 
 Two drives through copies of a street, one block apart, agree in every query, and nothing in them
 tells. A third place reveals copies: a session that came through several copies has two places with
-support for one query, or the alignments of three sessions contradict each other.
+support for one query, or the alignments of three sessions contradict each other. Queries without
+neighbours, such as single sweeps, are told by the latter alone.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT
 from semloc_logs.closures.acceptance.placements import (
     ARM,
     FAR,
+    Bools,
     Pairs,
     Placed,
     contradicts_odometry,
@@ -31,6 +33,7 @@ I64 = NDArray[np.int64]
 APART = 20.0
 LEAST_SUPPORT = 0.1  # of a second place: less is chance
 BEYOND_DOUBT = 0.7  # support of alignments that may contradict others
+CHANCE = 0.03  # contradictions of lone queries that are less likely without copies tell of copies
 
 
 def ambiguity(
@@ -39,12 +42,19 @@ def ambiguity(
     """How ambiguous the road around either end of each alignment is (n,), in [0, 1].
 
     ``support`` (n,) is the probability of an alignment ignoring rivals, times the share of near
-    neighbours that agree; :func:`.placements.query_roads` makes ``roads``.
+    neighbours that agree, or NaN where the query is a ``lone`` one without neighbours;
+    :func:`.placements.query_roads` makes ``roads``.
 
     It is the mean over the queries about an end of the support of a second place in one session, or
     the share of them that three sessions contradict each other about; the session that shows it
-    most counts.
+    most counts. Of lone queries it is 1 in a session that copies alone explain.
     """
+    lone = np.isnan(support)
+    triples = _contradictions(
+        placed, pairs, np.where(lone, placed.probability_ignoring_rivals, support), voxel_size
+    )
+    support = np.where(lone, 0.0, support)
+    with_lone = lone[triples].any(axis=1)
     reach = FAR * voxel_size / STREET_VOXEL
     # by session: roads of all queries that can show it; where some do, and how much
     shown: dict[str, list[tuple[F64, F64, F64]]] = {}
@@ -56,9 +66,12 @@ def ambiguity(
             shown.setdefault(target, []).append(
                 (placed.target_road[first], placed.target_road[both], np.r_[much, much[much > 0]])
             )
-    for session, road in _contradicted(placed, pairs, support, voxel_size).items():
+    contradicted = triples[~with_lone, 0]
+    for session in sorted(set(placed.query_session[contradicted])):
+        mine = contradicted[placed.query_session[contradicted] == session]
+        road = np.unique(placed.road[mine])
         shown.setdefault(session, []).append((roads[session], road, np.ones(len(road))))
-    out = np.zeros(len(placed))
+    out = np.where(lone & _among_copies(placed, triples[with_lone]), 1.0, 0.0)
     for sessions, end_roads in (
         (placed.query_session, placed.road),
         (placed.target_session, placed.target_road),
@@ -118,8 +131,8 @@ def _second_places(
     return np.array(first), np.array(second), np.array(most)
 
 
-def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float) -> dict[str, F64]:
-    """Roads of the queries whose places in two sessions contradict the alignments between these.
+def _contradictions(placed: Placed, pairs: Pairs, support: F64, voxel_size: float) -> I64:
+    """Rows (m, 3) of alignments of three sessions that contradict each other.
 
     Of three sessions a, g, h those alignments are compared that hardly anybody doubts: a query of a
     in g, the nearest one of a in h, and the nearest one of g in h; odometry leads from one to the
@@ -136,7 +149,7 @@ def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float)
     targets: dict[str, list[str]] = {}
     for query, target in sure:
         targets.setdefault(query, []).append(target)
-    found: dict[str, set[float]] = {}
+    found = [np.zeros((0, 3), np.int64)]
     for (a, g), x in sure.items():
         for h in targets[a]:
             if h == g or (g, h) not in sure:
@@ -156,10 +169,24 @@ def _contradicted(placed: Placed, pairs: Pairs, support: F64, voxel_size: float)
             wrong = (off > APART * scale + (ODOMETRY_DRIFT + ARM) * way) & (
                 np.maximum(*along) <= FAR * scale
             )
-            found.setdefault(a, set()).update(placed.road[x[wrong]].tolist())
-    return {
-        session: np.sort(np.fromiter(roads, float, len(roads))) for session, roads in found.items()
-    }
+            found.append(np.stack([x, y, z], axis=1)[wrong])
+    return np.concatenate(found)
+
+
+def _among_copies(placed: Placed, triples: I64) -> Bools:
+    """Alignments (n,) of sessions whose contradictions chance does not explain.
+
+    One wrong alignment may contradict many right ones; so of each of the ``triples`` (m, 3) the
+    least probable alignment is held for wrong, each once, by chance.
+    """
+    p = placed.probability_ignoring_rivals
+    weakest = triples[np.arange(len(triples)), np.argmin(p[triples], axis=1)]
+    wrong: dict[str, set[int]] = {}
+    for rows, row in zip(triples, weakest.tolist(), strict=True):
+        for session in {*placed.query_session[rows], *placed.target_session[rows]}:
+            wrong.setdefault(session, set()).add(row)
+    copies = [s for s, rows in wrong.items() if np.prod(1 - p[sorted(rows)]) < CHANCE]
+    return np.isin(placed.query_session, copies) | np.isin(placed.target_session, copies)
 
 
 def _nearest(values: F64, wanted: F64) -> I64:

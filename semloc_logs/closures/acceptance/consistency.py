@@ -67,11 +67,8 @@ def count_votes(
         votes.conflict[rows] = sums[1]
         votes.far_support[rows] = sums[2]
         votes.far_conflict[rows] = sums[3]
-        support[rows] = (
-            group.probability_ignoring_rivals
-            * sums_ignoring_rivals[0]
-            / np.maximum(votes.neighbours[rows], 1)
-        )
+        neighbours = np.where(votes.neighbours[rows] > 0, votes.neighbours[rows], np.nan)
+        support[rows] = group.probability_ignoring_rivals * sums_ignoring_rivals[0] / neighbours
     return replace(votes, ambiguity=ambiguity(placed, pairs, roads, support, voxel_size))
 
 

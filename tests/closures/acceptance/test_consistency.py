@@ -474,6 +474,27 @@ def test_three_sessions_that_contradict_each_other_look_like_others() -> None:
             assert not accepted(a)
 
 
+@pytest.mark.parametrize(
+    ("weakest", "copies"),
+    [(0.75, False), (0.98, True)],  # chance explains one of four, but not one of fifty
+)
+def test_three_single_sweeps_that_contradict_each_other(weakest: float, copies: bool) -> None:
+    """Of sweeps a in b and c, and b in c, the least probable one is 40 m off."""
+
+    def sweep(query: str, target: str, at: int, alone: float) -> Alignment:
+        features = dataclasses.replace(GOOD, stiffness=float(np.log(alone / (1 - alone))))
+        return dataclasses.replace(in_street(30, at, query, target), features=features)
+
+    a_in_b = sweep("a", "b", 30, 0.999)
+    b_in_c = sweep("b", "c", 30, 0.999)
+    consistent = [a_in_b, b_in_c, sweep("a", "c", 30, weakest)]
+    for outcome in decide(consistent, STREETS, SETTINGS, model=MODEL):
+        assert outcome.decision.agreement.ambiguity == 0
+    contradicting = [a_in_b, b_in_c, sweep("a", "c", 50, weakest)]
+    for outcome in decide(contradicting, STREETS, SETTINGS, model=MODEL):
+        assert outcome.decision.agreement.ambiguity == (1.0 if copies else 0.0)
+
+
 def test_streets_that_a_session_itself_has_twice_are_ambiguous() -> None:
     rows = [in_street(k, k) for k in COPIED] + [in_street(k, k + 40, target="a") for k in COPIED]
     for a in decide(rows, STREETS, SETTINGS, model=MODEL):
