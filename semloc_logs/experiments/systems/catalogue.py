@@ -68,7 +68,8 @@ def entries(names: Iterable[str] = ()) -> list[Entry]:
     for name in chosen:
         if name not in known:
             raise SettingsError(
-                f"Unknown system '{name}'{did_you_mean(name, known)}: there are {', '.join(known)}."
+                f"Unknown system '{name}'.{did_you_mean(name, known)} "
+                f"There are {', '.join(known) or 'none'}."
             )
     return [known[name] for name in dict.fromkeys(chosen)]
 
