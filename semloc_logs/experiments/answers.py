@@ -238,7 +238,7 @@ class Answers:
     """The answers of one system to one scenario, queries (q,) by name, ranks (r,) to MOST_POSES.
 
     ``errors_m``, ``errors_deg`` (q, r) are infinite, ``score`` (q, r) is -inf and ``positions`` (q,
-    r, 3) are NaN where there is no pose. ``truth`` (q, 3) are the true positions, ``trial`` (q,)
+    r, 3) are NaN where a pose is missing. ``truth`` (q, 3) are the true positions, ``trial`` (q,)
     names of trials, ``passage`` (q,), ``cpu_s`` (q,); ``fit_cpu_s`` in all.
     """
 

@@ -189,7 +189,7 @@ def run_systems(
     stores: Mapping[str, ViewStore],
     scenarios: Mapping[str, Sequence[Scenario]],
 ) -> PaperFiles:
-    """Answer what is open, then write the tables and figures of all answers."""
+    """Answer the open queries, then write the tables and figures of all answers."""
     answers = request.folder / "answers"
     rows = []
     for entry in chosen:

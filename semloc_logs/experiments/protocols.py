@@ -146,7 +146,7 @@ class RegistrationFigures(NamedTuple):
 
 
 def registration_figures(error_m: F64, error_deg: F64, passage: I64) -> RegistrationFigures:
-    """The figures of poses with these errors (n,): infinite where there is no pose."""
+    """The figures of poses with these errors (n,): infinite where it is missing."""
     right = (error_m < SUCCESS_M) & (error_deg < SUCCESS_DEG)
     mean = float(error_m[right].mean()) if right.any() else float("nan")
     turn = float(error_deg[right].mean()) if right.any() else float("nan")

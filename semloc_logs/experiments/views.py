@@ -125,7 +125,7 @@ class ViewStore(Sequence[View]):
     def of_session(self, name: str) -> I64:
         """Numbers of the views of a session whose true pose is known."""
         if name not in self.names:
-            raise WorkspaceError(f"There is no session {name}: there are {', '.join(self.names)}.")
+            raise WorkspaceError(f"Session {name} is not there: there are {', '.join(self.names)}.")
         return np.flatnonzero((self.session_of == self.names.index(name)) & self.known)
 
     def selection(self, numbers: Iterable[int] | I64) -> ViewSelection:
