@@ -27,6 +27,10 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
     return lengths
 
 
+def _names(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in value.split(",") if name.strip())
+
+
 @click.command(cls=Command)
 @click.argument("name", metavar="NAME")
 @click.argument("logs", metavar="[LOG]...", nargs=-1, type=click.Path(path_type=Path))
@@ -76,6 +80,36 @@ def _lengths(_: click.Context, __: click.Parameter, value: str) -> tuple[int, ..
     help="Folder that keeps the simulated streets, for retrieval, completion, scaling and"
     " localisation.",
 )
+@click.option("--quick", is_flag=True, help="A small scene in under ten minutes, for paper.")
+@click.option(
+    "--systems",
+    metavar="NAME,...",
+    default="",
+    callback=_names,
+    help="Systems instead of all, for paper.",
+)
+@click.option(
+    "--sensors",
+    metavar="NAME,...",
+    default="",
+    callback=_names,
+    help="lidar or stereo instead of both, for paper.",
+)
+@click.option(
+    "--scenarios",
+    metavar="NAME,...",
+    default="",
+    callback=_names,
+    help="Scenarios instead of all, such as 0,90,180, for paper.",
+)
+@path_option("-o", "--output", help="Folder of the run, for paper.  [default: paper]")
+@click.option(
+    "-j",
+    "--jobs",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Processes that simulate and fuse, for paper.  [default: the cores]",
+)
 @json_option
 @settings_options
 @console_options
@@ -91,6 +125,12 @@ def command(
     queries: int | None,
     picture: Path | None,
     work: Path | None,
+    quick: bool,
+    systems: tuple[str, ...],
+    sensors: tuple[str, ...],
+    scenarios: tuple[str, ...],
+    output: Path | None,
+    jobs: int | None,
     as_json: bool,
     settings: Resolved,
 ) -> int:
@@ -107,6 +147,9 @@ def command(
     weights beside random ones), labels (classes from geometry against recorded labels), realism
     (simulated sweeps beside labelled ones). Close other programs first: times are wall-clock.
 
+    paper runs the experiments of the paper with every system that it compares, on simulated drives
+    or on LOGs with --truth. It continues in its folder where it was interrupted.
+
     \b
     Example:  semloc benchmark reading --json
               semloc benchmark fusion --peer octomap=octomap/bin/python
@@ -116,7 +159,36 @@ def command(
               semloc benchmark realism labelled.mcap
               semloc benchmark retrieval --work streets --peer fpfh=open3d/bin/python
               semloc benchmark localisation --work city --peer kiss_matcher=kiss/bin/python
+              semloc benchmark paper --quick
+              semloc benchmark paper monday.mcap tuesday.bag --truth truth.json --systems paper
     """
+    if name == "paper":
+        from semloc_logs.experiments.paper import PaperRequest, run_paper
+        from semloc_logs.tables.table import read_json
+
+        with console.progress():
+            files = run_paper(
+                PaperRequest(
+                    settings,
+                    output or Path("paper"),
+                    systems,
+                    quick,
+                    logs,
+                    truth,
+                    queries,
+                    sensors,
+                    scenarios,
+                    jobs,
+                    console.note,
+                )
+            )
+        if as_json:
+            console.result_json(read_json(files.json))
+        else:
+            for path in (files.table, files.json, *files.figures, files.answers):
+                console.result(str(path))
+        return 0
+
     from semloc_logs.benchmarks.named import Request, run_named
 
     request = Request(

@@ -45,6 +45,7 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "report": ("report", "One page with maps, closures and reasons."),
     "export": ("export", "Poses, pose graph or map for other programs."),
     "simulate": ("simulate", "Drive logs through a procedural town, with truth."),
+    "import": ("import_dataset", "Public data sets -> logs with truth."),
     "train": ("train", "Learn the descriptor."),
     "vocabulary": ("vocabulary", "Learn the words."),
     "demo": ("demo", "Everything once, on two simulated sessions."),

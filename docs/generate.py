@@ -40,6 +40,7 @@ FILES_OF_TABLES = {  # table -> where it lies in a workspace
     "words": "sessions/NAME/words/",
     "ground": "sessions/NAME/ground.parquet",
     "blocks": "sessions/NAME/blocks/",
+    "answers": "PAPER/answers/system=NAME/SENSOR-SCENARIO/TRIAL-PART.parquet",
 }
 _FIGURE = re.compile(r"\{[^}]*\}")  # a place for a figure in a sentence
 LANGUAGES = {".msg": "text", ".proto": "protobuf", ".json": "json"}

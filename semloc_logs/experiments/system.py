@@ -32,9 +32,9 @@ class View:
     """What a drive saw at ``stamp_ns``.
 
     ``points`` (n, 3) metres in the base frame at that time, ``label`` (n,) classes of the label
-    space, ``origin`` (3,) or (n, 3) of the rays, ``odom_T_base`` (4, 4) by odometry, and
-    ``world_T_base`` (4, 4), the truth: systems may read it of the database, never of a query.
-    ``picture`` where a camera saw it.
+    space, ``origin`` (3,) or (n, 3) of the rays, ``odom_T_base`` (4, 4) by odometry with z up, and
+    ``world_T_base`` (4, 4), the truth: systems may read it of the database, never of a query, where
+    it is NaN. ``picture`` where a camera saw it.
     """
 
     session: str

@@ -102,7 +102,8 @@ class RosMessages:
     def _make(self, type_: str, **fields: Any) -> Any:
         return self._types[type_](**fields)
 
-    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+    def header(self, stamp_ns: int, frame_id: str) -> Any:
+        """A std_msgs/Header."""
         stamp = self._make(
             "builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9
         )
@@ -127,7 +128,7 @@ class RosMessages:
         pose = self._make(
             "geometry_msgs/msg/Transform", translation=self._vector(t), rotation=self._quaternion(q)
         )
-        header = self._header(stamp_ns, "base_link")
+        header = self.header(stamp_ns, "base_link")
         edge = self._make(
             "geometry_msgs/msg/TransformStamped",
             header=header,
@@ -145,7 +146,7 @@ class RosMessages:
 
     def picture(self, topic: str, stamp_ns: int, frame_id: str, format_: str, data: bytes) -> Made:
         kind = "sensor_msgs/msg/CompressedImage"
-        header = self._header(stamp_ns, frame_id)
+        header = self.header(stamp_ns, frame_id)
         return (
             topic,
             kind,
@@ -171,7 +172,7 @@ class RosMessages:
         )
         info = self._make(
             kind,
-            header=self._header(stamp_ns, frame_id),
+            header=self.header(stamp_ns, frame_id),
             width=size[0],
             height=size[1],
             distortion_model="plumb_bob",
@@ -203,7 +204,7 @@ class RosMessages:
         ]
         cloud = self._make(
             "sensor_msgs/msg/PointCloud2",
-            header=self._header(frame.stamp_ns, "lidar"),
+            header=self.header(frame.stamp_ns, "lidar"),
             height=1,
             width=len(points),
             fields=fields,
@@ -228,7 +229,7 @@ class RosMessages:
         )
         odometry = self._make(
             "nav_msgs/msg/Odometry",
-            header=self._header(stamp_ns, "odom"),
+            header=self.header(stamp_ns, "odom"),
             child_frame_id="base_link",
             pose=self._make("geometry_msgs/msg/PoseWithCovariance", pose=where, covariance=none),
             twist=self._make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
@@ -238,7 +239,7 @@ class RosMessages:
     def imu(self, stamp_ns: int, force: F64, rate: F64) -> Made:
         imu = self._make(
             "sensor_msgs/msg/Imu",
-            header=self._header(stamp_ns, "base_link"),
+            header=self.header(stamp_ns, "base_link"),
             orientation=self._quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
             orientation_covariance=np.array([-1.0] + [0.0] * 8),  # -1: without orientation
             angular_velocity=self._vector(rate),
@@ -252,7 +253,7 @@ class RosMessages:
         known = status >= 0
         fix = self._make(
             "sensor_msgs/msg/NavSatFix",
-            header=self._header(stamp_ns, "gnss"),
+            header=self.header(stamp_ns, "gnss"),
             status=self._make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
             latitude=float(geodetic[0]) if known else float("nan"),
             longitude=float(geodetic[1]) if known else float("nan"),

@@ -1,0 +1,263 @@
+"""`semloc benchmark paper`: every system on the same queries of every scenario.
+
+A folder keeps logs, maps, pictures, answers, and what systems have trained; a run that was
+interrupted continues there.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from semloc_logs.engines import Engine, make_engine
+from semloc_logs.errors import SemlocError, SettingsError
+from semloc_logs.experiments.answers import Run, answer_scenario, read_answers
+from semloc_logs.experiments.figure import draw_figure
+from semloc_logs.experiments.orderings import findings
+from semloc_logs.experiments.scenarios import (
+    Extent,
+    Scenario,
+    heading_scenario,
+    time_scenario,
+)
+from semloc_logs.experiments.sessions import (
+    SENSORS,
+    Recorded,
+    fused_views,
+    recorded_logs,
+    simulated_logs,
+)
+from semloc_logs.experiments.simulated_drives import (
+    AGAIN,
+    BACK,
+    MAP,
+    Town,
+    full_town,
+    quick_town,
+    time_session,
+)
+from semloc_logs.experiments.summary import Outcome, Row, to_json, to_markdown
+from semloc_logs.experiments.systems.catalogue import (
+    BASELINES,
+    MODULES,
+    Entry,
+    SystemOptions,
+    entries,
+    make_system,
+)
+from semloc_logs.experiments.versions import module_version
+from semloc_logs.experiments.views import ViewStore
+from semloc_logs.settings import Resolved
+from semloc_logs.tables.atomic_files import replacing_file
+from semloc_logs.tables.table import write_json
+
+HEADINGS_DEG = 0.0, 90.0, 180.0
+QUICK = Extent(per_passage=4, most=4)
+FULL = Extent(most=120)
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class PaperRequest:
+    """Which experiments: ``folder`` of the run; ``systems``: names, all without; ``quick``: a small
+    simulated scene; ``logs`` with their ``truth`` instead of simulated ones; ``queries``: the most
+    of a scenario; ``sensors`` and ``scenarios``: names, all without.
+    """
+
+    settings: Resolved
+    folder: Path
+    systems: Sequence[str] = ()
+    quick: bool = False
+    logs: Sequence[Path] = ()
+    truth: Path | None = None
+    queries: int | None = None
+    sensors: Sequence[str] = ()
+    scenarios: Sequence[str] = ()
+    jobs: int | None = None
+    note: Callable[[str], None] = lambda _: None
+
+
+@dataclass(frozen=True, slots=True)
+class PaperFiles:
+    """What a run has written."""
+
+    table: Path
+    json: Path
+    figures: list[Path] = field(default_factory=list)
+    answers: Path = Path()
+
+
+def run_paper(request: PaperRequest) -> PaperFiles:
+    """Run the experiments and write tables and figures.
+
+    SettingsError for unknown names, logs without truth; SemlocError when a log cannot be used. A
+    system that fails is a row that tells why, and the others go on.
+    """
+    chosen = entries(request.systems)
+    for name in request.sensors:
+        if name not in SENSORS:
+            raise SettingsError(f"Unknown sensor '{name}': there are {', '.join(SENSORS)}.")
+    if bool(request.logs) != (request.truth is not None):
+        raise SettingsError("Benchmark paper takes logs and --truth FILE, or neither.")
+    engine = make_engine("processes", request.jobs)
+    try:
+        stores, scenarios = _prepared(request, engine)
+    finally:
+        engine.close()
+    return run_systems(request, chosen, stores, scenarios)
+
+
+def _prepared(
+    request: PaperRequest, engine: Engine
+) -> tuple[dict[str, ViewStore], dict[str, list[Scenario]]]:
+    """The views and scenarios of every sensor."""
+    town: Town | None = None
+    if request.truth is not None:
+        recorded = recorded_logs(request.logs, request.truth)
+    else:
+        town = quick_town() if request.quick else full_town()
+        name = "quick" if request.quick else "full"
+        request.note(f"Simulating {len(town.drives)} drives ...")
+        recorded = simulated_logs(town, request.folder / "logs" / name, engine)
+    stores: dict[str, ViewStore] = {}
+    scenarios: dict[str, list[Scenario]] = {}
+    for sensor in request.sensors or SENSORS:
+        try:
+            stores[sensor] = _views(request, recorded, sensor, engine)
+        except SemlocError as problem:
+            if town is not None or len(request.sensors or SENSORS) == 1:
+                raise
+            request.note(f"No views by {sensor}: {problem}")
+            continue
+        scenarios[sensor] = _scenarios(request, stores[sensor], town)
+    if not stores:
+        raise SemlocError("None of the logs gave views: name their topics or another log.")
+    return stores, scenarios
+
+
+def _views(request: PaperRequest, recorded: Recorded, sensor: str, engine: Engine) -> ViewStore:
+    name = "quick" if request.quick else "full"
+    folder = request.folder / "maps" / ("own" if request.truth is not None else name)
+    return fused_views(recorded, sensor, folder, request.settings, engine)
+
+
+def _scenarios(request: PaperRequest, store: ViewStore, town: Town | None) -> list[Scenario]:
+    """The scenarios of a store: all sessions in all others where the logs are the user's."""
+    extent = QUICK if request.quick else FULL
+    if request.queries is not None:
+        extent = Extent(min(extent.per_passage, request.queries), request.queries)
+    if town is None:
+        database: Sequence[str] = store.names
+        queries: Sequence[str] = store.names
+        pairs = [
+            (f"{one}>{other}", one, other)
+            for one in store.names
+            for other in store.names
+            if one != other
+        ]
+    else:
+        database = [MAP]
+        queries = [AGAIN, BACK]
+        pairs = [
+            (
+                f"{one.name}>{other.name}",
+                time_session(one, is_query=False),
+                time_session(other, is_query=True),
+            )
+            for one in town.times
+            for other in town.times
+        ]
+    out = [heading_scenario(store, h, database, queries, extent) for h in HEADINGS_DEG]
+    out += [time_scenario(store, name, one, other, extent) for name, one, other in pairs]
+    wanted = set(request.scenarios)
+    unknown = wanted - {scenario.name for scenario in out}
+    if unknown:
+        raise SettingsError(
+            f"Unknown scenario '{min(unknown)}': "
+            f"there are {', '.join(scenario.name for scenario in out)}."
+        )
+    return [s for s in out if (not wanted or s.name in wanted) and s.trials]
+
+
+def run_systems(
+    request: PaperRequest,
+    chosen: Sequence[Entry],
+    stores: Mapping[str, ViewStore],
+    scenarios: Mapping[str, Sequence[Scenario]],
+) -> PaperFiles:
+    """Answer the open queries, then write the tables and figures of all answers."""
+    answers = request.folder / "answers"
+    rows = []
+    for entry in chosen:
+        row = Row(entry.name, entry.title, entry.remark)
+        for sensor, store in stores.items():
+            reason = _answer_all(request, entry, sensor, store, scenarios[sensor])
+            if reason:
+                row.not_run[sensor] = reason
+                request.note(f"{entry.title}, {sensor}: {reason}")
+            run = _run_of(entry, sensor)
+            for scenario in scenarios[sensor]:
+                found = read_answers(run, scenario, answers)
+                if len(found):
+                    row.answers[sensor, scenario.name] = found
+        rows.append(row)
+    known = {
+        (row.name, sensor, scenario): found
+        for row in rows
+        for (sensor, scenario), found in row.answers.items()
+    }
+    rivals = [entry.name for entry in BASELINES]
+    outcome = Outcome(rows, scenarios, stores, findings(known, rivals))
+    return _write(request.folder, outcome)
+
+
+def _run_of(entry: Entry, sensor: str) -> Run:
+    version = module_version(f"{MODULES}.{entry.made_by.partition(':')[0]}")
+    return Run(entry.name, sensor, entry.frames, version)
+
+
+def _answer_all(
+    request: PaperRequest,
+    entry: Entry,
+    sensor: str,
+    store: ViewStore,
+    scenarios: Sequence[Scenario],
+) -> str:
+    """Answer the open queries of a system; why it could not, or "" where it could."""
+    if entry.needs_pictures and not store.has_pictures:
+        return "it works on pictures, and the logs have no calibrated camera."
+    folder = request.folder / "systems" / entry.name
+    folder.mkdir(parents=True, exist_ok=True)
+    options = SystemOptions(request.settings, folder, request.quick)
+    run = _run_of(entry, sensor)
+    answers = request.folder / "answers"
+    try:
+        for scenario in scenarios:
+            make = partial(make_system, entry, options)
+            answer_scenario(run, scenario, store, answers, make)
+    except SemlocError as problem:
+        return str(problem)
+    except Exception as problem:  # one system must not end a run of hours
+        _log.exception("%s failed", entry.title)
+        return f"it failed: {type(problem).__name__}: {problem}"
+    return ""
+
+
+def _write(folder: Path, outcome: Outcome) -> PaperFiles:
+    """Tables and figures of a run."""
+    table = folder / "table.md"
+    with replacing_file(table) as temporary:
+        temporary.write_text(to_markdown(outcome), encoding="utf-8")
+    content = folder / "table.json"
+    write_json(content, to_json(outcome))
+    figures = []
+    for sensor in outcome.stores:
+        if any(s == sensor for row in outcome.rows for s, _ in row.answers):
+            path = folder / f"figure_{sensor}.png"
+            draw_figure(outcome, sensor, path)
+            figures.append(path)
+    return PaperFiles(table, content, figures, folder / "answers")

@@ -1,0 +1,290 @@
+"""The table of a run: a row a system, a column a scenario, in Markdown and JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.experiments.answers import Answers
+from semloc_logs.experiments.measures import (
+    THRESHOLDS_M,
+    Bounded,
+    abstaining,
+    localised,
+    median_within,
+    rank_recall,
+    ratio,
+)
+from semloc_logs.experiments.orderings import Finding
+from semloc_logs.experiments.protocols import (
+    LOOP_M,
+    Retrieval,
+    loop_figures,
+    nearest_frames,
+    pair_figures,
+    registration_figures,
+)
+from semloc_logs.experiments.scenarios import Scenario
+from semloc_logs.experiments.system import MOST_POSES
+from semloc_logs.experiments.views import ViewStore
+
+RANKS = (1, 5, 20, MOST_POSES)  # of the tables; the curves have all
+ALLOWED_FDR = 0.05  # share of wrong answers that an abstaining system may give
+
+
+@dataclass(eq=False)
+class Row:
+    """A system: ``name``, ``title``, its answers by sensor and scenario, and why it did not run."""
+
+    name: str
+    title: str
+    remark: str = ""
+    answers: dict[tuple[str, str], Answers] = field(default_factory=dict)
+    not_run: dict[str, str] = field(default_factory=dict)  # by sensor
+
+    @property
+    def cpu_hours(self) -> float:
+        """Of learning the databases and of all queries."""
+        seconds = sum(a.fit_cpu_s + float(a.cpu_s.sum()) for a in self.answers.values())
+        return seconds / 3600.0
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A whole run: ``rows`` of systems, ``scenarios`` and ``stores`` by sensor, ``findings``."""
+
+    rows: Sequence[Row]
+    scenarios: Mapping[str, Sequence[Scenario]]
+    stores: Mapping[str, ViewStore]
+    findings: Sequence[Finding]
+
+    def columns(self) -> list[tuple[str, str]]:
+        """Sensor and name of every scenario that has queries."""
+        return [
+            (sensor, scenario.name)
+            for sensor, scenarios in self.scenarios.items()
+            for scenario in scenarios
+            if scenario.trials
+        ]
+
+
+def figures_of(answers: Answers, scenario: Scenario, store: ViewStore) -> dict[str, Any]:
+    """Every measure of one system on one scenario."""
+    out: dict[str, Any] = {"queries": len(answers), "passages": len(np.unique(answers.passage))}
+    for threshold in THRESHOLDS_M:
+        curve = rank_recall(answers.errors_m, threshold)
+        out[f"within {threshold:g} m"] = {
+            **{
+                f"rank {rank}": _json(
+                    ratio(localised(answers.errors_m, threshold, rank), answers.passage)
+                )
+                for rank in RANKS
+            },
+            "rank-recall": [_number(value) for value in curve],
+            "median error": _number(median_within(answers.first_m, threshold)),
+        }
+    retrievals = retrievals_of(answers, scenario, store)
+    loops = loop_figures(retrievals)
+    pairs = pair_figures(retrievals)
+    has_loop = _has_loop(answers, scenario, store)
+    registered = registration_figures(
+        answers.first_m[has_loop], answers.errors_deg[has_loop, 0], answers.passage[has_loop]
+    )
+    right = localised(answers.errors_m, THRESHOLDS_M[-1])
+    careful = abstaining(answers.first_score, right, answers.passage, ALLOWED_FDR)
+    return out | {
+        "KITTI loops": {name: _number(value) for name, value in loops._asdict().items()},
+        "SSC pairs": {name: _number(value) for name, value in pairs._asdict().items()},
+        "registration": {
+            "success": _json(registered.success),
+            "translation_m": _number(registered.translation_m),
+            "rotation_deg": _number(registered.rotation_deg),
+        },
+        "abstaining": {
+            "allowed": ALLOWED_FDR,
+            "false_discovery": _json(careful.false_discovery),
+            "coverage": _json(careful.coverage),
+        },
+        "cpu_s": {
+            "query": _number(float(np.median(answers.cpu_s)) if len(answers) else math.nan),
+            "fit": answers.fit_cpu_s,
+        },
+    }
+
+
+def retrievals_of(answers: Answers, scenario: Scenario, store: ViewStore) -> list[Retrieval]:
+    """The answers as frames of the database, a trial each."""
+    out = []
+    place = store.world_T_base[:, :3, 3]
+    for trial in scenario.trials:
+        rows = answers.of_trial(trial.name)
+        if len(rows):
+            database = place[trial.database]
+            frame = nearest_frames(answers.positions[rows], database)
+            out.append(Retrieval(answers.truth[rows], database, frame, answers.score[rows]))
+    return out
+
+
+def _has_loop(answers: Answers, scenario: Scenario, store: ViewStore) -> NDArray[np.bool_]:
+    out = np.zeros(len(answers), bool)
+    place = store.world_T_base[:, :3, 3]
+    for trial in scenario.trials:
+        rows = answers.of_trial(trial.name)
+        away = np.linalg.norm(answers.truth[rows][:, None] - place[trial.database], axis=2)
+        out[rows] = away.min(axis=1, initial=np.inf) <= LOOP_M
+    return out
+
+
+def to_json(outcome: Outcome) -> dict[str, Any]:
+    """The whole run."""
+    by_name = {
+        sensor: {s.name: s for s in scenarios} for sensor, scenarios in outcome.scenarios.items()
+    }
+    return {
+        "scenarios": [
+            {
+                "sensor": sensor,
+                "scenario": scenario.name,
+                "queries": len(scenario.queries),
+                "passages": len({q.passage for q in scenario.queries}),
+                "databases": [len(t.database) for t in scenario.trials],
+            }
+            for sensor, scenarios in outcome.scenarios.items()
+            for scenario in scenarios
+        ],
+        "systems": [
+            {
+                "name": row.name,
+                "title": row.title,
+                "cpu_hours": row.cpu_hours,
+                "not_run": row.not_run,
+                "remark": row.remark,
+                "scenarios": {
+                    f"{sensor} {name}": figures_of(
+                        answers, by_name[sensor][name], outcome.stores[sensor]
+                    )
+                    for (sensor, name), answers in row.answers.items()
+                    if len(answers)
+                },
+            }
+            for row in outcome.rows
+        ],
+        "findings": [
+            {
+                "hypothesis": f.hypothesis,
+                "sensor": f.sensor,
+                "scenario": f.scenario,
+                "figure": None if f.figure is None else _json(f.figure),
+                "verdict": str(f.verdict),
+            }
+            for f in outcome.findings
+        ],
+    }
+
+
+def _json(value: Bounded) -> dict[str, float | None]:
+    return {name: _number(figure) for name, figure in value._asdict().items()}
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else float(value)
+
+
+# -- Markdown
+
+
+def to_markdown(outcome: Outcome) -> str:
+    """The tables of a run, hypotheses and remarks."""
+    columns = outcome.columns()
+    parts = ["# Experiments of the paper"]
+    for threshold in THRESHOLDS_M:
+        for rank, title in ((1, "first pose"), (MOST_POSES, f"first {MOST_POSES} poses")):
+            parts += [
+                f"## Localised within {threshold:g} m, {title}",
+                "Share of queries, with 95 % bounds over passages.",
+                _table(outcome, columns, threshold, rank),
+            ]
+    parts += ["## Time", _times(outcome), "## Orderings of the paper", _orderings(outcome)]
+    remarks = [f"- {row.title}: {row.remark}" for row in outcome.rows if row.remark]
+    reasons = [
+        f"- {row.title}, {sensor}: {reason}"
+        for row in outcome.rows
+        for sensor, reason in row.not_run.items()
+    ]
+    if remarks:
+        parts += ["## Remarks", "\n".join(remarks)]
+    if reasons:
+        parts += ["## Not run", "\n".join(reasons)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(
+    outcome: Outcome, columns: Sequence[tuple[str, str]], threshold: float, rank: int
+) -> str:
+    lines = [_line("", [f"{sensor} {name}" for sensor, name in columns])]
+    lines.append(_line("---", ["---"] * len(columns)))
+    counts = {
+        (sensor, scenario.name): len(scenario.queries)
+        for sensor, scenarios in outcome.scenarios.items()
+        for scenario in scenarios
+    }
+    lines.append(_line("queries", [str(counts[column]) for column in columns]))
+    for row in outcome.rows:
+        cells = []
+        for column in columns:
+            answers = row.answers.get(column)
+            if answers is None or not len(answers):
+                cells.append("not run" if column[0] in row.not_run else "")
+                continue
+            share = ratio(localised(answers.errors_m, threshold, rank), answers.passage)
+            open_ = "" if len(answers) == counts[column] else f" ({len(answers)} queries)"
+            cells.append(f"{_shown(share)}{open_}")
+        lines.append(_line(row.title, cells))
+    return "\n".join(lines)
+
+
+def _times(outcome: Outcome) -> str:
+    lines = [
+        _line("", ["CPU hours", "median CPU s of a query", "CPU s of the databases"]),
+        _line("---", ["---"] * 3),
+    ]
+    for row in outcome.rows:
+        spent = [a.cpu_s for a in row.answers.values() if len(a)]
+        median = f"{np.median(np.concatenate(spent)):.2f}" if spent else ""
+        fits = f"{sum(a.fit_cpu_s for a in row.answers.values()):.1f}" if spent else ""
+        hours = f"{row.cpu_hours:.3f}" if spent else ""
+        lines.append(_line(row.title, [hours, median, fits]))
+    return "\n".join(lines)
+
+
+def _orderings(outcome: Outcome) -> str:
+    lines = [
+        _line("hypothesis", ["sensor", "scenario", "figure", "verdict"]),
+        _line("---", ["---"] * 4),
+    ]
+    lines += [
+        _line(
+            f.hypothesis,
+            [
+                f.sensor,
+                f.scenario.replace("|", "/"),
+                "" if f.figure is None else _shown(f.figure),
+                str(f.verdict),
+            ],
+        )
+        for f in outcome.findings
+    ]
+    return "\n".join(lines)
+
+
+def _line(first: str, cells: Sequence[str]) -> str:
+    return "| " + " | ".join([first, *cells]) + " |"
+
+
+def _shown(value: Bounded) -> str:
+    return f"{value.value:.2f} [{value.low:.2f}, {value.high:.2f}]"

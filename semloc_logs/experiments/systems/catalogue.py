@@ -1,0 +1,93 @@
+"""The systems of the experiments by name. A module of a system is imported when it is needed, so
+that libraries of the extra ``baselines`` may be missing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from semloc_logs.errors import SettingsError, did_you_mean
+from semloc_logs.experiments.system import System
+from semloc_logs.settings import Resolved
+
+MODULES = "semloc_logs.experiments.systems"
+
+
+@dataclass(frozen=True, slots=True)
+class SystemOptions:
+    """With what a system is made: ``settings``; ``folder`` of its own, where it may keep what it
+    has trained; ``quick``: a small scene that must be done within a minute; ``seed``.
+    """
+
+    settings: Resolved
+    folder: Path
+    quick: bool = False
+    seed: int = 0
+
+
+MakeSystem = Callable[[SystemOptions], System]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A row of the table: ``name`` on the command line, ``title`` in figures, ``made_by``:
+    ``module:function`` below ``systems`` that takes :class:`SystemOptions`.
+
+    ``extra``: the optional dependencies that it needs; ``frames``: consecutive views of a query (5
+    for *acc.*); ``needs_pictures``: it works on pictures, and cannot run without a camera;
+    ``remark``: printed below the table.
+    """
+
+    name: str
+    title: str
+    made_by: str
+    extra: str = ""
+    frames: int = 1
+    needs_pictures: bool = False
+    remark: str = ""
+
+
+# our pipeline and the paper's plain method
+OURS: tuple[Entry, ...] = ()
+
+# the systems that the paper compares with, and the peers of today
+BASELINES: tuple[Entry, ...] = ()
+
+
+class NotInstalledError(SettingsError):
+    """A library of an extra is missing."""
+
+
+def entries(names: Iterable[str] = ()) -> list[Entry]:
+    """The entries called ``names``, all of them without names. SettingsError for an unknown one."""
+    known = {entry.name: entry for entry in (*OURS, *BASELINES)}
+    chosen = [*names] or [*known]
+    for name in chosen:
+        if name not in known:
+            raise SettingsError(
+                f"Unknown system '{name}'.{did_you_mean(name, known)} "
+                f"There are {', '.join(known) or 'none'}."
+            )
+    return [known[name] for name in dict.fromkeys(chosen)]
+
+
+def make_system(entry: Entry, options: SystemOptions) -> System:
+    """The system of an entry. NotInstalledError when its libraries are missing."""
+    module, _, function = entry.made_by.partition(":")
+    try:
+        make: MakeSystem = getattr(importlib.import_module(f"{MODULES}.{module}"), function)
+        return make(options)
+    except ModuleNotFoundError as problem:
+        if (problem.name or "").startswith("semloc_logs"):
+            raise
+        remedy = (
+            f"pip install 'semloc_logs[{entry.extra}]'"
+            if entry.extra
+            else f"install {problem.name}"
+        )
+        raise NotInstalledError(
+            f"{entry.title} needs {problem.name}, which is not installed: {remedy}."
+        ) from None

@@ -1,0 +1,58 @@
+"""The version of a system: a hash of its module and of everything of ours that it imports."""
+
+from __future__ import annotations
+
+import ast
+from functools import cache
+from pathlib import Path
+
+import semloc_logs
+from semloc_logs.benchmarks.versions import SUFFIXES, files_version
+
+_ROOT = Path(semloc_logs.__file__).parent
+_PACKAGE = "semloc_logs"
+
+
+def module_version(module: str) -> str:
+    """The version of a module, by its full name."""
+    return files_version(sorted(_files_of(module)))
+
+
+def _files_of(module: str) -> set[Path]:
+    """The files that a module consists of, directly and by its imports; data files of a package
+    such as weights count with its modules.
+    """
+    found: set[Path] = set()
+    left = [module]
+    while left:
+        path = _path(left.pop())
+        if path is None or path in found:
+            continue
+        found.add(path)
+        left += _imports(path)
+    folders = {path.parent for path in found} - {_ROOT}
+    data = {
+        file
+        for folder in folders
+        for file in folder.glob("*/*")
+        if file.suffix in SUFFIXES and file.suffix != ".py"
+    }
+    return found | data
+
+
+@cache
+def _imports(path: Path) -> tuple[str, ...]:
+    """The modules of ours that a file names, also inside functions."""
+    out = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            out += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            out += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return tuple(name for name in out if name.startswith(f"{_PACKAGE}."))
+
+
+def _path(module: str) -> Path | None:
+    """The file of a module of ours; None for a package or another name."""
+    path = _ROOT.joinpath(*module.split(".")[1:]).with_suffix(".py")
+    return path if path.is_file() else None
