@@ -54,7 +54,7 @@ class Entry:
 OURS: tuple[Entry, ...] = ()
 
 # the systems that the paper compares with, and the peers of today
-BASELINES: tuple[Entry, ...] = ()
+BASELINES: tuple[Entry, ...] = (Entry("fpfh", "FPFH", "fpfh:make_fpfh"),)
 
 
 class NotInstalledError(SettingsError):
