@@ -54,7 +54,13 @@ class Entry:
 OURS: tuple[Entry, ...] = ()
 
 # the systems that the paper compares with, and the peers of today
-BASELINES: tuple[Entry, ...] = (Entry("fpfh", "FPFH", "fpfh:make_fpfh"),)
+BASELINES: tuple[Entry, ...] = (
+    Entry("sift", "SIFT", "sift:make_sift", needs_pictures=True),
+    Entry("dsp-sift", "DSP-SIFT", "sift:make_dsp_sift", needs_pictures=True),
+    Entry("mser", "MSER + DSP-SIFT", "sift:make_mser", needs_pictures=True),
+    Entry("dense-vlad", "DenseVLAD", "dense_vlad:make_dense_vlad", needs_pictures=True),
+    Entry("fpfh", "FPFH", "fpfh:make_fpfh"),
+)
 
 
 class NotInstalledError(SettingsError):
