@@ -60,6 +60,13 @@ BASELINES: tuple[Entry, ...] = (
     Entry("mser", "MSER + DSP-SIFT", "sift:make_mser", needs_pictures=True),
     Entry("dense-vlad", "DenseVLAD", "dense_vlad:make_dense_vlad", needs_pictures=True),
     Entry("fpfh", "FPFH", "fpfh:make_fpfh"),
+    Entry("scan-context", "Scan Context + GICP", "scan_registration:make_scan_context"),
+    Entry(
+        "kiss-matcher",
+        "Scan Context + KISS-Matcher",
+        "scan_registration:make_kiss_matcher",
+        extra="baselines",
+    ),
 )
 
 

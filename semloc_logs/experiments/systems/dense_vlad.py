@@ -2,7 +2,7 @@
 
 A vocabulary of 128 words, residuals added up for each word (VLAD) and scaled to unit length, then
 the whole; principal components to 4096 dimensions, or as many as there are pictures. The database
-is compared exhaustively. Poses are those of the DSP-SIFT pipeline.
+is compared exhaustively. The DSP-SIFT pipeline finds the poses.
 """
 
 from __future__ import annotations

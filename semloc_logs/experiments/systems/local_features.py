@@ -20,7 +20,7 @@ LAYERS = 3  # scales in an octave
 PEAK = 0.02  # OpenCV divides it by the layers
 EDGE = 10.0
 FIRST_SIGMA = 1.6
-FIRST_OCTAVE, OCTAVES = -1, 4  # the first octave is that of the picture at twice its size
+FIRST_OCTAVE, OCTAVES = -1, 4  # the first octave holds the picture at twice its size
 DOMAINS = np.linspace(1 / 6, 3, 10)  # pooling scales of DSP-SIFT (Dong and Soatto, CVPR 2015)
 MOST_FEATURES = 4000  # of a picture, the strongest
 # the paper's step of 2, areas and variation are the defaults of a function that gives the step in

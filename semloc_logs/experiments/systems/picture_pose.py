@@ -70,7 +70,7 @@ def mutual_matches(a: F32, b: F32, places: F32) -> I64:
 
 
 def points_of(picture: Picture, xy: F32) -> F32:
-    """Points (n, 3) that the pixels ``xy`` (n, 2) show, base frame, NaN where there is no depth."""
+    """Points (n, 3) that the pixels ``xy`` (n, 2) show, base frame, NaN without depth."""
     height, width = picture.depth.shape
     near = np.argsort([dx * dx + dy * dy for dx in _WINDOW for dy in _WINDOW], kind="stable")
     depth = np.full(len(xy), np.nan, np.float32)

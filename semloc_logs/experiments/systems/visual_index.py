@@ -1,7 +1,7 @@
 """Retrieval of pictures by visual words with a Hamming embedding (Jegou et al. 2008) and burstiness
 weighting (Jegou et al. 2009), as section 4.4 has it for SIFT.
 
-The vocabulary is the same tree as that of the shapes: 256 x 256 words and 64 bits.
+The vocabulary is a tree of 256 x 256 words with 64 bits, as for shapes.
 """
 
 from __future__ import annotations
