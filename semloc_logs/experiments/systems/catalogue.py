@@ -58,6 +58,7 @@ BASELINES: tuple[Entry, ...] = (
     Entry("sift", "SIFT", "sift:make_sift", needs_pictures=True),
     Entry("dsp-sift", "DSP-SIFT", "sift:make_dsp_sift", needs_pictures=True),
     Entry("mser", "MSER + DSP-SIFT", "sift:make_mser", needs_pictures=True),
+    Entry("vip", "VIP", "ground_patches:make_vip", needs_pictures=True),
     Entry("dense-vlad", "DenseVLAD", "dense_vlad:make_dense_vlad", needs_pictures=True),
     Entry("fpfh", "FPFH", "fpfh:make_fpfh"),
     Entry("scan-context", "Scan Context + GICP", "scan_registration:make_scan_context"),
