@@ -61,6 +61,8 @@ BASELINES: tuple[Entry, ...] = (
     Entry("vip", "VIP", "ground_patches:make_vip", needs_pictures=True),
     Entry("dense-vlad", "DenseVLAD", "dense_vlad:make_dense_vlad", needs_pictures=True),
     Entry("fpfh", "FPFH", "fpfh:make_fpfh"),
+    Entry("cgf", "CGF", "spherical_histograms:make_cgf"),
+    Entry("3dmatch", "3DMatch", "distance_volumes:make_3dmatch"),
     Entry("scan-context", "Scan Context + GICP", "scan_registration:make_scan_context"),
     Entry(
         "kiss-matcher",

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.numerics.cells import by_cell
+from semloc_logs.experiments.systems.near_points import Cells, cells_of, neighbours
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -16,7 +16,6 @@ I64 = NDArray[np.int64]
 BINS = 11  # of each of the three angles
 SIZE = 3 * BINS
 SUM = 100.0  # of the bins of each angle
-NEAREST = 1e-6  # m: points nearer than this are one
 
 
 def feature_histograms(points: F64, normals: F64, keypoints: I64, radius: float) -> F32:
@@ -27,36 +26,9 @@ def feature_histograms(points: F64, normals: F64, keypoints: I64, radius: float)
     """
     if not len(points) or not len(keypoints):
         return np.zeros((len(keypoints), SIZE), np.float32)
-    low = points.min(0)
-    ijk = ((points - low) / radius).astype(np.int64)
-    shape = ijk.max(0) + 1
-    order, start = by_cell((ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2], shape.prod())
-    cells = (order, start.astype(np.int64), ijk, shape)
+    cells = cells_of(points, radius)
     simple = _simple_histograms(points, normals, cells, radius)
     return _weighted_sums(points, simple, cells, np.asarray(keypoints, np.int64), radius)
-
-
-@njit(cache=True, nogil=True)
-def _neighbours(
-    points: F64, cells: tuple[I64, I64, I64, I64], row: int, radius: float, out: I64
-) -> int:
-    """Rows of the points within ``radius`` of point ``row``, into ``out``; their number."""
-    order, start, ijk, shape = cells
-    count = 0
-    for i in range(max(ijk[row, 0] - 1, 0), min(ijk[row, 0] + 2, shape[0])):
-        for j in range(max(ijk[row, 1] - 1, 0), min(ijk[row, 1] + 2, shape[1])):
-            for k in range(max(ijk[row, 2] - 1, 0), min(ijk[row, 2] + 2, shape[2])):
-                cell = (i * shape[1] + j) * shape[2] + k
-                for place in range(start[cell], start[cell + 1]):
-                    other = order[place]
-                    dx = points[other, 0] - points[row, 0]
-                    dy = points[other, 1] - points[row, 1]
-                    dz = points[other, 2] - points[row, 2]
-                    far = dx * dx + dy * dy + dz * dz
-                    if NEAREST**2 < far < radius**2:
-                        out[count] = other
-                        count += 1
-    return count
 
 
 @njit(cache=True, nogil=True)
@@ -99,14 +71,12 @@ def _add_pair(p: F64, n: F64, q: F64, m: F64, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _simple_histograms(
-    points: F64, normals: F64, cells: tuple[I64, I64, I64, I64], radius: float
-) -> F64:
+def _simple_histograms(points: F64, normals: F64, cells: Cells, radius: float) -> F64:
     """Simplified histograms (n, 33) of the pairs of each point with its neighbours."""
     out = np.zeros((len(points), SIZE))
     near = np.empty(len(points), np.int64)
     for row in range(len(points)):
-        count = _neighbours(points, cells, row, radius, near)
+        count = neighbours(points, cells, row, radius, near)
         for other in near[:count]:
             _add_pair(points[row], normals[row], points[other], normals[other], out[row])
         _scale(out[row])
@@ -122,16 +92,14 @@ def _scale(histogram: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _weighted_sums(
-    points: F64, simple: F64, cells: tuple[I64, I64, I64, I64], keypoints: I64, radius: float
-) -> F32:
+def _weighted_sums(points: F64, simple: F64, cells: Cells, keypoints: I64, radius: float) -> F32:
     """The histogram of each keypoint and the mean of its neighbours', weighted by 1 / distance."""
     out = np.zeros((len(keypoints), SIZE), np.float32)
     near = np.empty(len(points), np.int64)
     total = np.empty(SIZE)
     for number in range(len(keypoints)):
         row = keypoints[number]
-        count = _neighbours(points, cells, row, radius, near)
+        count = neighbours(points, cells, row, radius, near)
         total[:] = 0.0
         for other in near[:count]:
             dx = points[other, 0] - points[row, 0]

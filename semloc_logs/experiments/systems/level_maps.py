@@ -59,6 +59,11 @@ def database_map(views: Iterable[View], settings: Resolved) -> LevelMap:
     return _fused(((view, view.world_T_base) for view in views), settings, np.inf)
 
 
+def view_map(view: View, settings: Resolved) -> LevelMap:
+    """The map of one view of the database in the world, as large as a query's."""
+    return _fused([(view, view.world_T_base)], settings, settings.query.radius)
+
+
 def query_map(query: Query, settings: Resolved) -> tuple[LevelMap, F64]:
     """The map of a query in its frame, within ``query.radius`` of the sensor, and ``query_T_base``
     (4, 4) of its last view.
