@@ -54,7 +54,23 @@ class Entry:
 OURS: tuple[Entry, ...] = ()
 
 # the systems that the paper compares with, and the peers of today
-BASELINES: tuple[Entry, ...] = ()
+BASELINES: tuple[Entry, ...] = (
+    Entry("sift", "SIFT", "sift:make_sift", needs_pictures=True),
+    Entry("dsp-sift", "DSP-SIFT", "sift:make_dsp_sift", needs_pictures=True),
+    Entry("mser", "MSER + DSP-SIFT", "sift:make_mser", needs_pictures=True),
+    Entry("vip", "VIP", "ground_patches:make_vip", needs_pictures=True),
+    Entry("dense-vlad", "DenseVLAD", "dense_vlad:make_dense_vlad", needs_pictures=True),
+    Entry("fpfh", "FPFH", "fpfh:make_fpfh"),
+    Entry("cgf", "CGF", "spherical_histograms:make_cgf"),
+    Entry("3dmatch", "3DMatch", "distance_volumes:make_3dmatch"),
+    Entry("scan-context", "Scan Context + GICP", "scan_registration:make_scan_context"),
+    Entry(
+        "kiss-matcher",
+        "Scan Context + KISS-Matcher",
+        "scan_registration:make_kiss_matcher",
+        extra="baselines",
+    ),
+)
 
 
 class NotInstalledError(SettingsError):

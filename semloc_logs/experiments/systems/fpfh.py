@@ -1,0 +1,45 @@
+"""FPFH in place of our descriptor: 33 dimensions, with the radius of our subvolumes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from semloc_logs.experiments.system import View
+from semloc_logs.experiments.systems.catalogue import SystemOptions
+from semloc_logs.experiments.systems.feature_histograms import feature_histograms
+from semloc_logs.experiments.systems.level_maps import LevelMap
+from semloc_logs.experiments.systems.shape_matching import (
+    STRIDE,
+    Described,
+    ShapeSystem,
+    keypoints_of,
+)
+from semloc_logs.mapping.selection import thin
+from semloc_logs.settings import Resolved
+from semloc_logs.subvolumes.cut import SIZE
+
+THINNED = 2.0  # voxels: of the cells that keep one point; with all it takes ten times as long
+
+
+class FeatureHistograms:
+    """FPFH of the centres of occupied voxels."""
+
+    turns = False
+
+    def fit(self, views: Sequence[View], settings: Resolved) -> None:
+        """Nothing is learnt."""
+
+    def describe(self, level_map: LevelMap, yaw: float) -> Described:
+        v = level_map.voxel_size
+        kept = thin(level_map.points, THINNED * v)
+        points = level_map.points[kept]
+        rows = keypoints_of(points, STRIDE * v)
+        histograms = feature_histograms(points, level_map.normals[kept], rows, SIZE / 2 * v)
+        return Described(points[rows], histograms.astype(np.float32))
+
+
+def make_fpfh(options: SystemOptions) -> ShapeSystem:
+    """FPFH in our pipeline."""
+    return ShapeSystem("fpfh", FeatureHistograms(), options.settings)

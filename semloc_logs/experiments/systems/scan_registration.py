@@ -1,0 +1,167 @@
+"""Peers of today on single scans: places by Scan Context, poses by generalised ICP (small_gicp) or
+by KISS-Matcher (Lim et al. 2025).
+
+Scan Context finds the place and the heading; the registration of the best places gives the pose.
+small_gicp and kiss-matcher are in the extra ``baselines``. Without small_gicp our own fit on points
+takes its part.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.icp import Step, align
+from semloc_logs.alignment.surface import surface_of
+from semloc_logs.benchmarks.peers.scan_context import nearest_contexts, scan_context
+from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
+from semloc_logs.experiments.systems.catalogue import SystemOptions
+from semloc_logs.experiments.systems.level_maps import level_points
+from semloc_logs.mapping.selection import thin
+from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+# target points, query points, start of target_T_query -> target_T_query and the score
+Register = Callable[[F64, F64, F64], tuple[F64, float]]
+KEPT_CELL = 0.2  # m: points of a scan are thinned to it
+GICP_CELL = 0.5  # m
+REACHES = (3.0, 1.0)  # m, of correspondences, one after the other
+KISS_VOXEL = 0.5  # m
+LEAST_KISS_INLIERS = 5
+GICP_CANDIDATES, KISS_CANDIDATES = 20, 10
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scan:
+    """A scan of the database: the file of its level points, and ``world_T_scan`` (4, 4)."""
+
+    path: Path
+    world_T_scan: F64
+
+
+class ScanSystem:
+    """The ``candidates`` best places of Scan Context, each registered."""
+
+    def __init__(self, name: str, register: Register, candidates: int) -> None:
+        self.name = name
+        self._register = register
+        self._candidates = candidates
+        self._folder = tempfile.TemporaryDirectory(prefix=f"semloc-{name}-")
+        self._scans: list[_Scan] = []
+        self._contexts: list[F64] = []
+
+    def fit(self, database: Sequence[View]) -> None:
+        self._scans = []
+        self._contexts = []
+        for number in range(len(database)):
+            view = database[number]
+            world_T_scan = level_pose(view.world_T_base)
+            points = _thinned(apply(inverse(world_T_scan) @ view.world_T_base, view.points))
+            path = Path(self._folder.name) / f"{number:06d}.npy"
+            np.save(path, points)
+            self._scans.append(_Scan(path, world_T_scan))
+            self._contexts.append(scan_context(points))
+
+    def localise(self, query: Query) -> list[RankedPose]:
+        points, query_T_base = level_points(query.views)
+        query_T_scan = level_pose(query_T_base)
+        scan = _thinned(apply(inverse(query_T_scan), points))
+        scan_T_base = inverse(query_T_scan) @ query_T_base
+        found = []
+        for number, yaw in nearest_contexts(scan_context(scan), self._contexts, self._candidates):
+            stored = self._scans[number]
+            pose, score = self._register(
+                np.load(stored.path).astype(np.float64),
+                scan.astype(np.float64),
+                yaw_transform(yaw),
+            )
+            if score > 0:
+                found.append(RankedPose(stored.world_T_scan @ pose @ scan_T_base, score))
+        return sorted(found, key=lambda pose: -pose.score)[:MOST_POSES]
+
+
+def level_pose(level_T_base: F64) -> F64:
+    """The pose (4, 4) of a base without its roll and pitch."""
+    yaw = float(np.arctan2(level_T_base[1, 0], level_T_base[0, 0]))
+    return yaw_transform(yaw, level_T_base[:3, 3])
+
+
+def _thinned(points: F64) -> F32:
+    kept = points.astype(np.float32)
+    return np.asarray(kept[thin(kept, KEPT_CELL)])
+
+
+def fit_on_points(target: F64, query: F64, start: F64) -> tuple[F64, float]:
+    """Our point-to-plane fit; the score is the share of points with a partner."""
+    kept = thin(query, GICP_CELL)
+    surface = surface_of(target, GICP_CELL)
+    fit = align(query[kept], surface, start, tuple(Step(reach, 30) for reach in REACHES))
+    return fit.target_T_query, fit.inliers
+
+
+def gicp() -> Register:
+    """Generalised ICP by small_gicp, or our own fit where that is not installed."""
+    try:
+        small_gicp = importlib.import_module("small_gicp")
+    except ModuleNotFoundError:
+        logger.warning("small_gicp is not installed: our own fit on points takes its part.")
+        return fit_on_points
+
+    def register(target: F64, query: F64, start: F64) -> tuple[F64, float]:
+        clouds = [
+            small_gicp.preprocess_points(points, downsampling_resolution=GICP_CELL, num_threads=1)
+            for points in (target, query)
+        ]
+        pose = start
+        for reach in REACHES:
+            fit = small_gicp.align(
+                clouds[0][0],
+                clouds[1][0],
+                clouds[0][1],
+                pose,
+                max_correspondence_distance=reach,
+                num_threads=1,
+                max_iterations=30,
+            )
+            pose = fit.T_target_source
+        return np.asarray(pose), fit.num_inliers / max(1, clouds[1][0].size())
+
+    return register
+
+
+def kiss_matcher() -> Register:
+    """KISS-Matcher, which takes no start; the score is the number of its inliers."""
+    library = importlib.import_module("kiss_matcher")
+
+    def register(target: F64, query: F64, start: F64) -> tuple[F64, float]:
+        matcher = library.KISSMatcher(library.KISSMatcherConfig(KISS_VOXEL))
+        found = matcher.estimate(query.astype(np.float32), target.astype(np.float32))
+        inliers = int(matcher.get_num_final_inliers())
+        if not found.valid or inliers < LEAST_KISS_INLIERS:
+            return start, 0.0
+        pose = np.eye(4)
+        pose[:3, :3] = np.asarray(found.rotation)
+        pose[:3, 3] = np.asarray(found.translation).ravel()
+        return pose, float(inliers)
+
+    return register
+
+
+def make_scan_context(options: SystemOptions) -> ScanSystem:
+    """Scan Context and generalised ICP."""
+    return ScanSystem("scan-context", gicp(), GICP_CANDIDATES)
+
+
+def make_kiss_matcher(options: SystemOptions) -> ScanSystem:
+    """Scan Context and KISS-Matcher."""
+    return ScanSystem("kiss-matcher", kiss_matcher(), KISS_CANDIDATES)

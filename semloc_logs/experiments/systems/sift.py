@@ -1,0 +1,22 @@
+"""SIFT, DSP-SIFT and MSER + DSP-SIFT of section 4.4, each with a vocabulary of its own."""
+
+from __future__ import annotations
+
+from semloc_logs.experiments.systems.catalogue import SystemOptions
+from semloc_logs.experiments.systems.local_features import dsp_sift, mser_dsp_sift, sift
+from semloc_logs.experiments.systems.picture_matching import PictureSystem, WordRetrieval
+
+
+def make_sift(options: SystemOptions) -> PictureSystem:
+    """SIFT."""
+    return PictureSystem("sift", sift, WordRetrieval())
+
+
+def make_dsp_sift(options: SystemOptions) -> PictureSystem:
+    """SIFT points with descriptors pooled over domain sizes."""
+    return PictureSystem("dsp-sift", dsp_sift, WordRetrieval())
+
+
+def make_mser(options: SystemOptions) -> PictureSystem:
+    """Maximally stable extremal regions with DSP-SIFT."""
+    return PictureSystem("mser", mser_dsp_sift, WordRetrieval())

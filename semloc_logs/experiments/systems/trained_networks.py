@@ -1,0 +1,39 @@
+"""Networks of the baselines: trained once for each database, and kept in a file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from semloc_logs.experiments.system import View
+from semloc_logs.tables.atomic_files import replacing_file
+
+
+def key_of(views: Sequence[View], *settings: object) -> str:
+    """A key of the views that something is learnt from, and of how."""
+    content = hashlib.sha256(repr(settings).encode())
+    for number in range(len(views)):
+        view = views[number]
+        content.update(f"{view.session} {view.stamp_ns} {view.world_T_base.tobytes()!r}".encode())
+    return content.hexdigest()[:16]
+
+
+def trained(path: Path, network: nn.Module, train: Callable[[], None]) -> None:
+    """Load the weights of ``network`` from the file ``path``, or ``train`` it and write them."""
+    torch.set_num_threads(1)
+    try:
+        network.load_state_dict(load_file(path))
+    except (OSError, SafetensorError, RuntimeError):
+        network.train()
+        train()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing_file(path) as temporary:
+            weights = {name: value.contiguous() for name, value in network.state_dict().items()}
+            save_file(weights, temporary)
+    network.eval()
