@@ -52,7 +52,7 @@ class _GivenLabels:
 
 def sensor_centre(view: View) -> NDArray[np.float32]:
     """The centre (3,) of the sensors of a view, base frame."""
-    return np.asarray(view.origin, np.float32).reshape(-1, 3).mean(0)
+    return np.asarray(np.mean(np.reshape(view.origin, (-1, 3)), axis=0), np.float32)
 
 
 def fuse_views(

@@ -50,8 +50,9 @@ def street() -> Scene:
     builder.add(box(120.0, 120.0, 1.0, z=-1.0), ROAD, ground="none")
     for side in (-1, 1):
         for x in np.cumsum(rng.uniform(6, 16, 8)) - 44:
-            size = rng.uniform(3, 9, 3)
-            builder.add(box(*size, x=x, y=side * (10 + size[1] / 2)), BUILDING, ground="none")
+            length, width, height = rng.uniform(3, 9, 3)
+            house = box(length, width, height, x=x, y=side * (10 + width / 2))
+            builder.add(house, BUILDING, ground="none")
             tree = ellipsoid((1.2, 1.2, rng.uniform(1.5, 2.5)), z=rng.uniform(2.5, 4))
             builder.add(
                 place(tree, x + rng.uniform(4, 6), side * rng.uniform(5, 8)),
