@@ -5,30 +5,150 @@ max-pooling, and a fully connected layer with tanh; mean and log-variance of the
 The decoder is its mirror image: a fully connected layer with tanh, a convolution, then four times
 upsampling by repetition and convolution, and a softmax at the end. The channels of Fig. 2 are not
 in the paper's text: these give 0.92 million parameters, and the paper has "around one million".
+
+The first and the last block, at full resolution, are computed in other ways that give the same
+numbers: one-hot voxels times a filter is a row of the filter, and most neighbourhoods hold nothing
+but unobserved voxels; a repeated voxel meets sums of a filter's weights.
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
+import numpy as np
 import torch
+from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semloc_logs.subvolumes.cut import CLASSES, SIZE
-from semloc_logs.subvolumes.network import LATENT, Describer, Network, channels_last, max_pool
+from semloc_logs.subvolumes.network import (
+    LATENT,
+    Describer,
+    Network,
+    as_volumes,
+    channels_last,
+    max_pool,
+    space_to_depth,
+)
 
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
 CHANNELS = (8, 16, 32, 64)
+FIRST = CHANNELS[0]
 CORNER = 2  # voxels along an edge after four poolings
 HIDDEN = CHANNELS[-1] * CORNER**3
+USUAL_CELL = 255  # marks a cell whose neighbourhood holds the usual code alone
+# of a filter along one axis, which weights a repeated voxel meets: [parity, coarse tap, fine tap]
+REPEATED = ((((1, 0, 0), (0, 1, 1), (0, 0, 0))), (((0, 0, 0), (1, 1, 0), (0, 0, 1))))
 
 
-def one_hot(codes: Tensor, inputs: int) -> Tensor:
-    """Codes (b, x, y, z) uint8 as ``inputs`` channels (b, inputs, x, y, z), channels last."""
-    reduced = torch.is_autocast_enabled("cpu") and not codes.is_cuda
-    dtype = torch.get_autocast_dtype("cpu") if reduced else torch.float32
-    table = torch.eye(inputs, dtype=dtype, device=codes.device)
-    return F.embedding(codes.int(), table).permute(0, 4, 1, 2, 3)
+@njit(cache=True, nogil=True)
+def first_block(codes: U8, table: F32, bias: F32, usual: int, out: F32, largest: U8) -> None:
+    """Convolution, ReLU and max-pooling of one-hot voxels.
+
+    ``codes`` (b, 34, 34, 34) have a margin of a code whose rows of ``table`` (27, codes, FIRST) are
+    zero. ``out`` is (b, 16, 16, 16, FIRST), ``largest`` of its shape gets the voxel of each cell
+    that has the maximum, or ``USUAL_CELL``.
+    """
+    of_usual = bias.copy()
+    for tap in range(27):
+        for c in range(FIRST):
+            of_usual[c] += table[tap, usual, c]
+    for c in range(FIRST):
+        of_usual[c] = max(of_usual[c], np.float32(0))
+    total = np.empty(FIRST, np.float32)
+    for b in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            for y in range(out.shape[2]):
+                for z in range(out.shape[3]):
+                    cell = codes[b, 2 * x : 2 * x + 4, 2 * y : 2 * y + 4, 2 * z : 2 * z + 4]
+                    same = True
+                    for i in range(4):
+                        for j in range(4):
+                            for k in range(4):
+                                same &= cell[i, j, k] == usual
+                        if not same:
+                            break
+                    best = out[b, x, y, z]
+                    if same:
+                        best[:] = of_usual
+                        largest[b, x, y, z, :] = USUAL_CELL
+                        continue
+                    best[:] = np.float32(0)
+                    largest[b, x, y, z, :] = 0
+                    for voxel in range(8):
+                        i = voxel >> 2
+                        j = (voxel >> 1) & 1
+                        k = voxel & 1
+                        total[:] = bias
+                        for tap in range(27):
+                            row = table[tap, cell[i + tap // 9, j + tap // 3 % 3, k + tap % 3]]
+                            for c in range(FIRST):
+                                total[c] += row[c]
+                        for c in range(FIRST):
+                            if total[c] > best[c]:
+                                best[c] = total[c]
+                                largest[b, x, y, z, c] = voxel
+
+
+@njit(cache=True, nogil=True)
+def first_block_gradient(
+    codes: U8, out: F32, largest: U8, gradient: F32, usual: int, of_table: F32, of_bias: F32
+) -> None:
+    """Add the gradients of the table and of the bias to ``of_table`` and ``of_bias``."""
+    of_usual = np.zeros(FIRST, np.float32)
+    for b in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            for y in range(out.shape[2]):
+                for z in range(out.shape[3]):
+                    cell = codes[b, 2 * x : 2 * x + 4, 2 * y : 2 * y + 4, 2 * z : 2 * z + 4]
+                    for c in range(FIRST):
+                        if out[b, x, y, z, c] <= 0:
+                            continue
+                        g = gradient[b, x, y, z, c]
+                        voxel = largest[b, x, y, z, c]
+                        of_bias[c] += g
+                        if voxel == USUAL_CELL:
+                            of_usual[c] += g
+                            continue
+                        i = voxel >> 2
+                        j = (voxel >> 1) & 1
+                        k = voxel & 1
+                        for tap in range(27):
+                            code = cell[i + tap // 9, j + tap // 3 % 3, k + tap % 3]
+                            of_table[tap, code, c] += g
+    for tap in range(27):
+        for c in range(FIRST):
+            of_table[tap, usual, c] += of_usual[c]
+
+
+class _FirstBlock(torch.autograd.Function):
+    """:func:`first_block` of codes (b, 32, 32, 32) with its gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, codes: Tensor, table: Tensor, bias: Tensor, usual: int) -> Tensor:
+        inputs = table.shape[1]
+        padded = np.full((len(codes), *(SIZE + 2,) * 3), inputs, np.uint8)
+        padded[:, 1:-1, 1:-1, 1:-1] = codes.numpy()
+        rows = F.pad(table.float(), (0, 0, 0, 1)).contiguous()  # the margin adds nothing
+        half = SIZE // 2
+        out = np.empty((len(codes), half, half, half, FIRST), np.float32)
+        largest = np.empty(out.shape, np.uint8)
+        first_block(padded, rows.numpy(), bias.float().numpy(), usual, out, largest)
+        ctx.kept = (padded, out, largest, usual, rows.shape)
+        return torch.from_numpy(out).permute(0, 4, 1, 2, 3)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, Tensor, None]:
+        padded, out, largest, usual, shape = ctx.kept
+        gradient = grads[0].float().permute(0, 2, 3, 4, 1).contiguous().numpy()
+        of_table = np.zeros(shape, np.float32)
+        of_bias = np.zeros(FIRST, np.float32)
+        first_block_gradient(padded, out, largest, gradient, usual, of_table, of_bias)
+        return None, torch.from_numpy(of_table[:, :-1].copy()), torch.from_numpy(of_bias), None
 
 
 class PlainEncoder(Describer):
@@ -45,11 +165,23 @@ class PlainEncoder(Describer):
         self.mean = nn.Linear(HIDDEN, latent)
         self.log_variance = nn.Linear(HIDDEN, latent)
 
+    def first_features(self, codes: Tensor) -> Tensor:
+        """The first block of codes (b, 32, 32, 32) uint8, (b, FIRST, 16, 16, 16)."""
+        first = self.blocks[0]
+        if codes.is_cuda:
+            voxels = F.one_hot(codes.long(), self.inputs).to(first.weight.dtype)
+            return F.relu(max_pool(first(voxels.permute(0, 4, 1, 2, 3))))
+        table = first.weight.permute(2, 3, 4, 1, 0).reshape(27, self.inputs, FIRST)
+        looked_up: Tensor = _FirstBlock.apply(  # type: ignore[no-untyped-call]
+            codes, table, first.bias, CLASSES[self.variant] + 1
+        )
+        return looked_up
+
     def features(self, codes: Tensor) -> Tensor:
         """The last hidden layer (b, HIDDEN)."""
         x, y = ((length - SIZE) // 2 for length in codes.shape[1:3])
-        voxels = one_hot(codes[:, x : x + SIZE, y : y + SIZE], self.inputs)
-        for block in self.blocks:
+        voxels = self.first_features(codes[:, x : x + SIZE, y : y + SIZE])
+        for block in self.blocks[1:]:
             voxels = F.relu(max_pool(block(voxels)))
         return torch.tanh(self.hidden(voxels.flatten(1)))
 
@@ -59,7 +191,10 @@ class PlainEncoder(Describer):
 
 
 class PlainDecoder(nn.Module):
-    """Latent code (b, latent) -> logits (b, L + 2, 32, 32, 32) of a subvolume."""
+    """Latent code (b, latent) -> logits (L + 2, 8, b, 16, 16, 16) of a subvolume.
+
+    The subvolume is ``space_to_depth``, the eight moved to the front.
+    """
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
         super().__init__()
@@ -70,11 +205,42 @@ class PlainDecoder(nn.Module):
 
     def forward(self, code: Tensor) -> Tensor:
         x: Tensor = torch.tanh(self.start(code)).reshape(-1, CHANNELS[-1], CORNER, CORNER, CORNER)
-        x = self.first(x.contiguous(memory_format=torch.channels_last_3d))
-        for block in self.blocks:
-            x = F.relu(x)
-            x = block(x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4))
-        return x
+        x = F.relu(self.first(x.contiguous(memory_format=torch.channels_last_3d)))
+        for block in self.blocks[:-1]:
+            x = x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4)
+            x = F.relu(block(x))
+        x = repeated_convolution(x, self.blocks[-1].weight, self.blocks[-1].bias)
+        b, channels, *cells = x.shape
+        columns: Tensor = _Transposed.apply(  # type: ignore[no-untyped-call]
+            x.permute(0, 2, 3, 4, 1).reshape(-1, channels)
+        )
+        return columns.reshape(-1, 8, b, *cells)
+
+
+def repeated_convolution(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Convolution of ``x`` repeated twice along each axis, before it is (b, 8 * outputs, ...).
+
+    Of the 2x2x2 voxels that a voxel is repeated to, each has a filter of its own. Channel
+    ``8 * output + voxel`` is of such a voxel.
+    """
+    repeated = torch.tensor(REPEATED, dtype=weight.dtype, device=weight.device)
+    of_each = torch.einsum(
+        "pai,qbj,rck,oxijk->opqrxabc", repeated, repeated, repeated, weight
+    ).flatten(0, 3)
+    of_each = of_each.contiguous(memory_format=torch.channels_last_3d)
+    return F.conv3d(x, of_each, bias.repeat_interleave(8), padding=1)
+
+
+class _Transposed(torch.autograd.Function):
+    """The transpose of a matrix in memory, copied block by block, and of its gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor) -> Tensor:
+        return matrix.contiguous().t().contiguous()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return grads[0].contiguous().t().contiguous()
 
 
 class PlainCompletion(Network):
@@ -90,13 +256,13 @@ class PlainCompletion(Network):
         channels_last(self)
 
     def arranged(self, states: Tensor) -> Tensor:
-        return states
+        return space_to_depth(states).movedim(-1, 0)
 
     def volumes(self, logits: Tensor) -> Tensor:
-        return logits.transpose(0, 1)
+        return as_volumes(logits)
 
     def forward(self, codes: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits (L + 2, b, 32, 32, 32) of the middle subvolume of ``codes`` (b, x, y, 32).
+        """Logits of the middle subvolume of ``codes`` (b, x, y, 32), as the decoder gives them.
 
         Also mu (b, latent, 1, 1) and log-variance (b, latent). Without ``noise`` (b, latent) the
         mean is decoded.
@@ -105,4 +271,4 @@ class PlainCompletion(Network):
         mu: Tensor = self.encoder.mean(features)
         log_variance: Tensor = self.encoder.log_variance(features).clamp(-8.0, 4.0)
         code = mu if noise is None else mu + noise * torch.exp(0.5 * log_variance)
-        return self.decoder(code).transpose(0, 1), mu[:, :, None, None], log_variance
+        return self.decoder(code), mu[:, :, None, None], log_variance

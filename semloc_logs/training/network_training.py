@@ -4,8 +4,8 @@ GPU, resumable from a checkpoint.
 Beside the paper's completion loss a contrastive term (InfoNCE over the batch) pulls the descriptor
 of an incomplete subvolume towards the descriptor of the complete one seen a little shifted and
 turned, which is what the database holds. Adam replaces ADADELTA because the shipped runs see few
-samples. With ``training.method=paper`` the network of the paper's Fig. 2 is trained as its supplement
-has it: single subvolumes, completion and prior alone, ADADELTA at a constant rate.
+samples. With ``training.method=paper`` the network of the paper's Fig. 2 is trained as its
+supplement has it: single subvolumes, completion and prior alone, ADADELTA at a constant rate.
 """
 
 from __future__ import annotations
