@@ -8,7 +8,7 @@ in the paper's text: these give 0.92 million parameters, and the paper has "arou
 
 The first and the last block, at full resolution, are computed in other ways that give the same
 numbers: one-hot voxels times a filter is a row of the filter, and most neighbourhoods hold nothing
-but unobserved voxels; a repeated voxel meets sums of a filter's weights.
+but free or but unobserved voxels; a repeated voxel meets sums of a filter's weights.
 """
 
 from __future__ import annotations
@@ -40,66 +40,88 @@ CHANNELS = (8, 16, 32, 64)
 FIRST = CHANNELS[0]
 CORNER = 2  # voxels along an edge after four poolings
 HIDDEN = CHANNELS[-1] * CORNER**3
-USUAL_CELL = 255  # marks a cell whose neighbourhood holds the usual code alone
+UNIFORM = 8  # and more mark cells whose neighbourhood is all free or all unobserved
 # of a filter along one axis, which weights a repeated voxel meets: [parity, coarse tap, fine tap]
 REPEATED = ((((1, 0, 0), (0, 1, 1), (0, 0, 0))), (((0, 0, 0), (1, 1, 0), (0, 0, 1))))
 
 
 @njit(cache=True, nogil=True)
-def first_block(codes: U8, table: F32, bias: F32, usual: int, out: F32, largest: U8) -> None:
+def first_block(codes: U8, table: F32, bias: F32, out: F32, largest: U8) -> None:
     """Convolution, ReLU and max-pooling of one-hot voxels.
 
-    ``codes`` (b, 34, 34, 34) have a margin of a code whose rows of ``table`` (27, codes, FIRST) are
-    zero. ``out`` is (b, 16, 16, 16, FIRST), ``largest`` of its shape gets the voxel of each cell
-    that has the maximum, or ``USUAL_CELL``.
+    ``codes`` (b, 34, 34, 34) have a margin of the code whose rows of ``table`` (27, codes, FIRST)
+    are zero, the last; before it are occupied of unknown class, unobserved and free. ``out`` is (b,
+    16, 16, 16, FIRST), ``largest`` of its shape gets the voxel of each cell that has the maximum,
+    or the uniform code of its neighbourhood plus ``UNIFORM``. Neighbourhoods are nearly uniform:
+    only the differences from free or unobserved space are added.
     """
-    of_usual = bias.copy()
-    for tap in range(27):
-        for c in range(FIRST):
-            of_usual[c] += table[tap, usual, c]
-    for c in range(FIRST):
-        of_usual[c] = max(of_usual[c], np.float32(0))
-    total = np.empty(FIRST, np.float32)
+    unobserved = table.shape[1] - 3
+    free = unobserved - 1
+    differences = np.empty((2, *table.shape), np.float32)
+    of_uniform = np.empty((2, FIRST), np.float32)
+    for u in range(2):
+        of_uniform[u] = bias
+        for tap in range(27):
+            of_uniform[u] += table[tap, free + u]
+            differences[u, tap] = table[tap] - table[tap, free + u]
+    total = np.empty((2, 2, 2, FIRST), np.float32)
     for b in range(out.shape[0]):
         for x in range(out.shape[1]):
             for y in range(out.shape[2]):
                 for z in range(out.shape[3]):
                     cell = codes[b, 2 * x : 2 * x + 4, 2 * y : 2 * y + 4, 2 * z : 2 * z + 4]
-                    same = True
+                    count_free = 0
+                    count_unobserved = 0
                     for i in range(4):
                         for j in range(4):
                             for k in range(4):
-                                same &= cell[i, j, k] == usual
-                        if not same:
-                            break
+                                count_free += cell[i, j, k] == free
+                                count_unobserved += cell[i, j, k] == unobserved
+                    u = int(count_unobserved > count_free)
                     best = out[b, x, y, z]
-                    if same:
-                        best[:] = of_usual
-                        largest[b, x, y, z, :] = USUAL_CELL
-                        continue
-                    best[:] = np.float32(0)
-                    largest[b, x, y, z, :] = 0
-                    for voxel in range(8):
-                        i = voxel >> 2
-                        j = (voxel >> 1) & 1
-                        k = voxel & 1
-                        total[:] = bias
-                        for tap in range(27):
-                            row = table[tap, cell[i + tap // 9, j + tap // 3 % 3, k + tap % 3]]
-                            for c in range(FIRST):
-                                total[c] += row[c]
+                    which = largest[b, x, y, z]
+                    if max(count_free, count_unobserved) == 64:
                         for c in range(FIRST):
-                            if total[c] > best[c]:
-                                best[c] = total[c]
-                                largest[b, x, y, z, c] = voxel
+                            best[c] = max(of_uniform[u, c], np.float32(0))
+                            which[c] = UNIFORM + u
+                        continue
+                    total[:] = of_uniform[u]
+                    _add_differences(cell, free + u, differences[u], total)
+                    for c in range(FIRST):
+                        best[c] = np.float32(0)
+                        which[c] = 0
+                        for voxel in range(8):
+                            value = total[voxel >> 2, (voxel >> 1) & 1, voxel & 1, c]
+                            if value > best[c]:
+                                best[c] = value
+                                which[c] = voxel
+
+
+@njit(cache=True, nogil=True)
+def _add_differences(cell: U8, uniform: int, difference: F32, total: F32) -> None:
+    """Add to ``total`` (2, 2, 2, FIRST) what the codes (4, 4, 4) around them differ by."""
+    for i in range(4):
+        for j in range(4):
+            for k in range(4):
+                code = cell[i, j, k]
+                if code == uniform:
+                    continue
+                for a in range(max(0, i - 2), min(1, i) + 1):
+                    for b in range(max(0, j - 2), min(1, j) + 1):
+                        for c in range(max(0, k - 2), min(1, k) + 1):
+                            row = difference[((i - a) * 3 + j - b) * 3 + k - c, code]
+                            into = total[a, b, c]
+                            for n in range(FIRST):
+                                into[n] += row[n]
 
 
 @njit(cache=True, nogil=True)
 def first_block_gradient(
-    codes: U8, out: F32, largest: U8, gradient: F32, usual: int, of_table: F32, of_bias: F32
+    codes: U8, out: F32, largest: U8, gradient: F32, of_table: F32, of_bias: F32
 ) -> None:
     """Add the gradients of the table and of the bias to ``of_table`` and ``of_bias``."""
-    of_usual = np.zeros(FIRST, np.float32)
+    free = of_table.shape[1] - 4
+    of_uniform = np.zeros((2, FIRST), np.float32)
     for b in range(out.shape[0]):
         for x in range(out.shape[1]):
             for y in range(out.shape[2]):
@@ -111,8 +133,8 @@ def first_block_gradient(
                         g = gradient[b, x, y, z, c]
                         voxel = largest[b, x, y, z, c]
                         of_bias[c] += g
-                        if voxel == USUAL_CELL:
-                            of_usual[c] += g
+                        if voxel >= UNIFORM:
+                            of_uniform[voxel - UNIFORM, c] += g
                             continue
                         i = voxel >> 2
                         j = (voxel >> 1) & 1
@@ -120,16 +142,16 @@ def first_block_gradient(
                         for tap in range(27):
                             code = cell[i + tap // 9, j + tap // 3 % 3, k + tap % 3]
                             of_table[tap, code, c] += g
-    for tap in range(27):
-        for c in range(FIRST):
-            of_table[tap, usual, c] += of_usual[c]
+    for u in range(2):
+        for tap in range(27):
+            of_table[tap, free + u] += of_uniform[u]
 
 
 class _FirstBlock(torch.autograd.Function):
     """:func:`first_block` of codes (b, 32, 32, 32) with its gradient."""
 
     @staticmethod
-    def forward(ctx: Any, codes: Tensor, table: Tensor, bias: Tensor, usual: int) -> Tensor:
+    def forward(ctx: Any, codes: Tensor, table: Tensor, bias: Tensor) -> Tensor:
         inputs = table.shape[1]
         padded = np.full((len(codes), *(SIZE + 2,) * 3), inputs, np.uint8)
         padded[:, 1:-1, 1:-1, 1:-1] = codes.numpy()
@@ -137,18 +159,18 @@ class _FirstBlock(torch.autograd.Function):
         half = SIZE // 2
         out = np.empty((len(codes), half, half, half, FIRST), np.float32)
         largest = np.empty(out.shape, np.uint8)
-        first_block(padded, rows.numpy(), bias.float().numpy(), usual, out, largest)
-        ctx.kept = (padded, out, largest, usual, rows.shape)
+        first_block(padded, rows.numpy(), bias.float().numpy(), out, largest)
+        ctx.kept = (padded, out, largest, rows.shape)
         return torch.from_numpy(out).permute(0, 4, 1, 2, 3)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, Tensor, None]:
-        padded, out, largest, usual, shape = ctx.kept
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, Tensor]:
+        padded, out, largest, shape = ctx.kept
         gradient = grads[0].float().permute(0, 2, 3, 4, 1).contiguous().numpy()
         of_table = np.zeros(shape, np.float32)
         of_bias = np.zeros(FIRST, np.float32)
-        first_block_gradient(padded, out, largest, gradient, usual, of_table, of_bias)
-        return None, torch.from_numpy(of_table[:, :-1].copy()), torch.from_numpy(of_bias), None
+        first_block_gradient(padded, out, largest, gradient, of_table, of_bias)
+        return None, torch.from_numpy(of_table[:, :-1].copy()), torch.from_numpy(of_bias)
 
 
 class PlainEncoder(Describer):
@@ -172,9 +194,7 @@ class PlainEncoder(Describer):
             voxels = F.one_hot(codes.long(), self.inputs).to(first.weight.dtype)
             return F.relu(max_pool(first(voxels.permute(0, 4, 1, 2, 3))))
         table = first.weight.permute(2, 3, 4, 1, 0).reshape(27, self.inputs, FIRST)
-        looked_up: Tensor = _FirstBlock.apply(  # type: ignore[no-untyped-call]
-            codes, table, first.bias, CLASSES[self.variant] + 1
-        )
+        looked_up: Tensor = _FirstBlock.apply(codes, table, first.bias)  # type: ignore[no-untyped-call]
         return looked_up
 
     def features(self, codes: Tensor) -> Tensor:
