@@ -30,6 +30,7 @@ from semloc_logs.subvolumes.network import (
     Completion,
     Decoder,
     Encoder,
+    Network,
     P4Convolution,
     channels_last,
     latent_mean,
@@ -158,7 +159,7 @@ class _AblatedCompletion(Completion):
         channels_last(self)
 
 
-def _optimiser(row: Row) -> Callable[[Completion], torch.optim.Optimizer]:
+def _optimiser(row: Row) -> Callable[[Network], torch.optim.Optimizer]:
     if row.adam:
         return lambda model: torch.optim.Adam(model.parameters(), lr=1.5e-3)
     return lambda model: torch.optim.Adadelta(model.parameters(), lr=1.0, rho=0.95, eps=1e-8)

@@ -37,7 +37,7 @@ FLAGS = {  # options that are short for a setting
     "scenes": "training.scenes",
     "seed": "training.seed",
 }
-DUMPED = {"work", "config", "assignments", *FLAGS}  # options that --dump-config looks at
+DUMPED = {"work", "config", "assignments", "method", *FLAGS}  # options that --dump-config looks at
 
 
 class Command(click.Command):
@@ -201,7 +201,9 @@ def settings_options(
     def with_settings(*args: Any, dump_config: bool, **options: Any) -> Any:
         settings = _settled(options, use)
         given = settings.resolved() if is_resolved else settings
-        rest = {k: v for k, v in options.items() if k not in {"config", "assignments", *FLAGS}}
+        rest = {
+            k: v for k, v in options.items() if k not in {"config", "assignments", "method", *FLAGS}
+        }
         return function(*args, settings=given, **rest)
 
     return with_settings
@@ -219,7 +221,7 @@ def _settings(options: Mapping[str, Any]) -> Settings:
     }
     if options.get("seg_model") is not None:
         assignments.setdefault("labels.source", "onnx")
-    return load(options.get("config"), assignments, os.environ)
+    return load(options.get("config"), assignments, os.environ, options.get("method"))
 
 
 def _settled(options: Mapping[str, Any], use: Use) -> Settings:
@@ -255,6 +257,15 @@ def _yaml_value(value: object) -> str:
         .removesuffix("...\n")
         .strip()
     )
+
+
+def method_option(function: Function) -> Function:
+    """--method, a settings file of the package that --config and --set change."""
+    return click.option(
+        "--method",
+        type=click.Choice(["paper"]),
+        help="Settings of a method: paper is the paper's, as written.",
+    )(function)
 
 
 def given_settings_options(function: Function) -> Function:

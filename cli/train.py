@@ -17,6 +17,7 @@ from .options import (
     console_options,
     engine_options,
     json_option,
+    method_option,
     path_option,
     tables_settings_options,
 )
@@ -70,6 +71,7 @@ if TYPE_CHECKING:
 @json_option
 @engine_options
 @tables_settings_options
+@method_option
 @console_options
 def command(
     variant: str,

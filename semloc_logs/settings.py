@@ -19,11 +19,12 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from semloc_logs.errors import SettingsError, did_you_mean
+from semloc_logs.schemas import names, read_text
 
 STREET_VOXEL = 0.30
 # sections that the tables of a workspace depend on, and settings in them that change no table
 TABLE_SECTIONS = ("fusion", "labels", "descriptor", "query", "closures")
-OF_MACHINE = frozenset({"logs.memory", "labels.threads"})
+OF_MACHINE = frozenset({"logs.memory", "labels.threads", "training.method"})
 MOST_VOXELS = 1000
 _UNIT = 1e-2  # of a quaternion's squared length, off 1: people write few digits
 _MOST_BYTES = 1 << 20  # of a YAML file
@@ -374,6 +375,11 @@ class Optimize(_Section):
 class Training(_Section):
     """The encoder-decoder's training (supplement 1)."""
 
+    method: Literal["ours", "paper"] = Field(
+        "ours",
+        description="ours; paper: the network of the paper's Fig. 2, on single subvolumes, with"
+        " ADADELTA",
+    )
     samples: int = Field(250_000, ge=32, description="subvolumes seen, nine of each cut pair")
     scenes: int = Field(
         60, ge=1, description="simulated scenes that pairs are cut from, when no session is given"
@@ -404,6 +410,35 @@ class Training(_Section):
         description="standard deviation of the incomplete view's vertical, per axis (rad)",
     )
     seed: int = 0
+
+
+class Plain(_Section):
+    """The paper's method as written, in the experiments (paper 3, 4.2 and supplement 1)."""
+
+    headings: int = Field(
+        18, ge=1, description="uniformly spaced yaw hypotheses; a query is described in each"
+    )
+    stride: int = Field(
+        8, ge=1, description="subvolumes every so many voxels along x, y and z (not in the paper)"
+    )
+    min_occupied: int = Field(
+        1, ge=1, description="subvolumes with fewer occupied voxels are not described"
+    )
+    neighbours: int = Field(5, ge=1, description="nearest database words of each query word (K)")
+    kappa: float = Field(
+        3.0, gt=0, description="greatest distance of aligned voxels (m at 0.30 m voxels)"
+    )
+    min_tau: float = Field(
+        0.3, ge=0, le=1, description="poses with a smaller share of aligned voxels are left out"
+    )
+    refined: int = Field(
+        100,
+        ge=1,
+        description="best hypotheses that the iterative closest points refine (the paper: all)",
+    )
+    iterations: int = Field(
+        10, ge=0, description="of the iterative closest points at most (not in the paper)"
+    )
 
 
 class ResolvedFusion(Fusion):
@@ -454,6 +489,7 @@ class Settings(_Section):
     closures: Closures = Closures()
     optimize: Optimize = Optimize()
     training: Training = Training()
+    plain: Plain = Plain()
 
     def resolved(self) -> Resolved:
         """The same settings with every ``None`` length filled in from the voxel size, and absolute
@@ -610,11 +646,13 @@ def load(
     file: Path | None = None,
     assignments: Mapping[str, str] | None = None,
     environment: Mapping[str, str] | None = None,
+    method: str | None = None,
 ) -> Settings:
-    """Settings from defaults < ``file`` (YAML) < ``environment`` < ``assignments`` (``key.path`` ->
-    YAML value).
+    """Settings from defaults < ``method`` < ``file`` (YAML) < ``environment`` < ``assignments``
+    (``key.path`` -> YAML value).
 
-    Raises SettingsError naming the key when it is unknown or its value impossible.
+    A ``method`` is a settings file of the package (schemas/methods). Raises SettingsError naming
+    the key when it is unknown or its value impossible.
     """
     merged: dict[str, Any] = {}
     if file is not None:
@@ -625,12 +663,25 @@ def load(
             )
         # a section may be empty
         merged = {str(k): {} if v is None else v for k, v in (content or {}).items()}
+    if method is not None:
+        for section, values in _method(method).items():
+            given = merged.setdefault(section, {})
+            merged[section] = {**values, **given} if isinstance(given, dict) else given
     for name, value in (environment or {}).items():
         if name.startswith("SEMLOC_") and "__" in name:
             _assign(merged, name[len("SEMLOC_") :].lower().replace("__", "."), value)
     for key, value in (assignments or {}).items():
         _assign(merged, key, value)
     return validated(merged)
+
+
+def _method(name: str) -> dict[str, dict[str, Any]]:
+    """The sections of a named method; SettingsError for another name."""
+    known = names("methods", ".yaml")
+    if name not in known:
+        raise SettingsError(f"Unknown method '{name}': there are {', '.join(known)}.")
+    content: dict[str, dict[str, Any]] = _from_yaml(read_text(f"methods/{name}.yaml"))
+    return content
 
 
 def validated(content: Mapping[str, Any]) -> Settings:

@@ -51,7 +51,9 @@ def tau(
     low = low - margin
     x, y, z = (-(-(high - low + margin) // CUBE) * CUBE).tolist()
     dense = target.dense(low, (x, y, z))
-    closest = _closest_observed(dense, _observed_cubes(dense), points, low, _cubes(reach), reach)
+    closest = _closest_observed(
+        dense, _observed_cubes(dense), points, low, cube_offsets(reach), reach
+    )
     table = np.arange(256, dtype=np.uint8) if coarse is None else coarse
     occupied = (closest != UNOBSERVED_STATE) & (closest != FREE_STATE)
     aligned = int((occupied & (table[closest] == table[label])).sum())
@@ -108,7 +110,7 @@ def _observed_cubes(state: U8) -> U64:
 
 
 @lru_cache(maxsize=4)
-def _cubes(reach: float) -> tuple[I64, F64]:
+def cube_offsets(reach: float) -> tuple[I64, F64]:
     """Offsets (n, 3) of the cubes that may have a cell within ``reach`` cells, and how near (n,).
 
     The point is in the middle cube. ``least`` (n,) are the squares of the least distances that a
@@ -132,7 +134,7 @@ def _closest_observed(
 
     It is unobserved where none is within reach. The grid begins at cell ``low`` (3,) and has a
     margin of twice ``reach`` and four cells on all sides; :func:`_observed_cubes` makes ``cubes``
-    and :func:`_cubes` ``offsets``.
+    and :func:`cube_offsets` ``offsets``.
     """
     out = np.full(len(points), UNOBSERVED_STATE, np.uint8)
     margin = int(reach) + 1
@@ -196,14 +198,14 @@ def _closest_around(
         az = max(oz, -oz - CUBE + 1, 0.0)
         if ax * ax + ay * ay + az * az >= best:
             continue
-        best, bit = _closest_bit(observed, (ox, oy, oz), best)
+        best, bit = closest_bit(observed, (ox, oy, oz), best)
         if bit >= 0:
             found = state[CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3)]
     return found
 
 
 @njit(cache=True, nogil=True)
-def _closest_bit(
+def closest_bit(
     observed: np.uint64, first: tuple[float, float, float], best: float
 ) -> tuple[float, int]:
     """Squared distance and bit of the closest ``observed`` cell nearer than ``best``; else -1.

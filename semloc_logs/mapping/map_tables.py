@@ -9,15 +9,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs import progress
-from semloc_logs.labels.labeller import Labeller
+from semloc_logs.labels.camera_labels import PointLabels
 from semloc_logs.labels.space import SKY
-from semloc_logs.labels.sweep_ground import ground_surface
+from semloc_logs.labels.sweep_ground import GroundSurface, ground_surface
 from semloc_logs.mapping.ground import GroundMapper, ground_height, write_ground
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.selection import road_distance, submap_ranges
@@ -45,6 +45,23 @@ VIEW = 24.0  # m at voxels of 0.30 m: as far as a query looks
 PROGRESS_EVERY = 50  # keyframes
 
 
+class LabelGiver(Protocol):
+    """Gives the points of keyframes their classes, as a ``Labeller`` does."""
+
+    @property
+    def source(self) -> str: ...
+
+    def labels(
+        self,
+        keyframe: int,
+        points: NDArray[np.floating],
+        origin: NDArray[np.floating],
+        labels: PointLabels | None,
+        scale: float,
+        ground: GroundSurface | None = None,
+    ) -> NDArray[np.uint8]: ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelSession:
     """The keyframes of session ``name``, with the pose of each in its map.
@@ -54,7 +71,7 @@ class LevelSession:
 
     name: str
     collected: Collected
-    labeller: Labeller
+    labeller: LabelGiver
     map_T_base: F64
     fusion: ResolvedFusion
     metadata: dict[str, Any]

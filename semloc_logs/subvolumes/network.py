@@ -153,7 +153,14 @@ def look_up_cells(codes: U8, table: F32, bias: F32, usual: int, out: F32) -> Non
                         out[b, i, j, m, c] = max(total[c], np.float32(0))
 
 
-class Encoder(nn.Module):
+class Describer(nn.Module):
+    """The part of a network that describes: codes (b, x, y, 32) -> mu (b, latent, i, j)."""
+
+    variant: str
+    latent: int
+
+
+class Encoder(Describer):
     """Codes (b, x, y, 32) with a margin of 8 voxels in x and y -> mu of the subvolumes.
 
     mu is (b, latent, (x - 40) / 8, (y - 40) / 8), codes are uint8. Output (i, j) describes the
@@ -303,14 +310,42 @@ def channels_last(module: nn.Module) -> None:
             parameter.data = parameter.data.contiguous(memory_format=layouts[parameter.ndim])
 
 
-class Completion(nn.Module):
-    """Encoder and decoder, as they are trained; the ``encoder`` alone describes."""
+class Network(nn.Module):
+    """An encoder and a decoder, as they are trained; the ``encoder`` alone describes.
+
+    :meth:`forward` takes codes (b, 80, 80, 32) and noise (b, latent) or None; it gives the logits
+    of the middle subvolumes, mu (b, latent, i, j) and the middle's log-variance (b, latent).
+    """
+
+    encoder: Describer
+    decoder: nn.Module
+
+    def arranged(self, states: Tensor) -> Tensor:
+        """Voxel states (b, 32, 32, 32) in the order of the logits, which have classes before it."""
+        raise NotImplementedError
+
+    def volumes(self, logits: Tensor) -> Tensor:
+        """Logits of :meth:`forward` as (b, L + 2, 32, 32, 32)."""
+        raise NotImplementedError
+
+
+class Completion(Network):
+    """Our encoder and decoder."""
+
+    encoder: Encoder
+    decoder: Decoder
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
         super().__init__()
         self.encoder = Encoder(variant, latent)
         self.decoder = Decoder(variant, latent)
         channels_last(self)
+
+    def arranged(self, states: Tensor) -> Tensor:
+        return space_to_depth(states).movedim(-1, 0)
+
+    def volumes(self, logits: Tensor) -> Tensor:
+        return as_volumes(logits)
 
     def complete(self, codes: Tensor) -> Tensor:
         """Logits (b, L + 2, 32, 32, 32) of the middle subvolumes of ``codes`` (b, 64, 64, 32).

@@ -13,13 +13,13 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from semloc_logs.errors import SettingsError
-from semloc_logs.subvolumes.network import Completion
+from semloc_logs.subvolumes.network import Network
 from semloc_logs.tables.atomic_files import replacing_file
 
-Network = TypeVar("Network", bound=nn.Module)
+Loaded = TypeVar("Loaded", bound=nn.Module)
 
 
-def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
+def save_weights(path: Path, model: Network, card: dict[str, str]) -> None:
     """The network in bf16 with a model card in the file's metadata."""
     tensors = {
         k: v.to("cpu", torch.bfloat16).contiguous()
@@ -31,8 +31,8 @@ def save_weights(path: Path, model: Completion, card: dict[str, str]) -> None:
 
 
 def load_weights(
-    build: Callable[[str, int], Network], part: str, variant: str, weights: Path | None = None
-) -> Network:
+    build: Callable[[str, int], Loaded], part: str, variant: str, weights: Path | None = None
+) -> Loaded:
     """The network that ``build(variant, latent)`` makes, with shipped weights or weights of a file.
 
     ``part`` is ``encoder.`` for the encoder alone, empty for all. SettingsError when the file does

@@ -57,7 +57,7 @@ def _plan(number: int, samples: int, shards: int, training: Training) -> list[tu
     """
     draw = np.random.default_rng((training.seed, number))
     parts = max(FIRST_SCENES, training.batch)
-    window = scene_window(samples, shards)
+    window = scene_window(samples, shards, training.method)
     rounds = [draw.permutation(window) for _ in range(-(-parts // len(window)))]
     scenes = np.concatenate(rounds)[:parts]
     return list(zip(scenes.tolist(), draw.integers(1 << 16, size=parts).tolist(), strict=True))
@@ -144,14 +144,14 @@ def _drawn(pool: Sequence[Pairs], training: Training, step: int) -> _Drawn:
     a, b, c = (
         np.stack([pool[s][k][r] for s, r in zip(scenes, rows, strict=True)]) for k in range(3)
     )
-    return _Drawn(
-        (a, b, c), int(rng.integers(4)), bool(rng.integers(2)), int(rng.integers(1 << 62))
-    )
+    quarter = int(rng.integers(4))
+    mirror = bool(rng.integers(2)) and training.method == "ours"
+    return _Drawn((a, b, c), quarter, mirror, int(rng.integers(1 << 62)))
 
 
 def _turned(drawn: _Drawn, training: Training, device: str) -> Batch:
     """The batch where the network runs; quarter turns and mirror images of the whole triple are as
-    good as new streets.
+    good as new streets. The paper turns, and does not mirror.
     """
     views = (torch.from_numpy(view).to(device) for view in drawn.views)
     a, b, c = (torch.rot90(v.flip(1) if drawn.mirror else v, drawn.quarter, (1, 2)) for v in views)

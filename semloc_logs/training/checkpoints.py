@@ -4,7 +4,6 @@ weights, written and read.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +14,13 @@ from torch import Tensor
 
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Training
-from semloc_logs.subvolumes.network import Completion
+from semloc_logs.subvolumes.network import Network
 from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.training.schedule import plateau_end, steps_of
 
 
 def save_checkpoint(
-    path: Path, model: Completion, optimiser: torch.optim.Optimizer, training: Training, step: int
+    path: Path, model: Network, optimiser: torch.optim.Optimizer, training: Training, step: int
 ) -> None:
     """What :func:`resume` needs to go on after ``step`` steps."""
     tensors = {f"model.{k}": v.contiguous() for k, v in model.state_dict().items()}
@@ -40,9 +39,7 @@ def save_checkpoint(
         save_file(tensors, temporary, metadata=note)
 
 
-def resume(
-    path: Path, model: Completion, optimiser: torch.optim.Optimizer, training: Training
-) -> int:
+def resume(path: Path, model: Network, optimiser: torch.optim.Optimizer, training: Training) -> int:
     """Put ``model`` and ``optimiser`` back to where the checkpoint was written; the number of steps
     done.
 
@@ -54,8 +51,9 @@ def resume(
         tensors = load_file(path)
         step = int(note["step"])
         same_network = note.get("variant", model.encoder.variant) == model.encoder.variant
+        before = Training.model_validate_json(note["training"])  # settings may be new since
         same = same_network and _goes_on(
-            json.loads(note["training"]), training.model_dump(mode="json"), step
+            before.model_dump(mode="json"), training.model_dump(mode="json"), step
         )
     except (OSError, SafetensorError, KeyError, ValueError) as problem:
         raise WorkspaceError(

@@ -9,14 +9,14 @@ import torch
 from numpy.typing import NDArray
 
 from semloc_logs.subvolumes.cut import CLASSES, code_table
-from semloc_logs.subvolumes.network import Completion, as_volumes, descriptors
+from semloc_logs.subvolumes.network import Network, descriptors
 from semloc_logs.training.network_training import targets
 
 U8 = NDArray[np.uint8]
 
 
 @torch.inference_mode()
-def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, float]:
+def completion_scores(model: Network, pairs: tuple[U8, U8, U8]) -> dict[str, float]:
     """How well the subvolumes of a held-out shard are completed, beside the trivial answers, and
     found again.
 
@@ -37,9 +37,9 @@ def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, 
         part, whole, other = (a[i : i + 32] for a in pairs)
         codes = torch.from_numpy(table[part])
         logits, mu, _ = model(codes, None)
-        ours.append(descriptors(mu[:, :, 1:2, 1:2]))
-        theirs.append(descriptors(model.encoder(torch.from_numpy(table[other]))[:, :, 1:2, 1:2]))
-        completed = as_volumes(logits)[:, : classes + 1].argmax(1).numpy()
+        ours.append(descriptors(_middle(mu)))
+        theirs.append(descriptors(_middle(model.encoder(torch.from_numpy(table[other])))))
+        completed = model.volumes(logits)[:, : classes + 1].argmax(1).numpy()
         target, known = (
             t.numpy() for t in targets(torch.from_numpy(whole), torch.from_numpy(table), classes)
         )
@@ -65,3 +65,9 @@ def completion_scores(model: Completion, pairs: tuple[U8, U8, U8]) -> dict[str, 
         "iou": float((inter[occurs] / union[occurs]).mean()) if occurs.any() else 0.0,
         "recall5": float(recall),
     }
+
+
+def _middle(mu: torch.Tensor) -> torch.Tensor:
+    """Of the subvolumes (b, latent, i, j) the one in the middle, (b, latent, 1, 1)."""
+    i, j = (count // 2 for count in mu.shape[2:])
+    return mu[:, :, i : i + 1, j : j + 1]

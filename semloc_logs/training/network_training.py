@@ -3,8 +3,9 @@ GPU, resumable from a checkpoint.
 
 Beside the paper's completion loss a contrastive term (InfoNCE over the batch) pulls the descriptor
 of an incomplete subvolume towards the descriptor of the complete one seen a little shifted and
-turned, which is what the database holds; ``training.contrastive_weight=0`` is the paper. Adam
-replaces ADADELTA because the shipped runs see few samples.
+turned, which is what the database holds. Adam replaces ADADELTA because the shipped runs see few
+samples. With ``training.method=paper`` the network of the paper's Fig. 2 is trained as its
+supplement has it: single subvolumes, completion and prior alone, ADADELTA at a constant rate.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from torch.nn import functional as F
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.cut import CLASSES, code_table
-from semloc_logs.subvolumes.network import Completion, descriptors, space_to_depth
+from semloc_logs.subvolumes.network import Completion, Network, descriptors
+from semloc_logs.subvolumes.plain_network import PlainCompletion
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.batches import Batch, OutOfTime, batches
 from semloc_logs.training.checkpoints import resume, save_checkpoint
@@ -88,11 +90,11 @@ class _Losses:
 
 
 def _losses(
-    model: Completion, batch: Batch, noise: Tensor, table: Tensor, training: Training
+    model: Network, batch: Batch, noise: Tensor, table: Tensor, training: Training
 ) -> _Losses:
     classes = CLASSES[model.encoder.variant]
     device = noise.device.type
-    target, known = targets(space_to_depth(batch.complete).movedim(-1, 0), table, classes)
+    target, known = targets(model.arranged(batch.complete), table, classes)
     with torch.autocast(device, dtype=torch.bfloat16):
         logits, mu, log_variance = model(table[batch.incomplete.long()], noise)
         # the complete view is the goal; a gradient through it too would cost a third more
@@ -126,8 +128,37 @@ def _losses(
     return _Losses(total, reconstruction, contrastive, matched)
 
 
-def _adam(model: Completion) -> torch.optim.Optimizer:
+def _adam(model: Network) -> torch.optim.Optimizer:
     return torch.optim.Adam(model.parameters(), lr=RATE)
+
+
+def _adadelta(model: Network) -> torch.optim.Optimizer:
+    return torch.optim.Adadelta(model.parameters(), lr=1.0, rho=0.95, eps=1e-8)
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How the network of a method is made and stepped.
+
+    ``rate`` is the share of the optimiser's rate at a step of so many; gradients with a norm above
+    ``max_gradient`` are cut to it.
+    """
+
+    network: Callable[[str, int], Network]
+    optimiser: Callable[[Network], torch.optim.Optimizer]
+    rate: Callable[[int, int], float]
+    scaled: bool  # the rate, with the square root of the batch
+    max_gradient: float
+
+
+def _constant(step: int, steps: int) -> float:
+    return 1.0
+
+
+RECIPES = {
+    "ours": Recipe(Completion, _adam, learning_rate, True, MAX_GRADIENT),
+    "paper": Recipe(PlainCompletion, _adadelta, _constant, False, math.inf),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +168,7 @@ class TrainingRun:
     ``checkpoint`` is renewed every ``save_every`` steps. Training stops when the clock
     ``time.monotonic()`` passes ``deadline``. ``snapshots`` is a folder that gets the weights after
     1/32, 1/16, ... 1/2 of the steps, for a learning curve. On the ``device`` cuda the network is
-    compiled. Another ``network`` and ``optimiser`` are for comparison.
+    compiled. Another ``network`` and ``optimiser`` than the method's are for comparison.
     """
 
     checkpoint: Path
@@ -145,8 +176,8 @@ class TrainingRun:
     device: str = "cpu"
     deadline: float = math.inf
     snapshots: Path | None = None
-    network: Callable[[str, int], Completion] = Completion
-    optimiser: Callable[[Completion], torch.optim.Optimizer] = _adam
+    network: Callable[[str, int], Network] | None = None
+    optimiser: Callable[[Network], torch.optim.Optimizer] | None = None
 
     @property
     def plateau(self) -> Path:
@@ -160,7 +191,7 @@ def train(
     training: Training,
     run: TrainingRun,
     on_step: Callable[[Progress], None] = lambda _: None,
-) -> Completion | None:
+) -> Network | None:
     """Train from scratch or from the checkpoint of ``run``; returns the finished network.
 
     None, with a checkpoint from which the same call continues, when the time is over. ``shards``
@@ -174,15 +205,18 @@ def train(
             "There is nothing to train on: give sessions with keyframes, or scenes to simulate."
         )
     torch.manual_seed(training.seed)
-    model = run.network(variant, training.latent).to(run.device)
-    optimiser = run.optimiser(model)
+    recipe = RECIPES[training.method]
+    model = (run.network or recipe.network)(variant, training.latent).to(run.device)
+    optimiser = (run.optimiser or recipe.optimiser)(model)
     steps = steps_of(training)
     done = resume(run.checkpoint, model, optimiser, training) if run.checkpoint.exists() else 0
     if run.device == "cuda":
         model.encoder.compile()
         model.decoder.compile()
     table = torch.from_numpy(code_table(variant)).to(run.device)
-    rate = optimiser.defaults["lr"] * math.sqrt(training.batch / BATCH_OF_RATE)
+    rate = optimiser.defaults["lr"]
+    if recipe.scaled:
+        rate *= math.sqrt(training.batch / BATCH_OF_RATE)
     model.train()
     keeper = _Keeper(run, model, optimiser, training)
     coming = batches(shards, training, done, steps, run.device, deadline=run.deadline)
@@ -194,12 +228,12 @@ def train(
                 keeper.save(step)
             return None
         for group in optimiser.param_groups:
-            group["lr"] = rate * learning_rate(step, steps)
+            group["lr"] = rate * recipe.rate(step, steps)
         noise = _noise(training, step).to(run.device)
         losses = _losses(model, batch, noise, table, training)
         optimiser.zero_grad(set_to_none=True)
         losses.total.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(model.parameters(), MAX_GRADIENT)
+        torch.nn.utils.clip_grad_norm_(model.parameters(), recipe.max_gradient)
         optimiser.step()
 
         is_late = time.monotonic() >= run.deadline
@@ -221,7 +255,7 @@ class _Keeper:
     """Writes the checkpoints and snapshots of a training."""
 
     run: TrainingRun
-    model: Completion
+    model: Network
     optimiser: torch.optim.Optimizer
     training: Training
 

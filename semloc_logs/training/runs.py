@@ -77,7 +77,7 @@ def simulated_shards(
         _shard_folder(folder, "simulated", settings), settings.training.scenes, settings
     )
     count = len(tasks) - HELD_OUT if len(tasks) > HELD_OUT else len(tasks)
-    first = scene_window(samples, count).start
+    first = scene_window(samples, count, settings.training.method).start
     made = engine.map(make_shard, tasks[first:count])
     train = Growing(
         made, count, lambda n: note(f"scene {n} of {count}"), first=first, ahead=SCENES_AHEAD
@@ -183,7 +183,8 @@ def learn_descriptor(
     reporter = _Reporter(variant, settings.training.samples, note)
 
     def on_step(step: Progress) -> None:
-        shards.drop(scene_window(step.samples, len(shards.train)).start - SCENES_KEPT)
+        window = scene_window(step.samples, len(shards.train), settings.training.method)
+        shards.drop(window.start - SCENES_KEPT)
         reporter.take(step)
 
     model = train(variant, shards.train, settings.training, run, on_step)

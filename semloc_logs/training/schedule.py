@@ -6,24 +6,25 @@ import math
 
 from semloc_logs.settings import Training
 
-SAMPLES_A_PAIR = 9
+SAMPLES_A_PAIR = {"ours": 9, "paper": 1}
 WARM_UP = 50  # steps
 DECAY = 0.25  # share of the steps, the last ones, over which the rate falls
 LAST_RATE = 0.02  # of the full rate, at the last step
 FIRST_SCENES = 12  # in use from the first step on
-# a further scene comes into use after so many samples: about as many as its pairs hold
+# a further scene comes into use after so many samples, nine of a pair: about as many as its pairs
+# hold
 SAMPLES_A_SCENE = 4000
 WINDOW = 256  # scenes in use at most
 
 
 def steps_of(training: Training) -> int:
     """Steps of the whole training."""
-    return math.ceil(training.samples / (training.batch * SAMPLES_A_PAIR))
+    return math.ceil(training.samples / samples_after(1, training))
 
 
 def samples_after(steps: int, training: Training) -> int:
     """Samples seen in so many steps."""
-    return steps * training.batch * SAMPLES_A_PAIR
+    return steps * training.batch * SAMPLES_A_PAIR[training.method]
 
 
 def learning_rate(step: int, steps: int) -> float:
@@ -47,9 +48,10 @@ def plateau_end(steps: int) -> int:
     return steps - int(DECAY * steps)
 
 
-def scene_window(samples: int, scenes: int) -> range:
+def scene_window(samples: int, scenes: int, method: str = "ours") -> range:
     """Numbers of the scenes in use when ``samples`` samples have been seen, of ``scenes`` there
     are.
     """
-    newest = min(scenes, FIRST_SCENES + samples // SAMPLES_A_SCENE)
+    in_pairs = samples // SAMPLES_A_PAIR[method]
+    newest = min(scenes, FIRST_SCENES + in_pairs * SAMPLES_A_PAIR["ours"] // SAMPLES_A_SCENE)
     return range(max(0, newest - WINDOW), newest)

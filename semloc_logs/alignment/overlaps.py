@@ -1,0 +1,440 @@
+"""The paper's tau of very many hypotheses (3.5), equal to :mod:`semloc_logs.alignment.tau`.
+
+A query voxel is aligned where the observed target voxel closest to it is occupied, of its class,
+and nearer than kappa. Which voxel is closest depends on where in its cell a point lies only beside
+borders: for each cell a mask has the classes of all voxels that may be closest to a point in it. So
+one look-up gives bounds of tau; the closest voxel itself is looked for in hypotheses whose upper
+bound is among the best, and there only for voxels that the mask leaves open.
+
+Masks are made when a cell is looked at first. They lie in the blocks of the target and those
+around them, as numbers of a palette of masks, one byte a cell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.tau import CUBE, closest_bit, cube_offsets
+from semloc_logs.labels.space import UNLABELLED
+from semloc_logs.numerics.bits import lowest_bit
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
+from semloc_logs.voxels.keys import BLOCK, unpack
+
+U8 = NDArray[np.uint8]
+U32 = NDArray[np.uint32]
+U64 = NDArray[np.uint64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+F64 = NDArray[np.float64]
+CLASSES = 29  # class ids that have bits of their own; the paper has 19
+UNLABELLED_BIT = 29
+NOT_ALIGNED = np.uint32(1 << 31)  # free space, or nothing within kappa
+ANYTHING = np.uint32(0xFFFFFFFF)
+NOT_MADE, ANY_MASK = 0, 1  # numbers of the palette
+PALETTE = 256
+HALF_DIAGONAL = float(np.sqrt(0.75))  # of a cell, in cells
+CHUNK = 512  # voxels counted between two checks whether a hypothesis can be among the best
+CUBES = BLOCK // CUBE  # along the edge of a block
+# of a map, in the order of OverlapMap.arrays
+Arrays = tuple[I32, I64, U8, U64, U8, U32, float]
+Offsets = tuple[I64, F64]  # of cubes, and the squares of their least distances
+
+
+def class_bit(label: U8) -> U32:
+    """The bit of each class: one of ``CLASSES``, or of unlabelled voxels."""
+    number = np.where(label == UNLABELLED, UNLABELLED_BIT, label).astype(np.uint32)
+    if (number > UNLABELLED_BIT).any() or ((label >= CLASSES) & (label != UNLABELLED)).any():
+        raise ValueError(f"classes are below {CLASSES}")
+    return np.uint32(1) << number
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OverlapMap:
+    """A target's voxels by blocks, and the masks of its cells.
+
+    ``number`` (x, y, z) is the row of each block from block ``first`` (3,) on, -1 without one;
+    ``state`` (rows, 4096) has voxel states, ``observed`` (rows, 64) which cells of each cube are
+    observed; ``mask`` (rows, 4096) numbers of the ``palette``, made when needed. Points farther
+    than ``reach`` voxels from all observed ones are not aligned.
+    """
+
+    number: I32
+    first: I64
+    state: U8
+    observed: U64
+    mask: U8
+    palette: U32
+    reach: float
+
+    @property
+    def arrays(self) -> Arrays:
+        """All of it, for compiled functions."""
+        return (
+            self.number,
+            self.first,
+            self.state,
+            self.observed,
+            self.mask,
+            self.palette,
+            self.reach,
+        )
+
+
+def overlap_map(target: BlockMap, reach: float) -> OverlapMap:
+    """The map of a target, for a kappa of ``reach`` voxels."""
+    blocks = unpack(target.keys).astype(np.int64)
+    beside = int(np.ceil((reach + 2) / BLOCK))
+    first = blocks.min(0) - beside if len(blocks) else np.zeros(3, np.int64)
+    last = blocks.max(0) + beside if len(blocks) else np.zeros(3, np.int64)
+    number = np.full(tuple((last - first + 1).tolist()), -1, np.int32)
+    side = range(-beside, beside + 1)
+    for dx in side:
+        for dy in side:
+            for dz in side:
+                number[tuple((blocks - first + (dx, dy, dz)).T)] = -2
+    number[tuple((blocks - first).T)] = np.arange(len(blocks))
+    around = number == -2
+    rows = len(blocks) + int(around.sum())
+    number[around] = np.arange(len(blocks), rows)
+    state = np.full((rows, BLOCK**3), UNOBSERVED_STATE, np.uint8)
+    state[: len(blocks)] = target.state
+    observed = np.zeros((rows, CUBES**3), np.uint64)
+    _mark_observed(state[: len(blocks)], observed)
+    palette = np.zeros(PALETTE, np.uint32)
+    palette[ANY_MASK] = ANYTHING
+    return OverlapMap(
+        number, first, state, observed, np.zeros((rows, BLOCK**3), np.uint8), palette, reach
+    )
+
+
+@njit(cache=True, nogil=True)
+def _mark_observed(state: U8, observed: U64) -> None:
+    for row in range(len(state)):
+        for m in range(BLOCK**3):
+            if state[row, m] != UNOBSERVED_STATE:
+                x = m >> 8
+                y = (m >> 4) & 15
+                z = m & 15
+                cube = ((x >> 2) * CUBES + (y >> 2)) * CUBES + (z >> 2)
+                bit = ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)
+                observed[row, cube] |= np.uint64(1) << np.uint64(bit)
+
+
+@njit(cache=True, nogil=True)
+def _row_of(number: I32, first: I64, x: int, y: int, z: int) -> int:
+    """The row of the block that voxel (x, y, z) lies in, -1 without one."""
+    i = (x >> 4) - first[0]
+    j = (y >> 4) - first[1]
+    k = (z >> 4) - first[2]
+    if (
+        i < 0
+        or j < 0
+        or k < 0
+        or i >= number.shape[0]
+        or j >= number.shape[1]
+        or k >= number.shape[2]
+    ):
+        return -1
+    return number[i, j, k]
+
+
+@njit(cache=True, nogil=True)
+def _cell_of(x: int, y: int, z: int) -> int:
+    """The place of a voxel in its block."""
+    return ((x & 15) << 8) | ((y & 15) << 4) | (z & 15)
+
+
+@njit(cache=True, nogil=True)
+def _observed_cube(arrays: Arrays, x: int, y: int, z: int) -> np.uint64:
+    """The observed cells of the cube (x, y, z), in cubes."""
+    row = _row_of(arrays[0], arrays[1], x << 2, y << 2, z << 2)
+    if row < 0:
+        return np.uint64(0)
+    return arrays[3][row, (((x & 3) << 2) | (y & 3)) << 2 | (z & 3)]
+
+
+@njit(cache=True, nogil=True)
+def _closest(
+    arrays: Arrays, point: tuple[float, float, float], offsets: Offsets, bound: float
+) -> tuple[float, int, int, int]:
+    """Squared distance and voxel of the observed voxel whose centre is closest to ``point``.
+
+    Only those nearer than ``bound`` (squared) count; without one the distance is ``bound``.
+    """
+    offset, least = offsets
+    cx = int(np.floor(point[0])) >> 2
+    cy = int(np.floor(point[1])) >> 2
+    cz = int(np.floor(point[2])) >> 2
+    best = bound
+    found = (0, 0, 0)
+    for m in range(len(offset)):
+        if least[m] >= best:
+            break
+        x = cx + offset[m, 0]
+        y = cy + offset[m, 1]
+        z = cz + offset[m, 2]
+        observed = _observed_cube(arrays, x, y, z)
+        if observed == 0:
+            continue
+        ox = CUBE * x + 0.5 - point[0]
+        oy = CUBE * y + 0.5 - point[1]
+        oz = CUBE * z + 0.5 - point[2]
+        ax = max(ox, -ox - CUBE + 1, 0.0)
+        ay = max(oy, -oy - CUBE + 1, 0.0)
+        az = max(oz, -oz - CUBE + 1, 0.0)
+        if ax * ax + ay * ay + az * az >= best:
+            continue
+        best, bit = closest_bit(observed, (ox, oy, oz), best)
+        if bit >= 0:
+            found = (CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3))
+    return best, found[0], found[1], found[2]
+
+
+@njit(cache=True, nogil=True)
+def _state_at(arrays: Arrays, x: int, y: int, z: int) -> int:
+    row = _row_of(arrays[0], arrays[1], x, y, z)
+    return int(arrays[2][row, _cell_of(x, y, z)]) if row >= 0 else UNOBSERVED_STATE
+
+
+@njit(cache=True, nogil=True)
+def _bit_of(state: int) -> np.uint32:
+    if state == FREE_STATE or state == UNOBSERVED_STATE:
+        return NOT_ALIGNED
+    return np.uint32(1) << np.uint32(UNLABELLED_BIT if state == UNLABELLED else state)
+
+
+@njit(cache=True, nogil=True)
+def _mask_of(arrays: Arrays, x: int, y: int, z: int, offsets: Offsets) -> np.uint32:
+    """The bits of all voxels that may be closest to a point in the cell (x, y, z)."""
+    reach = arrays[6]
+    state = _state_at(arrays, x, y, z)
+    if state != UNOBSERVED_STATE and reach > HALF_DIAGONAL:
+        return _bit_of(state)
+    centre = (x + 0.5, y + 0.5, z + 0.5)
+    far = reach + HALF_DIAGONAL
+    nearest, _, _, _ = _closest(arrays, centre, offsets, far * far)
+    if nearest >= far * far:
+        return NOT_ALIGNED
+    away = np.sqrt(nearest)
+    mask = NOT_ALIGNED if away + HALF_DIAGONAL >= reach else np.uint32(0)
+    # a little more, for the rounding of points
+    radius = min(away + 2 * HALF_DIAGONAL + 1e-6, far)
+    offset, least = offsets
+    for m in range(len(offset)):
+        if least[m] > radius * radius:
+            break
+        cube_x = (x >> 2) + offset[m, 0]
+        cube_y = (y >> 2) + offset[m, 1]
+        cube_z = (z >> 2) + offset[m, 2]
+        observed = _observed_cube(arrays, cube_x, cube_y, cube_z)
+        while observed:
+            bit = lowest_bit(observed)
+            observed &= observed - np.uint64(1)
+            i = CUBE * cube_x + (bit >> 4)
+            j = CUBE * cube_y + ((bit >> 2) & 3)
+            k = CUBE * cube_z + (bit & 3)
+            if (i - x) ** 2 + (j - y) ** 2 + (k - z) ** 2 <= radius * radius:
+                mask |= _bit_of(_state_at(arrays, i, j, k))
+    return mask
+
+
+@njit(cache=True, nogil=True)
+def _number_of(palette: U32, mask: np.uint32) -> int:
+    """The number of ``mask`` in the palette, where it is entered; ``ANY_MASK`` in a full one."""
+    for n in range(2, len(palette)):
+        if palette[n] == mask:
+            return n
+        if palette[n] == 0:
+            palette[n] = mask
+            return n
+    return ANY_MASK
+
+
+@njit(cache=True, nogil=True)
+def _look_up(arrays: Arrays, x: int, y: int, z: int, offsets: Offsets) -> np.uint32:
+    """The mask of a cell."""
+    row = _row_of(arrays[0], arrays[1], x, y, z)
+    if row < 0:
+        return NOT_ALIGNED
+    cell = _cell_of(x, y, z)
+    number = arrays[4][row, cell]
+    if number == NOT_MADE:
+        number = _number_of(arrays[5], _mask_of(arrays, x, y, z, offsets))
+        arrays[4][row, cell] = number
+    return arrays[5][number]
+
+
+@njit(cache=True, nogil=True)
+def _upper_bounds(
+    arrays: Arrays, cells: I32, bits: U32, shifts: I64, least: int, offsets: Offsets
+) -> I64:
+    """Of each of ``shifts`` (m, 3): how many of the voxels may be aligned, -1 below ``least``."""
+    out = np.empty(len(shifts), np.int64)
+    n = len(cells)
+    for m in range(len(shifts)):
+        possible = 0
+        done = 0
+        while done < n:
+            end = min(done + CHUNK, n)
+            for i in range(done, end):
+                mask = _look_up(
+                    arrays,
+                    cells[i, 0] + shifts[m, 0],
+                    cells[i, 1] + shifts[m, 1],
+                    cells[i, 2] + shifts[m, 2],
+                    offsets,
+                )
+                possible += (mask & bits[i]) != 0
+            done = end
+            if possible + n - done < least:
+                possible = -1
+                break
+        out[m] = possible
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _count(arrays: Arrays, points: F64, bits: U32, most_missed: int, offsets: Offsets) -> int:
+    """How many of ``points`` (n, 3), in voxels, are aligned; -1 once more are not."""
+    aligned = 0
+    reach = arrays[6]
+    for i in range(len(points)):
+        x = int(np.floor(points[i, 0]))
+        y = int(np.floor(points[i, 1]))
+        z = int(np.floor(points[i, 2]))
+        mask = _look_up(arrays, x, y, z, offsets)
+        if mask == bits[i]:
+            aligned += 1
+        elif mask & bits[i]:
+            point = (points[i, 0], points[i, 1], points[i, 2])
+            best, a, b, c = _closest(arrays, point, offsets, reach * reach)
+            if best < reach * reach and _bit_of(_state_at(arrays, a, b, c)) == bits[i]:
+                aligned += 1
+        if i + 1 - aligned > most_missed:
+            return -1
+    return aligned
+
+
+@njit(cache=True, nogil=True)
+def _pairs(arrays: Arrays, points: F64, bits: U32, offsets: Offsets) -> tuple[I64, F64]:
+    """The numbers (k,) of the aligned points, and the centres (k, 3) that they lie closest to."""
+    rows = np.empty(len(points), np.int64)
+    centres = np.empty((len(points), 3))
+    count = 0
+    reach = arrays[6]
+    for i in range(len(points)):
+        x = int(np.floor(points[i, 0]))
+        y = int(np.floor(points[i, 1]))
+        z = int(np.floor(points[i, 2]))
+        mask = _look_up(arrays, x, y, z, offsets)
+        if not mask & bits[i]:
+            continue
+        if _state_at(arrays, x, y, z) == UNOBSERVED_STATE or reach <= HALF_DIAGONAL:
+            point = (points[i, 0], points[i, 1], points[i, 2])
+            best, x, y, z = _closest(arrays, point, offsets, reach * reach)
+            if best >= reach * reach or _bit_of(_state_at(arrays, x, y, z)) != bits[i]:
+                continue
+        rows[count] = i
+        centres[count, 0] = x + 0.5
+        centres[count, 1] = y + 0.5
+        centres[count, 2] = z + 0.5
+        count += 1
+    return rows[:count], centres[:count]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Voxels:
+    """Occupied voxels of a query: their ``centres`` (n, 3) in voxels and the ``bits`` (n,) of their
+    classes, in a random order, so that the first of them stand for all.
+    """
+
+    centres: F64
+    bits: U32
+
+    def turned(self, rotation: F64, shift: F64) -> F64:
+        """The centres (n, 3) under a rotation (3, 3) and a shift (3,) in voxels."""
+        return np.asarray(self.centres @ rotation.T + shift)
+
+
+def query_voxels(occupied: tuple[NDArray[np.int32], U8]) -> Voxels:
+    """The occupied voxels of a map: coordinates (n, 3) and classes (n,)."""
+    ijk, label = occupied
+    order = np.random.default_rng(0).permutation(len(ijk))
+    return Voxels(ijk[order] + 0.5, class_bit(label)[order])
+
+
+def overlap(target: OverlapMap, query: Voxels, target_T_query: F64) -> float:
+    """The ratio tau; the translation of the transform is in voxels."""
+    if not len(query.bits):
+        return 0.0
+    points = query.turned(target_T_query[:3, :3], target_T_query[:3, 3])
+    offsets = cube_offsets(target.reach + 2)
+    return _count(target.arrays, points, query.bits, len(points), offsets) / len(points)
+
+
+def aligned_pairs(target: OverlapMap, query: Voxels, target_T_query: F64) -> tuple[F64, F64]:
+    """Centres (k, 3) of the aligned voxels of the query, and of the target's closest to them.
+
+    In voxels, each in its own map.
+    """
+    points = query.turned(target_T_query[:3, :3], target_T_query[:3, 3])
+    offsets = cube_offsets(target.reach + 2)
+    rows, centres = _pairs(target.arrays, points, query.bits, offsets)
+    return query.centres[rows], centres
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shifts:
+    """Hypotheses of one rotation (3, 3): ``whole`` shifts (m, 3) beside a common ``part`` (3,)."""
+
+    rotation: F64
+    part: F64
+    whole: I64
+
+
+@dataclass(frozen=True, slots=True)
+class Ranked:
+    """A hypothesis: number of its :class:`Shifts`, row among them, and tau."""
+
+    group: int
+    row: int
+    tau: float
+
+
+def best_overlaps(
+    target: OverlapMap, query: Voxels, groups: list[Shifts], most: int, least: float
+) -> list[Ranked]:
+    """The ``most`` hypotheses of highest tau, of those with ``least`` or more, best first.
+
+    Of equals the first are kept.
+    """
+    n = len(query.bits)
+    if not n:
+        return []
+    offsets = cube_offsets(target.reach + 2)
+    needed = int(np.ceil(least * n - 1e-9))
+    bounds = []
+    for number, group in enumerate(groups):
+        cells = np.floor(query.turned(group.rotation, group.part)).astype(np.int32)
+        upper = _upper_bounds(target.arrays, cells, query.bits, group.whole, needed, offsets)
+        bounds += [(-int(u), number, row) for row, u in enumerate(upper) if u >= needed]
+    bounds.sort()
+    found: list[tuple[int, int, int]] = []
+    for upper, number, row in bounds:
+        if -upper < needed:
+            break
+        group = groups[number]
+        points = query.turned(group.rotation, group.part + group.whole[row])
+        aligned = _count(target.arrays, points, query.bits, n - needed, offsets)
+        if aligned < 0:
+            continue
+        found.append((-aligned, number, row))
+        if len(found) >= 2 * most or (len(found) >= most and aligned > needed):
+            found = sorted(found)[:most]
+            # an equal one that comes later by number would not displace the last
+            needed = max(needed, -found[-1][0])
+    return [Ranked(number, row, -a / n) for a, number, row in sorted(found)[:most]]

@@ -1,0 +1,294 @@
+"""The paper's encoder-decoder as its Fig. 2 and supplement 1 have it, for single subvolumes.
+
+The encoder takes one-hot voxels through four blocks of 3x3x3 convolution, ReLU and 2x2x2
+max-pooling, and a fully connected layer with tanh; mean and log-variance of the latent code follow.
+The decoder is its mirror image: a fully connected layer with tanh, a convolution, then four times
+upsampling by repetition and convolution, and a softmax at the end. The channels of Fig. 2 are not
+in the paper's text: these give 0.92 million parameters, and the paper has "around one million".
+
+The first and the last block, at full resolution, are computed in other ways that give the same
+numbers: one-hot voxels times a filter is a row of the filter, and most neighbourhoods hold nothing
+but free or but unobserved voxels; a repeated voxel meets sums of a filter's weights.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semloc_logs.subvolumes.cut import CLASSES, SIZE
+from semloc_logs.subvolumes.network import (
+    LATENT,
+    Describer,
+    Network,
+    as_volumes,
+    channels_last,
+    max_pool,
+    space_to_depth,
+)
+
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+CHANNELS = (8, 16, 32, 64)
+FIRST = CHANNELS[0]
+CORNER = 2  # voxels along an edge after four poolings
+HIDDEN = CHANNELS[-1] * CORNER**3
+UNIFORM = 8  # and more mark cells whose neighbourhood is all free or all unobserved
+# of a filter along one axis, which weights a repeated voxel meets: [parity, coarse tap, fine tap]
+REPEATED = ((((1, 0, 0), (0, 1, 1), (0, 0, 0))), (((0, 0, 0), (1, 1, 0), (0, 0, 1))))
+
+
+@njit(cache=True, nogil=True)
+def first_block(codes: U8, table: F32, bias: F32, out: F32, largest: U8) -> None:
+    """Convolution, ReLU and max-pooling of one-hot voxels.
+
+    ``codes`` (b, 34, 34, 34) have a margin of the code whose rows of ``table`` (27, codes, FIRST)
+    are zero, the last; before it are occupied of unknown class, unobserved and free. ``out`` is (b,
+    16, 16, 16, FIRST), ``largest`` of its shape gets the voxel of each cell that has the maximum,
+    or the uniform code of its neighbourhood plus ``UNIFORM``. Neighbourhoods are nearly uniform:
+    only the differences from free or unobserved space are added.
+    """
+    unobserved = table.shape[1] - 3
+    free = unobserved - 1
+    differences = np.empty((2, *table.shape), np.float32)
+    of_uniform = np.empty((2, FIRST), np.float32)
+    for u in range(2):
+        of_uniform[u] = bias
+        for tap in range(27):
+            of_uniform[u] += table[tap, free + u]
+            differences[u, tap] = table[tap] - table[tap, free + u]
+    total = np.empty((2, 2, 2, FIRST), np.float32)
+    for b in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            for y in range(out.shape[2]):
+                for z in range(out.shape[3]):
+                    cell = codes[b, 2 * x : 2 * x + 4, 2 * y : 2 * y + 4, 2 * z : 2 * z + 4]
+                    count_free = 0
+                    count_unobserved = 0
+                    for i in range(4):
+                        for j in range(4):
+                            for k in range(4):
+                                count_free += cell[i, j, k] == free
+                                count_unobserved += cell[i, j, k] == unobserved
+                    u = int(count_unobserved > count_free)
+                    best = out[b, x, y, z]
+                    which = largest[b, x, y, z]
+                    if max(count_free, count_unobserved) == 64:
+                        for c in range(FIRST):
+                            best[c] = max(of_uniform[u, c], np.float32(0))
+                            which[c] = UNIFORM + u
+                        continue
+                    total[:] = of_uniform[u]
+                    _add_differences(cell, free + u, differences[u], total)
+                    for c in range(FIRST):
+                        best[c] = np.float32(0)
+                        which[c] = 0
+                        for voxel in range(8):
+                            value = total[voxel >> 2, (voxel >> 1) & 1, voxel & 1, c]
+                            if value > best[c]:
+                                best[c] = value
+                                which[c] = voxel
+
+
+@njit(cache=True, nogil=True)
+def _add_differences(cell: U8, uniform: int, difference: F32, total: F32) -> None:
+    """Add to ``total`` (2, 2, 2, FIRST) what the codes (4, 4, 4) around them differ by."""
+    for i in range(4):
+        for j in range(4):
+            for k in range(4):
+                code = cell[i, j, k]
+                if code == uniform:
+                    continue
+                for a in range(max(0, i - 2), min(1, i) + 1):
+                    for b in range(max(0, j - 2), min(1, j) + 1):
+                        for c in range(max(0, k - 2), min(1, k) + 1):
+                            row = difference[((i - a) * 3 + j - b) * 3 + k - c, code]
+                            into = total[a, b, c]
+                            for n in range(FIRST):
+                                into[n] += row[n]
+
+
+@njit(cache=True, nogil=True)
+def first_block_gradient(
+    codes: U8, out: F32, largest: U8, gradient: F32, of_table: F32, of_bias: F32
+) -> None:
+    """Add the gradients of the table and of the bias to ``of_table`` and ``of_bias``."""
+    free = of_table.shape[1] - 4
+    of_uniform = np.zeros((2, FIRST), np.float32)
+    for b in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            for y in range(out.shape[2]):
+                for z in range(out.shape[3]):
+                    cell = codes[b, 2 * x : 2 * x + 4, 2 * y : 2 * y + 4, 2 * z : 2 * z + 4]
+                    for c in range(FIRST):
+                        if out[b, x, y, z, c] <= 0:
+                            continue
+                        g = gradient[b, x, y, z, c]
+                        voxel = largest[b, x, y, z, c]
+                        of_bias[c] += g
+                        if voxel >= UNIFORM:
+                            of_uniform[voxel - UNIFORM, c] += g
+                            continue
+                        i = voxel >> 2
+                        j = (voxel >> 1) & 1
+                        k = voxel & 1
+                        for tap in range(27):
+                            code = cell[i + tap // 9, j + tap // 3 % 3, k + tap % 3]
+                            of_table[tap, code, c] += g
+    for u in range(2):
+        for tap in range(27):
+            of_table[tap, free + u] += of_uniform[u]
+
+
+class _FirstBlock(torch.autograd.Function):
+    """:func:`first_block` of codes (b, 32, 32, 32) with its gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, codes: Tensor, table: Tensor, bias: Tensor) -> Tensor:
+        inputs = table.shape[1]
+        padded = np.full((len(codes), *(SIZE + 2,) * 3), inputs, np.uint8)
+        padded[:, 1:-1, 1:-1, 1:-1] = codes.numpy()
+        rows = F.pad(table.float(), (0, 0, 0, 1)).contiguous()  # the margin adds nothing
+        half = SIZE // 2
+        out = np.empty((len(codes), half, half, half, FIRST), np.float32)
+        largest = np.empty(out.shape, np.uint8)
+        first_block(padded, rows.numpy(), bias.float().numpy(), out, largest)
+        ctx.kept = (padded, out, largest, rows.shape)
+        return torch.from_numpy(out).permute(0, 4, 1, 2, 3)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, Tensor]:
+        padded, out, largest, shape = ctx.kept
+        gradient = grads[0].float().permute(0, 2, 3, 4, 1).contiguous().numpy()
+        of_table = np.zeros(shape, np.float32)
+        of_bias = np.zeros(FIRST, np.float32)
+        first_block_gradient(padded, out, largest, gradient, of_table, of_bias)
+        return None, torch.from_numpy(of_table[:, :-1].copy()), torch.from_numpy(of_bias)
+
+
+class PlainEncoder(Describer):
+    """Codes (b, x, y, 32) -> mu (b, latent, 1, 1) of the subvolume in their middle."""
+
+    def __init__(self, variant: str, latent: int = LATENT) -> None:
+        super().__init__()
+        self.variant, self.latent = variant, latent
+        self.inputs = CLASSES[variant] + 3  # classes, free, unobserved, occupied of unknown class
+        self.blocks = nn.ModuleList(
+            nn.Conv3d(a, b, 3, padding=1) for a, b in pairwise((self.inputs, *CHANNELS))
+        )
+        self.hidden = nn.Linear(HIDDEN, HIDDEN)
+        self.mean = nn.Linear(HIDDEN, latent)
+        self.log_variance = nn.Linear(HIDDEN, latent)
+
+    def first_features(self, codes: Tensor) -> Tensor:
+        """The first block of codes (b, 32, 32, 32) uint8, (b, FIRST, 16, 16, 16)."""
+        first = self.blocks[0]
+        if codes.is_cuda:
+            voxels = F.one_hot(codes.long(), self.inputs).to(first.weight.dtype)
+            return F.relu(max_pool(first(voxels.permute(0, 4, 1, 2, 3))))
+        table = first.weight.permute(2, 3, 4, 1, 0).reshape(27, self.inputs, FIRST)
+        looked_up: Tensor = _FirstBlock.apply(codes, table, first.bias)  # type: ignore[no-untyped-call]
+        return looked_up
+
+    def features(self, codes: Tensor) -> Tensor:
+        """The last hidden layer (b, HIDDEN)."""
+        x, y = ((length - SIZE) // 2 for length in codes.shape[1:3])
+        voxels = self.first_features(codes[:, x : x + SIZE, y : y + SIZE])
+        for block in self.blocks[1:]:
+            voxels = F.relu(max_pool(block(voxels)))
+        return torch.tanh(self.hidden(voxels.flatten(1)))
+
+    def forward(self, codes: Tensor) -> Tensor:
+        mean: Tensor = self.mean(self.features(codes))
+        return mean[:, :, None, None]
+
+
+class PlainDecoder(nn.Module):
+    """Latent code (b, latent) -> logits (L + 2, 8, b, 16, 16, 16) of a subvolume.
+
+    The subvolume is ``space_to_depth``, the eight moved to the front.
+    """
+
+    def __init__(self, variant: str, latent: int = LATENT) -> None:
+        super().__init__()
+        self.start = nn.Linear(latent, HIDDEN)
+        self.first = nn.Conv3d(CHANNELS[-1], CHANNELS[-1], 3, padding=1)
+        channels = (*CHANNELS[::-1], CLASSES[variant] + 2)
+        self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in pairwise(channels))
+
+    def forward(self, code: Tensor) -> Tensor:
+        x: Tensor = torch.tanh(self.start(code)).reshape(-1, CHANNELS[-1], CORNER, CORNER, CORNER)
+        x = F.relu(self.first(x.contiguous(memory_format=torch.channels_last_3d)))
+        for block in self.blocks[:-1]:
+            x = x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4)
+            x = F.relu(block(x))
+        x = repeated_convolution(x, self.blocks[-1].weight, self.blocks[-1].bias)
+        b, channels, *cells = x.shape
+        columns: Tensor = _Transposed.apply(  # type: ignore[no-untyped-call]
+            x.permute(0, 2, 3, 4, 1).reshape(-1, channels)
+        )
+        return columns.reshape(-1, 8, b, *cells)
+
+
+def repeated_convolution(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Convolution of ``x`` repeated twice along each axis, before it is (b, 8 * outputs, ...).
+
+    Of the 2x2x2 voxels that a voxel is repeated to, each has a filter of its own. Channel
+    ``8 * output + voxel`` is of such a voxel.
+    """
+    repeated = torch.tensor(REPEATED, dtype=weight.dtype, device=weight.device)
+    of_each = torch.einsum(
+        "pai,qbj,rck,oxijk->opqrxabc", repeated, repeated, repeated, weight
+    ).flatten(0, 3)
+    of_each = of_each.contiguous(memory_format=torch.channels_last_3d)
+    return F.conv3d(x, of_each, bias.repeat_interleave(8), padding=1)
+
+
+class _Transposed(torch.autograd.Function):
+    """The transpose of a matrix in memory, copied block by block, and of its gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor) -> Tensor:
+        return matrix.contiguous().t().contiguous()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return grads[0].contiguous().t().contiguous()
+
+
+class PlainCompletion(Network):
+    """Encoder and decoder, as they are trained."""
+
+    encoder: PlainEncoder
+    decoder: PlainDecoder
+
+    def __init__(self, variant: str, latent: int = LATENT) -> None:
+        super().__init__()
+        self.encoder = PlainEncoder(variant, latent)
+        self.decoder = PlainDecoder(variant, latent)
+        channels_last(self)
+
+    def arranged(self, states: Tensor) -> Tensor:
+        return space_to_depth(states).movedim(-1, 0)
+
+    def volumes(self, logits: Tensor) -> Tensor:
+        return as_volumes(logits)
+
+    def forward(self, codes: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Logits of the middle subvolume of ``codes`` (b, x, y, 32), as the decoder gives them.
+
+        Also mu (b, latent, 1, 1) and log-variance (b, latent). Without ``noise`` (b, latent) the
+        mean is decoded.
+        """
+        features = self.encoder.features(codes)
+        mu: Tensor = self.encoder.mean(features)
+        log_variance: Tensor = self.encoder.log_variance(features).clamp(-8.0, 4.0)
+        code = mu if noise is None else mu + noise * torch.exp(0.5 * log_variance)
+        return self.decoder(code), mu[:, :, None, None], log_variance

@@ -1,0 +1,152 @@
+"""The quick tau of many hypotheses against cases checked by hand, and against the slow one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.overlaps import (
+    Shifts,
+    aligned_pairs,
+    best_overlaps,
+    overlap,
+    overlap_map,
+    query_voxels,
+)
+from semloc_logs.alignment.tau import tau
+from semloc_logs.numerics.transforms import yaw_transform
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
+from semloc_logs.voxels.keys import BLOCK, pack
+
+ROAD, WALL = 0, 2
+
+
+def blocks_of(voxels: dict[tuple[int, int, int], int]) -> BlockMap:
+    """A map of voxel states."""
+    rows: dict[int, NDArray[np.uint8]] = {}
+    for ijk, state in voxels.items():
+        key = int(pack(np.array(ijk) // BLOCK))
+        block = rows.setdefault(key, np.full(BLOCK**3, UNOBSERVED_STATE, np.uint8))
+        x, y, z = (c % BLOCK for c in ijk)
+        block[(x * BLOCK + y) * BLOCK + z] = state
+    keys = np.array(sorted(rows), np.int64)
+    state = np.array([rows[k] for k in keys.tolist()], np.uint8).reshape(-1, BLOCK**3)
+    nothing = np.zeros(0, np.int64)
+    return BlockMap(keys, np.zeros(state.shape, np.int8), state, nothing, nothing)
+
+
+def query(*voxels: tuple[int, int, int, int]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+    """Coordinates and classes of occupied voxels."""
+    a = np.array(voxels)
+    return a[:, :3].astype(np.int32), a[:, 3].astype(np.uint8)
+
+
+def shifted(x: float, y: float = 0.0, z: float = 0.0) -> NDArray[np.float64]:
+    return yaw_transform(0.0, (x, y, z))
+
+
+def test_voxels_of_the_same_class_within_kappa_are_aligned() -> None:
+    target = overlap_map(blocks_of({(0, 0, 0): ROAD, (9, 0, 0): WALL}), 3.0)
+    four = query_voxels(query((0, 0, 0, ROAD), (1, 0, 0, WALL), (8, 0, 0, WALL), (5, 0, 0, ROAD)))
+    # the road on itself; a wall beside the road; a wall beside the wall; a road 4 voxels from the
+    # wall and 5 from the road
+    assert overlap(target, four, np.eye(4)) == 2 / 4
+    # all lie on the other side of both, 20 voxels away
+    assert overlap(target, four, shifted(-30)) == 0.0
+    # turned by half a turn about the corner of the first voxel: only the first two are within
+    # kappa, at cells -1 and -2
+    assert overlap(target, four, yaw_transform(np.pi, (0, 1, 0))) == 1 / 4
+
+
+def test_free_space_that_is_closest_does_not_count() -> None:
+    voxels = {(0, 0, 0): ROAD, (2, 0, 0): FREE_STATE}
+    target = overlap_map(blocks_of(voxels), 5.0)
+    assert overlap(target, query_voxels(query((0, 0, 0, ROAD))), shifted(0.6)) == 1.0
+    assert overlap(target, query_voxels(query((2, 0, 0, ROAD))), np.eye(4)) == 0.0
+    # 1.9 voxels from the road and 0.1 from free space; 0.9 and 1.1
+    assert overlap(target, query_voxels(query((0, 0, 0, ROAD))), shifted(1.9)) == 0.0
+    assert overlap(target, query_voxels(query((0, 0, 0, ROAD))), shifted(0.9)) == 1.0
+
+
+def test_kappa_ends_at_its_distance() -> None:
+    target = overlap_map(blocks_of({(0, 0, 0): WALL}), 10.0)
+    one = query_voxels(query((0, 0, 0, WALL)))
+    assert overlap(target, one, shifted(9.99)) == 1.0
+    assert overlap(target, one, shifted(10.01)) == 0.0
+    assert overlap(target, one, shifted(6.0, 7.99, 0.0)) == 1.0
+    assert overlap(target, one, shifted(6.0, 8.01, 0.0)) == 0.0
+
+
+def test_pairs_are_the_centres_of_aligned_voxels() -> None:
+    target = overlap_map(blocks_of({(0, 0, 0): ROAD, (9, 0, 0): WALL}), 3.0)
+    three = query_voxels(query((0, 0, 0, ROAD), (1, 0, 0, WALL), (8, 0, 0, WALL)))
+    ours, theirs = aligned_pairs(target, three, shifted(0.25))
+    order = np.argsort(ours[:, 0])
+    np.testing.assert_array_equal(ours[order], [[0.5, 0.5, 0.5], [8.5, 0.5, 0.5]])
+    np.testing.assert_array_equal(theirs[order], [[0.5, 0.5, 0.5], [9.5, 0.5, 0.5]])
+
+
+def random_map(seed: int) -> BlockMap:
+    """Clusters of a few classes and free space on either side of a border of blocks."""
+    rng = np.random.default_rng(seed)
+    voxels = {}
+    for _ in range(12):
+        middle = rng.integers(-14, 14, 3)
+        state = int(rng.choice([ROAD, WALL, 8, FREE_STATE, 255]))
+        for offset in rng.integers(-3, 4, (30, 3)):
+            voxels[tuple((middle + offset).tolist())] = state
+    return blocks_of(voxels)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    yaw=st.floats(0.1, 6.0),
+    reach=st.sampled_from([0.5, 1.3, 4.0, 10.0]),
+    shift=st.tuples(*[st.floats(-12, 12)] * 3),
+)
+def test_it_equals_the_slow_one(
+    seed: int, yaw: float, reach: float, shift: tuple[float, float, float]
+) -> None:
+    blocks = random_map(seed)
+    occupied = random_map(seed + 1).occupied()
+    # no point lies as far from two voxels, which would leave open which of them is closest
+    pose = yaw_transform(yaw, np.array(shift) + (1e-3, 2e-3, 3e-3))
+    slow, _ = tau(occupied, blocks, 1.0, pose, reach)
+    assert overlap(overlap_map(blocks, reach), query_voxels(occupied), pose) == slow
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000), most=st.sampled_from([1, 7, 400]))
+def test_the_best_of_many_are_the_best_by_the_slow_one(seed: int, most: int) -> None:
+    rng = np.random.default_rng(seed)
+    blocks = random_map(seed)
+    occupied = random_map(seed + 1).occupied()
+    reach = 3.0
+    groups = [
+        Shifts(
+            yaw_transform(yaw, (0, 0, 0))[:3, :3],
+            rng.uniform(0.01, 0.99, 3),
+            rng.integers(-9, 9, (60, 3)),
+        )
+        for yaw in (0.3, 1.9, 4.4)
+    ]
+    slow = []
+    for number, group in enumerate(groups):
+        for row, whole in enumerate(group.whole):
+            pose = np.eye(4)
+            pose[:3, :3] = group.rotation
+            pose[:3, 3] = group.part + whole
+            share, _ = tau(occupied, blocks, 1.0, pose, reach)
+            if share >= 0.05:
+                slow.append((-share, number, row))
+    found = best_overlaps(overlap_map(blocks, reach), query_voxels(occupied), groups, most, 0.05)
+    assert [(-f.tau, f.group, f.row) for f in found] == sorted(slow)[:most]
+
+
+def test_classes_beyond_the_masks_are_refused() -> None:
+    with pytest.raises(ValueError, match="below 29"):
+        query_voxels(query((0, 0, 0, 40)))
