@@ -143,7 +143,8 @@ def _add(gradient: F64, vertices: I64, transposed: F64, errors: F64) -> None:
 
 
 def _rotvec(rotation: F64) -> F64:
-    return Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 3)
+    turns = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
+    return np.asarray(turns.reshape(-1, 3))
 
 
 def _vectors(error: F64) -> F64:
@@ -153,7 +154,7 @@ def _vectors(error: F64) -> F64:
 
 def _edge_errors(edges: Edges, poses: F64) -> F64:
     error = inverse(edges.a_T_b) @ inverse(poses[edges.a]) @ poses[edges.b]
-    return np.einsum("mij,mj->mi", edges.root, _vectors(error))
+    return np.asarray(np.einsum("mij,mj->mi", edges.root, _vectors(error)))
 
 
 def _edge_derivatives(edges: Edges, poses: F64) -> tuple[F64, F64, F64]:
@@ -176,7 +177,7 @@ def _edge_derivatives(edges: Edges, poses: F64) -> tuple[F64, F64, F64]:
 
 def _prior_errors(priors: PosePriors, poses: F64) -> F64:
     vectors = _vectors(inverse(priors.poses) @ poses[priors.vertices])
-    return np.einsum("mij,mj->mi", priors.root, vectors)
+    return np.asarray(np.einsum("mij,mj->mi", priors.root, vectors))
 
 
 def _prior_derivatives(priors: PosePriors, poses: F64) -> tuple[F64, F64]:
@@ -208,4 +209,4 @@ def _inverse_right_jacobian(rotvec: F64) -> F64:
     quotient = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))
     factor = np.where(angle > SMALL_TURN, quotient, 1.0 / 12.0)
     cross = crossed(rotvec)
-    return np.eye(3) + 0.5 * cross + factor[:, None, None] * (cross @ cross)
+    return np.asarray(np.eye(3) + 0.5 * cross + factor[:, None, None] * (cross @ cross))
