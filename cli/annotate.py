@@ -44,6 +44,14 @@ if TYPE_CHECKING:
     shell_complete=session_names,
     help="Session of the log; default: its file stem or folder name.",
 )
+@click.option(
+    "--frame",
+    type=click.Choice(["target", "common"]),
+    default="target",
+    show_default=True,
+    help="/semloc/pose is in the frames of target sessions, or in the common frame of semloc"
+    " optimize.",
+)
 @overwrite_option
 @json_option
 @tables_settings_options
@@ -55,12 +63,13 @@ def command(
     in_place: bool,
     sidecar: Path | None,
     session: str | None,
+    frame: str,
     overwrite: bool,
     as_json: bool,
     settings: Resolved,
 ) -> int:
     """Closures -> channels of the log, in its own encoding: /semloc/loop_closures, /semloc/pose,
-    /semloc/markers, and transforms that place their frames.
+    /semloc/markers, a map, and transforms that place their frames.
 
     Give exactly one of -o, --in-place and --sidecar. The recorded messages stay as they are; a
     second run replaces the earlier results.
@@ -77,7 +86,9 @@ def command(
     from semloc_logs.stages.annotate import Annotation, AnnotationMode, annotate
     from semloc_logs.workspace import Workspace
 
-    annotation = Annotation(AnnotationMode(chosen[0]), output or sidecar, overwrite)
+    annotation = Annotation(
+        AnnotationMode(chosen[0]), output or sidecar, overwrite, frame == "common"
+    )
     made = annotate(log, Workspace(work), settings, annotation, session=session)
     if as_json:
         console.result_json({k: getattr(made, k) for k in made.__dataclass_fields__})

@@ -3,7 +3,8 @@
 Mangelson, Dominic, Eustice, Vasudevan: Pairwise Consistent Measurement Set Maximization for Robust
 Multi-Robot Map Merging, ICRA 2018. Two closures are consistent when the way around the loop of both
 and of the odometry between their ends leads back, within its uncertainty. The largest set in which
-all agree is a maximum clique; it is found by a greedy search, as there.
+all agree is a maximum clique; it is found by a greedy search, as there. Closures of one stretch of
+road see the same houses, whose copies mislead all of them alike: together they count as one.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ Mask = NDArray[np.bool_]
 # standard deviations that a way around may be off; 3.5 of a normal distribution in 3 axes: 0.7 %
 GATE = 3.5
 STARTS = 32  # closures of most agreement from which a set is grown
+STRETCH = 20.0  # vertex spacings of road in which closures count as one; 100 m outdoors
 ROWS = 256  # closures that are compared with all others at once
 
 
@@ -33,13 +35,15 @@ ROWS = 256  # closures that are compared with all others at once
 class ConsistentSet:
     """The closures ``members`` (k,) of the sessions ``a`` <= ``b`` that agree, most central first.
 
-    ``others`` are the remaining closures of these sessions.
+    ``others`` are the remaining closures of these sessions, ``support`` the number of stretches of
+    road that the members are of.
     """
 
     a: int
     b: int
     members: I64
     others: I64
+    support: float
 
 
 def consistent_sets(graph: PoseGraph, settings: ResolvedOptimize) -> list[ConsistentSet]:
@@ -49,10 +53,12 @@ def consistent_sets(graph: PoseGraph, settings: ResolvedOptimize) -> list[Consis
     sets = []
     for a, b, rows in _pairs(graph, loops):
         agree = _agreement(graph, loops.part(rows), noise, settings)
-        clique = largest_clique(agree)
-        central = clique[np.argsort(-agree[clique].sum(1), kind="stable")]
+        weight = _independence(graph, loops.part(rows), STRETCH * settings.vertex_spacing)
+        clique = largest_clique(agree, weight)
+        central = clique[np.argsort(-(agree[clique] @ weight), kind="stable")]
         others = np.setdiff1d(np.arange(len(rows)), clique)
-        sets.append(ConsistentSet(a, b, rows[central], rows[others]))
+        support = float(weight[clique].sum())
+        sets.append(ConsistentSet(a, b, rows[central], rows[others], support))
     return sets
 
 
@@ -126,17 +132,29 @@ def _own_sigma(loops: Loops, settings: ResolvedOptimize) -> tuple[F64, F64]:
     )
 
 
-def largest_clique(agree: Mask) -> I64:
-    """Rows (k,), ascending, of a large set in which all agree: greedy from the best starts."""
-    order = np.argsort(-agree.sum(1), kind="stable")
-    degree = agree.sum(1)
+def _independence(graph: PoseGraph, loops: Loops, stretch: float) -> F64:
+    """Weights (m,) of the closures of one pair: one, shared by those of the same stretches."""
+    ends = np.stack([graph.distance[loops.target], graph.distance[loops.query]], axis=1)
+    _, place, counts = np.unique(
+        np.floor(ends / stretch), axis=0, return_inverse=True, return_counts=True
+    )
+    return np.asarray(1.0 / counts[place.ravel()])
+
+
+def largest_clique(agree: Mask, weight: F64 | None = None) -> I64:
+    """Rows (k,), ascending, of a heavy set in which all agree: greedy from the best starts."""
+    weight = np.ones(len(agree)) if weight is None else weight
+    degree = agree @ weight
+    order = np.argsort(-degree, kind="stable")
     best = np.zeros(0, np.int64)
+    most = 0.0
     for start in order[:STARTS]:
-        if degree[start] <= len(best):
+        if degree[start] <= most:
             break
         clique = _grown(agree, int(start), order)
-        if len(clique) > len(best):
+        if weight[clique].sum() > most:
             best = clique
+            most = float(weight[clique].sum())
     return np.sort(best)
 
 

@@ -25,7 +25,7 @@ class Placement:
 
 
 def place_sessions(graph: PoseGraph, sets: Sequence[ConsistentSet]) -> Placement:
-    """The tree takes pairs of sessions in the order of how many of their closures agree.
+    """The tree takes pairs of sessions in the order of how many stretches of road agree.
 
     The frame of a component is the map frame of its first session. A pair is placed by the closure
     that agrees with most others.
@@ -34,7 +34,7 @@ def place_sessions(graph: PoseGraph, sets: Sequence[ConsistentSet]) -> Placement
     component = np.arange(count)
     common_T_map = np.tile(np.eye(4), (count, 1, 1))
     loops = graph.loops
-    for pair in sorted(sets, key=lambda s: (-len(s.members), s.a, s.b)):
+    for pair in sorted(sets, key=lambda s: (-s.support, -len(s.members), s.a, s.b)):
         if component[pair.a] == component[pair.b]:
             continue
         row = pair.members[0]

@@ -78,11 +78,11 @@ def optimise_graph(
 
     # a coarse graph tells closures apart, a fine one has the poses
     coarse = coarse_problem(graph, settings)
-    solver = Solver(coarse, _anchors(coarse, placement.component), placed[coarse.kept])
+    solver = Solver(coarse, placement.component[coarse.chain], placed[coarse.kept])
     rough = solver.solve(placed[coarse.kept], consistent.astype(float), settings.seconds)
     carried = _all_poses(graph, coarse, rough.common_T_base)
     problem = fine_problem(graph, settings)
-    solver = Solver(problem, _anchors(problem, placement.component), carried[problem.kept])
+    solver = Solver(problem, placement.component[problem.chain], carried[problem.kept])
     solution = solver.refined(carried[problem.kept], rough.weight)
     solution = _readmitted(solver, solution)
     kept = solution.weight > 0.5
@@ -125,12 +125,6 @@ def _readmitted(solver: Solver, solution: Solution) -> Solution:
             break
         solution = solver.refined(solution.common_T_base, fits.astype(float))
     return solution
-
-
-def _anchors(problem: Problem, component: I64) -> I64:
-    """The first vertex of each component."""
-    _, first = np.unique(component[problem.chain], return_index=True)
-    return np.asarray(first, np.int64)
 
 
 def _components(graph: PoseGraph, kept: Mask) -> I64:

@@ -41,6 +41,15 @@ class Edges:
         """Some of the edges."""
         return Edges(self.a[rows], self.b[rows], self.a_T_b[rows], self.root[rows])
 
+    def joined(self, others: Edges) -> Edges:
+        """These edges, then the others."""
+        return Edges(
+            np.concatenate([self.a, others.a]),
+            np.concatenate([self.b, others.b]),
+            np.concatenate([self.a_T_b, others.a_T_b]),
+            np.concatenate([self.root, others.root]),
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directions:
@@ -56,6 +65,7 @@ class Problem:
     """``kept`` are the graph's vertices (v,) that are solved for, ``chain`` (v,) their sessions.
 
     ``odometry`` connects neighbours of a chain, ``loops`` are in the order of the closures.
+    ``spacing`` is the setting of the spacing of vertices, metres.
     """
 
     kept: I64
@@ -63,6 +73,7 @@ class Problem:
     odometry: Edges
     loops: Edges
     up: Directions
+    spacing: float
 
 
 def coarse_problem(graph: PoseGraph, settings: ResolvedOptimize) -> Problem:
@@ -92,7 +103,8 @@ def _problem(graph: PoseGraph, settings: ResolvedOptimize, kept: I64) -> Problem
     noise = OdometryNoise.of(settings)
     odometry = _odometry(graph, kept, noise)
     loops = _moved_loops(graph, kept, noise, settings)
-    return Problem(kept, graph.chain_of[kept], odometry, loops, _up(graph, kept, settings))
+    up = _up(graph, kept, settings)
+    return Problem(kept, graph.chain_of[kept], odometry, loops, up, settings.vertex_spacing)
 
 
 def _kept(graph: PoseGraph, spacing: float) -> I64:

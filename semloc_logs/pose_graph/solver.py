@@ -11,6 +11,7 @@ import logging
 import time
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from importlib import import_module
 from typing import Any
 
@@ -21,11 +22,14 @@ from scipy.stats import chi2
 
 from semloc_logs.errors import SemlocError
 from semloc_logs.numerics.transforms import inverse
+from semloc_logs.pose_graph.conjugate_gradients import Layout, Limits, minimised
 from semloc_logs.pose_graph.graph import turned_covariance
+from semloc_logs.pose_graph.normal_equations import UP_HUBER, NormalEquations, PosePriors
 from semloc_logs.pose_graph.problem import Edges, Problem
 
 LOGGER = logging.getLogger(__name__)
 F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 # share of right closures whose errors are below the bound, if their covariances are right
 INLIER_SHARE = 0.999
@@ -36,15 +40,15 @@ STEP_ITERATIONS = 1  # of Levenberg-Marquardt in each step of the schedule
 LAST_ITERATIONS = 20  # in the solution that follows
 TOLERANCE = 1e-6  # relative decrease of the error that ends it
 MOST_STEPS = 100
-# vertices that are solved together; beyond, one session after the other, the others held
-MOST_TOGETHER = 20_000
-SWEEPS = 4  # over all sessions
-TURN_ITERATIONS = 5  # for a session in a sweep
+# vertices that GTSAM solves; conjugate gradients beyond, as many sessions of the same roads fill
+# the matrix of a direct solution
+MOST_DIRECT = 5_000
+NODES_APART = 20.0  # vertex spacings between the nodes of a motion that all sessions share
+RESIDUAL = 1e-2  # of each step; the steps that follow take away what it leaves
 BINARY = 1e-3  # a weight that is nearer to 0 or 1 counts as that
 # a chain whose closures are all refused stays where it is, to the width of a continent
 LOOSE = [1e3, 1e3, 1e3, 3.0, 3.0, 3.0]  # m and rad
 ANCHOR_SIGMA = 1e-4  # the first vertex of a component, m and rad
-UP_HUBER = 1.345  # Huber's constant for 95 % efficiency: gravity may be wrong in places
 
 
 class Method(Enum):
@@ -79,14 +83,15 @@ def gtsam_library() -> Any:
 
 
 class Solver:
-    """A problem with its factors; ``anchors`` are the vertices that hold the components."""
+    """A problem with its factors; ``component`` (v,) numbers the frame of each vertex."""
 
-    def __init__(self, problem: Problem, anchors: NDArray[np.int64], initial: F64) -> None:
+    def __init__(self, problem: Problem, component: I64, initial: F64) -> None:
         self._gtsam = gtsam_library()
         self._problem = problem
+        self._component = component
+        _, anchors = np.unique(component, return_index=True)
         self._anchors = set(anchors.tolist())
         self._initial = initial
-        self._fixed = self._fixed_factors()
         self._ordering: Any = None
 
     def solve(self, initial: F64, start: F64, seconds: float) -> Solution:
@@ -121,10 +126,7 @@ class Solver:
 
     def refined(self, initial: F64, weight: F64) -> Solution:
         """Least squares from ``initial`` (v, 4, 4) with given weights of the closures."""
-        if len(initial) > MOST_TOGETHER:
-            poses = self._solved_in_turn(initial, weight)
-        else:
-            poses = self._solved(initial, weight, LAST_ITERATIONS)
+        poses = self._solved(initial, weight, LAST_ITERATIONS)
         return Solution(poses, weight, squared_errors(self._problem.loops, poses), Method.GNC)
 
     def cauchy(self, initial: F64, start: F64) -> Solution:
@@ -143,9 +145,7 @@ class Solver:
 
         Increments are in the axes of the frame, x y z rotation-x rotation-y rotation-z.
         """
-        marginals = self._gtsam.Marginals(
-            self._weighted(weight), self._values(poses, slice(0, len(poses)))
-        )
+        marginals = self._gtsam.Marginals(self._weighted(weight), self._values(poses))
         local = np.array([marginals.marginalCovariance(k) for k in range(len(poses))])
         # GTSAM orders a pose's error as rotation, position, in the axes of the pose
         local = np.roll(np.roll(local.reshape(-1, 6, 6), 3, axis=1), 3, axis=2)
@@ -160,99 +160,70 @@ class Solver:
             graph.add(_between(self._gtsam, loops, row, root))
         return graph
 
-    def _values(self, poses: F64, rows: slice) -> Any:
+    def _values(self, poses: F64) -> Any:
         values = self._gtsam.Values()
-        for vertex in range(rows.start, rows.stop):
-            values.insert(vertex, self._gtsam.Pose3(poses[vertex]))
+        for vertex, pose in enumerate(poses):
+            values.insert(vertex, self._gtsam.Pose3(pose))
         return values
 
     def _solved(self, initial: F64, weight: F64, iterations: int) -> F64:
         """Least squares with these weights of the closures, at most so many iterations."""
+        if len(initial) > MOST_DIRECT:
+            limits = Limits(iterations, TOLERANCE, RESIDUAL)
+            weights = np.concatenate([np.ones(len(self._problem.odometry)), weight])
+            return minimised(self._equations, initial, weights, self._layout, limits)
         gtsam = self._gtsam
         graph = self._weighted(weight)
         if self._ordering is None:
             self._ordering = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
-        every = slice(0, len(initial))
-        return self._optimised(graph, initial, every, iterations, self._ordering)
-
-    def _optimised(
-        self, graph: Any, poses: F64, rows: slice, iterations: int, ordering: Any = None
-    ) -> F64:
-        """Poses of the vertices ``rows`` by Levenberg-Marquardt from ``poses`` (v, 4, 4)."""
-        gtsam = self._gtsam
         parameters = gtsam.LevenbergMarquardtParams()
-        if ordering is not None:
-            parameters.setOrdering(ordering)
+        parameters.setOrdering(self._ordering)
         parameters.setMaxIterations(iterations)
         parameters.setRelativeErrorTol(TOLERANCE)
-        values = self._values(poses, rows)
+        values = self._values(initial)
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        return np.array([solved.atPose3(k).matrix() for k in range(rows.start, rows.stop)])
+        return np.array([solved.atPose3(k).matrix() for k in range(len(initial))])
 
-    def _solved_in_turn(self, initial: F64, weight: F64) -> F64:
-        """The same by Gauss-Seidel sweeps over the sessions, for a start that is nearly right.
+    @cached_property
+    def _layout(self) -> Layout:
+        problem = self._problem
+        return Layout(problem.chain, self._component, NODES_APART * problem.spacing)
 
-        With the other sessions held, a session is a chain, so time and memory grow with its length
-        only; many sessions of the same road would fill the matrix of a common solution.
-        """
-        poses = initial.copy()
+    @cached_property
+    def _equations(self) -> NormalEquations:
+        problem = self._problem
+        edges = problem.odometry.joined(problem.loops)
+        return NormalEquations(len(problem.kept), edges, problem.up, self._priors)
+
+    @cached_property
+    def _priors(self) -> PosePriors:
+        """What holds the frames: the first vertex of each chain."""
         chain = self._problem.chain
-        bounds = np.searchsorted(chain, np.arange(chain[-1] + 2))
-        fixed = [self._fixed_factors_of(k) for k in range(len(bounds) - 1)]
-        for _ in range(SWEEPS):
-            for k, factors in enumerate(fixed):
-                graph = self._gtsam.NonlinearFactorGraph(factors)
-                self._add_loops_of(k, graph, poses, weight)
-                rows = slice(int(bounds[k]), int(bounds[k + 1]))
-                poses[rows] = self._optimised(graph, poses, rows, TURN_ITERATIONS)
-        return poses
+        first = np.flatnonzero(np.diff(chain, prepend=-1))
+        sigma = [[ANCHOR_SIGMA] * 6 if k in self._anchors else LOOSE for k in first.tolist()]
+        root = np.eye(6) / np.array(sigma)[:, None, :]
+        return PosePriors(first, self._initial[first], root)
 
-    def _add_loops_of(self, chain: int, graph: Any, poses: F64, weight: F64) -> None:
-        """Closures of a session: with itself between vertices, with others as where they put it."""
-        loops = self._problem.loops
-        a_is_own = self._problem.chain[loops.a] == chain
-        b_is_own = self._problem.chain[loops.b] == chain
-        for row in np.flatnonzero((a_is_own | b_is_own) & (weight > 0.5)).tolist():
-            root = loops.root[row]
-            if a_is_own[row] and b_is_own[row]:
-                graph.add(_between(self._gtsam, loops, row, root))
-            elif b_is_own[row]:
-                placed = poses[loops.a[row]] @ loops.a_T_b[row]
-                graph.add(_prior(self._gtsam, int(loops.b[row]), placed, root))
-            else:
-                b_T_a = inverse(loops.a_T_b[row])
-                placed = poses[loops.b[row]] @ b_T_a
-                graph.add(_prior(self._gtsam, int(loops.a[row]), placed, root @ _adjoint(b_T_a)))
-
-    def _fixed_factors(self) -> Any:
-        """Odometry, gravity, and what holds the frames."""
-        graph = self._gtsam.NonlinearFactorGraph()
-        for chain in range(int(self._problem.chain[-1]) + 1 if len(self._problem.chain) else 0):
-            graph.push_back(self._fixed_factors_of(chain))
-        return graph
-
-    def _fixed_factors_of(self, chain: int) -> Any:
+    @cached_property
+    def _fixed(self) -> Any:
+        """Factors of odometry, gravity, and what holds the frames."""
         gtsam = self._gtsam
         problem = self._problem
         graph = gtsam.NonlinearFactorGraph()
-        first, end = np.searchsorted(problem.chain, [chain, chain + 1]).tolist()
-        begun, done = np.searchsorted(problem.odometry.a, [first, end]).tolist()
-        for row in range(begun, done):
+        for row in range(len(problem.odometry)):
             graph.add(_between(gtsam, problem.odometry, row, problem.odometry.root[row]))
         up = gtsam.Unit3(0.0, 0.0, 1.0)
         tilt = gtsam.noiseModel.Robust.Create(
             gtsam.noiseModel.mEstimator.Huber.Create(UP_HUBER),
             gtsam.noiseModel.Isotropic.Sigma(2, problem.up.sigma),
         )
-        begun, done = np.searchsorted(problem.up.vertices, [first, end]).tolist()
-        for row in range(begun, done):
-            direction = gtsam.Unit3(*problem.up.up[row])
-            vertex = int(problem.up.vertices[row])
-            graph.add(gtsam.AttitudeFactorPose3(vertex, up, tilt, direction))
-        if first < end:
-            sigma = [ANCHOR_SIGMA] * 6 if first in self._anchors else LOOSE
-            root = np.diag(1.0 / np.array(sigma))
-            graph.add(_prior(gtsam, first, self._initial[first], root))
+        for vertex, own_up in zip(problem.up.vertices.tolist(), problem.up.up, strict=True):
+            graph.add(gtsam.AttitudeFactorPose3(vertex, up, tilt, gtsam.Unit3(*own_up)))
+        priors = self._priors
+        for vertex, pose, root in zip(
+            priors.vertices.tolist(), priors.poses, priors.root, strict=True
+        ):
+            graph.add(_prior(gtsam, vertex, pose, root))
         return graph
 
 
@@ -270,18 +241,6 @@ def _model(gtsam: Any, root: F64) -> Any:
     # GTSAM orders a pose's error as rotation, position
     swapped = np.roll(np.roll(root, 3, axis=0), 3, axis=1)
     return gtsam.noiseModel.Gaussian.SqrtInformation(swapped)
-
-
-def _adjoint(b_T_a: F64) -> F64:
-    """From errors (position, rotation) in the axes of ``a`` to ones in the axes of ``b``."""
-    rotation = b_T_a[:3, :3]
-    x, y, z = b_T_a[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    out = np.zeros((6, 6))
-    out[:3, :3] = rotation
-    out[3:, 3:] = rotation
-    out[:3, 3:] = cross @ rotation
-    return out
 
 
 def squared_errors(edges: Edges, poses: F64) -> F64:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 import semloc_logs
 from semloc_logs.closures.closure_tables import keyframe_at, read_closures
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.exports.map_cloud import map_cloud
 from semloc_logs.logs.annotation.annotate import (
     AnnotateReport,
     ClosureRecord,
@@ -23,10 +24,11 @@ from semloc_logs.logs.annotation.annotate import (
     annotate_sidecar,
     recover,
 )
-from semloc_logs.logs.annotation.channels import Frames, Transform
+from semloc_logs.logs.annotation.channels import COMMON_FRAME, Scene, StampedPose, Transform
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse, transform
+from semloc_logs.pose_graph.merged_map import keyframe_poses
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import session_name
 from semloc_logs.workspace import Workspace
@@ -46,11 +48,15 @@ class AnnotationMode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Annotation:
-    """``output`` is the file of a copy or a sidecar; ``overwrite`` allows to replace it."""
+    """``output`` is the file of a copy or a sidecar; ``overwrite`` allows to replace it.
+
+    ``common``: /semloc/pose has the poses of ``semloc optimize``, in the common frame.
+    """
 
     mode: AnnotationMode
     output: Path | None = None
     overwrite: bool = False
+    common: bool = False
 
 
 def annotate(
@@ -69,7 +75,7 @@ def annotate(
     name = session or session_name(log)
     own = SessionMap(work.chosen([name])[0])
     _check_log(log, own)
-    results = _results(work, own, name, settings)
+    results = _results(work, own, settings, common=annotation.common)
     if annotation.mode is AnnotationMode.IN_PLACE:
         return annotate_in_place(log, results)
     if annotation.output is None:
@@ -92,8 +98,9 @@ def _check_log(log: Path, own: SessionMap) -> None:
         )
 
 
-def _results(work: Workspace, own: SessionMap, name: str, settings: Resolved) -> Results:
+def _results(work: Workspace, own: SessionMap, settings: Resolved, *, common: bool) -> Results:
     """Every closure that the session takes part in, as query or as target."""
+    name = own.folder.name
     rows = [
         row
         for row in read_closures(work.closures)
@@ -110,8 +117,11 @@ def _results(work: Workspace, own: SessionMap, name: str, settings: Resolved) ->
     }
     frame_id = str(own.json.get("session_frame") or "") or None
     memory = settings.logs.memory
-    frames = _frames(others, own, name, rows) if frame_id else Frames()
-    return Results(records, name, notes, times, frame_id=frame_id, memory=memory, frames=frames)
+    scene = _scene(others, own, rows) if frame_id else Scene()
+    if common:
+        notes["pose_frame"] = COMMON_FRAME
+        scene = _with_common_poses(scene, work, own)
+    return Results(records, name, notes, times, frame_id=frame_id, memory=memory, scene=scene)
 
 
 class _Sessions:
@@ -156,12 +166,13 @@ def _record(sessions: _Sessions, own: SessionMap, name: str, row: dict[str, Any]
     )
 
 
-def _frames(sessions: _Sessions, own: SessionMap, name: str, rows: list[dict[str, Any]]) -> Frames:
-    """Transforms by which a viewer places our frames.
+def _scene(sessions: _Sessions, own: SessionMap, rows: list[dict[str, Any]]) -> Scene:
+    """What viewers show around the closures: the frames of the messages, and a map.
 
     ``semloc/SESSION`` is the session frame of each session that closures connect with the log, laid
     by the most probable one. The vehicle's own poses are given where the log has no transforms.
     """
+    name = own.folder.name
     frame_id = str(own.json["session_frame"])
     start_ns = int(own.stamps_ns[0])
     placed = {name: np.eye(4)}
@@ -178,13 +189,45 @@ def _frames(sessions: _Sessions, own: SessionMap, name: str, rows: list[dict[str
         Transform(start_ns, frame_id, f"semloc/{session}", pose)
         for session, pose in sorted(placed.items())
     ]
+    shown = {n: pose for n, pose in placed.items() if n != name} or placed
+    cloud = map_cloud([(sessions[n], pose) for n, pose in shown.items()], frame_id)
     base_frame = str(own.json.get("base_frame") or "")
     has_transforms = "tf" in own.json.get("roles", {})
     if not own.posed or has_transforms or base_frame in ("", frame_id):
-        return Frames(fixed=fixed)
+        return Scene(fixed=fixed, cloud=cloud)
     session_T_map = np.array(own.json["session_T_map"])
     moving = [
         Transform(int(stamp_ns), frame_id, base_frame, session_T_map @ pose)
         for stamp_ns, pose in zip(own.stamps_ns, own.map_T_base, strict=True)
     ]
-    return Frames(moving, fixed)
+    return Scene(moving, fixed, cloud=cloud)
+
+
+def _with_common_poses(scene: Scene, work: Workspace, own: SessionMap) -> Scene:
+    """The keyframes' poses in the common frame, and that frame in the one of the log's poses.
+
+    Odometry drifts against the common frame, so its transform moves.
+    """
+    path = work.optimized_trajectory(own.folder.name)
+    if not own.posed or not path.exists():
+        raise WorkspaceError(
+            f"Session {own.folder.name} has no poses in a common frame: run 'semloc optimize -w"
+            f" {work.path}' first."
+        )
+    common_T_base = keyframe_poses(work, own)
+    stamps_ns = own.stamps_ns.tolist()
+    unknown = np.zeros((6, 6))  # as ROS has it
+    poses = [
+        StampedPose(stamp_ns, COMMON_FRAME, pose, unknown)
+        for stamp_ns, pose in zip(stamps_ns, common_T_base, strict=True)
+    ]
+    frame_id = str(own.json.get("session_frame") or "")
+    if not frame_id:
+        return replace(scene, common=poses)
+    session_T_base = np.array(own.json["session_T_map"]) @ own.map_T_base
+    session_T_common = session_T_base @ inverse(common_T_base)
+    frames = [
+        Transform(stamp_ns, frame_id, COMMON_FRAME, pose)
+        for stamp_ns, pose in zip(stamps_ns, session_T_common, strict=True)
+    ]
+    return replace(scene, moving=[*scene.moving, *frames], common=poses)

@@ -4,6 +4,7 @@ table and the truth.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.stages import annotate as annotate_stage
 from semloc_logs.stages.annotate import Annotation, AnnotationMode
+from semloc_logs.stages.optimise import optimise
 from semloc_logs.workspace import Workspace
 
 # after its stamp a sweep is in the log: it takes 0.1 s, and 4 ms to be written
@@ -93,11 +95,13 @@ def annotated(
     by_topic: dict[str, list[Read]] = {}
     for read in READERS[name](output):
         by_topic.setdefault(read.topic, []).append(read)
-    own = {"/semloc/loop_closures", "/semloc/markers", "/semloc/tf_static"}
+    own = {"/semloc/loop_closures", "/semloc/markers", "/semloc/tf_static", "/semloc/map"}
     if name != "wednesday":  # whose log has transforms of the vehicle
         own.add("/semloc/tf")
     if name != "monday":  # the first drive is never localised in another
-        own.add("/semloc/pose")
+        own |= {"/semloc/pose", "/semloc/pose/monday"}
+    if name == "wednesday":
+        own.add("/semloc/pose/tuesday")
     assert own == {topic for topic in by_topic if topic.startswith("/semloc")}
     assert ("/lidar/points" in by_topic) == (mode == "copy")
     assert report.messages == sum(len(by_topic[topic]) for topic in own)
@@ -145,6 +149,28 @@ def pose_of(pose: Any) -> Any:
     p = pose.position
     q = pose.orientation
     return transform(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+
+
+def test_the_reader_of_mcap_for_ros_2_decodes_all_topics(
+    labelled: Workspace, drives: Any, tools: SimpleNamespace, tmp_path: Path
+) -> None:
+    decoders = pytest.importorskip("mcap_ros2.decoder")
+    output = tmp_path / "out.mcap"
+    annotation = Annotation(AnnotationMode.COPY, output)
+    report = annotate_stage.annotate(
+        drives["monday"].log, labelled, tools.quick_settings(), annotation
+    )
+    with output.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[decoders.DecoderFactory()])
+        own = [
+            (channel, message)
+            for _, channel, _, message in reader.iter_decoded_messages()
+            if channel.topic.startswith("/semloc/")
+        ]
+    assert len(own) == report.messages
+    ((channel, cloud),) = [pair for pair in own if pair[0].topic == "/semloc/map"]
+    assert "durability: 1" in channel.metadata["offered_qos_profiles"]
+    assert cloud.width * cloud.point_step == len(cloud.data)
 
 
 def test_every_closure_of_the_log_is_there_as_query_and_as_target(
@@ -270,6 +296,67 @@ def test_the_vehicle_moves_in_logs_without_transforms(annotated: Any, drives: An
         truth = drives[name].session_T_world @ drives[name].world_T_base(stamp)
         t = edge.transform.translation
         np.testing.assert_allclose([t.x, t.y, t.z], truth[:3, 3], atol=0.01)
+
+
+def test_the_map_of_the_other_sessions_lies_along_the_road(annotated: Any, drives: Any) -> None:
+    name, topics = annotated
+    (read,) = topics["/semloc/map"]
+    message = read.message
+    if name == "wednesday":
+        rows = np.frombuffer(message.data, np.uint8).reshape(-1, message.point_stride)
+        assert message.frame_id == "odom"
+    else:
+        rows = np.asarray(message.data).reshape(message.width, message.point_step)
+        assert message.header.frame_id == "odom"
+    points = np.ascontiguousarray(rows[:, :12]).view("<f4")
+    assert 500 < len(points) <= 100_000
+    own = drives[name].trajectory
+    places = np.array(
+        [
+            (drives[name].session_T_world @ drives[name].world_T_base(int(t)))[:3, 3]
+            for t in own.stamps_ns[::10]
+        ]
+    )
+    away = np.linalg.norm(points[:, None, :2] - places[None, :, :2], axis=2).min(0)
+    assert np.median(away) < 5.0  # the road or a wall beside it
+
+
+def test_poses_in_the_common_frame(
+    labelled: Workspace, drives: Any, tools: SimpleNamespace, tmp_path: Path
+) -> None:
+    pytest.importorskip("gtsam")
+    optimise(labelled, tools.quick_settings())
+    annotation = Annotation(AnnotationMode.SIDECAR, tmp_path / "out.mcap", common=True)
+    annotate_stage.annotate(drives["monday"].log, labelled, tools.quick_settings(), annotation)
+    reads = list(read_ros2(tmp_path / "out.mcap"))
+    poses = {r.log_time_ns: r.message for r in reads if r.topic == "/semloc/pose"}
+    assert len(poses) > 10
+    frames = {
+        r.log_time_ns: r.message.transforms[0]
+        for r in reads
+        if r.topic == "/semloc/tf" and r.message.transforms[0].child_frame_id == "semloc/common"
+    }
+    assert set(frames) == set(poses)
+    for time, message in poses.items():
+        stamp, frame_id = header(message)
+        assert frame_id == "semloc/common"
+        edge = frames[time]
+        assert edge.header.frame_id == "odom"
+        t, q = edge.transform.translation, edge.transform.rotation
+        odom_T_common = transform(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
+        truth = drives["monday"].session_T_world @ drives["monday"].world_T_base(stamp)
+        found = odom_T_common @ pose_of(message.pose.pose)
+        np.testing.assert_allclose(found[:3, 3], truth[:3, 3], atol=0.01)
+
+
+def test_common_poses_need_an_optimised_workspace(
+    labelled: Workspace, drives: Any, tools: SimpleNamespace, tmp_path: Path
+) -> None:
+    work = Workspace(tmp_path / "work")
+    shutil.copytree(labelled.path, work.path, ignore=shutil.ignore_patterns("optimized"))
+    annotation = Annotation(AnnotationMode.SIDECAR, tmp_path / "out.mcap", common=True)
+    with pytest.raises(WorkspaceError, match="run 'semloc optimize"):
+        annotate_stage.annotate(drives["monday"].log, work, tools.quick_settings(), annotation)
 
 
 def test_annotating_under_another_name_takes_the_closures_of_that_session(

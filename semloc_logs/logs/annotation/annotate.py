@@ -14,13 +14,14 @@ from typing import BinaryIO
 from semloc_logs import __version__
 from semloc_logs.errors import LogError
 from semloc_logs.logs.annotation.channels import (
-    NO_FRAMES,
+    NO_SCENE,
+    QOS_KEY,
     ClosureRecord,
     Encoder,
     Encoding,
-    Frames,
     LogContext,
     LogFacts,
+    Scene,
     channel_metadata,
     encode,
     is_old_marker,
@@ -37,7 +38,7 @@ from semloc_logs.logs.annotation.mcap_append import (
     read_end,
     read_header,
 )
-from semloc_logs.logs.annotation.rosbag_copy import QOS_KEY, bag_facts, opened, write_copy
+from semloc_logs.logs.annotation.rosbag_copy import bag_facts, opened, write_copy
 from semloc_logs.logs.annotation.tail_swap import (
     SIDE_SUFFIX,
     copy_start,
@@ -98,7 +99,7 @@ class Results:
     The ``closures`` in which ``session`` takes part, and the ``settings`` behind them.
     ``log_times`` maps the stamp (ns) of an end in this log to the receive time (ns) of the frame
     there; ``frame_id`` is the frame of the log's pose stream, for the markers; None:
-    semloc/SESSION. ``frames`` place these frames, and the ones of other sessions. ``memory``: bytes
+    semloc/SESSION. ``scene`` places these frames, and the ones of other sessions. ``memory``: bytes
     of the log that may be in memory at once.
     """
 
@@ -108,14 +109,14 @@ class Results:
     log_times: Mapping[int, int]
     frame_id: str | None = None
     memory: int = DEFAULT
-    frames: Frames = NO_FRAMES
+    scene: Scene = NO_SCENE
 
     def plan(self, output: Path, end: LogEnd, facts: LogFacts) -> tuple[AppendPlan, AnnotateReport]:
         """How a file that ends with ``end`` takes the results."""
         run = run_id(self.closures, self.session, self.settings, __version__)
         frame_id = f"semloc/{self.session}" if self.frame_id is None else self.frame_id
         size = _marker_size(self.settings)
-        context = LogContext(self.session, facts, self.log_times, frame_id, size, self.frames)
+        context = LogContext(self.session, facts, self.log_times, frame_id, size, self.scene)
         metadata = channel_metadata(run, __version__)
         channels, messages = encode(self.closures, context, encoder_for(facts), metadata)
 

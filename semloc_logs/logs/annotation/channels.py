@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Literal, Protocol
+from enum import Enum
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +22,54 @@ from semloc_logs.numerics.transforms import inverse, transform
 
 F64 = NDArray[np.float64]
 Encoding = Literal["ros2", "ros1", "protobuf", "json"]
-TOPICS = (
+
+
+class Kind(Enum):
+    """What the messages of a topic are."""
+
+    CLOSURE = "closure"
+    POSE = "pose"
+    MARKERS = "markers"
+    TRANSFORMS = "transforms"
+    CLOUD = "cloud"
+
+
+CLOSURES, POSE, MARKERS, MAP = (
     "/semloc/loop_closures",
     "/semloc/pose",
     "/semloc/markers",
-    "/semloc/tf",
-    "/semloc/tf_static",
+    "/semloc/map",
 )
+MOVING, FIXED = "/semloc/tf", "/semloc/tf_static"
+TOPICS = {
+    CLOSURES: Kind.CLOSURE,
+    POSE: Kind.POSE,
+    MARKERS: Kind.MARKERS,
+    MOVING: Kind.TRANSFORMS,
+    FIXED: Kind.TRANSFORMS,
+    MAP: Kind.CLOUD,
+}
+LATCHED = (FIXED, MAP)  # a reader that starts later gets the last message
+COMMON_FRAME = "semloc/common"
+QOS_KEY = "offered_qos_profiles"
+LATCHING_KEY = "latching"  # of a ROS 1 connection
+# where a log has none; as rosbag2 writes it for reliable topics
+DEFAULT_QOS = """- history: 1
+  depth: 1
+  reliability: 1
+  durability: 2
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false
+"""
 RUN_KEY = "semloc.run_id"  # in the metadata of each of our channels
 
 
@@ -64,18 +107,52 @@ class Transform:
     parent_T_child: F64
 
 
-@dataclass(frozen=True, slots=True)
-class Frames:
-    """Transforms that place the frames of our messages for viewers.
+@dataclass(frozen=True, slots=True, eq=False)
+class StampedPose:
+    """Pose (4, 4) of the base frame in ``frame_id``; covariance (6, 6), zeros where unknown."""
 
-    ``moving`` are of the vehicle, where the log has none; ``fixed`` hold for the whole log.
+    stamp_ns: int
+    frame_id: str
+    frame_T_base: F64
+    covariance: F64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points (n, 3) in ``frame_id``, their colours (n, 3) and train ids (n,)."""
+
+    frame_id: str
+    points: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    label: NDArray[np.uint8]
+
+    def rows(self, names: Sequence[str]) -> NDArray[Any]:
+        """x y z as floats, then single bytes called ``names``: blue, green, red, 0, label."""
+        kinds = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in names]
+        out = np.zeros(len(self.points), np.dtype(kinds))
+        out["x"], out["y"], out["z"] = self.points.T
+        blue, green, red, _, label = names
+        out[red], out[green], out[blue] = self.colours.T
+        out[label] = self.label
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What viewers show around the closures.
+
+    ``moving`` transforms are of the vehicle, where the log has none, and of the common frame;
+    ``fixed`` ones hold for the whole log. ``common`` are poses in the common frame, which /semloc/
+    pose has instead of the ones in the frames of the targets. ``cloud`` is the map.
     """
 
     moving: Sequence[Transform] = ()
     fixed: Sequence[Transform] = ()
+    common: Sequence[StampedPose] = ()
+    cloud: Cloud | None = None
 
 
-NO_FRAMES = Frames()
+NO_SCENE = Scene()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,13 +278,14 @@ class Mark:
 
 
 class Encoder(Protocol):
-    """The messages in one encoding: channels in the order of ``TOPICS``, and their bytes."""
+    """The messages in one encoding: a channel for each topic, and the bytes of messages."""
 
-    def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]: ...
+    def channel(self, topic: str, kind: Kind, metadata: Mapping[str, str]) -> NewChannel: ...
     def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes: ...
-    def pose(self, closure: ClosureRecord, frame_id: str) -> bytes: ...
+    def pose(self, pose: StampedPose) -> bytes: ...
     def mark(self, mark: Mark) -> bytes: ...
     def transforms(self, transforms: Sequence[Transform]) -> bytes: ...
+    def cloud(self, cloud: Cloud, stamp_ns: int) -> bytes: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,8 +311,8 @@ class LogContext:
     """What the messages of one log share.
 
     ``log_times`` maps the stamp (ns) of an end to the receive time (ns) of the log at that frame.
-    ``frame_id`` is the frame of the markers, ``marker_size`` their diameter in metres. ``frames``
-    are published if the log takes part in a closure.
+    ``frame_id`` is the frame of the markers, ``marker_size`` their diameter in metres. ``scene`` is
+    published if the log takes part in a closure.
     """
 
     session: str
@@ -242,7 +320,7 @@ class LogContext:
     log_times: Mapping[int, int]
     frame_id: str
     marker_size: float
-    frames: Frames = NO_FRAMES
+    scene: Scene = NO_SCENE
 
     def log_time(self, stamp_ns: int) -> int:
         """The receive time at a stamp; without one, the stamp within the log's time range."""
@@ -285,38 +363,87 @@ def encode(
     """
     session = context.session
     mine = [c for c in closures if session in (c.query_session, c.target_session)]
+    placed = [c for c in mine if c.query_session == session and c.session_T_query is not None]
+    pose_topics = topics_of_targets({c.target_session for c in placed})
+    topics = [*TOPICS.items(), *((topic, Kind.POSE) for topic in pose_topics.values())]
+    number = {topic: k for k, (topic, _) in enumerate(topics)}
     messages: list[NewMessage] = []
     for key, closure in enumerate(sorted(mine, key=_order)):
         _refuse_infinite(closure)
         is_query = closure.query_session == session
         stamp = closure.query_stamp_ns if is_query else closure.target_stamp_ns
         log_time = context.log_time(stamp)
-        messages.append(NewMessage(0, log_time, encoder.loop_closure(closure, stamp)))
+        data = encoder.loop_closure(closure, stamp)
+        messages.append(NewMessage(number[CLOSURES], log_time, data))
         if is_query and closure.session_T_query is not None:
-            pose = encoder.pose(closure, f"semloc/{closure.target_session}")
-            messages.append(NewMessage(1, log_time, pose))
+            data = encoder.pose(_pose_in_target(closure, closure.session_T_query))
+            if not context.scene.common:
+                messages.append(NewMessage(number[POSE], log_time, data))
+            topic = pose_topics[closure.target_session]
+            messages.append(NewMessage(number[topic], log_time, data))
         if closure.session_position is not None:
             mark = _mark(closure, stamp, key, context)
-            messages.append(NewMessage(2, log_time, encoder.mark(mark)))
+            messages.append(NewMessage(number[MARKERS], log_time, encoder.mark(mark)))
     if mine:
-        messages += _transforms(context, encoder)
+        messages += _scene(context, encoder, number)
     messages.sort(key=lambda m: m.log_time_ns)  # stable: closures of one frame stay in their order
-    channels = encoder.channels({**context.facts.channel_metadata, **metadata})
+    shared = {**context.facts.channel_metadata, **metadata}
+    channels = [
+        encoder.channel(topic, kind, latched(shared, context.facts) if topic in LATCHED else shared)
+        for topic, kind in topics
+    ]
     return _used(channels, messages)
 
 
-def _transforms(context: LogContext, encoder: Encoder) -> list[NewMessage]:
-    """One message for each transform of the vehicle, and one, at the start, for all fixed ones."""
+def topics_of_targets(targets: Collection[str]) -> dict[str, str]:
+    """A topic for the poses in the frame of each target session, as ROS allows names."""
+    topics: dict[str, str] = {}
+    for target in sorted(targets):
+        name = re.sub("[^A-Za-z0-9_]", "_", target)
+        if not name[:1].isalpha():
+            name = f"session_{name}"
+        topic = f"{POSE}/{name}"
+        while topic in topics.values():
+            topic += "_"
+        topics[target] = topic
+    return topics
+
+
+def latched(metadata: Mapping[str, str], facts: LogFacts) -> dict[str, str]:
+    """Metadata of a topic whose last message a late reader gets."""
+    if facts.encoding == "ros1":
+        return {**metadata, LATCHING_KEY: "1"}
+    if facts.encoding != "ros2":
+        return dict(metadata)
+    profile = metadata.get(QOS_KEY) or DEFAULT_QOS
+    for volatile, local in (("volatile", "transient_local"), ("2", "1")):
+        profile = re.sub(rf"durability: {volatile}\b", f"durability: {local}", profile)
+    return {**metadata, QOS_KEY: profile}
+
+
+def _pose_in_target(closure: ClosureRecord, session_T_query: F64) -> StampedPose:
+    frame_id = f"semloc/{closure.target_session}"
+    covariance = closure.covariance_in_session()
+    return StampedPose(closure.query_stamp_ns, frame_id, session_T_query, covariance)
+
+
+def _scene(context: LogContext, encoder: Encoder, number: Mapping[str, int]) -> list[NewMessage]:
+    """A message for each moving transform and pose, and one, at the start, for what is fixed."""
+    scene = context.scene
+    moving = [(t.stamp_ns, MOVING, encoder.transforms([t])) for t in scene.moving]
+    moving += [(pose.stamp_ns, POSE, encoder.pose(pose)) for pose in scene.common]
     facts = context.facts
-    times = [context.log_time(t.stamp_ns) for t in context.frames.moving]
-    messages = [  # a session may have other logs, too
-        NewMessage(3, time, encoder.transforms([transform]))
-        for time, transform in zip(times, context.frames.moving, strict=True)
-        if facts.start_ns <= time <= facts.end_ns
-    ]
-    if context.frames.fixed:
-        start_ns = max(0, facts.start_ns)
-        messages.append(NewMessage(4, start_ns, encoder.transforms(context.frames.fixed)))
+    messages = []
+    for stamp_ns, topic, data in moving:
+        time = context.log_time(stamp_ns)
+        if facts.start_ns <= time <= facts.end_ns:  # a session may have other logs, too
+            messages.append(NewMessage(number[topic], time, data))
+    start_ns = max(0, facts.start_ns)
+    if scene.fixed:
+        messages.append(NewMessage(number[FIXED], start_ns, encoder.transforms(scene.fixed)))
+    if scene.cloud is not None:
+        stamp_ns = scene.fixed[0].stamp_ns if scene.fixed else start_ns
+        messages.append(NewMessage(number[MAP], start_ns, encoder.cloud(scene.cloud, stamp_ns)))
     return messages
 
 

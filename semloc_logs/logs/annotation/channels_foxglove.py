@@ -11,7 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -22,10 +24,12 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from semloc_logs.logs.annotation.channels import (
     F64,
-    TOPICS,
     ClosureRecord,
+    Cloud,
+    Kind,
     Mark,
     NewChannel,
+    StampedPose,
     Transform,
 )
 from semloc_logs.numerics.transforms import translation_quaternion
@@ -67,36 +71,40 @@ class FoxgloveEncoder:
     def __init__(self, encoding: Literal["protobuf", "json"]) -> None:
         self.encoding = encoding
 
-    def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]:
-        out = []
-        kinds = (
-            loop_closure_class(),
-            PoseInFrame,
-            SceneUpdate,
-            FrameTransforms,
-            FrameTransforms,
-        )
-        for topic, kind in zip(TOPICS, kinds, strict=True):
-            name = kind.DESCRIPTOR.full_name
-            if self.encoding == "protobuf":
-                data = build_file_descriptor_set(kind).SerializeToString(deterministic=True)
-                schema_encoding = "protobuf"
-            elif topic == TOPICS[0]:
-                data = read_text("messages/LoopClosure.json").encode()
-                schema_encoding = "jsonschema"
-            else:
-                data = json.dumps({"title": name, **json_schema(kind.DESCRIPTOR)}).encode()
-                schema_encoding = "jsonschema"
-            out.append(NewChannel(topic, self.encoding, name, schema_encoding, data, metadata))
-        return out
+    def channel(self, topic: str, kind: Kind, metadata: Mapping[str, str]) -> NewChannel:
+        message = _class_of(kind)
+        name = message.DESCRIPTOR.full_name
+        if self.encoding == "protobuf":
+            data = build_file_descriptor_set(message).SerializeToString(deterministic=True)
+            return NewChannel(topic, self.encoding, name, "protobuf", data, metadata)
+        if kind is Kind.CLOSURE:
+            data = read_text("messages/LoopClosure.json").encode()
+        else:
+            data = json.dumps({"title": name, **json_schema(message.DESCRIPTOR)}).encode()
+        return NewChannel(topic, self.encoding, name, "jsonschema", data, metadata)
 
     def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes:
         return self._bytes(loop_closure_class()(timestamp=_time(stamp_ns), **closure.columns()))
 
-    def pose(self, closure: ClosureRecord, frame_id: str) -> bytes:
-        session_T_query = np.eye(4) if closure.session_T_query is None else closure.session_T_query
-        message = PoseInFrame(timestamp=_time(closure.query_stamp_ns), frame_id=frame_id)
-        _set_pose(message.pose, *translation_quaternion(session_T_query))
+    def pose(self, pose: StampedPose) -> bytes:
+        message = PoseInFrame(timestamp=_time(pose.stamp_ns), frame_id=pose.frame_id)
+        _set_pose(message.pose, *translation_quaternion(pose.frame_T_base))
+        return self._bytes(message)
+
+    def cloud(self, cloud: Cloud, stamp_ns: int) -> bytes:
+        rows = cloud.rows(("blue", "green", "red", "alpha", "label"))
+        rows["alpha"] = 255
+        message = PointCloud(
+            timestamp=_time(stamp_ns),
+            frame_id=cloud.frame_id,
+            point_stride=rows.itemsize,
+            data=rows.tobytes(),
+        )
+        _set_pose(message.pose, np.zeros(3))
+        for name, (kind, offset, *_) in (rows.dtype.fields or {}).items():
+            is_byte = kind == np.uint8
+            element = PackedElementField.UINT8 if is_byte else PackedElementField.FLOAT32
+            message.fields.add(name=name, offset=offset, type=element)
         return self._bytes(message)
 
     def mark(self, mark: Mark) -> bytes:
@@ -138,6 +146,16 @@ class FoxgloveEncoder:
         if self.encoding == "protobuf":
             return bytes(message.SerializeToString(deterministic=True))
         return json.dumps(_json_value(message), allow_nan=False).encode()
+
+
+def _class_of(kind: Kind) -> Any:
+    classes = {
+        Kind.POSE: PoseInFrame,
+        Kind.MARKERS: SceneUpdate,
+        Kind.TRANSFORMS: FrameTransforms,
+        Kind.CLOUD: PointCloud,
+    }
+    return loop_closure_class() if kind is Kind.CLOSURE else classes[kind]
 
 
 @cache

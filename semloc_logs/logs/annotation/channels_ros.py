@@ -12,10 +12,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.logs.annotation.channels import (
     F64,
-    TOPICS,
     ClosureRecord,
+    Cloud,
+    Kind,
     Mark,
     NewChannel,
+    StampedPose,
     Transform,
 )
 from semloc_logs.numerics.transforms import translation_quaternion
@@ -25,6 +27,15 @@ CLOSURE = "semloc_msgs/msg/LoopClosure"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+CLOUD = "sensor_msgs/msg/PointCloud2"
+NAMES = {
+    Kind.CLOSURE: CLOSURE,
+    Kind.POSE: POSE,
+    Kind.MARKERS: MARKERS,
+    Kind.TRANSFORMS: TRANSFORMS,
+    Kind.CLOUD: CLOUD,
+}
+_UINT8, _FLOAT32 = 2, 7  # values of sensor_msgs/PointField.datatype
 _SPHERE, _LINE_LIST, _TEXT = (
     2,
     5,
@@ -40,39 +51,47 @@ class RosEncoder:
         ros2 = Stores.ROS2_FOXY if old_markers else Stores.ROS2_HUMBLE
         self.store = _store(Stores.ROS1_NOETIC if version == 1 else ros2)
 
-    def channels(self, metadata: Mapping[str, str]) -> list[NewChannel]:
+    def channel(self, topic: str, kind: Kind, metadata: Mapping[str, str]) -> NewChannel:
         encoding, schema_encoding = ("ros1", "ros1msg") if self.version == 1 else ("cdr", "ros2msg")
-        out = []
-        for topic, name in zip(
-            TOPICS, (CLOSURE, POSE, MARKERS, TRANSFORMS, TRANSFORMS), strict=True
-        ):
-            shown = name if self.version == 2 else name.replace("/msg/", "/")
-            out.append(
-                NewChannel(
-                    topic,
-                    encoding,
-                    shown,
-                    schema_encoding,
-                    self._definition(name).encode(),
-                    metadata,
-                )
-            )
-        return out
+        name = NAMES[kind]
+        shown = name if self.version == 2 else name.replace("/msg/", "/")
+        definition = self._definition(name).encode()
+        return NewChannel(topic, encoding, shown, schema_encoding, definition, metadata)
 
     def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes:
         columns = closure.columns() | {"covariance": np.array(closure.covariance)}
         return self._bytes(self._new(CLOSURE, header=self._header(stamp_ns, ""), **columns))
 
-    def pose(self, closure: ClosureRecord, frame_id: str) -> bytes:
-        session_T_query = np.eye(4) if closure.session_T_query is None else closure.session_T_query
-        pose = self._new(
+    def pose(self, pose: StampedPose) -> bytes:
+        inner = self._new(
             "geometry_msgs/msg/PoseWithCovariance",
-            pose=self._pose(*translation_quaternion(session_T_query)),
-            covariance=closure.covariance_in_session().reshape(36),
+            pose=self._pose(*translation_quaternion(pose.frame_T_base)),
+            covariance=pose.covariance.reshape(36),
         )
-        return self._bytes(
-            self._new(POSE, header=self._header(closure.query_stamp_ns, frame_id), pose=pose)
+        header = self._header(pose.stamp_ns, pose.frame_id)
+        return self._bytes(self._new(POSE, header=header, pose=inner))
+
+    def cloud(self, cloud: Cloud, stamp_ns: int) -> bytes:
+        # rgb is a float whose bytes are blue, green, red, 0: as PCL has it
+        rows = cloud.rows(("b", "g", "r", "zero", "label"))
+        kinds = {"x": _FLOAT32, "y": _FLOAT32, "z": _FLOAT32, "rgb": _FLOAT32, "label": _UINT8}
+        fields = [
+            self.store.types["sensor_msgs/msg/PointField"](name, 4 * k, kind, 1)
+            for k, (name, kind) in enumerate(kinds.items())
+        ]
+        data = np.frombuffer(rows.tobytes(), np.uint8)
+        message = self._new(
+            CLOUD,
+            header=self._header(stamp_ns, cloud.frame_id),
+            height=1,
+            width=len(rows),
+            fields=fields,
+            point_step=rows.itemsize,
+            row_step=len(data),
+            data=data,
+            is_dense=True,
         )
+        return self._bytes(message)
 
     def mark(self, mark: Mark) -> bytes:
         markers = [self._marker(mark, _SPHERE, "semloc/places", mark.position, (mark.size,) * 3)]

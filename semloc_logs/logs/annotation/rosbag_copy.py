@@ -19,15 +19,13 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.errors import LogError, SemlocError
-from semloc_logs.logs.annotation.channels import LogFacts, is_old_marker
+from semloc_logs.logs.annotation.channels import QOS_KEY, LogFacts, is_old_marker
 from semloc_logs.logs.containers import sqlite_file
 from semloc_logs.logs.containers.base import unpack_whole
 from semloc_logs.logs.containers.memory import DEFAULT, Memory
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.messages.type_names import ros2_type
 from semloc_logs.logs.remote import is_remote
-
-QOS_KEY = "offered_qos_profiles"
 
 
 class _Sqlite(Sqlite3Reader):

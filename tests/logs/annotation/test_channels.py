@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections.abc import Sequence
@@ -19,16 +20,22 @@ from semloc_logs.errors import ContractError
 from semloc_logs.logs.annotation.annotate import encoder_for
 from semloc_logs.logs.annotation.channels import (
     COLUMNS,
+    NO_SCENE,
     TOPICS,
     ClosureRecord,
+    Cloud,
     Encoding,
     LogContext,
     LogFacts,
     NewChannel,
     NewMessage,
+    Scene,
+    StampedPose,
     channel_metadata,
     encode,
+    latched,
     run_id,
+    topics_of_targets,
 )
 from semloc_logs.logs.annotation.channels_foxglove import loop_closure_class
 from semloc_logs.numerics.transforms import transform, yaw_transform
@@ -81,17 +88,17 @@ def decoded(
     session: str,
     encoding: Encoding,
     log_times: dict[int, int] | None = None,
+    scene: Scene = NO_SCENE,
 ) -> dict[str, list[tuple[int, Any]]]:
     facts = LogFacts(encoding, "", {}, 10, 20, 1)
-    channels, messages = encode(
-        closures,
-        LogContext(session, facts, log_times or {}, frame_id="odom", marker_size=1.0),
-        encoder_for(facts),
-        {"run": "1"},
+    context = LogContext(
+        session, facts, log_times or {}, frame_id="odom", marker_size=1.0, scene=scene
     )
+    channels, messages = encode(closures, context, encoder_for(facts), {"run": "1"})
     out: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in TOPICS}
     for m in messages:
-        out[channels[m.channel].topic].append((m.log_time_ns, decode(channels[m.channel], m)))
+        channel = channels[m.channel]
+        out.setdefault(channel.topic, []).append((m.log_time_ns, decode(channel, m)))
     return out
 
 
@@ -186,7 +193,7 @@ def test_markers_show_the_place_and_the_other_end() -> None:
         session_position=np.array([5.0, 0.0, 0.0]),
     )
     found = decoded([closure], "wet_monday", "ros2")
-    assert [len(found[t]) for t in TOPICS] == [1, 1, 1, 0, 0]  # one message, at the query's end
+    assert [len(found[t]) for t in TOPICS] == [1, 1, 1, 0, 0, 0]  # one message, at the query's end
     sphere, line, text = found["/semloc/markers"][0][1].markers
     assert (sphere.type, line.type, text.type) == (2, 5, 9)
     assert {m.header.frame_id for m in (sphere, line, text)} == {"odom"}
@@ -300,6 +307,13 @@ def test_ros_definitions_name_their_types_as_the_profile_wants() -> None:
             {"run": "1"},
         ),
         ("/semloc/markers", "visualization_msgs/MarkerArray", "ros1msg", "ros1", {"run": "1"}),
+        (
+            "/semloc/pose/dry_sunday",
+            "geometry_msgs/PoseWithCovarianceStamped",
+            "ros1msg",
+            "ros1",
+            {"run": "1"},
+        ),
     ]
     assert b"MSG: std_msgs/Header\nuint32 seq\ntime stamp" in channels[0].schema_data
 
@@ -348,3 +362,89 @@ def test_run_id_follows_content() -> None:
     assert all(run_id(*other) != same for other in others)
     assert re.fullmatch("[0-9a-f]{16}", same)
     assert channel_metadata(same, "1")["semloc.run_id"] == same
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_each_target_has_a_topic_of_its_poses(encoding: Encoding) -> None:
+    sunday = ClosureRecord.from_row(ROW, session_T_query=np.eye(4))
+    friday = ClosureRecord.from_row(ROW | {"target_session": "friday"}, session_T_query=np.eye(4))
+    found = decoded([sunday, friday], "wet_monday", encoding)
+    assert len(found["/semloc/pose"]) == 2
+    for target in ("dry_sunday", "friday"):
+        ((_, message),) = found[f"/semloc/pose/{target}"]
+        in_ros = encoding.startswith("ros")
+        frame_id = message.header.frame_id if in_ros else message.frame_id
+        assert frame_id == f"semloc/{target}"
+
+
+def test_topics_are_names_that_ros_allows() -> None:
+    names = ["2021-08-05", "a b", "a-b", "Straße", "x"]
+    assert topics_of_targets(names) == {
+        "2021-08-05": "/semloc/pose/session_2021_08_05",
+        "Straße": "/semloc/pose/Stra_e",
+        "a b": "/semloc/pose/a_b",
+        "a-b": "/semloc/pose/a_b_",
+        "x": "/semloc/pose/x",
+    }
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_poses_in_the_common_frame_replace_the_ones_of_targets(encoding: Encoding) -> None:
+    closure = ClosureRecord.from_row(ROW, session_T_query=np.eye(4))
+    pose = StampedPose(12, "semloc/common", yaw_transform(0.0, (1.0, 2.0, 3.0)), np.zeros((6, 6)))
+    found = decoded([closure], "wet_monday", encoding, scene=Scene(common=[pose]))
+    ((time, message),) = found["/semloc/pose"]
+    in_ros = encoding.startswith("ros")
+    inner = message.pose.pose if in_ros else message.pose
+    assert time == 12
+    assert (message.header if in_ros else message).frame_id == "semloc/common"
+    assert (inner.position.x, inner.position.y, inner.position.z) == (1.0, 2.0, 3.0)
+    assert len(found["/semloc/pose/dry_sunday"]) == 1
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_the_map_is_a_cloud_at_the_start(encoding: Encoding) -> None:
+    points = np.array([[1.0, 2.0, 3.0], [-4.0, 5.5, 0.25]], np.float32)
+    colours = np.array([[128, 64, 127], [1, 2, 3]], np.uint8)
+    cloud = Cloud("odom", points, colours, np.array([0, 255], np.uint8))
+    closure = ClosureRecord.from_row(ROW)
+    found = decoded([closure], "wet_monday", encoding, scene=Scene(cloud=cloud))
+    ((time, message),) = found["/semloc/map"]
+    assert time == 10
+    if encoding.startswith("ros"):
+        assert (message.width, message.height, message.header.frame_id) == (2, 1, "odom")
+        step = message.point_step
+        data = bytes(message.data)
+        assert message.row_step == len(data) == 2 * step
+        colour = ("b", "g", "r")
+        offset = {f.name: f.offset for f in message.fields}
+        places = {c: offset["rgb"] + k for k, c in enumerate(colour)}
+    else:
+        assert message.frame_id == "odom"
+        step = message.point_stride
+        data = base64.b64decode(message.data) if encoding == "json" else message.data
+        offset = {f.name: f.offset for f in message.fields}
+        places = {c[0]: offset[c] for c in ("red", "green", "blue")}
+    for k in range(2):
+        row = data[k * step : (k + 1) * step]
+        xyz = [np.frombuffer(row, "<f4", 1, offset[axis])[0] for axis in "xyz"]
+        assert xyz == points[k].tolist()
+        assert [row[places[c]] for c in "rgb"] == colours[k].tolist()
+        assert row[offset["label"]] == (0, 255)[k]
+
+
+def test_late_readers_get_the_map() -> None:
+    def facts(encoding: Encoding) -> LogFacts:
+        return LogFacts(encoding, "", {}, 0, 0, 0)
+
+    numbers = {"offered_qos_profiles": "- history: 3\n  durability: 2\n  depth: 0\n"}
+    words = {"offered_qos_profiles": "- history: keep_all\n  durability: volatile\n"}
+    assert latched(numbers, facts("ros2"))["offered_qos_profiles"] == (
+        "- history: 3\n  durability: 1\n  depth: 0\n"
+    )
+    assert latched(words, facts("ros2"))["offered_qos_profiles"].endswith(
+        "durability: transient_local\n"
+    )
+    assert "durability: 1\n" in latched({}, facts("ros2"))["offered_qos_profiles"]
+    assert latched({}, facts("ros1")) == {"latching": "1"}
+    assert latched({"run": "1"}, facts("json")) == {"run": "1"}
