@@ -20,6 +20,8 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 DOUBT = 150  # voxels that are added to the observed ones, and their shares in wrong poses
 DOUBTFUL_ALIGNED, DOUBTFUL_FREE = 0.5, 0.2
+# of the structure of both sides, in free space: less in most right poses, more in most wrong ones
+CONSISTENT = 0.1
 ENOUGH_COVERAGE = 0.5  # of the query's structure in observed space: less of it lowers the score
 
 
@@ -84,6 +86,34 @@ def mutual_shares(forward: Scores, reverse: Scores) -> tuple[float, float]:
     aligned = [(s.aligned + DOUBT * DOUBTFUL_ALIGNED) / (s.observed + DOUBT) for s in sides]
     free = [(s.free + DOUBT * DOUBTFUL_FREE) / (s.observed + DOUBT) for s in sides]
     return _weighted(min(aligned), max(aligned)), _weighted(max(free), min(free))
+
+
+class MutualScores(NamedTuple):
+    """``forward``: the query's structure on the target's map; ``reverse``: the target's on the
+    query's.
+    """
+
+    forward: Scores
+    reverse: Scores
+
+    @property
+    def score(self) -> float:
+        """The rank among alignments of one query, in [-1, 1]."""
+        aligned, free = mutual_shares(*self)
+        return aligned - free
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether so little structure of either side is in free space that the pose may be right."""
+        return mutual_shares(*self)[1] < CONSISTENT
+
+
+def mutual_scores(query: Query, target: Target, target_T_query: F64) -> MutualScores:
+    """The scores of a pose on both sides."""
+    return MutualScores(
+        structure_scores(query, target, target_T_query),
+        reverse_scores(query, target, target_T_query),
+    )
 
 
 def _weighted(worse: float, better: float) -> float:

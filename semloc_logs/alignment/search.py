@@ -17,7 +17,7 @@ from semloc_logs.alignment.hypotheses import (
 )
 from semloc_logs.alignment.mask_grid import FREE_BIT, REACH, Arrays, MaskGrid
 from semloc_logs.alignment.query_map import SEARCH_VOXELS, STRUCTURE_SHARE, Evidence, Query
-from semloc_logs.alignment.scores import mutual_shares, reverse_scores, structure_scores
+from semloc_logs.alignment.scores import mutual_scores
 from semloc_logs.alignment.target_map import Target
 
 U8 = NDArray[np.uint8]
@@ -52,8 +52,7 @@ FIRST = SearchStep(0.8, 2, 200, BEGUN)
 KEPT = 16  # hypotheses after a search
 SECOND = SearchStep(0.3, 1, SEARCH_VOXELS, SAME_PLACE_VOXELS)
 BY_SEARCH = 2  # candidates by their score in the search; the others by what both sides observed
-# of the best candidate of a search; right ones have 0.4 and more
-MIN_SEARCH_SCORE = 0.2
+MIN_SEARCH_SCORE = 0.2  # of the best candidate, unless one is consistent with what both sides saw
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +84,7 @@ def search_hypotheses(
     """The ``most`` best candidates after two searches around each hypothesis.
 
     The first is in steps of two voxels with few of the query's voxels; the second, for the best, in
-    steps of one with more. None if the best one scores so little that no fit makes a good alignment
-    of it.
+    steps of one with more. None if no fit can make a good alignment of any of them.
     """
     searched = [_Searched(h, np.array(h.pose), 0.0) for h in hypotheses]
     searched = _suppressed(searched, BEGUN * query.voxel_size, len(searched))
@@ -100,8 +98,6 @@ def search_hypotheses(
             better.append(_Searched(s.hypothesis, pose, score))
         better.sort(key=lambda s: (-s.score, s.hypothesis.group, tuple(s.pose)))
         searched = _suppressed(better, step.distance * query.voxel_size, KEPT)
-    if not searched or searched[0].score < MIN_SEARCH_SCORE:
-        return []
     candidates = [
         Candidate(s.hypothesis.group, pose_matrix(s.pose), s.score, s.hypothesis.votes)
         for s in searched
@@ -118,17 +114,14 @@ def _chosen(
     The search counts whatever lies outside the target's view against a pose. So it prefers poses
     from which both sensors saw the same part of the road to a right one 30 m away.
     """
-    first = min(BY_SEARCH, most)
-
-    def misfit(candidate: Candidate) -> float:
-        target = targets[candidate.group]
-        pose = candidate.target_T_query
-        aligned, free = mutual_shares(
-            structure_scores(query, target, pose), reverse_scores(query, target, pose)
-        )
-        return free - aligned
-
-    return candidates[:first] + sorted(candidates[first:], key=misfit)[: most - first]
+    scores = [mutual_scores(query, targets[c.group], c.target_T_query) for c in candidates]
+    best_score = max((c.score for c in candidates), default=0.0)
+    if best_score < MIN_SEARCH_SCORE and not any(s.is_consistent for s in scores):
+        return []
+    order = sorted(range(len(candidates)), key=lambda k: -scores[k].score)
+    first = list(range(min(BY_SEARCH, most, len(candidates))))
+    chosen = [*first, *(k for k in order if k not in first)][:most]
+    return [candidates[k] for k in chosen]
 
 
 def _suppressed(searched: Sequence[_Searched], distance: float, most: int) -> list[_Searched]:

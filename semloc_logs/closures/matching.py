@@ -14,7 +14,7 @@ from semloc_logs.alignment.hypotheses import Hypothesis, keep_best_submaps, pool
 from semloc_logs.alignment.icp import Fit
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit, measured
-from semloc_logs.alignment.scores import Scores, mutual_shares, reverse_scores, structure_scores
+from semloc_logs.alignment.scores import MutualScores, mutual_scores, mutual_shares
 from semloc_logs.alignment.search import Candidate, search_hypotheses
 from semloc_logs.alignment.target_map import is_uncertain
 from semloc_logs.alignment.tau import tau
@@ -42,9 +42,9 @@ VOTE_CELL = 2.4  # m, at voxels of 0.30 m: edge of the cells that word matches v
 # the weight of a word match falls to LEAST_WEIGHT at so many bits between the words
 FAR_WORD = 32.0
 LEAST_WEIGHT = 1e-3
-# of the best score, and a score: no right alignment has less
+# of the best score, and a score: right alignments have more
 MIN_RELATIVE_SCORE = 0.8
-MIN_SCORE = 0.3
+MIN_SCORE = 0.25
 
 Prepared = tuple[Described, list[list[LookUp]]]
 _PREPARED: WeakKeyDictionary[Query, dict[str, Prepared]] = WeakKeyDictionary()
@@ -104,7 +104,7 @@ class Fitted:
     nearest: int
     view: F64
     fit: Fit
-    scores: Scores
+    scores: MutualScores
     range_sigma: float
 
 
@@ -309,7 +309,7 @@ def _coarse(context: QueryContext, candidate: Candidate) -> Fitted:
         visible.nearest_keyframe(group, candidate.target_T_query[:3, 3]),
         apply(candidate.target_T_query, query.view_centre[None])[0],
         fit,
-        structure_scores(query, target, fit.target_T_query),
+        mutual_scores(query, target, fit.target_T_query),
         query.sigma,
     )
 
@@ -330,7 +330,7 @@ def _fine(context: QueryContext, fitted: Fitted, best_score: float) -> Fitted:
     return replace(
         fitted,
         fit=fit,
-        scores=structure_scores(query, target, fit.target_T_query),
+        scores=mutual_scores(query, target, fit.target_T_query),
         range_sigma=max(query.sigma, surface.sigma),
     )
 
@@ -351,7 +351,7 @@ def _alignment(context: QueryContext, fitted: Fitted) -> Alignment:
     session = context.session
     group = fitted.candidate.group
     target_session = context.target_session(group)
-    features = _features(context, fitted)
+    features = _features(fitted, context.voxel_size)
     overlap, inliers = _overlap(context, fitted)
 
     map_T_query_base = fitted.fit.target_T_query @ context.query_T_base
@@ -393,11 +393,9 @@ def _roads(context: QueryContext, fitted: Fitted, nearest: int) -> Roads:
     )
 
 
-def _features(context: QueryContext, fitted: Fitted) -> Features[float]:
+def _features(fitted: Fitted, voxel_size: float) -> Features[float]:
     """The evidence of both sides: the query on the target's map, and this on the query's."""
-    forward = fitted.scores
-    target = context.visible.target(fitted.candidate.group)
-    reverse = reverse_scores(context.query, target, fitted.fit.target_T_query)
+    forward, reverse = fitted.scores
     structure, contradiction = mutual_shares(forward, reverse)
     return Features(
         structure=structure,
@@ -406,7 +404,7 @@ def _features(context: QueryContext, fitted: Fitted) -> Features[float]:
         fit=fitted.fit.inliers,
         support=float(np.log10(forward.aligned + reverse.aligned + 1)),
         stiffness=float(np.log10(stiffness(fitted.fit) + 1)),
-        range_sigma=fitted.range_sigma / context.voxel_size,
+        range_sigma=fitted.range_sigma / voxel_size,
     )
 
 

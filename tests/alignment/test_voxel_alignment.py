@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,6 +21,7 @@ from semloc_logs.alignment.mask_grid import (
 from semloc_logs.alignment.query_map import Evidence, Query, structure_mask
 from semloc_logs.alignment.refine import coarse_fit, escaped, fine_fit, measured
 from semloc_logs.alignment.scores import (
+    MutualScores,
     Scores,
     alignment_score,
     mutual_shares,
@@ -280,11 +283,10 @@ def test_a_candidate_that_both_sides_hold_for_right_is_kept_though_few_voxels_ov
     far = Scores(5000, 500, 450, 0)
     near = Scores(5000, 4000, 2000, 1300)
 
-    def scores(query: object, target: object, pose: np.ndarray) -> Scores:
-        return far if pose[0, 3] == 4.0 else near
+    def scores(query: object, target: object, pose: np.ndarray) -> MutualScores:
+        return MutualScores(far, far) if pose[0, 3] == 4.0 else MutualScores(near, near)
 
-    monkeypatch.setattr(search_module, "structure_scores", scores)
-    monkeypatch.setattr(search_module, "reverse_scores", scores)
+    monkeypatch.setattr(search_module, "mutual_scores", scores)
     rows = [Candidate(0, yaw_transform(0.0, (x, 0, 0)), 0.9 - 0.1 * x, 3) for x in np.arange(6.0)]
     target = Target(block_map(town()), V)
     query = Query(block_map(town()), points_of(town()), V)
@@ -292,6 +294,11 @@ def test_a_candidate_that_both_sides_hold_for_right_is_kept_though_few_voxels_ov
     assert [c.target_T_query[0, 3] for c in chosen] == [0.0, 1.0, 4.0, 2.0]
     assert search_module._chosen(rows[:1], {0: target}, query, 4) == rows[:1]
     assert search_module._chosen(rows, {0: target}, query, 1) == rows[:1]
+
+    poor = [replace(c, score=0.1) for c in rows]
+    chosen = search_module._chosen(poor, {0: target}, query, 4)
+    assert chosen[2] == poor[4], "the search hardly saw it, but nothing contradicts it"
+    assert search_module._chosen(poor[:4], {0: target}, query, 4) == []
 
 
 def evidence_of(cells: dict[Cell, int], structure: int) -> Evidence:

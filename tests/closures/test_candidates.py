@@ -10,7 +10,7 @@ import pytest
 
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.icp import Fit
-from semloc_logs.alignment.scores import Scores
+from semloc_logs.alignment.scores import MutualScores, Scores
 from semloc_logs.alignment.search import Candidate
 from semloc_logs.closures import matching
 from semloc_logs.closures.matching import (
@@ -42,16 +42,17 @@ def context(made: Resolved, road: tuple[float, ...] = (0.0, 2000.0)) -> QueryCon
 
 
 def fitted(x: float, score: float) -> Fitted:
-    """A fit at ``x`` metres; the score is the structure where all of it is observed."""
+    """A fit at ``x`` metres that aligns so much structure, all of it observed by both sides."""
     none = np.zeros((6, 6))
     fit = Fit(yaw_transform(0.0, (x, 0, 0)), 1.0, 100, 0.1, none, np.zeros(3), np.zeros((2, 6)))
     scores = Scores(100, 100, round(100 * score), 0)
-    return Fitted(Candidate(0, np.eye(4), 0.5, 3), 0, np.zeros(3), fit, scores, 0.0)
+    both = MutualScores(scores, scores)
+    return Fitted(Candidate(0, np.eye(4), 0.5, 3), 0, np.zeros(3), fit, both, 0.0)
 
 
 def test_the_best_fit_of_each_place_is_kept() -> None:
     rows = [fitted(0.5, 0.4), fitted(0.0, 0.6), fitted(9.0, 0.5)]
-    assert [f.scores.score for f in _each_place_once(rows, 0.3)] == [0.6, 0.5]
+    assert [f.scores.forward.aligned for f in _each_place_once(rows, 0.3)] == [60, 50]
 
 
 def test_candidates_of_each_session_are_as_many_as_the_settings_name(

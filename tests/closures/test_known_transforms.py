@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.alignment.covariance import stiffness
 from semloc_logs.alignment.icp import Fit
-from semloc_logs.alignment.scores import Scores
+from semloc_logs.alignment.scores import MutualScores, Scores
 from semloc_logs.alignment.search import Candidate
 from semloc_logs.closures.acceptance.calibration import log_odds, shipped
 from semloc_logs.closures.acceptance.decide import decide
@@ -399,7 +399,8 @@ def fitted(score: float, x: float = 0.0, degrees: float = 0.0) -> Fitted:
     T = yaw_transform(np.radians(degrees), (x, 0.0, 0.0))
     fit = Fit(T, 1.0, 1000, 0.1, np.eye(6), np.zeros(3), np.zeros((2, 6)))
     scores = Scores(1000, 1000, round(1000 * score), 0)
-    return Fitted(Candidate(0, T, score, 1), 0, np.zeros(3), fit, scores, 0.0)
+    both = MutualScores(scores, scores)
+    return Fitted(Candidate(0, T, score, 1), 0, np.zeros(3), fit, both, 0.0)
 
 
 def test_each_place_is_kept_once_and_the_best_first() -> None:
@@ -411,7 +412,7 @@ def test_each_place_is_kept_once_and_the_best_first() -> None:
         fitted(0.7, 0.9, 6.0),
         fitted(0.8, 0.5, 4.0),
     ]
-    assert [f.scores.score for f in _each_place_once(every, V)] == [0.9, 0.7, 0.6]
+    assert [f.scores.forward.aligned for f in _each_place_once(every, V)] == [900, 700, 600]
 
 
 def test_stiffness_is_what_holds_the_weakest_direction_while_the_rotation_is_free() -> None:
