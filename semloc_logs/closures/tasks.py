@@ -22,7 +22,7 @@ from semloc_logs.closures.alignment_tables import write_part
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import open_database
 from semloc_logs.closures.matching import ground_below, prepare, search_query
-from semloc_logs.closures.query import build_query
+from semloc_logs.closures.query import build_query, query_keyframes
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.words.catalogue import segments
@@ -61,7 +61,8 @@ def search_queries(task: SearchTask) -> int:
     """
     session = SessionMap(Workspace(task.work).session(task.session))
     queries = {k: build_query(session, k, task.settings) for k in task.keyframes}
-    votes = survey_queries(task, session, queries)
+    least_votes = min_votes(session, task.settings)
+    votes = survey_queries(task, session, queries) if least_votes > 0 else {k: {} for k in queries}
     found: list[Alignment] = []
     for target, fingerprint in task.targets.items():
 
@@ -74,10 +75,17 @@ def search_queries(task: SearchTask) -> int:
             continue
         of_target = {k: votes[k].get(target, NO_VOTES) for k in queries}
         for block in _blocks(task.keyframes, block_size(task.settings)):
-            found += _search_block(block, of_target, task.settings.closures.min_votes, search)
+            found += _search_block(block, of_target, least_votes, search)
     found.sort(key=lambda a: (a.query_keyframe, a.target_session))
     write_part(task.output, task.keyframes, task.targets, found)
     return len(found)
+
+
+def min_votes(session: SessionMap, settings: Resolved) -> float:
+    """Votes that are worth a search. A single query is searched in any case: no neighbour finds
+    what its survey missed.
+    """
+    return settings.closures.min_votes if len(query_keyframes(session, settings)) > 1 else 0.0
 
 
 def block_size(settings: Resolved) -> int:
@@ -128,7 +136,7 @@ def survey_queries(task: SearchTask, session: SessionMap, queries: Mapping[int, 
     settings = task.settings
     votes: dict[int, dict[str, Votes]] = {keyframe: {} for keyframe in queries}
     targets = tuple((n, made_from) for n, made_from in task.targets.items() if n != task.session)
-    if settings.closures.min_votes <= 0 or not targets:
+    if not targets:
         return votes
     for variant, survey in _surveys(task.work, targets, session.has_classes, settings).items():
         for keyframe, (query, _) in queries.items():

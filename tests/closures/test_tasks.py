@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
+from semloc_logs.closures import tasks
 from semloc_logs.closures.closure import Features
 from semloc_logs.closures.tasks import _search_block
+from semloc_logs.settings import load
 from semloc_logs.words.survey import Votes
 
 BLOCK = (10, 12, 14, 16)
@@ -62,3 +64,12 @@ def test_in_a_small_map_fewer_votes_are_enough() -> None:
 
 def test_all_are_searched_without_a_bound() -> None:
     assert searched(votes(0.0, 0.0, 0.0, 0.0), {}, 0.0) == list(BLOCK)
+
+
+@pytest.mark.parametrize(("queries", "least"), [([4], 0.0), ([4, 8], MIN_VOTES)])
+def test_a_single_query_is_searched_whatever_its_votes(
+    queries: list[int], least: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "query_keyframes", lambda session, settings: queries)
+    settings = load(assignments={"closures.min_votes": str(MIN_VOTES)}).resolved()
+    assert tasks.min_votes(cast(Any, None), settings) == least

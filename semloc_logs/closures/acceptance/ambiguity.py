@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT
+from semloc_logs.closures.acceptance.calibration import position_confidence
 from semloc_logs.closures.acceptance.placements import (
     ARM,
     FAR,
@@ -50,9 +51,8 @@ def ambiguity(
     most counts. Of lone queries it is 1 in a session that copies alone explain.
     """
     lone = np.isnan(support)
-    triples = _contradictions(
-        placed, pairs, np.where(lone, placed.probability_ignoring_rivals, support), voxel_size
-    )
+    known = placed.probability_ignoring_rivals * position_confidence(placed.sigma, voxel_size)
+    triples = _contradictions(placed, pairs, np.where(lone, known, support), voxel_size)
     support = np.where(lone, 0.0, support)
     with_lone = lone[triples].any(axis=1)
     reach = FAR * voxel_size / STREET_VOXEL
@@ -71,7 +71,7 @@ def ambiguity(
         mine = contradicted[placed.query_session[contradicted] == session]
         road = np.unique(placed.road[mine])
         shown.setdefault(session, []).append((roads[session], road, np.ones(len(road))))
-    out = np.where(lone & _among_copies(placed, triples[with_lone]), 1.0, 0.0)
+    out = np.where(lone & _among_copies(placed, known, triples[with_lone]), 1.0, 0.0)
     for sessions, end_roads in (
         (placed.query_session, placed.road),
         (placed.target_session, placed.target_road),
@@ -173,19 +173,19 @@ def _contradictions(placed: Placed, pairs: Pairs, support: F64, voxel_size: floa
     return np.concatenate(found)
 
 
-def _among_copies(placed: Placed, triples: I64) -> Bools:
+def _among_copies(placed: Placed, known: F64, triples: I64) -> Bools:
     """Alignments (n,) of sessions whose contradictions chance does not explain.
 
     One wrong alignment may contradict many right ones; so of each of the ``triples`` (m, 3) the
-    least probable alignment is held for wrong, each once, by chance.
+    least probable alignment is held for wrong, each once, by chance. ``known`` (n,) are the
+    probabilities that an alignment is right, and its position within the bound.
     """
-    p = placed.probability_ignoring_rivals
-    weakest = triples[np.arange(len(triples)), np.argmin(p[triples], axis=1)]
+    weakest = triples[np.arange(len(triples)), np.argmin(known[triples], axis=1)]
     wrong: dict[str, set[int]] = {}
     for rows, row in zip(triples, weakest.tolist(), strict=True):
         for session in {*placed.query_session[rows], *placed.target_session[rows]}:
             wrong.setdefault(session, set()).add(row)
-    copies = [s for s, rows in wrong.items() if np.prod(1 - p[sorted(rows)]) < CHANCE]
+    copies = [s for s, rows in wrong.items() if np.prod(1 - known[sorted(rows)]) < CHANCE]
     return np.isin(placed.query_session, copies) | np.isin(placed.target_session, copies)
 
 
