@@ -16,11 +16,21 @@ from semloc_logs.alignment.mask_grid import FREE_BIT, MaskGrid
 from semloc_logs.alignment.overlaps import overlap, overlap_map, query_voxels
 from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.system import Query, RankedPose, View
+from semloc_logs.experiments.systems import plain
 from semloc_logs.experiments.systems.ablations import (
     ABLATIONS,
     ablated,
     described_alone,
     without_free_space,
+)
+from semloc_logs.experiments.systems.catalogue import (
+    ABLATIONS as CATALOGUED,
+)
+from semloc_logs.experiments.systems.catalogue import (
+    OURS,
+    SystemOptions,
+    entries,
+    make_system,
 )
 from semloc_logs.experiments.systems.ours import Ours
 from semloc_logs.experiments.systems.plain import Plain, refined, rigid_fit
@@ -216,10 +226,37 @@ def test_poses_below_the_least_tau_are_left_out(database: list[View]) -> None:
     assert system.localise(Query("vegetation", (changed,))) == []
 
 
-def test_the_plain_method_names_what_it_lacks(database: list[View]) -> None:
-    system = Plain(settings=plain_settings(descriptor__weights="missing.safetensors"))
-    with pytest.raises(SettingsError, match=r"missing\.safetensors"):
+def test_the_plain_method_names_what_it_lacks(database: list[View], tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"plain\.weights.*train --method paper"):
+        Plain(settings=plain_settings()).fit(database)
+    system = Plain("geometric", plain_settings(plain__weights=str(tmp_path)))
+    with pytest.raises(SettingsError, match=r"geometric\.safetensors"):
         system.fit(database)
+
+
+def test_every_row_of_ours_is_made_by_its_name(
+    database: list[View],
+    queries: list[Query],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(plain, "QUICK_SAMPLES", 64)
+    options = SystemOptions(plain_settings(), tmp_path, quick=True)
+    for entry in (*OURS, *CATALOGUED):
+        assert entries([entry.name]) == [entry]
+        assert make_system(entry, options).name
+    assert not set(CATALOGUED) & set(entries())
+    # a small scene trains a network of its own, once
+    system = make_system(entries(["paper-geometric"])[0], options)
+    system.fit(database)
+    kept = {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/pairs.parquet")}
+    assert len(kept) == 1
+    assert len(system.localise(hidden(queries[0]))) > 0
+    again = make_system(entries(["paper-geometric"])[0], options)
+    again.fit(database)
+    assert kept == {
+        p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/pairs.parquet")
+    }
 
 
 def test_iterative_closest_points_move_a_wall_onto_a_wall() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -26,6 +27,8 @@ from semloc_logs.alignment.overlaps import (
 )
 from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
+from semloc_logs.experiments.systems.catalogue import SystemOptions
+from semloc_logs.experiments.systems.trained_networks import key_of
 from semloc_logs.experiments.view_sessions import sensor_centre
 from semloc_logs.labels.space import SKY
 from semloc_logs.mapping.selection import thin
@@ -38,9 +41,16 @@ from semloc_logs.subvolumes.plain_describe import (
     load_plain_encoder,
 )
 from semloc_logs.subvolumes.plain_network import PlainEncoder
+from semloc_logs.training.descriptor_samples import plain_shard_descriptors
+from semloc_logs.training.network_training import TrainingRun, train
+from semloc_logs.training.pairs import SceneFrame, cut_pairs, write_shard
 from semloc_logs.voxels.grid import BlockMap, Fuser
 from semloc_logs.words.index import Allowed, Index
-from semloc_logs.words.plain_vocabulary import PlainVocabulary, load_plain_vocabulary
+from semloc_logs.words.plain_vocabulary import (
+    PlainVocabulary,
+    load_plain_vocabulary,
+    train_plain_vocabulary,
+)
 
 U8 = NDArray[np.uint8]
 F64 = NDArray[np.float64]
@@ -50,6 +60,9 @@ METHOD = "paper"
 SINGLE_LABEL = 2  # of all voxels, in the geometric variant
 PROBES = 1  # the tree is traversed to one cell
 CONVERGED = 1e-3  # voxels and radians
+# of the network of a small scene
+QUICK_FRAMES = 24
+QUICK_SAMPLES = 640
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,8 +89,9 @@ class _Database:
 class Plain:
     """The method of ``settings`` (schemas/methods/paper.yaml), in one of the ``variant``s of 4.4.
 
-    The geometric one gives all voxels one label. A query of five views is the paper's *acc.* The
-    weights and the vocabulary of the settings may be replaced by an ``encoder`` and ``words``.
+    The geometric one gives all voxels one label. A query of five views is the paper's *acc.* An
+    ``encoder`` and ``words`` may replace those of ``plain.weights``. In a small scene (``quick``, a
+    folder) without them a network is trained for a minute on the first database itself.
     """
 
     variant: Variant = "semantic"
@@ -85,6 +99,7 @@ class Plain:
     encoder: PlainEncoder | None = None
     words: PlainVocabulary | None = None
     name: str = ""
+    quick: Path | None = None
 
     def __post_init__(self) -> None:
         self.name = self.name or f"paper ({self.variant})"
@@ -92,25 +107,25 @@ class Plain:
 
     # -- parts
 
+    def _file(self, ending: str) -> Path:
+        """The file of a network or of its words."""
+        folder = self.settings.plain.weights
+        if folder is None or not (folder / f"{self.variant}{ending}").is_file():
+            raise SettingsError(
+                f"{self.name} needs {folder or 'the folder plain.weights'}/{self.variant}{ending}:"
+                " 'semloc train --method paper' and 'semloc vocabulary --method paper' make it"
+                " (docs/how_to/paper.md)."
+            )
+        return folder / f"{self.variant}{ending}"
+
     def _encoder(self) -> PlainEncoder:
         if self.encoder is None:
-            weights = self.settings.descriptor.weights
-            if weights is None:
-                raise SettingsError(
-                    "The paper's method has no shipped weights: train them with 'semloc train"
-                    " --method paper', and name the file with descriptor.weights."
-                )
-            self.encoder = load_plain_encoder(self.variant, weights)
+            self.encoder = load_plain_encoder(self.variant, self._file(".safetensors"))
         return self.encoder
 
     def _vocabulary(self) -> PlainVocabulary:
         if self.words is None:
-            path = self.settings.descriptor.vocabulary
-            if path is None:
-                raise SettingsError(
-                    "The paper's method has no shipped vocabulary: make one with 'semloc"
-                    " vocabulary --method paper', and name the file with descriptor.vocabulary."
-                )
+            path = self._file("-words.safetensors")
             self.words = load_plain_vocabulary(self.variant, path)
         return self.words
 
@@ -139,6 +154,8 @@ class Plain:
         settings = self.settings
         plain = settings.plain
         v = settings.fusion.voxel_size
+        if self.quick is not None and plain.weights is None and self.encoder is None:
+            self.encoder, self.words = _trained_on(database, self.variant, settings, self.quick)
         world_T_map = np.eye(4)
         world_T_map[:3, 3] = database[0].world_T_base[:3, 3]
         fused = self._fused(
@@ -225,6 +242,43 @@ class Plain:
             part = -turned_R_map @ np.array([*turned.middle, 0.0])
             out.append(Shifts(turned_R_map, part, np.unique(shift, axis=0).reshape(-1, 3)))
         return out
+
+
+def _trained_on(
+    database: Sequence[View], variant: Variant, settings: Resolved, folder: Path
+) -> tuple[PlainEncoder, PlainVocabulary]:
+    """A network and words of some subvolumes of the database; kept in ``folder``."""
+    views = [database[i] for i in range(0, len(database), max(1, len(database) // QUICK_FRAMES))]
+    own = folder / f"{variant}-{key_of(views)}"
+    shard = own / "pairs.parquet"
+    method = load(method=METHOD).training.model_copy(update={"samples": QUICK_SAMPLES})
+    if not shard.exists():
+        frames = []
+        for view in views:
+            kept = thin(view.points, settings.fusion.keyframe_resolution)
+            kept = kept[view.label[kept] != SKY]
+            points = view.points[kept]
+            frames.append(
+                SceneFrame(points, sensor_centre(view), view.label[kept], view.world_T_base)
+            )
+        own.mkdir(parents=True, exist_ok=True)
+        rng = np.random.default_rng(method.seed)
+        write_shard(shard, cut_pairs(frames, settings.fusion, method, rng))
+    network = train(variant, [shard], method, TrainingRun(own / "checkpoint.safetensors"))
+    if network is None or not isinstance(network.encoder, PlainEncoder):
+        raise SettingsError(f"{shard}: the network of the paper could not be trained.")
+    encoder = network.encoder.eval()
+    return encoder, train_plain_vocabulary(plain_shard_descriptors([shard], encoder))
+
+
+def make_semantic(options: SystemOptions) -> Plain:
+    """The paper's method."""
+    return Plain("semantic", options.settings, quick=options.folder if options.quick else None)
+
+
+def make_geometric(options: SystemOptions) -> Plain:
+    """The paper's method with one label."""
+    return Plain("geometric", options.settings, quick=options.folder if options.quick else None)
 
 
 def refined(target: OverlapMap, query: Voxels, start: F64, iterations: int) -> tuple[F64, float]:
