@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs import progress
 from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix, same_place
 from semloc_logs.alignment.search import Candidate
 from semloc_logs.closures.acceptance.calibration import shipped
@@ -86,7 +87,8 @@ class Ours:
                 )
             }
         )
-        fuse_views(query.views, folder, settings, "odometry")
+        with progress.listening(lambda _: None):  # a second's work
+            fuse_views(query.views, folder, settings, "odometry")
         session = SessionMap(folder)
         last = len(query.views) - 1
         built, query_T_base = build_query(session, last, settings)
