@@ -208,7 +208,6 @@ class _Ablated(Ours):
         return super()._aligned(context, candidates) if self.row.fitted else []
 
     def _score(self, alignment: Alignment) -> float:
-        # the log-odds live on the share that contradicts
         return super()._score(alignment) if self.row.contradicts else alignment.features.structure
 
 

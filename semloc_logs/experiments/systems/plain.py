@@ -90,8 +90,8 @@ class Plain:
     """The method of ``settings`` (schemas/methods/paper.yaml), in one of the ``variant``s of 4.4.
 
     The geometric one gives all voxels one label. A query of five views is the paper's *acc.* An
-    ``encoder`` and ``words`` may replace the files of ``plain.weights``. In a small scene (``quick``, a
-    folder) without them a network is trained for a minute on the first database itself.
+    ``encoder`` and ``words`` may replace the files of ``plain.weights``. In a small scene
+    (``quick``, a folder) without them a network is trained for a minute on the first database.
     """
 
     variant: Variant = "semantic"
