@@ -415,11 +415,6 @@ class Training(_Section):
 class Plain(_Section):
     """The paper's method as written, in the experiments (paper 3, 4.2 and supplement 1)."""
 
-    weights: Path | None = Field(
-        None,
-        description="folder of the networks and words: semantic.safetensors,"
-        " semantic-words.safetensors, and geometric ones",
-    )
     headings: int = Field(
         18, ge=1, description="uniformly spaced yaw hypotheses; a query is described in each"
     )

@@ -23,15 +23,6 @@ from semloc_logs.experiments.systems.ablations import (
     described_alone,
     without_free_space,
 )
-from semloc_logs.experiments.systems.catalogue import (
-    ABLATIONS as CATALOGUED,
-)
-from semloc_logs.experiments.systems.catalogue import (
-    OURS,
-    SystemOptions,
-    entries,
-    make_system,
-)
 from semloc_logs.experiments.systems.ours import Ours
 from semloc_logs.experiments.systems.plain import Plain, refined, rigid_fit
 from semloc_logs.numerics.transforms import inverse, rotation_angle, yaw_transform
@@ -226,37 +217,31 @@ def test_poses_below_the_least_tau_are_left_out(database: list[View]) -> None:
     assert system.localise(Query("vegetation", (changed,))) == []
 
 
-def test_the_plain_method_names_what_it_lacks(database: list[View], tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"plain\.weights.*train --method paper"):
+def test_the_plain_method_names_what_it_lacks(database: list[View]) -> None:
+    with pytest.raises(SettingsError, match="no shipped weights: train them"):
         Plain(settings=plain_settings()).fit(database)
-    system = Plain("geometric", plain_settings(plain__weights=str(tmp_path)))
-    with pytest.raises(SettingsError, match=r"geometric\.safetensors"):
-        system.fit(database)
+    missing = plain_settings(descriptor__weights="missing.safetensors")
+    with pytest.raises(SettingsError, match=r"missing\.safetensors"):
+        Plain(settings=missing).fit(database)
+    encoder = PlainEncoder("semantic").eval()
+    with pytest.raises(SettingsError, match="no shipped vocabulary: make one"):
+        Plain(settings=plain_settings(), encoder=encoder).fit(database)
 
 
-def test_every_row_of_ours_is_made_by_its_name(
+def test_a_small_scene_trains_a_network_of_its_own_once(
     database: list[View],
     queries: list[Query],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(plain, "QUICK_SAMPLES", 64)
-    options = SystemOptions(plain_settings(), tmp_path, quick=True)
-    for entry in (*OURS, *CATALOGUED):
-        assert entries([entry.name]) == [entry]
-        assert make_system(entry, options).name
-    assert not set(CATALOGUED) & set(entries())
-    # a small scene trains a network of its own, once
-    system = make_system(entries(["paper-geometric"])[0], options)
+    system = Plain("geometric", plain_settings(), quick=tmp_path)
     system.fit(database)
-    kept = {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/pairs.parquet")}
-    assert len(kept) == 1
+    kept = {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/*")}
+    assert {"pairs.parquet", "checkpoint.safetensors"} <= set(kept)
     assert len(system.localise(hidden(queries[0]))) > 0
-    again = make_system(entries(["paper-geometric"])[0], options)
-    again.fit(database)
-    assert kept == {
-        p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/pairs.parquet")
-    }
+    Plain("geometric", plain_settings(), quick=tmp_path).fit(database)
+    assert kept == {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/*")}
 
 
 def test_iterative_closest_points_move_a_wall_onto_a_wall() -> None:

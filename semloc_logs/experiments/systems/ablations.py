@@ -30,7 +30,6 @@ from semloc_logs.closures.matching import (
 )
 from semloc_logs.errors import SettingsError, did_you_mean
 from semloc_logs.experiments.system import RankedPose
-from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.ours import Ours
 from semloc_logs.settings import Resolved, Settings, validated
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, WIDE, code_table
@@ -214,38 +213,3 @@ class _Ablated(Ours):
 def without_free_space(grid: MaskGrid) -> MaskGrid:
     """The masks without the bit of free space: it neither contradicts nor is observed."""
     return MaskGrid(grid.mask & np.uint8(FREE_BIT - 1), grid.corner, grid.cell)
-
-
-def make_geometric_words(options: SystemOptions) -> Ours:
-    """Our pipeline with words of the geometric network."""
-    return ablated("ours, words without classes", options.settings)
-
-
-def make_every_heading(options: SystemOptions) -> Ours:
-    """Our pipeline with a query that is described again in every heading."""
-    return ablated("ours, every heading described", options.settings)
-
-
-def make_alone(options: SystemOptions) -> Ours:
-    """Our pipeline with subvolumes of the query that are described one by one."""
-    return ablated("ours, query subvolumes alone", options.settings)
-
-
-def make_dense(options: SystemOptions) -> Ours:
-    """Our pipeline with four times as many subvolumes."""
-    return ablated("ours, subvolumes every 4 voxels", options.settings)
-
-
-def make_one_neighbour(options: SystemOptions) -> Ours:
-    """Our pipeline with one nearest word of each."""
-    return ablated("ours, one neighbour", options.settings)
-
-
-def make_free_space_ignored(options: SystemOptions) -> Ours:
-    """Our pipeline without free space that contradicts."""
-    return ablated("ours, free space ignored", options.settings)
-
-
-def make_not_refined(options: SystemOptions) -> Ours:
-    """Our pipeline without fits on points."""
-    return ablated("ours, not refined", options.settings)

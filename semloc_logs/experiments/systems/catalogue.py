@@ -51,24 +51,7 @@ class Entry:
 
 
 # our pipeline and the paper's plain method
-OURS: tuple[Entry, ...] = (
-    Entry("paper-semantic", "Paper (semantic)", "plain:make_semantic"),
-    Entry("paper-geometric", "Paper (geometric)", "plain:make_geometric"),
-    Entry("paper-acc", "Paper (acc.)", "plain:make_semantic", frames=5),
-    Entry("ours", "Ours", "ours:make_ours"),
-    Entry("ours-acc", "Ours (acc.)", "ours:make_ours", frames=5),
-)
-
-# our pipeline without what it has beyond the paper; they run where they are named
-ABLATIONS: tuple[Entry, ...] = (
-    Entry("ours-geometric", "Ours, words without classes", "ablations:make_geometric_words"),
-    Entry("ours-every-heading", "Ours, every heading described", "ablations:make_every_heading"),
-    Entry("ours-alone", "Ours, query subvolumes alone", "ablations:make_alone"),
-    Entry("ours-dense", "Ours, subvolumes every 4 voxels", "ablations:make_dense"),
-    Entry("ours-one-neighbour", "Ours, one neighbour", "ablations:make_one_neighbour"),
-    Entry("ours-no-free-space", "Ours, free space ignored", "ablations:make_free_space_ignored"),
-    Entry("ours-not-refined", "Ours, not refined", "ablations:make_not_refined"),
-)
+OURS: tuple[Entry, ...] = ()
 
 # the systems that the paper compares with, and the peers of today
 BASELINES: tuple[Entry, ...] = (
@@ -95,11 +78,9 @@ class NotInstalledError(SettingsError):
 
 
 def entries(names: Iterable[str] = ()) -> list[Entry]:
-    """The entries called ``names``; without names all but the ablations. SettingsError for an
-    unknown one.
-    """
-    known = {entry.name: entry for entry in (*OURS, *BASELINES, *ABLATIONS)}
-    chosen = [*names] or [entry.name for entry in (*OURS, *BASELINES)]
+    """The entries called ``names``, all of them without names. SettingsError for an unknown one."""
+    known = {entry.name: entry for entry in (*OURS, *BASELINES)}
+    chosen = [*names] or [*known]
     for name in chosen:
         if name not in known:
             raise SettingsError(

@@ -27,7 +27,6 @@ from semloc_logs.closures.query import build_query
 from semloc_logs.closures.visibility import visible_to
 from semloc_logs.engines import Serial
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
-from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.view_sessions import fuse_views
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved, Settings
@@ -146,8 +145,3 @@ class Ours:
         name = alignment.target_session
         map_T_target = self._database.sessions[name].map_T_base[alignment.target_keyframe]
         return np.asarray(self._world_T_map[name] @ map_T_target @ alignment.target_T_query)
-
-
-def make_ours(options: SystemOptions) -> Ours:
-    """Our pipeline."""
-    return Ours(settings=options.settings)

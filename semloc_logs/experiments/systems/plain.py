@@ -27,7 +27,6 @@ from semloc_logs.alignment.overlaps import (
 )
 from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
-from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.trained_networks import key_of
 from semloc_logs.experiments.view_sessions import sensor_centre
 from semloc_logs.labels.space import SKY
@@ -90,8 +89,9 @@ class Plain:
     """The method of ``settings`` (schemas/methods/paper.yaml), in one of the ``variant``s of 4.4.
 
     The geometric one gives all voxels one label. A query of five views is the paper's *acc.* An
-    ``encoder`` and ``words`` may replace the files of ``plain.weights``. In a small scene
-    (``quick``, a folder) without them a network is trained for a minute on the first database.
+    ``encoder`` and ``words`` may replace the files that the settings name. With a folder ``quick``
+    and without such files a network is trained for a minute on the first database, for small
+    scenes that only show that everything runs.
     """
 
     variant: Variant = "semantic"
@@ -107,25 +107,25 @@ class Plain:
 
     # -- parts
 
-    def _file(self, ending: str) -> Path:
-        """The file of a network or of its words."""
-        folder = self.settings.plain.weights
-        if folder is None or not (folder / f"{self.variant}{ending}").is_file():
-            raise SettingsError(
-                f"{self.name} needs {folder or 'the folder plain.weights'}/{self.variant}{ending}:"
-                " 'semloc train --method paper' and 'semloc vocabulary --method paper' make it"
-                " (docs/how_to/paper.md)."
-            )
-        return folder / f"{self.variant}{ending}"
-
     def _encoder(self) -> PlainEncoder:
         if self.encoder is None:
-            self.encoder = load_plain_encoder(self.variant, self._file(".safetensors"))
+            weights = self.settings.descriptor.weights
+            if weights is None:
+                raise SettingsError(
+                    "The paper's method has no shipped weights: train them with 'semloc train"
+                    " --method paper', and name the file with descriptor.weights."
+                )
+            self.encoder = load_plain_encoder(self.variant, weights)
         return self.encoder
 
     def _vocabulary(self) -> PlainVocabulary:
         if self.words is None:
-            path = self._file("-words.safetensors")
+            path = self.settings.descriptor.vocabulary
+            if path is None:
+                raise SettingsError(
+                    "The paper's method has no shipped vocabulary: make one with 'semloc"
+                    " vocabulary --method paper', and name the file with descriptor.vocabulary."
+                )
             self.words = load_plain_vocabulary(self.variant, path)
         return self.words
 
@@ -154,7 +154,8 @@ class Plain:
         settings = self.settings
         plain = settings.plain
         v = settings.fusion.voxel_size
-        if self.quick is not None and plain.weights is None and self.encoder is None:
+        named = settings.descriptor.weights
+        if self.quick is not None and named is None and self.encoder is None:
             self.encoder, self.words = _trained_on(database, self.variant, settings, self.quick)
         world_T_map = np.eye(4)
         world_T_map[:3, 3] = database[0].world_T_base[:3, 3]
@@ -269,16 +270,6 @@ def _trained_on(
         raise SettingsError(f"{shard}: the network of the paper could not be trained.")
     encoder = network.encoder.eval()
     return encoder, train_plain_vocabulary(plain_shard_descriptors([shard], encoder))
-
-
-def make_semantic(options: SystemOptions) -> Plain:
-    """The paper's method."""
-    return Plain("semantic", options.settings, quick=options.folder if options.quick else None)
-
-
-def make_geometric(options: SystemOptions) -> Plain:
-    """The paper's method with one label."""
-    return Plain("geometric", options.settings, quick=options.folder if options.quick else None)
 
 
 def refined(target: OverlapMap, query: Voxels, start: F64, iterations: int) -> tuple[F64, float]:
