@@ -84,8 +84,10 @@ class OverlapMap:
         )
 
 
-def overlap_map(target: BlockMap, reach: float) -> OverlapMap:
-    """The map of a target, for a kappa of ``reach`` voxels."""
+def overlap_map(target: BlockMap, reach: float, *, free: bool = True) -> OverlapMap:
+    """The map of a target, for a kappa of ``reach`` voxels; without ``free``, occupied voxels alone
+    may be closest.
+    """
     blocks = unpack(target.keys).astype(np.int64)
     beside = int(np.ceil((reach + 2) / BLOCK))
     first = blocks.min(0) - beside if len(blocks) else np.zeros(3, np.int64)
@@ -102,6 +104,8 @@ def overlap_map(target: BlockMap, reach: float) -> OverlapMap:
     number[around] = np.arange(len(blocks), rows)
     state = np.full((rows, BLOCK**3), UNOBSERVED_STATE, np.uint8)
     state[: len(blocks)] = target.state
+    if not free:
+        state[state == FREE_STATE] = UNOBSERVED_STATE
     observed = np.zeros((rows, CUBES**3), np.uint64)
     _mark_observed(state[: len(blocks)], observed)
     palette = np.zeros(PALETTE, np.uint32)
@@ -139,7 +143,7 @@ def _row_of(number: I32, first: I64, x: int, y: int, z: int) -> int:
         or k >= number.shape[2]
     ):
         return -1
-    return number[i, j, k]
+    return int(number[i, j, k])
 
 
 @njit(cache=True, nogil=True)
@@ -154,7 +158,7 @@ def _observed_cube(arrays: Arrays, x: int, y: int, z: int) -> np.uint64:
     row = _row_of(arrays[0], arrays[1], x << 2, y << 2, z << 2)
     if row < 0:
         return np.uint64(0)
-    return arrays[3][row, (((x & 3) << 2) | (y & 3)) << 2 | (z & 3)]
+    return np.uint64(arrays[3][row, (((x & 3) << 2) | (y & 3)) << 2 | (z & 3)])
 
 
 @njit(cache=True, nogil=True)
@@ -202,7 +206,7 @@ def _state_at(arrays: Arrays, x: int, y: int, z: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _bit_of(state: int) -> np.uint32:
-    if state == FREE_STATE or state == UNOBSERVED_STATE:
+    if state in (FREE_STATE, UNOBSERVED_STATE):
         return NOT_ALIGNED
     return np.uint32(1) << np.uint32(UNLABELLED_BIT if state == UNLABELLED else state)
 
@@ -265,7 +269,7 @@ def _look_up(arrays: Arrays, x: int, y: int, z: int, offsets: Offsets) -> np.uin
     if number == NOT_MADE:
         number = _number_of(arrays[5], _mask_of(arrays, x, y, z, offsets))
         arrays[4][row, cell] = number
-    return arrays[5][number]
+    return np.uint32(arrays[5][number])
 
 
 @njit(cache=True, nogil=True)
@@ -364,7 +368,7 @@ def query_voxels(occupied: tuple[NDArray[np.int32], U8]) -> Voxels:
     """The occupied voxels of a map: coordinates (n, 3) and classes (n,)."""
     ijk, label = occupied
     order = np.random.default_rng(0).permutation(len(ijk))
-    return Voxels(ijk[order] + 0.5, class_bit(label)[order])
+    return Voxels(ijk[order].astype(np.float64) + 0.5, class_bit(label)[order])
 
 
 def overlap(target: OverlapMap, query: Voxels, target_T_query: F64) -> float:
@@ -424,8 +428,8 @@ def best_overlaps(
         bounds += [(-int(u), number, row) for row, u in enumerate(upper) if u >= needed]
     bounds.sort()
     found: list[tuple[int, int, int]] = []
-    for upper, number, row in bounds:
-        if -upper < needed:
+    for negative, number, row in bounds:
+        if -negative < needed:
             break
         group = groups[number]
         points = query.turned(group.rotation, group.part + group.whole[row])

@@ -9,9 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from scipy.spatial.transform import Rotation
 
+from semloc_logs.alignment.overlaps import overlap, overlap_map, query_voxels
+from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.system import Query, RankedPose, View
 from semloc_logs.experiments.systems.ours import Ours
+from semloc_logs.experiments.systems.plain import Plain, refined, rigid_fit
 from semloc_logs.numerics.transforms import inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import Resolved, load
 from semloc_logs.simulation.meshes.world import (
@@ -27,6 +32,11 @@ from semloc_logs.simulation.meshes.world import (
 )
 from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
 from semloc_logs.simulation.sensors.lidar_models import MODELS
+from semloc_logs.subvolumes.plain_describe import describe_blocks
+from semloc_logs.subvolumes.plain_network import PlainEncoder
+from semloc_logs.voxels.grid import UNOBSERVED_STATE, BlockMap, Fuser
+from semloc_logs.voxels.keys import BLOCK, pack
+from semloc_logs.words.plain_vocabulary import train_plain_vocabulary
 
 ODOM_T_WORLD = yaw_transform(np.radians(70), (200.0, -30.0, 4.0))
 SETTINGS = {
@@ -104,6 +114,16 @@ def errors(pose: RankedPose, query: Query) -> tuple[float, float]:
     return float(np.linalg.norm(off[:3, 3])), float(np.degrees(rotation_angle(off[:3, :3])))
 
 
+def blocks_with(ijk: np.ndarray, label: np.ndarray) -> BlockMap:
+    """A map of occupied voxels and nothing else."""
+    keys, row = np.unique(pack(ijk // BLOCK), return_inverse=True)
+    state = np.full((len(keys), BLOCK**3), UNOBSERVED_STATE, np.uint8)
+    x, y, z = (ijk % BLOCK).T
+    state[row.ravel(), (x * BLOCK + y) * BLOCK + z] = label
+    nothing = np.zeros(0, np.int64)
+    return BlockMap(keys, np.zeros(state.shape, np.int8), state, nothing, nothing)
+
+
 def hidden(query: Query) -> Query:
     """The query without its truth, which no system may read."""
     nowhere = np.full((4, 4), np.nan)
@@ -124,3 +144,94 @@ def test_ours_finds_both_queries_to_centimetres(
         assert len(found) > 3
         scores = [pose.score for pose in found]
         assert scores == sorted(scores, reverse=True)
+
+
+PLAIN = {
+    "fusion.max_range": "20",
+    "query.radius": "15",
+    "plain.headings": "6",
+    "plain.refined": "10",
+}
+
+
+def plain_settings(**changes: str) -> Resolved:
+    """The paper's settings with fewer headings, near points and large voxels."""
+    given = {key.replace("__", "."): value for key, value in changes.items()}
+    return load(assignments={**SETTINGS, **PLAIN, **given}, method="paper").resolved()
+
+
+def plain_system(variant: str, database: list[View], chosen: Resolved) -> Plain:
+    """The plain method with an untrained network: the same cloud has the same descriptors."""
+    torch.manual_seed(0)
+    encoder = PlainEncoder(variant).eval()
+    fuser = Fuser(chosen.fusion)
+    for v in database:
+        fuser.add(v.points, v.label, v.origin, None, v.world_T_base)
+    described = describe_blocks(fuser.finish(), 8, 1, encoder)
+    assert variant in ("semantic", "geometric")
+    words = train_plain_vocabulary(described.descriptor)
+    return Plain("semantic" if variant == "semantic" else "geometric", chosen, encoder, words)
+
+
+@pytest.mark.parametrize("variant", ["semantic", "geometric"])
+def test_the_plain_method_finds_a_cloud_again_that_was_turned(
+    database: list[View], variant: str
+) -> None:
+    # four places that share nothing, a multiple of the stride of eight voxels apart
+    places = [
+        replace(v, world_T_base=yaw_transform(0.0, (96.0 * i, 8.0 * i, 0.0)))
+        for i, v in enumerate(database[::5])
+    ]
+    system = plain_system(variant, places, plain_settings())
+    assert system.name == f"paper ({variant})"
+    system.fit(places)
+    turned = yaw_transform(np.pi, (50.3, 7.1, -2.0))
+    query = Query("again", (replace(places[2], odom_T_base=turned),))
+    found = system.localise(hidden(query))
+    assert len(found) == 10
+    metres, degrees = errors(found[0], query)
+    assert metres < 0.2
+    assert degrees < 1.0
+    scores = [pose.score for pose in found]
+    assert scores == sorted(scores, reverse=True)
+    assert scores[-1] >= 0.3
+    assert scores[0] <= 1.0
+
+
+def test_poses_below_the_least_tau_are_left_out(database: list[View]) -> None:
+    system = plain_system("semantic", database, plain_settings(plain__min_tau="1.0"))
+    system.fit(database)
+    changed = replace(database[10], label=np.full_like(database[10].label, 8))
+    assert system.localise(Query("vegetation", (changed,))) == []
+
+
+def test_the_plain_method_names_what_it_lacks(database: list[View]) -> None:
+    system = Plain(settings=plain_settings(descriptor__weights="missing.safetensors"))
+    with pytest.raises(SettingsError, match=r"missing\.safetensors"):
+        system.fit(database)
+
+
+def test_iterative_closest_points_move_a_wall_onto_a_wall() -> None:
+    wall = np.array([[x, 0, z] for x in range(12) for z in range(12)], np.int32)
+    floor = np.array([[x, y, 0] for x in range(12) for y in range(1, 12)], np.int32)
+    ijk = np.concatenate([wall, floor])
+    label = np.r_[np.full(len(wall), 2), np.zeros(len(floor))].astype(np.uint8)
+    blocks = blocks_with(ijk, label)
+    start = yaw_transform(0.02, (0.3, 2.2, 0.4))
+    target = overlap_map(blocks, 5.0)
+    query = query_voxels((ijk, label))
+    pose, tau = refined(target, query, start, 30)
+    # from 2.2 voxels to less than one: within a voxel all closest voxels stay the same
+    assert overlap(target, query, start) < 0.91 < 0.95 < tau
+    assert np.abs(pose[:3, 3]).max() < 0.7
+    assert np.abs(pose[:3, :3] - np.eye(3)).max() < 0.03
+
+
+def test_a_rigid_fit_is_exact_on_exact_points() -> None:
+    source = np.random.default_rng(0).normal(size=(9, 3))
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 2.0]).as_matrix()
+    pose[:3, 3] = 1.0, -2.0, 0.5
+    np.testing.assert_allclose(
+        rigid_fit(source, source @ pose[:3, :3].T + pose[:3, 3]), pose, atol=1e-12
+    )
