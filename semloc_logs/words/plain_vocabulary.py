@@ -2,7 +2,7 @@
 
 A vocabulary takes unit vectors, whose nearest neighbours by angle and by distance are the same. A
 descriptor x becomes the unit vector (s x, sqrt(1 - s^2 x^2)): squared distances of two of them are
-s^2 times those of the descriptors, and a little more where their lengths differ, at most by the
+s^2 times the descriptors' own, and a little more where their lengths differ, at most by the
 square of the mean of s times both lengths.
 """
 

@@ -12,9 +12,16 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.alignment.mask_grid import FREE_BIT, MaskGrid
 from semloc_logs.alignment.overlaps import overlap, overlap_map, query_voxels
 from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.system import Query, RankedPose, View
+from semloc_logs.experiments.systems.ablations import (
+    ABLATIONS,
+    ablated,
+    described_alone,
+    without_free_space,
+)
 from semloc_logs.experiments.systems.ours import Ours
 from semloc_logs.experiments.systems.plain import Plain, refined, rigid_fit
 from semloc_logs.numerics.transforms import inverse, rotation_angle, yaw_transform
@@ -32,11 +39,15 @@ from semloc_logs.simulation.meshes.world import (
 )
 from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
 from semloc_logs.simulation.sensors.lidar_models import MODELS
+from semloc_logs.subvolumes.describe import Windows, describe_map, load_encoder
+from semloc_logs.subvolumes.network import Completion, Encoder
 from semloc_logs.subvolumes.plain_describe import describe_blocks
 from semloc_logs.subvolumes.plain_network import PlainEncoder
+from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.voxels.grid import UNOBSERVED_STATE, BlockMap, Fuser
 from semloc_logs.voxels.keys import BLOCK, pack
 from semloc_logs.words.plain_vocabulary import train_plain_vocabulary
+from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 
 ODOM_T_WORLD = yaw_transform(np.radians(70), (200.0, -30.0, 4.0))
 SETTINGS = {
@@ -44,7 +55,7 @@ SETTINGS = {
     "fusion.max_range": "25",
     "descriptor.reach": "15",
     "descriptor.headings": "8",
-    "closures.hypotheses": "16",
+    "closures.hypotheses": "64",
 }
 
 
@@ -224,7 +235,8 @@ def test_iterative_closest_points_move_a_wall_onto_a_wall() -> None:
     # from 2.2 voxels to less than one: within a voxel all closest voxels stay the same
     assert overlap(target, query, start) < 0.91 < 0.95 < tau
     assert np.abs(pose[:3, 3]).max() < 0.7
-    assert np.abs(pose[:3, :3] - np.eye(3)).max() < 0.03
+    assert abs(pose[0, 1]) < 1e-6  # the turn about the vertical, 0.02 at first, is gone
+    assert np.abs(pose[:3, :3] - np.eye(3)).max() < 0.06
 
 
 def test_a_rigid_fit_is_exact_on_exact_points() -> None:
@@ -235,3 +247,63 @@ def test_a_rigid_fit_is_exact_on_exact_points() -> None:
     np.testing.assert_allclose(
         rigid_fit(source, source @ pose[:3, :3].T + pose[:3, 3]), pose, atol=1e-12
     )
+
+
+@pytest.mark.parametrize("name", [n for n, row in ABLATIONS.items() if not row.training])
+def test_every_ablation_finds_the_view_of_the_opposite_lane(
+    name: str, database: list[View], queries: list[Query]
+) -> None:
+    system = ablated(name, settings())
+    assert system.name == name
+    system.fit(database)
+    query = queries[0]
+    found = system.localise(hidden(query))
+    metres, degrees = errors(found[0], query)
+    # a pose that was not refined is as good as the steps of the search
+    assert metres < (1.0 if name == "ours, not refined" else 0.25)
+    assert degrees < (5.0 if name == "ours, not refined" else 1.0)
+
+
+def test_ablations_change_what_they_name(database: list[View], queries: list[Query]) -> None:
+    assert ablated("ours, one neighbour").settings.closures.neighbours == 1
+    four = ablated("ours, subvolumes every 4 voxels").settings.descriptor
+    assert (four.stride, four.query_stride) == (4, 4)
+    with pytest.raises(SettingsError, match="there are ours"):
+        ablated("ours, no words")
+
+
+def test_a_network_trained_otherwise_is_named_with_its_command(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"training\.contrastive_weight=0"):
+        ablated("ours, no contrastive term", weights=tmp_path)
+    # any network with 64 numbers in place of a trained one
+    torch.manual_seed(0)
+    save_weights(tmp_path / "semantic.safetensors", Completion("semantic", 64), {})
+    random = np.random.default_rng(0).normal(size=(300, 64))
+    random /= np.linalg.norm(random, axis=1, keepdims=True)
+    save_vocabulary(tmp_path / "words.safetensors", train_vocabulary(random), {})
+    system = ablated("ours, N = 64", settings(), tmp_path)
+    chosen = system.settings.descriptor
+    assert chosen.weights == tmp_path / "semantic.safetensors"
+    assert load_encoder("semantic", chosen.weights).latent == 64
+
+
+def test_masks_without_free_space_keep_their_classes() -> None:
+    grid = MaskGrid(np.array([[[FREE_BIT, 0b1000001, 0]]], np.uint8), np.zeros(3), 0.3)
+    np.testing.assert_array_equal(without_free_space(grid).mask, [[[0, 0b1000001, 0]]])
+
+
+def test_a_subvolume_alone_is_described_as_a_map_that_holds_nothing_else() -> None:
+    torch.manual_seed(0)
+    encoder = Encoder("geometric").eval()
+    state = np.full((32, 32, 32), UNOBSERVED_STATE, np.uint8)
+    state[:, 4:20, 3] = 0
+    state[11, :, 3:9] = 2
+    low = np.array([8, -16, 0])
+    together = describe_map(state, low, 1.2, encoder, Windows(0.3, 8, 40))
+    whole = (together.centre[:, :2] == [24.0, 0.0]).all(1)
+    assert whole.sum() == 1
+    alone = described_alone(state, low, together.centre[whole], encoder)
+    np.testing.assert_allclose(alone, together.descriptor[whole], atol=2e-2)
+    # beside it others see a part of the map alone, and more of it together
+    others = described_alone(state, low, together.centre[~whole], encoder)
+    assert np.abs(others - together.descriptor[~whole]).max() > 2e-2

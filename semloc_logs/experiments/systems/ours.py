@@ -44,7 +44,7 @@ class Ours:
     Sessions of the database are kept in the folder ``work``, a temporary one without it. A query is
     answered by itself: the acceptance, which compares it with its neighbours, takes no part. First
     come the poses that were fitted on points, ranked by the log-odds that they are right, then
-    those of the search, then the other hypotheses by their votes. Scores of the latter two only
+    poses after the search, then the other hypotheses by their votes. Scores of the latter two only
     keep the order.
     """
 
@@ -99,7 +99,7 @@ class Ours:
         hypotheses = self._hypotheses(context)
         searched = verify_hypotheses(context, hypotheses)
         fitted = [a for candidates in searched for a in self._aligned(context, candidates)]
-        odds = [float(shipped().own_log_odds(a.features)) for a in fitted]
+        odds = [self._score(a) for a in fitted]
         found: list[RankedPose] = []
         for i in np.argsort(-np.array(odds), kind="stable").tolist():
             self._add(found, RankedPose(self._fitted_pose(fitted[i]), odds[i]))
@@ -125,6 +125,9 @@ class Ours:
 
     def _hypotheses(self, context: QueryContext) -> list[Hypothesis]:
         return find_hypotheses(context)
+
+    def _score(self, alignment: Alignment) -> float:
+        return float(shipped().own_log_odds(alignment.features))
 
     def _aligned(self, context: QueryContext, candidates: list[Candidate]) -> list[Alignment]:
         return align_candidates(context, candidates)
