@@ -21,7 +21,6 @@ from semloc_logs.alignment.overlaps import (
     Voxels,
     aligned_pairs,
     best_overlaps,
-    overlap,
     overlap_map,
     query_voxels,
 )
@@ -234,19 +233,19 @@ def refined(target: OverlapMap, query: Voxels, start: F64, iterations: int) -> t
     Closest points are the aligned voxels of the pose before. Translations are in voxels.
     """
     pose = start
-    best = (start, overlap(target, query, start))
-    for _ in range(iterations):
+    best = (start, -1.0)
+    for iteration in range(iterations + 1):
         ours, theirs = aligned_pairs(target, query, pose)
-        if len(ours) < 3:
+        tau = len(ours) / max(1, len(query.bits))
+        if tau > best[1]:
+            best = (pose, tau)
+        if iteration == iterations or len(ours) < 3:
             break
         moved = rigid_fit(ours, theirs)
         change = inverse(pose) @ moved
-        pose = moved
-        tau = overlap(target, query, pose)
-        if tau > best[1]:
-            best = (pose, tau)
         if max(np.abs(change[:3, 3]).max(), np.abs(change[:3, :3] - np.eye(3)).max()) < CONVERGED:
             break
+        pose = moved
     return best
 
 
