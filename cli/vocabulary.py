@@ -14,6 +14,7 @@ from .options import (
     console_options,
     engine_options,
     json_option,
+    method_option,
     path_option,
     tables_settings_options,
 )
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
 @json_option
 @engine_options
 @tables_settings_options
+@method_option
 @console_options
 def command(
     variant: str,

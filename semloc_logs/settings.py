@@ -420,7 +420,15 @@ class Plain(_Section):
         18, ge=1, description="uniformly spaced yaw hypotheses; a query is described in each"
     )
     stride: int = Field(
-        8, ge=1, description="subvolumes every so many voxels along x, y and z (not in the paper)"
+        8,
+        ge=1,
+        description="database subvolumes every so many voxels along x, y and z (not in the paper)",
+    )
+    query_stride: int = Field(
+        16,
+        ge=1,
+        description="query subvolumes every so many voxels (not in the paper, which has several"
+        " thousand in all headings)",
     )
     min_occupied: int = Field(
         1, ge=1, description="subvolumes with fewer occupied voxels are not described"
@@ -428,6 +436,11 @@ class Plain(_Section):
     neighbours: int = Field(5, ge=1, description="nearest database words of each query word (K)")
     kappa: float = Field(
         3.0, gt=0, description="greatest distance of aligned voxels (m at 0.30 m voxels)"
+    )
+    closest: Literal["observed", "occupied"] = Field(
+        "observed",
+        description="the voxels that may be closest to an aligned one; observed: free space, too,"
+        " as the paper's text has it",
     )
     min_tau: float = Field(
         0.3, ge=0, le=1, description="poses with a smaller share of aligned voxels are left out"

@@ -78,7 +78,7 @@ def test_unknown_keys_are_refused_by_name_from_the_environment() -> None:
 
 def test_every_section_refuses_unknown_keys() -> None:
     sections = [name for name, value in Settings() if isinstance(value, BaseModel)]
-    assert len(sections) == 8
+    assert len(sections) == 9
     for section in sections:
         with pytest.raises(SettingsError, match=rf"{section}\.no_such_key"):
             load(assignments={f"{section}.no_such_key": "1"})
@@ -240,3 +240,20 @@ def test_a_key_that_is_spelled_wrong_is_suggested(key: str, meant: str | None) -
         load(assignments={key: "1"})
     assert ("Did you mean" in str(caught.value)) == (meant is not None)
     assert meant is None or f"'{meant}'?" in str(caught.value)
+
+
+def test_a_method_is_a_settings_file_that_others_change(tmp_path: Path) -> None:
+    paper = load(method="paper")
+    assert paper.training.method == "paper"
+    assert (paper.training.batch, paper.training.dropout) == (32, 0.10)
+    assert (paper.training.reconstruction_weight, paper.training.occupied_weight) == (10, 10)
+    assert paper.training.contrastive_weight == 0
+    assert (paper.plain.headings, paper.plain.neighbours) == (18, 5)
+    assert (paper.plain.kappa, paper.plain.min_tau) == (3.0, 0.3)
+    file = tmp_path / "own.yaml"
+    file.write_text("training:\n  batch: 8\nplain:\n")
+    changed = load(file, {"plain.kappa": "2"}, method="paper")
+    assert (changed.training.batch, changed.training.method) == (8, "paper")
+    assert changed.plain.kappa == 2.0
+    with pytest.raises(SettingsError, match="there are paper"):
+        load(method="papers")

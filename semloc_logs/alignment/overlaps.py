@@ -6,8 +6,8 @@ borders: for each cell a mask has the classes of all voxels that may be closest 
 one look-up gives bounds of tau; the closest voxel itself is looked for in hypotheses whose upper
 bound is among the best, and there only for voxels that the mask leaves open.
 
-Masks are made when a cell is looked at first. They lie in the blocks of the target and those
-around them, as numbers of a palette of masks, one byte a cell.
+Masks are made when a cell is looked at first: numbers of a palette of masks, one byte a cell of a
+dense grid, whose memory is used where something was looked up.
 """
 
 from __future__ import annotations
@@ -36,11 +36,12 @@ NOT_ALIGNED = np.uint32(1 << 31)  # free space, or nothing within kappa
 ANYTHING = np.uint32(0xFFFFFFFF)
 NOT_MADE, ANY_MASK = 0, 1  # numbers of the palette
 PALETTE = 256
+MARGIN = (96, 96, 48)  # voxels of the grid around the blocks, so that look-ups seldom leave it
 HALF_DIAGONAL = float(np.sqrt(0.75))  # of a cell, in cells
 CHUNK = 512  # voxels counted between two checks whether a hypothesis can be among the best
 CUBES = BLOCK // CUBE  # along the edge of a block
-# of a map, in the order of OverlapMap.arrays
-Arrays = tuple[I32, I64, U8, U64, U8, U32, float]
+# of a map, in the order of its fields
+Arrays = tuple[I32, I64, U8, U64, U8, I64, U32, float]
 Offsets = tuple[I64, F64]  # of cubes, and the squares of their least distances
 
 
@@ -58,8 +59,8 @@ class OverlapMap:
 
     ``number`` (x, y, z) is the row of each block from block ``first`` (3,) on, -1 without one;
     ``state`` (rows, 4096) has voxel states, ``observed`` (rows, 64) which cells of each cube are
-    observed; ``mask`` (rows, 4096) numbers of the ``palette``, made when needed. Points farther
-    than ``reach`` voxels from all observed ones are not aligned.
+    observed. ``mask`` (x, y, z), from voxel ``low`` (3,) on, has numbers of the ``palette``, made
+    when needed. Points farther than ``reach`` voxels from all observed ones are not aligned.
     """
 
     number: I32
@@ -67,6 +68,7 @@ class OverlapMap:
     state: U8
     observed: U64
     mask: U8
+    low: I64
     palette: U32
     reach: float
 
@@ -79,13 +81,16 @@ class OverlapMap:
             self.state,
             self.observed,
             self.mask,
+            self.low,
             self.palette,
             self.reach,
         )
 
 
-def overlap_map(target: BlockMap, reach: float) -> OverlapMap:
-    """The map of a target, for a kappa of ``reach`` voxels."""
+def overlap_map(target: BlockMap, reach: float, *, free: bool = True) -> OverlapMap:
+    """The map of a target, for a kappa of ``reach`` voxels; without ``free``, occupied voxels alone
+    may be closest.
+    """
     blocks = unpack(target.keys).astype(np.int64)
     beside = int(np.ceil((reach + 2) / BLOCK))
     first = blocks.min(0) - beside if len(blocks) else np.zeros(3, np.int64)
@@ -102,13 +107,16 @@ def overlap_map(target: BlockMap, reach: float) -> OverlapMap:
     number[around] = np.arange(len(blocks), rows)
     state = np.full((rows, BLOCK**3), UNOBSERVED_STATE, np.uint8)
     state[: len(blocks)] = target.state
+    if not free:
+        state[state == FREE_STATE] = UNOBSERVED_STATE
     observed = np.zeros((rows, CUBES**3), np.uint64)
     _mark_observed(state[: len(blocks)], observed)
     palette = np.zeros(PALETTE, np.uint32)
     palette[ANY_MASK] = ANYTHING
-    return OverlapMap(
-        number, first, state, observed, np.zeros((rows, BLOCK**3), np.uint8), palette, reach
-    )
+    margin = np.array(MARGIN, np.int64)
+    low = first * BLOCK - margin
+    mask = np.zeros(tuple(((last + 1) * BLOCK + margin - low).tolist()), np.uint8)
+    return OverlapMap(number, first, state, observed, mask, low, palette, reach)
 
 
 @njit(cache=True, nogil=True)
@@ -139,7 +147,7 @@ def _row_of(number: I32, first: I64, x: int, y: int, z: int) -> int:
         or k >= number.shape[2]
     ):
         return -1
-    return number[i, j, k]
+    return int(number[i, j, k])
 
 
 @njit(cache=True, nogil=True)
@@ -154,7 +162,7 @@ def _observed_cube(arrays: Arrays, x: int, y: int, z: int) -> np.uint64:
     row = _row_of(arrays[0], arrays[1], x << 2, y << 2, z << 2)
     if row < 0:
         return np.uint64(0)
-    return arrays[3][row, (((x & 3) << 2) | (y & 3)) << 2 | (z & 3)]
+    return np.uint64(arrays[3][row, (((x & 3) << 2) | (y & 3)) << 2 | (z & 3)])
 
 
 @njit(cache=True, nogil=True)
@@ -202,7 +210,7 @@ def _state_at(arrays: Arrays, x: int, y: int, z: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _bit_of(state: int) -> np.uint32:
-    if state == FREE_STATE or state == UNOBSERVED_STATE:
+    if state in (FREE_STATE, UNOBSERVED_STATE):
         return NOT_ALIGNED
     return np.uint32(1) << np.uint32(UNLABELLED_BIT if state == UNLABELLED else state)
 
@@ -210,7 +218,9 @@ def _bit_of(state: int) -> np.uint32:
 @njit(cache=True, nogil=True)
 def _mask_of(arrays: Arrays, x: int, y: int, z: int, offsets: Offsets) -> np.uint32:
     """The bits of all voxels that may be closest to a point in the cell (x, y, z)."""
-    reach = arrays[6]
+    if _row_of(arrays[0], arrays[1], x, y, z) < 0:
+        return NOT_ALIGNED
+    reach = arrays[7]
     state = _state_at(arrays, x, y, z)
     if state != UNOBSERVED_STATE and reach > HALF_DIAGONAL:
         return _bit_of(state)
@@ -257,15 +267,15 @@ def _number_of(palette: U32, mask: np.uint32) -> int:
 @njit(cache=True, nogil=True)
 def _look_up(arrays: Arrays, x: int, y: int, z: int, offsets: Offsets) -> np.uint32:
     """The mask of a cell."""
-    row = _row_of(arrays[0], arrays[1], x, y, z)
-    if row < 0:
+    mask = arrays[4]
+    i = x - arrays[5][0]
+    j = y - arrays[5][1]
+    k = z - arrays[5][2]
+    if i < 0 or j < 0 or k < 0 or i >= mask.shape[0] or j >= mask.shape[1] or k >= mask.shape[2]:
         return NOT_ALIGNED
-    cell = _cell_of(x, y, z)
-    number = arrays[4][row, cell]
-    if number == NOT_MADE:
-        number = _number_of(arrays[5], _mask_of(arrays, x, y, z, offsets))
-        arrays[4][row, cell] = number
-    return arrays[5][number]
+    if mask[i, j, k] == NOT_MADE:
+        mask[i, j, k] = _number_of(arrays[6], _mask_of(arrays, x, y, z, offsets))
+    return np.uint32(arrays[6][mask[i, j, k]])
 
 
 @njit(cache=True, nogil=True)
@@ -275,20 +285,55 @@ def _upper_bounds(
     """Of each of ``shifts`` (m, 3): how many of the voxels may be aligned, -1 below ``least``."""
     out = np.empty(len(shifts), np.int64)
     n = len(cells)
+    mask = arrays[4]
+    low = arrays[5]
+    palette = arrays[6]
+    cell_numbers = mask.ravel()
+    sy = mask.shape[1]
+    sz = mask.shape[2]
+    flat = np.empty(n, np.int64)
+    lowest = np.full(3, np.iinfo(np.int64).max)
+    highest = np.full(3, np.iinfo(np.int64).min)
+    for i in range(n):
+        for axis in range(3):
+            place = cells[i, axis] - low[axis]
+            lowest[axis] = min(lowest[axis], place)
+            highest[axis] = max(highest[axis], place)
+        flat[i] = ((cells[i, 0] - low[0]) * sy + cells[i, 1] - low[1]) * sz + cells[i, 2] - low[2]
     for m in range(len(shifts)):
+        shift = (shifts[m, 0] * sy + shifts[m, 1]) * sz + shifts[m, 2]
+        inside = True
+        for axis in range(3):
+            inside &= lowest[axis] + shifts[m, axis] >= 0
+            inside &= highest[axis] + shifts[m, axis] < mask.shape[axis]
         possible = 0
         done = 0
         while done < n:
             end = min(done + CHUNK, n)
-            for i in range(done, end):
-                mask = _look_up(
-                    arrays,
-                    cells[i, 0] + shifts[m, 0],
-                    cells[i, 1] + shifts[m, 1],
-                    cells[i, 2] + shifts[m, 2],
-                    offsets,
-                )
-                possible += (mask & bits[i]) != 0
+            if inside:
+                for i in range(np.uint64(done), np.uint64(end)):
+                    place = np.uint64(flat[i] + shift)
+                    number = cell_numbers[place]
+                    if number == NOT_MADE:
+                        _look_up(
+                            arrays,
+                            cells[i, 0] + shifts[m, 0],
+                            cells[i, 1] + shifts[m, 1],
+                            cells[i, 2] + shifts[m, 2],
+                            offsets,
+                        )
+                        number = cell_numbers[place]
+                    possible += (palette[number] & bits[i]) != 0
+            else:
+                for i in range(done, end):
+                    mask_of_cell = _look_up(
+                        arrays,
+                        cells[i, 0] + shifts[m, 0],
+                        cells[i, 1] + shifts[m, 1],
+                        cells[i, 2] + shifts[m, 2],
+                        offsets,
+                    )
+                    possible += (mask_of_cell & bits[i]) != 0
             done = end
             if possible + n - done < least:
                 possible = -1
@@ -298,10 +343,12 @@ def _upper_bounds(
 
 
 @njit(cache=True, nogil=True)
-def _count(arrays: Arrays, points: F64, bits: U32, most_missed: int, offsets: Offsets) -> int:
-    """How many of ``points`` (n, 3), in voxels, are aligned; -1 once more are not."""
+def _count(arrays: Arrays, points: F64, bits: U32, least: int, offsets: Offsets) -> int:
+    """How many of ``points`` (n, 3), in voxels, are aligned; -1 below ``least``."""
     aligned = 0
-    reach = arrays[6]
+    unclear = np.empty(len(points), np.int64)
+    left = 0
+    reach = arrays[7]
     for i in range(len(points)):
         x = int(np.floor(points[i, 0]))
         y = int(np.floor(points[i, 1]))
@@ -310,13 +357,16 @@ def _count(arrays: Arrays, points: F64, bits: U32, most_missed: int, offsets: Of
         if mask == bits[i]:
             aligned += 1
         elif mask & bits[i]:
-            point = (points[i, 0], points[i, 1], points[i, 2])
-            best, a, b, c = _closest(arrays, point, offsets, reach * reach)
-            if best < reach * reach and _bit_of(_state_at(arrays, a, b, c)) == bits[i]:
-                aligned += 1
-        if i + 1 - aligned > most_missed:
-            return -1
-    return aligned
+            unclear[left] = i
+            left += 1
+    while left and aligned + left >= least:
+        left -= 1
+        i = unclear[left]
+        point = (points[i, 0], points[i, 1], points[i, 2])
+        best, x, y, z = _closest(arrays, point, offsets, reach * reach)
+        if best < reach * reach and _bit_of(_state_at(arrays, x, y, z)) == bits[i]:
+            aligned += 1
+    return aligned if aligned + left >= least else -1
 
 
 @njit(cache=True, nogil=True)
@@ -325,7 +375,7 @@ def _pairs(arrays: Arrays, points: F64, bits: U32, offsets: Offsets) -> tuple[I6
     rows = np.empty(len(points), np.int64)
     centres = np.empty((len(points), 3))
     count = 0
-    reach = arrays[6]
+    reach = arrays[7]
     for i in range(len(points)):
         x = int(np.floor(points[i, 0]))
         y = int(np.floor(points[i, 1]))
@@ -349,7 +399,7 @@ def _pairs(arrays: Arrays, points: F64, bits: U32, offsets: Offsets) -> tuple[I6
 @dataclass(frozen=True, slots=True, eq=False)
 class Voxels:
     """Occupied voxels of a query: their ``centres`` (n, 3) in voxels and the ``bits`` (n,) of their
-    classes, in a random order, so that the first of them stand for all.
+    classes. The first stand for all, and voxels that follow each other lie near each other.
     """
 
     centres: F64
@@ -363,8 +413,10 @@ class Voxels:
 def query_voxels(occupied: tuple[NDArray[np.int32], U8]) -> Voxels:
     """The occupied voxels of a map: coordinates (n, 3) and classes (n,)."""
     ijk, label = occupied
-    order = np.random.default_rng(0).permutation(len(ijk))
-    return Voxels(ijk[order] + 0.5, class_bit(label)[order])
+    order = np.lexsort(ijk.T[::-1])
+    parts = -(-len(order) // CHUNK)
+    order = np.concatenate([order[part::parts] for part in range(parts)]) if parts else order
+    return Voxels(ijk[order].astype(np.float64) + 0.5, class_bit(label)[order])
 
 
 def overlap(target: OverlapMap, query: Voxels, target_T_query: F64) -> float:
@@ -373,7 +425,7 @@ def overlap(target: OverlapMap, query: Voxels, target_T_query: F64) -> float:
         return 0.0
     points = query.turned(target_T_query[:3, :3], target_T_query[:3, 3])
     offsets = cube_offsets(target.reach + 2)
-    return _count(target.arrays, points, query.bits, len(points), offsets) / len(points)
+    return _count(target.arrays, points, query.bits, 0, offsets) / len(points)
 
 
 def aligned_pairs(target: OverlapMap, query: Voxels, target_T_query: F64) -> tuple[F64, F64]:
@@ -424,12 +476,12 @@ def best_overlaps(
         bounds += [(-int(u), number, row) for row, u in enumerate(upper) if u >= needed]
     bounds.sort()
     found: list[tuple[int, int, int]] = []
-    for upper, number, row in bounds:
-        if -upper < needed:
+    for negative, number, row in bounds:
+        if -negative < needed:
             break
         group = groups[number]
         points = query.turned(group.rotation, group.part + group.whole[row])
-        aligned = _count(target.arrays, points, query.bits, n - needed, offsets)
+        aligned = _count(target.arrays, points, query.bits, needed, offsets)
         if aligned < 0:
             continue
         found.append((-aligned, number, row))

@@ -313,7 +313,7 @@ def channels_last(module: nn.Module) -> None:
 class Network(nn.Module):
     """An encoder and a decoder, as they are trained; the ``encoder`` alone describes.
 
-    :meth:`forward` takes codes (b, 80, 80, 32) and noise (b, latent) or None; it gives the logits
+    :meth:`forward` takes codes (b, 64, 64, 32) and noise (b, latent) or None; it gives the logits
     of the middle subvolumes, mu (b, latent, i, j) and the middle's log-variance (b, latent).
     """
 

@@ -180,16 +180,15 @@ class PlainEncoder(Describer):
         super().__init__()
         self.variant, self.latent = variant, latent
         self.inputs = CLASSES[variant] + 3  # classes, free, unobserved, occupied of unknown class
-        self.blocks = nn.ModuleList(
-            nn.Conv3d(a, b, 3, padding=1) for a, b in pairwise((self.inputs, *CHANNELS))
-        )
+        self.first = nn.Conv3d(self.inputs, FIRST, 3, padding=1)
+        self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in pairwise(CHANNELS))
         self.hidden = nn.Linear(HIDDEN, HIDDEN)
         self.mean = nn.Linear(HIDDEN, latent)
         self.log_variance = nn.Linear(HIDDEN, latent)
 
     def first_features(self, codes: Tensor) -> Tensor:
         """The first block of codes (b, 32, 32, 32) uint8, (b, FIRST, 16, 16, 16)."""
-        first = self.blocks[0]
+        first = self.first
         if codes.is_cuda:
             voxels = F.one_hot(codes.long(), self.inputs).to(first.weight.dtype)
             return F.relu(max_pool(first(voxels.permute(0, 4, 1, 2, 3))))
@@ -201,7 +200,7 @@ class PlainEncoder(Describer):
         """The last hidden layer (b, HIDDEN)."""
         x, y = ((length - SIZE) // 2 for length in codes.shape[1:3])
         voxels = self.first_features(codes[:, x : x + SIZE, y : y + SIZE])
-        for block in self.blocks[1:]:
+        for block in self.blocks:
             voxels = F.relu(max_pool(block(voxels)))
         return torch.tanh(self.hidden(voxels.flatten(1)))
 
@@ -220,16 +219,17 @@ class PlainDecoder(nn.Module):
         super().__init__()
         self.start = nn.Linear(latent, HIDDEN)
         self.first = nn.Conv3d(CHANNELS[-1], CHANNELS[-1], 3, padding=1)
-        channels = (*CHANNELS[::-1], CLASSES[variant] + 2)
+        channels = CHANNELS[::-1]
         self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in pairwise(channels))
+        self.last = nn.Conv3d(FIRST, CLASSES[variant] + 2, 3, padding=1)
 
     def forward(self, code: Tensor) -> Tensor:
         x: Tensor = torch.tanh(self.start(code)).reshape(-1, CHANNELS[-1], CORNER, CORNER, CORNER)
         x = F.relu(self.first(x.contiguous(memory_format=torch.channels_last_3d)))
-        for block in self.blocks[:-1]:
+        for block in self.blocks:
             x = x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4)
             x = F.relu(block(x))
-        x = repeated_convolution(x, self.blocks[-1].weight, self.blocks[-1].bias)
+        x = repeated_convolution(x, self.last)
         b, channels, *cells = x.shape
         columns: Tensor = _Transposed.apply(  # type: ignore[no-untyped-call]
             x.permute(0, 2, 3, 4, 1).reshape(-1, channels)
@@ -237,12 +237,15 @@ class PlainDecoder(nn.Module):
         return columns.reshape(-1, 8, b, *cells)
 
 
-def repeated_convolution(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Convolution of ``x`` repeated twice along each axis, before it is (b, 8 * outputs, ...).
+def repeated_convolution(x: Tensor, layer: nn.Conv3d) -> Tensor:
+    """The 3x3x3 ``layer`` of ``x`` repeated twice along each axis, as (b, 8 * outputs, ...) of x.
 
     Of the 2x2x2 voxels that a voxel is repeated to, each has a filter of its own. Channel
     ``8 * output + voxel`` is of such a voxel.
     """
+    weight = layer.weight
+    bias = layer.bias
+    assert bias is not None
     repeated = torch.tensor(REPEATED, dtype=weight.dtype, device=weight.device)
     of_each = torch.einsum(
         "pai,qbj,rck,oxijk->opqrxabc", repeated, repeated, repeated, weight

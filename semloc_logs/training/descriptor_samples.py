@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from semloc_logs.subvolumes.cut import code_table
+from semloc_logs.subvolumes.cut import SIZE, code_table
 from semloc_logs.subvolumes.network import Encoder, descriptors
+from semloc_logs.subvolumes.plain_network import PlainEncoder
 from semloc_logs.training.pairs import read_shard
 
 
@@ -38,3 +39,29 @@ def shard_descriptors(
         if note is not None:
             note(f"{encoder.variant}: descriptors of {done} of {len(shards)} shards")
     return np.concatenate(out) if out else np.zeros((0, 256), np.float16)
+
+
+@torch.inference_mode()
+def plain_shard_descriptors(
+    shards: Sequence[Path],
+    encoder: PlainEncoder,
+    pairs_per_shard: int | None = None,
+    note: Callable[[str], None] | None = None,
+) -> NDArray[np.float32]:
+    """Descriptors mu (n, N) of the paper's network, nine of the complete view of each pair, 16
+    voxels apart: the words of the training maps.
+    """
+    table = code_table(encoder.variant)
+    out = []
+    for done, path in enumerate(shards, 1):
+        views = read_shard(path)[2][:pairs_per_shard]
+        for view in views:
+            codes = torch.from_numpy(table[view])
+            windows = codes.unfold(0, SIZE, SIZE // 2).unfold(1, SIZE, SIZE // 2)
+            single = windows.permute(0, 1, 3, 4, 2)[:3, :3].reshape(-1, *(SIZE,) * 3)
+            with torch.autocast("cpu", dtype=torch.bfloat16):
+                mu = encoder(single)
+            out.append(mu[:, :, 0, 0].float().numpy())
+        if note is not None:
+            note(f"{encoder.variant}: descriptors of {done} of {len(shards)} shards")
+    return np.concatenate(out) if out else np.zeros((0, encoder.latent), np.float32)

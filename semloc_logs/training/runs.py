@@ -20,14 +20,16 @@ from semloc_logs.engines.streamed import Growing
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Resolved, Training
 from semloc_logs.subvolumes.describe import load_encoder
+from semloc_logs.subvolumes.plain_describe import load_plain_encoder
 from semloc_logs.subvolumes.weight_files import save_weights
 from semloc_logs.training.completion_scores import completion_scores
-from semloc_logs.training.descriptor_samples import shard_descriptors
+from semloc_logs.training.descriptor_samples import plain_shard_descriptors, shard_descriptors
 from semloc_logs.training.network_training import Progress, TrainingRun, train
 from semloc_logs.training.own_sessions import cut_stretch, stretch_tasks
 from semloc_logs.training.pairs import read_shard, rows_of
 from semloc_logs.training.scene_shards import make_shard, scene_tasks
 from semloc_logs.training.schedule import scene_window
+from semloc_logs.words.plain_vocabulary import save_plain_vocabulary, train_plain_vocabulary
 from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 from semloc_logs.workspace import SessionFolder
 
@@ -208,8 +210,10 @@ def learn_vocabulary(
     """A vocabulary from the descriptors of the shards' complete views; the number of descriptors.
 
     2^16 words need half a million descriptors or more to lie well; with fewer there are words of
-    few descriptors or of none.
+    few descriptors or of none. The paper's method needs its weights as a file: SettingsError.
     """
+    if settings.training.method == "paper":
+        return _learn_plain_vocabulary(variant, shards, settings, output, pairs_per_shard, note)
     threads = torch.get_num_threads()
     encoder = load_encoder(variant, settings.descriptor.weights)
     use_threads(threads)  # loading left one
@@ -221,6 +225,32 @@ def learn_vocabulary(
         vocabulary,
         _card(settings, len(shards), variant=variant, descriptors=len(descriptors)),
     )
+    return len(descriptors)
+
+
+def _learn_plain_vocabulary(
+    variant: str,
+    shards: Sequence[Path],
+    settings: Resolved,
+    output: Path,
+    pairs_per_shard: int | None,
+    note: Note,
+) -> int:
+    """The same of the paper's network."""
+    weights = settings.descriptor.weights
+    if weights is None:
+        raise SettingsError(
+            "The paper's method has no shipped weights: name the file that 'semloc train --method"
+            " paper' wrote with --set descriptor.weights=FILE."
+        )
+    threads = torch.get_num_threads()
+    encoder = load_plain_encoder(variant, weights)
+    use_threads(threads)
+    descriptors = plain_shard_descriptors(shards, encoder, pairs_per_shard, note)
+    note(f"{variant}: clustering {len(descriptors)} descriptors")
+    words = train_plain_vocabulary(descriptors, seed=settings.training.seed)
+    card = _card(settings, len(shards), variant=variant, descriptors=len(descriptors))
+    save_plain_vocabulary(output, words, card)
     return len(descriptors)
 
 

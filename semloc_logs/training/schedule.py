@@ -52,6 +52,6 @@ def scene_window(samples: int, scenes: int, method: str = "ours") -> range:
     """Numbers of the scenes in use when ``samples`` samples have been seen, of ``scenes`` there
     are.
     """
-    in_pairs = samples // SAMPLES_A_PAIR[method]
-    newest = min(scenes, FIRST_SCENES + in_pairs * SAMPLES_A_PAIR["ours"] // SAMPLES_A_SCENE)
+    nine_of_a_pair = samples * SAMPLES_A_PAIR["ours"] // SAMPLES_A_PAIR[method]
+    newest = min(scenes, FIRST_SCENES + nine_of_a_pair // SAMPLES_A_SCENE)
     return range(max(0, newest - WINDOW), newest)

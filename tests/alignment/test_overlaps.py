@@ -27,11 +27,11 @@ ROAD, WALL = 0, 2
 def blocks_of(voxels: dict[tuple[int, int, int], int]) -> BlockMap:
     """A map of voxel states."""
     rows: dict[int, NDArray[np.uint8]] = {}
-    for ijk, state in voxels.items():
+    for ijk, value in voxels.items():
         key = int(pack(np.array(ijk) // BLOCK))
         block = rows.setdefault(key, np.full(BLOCK**3, UNOBSERVED_STATE, np.uint8))
         x, y, z = (c % BLOCK for c in ijk)
-        block[(x * BLOCK + y) * BLOCK + z] = state
+        block[(x * BLOCK + y) * BLOCK + z] = value
     keys = np.array(sorted(rows), np.int64)
     state = np.array([rows[k] for k in keys.tolist()], np.uint8).reshape(-1, BLOCK**3)
     nothing = np.zeros(0, np.int64)
@@ -69,6 +69,9 @@ def test_free_space_that_is_closest_does_not_count() -> None:
     # 1.9 voxels from the road and 0.1 from free space; 0.9 and 1.1
     assert overlap(target, query_voxels(query((0, 0, 0, ROAD))), shifted(1.9)) == 0.0
     assert overlap(target, query_voxels(query((0, 0, 0, ROAD))), shifted(0.9)) == 1.0
+    # without free space in the map the road is closest, 1.9 voxels away
+    occupied = overlap_map(blocks_of(voxels), 5.0, free=False)
+    assert overlap(occupied, query_voxels(query((0, 0, 0, ROAD))), shifted(1.9)) == 1.0
 
 
 def test_kappa_ends_at_its_distance() -> None:
@@ -114,7 +117,7 @@ def test_it_equals_the_slow_one(
     blocks = random_map(seed)
     occupied = random_map(seed + 1).occupied()
     # no point lies as far from two voxels, which would leave open which of them is closest
-    pose = yaw_transform(yaw, np.array(shift) + (1e-3, 2e-3, 3e-3))
+    pose = yaw_transform(yaw, np.add(shift, 1e-3))
     slow, _ = tau(occupied, blocks, 1.0, pose, reach)
     assert overlap(overlap_map(blocks, reach), query_voxels(occupied), pose) == slow
 

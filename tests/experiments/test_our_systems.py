@@ -9,9 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from scipy.spatial.transform import Rotation
 
+from semloc_logs.alignment.mask_grid import FREE_BIT, MaskGrid
+from semloc_logs.alignment.overlaps import overlap, overlap_map, query_voxels
+from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.system import Query, RankedPose, View
+from semloc_logs.experiments.systems import plain
+from semloc_logs.experiments.systems.ablations import (
+    ABLATIONS,
+    ablated,
+    described_alone,
+    without_free_space,
+)
 from semloc_logs.experiments.systems.ours import Ours
+from semloc_logs.experiments.systems.plain import Plain, refined, rigid_fit
 from semloc_logs.numerics.transforms import inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import Resolved, load
 from semloc_logs.simulation.meshes.world import (
@@ -27,6 +40,15 @@ from semloc_logs.simulation.meshes.world import (
 )
 from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
 from semloc_logs.simulation.sensors.lidar_models import MODELS
+from semloc_logs.subvolumes.describe import Windows, describe_map, load_encoder
+from semloc_logs.subvolumes.network import Completion, Encoder
+from semloc_logs.subvolumes.plain_describe import describe_blocks
+from semloc_logs.subvolumes.plain_network import PlainEncoder
+from semloc_logs.subvolumes.weight_files import save_weights
+from semloc_logs.voxels.grid import UNOBSERVED_STATE, BlockMap, Fuser
+from semloc_logs.voxels.keys import BLOCK, pack
+from semloc_logs.words.plain_vocabulary import train_plain_vocabulary
+from semloc_logs.words.vocabulary import save_vocabulary, train_vocabulary
 
 ODOM_T_WORLD = yaw_transform(np.radians(70), (200.0, -30.0, 4.0))
 SETTINGS = {
@@ -34,7 +56,7 @@ SETTINGS = {
     "fusion.max_range": "25",
     "descriptor.reach": "15",
     "descriptor.headings": "8",
-    "closures.hypotheses": "16",
+    "closures.hypotheses": "64",
 }
 
 
@@ -104,6 +126,16 @@ def errors(pose: RankedPose, query: Query) -> tuple[float, float]:
     return float(np.linalg.norm(off[:3, 3])), float(np.degrees(rotation_angle(off[:3, :3])))
 
 
+def blocks_with(ijk: np.ndarray, label: np.ndarray) -> BlockMap:
+    """A map of occupied voxels and nothing else."""
+    keys, row = np.unique(pack(ijk // BLOCK), return_inverse=True)
+    state = np.full((len(keys), BLOCK**3), UNOBSERVED_STATE, np.uint8)
+    x, y, z = (ijk % BLOCK).T
+    state[row.ravel(), (x * BLOCK + y) * BLOCK + z] = label
+    nothing = np.zeros(0, np.int64)
+    return BlockMap(keys, np.zeros(state.shape, np.int8), state, nothing, nothing)
+
+
 def hidden(query: Query) -> Query:
     """The query without its truth, which no system may read."""
     nowhere = np.full((4, 4), np.nan)
@@ -124,3 +156,176 @@ def test_ours_finds_both_queries_to_centimetres(
         assert len(found) > 3
         scores = [pose.score for pose in found]
         assert scores == sorted(scores, reverse=True)
+
+
+PLAIN = {
+    "fusion.max_range": "20",
+    "query.radius": "15",
+    "plain.headings": "6",
+    "plain.refined": "10",
+}
+
+
+def plain_settings(**changes: str) -> Resolved:
+    """The paper's settings with fewer headings, near points and large voxels."""
+    given = {key.replace("__", "."): value for key, value in changes.items()}
+    return load(assignments={**SETTINGS, **PLAIN, **given}, method="paper").resolved()
+
+
+def plain_system(variant: str, database: list[View], chosen: Resolved) -> Plain:
+    """The plain method with an untrained network: the same cloud has the same descriptors."""
+    torch.manual_seed(0)
+    encoder = PlainEncoder(variant).eval()
+    fuser = Fuser(chosen.fusion)
+    for v in database:
+        fuser.add(v.points, v.label, v.origin, None, v.world_T_base)
+    described = describe_blocks(fuser.finish(), 8, 1, encoder)
+    assert variant in ("semantic", "geometric")
+    words = train_plain_vocabulary(described.descriptor)
+    return Plain("semantic" if variant == "semantic" else "geometric", chosen, encoder, words)
+
+
+@pytest.mark.parametrize("variant", ["semantic", "geometric"])
+def test_the_plain_method_finds_a_cloud_again_that_was_turned(
+    database: list[View], variant: str
+) -> None:
+    # four places that share nothing, a multiple of the stride of eight voxels apart
+    places = [
+        replace(v, world_T_base=yaw_transform(0.0, (96.0 * i, 8.0 * i, 0.0)))
+        for i, v in enumerate(database[::5])
+    ]
+    system = plain_system(variant, places, plain_settings())
+    assert system.name == f"paper ({variant})"
+    system.fit(places)
+    turned = yaw_transform(np.pi, (50.3, 7.1, -2.0))
+    query = Query("again", (replace(places[2], odom_T_base=turned),))
+    found = system.localise(hidden(query))
+    assert len(found) == 10
+    metres, degrees = errors(found[0], query)
+    assert metres < 0.2
+    assert degrees < 1.0
+    scores = [pose.score for pose in found]
+    assert scores == sorted(scores, reverse=True)
+    assert scores[-1] >= 0.3
+    assert scores[0] <= 1.0
+
+
+def test_poses_below_the_least_tau_are_left_out(database: list[View]) -> None:
+    system = plain_system("semantic", database, plain_settings(plain__min_tau="1.0"))
+    system.fit(database)
+    changed = replace(database[10], label=np.full_like(database[10].label, 8))
+    assert system.localise(Query("vegetation", (changed,))) == []
+
+
+def test_the_plain_method_names_what_it_lacks(database: list[View]) -> None:
+    with pytest.raises(SettingsError, match="no shipped weights: train them"):
+        Plain(settings=plain_settings()).fit(database)
+    missing = plain_settings(descriptor__weights="missing.safetensors")
+    with pytest.raises(SettingsError, match=r"missing\.safetensors"):
+        Plain(settings=missing).fit(database)
+    encoder = PlainEncoder("semantic").eval()
+    with pytest.raises(SettingsError, match="no shipped vocabulary: make one"):
+        Plain(settings=plain_settings(), encoder=encoder).fit(database)
+
+
+def test_a_small_scene_trains_a_network_of_its_own_once(
+    database: list[View],
+    queries: list[Query],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(plain, "QUICK_SAMPLES", 64)
+    system = Plain("geometric", plain_settings(), quick=tmp_path)
+    system.fit(database)
+    kept = {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/*")}
+    assert {"pairs.parquet", "checkpoint.safetensors"} <= set(kept)
+    assert len(system.localise(hidden(queries[0]))) > 0
+    Plain("geometric", plain_settings(), quick=tmp_path).fit(database)
+    assert kept == {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/*")}
+
+
+def test_iterative_closest_points_move_a_wall_onto_a_wall() -> None:
+    wall = np.array([[x, 0, z] for x in range(12) for z in range(12)], np.int32)
+    floor = np.array([[x, y, 0] for x in range(12) for y in range(1, 12)], np.int32)
+    ijk = np.concatenate([wall, floor])
+    label = np.r_[np.full(len(wall), 2), np.zeros(len(floor))].astype(np.uint8)
+    blocks = blocks_with(ijk, label)
+    start = yaw_transform(0.02, (0.3, 2.2, 0.4))
+    target = overlap_map(blocks, 5.0)
+    query = query_voxels((ijk, label))
+    pose, tau = refined(target, query, start, 30)
+    # from 2.2 voxels to less than one: within a voxel all closest voxels stay the same
+    assert overlap(target, query, start) < 0.91 < 0.95 < tau
+    assert np.abs(pose[:3, 3]).max() < 0.7
+    assert abs(pose[0, 1]) < 1e-6  # the turn about the vertical, 0.02 at first, is gone
+    assert np.abs(pose[:3, :3] - np.eye(3)).max() < 0.06
+
+
+def test_a_rigid_fit_is_exact_on_exact_points() -> None:
+    source = np.random.default_rng(0).normal(size=(9, 3))
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 2.0]).as_matrix()
+    pose[:3, 3] = 1.0, -2.0, 0.5
+    np.testing.assert_allclose(
+        rigid_fit(source, source @ pose[:3, :3].T + pose[:3, 3]), pose, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("name", [n for n, row in ABLATIONS.items() if not row.training])
+def test_every_ablation_finds_the_view_of_the_opposite_lane(
+    name: str, database: list[View], queries: list[Query]
+) -> None:
+    system = ablated(name, settings())
+    assert system.name == name
+    system.fit(database)
+    query = queries[0]
+    found = system.localise(hidden(query))
+    metres, degrees = errors(found[0], query)
+    # a pose that was not refined is as good as the steps of the search
+    assert metres < (1.0 if name == "ours, not refined" else 0.25)
+    assert degrees < (5.0 if name == "ours, not refined" else 1.0)
+
+
+def test_ablations_change_what_they_name(database: list[View], queries: list[Query]) -> None:
+    assert ablated("ours, one neighbour").settings.closures.neighbours == 1
+    four = ablated("ours, subvolumes every 4 voxels").settings.descriptor
+    assert (four.stride, four.query_stride) == (4, 4)
+    with pytest.raises(SettingsError, match="there are ours"):
+        ablated("ours, no words")
+
+
+def test_a_network_trained_otherwise_is_named_with_its_command(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"training\.contrastive_weight=0"):
+        ablated("ours, no contrastive term", weights=tmp_path)
+    # any network with 64 numbers in place of a trained one
+    torch.manual_seed(0)
+    save_weights(tmp_path / "semantic.safetensors", Completion("semantic", 64), {})
+    random = np.random.default_rng(0).normal(size=(300, 64))
+    random /= np.linalg.norm(random, axis=1, keepdims=True)
+    save_vocabulary(tmp_path / "words.safetensors", train_vocabulary(random), {})
+    system = ablated("ours, N = 64", settings(), tmp_path)
+    chosen = system.settings.descriptor
+    assert chosen.weights == tmp_path / "semantic.safetensors"
+    assert load_encoder("semantic", chosen.weights).latent == 64
+
+
+def test_masks_without_free_space_keep_their_classes() -> None:
+    grid = MaskGrid(np.array([[[FREE_BIT, 0b1000001, 0]]], np.uint8), np.zeros(3), 0.3)
+    np.testing.assert_array_equal(without_free_space(grid).mask, [[[0, 0b1000001, 0]]])
+
+
+def test_a_subvolume_alone_is_described_as_a_map_that_holds_nothing_else() -> None:
+    torch.manual_seed(0)
+    encoder = Encoder("geometric").eval()
+    state = np.full((32, 32, 32), UNOBSERVED_STATE, np.uint8)
+    state[:, 4:20, 3] = 0
+    state[11, :, 3:9] = 2
+    low = np.array([8, -16, 0])
+    together = describe_map(state, low, 1.2, encoder, Windows(0.3, 8, 40))
+    whole = (together.centre[:, :2] == [24.0, 0.0]).all(1)
+    assert whole.sum() == 1
+    alone = described_alone(state, low, together.centre[whole], encoder)
+    np.testing.assert_allclose(alone, together.descriptor[whole], atol=2e-2)
+    # beside it others see a part of the map alone, and more of it together
+    others = described_alone(state, low, together.centre[~whole], encoder)
+    assert np.abs(others - together.descriptor[~whole]).max() > 2e-2

@@ -34,7 +34,8 @@ def test_it_has_around_one_million_parameters() -> None:
 def test_the_first_block_equals_convolution_relu_and_pooling(variant: str) -> None:
     torch.manual_seed(0)
     encoder = PlainEncoder(variant)
-    first = encoder.blocks[0]
+    first = encoder.first
+    assert first.bias is not None
     given = codes(variant)
     voxels = F.one_hot(given.long(), encoder.inputs).float().permute(0, 4, 1, 2, 3)
     plain = F.max_pool3d(F.relu(first(voxels)), 2)
@@ -52,7 +53,7 @@ def test_the_last_block_equals_repetition_and_convolution() -> None:
     layer = torch.nn.Conv3d(3, 5, 3, padding=1)
     x = torch.randn(2, 3, 4, 4, 4)
     large = x.repeat_interleave(2, 2).repeat_interleave(2, 3).repeat_interleave(2, 4)
-    found = repeated_convolution(x, layer.weight, layer.bias).unflatten(1, (-1, 8))
+    found = repeated_convolution(x, layer).reshape(2, 5, 8, 4, 4, 4)
     volumes = as_volumes(found.permute(1, 2, 0, 3, 4, 5))
     torch.testing.assert_close(volumes, layer(large))
 

@@ -241,6 +241,9 @@ def test_scenes_come_into_use_and_leave_again() -> None:
     assert scene_window(10**6, 4000) == range(6, 262)
     assert scene_window(16 * 10**6, 4000) == range(3744, 4000)
     assert scene_window(10**6, 100) == range(100)
+    # the paper takes one sample of a pair, and so many pairs a scene
+    assert scene_window(4000 // 9 + 1, 4000, "paper") == range(13)
+    assert scene_window(4000 // 9, 4000, "paper") == range(12)
 
 
 def test_scenes_are_used_as_they_come(shards: list[Path]) -> None:

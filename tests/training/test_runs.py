@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from semloc_logs.engines import make_engine
 from semloc_logs.errors import SettingsError
@@ -17,7 +18,8 @@ from semloc_logs.numerics.transforms import apply, yaw_transform
 from semloc_logs.settings import Resolved, load
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
-from semloc_logs.training.network_training import TrainingRun
+from semloc_logs.training.batches import _drawn
+from semloc_logs.training.network_training import RECIPES, TrainingRun, train
 from semloc_logs.training.own_sessions import session_frames, stretch_tasks
 from semloc_logs.training.pairs import read_shard, write_shard
 from semloc_logs.training.runs import (
@@ -28,6 +30,7 @@ from semloc_logs.training.runs import (
     simulated_shards,
 )
 from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
+from semloc_logs.words.plain_vocabulary import load_plain_vocabulary
 from semloc_logs.workspace import SessionFolder
 
 METADATA = {"schema_version": 1}
@@ -252,3 +255,83 @@ def test_used_scenes_are_dropped_and_others_stay(
         assert sum(path.exists() for path in paths) == left
     assert [path.exists() for path in paths[:6]] == [False] * 5 + [True]
     packed.close()
+
+
+def test_the_papers_network_is_learned_as_written_with_words_of_its_own(
+    shards: list[Path], tmp_path: Path
+) -> None:
+    settings = load(
+        method="paper", assignments={"training.samples": "32", "training.batch": "16"}
+    ).resolved()
+    assert settings.training.contrastive_weight == 0
+    output = tmp_path / "geometric.safetensors"
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    steps = list[str]()
+    scores = learn_descriptor(
+        "geometric",
+        Packed(shards[:2], shards[2:]),
+        settings,
+        TrainingRun(checkpoint),
+        output,
+        steps.append,
+    )
+    assert scores is not None
+    # two steps of sixteen pairs, one sample a pair
+    assert "32 of 32 samples" in steps[-1]
+    assert "contrastive 0.000" in steps[-1]
+    state = load_file(checkpoint)
+    assert float(state["optimiser.0.step"]) == 2
+    assert {k.split(".")[-1] for k in state if k.startswith("optimiser.0.")} == {
+        "step",
+        "square_avg",
+        "acc_delta",
+    }
+    words = tmp_path / "words.safetensors"
+    with pytest.raises(SettingsError, match="no shipped weights"):
+        learn_vocabulary("geometric", shards, settings, words)
+    named = settings.model_copy(
+        update={"descriptor": settings.descriptor.model_copy(update={"weights": output})}
+    )
+    # nine subvolumes of each of 24 pairs are too few for a vocabulary, 288 are not
+    with pytest.raises(SettingsError, match="at least 256"):
+        learn_vocabulary("geometric", shards, named, words)
+    assert learn_vocabulary("geometric", [*shards, *shards[:2]], named, words) == 36 * 9
+    loaded = load_plain_vocabulary("geometric", words)
+    assert loaded.vocabulary.projection.shape == (64, 257)
+    shipped = files("semloc_logs.words") / "vocabularies" / "geometric.safetensors"
+    with (
+        as_file(shipped) as ours,
+        pytest.raises(SettingsError, match="not a vocabulary of the paper's method"),
+    ):
+        load_plain_vocabulary("geometric", ours)
+
+
+def test_the_rate_of_the_paper_stays_and_nothing_is_mirrored(shards: list[Path]) -> None:
+    ours = _settings(samples=54, batch=2)
+    paper = load(method="paper").resolved()
+    recipe = RECIPES[paper.training.method]
+    assert {recipe.rate(step, 100) for step in (0, 50, 99)} == {1.0}
+    assert recipe.max_gradient == np.inf
+    mirrored = {
+        settings.training.method: [
+            _drawn([read_shard(shards[0])], settings.training, step).mirror for step in range(20)
+        ]
+        for settings in (ours, paper)
+    }
+    assert any(mirrored["ours"])
+    assert not any(mirrored["paper"])
+
+
+def test_a_checkpoint_of_before_a_setting_was_made_goes_on(
+    shards: list[Path], tmp_path: Path
+) -> None:
+    training = _settings(samples=72, batch=2).training
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    assert train("geometric", shards, training, TrainingRun(checkpoint, deadline=0.0)) is None
+    tensors = load_file(checkpoint)
+    with safe_open(checkpoint, "pt") as handle:
+        note = dict(handle.metadata())
+    content = json.loads(note["training"])
+    del content["method"]
+    save_file(tensors, checkpoint, metadata={**note, "training": json.dumps(content)})
+    assert train("geometric", shards, training, TrainingRun(checkpoint)) is not None

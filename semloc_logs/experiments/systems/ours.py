@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs import progress
 from semloc_logs.alignment.hypotheses import Hypothesis, pose_matrix, same_place
 from semloc_logs.alignment.search import Candidate
-from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import Database
 from semloc_logs.closures.matching import (
@@ -43,9 +43,9 @@ class Ours:
 
     Sessions of the database are kept in the folder ``work``, a temporary one without it. A query is
     answered by itself: the acceptance, which compares it with its neighbours, takes no part. First
-    come the poses that were fitted on points, ranked by the log-odds that they are right, then
-    those of the search, then the other hypotheses by their votes. Scores of the latter two only
-    keep the order.
+    come the poses that were fitted on points, ranked as in the pipeline by the structure that is
+    aligned less the structure in free space, then poses after the search, then the other hypotheses
+    by their votes. Scores of the latter two only keep the order.
     """
 
     name: str = "ours"
@@ -85,7 +85,8 @@ class Ours:
                 )
             }
         )
-        fuse_views(query.views, folder, settings, "odometry")
+        with progress.listening(lambda _: None):  # a second's work
+            fuse_views(query.views, folder, settings, "odometry")
         session = SessionMap(folder)
         last = len(query.views) - 1
         built, query_T_base = build_query(session, last, settings)
@@ -99,11 +100,11 @@ class Ours:
         hypotheses = self._hypotheses(context)
         searched = verify_hypotheses(context, hypotheses)
         fitted = [a for candidates in searched for a in self._aligned(context, candidates)]
-        odds = [float(shipped().own_log_odds(a.features)) for a in fitted]
+        scores = [self._score(a) for a in fitted]
         found: list[RankedPose] = []
-        for i in np.argsort(-np.array(odds), kind="stable").tolist():
-            self._add(found, RankedPose(self._fitted_pose(fitted[i]), odds[i]))
-        worst = min(odds, default=0.0)
+        for i in np.argsort(-np.array(scores), kind="stable").tolist():
+            self._add(found, RankedPose(self._fitted_pose(fitted[i]), scores[i]))
+        worst = min(scores, default=0.0)
         by_score = sorted(chain.from_iterable(searched), key=lambda c: -c.score)
         by_weight = sorted(hypotheses, key=lambda h: -h.weight)
         rest = chain(
@@ -125,6 +126,10 @@ class Ours:
 
     def _hypotheses(self, context: QueryContext) -> list[Hypothesis]:
         return find_hypotheses(context)
+
+    def _score(self, alignment: Alignment) -> float:
+        features = alignment.features
+        return features.structure - features.contradiction
 
     def _aligned(self, context: QueryContext, candidates: list[Candidate]) -> list[Alignment]:
         return align_candidates(context, candidates)

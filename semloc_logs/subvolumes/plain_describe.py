@@ -1,0 +1,155 @@
+"""Descriptors of all occupied subvolumes of a map by the paper's network (3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from semloc_logs.subvolumes.cut import SIZE, code_table
+from semloc_logs.subvolumes.describe import Described
+from semloc_logs.subvolumes.plain_network import PlainEncoder
+from semloc_logs.subvolumes.weight_files import load_weights
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
+
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
+TILE = 256  # voxels along the edge of the part of a map that is in memory at once
+BATCH = 64  # subvolumes that are encoded together
+
+
+@lru_cache(maxsize=8)
+def load_plain_encoder(variant: str, weights: Path) -> PlainEncoder:
+    """The encoder of a file; SettingsError when it does not hold one of the paper's network."""
+    encoder = load_weights(PlainEncoder, "encoder.", variant, weights)
+    torch.set_num_threads(1)
+    return encoder
+
+
+@njit(cache=True, nogil=True)
+def _occupied_sums(state: U8, stride: int) -> NDArray[np.int32]:
+    """Occupied voxels in each 32^3 window, every ``stride`` voxels."""
+    nx, ny, nz = state.shape
+    sums = np.zeros((nx + 1, ny + 1, nz + 1), np.int32)
+    for x in range(nx):
+        for y in range(ny):
+            row = 0
+            for z in range(nz):
+                row += (state[x, y, z] != FREE_STATE) & (state[x, y, z] != UNOBSERVED_STATE)
+                sums[x + 1, y + 1, z + 1] = (
+                    row + sums[x, y + 1, z + 1] + sums[x + 1, y, z + 1] - sums[x, y, z + 1]
+                )
+    out = np.zeros(
+        ((nx - SIZE) // stride + 1, (ny - SIZE) // stride + 1, (nz - SIZE) // stride + 1), np.int32
+    )
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            for k in range(out.shape[2]):
+                a = i * stride
+                b = j * stride
+                c = k * stride
+                for dx in range(2):
+                    for dy in range(2):
+                        for dz in range(2):
+                            sign = 1 if (dx + dy + dz) % 2 == 1 else -1
+                            out[i, j, k] += sign * sums[a + dx * SIZE, b + dy * SIZE, c + dz * SIZE]
+    return out
+
+
+def occupied_windows(state: U8, low: NDArray[np.integer], stride: int, least: int) -> I64:
+    """Corners (n, 3), voxels of the map, of the 32^3 windows with ``least`` occupied voxels.
+
+    They lie on multiples of ``stride`` and within the box ``state``, whose corner ``low`` is one.
+    """
+    if min(state.shape) < SIZE:
+        return np.zeros((0, 3), np.int64)
+    return np.argwhere(_occupied_sums(state, stride) >= least) * stride + np.asarray(low, np.int64)
+
+
+@torch.inference_mode()
+def describe_windows(state: U8, corners: I64, encoder: PlainEncoder) -> F32:
+    """Descriptors mu (n, latent) of the windows of ``state`` at ``corners`` (n, 3) in it."""
+    table = code_table(encoder.variant)
+    out = np.zeros((len(corners), encoder.latent), np.float32)
+    for first in range(0, len(corners), BATCH):
+        part = corners[first : first + BATCH]
+        codes = np.stack(
+            [table[state[x : x + SIZE, y : y + SIZE, z : z + SIZE]] for x, y, z in part.tolist()]
+        )
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            mu = encoder(torch.from_numpy(codes))
+        out[first : first + BATCH] = mu[:, :, 0, 0].float().numpy()
+    return out
+
+
+def describe_box(
+    state: U8, low: NDArray[np.integer], stride: int, least: int, encoder: PlainEncoder
+) -> Described:
+    """All occupied subvolumes of the box ``state``, whose corner is at voxel ``low``.
+
+    Windows may reach over its edges. The descriptors are mu, of any length.
+    """
+    start = np.floor((np.asarray(low) - SIZE + 1) / stride).astype(np.int64) * stride
+    before = np.asarray(low, np.int64) - start
+    padding = [(int(b), SIZE + stride) for b in before]
+    box = np.pad(state, padding, constant_values=UNOBSERVED_STATE)
+    corners = occupied_windows(box, start, stride, least)
+    vectors = describe_windows(box, corners - start, encoder)
+    return Described((corners + SIZE / 2).astype(np.float32), vectors)
+
+
+def describe_blocks(
+    blocks: BlockMap,
+    stride: int,
+    least: int,
+    encoder: PlainEncoder,
+    road: tuple[NDArray[np.floating], float] | None = None,
+) -> Described:
+    """All occupied subvolumes of a map; with a ``road``, its places (m, 2) and a distance, those
+    whose centre is so near to it. Lengths are in voxels.
+    """
+    parts = [
+        Described(np.zeros((0, 3), np.float32), np.zeros((0, encoder.latent), np.float32)),
+        *_tiles(blocks, stride, least, encoder, road),
+    ]
+    return Described(
+        np.concatenate([p.centre for p in parts]), np.concatenate([p.descriptor for p in parts])
+    )
+
+
+def _tiles(
+    blocks: BlockMap,
+    stride: int,
+    least: int,
+    encoder: PlainEncoder,
+    road: tuple[NDArray[np.floating], float] | None,
+) -> Iterator[Described]:
+    low, high = (bound.astype(np.int64) for bound in blocks.bounds())
+    start = np.floor((low - SIZE + 1) / stride).astype(np.int64) * stride
+    tree = None if road is None else cKDTree(road[0])
+    step = TILE // stride * stride
+    height = int(high[2] - start[2]) + SIZE + stride
+    for x in range(int(start[0]), int(high[0]), step):
+        for y in range(int(start[1]), int(high[1]), step):
+            corner = np.array([x, y, start[2]])
+            if tree is not None and road is not None:
+                away, _ = tree.query(corner[:2] + step / 2)
+                if away > road[1] + step:
+                    continue
+            # windows that begin in this tile
+            wide = step - stride + SIZE
+            state = blocks.dense(corner, (wide, wide, height))
+            corners = occupied_windows(state, corner, stride, least)
+            if tree is not None and road is not None and len(corners):
+                away, _ = tree.query(corners[:, :2] + SIZE / 2)
+                corners = corners[away <= road[1]]
+            if len(corners):
+                vectors = describe_windows(state, corners - corner, encoder)
+                yield Described((corners + SIZE / 2).astype(np.float32), vectors)

@@ -1,0 +1,75 @@
+"""Which subvolumes the paper's method describes, and that tiles change nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from semloc_logs.subvolumes.plain_describe import (
+    TILE,
+    describe_blocks,
+    describe_box,
+    occupied_windows,
+)
+from semloc_logs.subvolumes.plain_network import PlainEncoder
+from semloc_logs.voxels.grid import UNOBSERVED_STATE, BlockMap
+from semloc_logs.voxels.keys import BLOCK, pack, unpack
+
+
+@pytest.fixture(scope="module")
+def encoder() -> PlainEncoder:
+    torch.manual_seed(0)
+    return PlainEncoder("geometric").eval()
+
+
+def one_voxel_a_block(blocks: np.ndarray) -> BlockMap:
+    """Blocks (n, 3) with one occupied voxel each, at (3, 3, 3) of the block."""
+    keys = np.sort(pack(blocks))
+    state = np.full((len(keys), BLOCK**3), UNOBSERVED_STATE, np.uint8)
+    state[:, (3 * BLOCK + 3) * BLOCK + 3] = 0
+    nothing = np.zeros(0, np.int64)
+    return BlockMap(keys, np.zeros(state.shape, np.int8), state, nothing, nothing)
+
+
+def test_windows_hold_so_many_occupied_voxels() -> None:
+    state = np.full((64, 64, 64), UNOBSERVED_STATE, np.uint8)
+    state[40, 40, 40] = 0
+    state[41, 40, 40] = 2
+    # corners 16, 24 and 32 along each axis hold the voxel at 40
+    one = occupied_windows(state, np.array([-8, 0, 8]), 8, 1)
+    assert len(one) == 27
+    assert one.min(0).tolist() == [8, 16, 24]
+    assert len(occupied_windows(state, np.zeros(3, int), 8, 2)) == 27
+    assert len(occupied_windows(state, np.zeros(3, int), 8, 3)) == 0
+    # of corners 0, 16 and 32 the latter two
+    assert len(occupied_windows(state, np.zeros(3, int), 16, 1)) == 8
+
+
+def test_every_subvolume_with_the_voxel_is_described(encoder: PlainEncoder) -> None:
+    found = describe_blocks(one_voxel_a_block(np.array([[0, 0, 0]])), 8, 1, encoder)
+    # the voxel at 3 lies in windows that begin at -24, -16, -8 and 0
+    assert len(found.centre) == 64
+    assert found.centre.min(0).tolist() == [-8, -8, -8]
+    assert found.centre.max(0).tolist() == [16, 16, 16]
+    assert found.descriptor.shape == (64, 256)
+
+
+def test_tiles_change_nothing(encoder: PlainEncoder) -> None:
+    blocks = one_voxel_a_block(np.array([[0, 0, 0], [TILE // BLOCK, 1, 0], [-3, -20, 0]]))
+    low, high = blocks.bounds()
+    state = blocks.dense(low, tuple((high - low).tolist()))
+    whole = describe_box(state, low, 8, 1, encoder)
+    tiled = describe_blocks(blocks, 8, 1, encoder)
+    assert len(whole.centre) == len(tiled.centre) == 3 * 64
+    order, other = (np.lexsort(d.centre.T) for d in (whole, tiled))
+    np.testing.assert_array_equal(whole.centre[order], tiled.centre[other])
+    np.testing.assert_allclose(whole.descriptor[order], tiled.descriptor[other], atol=1e-3)
+
+
+def test_only_subvolumes_near_the_road_are_described(encoder: PlainEncoder) -> None:
+    blocks = one_voxel_a_block(np.array([[0, 0, 0], [40, 0, 0]]))
+    assert unpack(blocks.keys)[1].tolist() == [40, 0, 0]
+    near = describe_blocks(blocks, 8, 1, encoder, (np.array([[0.0, 0.0]]), 100.0))
+    assert len(near.centre) == 64
+    assert near.centre[:, 0].max() < 100
