@@ -63,6 +63,8 @@ BASELINES: tuple[Entry, ...] = (
     Entry("fpfh", "FPFH", "fpfh:make_fpfh"),
     Entry("cgf", "CGF", "spherical_histograms:make_cgf"),
     Entry("3dmatch", "3DMatch", "distance_volumes:make_3dmatch"),
+    Entry("posenet", "PoseNet", "pose_regression:make_posenet", needs_pictures=True),
+    Entry("dsac", "DSAC", "scene_coordinates:make_dsac", needs_pictures=True),
     Entry("scan-context", "Scan Context + GICP", "scan_registration:make_scan_context"),
     Entry(
         "kiss-matcher",
