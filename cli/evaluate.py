@@ -32,16 +32,30 @@ if TYPE_CHECKING:
     help="Truth file (JSON): SESSION_FILE -> T_common_session (4x4) or trajectory (a TUM file).",
 )
 @click.option("--no-self", is_flag=True, help="Leave revisits within a session out of the recall.")
+@click.option(
+    "--heading",
+    type=click.FloatRange(0, 180),
+    metavar="DEGREES",
+    help="Only revisits at this angle to the query, such as 0, 90 or 180; 20 degrees less or more.",
+)
 @query_options
 @json_option
 @tables_settings_options
 @console_options
-def command(work: Path, truth: Path, no_self: bool, as_json: bool, settings: Resolved) -> int:
+def command(
+    work: Path,
+    truth: Path,
+    no_self: bool,
+    heading: float | None,
+    as_json: bool,
+    settings: Resolved,
+) -> int:
     """Closures against the truth: a closure is correct within 1 m and 5 degrees.
 
     Recall is the share of the queries near a database keyframe (5 m) that have a correct closure.
     After semloc optimize also the errors of the trajectories before and after: ATE and RPE of 10 m,
-    root mean squares, as evo defines them.
+    root mean squares, as evo defines them. With --heading 90 a query counts where all keyframes
+    near it were driven across, and closures between such views.
 
     \b
     Example:  semloc evaluate -w work --truth truth.json
@@ -51,7 +65,9 @@ def command(work: Path, truth: Path, no_self: bool, as_json: bool, settings: Res
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)
-    result = evaluate_closures(workspace, truth, settings, self_closures=not no_self)
+    result = evaluate_closures(
+        workspace, truth, settings, self_closures=not no_self, heading_deg=heading
+    )
     errors = trajectory_errors(workspace, truth) if workspace.graph_closures.exists() else None
     if as_json:
         console.result_json(result.to_json() | ({} if errors is None else errors.to_json()))

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.closures.query import query_keyframes
 from semloc_logs.errors import TruthError, WorkspaceError
+from semloc_logs.evaluation.headings import headings_deg, in_window
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import interpolate, inverse, rotation_angle, transform
 from semloc_logs.settings import Resolved, ResolvedClosures, ResolvedQuery
@@ -151,15 +152,22 @@ def _median(values: Iterable[float | None]) -> float | None:
 
 
 def evaluate_closures(
-    work: Workspace, truth: Path, settings: Resolved, *, self_closures: bool = True
+    work: Workspace,
+    truth: Path,
+    settings: Resolved,
+    *,
+    self_closures: bool = True,
+    heading_deg: float | None = None,
 ) -> Evaluation:
     """The closures of a workspace against the file ``truth``; queries are counted with the settings
     that the closures were made with.
 
     A query is possible when a keyframe of another session, or one of its own that is not excluded
     as near in time or along the road, truly lies within 5 m. It is answered when a correct closure
-    has it at either end: a closure found from both ends is reported once. Raises TruthError when
-    the truth file is missing or wrong, WorkspaceError without closures.
+    has it at either end: a closure found from both ends is reported once. With ``heading_deg`` a
+    query is possible only where all these keyframes of a session were truly driven at this angle to
+    it (+- 20 degrees), and only closures between such views count. Raises TruthError when the truth
+    file is missing or wrong, WorkspaceError without closures.
     """
     work.chosen(())
     if not work.closures.exists():
@@ -167,8 +175,12 @@ def evaluate_closures(
     settings = _settings_of(work, settings.resolved())
     sessions = {f.name: SessionMap(f) for f in work.sessions()}
     tracks = read_truth(truth, sessions)
-    rows = [judge_closure(row, tracks) for row in read_closures(work.closures)]
-    counts = _count_queries(sessions, tracks, rows, settings, self_closures)
+    closures = read_closures(work.closures)
+    if heading_deg is not None:
+        closures = [row for row in closures if _is_at_heading(row, tracks, heading_deg)]
+    rows = [judge_closure(row, tracks) for row in closures]
+    revisits = _Revisits.of(sessions, tracks, heading_deg)
+    counts = _count_queries(sessions, revisits, rows, settings, self_closures)
     return Evaluation(rows, counts.queries, counts.possible, counts.answered, _pairs(rows, counts))
 
 
@@ -209,6 +221,20 @@ def judge_closure(row: Mapping[str, Any], tracks: Mapping[str, TrueTrack]) -> Ju
     return Judged(
         **{n: row[n] for n in names}, error_m=error_m, error_deg=error_deg, correct=correct
     )
+
+
+def _is_at_heading(
+    row: Mapping[str, Any], tracks: Mapping[str, TrueTrack], heading_deg: float
+) -> bool:
+    """Whether the ends of a closure were truly driven at an angle to each other."""
+    ends = [
+        _pose(tracks.get(row[f"{end}_session"]), row[f"{end}_stamp_ns"])
+        for end in ("query", "target")
+    ]
+    if ends[0] is None or ends[1] is None:
+        return False
+    query, target = headings_deg(np.stack([ends[0], ends[1]]))
+    return bool(in_window(query, target, heading_deg))
 
 
 def _pose(track: TrueTrack | None, stamp_ns: int) -> F64 | None:
@@ -255,36 +281,73 @@ def _pairs(rows: list[Judged], counts: _Counts) -> list[PairFigures]:
     ]
 
 
+@dataclass(slots=True, eq=False)
+class _Revisits:
+    """Where the keyframes of each session truly were, and which of them are revisits of a place:
+    within ``REVISIT_M``, and all at ``heading_deg`` to the query if that is given.
+    """
+
+    positions: dict[str, F64]
+    headings: dict[str, F64]
+    known: dict[str, NDArray[np.bool_]]
+    trees: dict[str, cKDTree]
+    heading_deg: float | None
+
+    @classmethod
+    def of(
+        cls,
+        sessions: Mapping[str, SessionMap],
+        tracks: Mapping[str, TrueTrack],
+        heading_deg: float | None,
+    ) -> _Revisits:
+        """The revisits among the sessions whose tracks are known."""
+        out = cls({}, {}, {}, {}, heading_deg)
+        for name, track in tracks.items():
+            poses, out.known[name] = track.at(sessions[name].stamps_ns)
+            out.positions[name] = poses[:, :3, 3]
+            out.headings[name] = headings_deg(poses)
+            if out.known[name].any():
+                out.trees[name] = cKDTree(out.positions[name][out.known[name]])
+        return out
+
+    def is_near(self, name: str, keyframe: int, other: str) -> bool:
+        """Whether session ``other`` truly was where a keyframe of session ``name`` is."""
+        here = self.positions[name][keyframe]
+        if self.heading_deg is None:
+            return bool(self.trees[other].query(here)[0] <= REVISIT_M)
+        near = self.trees[other].query_ball_point(here, REVISIT_M)
+        return self.fits(name, keyframe, self.headings[other][self.known[other]][near])
+
+    def fits(self, name: str, keyframe: int, headings: F64) -> bool:
+        """Whether there are headings (n,), and all are at the angle to a keyframe."""
+        if self.heading_deg is None or not len(headings):
+            return len(headings) > 0
+        return bool(in_window(headings, self.headings[name][keyframe], self.heading_deg).all())
+
+
 def _count_queries(
     sessions: Mapping[str, SessionMap],
-    tracks: Mapping[str, TrueTrack],
+    revisits: _Revisits,
     rows: list[Judged],
     settings: Resolved,
     self_closures: bool,
 ) -> _Counts:
-    positions: dict[str, F64] = {}
-    known: dict[str, NDArray[np.bool_]] = {}
-    for name, track in tracks.items():
-        poses, known[name] = track.at(sessions[name].stamps_ns)
-        positions[name] = poses[:, :3, 3]
-    trees = {name: cKDTree(p[known[name]]) for name, p in positions.items() if known[name].any()}
+    positions = revisits.positions
+    known = revisits.known
     right = _correct_ends(sessions, rows)
     counts = _Counts()
-    for name in trees:
+    for name in revisits.trees:
         mine = sessions[name]
         for k in query_keyframes(mine, settings):
             if not known[name][k]:
                 continue
             counts.queries += 1
-            here = positions[name][k]
             near = [
                 other
-                for other, tree in trees.items()
-                if other != name and tree.query(here)[0] <= REVISIT_M
+                for other in revisits.trees
+                if other != name and revisits.is_near(name, k, other)
             ]
-            if self_closures and _revisits_itself(
-                mine, positions[name], known[name], k, settings.closures
-            ):
+            if self_closures and _revisits_itself(mine, revisits, name, k, settings.closures):
                 near.append(name)
             if not near:
                 continue
@@ -337,19 +400,21 @@ def _is_answered(
 
 def _revisits_itself(
     session: SessionMap,
-    positions: F64,
-    known: NDArray[np.bool_],
+    revisits: _Revisits,
+    name: str,
     keyframe: int,
     closures: ResolvedClosures,
 ) -> bool:
     if not session.posed:
         return False
-    near = known & (np.linalg.norm(positions - positions[keyframe], axis=1) <= REVISIT_M)
+    positions = revisits.positions[name]
+    away = np.linalg.norm(positions - positions[keyframe], axis=1)
+    near = revisits.known[name] & (away <= REVISIT_M)
     later = (
         np.abs(session.stamps_ns - session.stamps_ns[keyframe]) >= closures.exclude_seconds * 1e9
     )
     farther = np.abs(session.distance - session.distance[keyframe]) >= (closures.exclude_distance)
-    return bool((near & later & farther).any())
+    return revisits.fits(name, keyframe, revisits.headings[name][near & later & farther])
 
 
 # -- files

@@ -81,13 +81,15 @@ def answer_scenario(
             system = make()
             system.fit(store.selection(trial.database))
             parts.fit_cpu_s = cpu_seconds() - started
-            for query in left:
-                parts.add(query, _localised(system, query, run.frames, store))
-                done += 1
-                answered += 1
-                name = f"{run.system}, {run.sensor} {scenario.name}"
-                progress.report("benchmark", name, done, total, "queries")
-            parts.write()
+            name = f"{run.system}, {run.sensor} {scenario.name}"
+            try:
+                for query in left:
+                    parts.add(query, _localised(system, query, run.frames, store))
+                    done += 1
+                    answered += 1
+                    progress.report("benchmark", name, done, total, "queries")
+            finally:
+                parts.write()
     return answered
 
 

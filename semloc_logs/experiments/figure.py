@@ -108,7 +108,7 @@ def _errors(panel: Axes, rows: Sequence[Row], sensor: str, scenario: str) -> Non
     at = np.linspace(0.0, _MOST_ERROR_M, 101)
     for number, answers in _lines(rows, sensor, scenario):
         panel.plot(at, error_curve(answers.first_m, at), **_style(number))
-    _frame(panel, _MOST_ERROR_M, "error (m)")
+    _frame(panel, (0.0, _MOST_ERROR_M), "error (m)")
 
 
 def _ranks(panel: Axes, rows: Sequence[Row], sensor: str, scenario: str, threshold: float) -> None:
@@ -116,8 +116,7 @@ def _ranks(panel: Axes, rows: Sequence[Row], sensor: str, scenario: str, thresho
     for number, answers in _lines(rows, sensor, scenario):
         panel.plot(at, rank_recall(answers.errors_m, threshold), **_style(number))
     panel.set_xscale("log")
-    _frame(panel, float(MOST_POSES), "rank")
-    panel.set_xlim(1, MOST_POSES)
+    _frame(panel, (1.0, float(MOST_POSES)), "rank")
     panel.set_xticks([1, 10, 100], ["1", "10", "100"])
 
 
@@ -137,8 +136,8 @@ def _style(number: int) -> dict[str, Any]:
     }
 
 
-def _frame(panel: Axes, most: float, label: str) -> None:
-    panel.set_xlim(0, most)
+def _frame(panel: Axes, extent: tuple[float, float], label: str) -> None:
+    panel.set_xlim(*extent)
     panel.set_ylim(-0.02, 1.02)
     panel.set_xlabel(label, fontsize=8)
     panel.tick_params(labelsize=7)

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from semloc_logs.evaluation.headings import in_window
 from semloc_logs.experiments.views import ViewStore
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-WINDOW_DEG = 20.0  # about the heading of a scenario (paper, section 4.5)
 PER_PASSAGE = 20  # queries around an intersection (paper, section 4.5)
 EXCLUDED_VIEWS = 50  # of the same session about a query: the protocol of KITTI loops
 NEAR_M = 10.0  # from a passage to the nearest view of its heading, and to its farthest query: 20
@@ -71,17 +71,6 @@ class Extent:
 
 
 # -- headings
-
-
-def heading_difference(one_deg: F64 | float, other_deg: F64 | float) -> F64:
-    """Angle between headings, degrees in [0, 180]."""
-    return np.abs((np.asarray(one_deg) - other_deg + 180.0) % 360.0 - 180.0)
-
-
-def in_window(one_deg: F64 | float, other_deg: F64 | float, heading_deg: float) -> Mask:
-    """Whether two headings differ by ``heading_deg`` +- ``WINDOW_DEG``."""
-    off = np.abs(heading_difference(one_deg, other_deg) - heading_deg)
-    return np.asarray(off <= WINDOW_DEG + 1e-9)
 
 
 def heading_scenario(

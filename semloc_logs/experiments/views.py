@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.evaluation.headings import headings_deg
 from semloc_logs.evaluation.truth import read_truth
 from semloc_logs.experiments.system import View
 from semloc_logs.experiments.view_pictures import PictureFolder
@@ -98,8 +99,7 @@ class ViewStore(Sequence[View]):
     @cached_property
     def headings_deg(self) -> F64:
         """Direction (n,) of the x axis of the base in the plane, degrees in [0, 360)."""
-        ahead = self.world_T_base[:, :2, 0]
-        return np.asarray(np.degrees(np.arctan2(ahead[:, 1], ahead[:, 0])) % 360.0)
+        return headings_deg(self.world_T_base)
 
     @property
     def has_pictures(self) -> bool:

@@ -323,3 +323,36 @@ def test_recall_of_each_pair_of_sessions(work: Workspace) -> None:
     # a query that several sessions can answer counts once in all
     assert result.answered == 2
     assert result.possible < sum(p.possible for p in result.pairs)
+
+
+def test_with_a_heading_only_revisits_at_that_angle_count(tmp_path: Path) -> None:
+    """a drives east along y = 0, across drives north along x = 10, back drives west along y = 3."""
+    work = Workspace(tmp_path / "work")
+    steps = np.arange(21.0)
+    north = np.array([yaw_transform(np.pi / 2, (10.0, y - 10.0, 0.0)) for y in steps])
+    west = np.array([yaw_transform(np.pi, (20.0 - x, 3.0, 0.0)) for x in steps])
+    _session(work, "a", 0, _poses(steps))
+    _session(work, "across", 1000, north)
+    truth = {name: {"T_common_session": np.eye(4).tolist()} for name in ("a", "across", "back")}
+    (tmp_path / "truth.json").write_text(json.dumps(truth))
+    # at the crossing: seconds 10 of a and 1010 of across
+    _closures(work, [("across", 1010, "a", 10, yaw_transform(np.pi / 2, (0.0, 0.0, 0.0)))])
+    # x = 6, 8 .. 14 of a and y = -4, -2 .. 4 of across are within 5 m of the other street
+    across = _evaluate(work, heading_deg=90.0)
+    assert (across.closures, across.correct, across.possible, across.answered) == (1, 1, 10, 2)
+    assert _evaluate(work).possible == 10
+    opposite = _evaluate(work, heading_deg=180.0)
+    assert (opposite.closures, opposite.possible) == (0, 0)
+
+    # all 11 queries of back are beside a, 5 of them near across as well; and a's 11 beside back
+    _session(work, "back", 2000, west)
+    opposite = _evaluate(work, heading_deg=180.0)
+    assert (opposite.closures, opposite.possible) == (0, 22)
+    assert {p.sessions for p in opposite.pairs} == {("a", "back")}
+
+    # once across was also driven east, a's queries meet more there than crossing views; the five
+    # queries of across on its way north still cross a
+    both = np.concatenate([north, _poses(np.arange(0.0, 21.0))])
+    _session(work, "across", 1000, both)
+    crossing = {p.sessions: p.possible for p in _evaluate(work, heading_deg=90.0).pairs}
+    assert crossing["a", "across"] == 5

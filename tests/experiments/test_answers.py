@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from semloc_logs.errors import SemlocError
-from semloc_logs.experiments import answers as answers_module
 from semloc_logs.experiments.answers import (
     Run,
     all_tables,
@@ -82,11 +81,8 @@ def test_answers_come_back_with_their_errors(
     assert all(table.schema.equals(contracts.schema("answers")) for table in tables)
 
 
-def test_an_interrupted_run_continues(
-    plan: tuple[ViewStore, Scenario], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_run_continues(plan: tuple[ViewStore, Scenario], tmp_path: Path) -> None:
     store, scenario = plan
-    monkeypatch.setattr(answers_module, "PART_S", -1.0)
     broken = Nearest(breaks_after=30)
     with pytest.raises(KeyboardInterrupt):
         answer_scenario(RUN, scenario, store, tmp_path, lambda: broken)
@@ -98,6 +94,22 @@ def test_an_interrupted_run_continues(
     idle = Nearest()
     assert answer_scenario(RUN, scenario, store, tmp_path, lambda: idle) == 0
     assert idle.fits == 0
+
+
+def test_answers_are_written_on_the_way_too(
+    plan: tuple[ViewStore, Scenario], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, scenario = plan
+    monkeypatch.setattr("semloc_logs.experiments.answers.PART_S", -1.0)
+    written: list[int] = []
+
+    class Watching(Nearest):
+        def localise(self, query: Query) -> list[RankedPose]:
+            written.append(len(read_answers(RUN, scenario, tmp_path)))
+            return super().localise(query)
+
+    answer_scenario(RUN, scenario, store, tmp_path, Watching)
+    assert written == list(range(100))
 
 
 def test_another_version_of_a_system_answers_again(

@@ -7,12 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from semloc_logs.evaluation.headings import heading_difference, in_window
 from semloc_logs.experiments.scenarios import (
     EXCLUDED_VIEWS,
     Extent,
-    heading_difference,
     heading_scenario,
-    in_window,
     query_views,
     time_scenario,
 )
