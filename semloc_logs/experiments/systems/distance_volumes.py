@@ -27,7 +27,8 @@ from semloc_logs.experiments.systems.shape_matching import (
     ShapeSystem,
     keypoints_of,
 )
-from semloc_logs.experiments.systems.trained_networks import key_of, trained
+from semloc_logs.experiments.systems.trained_networks import trained
+from semloc_logs.experiments.systems.training_views import Training, simulated_training
 from semloc_logs.numerics.transforms import turned_about_z
 from semloc_logs.settings import Resolved
 
@@ -85,12 +86,12 @@ class DistanceVolumes:
         self._network = Volumes()
         self._network.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
 
-    def fit(self, views: Sequence[View], settings: Resolved) -> None:
-        key = key_of(views, self._steps, settings.fusion)
+    def fit(self, training: Training, settings: Resolved) -> None:
+        key = f"{training.key}-{self._steps}-{settings.fingerprint('fusion')}"
         trained(
             self._folder / f"3dmatch-{key}.safetensors",
             self._network,
-            lambda: self._train(views, settings),
+            lambda: self._train(training.views(), settings),
         )
 
     def describe(self, level_map: LevelMap, yaw: float) -> Described:
@@ -209,5 +210,10 @@ def _reset(module: nn.Module) -> None:
 
 def make_3dmatch(options: SystemOptions) -> ShapeSystem:
     """3DMatch in our pipeline."""
+    return volume_system(options, simulated_training(quick=options.quick))
+
+
+def volume_system(options: SystemOptions, training: Training) -> ShapeSystem:
+    """The same, learnt from ``training``."""
     descriptor = DistanceVolumes(options.folder, quick=options.quick)
-    return ShapeSystem("3dmatch", descriptor, options.settings)
+    return ShapeSystem("3dmatch", descriptor, options.settings, training, options.folder)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from semloc_logs.experiments.system import View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.feature_histograms import feature_histograms
 from semloc_logs.experiments.systems.level_maps import LevelMap
@@ -16,6 +13,7 @@ from semloc_logs.experiments.systems.shape_matching import (
     ShapeSystem,
     keypoints_of,
 )
+from semloc_logs.experiments.systems.training_views import Training, simulated_training
 from semloc_logs.mapping.selection import thin
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import SIZE
@@ -28,7 +26,7 @@ class FeatureHistograms:
 
     turns = False
 
-    def fit(self, views: Sequence[View], settings: Resolved) -> None:
+    def fit(self, training: Training, settings: Resolved) -> None:
         """Nothing is learnt."""
 
     def describe(self, level_map: LevelMap, yaw: float) -> Described:
@@ -42,4 +40,9 @@ class FeatureHistograms:
 
 def make_fpfh(options: SystemOptions) -> ShapeSystem:
     """FPFH in our pipeline."""
-    return ShapeSystem("fpfh", FeatureHistograms(), options.settings)
+    return fpfh_system(options, simulated_training(quick=options.quick))
+
+
+def fpfh_system(options: SystemOptions, training: Training) -> ShapeSystem:
+    """The same, with words learnt from ``training``."""
+    return ShapeSystem("fpfh", FeatureHistograms(), options.settings, training, options.folder)

@@ -8,6 +8,7 @@ do not depend on the heading leave it open: each match then stands for one hypot
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -15,11 +16,18 @@ from numpy.typing import NDArray
 
 from semloc_logs.experiments.system import Query, RankedPose, View
 from semloc_logs.experiments.systems.level_maps import LevelMap, database_map, query_map
+from semloc_logs.experiments.systems.training_views import Training
 from semloc_logs.experiments.systems.voxel_verification import Verifier
 from semloc_logs.numerics.transforms import turned_about_z
 from semloc_logs.settings import Resolved
 from semloc_logs.words.index import Allowed, Index
-from semloc_logs.words.vocabulary import BITS, train_vocabulary
+from semloc_logs.words.vocabulary import (
+    BITS,
+    Vocabulary,
+    load_vocabulary,
+    save_vocabulary,
+    train_vocabulary,
+)
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -27,7 +35,6 @@ I64 = NDArray[np.int64]
 HEADINGS = 18  # of the paper
 STRIDE = 8  # voxels between keypoints
 TRAINING_KEYPOINTS = 200_000  # that a vocabulary is trained on, at most
-LEAST_WORDS = 256  # keypoints that a vocabulary needs
 
 
 class Described(NamedTuple):
@@ -42,8 +49,8 @@ class ShapeDescriptor(Protocol):
 
     turns: bool  # whether it depends on the heading, so that queries are described in all headings
 
-    def fit(self, views: Sequence[View], settings: Resolved) -> None:
-        """Learn from ``views``, where there is anything to learn."""
+    def fit(self, training: Training, settings: Resolved) -> None:
+        """Learn, where there is anything to learn."""
         ...
 
     def describe(self, level_map: LevelMap, yaw: float) -> Described:
@@ -54,7 +61,8 @@ class ShapeDescriptor(Protocol):
 class ShapeSystem:
     """Places found by words of a ``descriptor``, and verified on voxels.
 
-    Descriptor and words are learnt from ``training``; where it is not given, from the database.
+    Descriptor and words are learnt from ``training``, not from the database; the words are kept in
+    ``folder``.
     """
 
     def __init__(
@@ -62,29 +70,43 @@ class ShapeSystem:
         name: str,
         descriptor: ShapeDescriptor,
         settings: Resolved,
-        training: Sequence[View] | None = None,
+        training: Training,
+        folder: Path,
     ) -> None:
         self.name = name
         self._descriptor = descriptor
         self._settings = settings
         self._training = training
+        self._folder = folder
         self._index: Index | None = None
         self._positions = np.zeros((0, 3))
 
     def fit(self, database: Sequence[View]) -> None:
-        self._descriptor.fit(self._training or database, self._settings)
+        self._descriptor.fit(self._training, self._settings)
+        vocabulary = self._vocabulary()
         level_map = database_map(database, self._settings)
-        described = self._descriptor.describe(level_map, 0.0)
-        words = described.descriptor
-        if self._training:
-            trained_on = database_map(self._training, self._settings)
-            words = self._descriptor.describe(trained_on, 0.0).descriptor
-        self._positions = described.position
-        v = self._settings.fusion.voxel_size
-        self._verifier = Verifier(level_map, self._settings.closures.kappa * v)
         self._index = None
-        if len(words) >= LEAST_WORDS and len(described.descriptor):
-            self._index = word_index(words, described.descriptor)
+        if not len(level_map.points):
+            return
+        described = self._descriptor.describe(level_map, 0.0)
+        word, code = vocabulary.words(unit_vectors(described.descriptor))
+        self._index = Index.of_words(vocabulary, word, code, np.zeros(len(word), np.int64))
+        self._positions = described.position
+        kappa = self._settings.closures.kappa * level_map.voxel_size
+        self._verifier = Verifier(level_map, kappa)
+
+    def _vocabulary(self) -> Vocabulary:
+        """The words of the descriptor: read from the folder, or learnt."""
+        key = f"{self._training.key}-{self._settings.fingerprint('fusion')}"
+        path = self._folder / f"{self.name}-words-{key}.safetensors"
+        if not path.exists():
+            trained_on = database_map(self._training.views(), self._settings)
+            words = unit_vectors(self._descriptor.describe(trained_on, 0.0).descriptor)
+            rng = np.random.default_rng(0)
+            some = np.sort(rng.permutation(len(words))[:TRAINING_KEYPOINTS])
+            self._folder.mkdir(parents=True, exist_ok=True)
+            save_vocabulary(path, train_vocabulary(words[some]), {"training": key})
+        return load_vocabulary(self.name, path)
 
     def localise(self, query: Query) -> list[RankedPose]:
         if self._index is None:
@@ -135,16 +157,6 @@ def unit_vectors(descriptor: NDArray[np.floating]) -> F32:
     length = np.linalg.norm(descriptor, axis=1, keepdims=True)
     out[:, : descriptor.shape[1]] = descriptor / np.maximum(length, 1e-9)
     return out
-
-
-def word_index(training: F32, descriptor: F32) -> Index:
-    """An index of ``descriptor`` (n, d), its words learnt from ``training`` (m, d)."""
-    rng = np.random.default_rng(0)
-    count = min(len(training), TRAINING_KEYPOINTS)
-    some = np.sort(rng.choice(len(training), count, replace=False))
-    vocabulary = train_vocabulary(unit_vectors(training[some]))
-    word, code = vocabulary.words(unit_vectors(descriptor))
-    return Index.of_words(vocabulary, word, code, np.zeros(len(word), np.int64))
 
 
 def keypoints_of(points: F64, spacing: float) -> I64:

@@ -30,7 +30,8 @@ from semloc_logs.experiments.systems.shape_matching import (
     ShapeSystem,
     keypoints_of,
 )
-from semloc_logs.experiments.systems.trained_networks import key_of, trained
+from semloc_logs.experiments.systems.trained_networks import trained
+from semloc_logs.experiments.systems.training_views import Training, simulated_training
 from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.eigen import eigen
 from semloc_logs.settings import Resolved
@@ -60,12 +61,12 @@ class SphericalHistograms:
         self._steps = QUICK_STEPS if quick else STEPS
         self._network = Embedding()
 
-    def fit(self, views: Sequence[View], settings: Resolved) -> None:
-        key = key_of(views, self._steps, settings.fusion)
+    def fit(self, training: Training, settings: Resolved) -> None:
+        key = f"{training.key}-{self._steps}-{settings.fingerprint('fusion')}"
         trained(
             self._folder / f"cgf-{key}.safetensors",
             self._network,
-            lambda: self._train(views, settings),
+            lambda: self._train(training.views(), settings),
         )
 
     def describe(self, level_map: LevelMap, yaw: float) -> Described:
@@ -213,5 +214,10 @@ def _reset(module: nn.Module) -> None:
 
 def make_cgf(options: SystemOptions) -> ShapeSystem:
     """CGF in our pipeline."""
+    return cgf_system(options, simulated_training(quick=options.quick))
+
+
+def cgf_system(options: SystemOptions, training: Training) -> ShapeSystem:
+    """The same, learnt from ``training``."""
     descriptor = SphericalHistograms(options.folder, quick=options.quick)
-    return ShapeSystem("cgf", descriptor, options.settings)
+    return ShapeSystem("cgf", descriptor, options.settings, training, options.folder)

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from semloc_logs.experiments.system import Picture, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
+from semloc_logs.experiments.systems.training_views import Training
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import Settings
 
@@ -160,6 +161,12 @@ def _drive(town: Town, step: float, with_picture: bool) -> Drive:
 def point_drive(town: Town) -> Drive:
     """Views by a LIDAR alone."""
     return _drive(town, 2.0, with_picture=False)
+
+
+@pytest.fixture(scope="session")
+def training(point_drive: Drive) -> Training:
+    """The database of the point drive, to learn from: streets of a simulator take longer."""
+    return Training("town", lambda: point_drive.database)
 
 
 @pytest.fixture(scope="session")

@@ -10,8 +10,8 @@ from semloc_logs.experiments.systems.distance_volumes import (
     Volumes,
     describe_points,
     distance_volume,
-    make_3dmatch,
     training_volumes,
+    volume_system,
 )
 from semloc_logs.numerics.transforms import yaw_transform
 
@@ -42,8 +42,8 @@ def test_a_subvolume_has_the_same_descriptor_in_a_map_and_alone() -> None:
 
 
 @pytest.fixture(scope="module")
-def system(point_drive: Any, options: Any) -> Any:
-    out = make_3dmatch(options)
+def system(point_drive: Any, options: Any, training: Any) -> Any:
+    out = volume_system(options, training)
     out.fit(point_drive.database)
     return out
 

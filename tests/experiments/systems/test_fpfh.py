@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semloc_logs.experiments.systems.feature_histograms import feature_histograms
-from semloc_logs.experiments.systems.fpfh import make_fpfh
+from semloc_logs.experiments.systems.fpfh import fpfh_system
 from semloc_logs.experiments.systems.level_maps import oriented_normals
 from semloc_logs.numerics.transforms import yaw_transform
 
@@ -58,8 +58,8 @@ def test_a_keypoint_alone_has_no_histogram() -> None:
 
 
 @pytest.fixture(scope="module")
-def system(point_drive: Any, options: Any) -> Any:
-    out = make_fpfh(options)
+def system(point_drive: Any, options: Any, training: Any) -> Any:
+    out = fpfh_system(options, training)
     out.fit(point_drive.database)
     return out
 
