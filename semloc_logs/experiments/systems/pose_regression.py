@@ -36,7 +36,7 @@ BRIGHTER = 0.2  # share that they are made brighter or darker by, at most
 TURN_WEIGHT = 1.0  # of the quaternion's error against the position's in extents
 CHECKED = 200  # steps after which the loss has to have fallen ...
 FALL = 0.03  # ... by this share, or training ends
-STEPS, QUICK_STEPS = 20_000, 150
+STEPS, QUICK_STEPS = 8000, 150
 
 
 class PoseNet(nn.Module):
@@ -143,7 +143,7 @@ def _turn_error(found: Tensor, wanted: Tensor) -> Tensor:
 
 
 def _has_settled(losses: Sequence[float]) -> bool:
-    """Whether the mean loss of the last steps is hardly below that of the steps before."""
+    """Whether the mean loss of the last steps is hardly below the mean of the steps before."""
     if len(losses) < 2 * CHECKED or len(losses) % CHECKED:
         return False
     last = float(np.mean(losses[-CHECKED:]))

@@ -25,13 +25,15 @@ from semloc_logs.experiments.systems.picture_pose import base_pose, pose_of_poin
 from semloc_logs.experiments.systems.trained_networks import key_of, trained
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 
+U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 WIDTH = 320  # pixels that wider pictures are scaled to
 CELL = 8  # pixels between coordinates
 CHANNELS = (16, 32, 64, 128)
+LEAST_EXTENT = 10.0  # m: coordinates are in units of the spread of the places and of this
 RATE, END_RATE = 2e-3, 1e-5  # of the first stage and of the second
-STEPS, QUICK_STEPS = 6000, 300
+STEPS, QUICK_STEPS = 4000, 300
 NEAREST = 3.0  # m: errors of coordinates count in units of their distance, of this at least
 END_STEPS, QUICK_END_STEPS = 300, 5
 HYPOTHESES = 16  # of a training picture
@@ -43,14 +45,22 @@ LONGEST = 1e3  # pixels: reprojection errors beyond are one
 
 
 class _Grid(NamedTuple):
-    """Cells of a scaled picture: ``grey`` (h, w), ``pixel`` (n, 2) middles of the cells, the
+    """Cells of a scaled picture: ``grey`` (h, w) levels, ``pixel`` (n, 2) middles of the cells, the
     scaled ``intrinsics``, and the ``points`` (n, 3) of the cells, base frame, NaN without depth.
     """
 
-    grey: F32
+    grey: U8
     pixel: F32
     intrinsics: F64
     points: F32
+
+
+class _Example(NamedTuple):
+    """A picture of the database and its true poses (4, 4)."""
+
+    grid: _Grid
+    world_T_base: F64
+    camera_T_world: F64
 
 
 class Coordinates(nn.Module):
@@ -98,16 +108,21 @@ class SceneCoordinateSystem:
         self._network: Coordinates | None = None
 
     def fit(self, database: Sequence[View]) -> None:
-        numbers = [n for n in range(len(database)) if database[n].picture is not None]
+        examples = []
+        for number in range(len(database)):
+            view = database[number]
+            if view.picture is not None:
+                camera_T_world = inverse(view.world_T_base @ view.picture.base_T_camera)
+                examples.append(_Example(_grid(view.picture), view.world_T_base, camera_T_world))
         self._network = None
-        if not numbers:
+        if not examples:
             return
         self._network = Coordinates()
         key = key_of(database, self._steps)
         trained(
             self._folder / f"dsac-{key}.safetensors",
             self._network,
-            lambda: self._train(database, numbers),
+            lambda: self._train(examples),
         )
 
     def localise(self, query: Query) -> list[RankedPose]:
@@ -122,26 +137,25 @@ class SceneCoordinateSystem:
             return []
         return [RankedPose(base_pose(pose, picture), float(pose.inliers))]
 
-    def _train(self, database: Sequence[View], numbers: Sequence[int]) -> None:
+    def _train(self, examples: Sequence[_Example]) -> None:
         assert self._network is not None
         torch.manual_seed(0)
         rng = np.random.default_rng(0)
         self._network.apply(_reset)
-        places = np.stack([database[n].world_T_base[:3, 3] for n in numbers])
+        places = np.stack([example.world_T_base[:3, 3] for example in examples])
         self._network.centre.copy_(torch.from_numpy(places.mean(0).astype(np.float32)))
-        self._network.extent.copy_(torch.from_numpy(places.std(0).astype(np.float32)) + 10.0)
+        self._network.extent.copy_(
+            torch.from_numpy(places.std(0).astype(np.float32)) + LEAST_EXTENT
+        )
         optimiser = torch.optim.Adam(self._network.parameters(), RATE)
         for step in range(sum(self._steps)):
             if step == self._steps[0]:
                 optimiser = torch.optim.Adam(self._network.parameters(), END_RATE)
-            view = database[numbers[int(rng.integers(len(numbers)))]]
-            assert view.picture is not None
-            grid = _grid(view.picture)
+            grid, world_T_base, camera_T_world = examples[int(rng.integers(len(examples)))]
             found = self._network(_tensor(grid)).flatten(2)[0].T
             if step < self._steps[0]:
-                loss = coordinate_loss(found, grid, view.world_T_base)
+                loss = coordinate_loss(found, grid, world_T_base)
             else:
-                camera_T_world = inverse(view.world_T_base @ view.picture.base_T_camera)
                 loss = expected_loss(found, grid.pixel, grid.intrinsics, camera_T_world, rng)
             if loss is None:
                 continue
@@ -231,7 +245,7 @@ def _grid(picture: Picture) -> _Grid:
     size = (columns * CELL, rows * CELL)
     factor = np.array([size[0] / width, size[1] / height])
     full_grey = cv2.cvtColor(picture.image, cv2.COLOR_RGB2GRAY)
-    grey = np.asarray(cv2.resize(full_grey, size, interpolation=cv2.INTER_AREA), np.float32)
+    grey = np.asarray(cv2.resize(full_grey, size, interpolation=cv2.INTER_AREA), np.uint8)
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     pixel = (np.c_[x.ravel(), y.ravel()] + 0.5) * CELL - 0.5
     # pixel middles are whole numbers, so scaling goes about the corner of the picture
@@ -247,7 +261,8 @@ def _grid(picture: Picture) -> _Grid:
 
 
 def _tensor(grid: _Grid) -> Tensor:
-    return torch.from_numpy((grid.grey - grid.grey.mean()) / 64)[None, None]
+    grey = grid.grey.astype(np.float32)
+    return torch.from_numpy((grey - grey.mean()) / 64)[None, None]
 
 
 def _reset(module: nn.Module) -> None:
