@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -98,7 +99,10 @@ class DistanceVolumes:
         v = level_map.voxel_size
         points = turned_about_z(level_map.points / v, np.full(len(level_map.points), -yaw))
         cell, descriptor = describe_points(points, self._network)
-        centre = (cell.astype(np.float64) + 0.5) * (STRIDE * v)
+        centre = (cell.astype(np.float64) + 0.5) * STRIDE
+        # the height of a surface, so that the ground comes to lie on the ground
+        centre[:, 2] = points[cKDTree(points).query(centre, workers=1)[1], 2] if len(cell) else 0.0
+        centre *= v
         return Described(turned_about_z(centre, np.full(len(centre), yaw)), descriptor)
 
     def _train(self, views: Sequence[View], settings: Resolved) -> None:

@@ -32,7 +32,10 @@ FEW, MANY = 64, 1500  # query voxels that rate all hypotheses, and the best
 BEST = 2000  # hypotheses that are rated with many voxels
 REFINED = 30  # hypotheses that are refined
 APART_VOXELS = 2.0  # poses nearer than this with one heading are one
-STEPS = (Step(10.0, 4), Step(4.0, 6), Step(2.0, 8))  # of a refinement; radii in voxels
+# voxels that a hypothesis may lie too high, as keypoints are half a stride off at most. The ground
+# then falls into free space, and nothing fits; where it lies too low, it is the closest surface
+HEIGHTS = (0.0, -2.0, -4.0)
+STEPS = (Step(10.0, 10), Step(4.0, 8), Step(2.0, 8))  # of a refinement; radii in voxels
 
 
 class Rated(NamedTuple):
@@ -71,8 +74,13 @@ class Verifier:
         centres = (ijk[order] + 0.5).astype(np.float64)
         states = label[order]
         self._complete_tiles(poses, float(np.linalg.norm(centres[:, :2], axis=1).max()))
-        some = self._tau(centres[:FEW], states[:FEW], poses)
-        chosen = poses[np.argsort(-some, kind="stable")[:BEST]]
+        lowered = np.repeat(poses[None], len(HEIGHTS), axis=0)
+        lowered[:, :, 3] += np.array(HEIGHTS)[:, None] * self._voxel_size
+        some = self._tau(centres[:FEW], states[:FEW], lowered.reshape(-1, 4))
+        some = some.reshape(len(HEIGHTS), -1)
+        height = some.argmax(0)
+        best = np.argsort(-some.max(0), kind="stable")[:BEST]
+        chosen = lowered[height[best], best]
         tau = self._tau(centres, states, chosen)
         chosen = chosen[np.argsort(-tau, kind="stable")]
         apart = APART_VOXELS * self._voxel_size
