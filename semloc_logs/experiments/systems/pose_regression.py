@@ -36,7 +36,7 @@ BRIGHTER = 0.2  # share that they are made brighter or darker by, at most
 TURN_WEIGHT = 1.0  # of the quaternion's error against the position's in extents
 CHECKED = 200  # steps after which the loss has to have fallen ...
 FALL = 0.03  # ... by this share, or training ends
-STEPS, QUICK_STEPS = 8000, 150
+STEPS, QUICK_STEPS = 8000, 20  # few steps show only that it runs
 
 
 class PoseNet(nn.Module):
@@ -68,13 +68,13 @@ class PoseNet(nn.Module):
 
 
 class PoseNetSystem:
-    """One pose a query; weights are kept in ``folder``."""
+    """One pose a query, after at most ``steps`` of training; weights are kept in ``folder``."""
 
     name = "posenet"
 
-    def __init__(self, folder: Path, *, quick: bool) -> None:
+    def __init__(self, folder: Path, steps: int) -> None:
         self._folder = folder
-        self._steps = QUICK_STEPS if quick else STEPS
+        self._steps = steps
         self._network: PoseNet | None = None
 
     def fit(self, database: Sequence[View]) -> None:
@@ -174,4 +174,4 @@ def _reset(module: nn.Module) -> None:
 
 def make_posenet(options: SystemOptions) -> PoseNetSystem:
     """PoseNet."""
-    return PoseNetSystem(options.folder, quick=options.quick)
+    return PoseNetSystem(options.folder, QUICK_STEPS if options.quick else STEPS)

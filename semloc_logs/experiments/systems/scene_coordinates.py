@@ -33,9 +33,9 @@ CELL = 8  # pixels between coordinates
 CHANNELS = (16, 32, 64, 128)
 LEAST_EXTENT = 10.0  # m: coordinates are in units of the spread of the places and of this
 RATE, END_RATE = 2e-3, 1e-5  # of the first stage and of the second
-STEPS, QUICK_STEPS = 4000, 300
+STEPS, QUICK_STEPS = 4000, 20  # few steps show only that it runs
 NEAREST = 3.0  # m: errors of coordinates count in units of their distance, of this at least
-END_STEPS, QUICK_END_STEPS = 300, 5
+END_STEPS, QUICK_END_STEPS = 300, 2
 HYPOTHESES = 16  # of a training picture
 POINTS = 4  # of a hypothesis
 INLIER_PIXELS, SOFTNESS = 5.0, 1.0  # of the soft count
@@ -98,13 +98,15 @@ class Coordinates(nn.Module):
 
 
 class SceneCoordinateSystem:
-    """The pose by the coordinates of all cells; weights are kept in ``folder``."""
+    """The pose by the coordinates of all cells, after the ``steps`` of both stages; weights are kept
+    in ``folder``.
+    """
 
     name = "dsac"
 
-    def __init__(self, folder: Path, *, quick: bool) -> None:
+    def __init__(self, folder: Path, steps: tuple[int, int]) -> None:
         self._folder = folder
-        self._steps = (QUICK_STEPS, QUICK_END_STEPS) if quick else (STEPS, END_STEPS)
+        self._steps = steps
         self._network: Coordinates | None = None
 
     def fit(self, database: Sequence[View]) -> None:
@@ -272,4 +274,5 @@ def _reset(module: nn.Module) -> None:
 
 def make_dsac(options: SystemOptions) -> SceneCoordinateSystem:
     """DSAC."""
-    return SceneCoordinateSystem(options.folder, quick=options.quick)
+    steps = (QUICK_STEPS, QUICK_END_STEPS) if options.quick else (STEPS, END_STEPS)
+    return SceneCoordinateSystem(options.folder, steps)

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from semloc_logs.experiments.systems.pose_regression import _has_settled, make_posenet
+from semloc_logs.experiments.systems.pose_regression import (
+    PoseNetSystem,
+    _has_settled,
+    make_posenet,
+)
 from semloc_logs.experiments.systems.scene_coordinates import (
+    SceneCoordinateSystem,
     _grid,
     chosen_loss,
     hypotheses,
@@ -20,7 +25,14 @@ from semloc_logs.experiments.systems.scene_coordinates import (
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 
 
-@pytest.mark.parametrize("make", [make_posenet, make_dsac])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda options: PoseNetSystem(options.folder, 150),
+        lambda options: SceneCoordinateSystem(options.folder, (300, 5)),
+    ],
+    ids=["posenet", "dsac"],
+)
 def test_pictures_of_the_database_are_localised(
     make: Any, picture_drive: Any, options: Any, errors: Any
 ) -> None:
@@ -41,9 +53,13 @@ def test_pictures_of_the_database_are_localised(
 
 
 @pytest.mark.parametrize("make", [make_posenet, make_dsac])
-def test_without_pictures_nothing_is_found(make: Any, point_drive: Any, options: Any) -> None:
+def test_without_pictures_nothing_is_found(
+    make: Any, point_drive: Any, picture_drive: Any, options: Any
+) -> None:
     system = make(options)
     system.fit(point_drive.database[:2])
+    assert system.localise(picture_drive.query_at(np.eye(4))) == []
+    system.fit(picture_drive.database[:2])
     assert system.localise(point_drive.query_at(np.eye(4))) == []
 
 

@@ -31,7 +31,7 @@ def test_the_share_is_the_papers_ratio(database: Any, point_drive: Any) -> None:
     query = view_map(point_drive.database[2], SETTINGS)
     verifier = Verifier(database, 3.0)
     ijk, label = query.blocks.occupied()
-    centres = ijk + 0.5
+    centres = (ijk + 0.5).astype(np.float64)
     # whole voxels and no turn: the middles of voxels fall on the middles of others
     for shift in ((0, 0, 0), (3, 1, 0), (-7, 4, 2), (40, 0, 1)):
         pose = np.eye(4)
