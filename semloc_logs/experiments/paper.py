@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -54,8 +54,9 @@ from semloc_logs.settings import Resolved
 from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.tables.table import write_json
 
+ANSWERS = "answers"  # folder of a run
 HEADINGS_DEG = 0.0, 90.0, 180.0
-QUICK = Extent(per_passage=4, most=4)
+QUICK = Extent(per_passage=2, most=2)
 FULL = Extent(most=120)
 
 _log = logging.getLogger(__name__)
@@ -106,9 +107,12 @@ def run_paper(request: PaperRequest) -> PaperFiles:
     engine = make_engine("processes", request.jobs)
     try:
         stores, scenarios = _prepared(request, engine)
+        return run_systems(request, chosen, stores, scenarios, engine)
+    except BaseException:
+        engine.stop()
+        raise
     finally:
         engine.close()
-    return run_systems(request, chosen, stores, scenarios)
 
 
 def _prepared(
@@ -168,11 +172,11 @@ def _scenarios(request: PaperRequest, store: ViewStore, town: Town | None) -> li
                 time_session(one, is_query=False),
                 time_session(other, is_query=True),
             )
-            for one in town.times
-            for other in town.times
+            for one, other in town.pairs
         ]
     out = [heading_scenario(store, h, database, queries, extent) for h in HEADINGS_DEG]
     out += [time_scenario(store, name, one, other, extent) for name, one, other in pairs]
+    out = [scenario for scenario in out if scenario.trials]
     wanted = set(request.scenarios)
     unknown = wanted - {scenario.name for scenario in out}
     if unknown:
@@ -180,7 +184,7 @@ def _scenarios(request: PaperRequest, store: ViewStore, town: Town | None) -> li
             f"Unknown scenario '{min(unknown)}': "
             f"there are {', '.join(scenario.name for scenario in out)}."
         )
-    return [s for s in out if (not wanted or s.name in wanted) and s.trials]
+    return [s for s in out if not wanted or s.name in wanted]
 
 
 def run_systems(
@@ -188,57 +192,76 @@ def run_systems(
     chosen: Sequence[Entry],
     stores: Mapping[str, ViewStore],
     scenarios: Mapping[str, Sequence[Scenario]],
+    engine: Engine | None = None,
 ) -> PaperFiles:
-    """Answer the open queries, then write the tables and figures of all answers."""
-    answers = request.folder / "answers"
-    rows = []
-    for entry in chosen:
-        row = Row(entry.name, entry.title, entry.remark)
-        for sensor, store in stores.items():
-            reason = _answer_all(request, entry, sensor, store, scenarios[sensor])
-            if reason:
-                row.not_run[sensor] = reason
-                request.note(f"{entry.title}, {sensor}: {reason}")
-            run = _run_of(entry, sensor)
-            for scenario in scenarios[sensor]:
-                found = read_answers(run, scenario, answers)
-                if len(found):
-                    row.answers[sensor, scenario.name] = found
-        rows.append(row)
+    """Answer the open queries, then write the tables and figures of all answers.
+
+    A system is a task of the ``engine``; without one they follow each other in this process.
+    """
+    tasks = [
+        _SystemTask(entry, sensor, stores[sensor], scenarios[sensor], request)
+        for entry in chosen
+        for sensor in stores
+    ]
+    rows = {entry.name: Row(entry.name, entry.title, entry.remark) for entry in chosen}
+    reasons = (engine or make_engine("serial")).map(_answer_all, [task.lean() for task in tasks])
+    for task, reason in zip(tasks, reasons, strict=True):
+        row = rows[task.entry.name]
+        if reason:
+            row.not_run[task.sensor] = reason
+            request.note(f"{task.entry.title}, {task.sensor}: {reason}")
+        for scenario in task.scenarios:
+            found = read_answers(task.run, scenario, request.folder / ANSWERS)
+            if len(found):
+                row.answers[task.sensor, scenario.name] = found
     known = {
         (row.name, sensor, scenario): found
-        for row in rows
+        for row in rows.values()
         for (sensor, scenario), found in row.answers.items()
     }
     rivals = [entry.name for entry in BASELINES]
-    outcome = Outcome(rows, scenarios, stores, findings(known, rivals))
+    outcome = Outcome([*rows.values()], scenarios, stores, findings(known, rivals))
     return _write(request.folder, outcome)
 
 
-def _run_of(entry: Entry, sensor: str) -> Run:
-    version = module_version(f"{MODULES}.{entry.made_by.partition(':')[0]}")
-    return Run(entry.name, sensor, entry.frames, version)
+@dataclass(frozen=True, eq=False)
+class _SystemTask:
+    """A system on all scenarios of a sensor; picklable when it is :meth:`lean`."""
+
+    entry: Entry
+    sensor: str
+    store: ViewStore
+    scenarios: Sequence[Scenario]
+    request: PaperRequest
+
+    def lean(self) -> _SystemTask:
+        """The task without the listener of the request."""
+        return replace(self, request=replace(self.request, note=_silent))
+
+    @property
+    def run(self) -> Run:
+        """Names and version of the system."""
+        version = module_version(f"{MODULES}.{self.entry.made_by.partition(':')[0]}")
+        return Run(self.entry.name, self.sensor, self.entry.frames, version)
 
 
-def _answer_all(
-    request: PaperRequest,
-    entry: Entry,
-    sensor: str,
-    store: ViewStore,
-    scenarios: Sequence[Scenario],
-) -> str:
+def _silent(_: str) -> None:
+    """Notes of tasks are made where they return."""
+
+
+def _answer_all(task: _SystemTask) -> str:
     """Answer the open queries of a system; why it could not, or "" where it could."""
-    if entry.needs_pictures and not store.has_pictures:
+    entry = task.entry
+    if entry.needs_pictures and not task.store.has_pictures:
         return "it works on pictures, and the logs have no calibrated camera."
-    folder = request.folder / "systems" / entry.name
+    request = task.request
+    folder = request.folder / "systems" / entry.name / task.sensor
     folder.mkdir(parents=True, exist_ok=True)
     options = SystemOptions(request.settings, folder, request.quick)
-    run = _run_of(entry, sensor)
-    answers = request.folder / "answers"
+    make = partial(make_system, entry, options)
     try:
-        for scenario in scenarios:
-            make = partial(make_system, entry, options)
-            answer_scenario(run, scenario, store, answers, make)
+        for scenario in task.scenarios:
+            answer_scenario(task.run, scenario, task.store, request.folder / ANSWERS, make)
     except SemlocError as problem:
         return str(problem)
     except Exception as problem:  # one system must not end a run of hours
@@ -260,4 +283,4 @@ def _write(folder: Path, outcome: Outcome) -> PaperFiles:
             path = folder / f"figure_{sensor}.png"
             draw_figure(outcome, sensor, path)
             figures.append(path)
-    return PaperFiles(table, content, figures, folder / "answers")
+    return PaperFiles(table, content, figures, folder / ANSWERS)

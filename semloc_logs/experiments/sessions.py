@@ -71,11 +71,14 @@ def fused_views(
     report = fuse(inputs, work, settings, engine)
     if report.failed:
         raise SemlocError(report.failed[0])
+    maps = {name: SessionMap(work.session(name)) for name in recorded.logs}
+    if sensor == LIDAR and not any(m.json["roles"].get("lidar") for m in maps.values()):
+        raise SemlocError("the logs have no LIDAR.")
     pictures = folder / "pictures"
     options = reading_options(settings, topics)
     for name, log in recorded.logs.items():
         # the keyframes of the sensors are not the same moments
-        keep_pictures([log], SessionMap(work.session(name)), pictures / sensor / name, options)
+        keep_pictures([log], maps[name], pictures / sensor / name, options)
     return read_views(work, recorded.truth, pictures=pictures / sensor)
 
 

@@ -74,15 +74,15 @@ class SimulatedDrive:
 class Town:
     """The plan (n, 3) of the streets, metres about every metre, and the drives through them.
 
-    ``rate_hz``: sweeps and pictures a second; ``speed`` in m/s; ``times``: the conditions of the
-    matrix.
+    ``rate_hz``: sweeps and pictures a second; ``speed`` in m/s; ``pairs`` of the cross-time matrix,
+    the map's condition first.
     """
 
     plan: F64
     drives: tuple[SimulatedDrive, ...]
     rate_hz: float
     speed: float
-    times: tuple[TimeCondition, ...]
+    pairs: tuple[tuple[TimeCondition, TimeCondition], ...]
     seed: int = SEED
     columns: int = field(default=900)  # of a turn of the LIDAR
 
@@ -112,28 +112,33 @@ def full_town(seed: int = SEED) -> Town:
     across = [
         (k * block, y) for k in (2, 1, 0) for y in ((high, low) if k % 2 == 0 else (low, high))
     ]
-    plan = _winding([*along, (high, high), *across], seed)
+    plan = _winding([*along, (high, high), *across], seed, bend=4.0)
     parts = _Parts((0.0, float(len(plan))), (0.0, 420.0), (20.0, 400.0))
-    drives = _drives(plan, parts, TIMES)
-    return Town(plan, drives, rate_hz=5.0, speed=7.0, times=TIMES, seed=seed)
+    pairs = tuple((one, other) for one in TIMES for other in TIMES)
+    drives = _drives(plan, parts, pairs)
+    return Town(plan, drives, rate_hz=5.0, speed=7.0, pairs=pairs, seed=seed)
 
 
 def quick_town(seed: int = SEED) -> Town:
-    """One street, and one that crosses it, driven in one loop; two conditions of the matrix."""
-    plan = _winding([(-35.0, 0.0), (35.0, 0.0), (35.0, 35.0), (0.0, 35.0), (0.0, -35.0)], seed)
-    times = (TIMES[0], TIMES[3])
-    drives = _drives(plan, _Parts((10.0, 60.0), (0.0, 55.0), (15.0, 45.0)), times)
-    return Town(plan, drives, rate_hz=2.0, speed=5.0, times=times, seed=seed)
+    """One street, and one that crosses it, driven in one loop; half a row of the matrix."""
+    corners = [(-25.0, 0.0), (25.0, 0.0), (25.0, 25.0), (0.0, 25.0), (0.0, -25.0)]
+    plan = _winding(corners, seed, bend=0.0)
+    summer, *_, snow = TIMES
+    pairs = ((summer, summer), (summer, snow))
+    drives = _drives(plan, _Parts((8.0, 45.0), (0.0, 40.0), (10.0, 35.0)), pairs)
+    return Town(plan, drives, rate_hz=2.0, speed=5.0, pairs=pairs, seed=seed)
 
 
-def _winding(corners: list[tuple[float, float]], seed: int) -> F64:
-    """A drive (n, 3) about every metre from corner to corner, bent and hilly, turned at random."""
+def _winding(corners: list[tuple[float, float]], seed: int, bend: float) -> F64:
+    """A drive (n, 3) about every metre from corner to corner, hilly, turned at random, and bent by
+    ``bend`` metres.
+    """
     rng = np.random.default_rng([seed, 71])
     line = resample(np.array(corners), 1.0)
     phase = rng.uniform(0, 2 * np.pi, 4)
     turn = rng.uniform(0, 2 * np.pi)
     x, y = line.T / 95.0
-    bent = line + 4.0 * np.column_stack(
+    bent = line + bend * np.column_stack(
         [np.sin(2 * np.pi * y + phase[0]), np.sin(2 * np.pi * x + phase[1])]
     )
     bent = np.column_stack([gaussian_filter1d(bent[:, k], _CORNER, mode="nearest") for k in (0, 1)])
@@ -145,7 +150,7 @@ def _winding(corners: list[tuple[float, float]], seed: int) -> F64:
 
 
 def _drives(
-    plan: F64, parts: _Parts, times: tuple[TimeCondition, ...]
+    plan: F64, parts: _Parts, pairs: tuple[tuple[TimeCondition, TimeCondition], ...]
 ) -> tuple[SimulatedDrive, ...]:
     """The drives of a plan."""
     there = resample(plan[:, :2], 0.5)
@@ -156,8 +161,12 @@ def _drives(
         SimulatedDrive(AGAIN, _part(again, parts.queries), Condition(1)),
         SimulatedDrive(BACK, _part(back, parts.queries)[::-1], Condition(2)),
     ]
-    for k, time in enumerate(times):
-        for is_query in (False, True):
+    maps = dict.fromkeys(one for one, _ in pairs)
+    queries = dict.fromkeys(other for _, other in pairs)
+    for k, time in enumerate(TIMES):
+        for is_query, chosen in ((False, maps), (True, queries)):
+            if time not in chosen:
+                continue
             condition = Condition(
                 3 + 2 * k + is_query,
                 time.season,
