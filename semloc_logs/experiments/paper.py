@@ -198,70 +198,72 @@ def run_systems(
 
     A system is a task of the ``engine``; without one they follow each other in this process.
     """
-    tasks = [
-        _SystemTask(entry, sensor, stores[sensor], scenarios[sensor], request)
-        for entry in chosen
-        for sensor in stores
-    ]
-    rows = {entry.name: Row(entry.name, entry.title, entry.remark) for entry in chosen}
-    reasons = (engine or make_engine("serial")).map(_answer_all, [task.lean() for task in tasks])
-    for task, reason in zip(tasks, reasons, strict=True):
-        row = rows[task.entry.name]
-        if reason:
-            row.not_run[task.sensor] = reason
-            request.note(f"{task.entry.title}, {task.sensor}: {reason}")
-        for scenario in task.scenarios:
-            found = read_answers(task.run, scenario, request.folder / ANSWERS)
-            if len(found):
-                row.answers[task.sensor, scenario.name] = found
+    tasks = [_SystemTask(entry, stores, scenarios, request) for entry in chosen]
+    outcomes = (engine or make_engine("serial")).map(_answer_all, [task.lean() for task in tasks])
+    rows = []
+    for task, not_run in zip(tasks, outcomes, strict=True):
+        row = Row(task.entry.name, task.entry.title, task.entry.remark, not_run=not_run)
+        for sensor, reason in not_run.items():
+            request.note(f"{task.entry.title}, {sensor}: {reason}")
+        for sensor in stores:
+            for scenario in scenarios[sensor]:
+                found = read_answers(task.run(sensor), scenario, request.folder / ANSWERS)
+                if len(found):
+                    row.answers[sensor, scenario.name] = found
+        rows.append(row)
     known = {
         (row.name, sensor, scenario): found
-        for row in rows.values()
+        for row in rows
         for (sensor, scenario), found in row.answers.items()
     }
     rivals = [entry.name for entry in BASELINES]
-    outcome = Outcome([*rows.values()], scenarios, stores, findings(known, rivals))
+    outcome = Outcome(rows, scenarios, stores, findings(known, rivals))
     return _write(request.folder, outcome)
 
 
 @dataclass(frozen=True, eq=False)
 class _SystemTask:
-    """A system on all scenarios of a sensor; picklable when it is :meth:`lean`."""
+    """A system on all scenarios of all sensors; picklable when it is :meth:`lean`."""
 
     entry: Entry
-    sensor: str
-    store: ViewStore
-    scenarios: Sequence[Scenario]
+    stores: Mapping[str, ViewStore]
+    scenarios: Mapping[str, Sequence[Scenario]]
     request: PaperRequest
 
     def lean(self) -> _SystemTask:
         """The task without the listener of the request."""
         return replace(self, request=replace(self.request, note=_silent))
 
-    @property
-    def run(self) -> Run:
-        """Names and version of the system."""
+    def run(self, sensor: str) -> Run:
+        """Names and version of the system on a sensor."""
         version = module_version(f"{MODULES}.{self.entry.made_by.partition(':')[0]}")
-        return Run(self.entry.name, self.sensor, self.entry.frames, version)
+        return Run(self.entry.name, sensor, self.entry.frames, version)
 
 
 def _silent(_: str) -> None:
     """Notes of tasks are made where they return."""
 
 
-def _answer_all(task: _SystemTask) -> str:
-    """Answer the open queries of a system; why it could not, or "" where it could."""
-    entry = task.entry
-    if entry.needs_pictures and not task.store.has_pictures:
-        return "it works on pictures, and the logs have no calibrated camera."
-    request = task.request
-    folder = request.folder / "systems" / entry.name / task.sensor
+def _answer_all(task: _SystemTask) -> dict[str, str]:
+    """Answer the open queries of a system; why it could not, by sensor."""
+    folder = task.request.folder / "systems" / task.entry.name
     folder.mkdir(parents=True, exist_ok=True)
-    options = SystemOptions(request.settings, folder, request.quick)
+    options = SystemOptions(task.request.settings, folder, task.request.quick)
+    reasons = {sensor: _answer_sensor(task, sensor, options) for sensor in task.stores}
+    return {sensor: reason for sensor, reason in reasons.items() if reason}
+
+
+def _answer_sensor(task: _SystemTask, sensor: str, options: SystemOptions) -> str:
+    """Answer the open queries of a sensor; why it could not, or "" where it could."""
+    entry = task.entry
+    store = task.stores[sensor]
+    if entry.needs_pictures and not store.has_pictures:
+        return "it works on pictures, and the logs have no calibrated camera."
     make = partial(make_system, entry, options)
     try:
-        for scenario in task.scenarios:
-            answer_scenario(task.run, scenario, task.store, request.folder / ANSWERS, make)
+        for scenario in task.scenarios[sensor]:
+            answers = task.request.folder / ANSWERS
+            answer_scenario(task.run(sensor), scenario, store, answers, make)
     except SemlocError as problem:
         return str(problem)
     except Exception as problem:  # one system must not end a run of hours
