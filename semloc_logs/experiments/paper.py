@@ -35,6 +35,7 @@ from semloc_logs.experiments.simulated_drives import (
     BACK,
     MAP,
     Town,
+    drives_version,
     full_town,
     quick_town,
     time_session,
@@ -124,9 +125,8 @@ def _prepared(
         recorded = recorded_logs(request.logs, request.truth)
     else:
         town = quick_town() if request.quick else full_town()
-        name = "quick" if request.quick else "full"
         request.note(f"Simulating {len(town.drives)} drives ...")
-        recorded = simulated_logs(town, request.folder / "logs" / name, engine)
+        recorded = simulated_logs(town, request.folder / "logs" / _scene(request), engine)
     stores: dict[str, ViewStore] = {}
     scenarios: dict[str, list[Scenario]] = {}
     for sensor in request.sensors or SENSORS:
@@ -143,9 +143,15 @@ def _prepared(
     return stores, scenarios
 
 
+def _scene(request: PaperRequest) -> str:
+    """The name of the scene in the folder of the run; another one for other code of the drives."""
+    if request.truth is not None:
+        return "own"
+    return f"{'quick' if request.quick else 'full'}-{drives_version()}"
+
+
 def _views(request: PaperRequest, recorded: Recorded, sensor: str, engine: Engine) -> ViewStore:
-    name = "quick" if request.quick else "full"
-    folder = request.folder / "maps" / ("own" if request.truth is not None else name)
+    folder = request.folder / "maps" / _scene(request)
     return fused_views(recorded, sensor, folder, request.settings, engine)
 
 

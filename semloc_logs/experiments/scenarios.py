@@ -7,6 +7,7 @@ allows for every one of them, so that no query ever meets a view that the paper 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -157,21 +158,22 @@ def _parts(run: I64, away: F64, place: F64) -> list[I64]:
     nearest = first + int(np.argmin(away[first : last + 1]))
     start = min(max(0, nearest - PER_PASSAGE // 2), max(0, len(away) - PER_PASSAGE))
     part = np.arange(start, min(len(away), start + PER_PASSAGE))
-    return [part[np.linalg.norm(place[part] - place[nearest], axis=1) <= NEAR_M]]
+    off = np.linalg.norm(place[part] - place[nearest], axis=1)
+    # in a bend the crossing street is not at the heading to all of them
+    return [part[(off <= NEAR_M) & (away[part] <= 2 * NEAR_M)]]
 
 
-def _thinned(passages: Sequence[I64], extent: Extent) -> list[tuple[int, I64]]:
-    """At most ``extent.most`` queries, evenly of all passages and evenly within them; each with the
-    number of its passage.
+def _thinned(passages: Sequence[I64], extent: Extent) -> list[tuple[int, int]]:
+    """At most ``extent.most`` queries, evenly of all passages and evenly within them: the number of
+    the passage and of the view.
     """
-    numbered = [(k, _evenly(p, extent.per_passage)) for k, p in enumerate(passages)]
-    count = sum(len(p) for _, p in numbered)
-    if count <= extent.most:
-        return numbered
-    wanted = max(1, extent.most // max(1, min(extent.per_passage, PER_PASSAGE)))
-    kept = _evenly(np.arange(len(numbered)), wanted)
-    share = max(1, extent.most // len(kept))
-    return [(numbered[k][0], _evenly(numbered[k][1], share)) for k in kept.tolist()]
+    thinned = [_evenly(p, extent.per_passage) for p in passages]
+    kept = np.arange(len(thinned))
+    if sum(len(p) for p in thinned) > extent.most:
+        usual = float(np.mean([len(p) for p in thinned]))
+        kept = _evenly(kept, max(1, math.ceil(extent.most / usual)))
+    queries = [(k, int(view)) for k in kept.tolist() for view in thinned[k]]
+    return [queries[i] for i in _evenly(np.arange(len(queries)), extent.most)]
 
 
 def _evenly(numbers: I64, most: int) -> I64:
@@ -181,14 +183,10 @@ def _evenly(numbers: I64, most: int) -> I64:
 
 
 def _trials(
-    passages: Iterable[tuple[int, I64]], allowed: _Allowed, store: ViewStore
+    chosen: Iterable[tuple[int, int]], allowed: _Allowed, store: ViewStore
 ) -> tuple[Trial, ...]:
     """Queries whose databases agree, and the views that every one of them allows."""
-    queries = [
-        PlannedQuery(_query_name(store, int(view)), int(view), passage)
-        for passage, views in passages
-        for view in views
-    ]
+    queries = [PlannedQuery(_query_name(store, view), view, passage) for passage, view in chosen]
     out: list[Trial] = []
     for group in _groups(queries, allowed):
         mask = np.logical_and.reduce([allowed.views(query.view) for query in group])
@@ -213,20 +211,24 @@ def _groups(queries: Sequence[PlannedQuery], allowed: _Allowed) -> list[list[Pla
         if allowed.heading_deg == 0:
             out.append(members)
             continue
-        out += _of_one_heading(members, store.headings_deg)
+        # opposite directions have the same streets across
+        period = 180.0 if allowed.heading_deg == 90 else 360.0
+        out += _of_one_heading(members, store.headings_deg % period, period)
     return out
 
 
-def _of_one_heading(queries: Sequence[PlannedQuery], headings: F64) -> list[list[PlannedQuery]]:
+def _of_one_heading(
+    queries: Sequence[PlannedQuery], headings: F64, period: float
+) -> list[list[PlannedQuery]]:
     """Cut the circle of headings where it is widest open, then group by ``_SPREAD_DEG``."""
     ordered = sorted(queries, key=lambda q: (float(headings[q.view]), q.view))
     values = np.array([headings[q.view] for q in ordered])
-    start = int(np.argmax(np.diff(np.append(values, values[0] + 360.0)))) + 1
+    start = int(np.argmax(np.diff(np.append(values, values[0] + period)))) + 1
     ordered = [*ordered[start:], *ordered[:start]]
     out: list[list[PlannedQuery]] = []
     for query in ordered:
         first = headings[out[-1][0].view] if out else 0.0
-        if out and (headings[query.view] - first) % 360.0 <= _SPREAD_DEG:
+        if out and (headings[query.view] - first) % period <= _SPREAD_DEG:
             out[-1].append(query)
         else:
             out.append([query])

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from semloc_logs.benchmarks.versions import files_version, room_files
 from semloc_logs.simulation.conditions import Condition
 from semloc_logs.simulation.drives.camera_drive import simulate_cameras
 from semloc_logs.simulation.drives.drive import simulate_drive
@@ -125,7 +126,7 @@ def quick_town(seed: int = SEED) -> Town:
     plan = _winding(corners, seed, bend=0.0)
     summer, *_, snow = TIMES
     pairs = ((summer, summer), (summer, snow))
-    drives = _drives(plan, _Parts((8.0, 45.0), (0.0, 40.0), (10.0, 35.0)), pairs)
+    drives = _drives(plan, _Parts((8.0, 38.0), (0.0, 40.0), (10.0, 35.0)), pairs)
     return Town(plan, drives, rate_hz=2.0, speed=5.0, pairs=pairs, seed=seed)
 
 
@@ -190,6 +191,11 @@ def _beside(line: F64) -> F64:
     tangent = np.gradient(line, axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     return np.asarray(line + _OFFSET * left_of(tangent))
+
+
+def drives_version() -> str:
+    """A hash of the code that makes the drives."""
+    return files_version([*room_files(("simulation",)), Path(__file__)])
 
 
 def drive_folder(folder: Path, name: str) -> Path:

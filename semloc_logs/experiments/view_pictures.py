@@ -204,13 +204,16 @@ def _colour(image: NDArray[np.uint8] | NDArray[np.uint16]) -> U8:
 def keep_pictures(
     logs: Sequence[Path], keyframes: SessionMap, folder: Path, options: SessionOptions
 ) -> bool:
-    """Write the pictures of a session's keyframes to ``folder``, unless they are there; whether its
-    logs have a calibrated camera.
+    """Write the pictures of a session's keyframes to ``folder``, unless they are there and the
+    session is the same; whether its logs have a calibrated camera.
 
     The picture topic is the left one of a pair, else the first that has a calibration.
     """
+    made_from = keyframes.json["fingerprint"]
     if (folder / INDEX).exists():
-        return len(read_json(folder / INDEX)["pictures"]) > 0
+        index = read_json(folder / INDEX)
+        if index.get("made_from") == made_from:
+            return len(index["pictures"]) > 0
     with closing(open_session(list(logs), options)) as session:
         roles = session.roles
         known = [t for t in roles.image if t in roles.info_of]
@@ -222,5 +225,6 @@ def keep_pictures(
                 for _ in session.clouds(collector.take, {topic}):
                     pass
                 collector.finish()
-            write_json(temporary / INDEX, {"topic": topic, "pictures": collector.entries})
+            content = {"made_from": made_from, "topic": topic, "pictures": collector.entries}
+            write_json(temporary / INDEX, content)
     return topic is not None and bool(collector.entries)
