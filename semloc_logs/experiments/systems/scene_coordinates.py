@@ -98,8 +98,9 @@ class Coordinates(nn.Module):
 
 
 class SceneCoordinateSystem:
-    """The pose by the coordinates of all cells, after the ``steps`` of both stages; weights are kept
-    in ``folder``.
+    """The pose by the coordinates of all cells, after the ``steps`` of both stages of training.
+
+    Weights are kept in ``folder``.
     """
 
     name = "dsac"
