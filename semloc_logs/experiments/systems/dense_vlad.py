@@ -86,4 +86,4 @@ def _unit(rows: F32) -> F32:
 
 def make_dense_vlad(options: SystemOptions) -> PictureSystem:
     """DenseVLAD in place of the visual words."""
-    return PictureSystem("dense-vlad", dsp_sift, DenseVlad())
+    return PictureSystem("dense-vlad", dsp_sift, DenseVlad(), options.folder)

@@ -68,11 +68,11 @@ class _Stored:
 
 
 class GroundPatchSystem:
-    """The pictures of the database as patches in files."""
+    """The pictures of the database as patches, in files in ``folder`` as long as it is used."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
         self.name = "vip"
-        self._folder = tempfile.TemporaryDirectory(prefix="semloc-vip-")
+        self._folder = tempfile.TemporaryDirectory(prefix=".scratch.", dir=folder)
         self._stored: list[_Stored] = []
 
     def fit(self, database: Sequence[View]) -> None:
@@ -217,4 +217,4 @@ def ground_fit(target: Patches, query: Patches) -> tuple[F64, int] | None:
 
 def make_vip(options: SystemOptions) -> GroundPatchSystem:
     """SIFT on the ground, rectified by the depth."""
-    return GroundPatchSystem()
+    return GroundPatchSystem(options.folder)

@@ -107,14 +107,15 @@ class WordRetrieval:
 class PictureSystem:
     """Features by ``extract``, candidates by ``retrieval``, poses by the points of their depth.
 
-    Features of the database lie in files, so that memory does not grow with them.
+    Features of the database lie in files in ``folder`` as long as the system is used, so that
+    memory does not grow with them.
     """
 
-    def __init__(self, name: str, extract: Extract, retrieval: Retrieval) -> None:
+    def __init__(self, name: str, extract: Extract, retrieval: Retrieval, folder: Path) -> None:
         self.name = name
         self._extract = extract
         self._retrieval = retrieval
-        self._folder = tempfile.TemporaryDirectory(prefix=f"semloc-{name}-")
+        self._folder = tempfile.TemporaryDirectory(prefix=".scratch.", dir=folder)
         self._stored: list[StoredPicture] = []
 
     def fit(self, database: Sequence[View]) -> None:

@@ -50,13 +50,16 @@ class _Scan:
 
 
 class ScanSystem:
-    """The ``candidates`` best places of Scan Context, each registered."""
+    """The ``candidates`` best places of Scan Context, each registered.
 
-    def __init__(self, name: str, register: Register, candidates: int) -> None:
+    Scans of the database lie in files in ``folder`` as long as it is used.
+    """
+
+    def __init__(self, name: str, register: Register, candidates: int, folder: Path) -> None:
         self.name = name
         self._register = register
         self._candidates = candidates
-        self._folder = tempfile.TemporaryDirectory(prefix=f"semloc-{name}-")
+        self._folder = tempfile.TemporaryDirectory(prefix=".scratch.", dir=folder)
         self._scans: list[_Scan] = []
         self._contexts: list[F64] = []
 
@@ -159,9 +162,9 @@ def kiss_matcher() -> Register:
 
 def make_scan_context(options: SystemOptions) -> ScanSystem:
     """Scan Context and generalised ICP."""
-    return ScanSystem("scan-context", gicp(), GICP_CANDIDATES)
+    return ScanSystem("scan-context", gicp(), GICP_CANDIDATES, options.folder)
 
 
 def make_kiss_matcher(options: SystemOptions) -> ScanSystem:
     """Scan Context and KISS-Matcher."""
-    return ScanSystem("kiss-matcher", kiss_matcher(), KISS_CANDIDATES)
+    return ScanSystem("kiss-matcher", kiss_matcher(), KISS_CANDIDATES, options.folder)

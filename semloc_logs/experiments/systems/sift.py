@@ -9,14 +9,14 @@ from semloc_logs.experiments.systems.picture_matching import PictureSystem, Word
 
 def make_sift(options: SystemOptions) -> PictureSystem:
     """SIFT."""
-    return PictureSystem("sift", sift, WordRetrieval())
+    return PictureSystem("sift", sift, WordRetrieval(), options.folder)
 
 
 def make_dsp_sift(options: SystemOptions) -> PictureSystem:
     """SIFT points with descriptors pooled over domain sizes."""
-    return PictureSystem("dsp-sift", dsp_sift, WordRetrieval())
+    return PictureSystem("dsp-sift", dsp_sift, WordRetrieval(), options.folder)
 
 
 def make_mser(options: SystemOptions) -> PictureSystem:
     """Maximally stable extremal regions with DSP-SIFT."""
-    return PictureSystem("mser", mser_dsp_sift, WordRetrieval())
+    return PictureSystem("mser", mser_dsp_sift, WordRetrieval(), options.folder)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,10 @@ def test_a_turned_query_is_localised(
     assert degrees < 3.0
 
 
-def test_a_registration_that_fails_gives_no_pose(point_drive: Any) -> None:
-    system = ScanSystem("none", lambda target, query, start: (start, 0.0), 3)
+def test_a_registration_that_fails_gives_no_pose(point_drive: Any, tmp_path: Path) -> None:
+    system = ScanSystem("none", lambda target, query, start: (start, 0.0), 3, tmp_path)
     system.fit(point_drive.database[:4])
     assert system.localise(point_drive.query_at(np.eye(4))) == []
+    assert any(tmp_path.glob("*/*.npy"))
+    del system
+    assert not any(tmp_path.iterdir())
