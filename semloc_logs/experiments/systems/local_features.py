@@ -22,7 +22,7 @@ EDGE = 10.0
 FIRST_SIGMA = 1.6
 FIRST_OCTAVE, OCTAVES = -1, 4  # the first octave holds the picture at twice its size
 DOMAINS = np.linspace(1 / 6, 3, 10)  # pooling scales of DSP-SIFT (Dong and Soatto, CVPR 2015)
-MOST_FEATURES = 4000  # of a picture, the strongest
+MOST_FEATURES = 4000  # of a picture: the strongest; of regions, which have no strength, any
 # the paper's step of 2, areas and variation are the defaults of a function that gives the step in
 # percent of the range: 5 of 255 levels
 MSER_STEP, MSER_AREA, MSER_VARIATION = 5, (30, 14000), 0.25
@@ -80,7 +80,9 @@ def mser_dsp_sift(image: U8) -> Features:
     for region in regions:
         x, y = np.mean(region, axis=0).tolist()
         points.append(keypoint(x, y, 2 * float(np.sqrt(len(region) / np.pi))))
-    return _pooled(grey, _distinct(points))
+    distinct = _distinct(points)
+    kept = np.random.default_rng(0).permutation(len(distinct))[:MOST_FEATURES]
+    return _pooled(grey, [distinct[k] for k in np.sort(kept)])
 
 
 def dense_sift(image: U8, step: int = DENSE_STEP) -> Features:
