@@ -58,7 +58,11 @@ def _names(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]
     show_default=True,
     help="Network with classes, without, or both, for retrieval and completion.",
 )
-@path_option("--weights", help="Weights instead of the shipped ones, for retrieval and completion.")
+@path_option(
+    "--weights",
+    help="Weights instead of the shipped ones, for retrieval and completion; for paper a folder of"
+    " networks.  [default: weights]",
+)
 @click.option(
     "--database",
     type=click.IntRange(1),
@@ -86,7 +90,7 @@ def _names(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]
     metavar="NAME,...",
     default="",
     callback=_names,
-    help="Systems instead of all, for paper.",
+    help="Systems instead of all, for paper; all-ours, all-baselines and all-ablations are groups.",
 )
 @click.option(
     "--sensors",
@@ -179,6 +183,7 @@ def command(
                     sensors,
                     scenarios,
                     jobs,
+                    weights,
                     console.note,
                 )
             )

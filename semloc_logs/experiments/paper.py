@@ -67,7 +67,8 @@ _log = logging.getLogger(__name__)
 class PaperRequest:
     """Which experiments: ``folder`` of the run; ``systems``: names, all without; ``quick``: a small
     simulated scene; ``logs`` with their ``truth`` instead of simulated ones; ``queries``: the most
-    of a scenario; ``sensors`` and ``scenarios``: names, all without.
+    of a scenario; ``sensors`` and ``scenarios``: names, all without; ``weights``: a folder of
+    trained networks.
     """
 
     settings: Resolved
@@ -80,6 +81,7 @@ class PaperRequest:
     sensors: Sequence[str] = ()
     scenarios: Sequence[str] = ()
     jobs: int | None = None
+    weights: Path | None = None
     note: Callable[[str], None] = lambda _: None
 
 
@@ -254,7 +256,14 @@ def _answer_all(task: _SystemTask) -> dict[str, str]:
     """Answer the open queries of a system; why it could not, by sensor."""
     folder = task.request.folder / "systems" / task.entry.name
     folder.mkdir(parents=True, exist_ok=True)
-    options = SystemOptions(task.request.settings, folder, task.request.quick)
+    request = task.request
+    options = SystemOptions(
+        request.settings,
+        folder,
+        request.quick,
+        name=task.entry.name,
+        weights=request.weights,
+    )
     reasons = {sensor: _answer_sensor(task, sensor, options) for sensor in task.stores}
     return {sensor: reason for sensor, reason in reasons.items() if reason}
 

@@ -71,7 +71,7 @@ def test_a_sequence_becomes_views_with_truth_pictures_and_depth(
     assert view.picture is not None
     assert view.picture.image.shape == (80, 120, 3)
     assert view.picture.image[0, 0].tolist() == [200, 20, 30]
-    assert np.allclose(view.picture.intrinsics, [[FOCAL, 0, 60], [0, FOCAL, 40], [0, 0, 1]])
+    assert view.picture.intrinsics.tolist() == [[FOCAL, 0, 60], [0, FOCAL, 40], [0, 0, 1]]
     # straight ahead is the wall; at the lower edge the ground: 1.7 m below, 100 px a metre at 1 m
     assert view.picture.depth[38, 60] == pytest.approx(WALL_X - 3.6, abs=0.1)
     assert view.picture.depth[75, 60] == pytest.approx(1.7 * FOCAL / 35, rel=0.08)

@@ -19,13 +19,16 @@ MODULES = "semloc_logs.experiments.systems"
 @dataclass(frozen=True, slots=True)
 class SystemOptions:
     """With what a system is made: ``settings``; ``folder`` of its own, where it may keep what it
-    has trained; ``quick``: a small scene that must be done within a minute; ``seed``.
+    has trained; ``quick``: a small scene that must be done within a minute; ``seed``; the ``name``
+    of its row; ``weights``: a folder of networks that were trained before.
     """
 
     settings: Resolved
     folder: Path
     quick: bool = False
     seed: int = 0
+    name: str = ""
+    weights: Path | None = None
 
 
 MakeSystem = Callable[[SystemOptions], System]
@@ -51,7 +54,13 @@ class Entry:
 
 
 # our pipeline and the paper's plain method
-OURS: tuple[Entry, ...] = ()
+OURS: tuple[Entry, ...] = (
+    Entry("paper-semantic", "Paper (semantic)", "own_rows:make_plain"),
+    Entry("paper-geometric", "Paper (geometric)", "own_rows:make_plain"),
+    Entry("paper-acc", "Paper (semantic, acc.)", "own_rows:make_plain", frames=5),
+    Entry("ours", "Ours", "own_rows:make_ours"),
+    Entry("ours-acc", "Ours (acc.)", "own_rows:make_ours", frames=5),
+)
 
 # the systems that the paper compares with, and the peers of today
 BASELINES: tuple[Entry, ...] = (
@@ -122,21 +131,46 @@ BASELINES: tuple[Entry, ...] = (
 )
 
 
+# our pipeline without one of its parts (`--systems ablations`)
+ABLATIONS: tuple[Entry, ...] = tuple(
+    Entry(name, title, "own_rows:make_ablation", frames=5)
+    for name, title in (
+        ("ours-no-classes", "Ours (acc.), words without classes"),
+        ("ours-every-heading", "Ours (acc.), every heading described"),
+        ("ours-alone", "Ours (acc.), query subvolumes alone"),
+        ("ours-stride-4", "Ours (acc.), subvolumes every 4 voxels"),
+        ("ours-one-neighbour", "Ours (acc.), one neighbour"),
+        ("ours-no-free-space", "Ours (acc.), free space ignored"),
+        ("ours-not-refined", "Ours (acc.), not refined"),
+        ("ours-no-contrast", "Ours (acc.), no contrastive term"),
+        ("ours-64", "Ours (acc.), N = 64"),
+        ("ours-512", "Ours (acc.), N = 512"),
+    )
+)
+GROUPS = {"ours": OURS, "baselines": BASELINES, "ablations": ABLATIONS}
+
+
 class NotInstalledError(SettingsError):
     """A library of an extra is missing."""
 
 
 def entries(names: Iterable[str] = ()) -> list[Entry]:
-    """The entries called ``names``, all of them without names. SettingsError for an unknown one."""
-    known = {entry.name: entry for entry in (*OURS, *BASELINES)}
-    chosen = [*names] or [*known]
-    for name in chosen:
+    """The entries called ``names``, or of groups of ``GROUPS``; without names all but the
+    ablations. SettingsError for an unknown one.
+    """
+    known: dict[str, tuple[Entry, ...]] = {
+        entry.name: (entry,) for entry in (*OURS, *BASELINES, *ABLATIONS)
+    }
+    known |= {f"all-{name}": group for name, group in GROUPS.items()}
+    found: dict[str, Entry] = {}
+    for name in [*names] or ["all-ours", "all-baselines"]:
         if name not in known:
             raise SettingsError(
                 f"Unknown system '{name}'.{did_you_mean(name, known)} "
                 f"There are {', '.join(known) or 'none'}."
             )
-    return [known[name] for name in dict.fromkeys(chosen)]
+        found |= {entry.name: entry for entry in known[name]}
+    return [*found.values()]
 
 
 def make_system(entry: Entry, options: SystemOptions) -> System:

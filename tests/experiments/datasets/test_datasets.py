@@ -16,7 +16,7 @@ from semloc_logs.evaluation.truth import read_tum
 from semloc_logs.experiments.datasets.conversion import import_dataset
 from semloc_logs.frames import ImageFrame, PosedCloud
 from semloc_logs.logs.session.session import Session, open_session
-from semloc_logs.numerics.transforms import apply
+from semloc_logs.numerics.transforms import apply, inverse
 
 # a wall 10 m ahead, 2 m to the left, 1 m up, and ground below
 POINTS = [(10.0, 2.0, 1.0), (10.0, -2.0, 1.0), (5.0, 0.0, -1.7), (6.0, 3.0, -1.7)]
@@ -99,7 +99,7 @@ def test_kittis_points_fall_into_its_pictures_where_its_projection_puts_them(
     for name, offset in (("left", 6.0), ("right", -48.0)):
         P = np.array([[FOCAL, 0, 20, offset], [0, FOCAL, 15, 0], [0, 0, 1, 0]])
         expected = P @ tr @ np.append(POINTS[0], 1.0)
-        camera_T_base = np.linalg.inv(session.base_T_sensors()[f"camera_{name}_optical"])
+        camera_T_base = inverse(session.base_T_sensors()[f"camera_{name}_optical"])
         K = session.cameras[f"/camera/{name}/image_rect/compressed"].K
         found = K @ apply(camera_T_base, np.array([POINTS[0]]))[0]
         assert found[:2] / found[2] == pytest.approx(expected[:2] / expected[2])
