@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help install demo test docs reference fuzz weights lint format wheel clean
+.PHONY: help install demo test paper docs reference fuzz weights lint format wheel clean
 
 help:
 	@echo "make install   a virtual environment in $(VENV) with semloc and the tools of development"
 	@echo "make demo      two simulated drives, their loop closures, and an annotated log, in demo/"
 	@echo "make test      all tests"
+	@echo "make paper     every system of the paper on a small scene, in paper-quick/"
 	@echo "make docs      the documentation, in docs/build/; make reference writes its generated pages only"
 	@echo "make fuzz      damaged messages and logs for MINUTES (1) from SEED (0) on"
 	@echo "make weights   the descriptor of 16 million subvolumes, in weights/, in runs of MINUTES (9); goes on where it stopped"
@@ -31,6 +32,9 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+paper: install
+	$(BIN)/semloc benchmark paper --quick -o paper-quick
 
 $(VENV)/installed-docs: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
@@ -66,4 +70,4 @@ wheel: install
 	$(BIN)/python -m build --wheel
 
 clean:
-	rm -rf $(VENV) build dist demo docs/build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist demo paper-quick docs/build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
