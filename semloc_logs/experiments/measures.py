@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -48,12 +49,21 @@ def resampled(passage: I64, samples: int = SAMPLES, seed: int = 0) -> F64:
     and Hinkley, Bootstrap Methods, 1997, section 3.8).
     """
     _, cluster = np.unique(passage, return_inverse=True)
+    return _drawn(cluster.astype(np.int64).tobytes(), samples, seed)
+
+
+@lru_cache(maxsize=8)
+def _drawn(clusters: bytes, samples: int, seed: int) -> F64:
+    """The draws of the numbered clusters of the queries; many figures share them."""
+    cluster = np.frombuffer(clusters, np.int64)
     count = int(cluster.max()) + 1 if len(cluster) else 0
     rng = np.random.default_rng([seed, 91])
     drawn = rng.integers(0, max(1, count), (samples, count))
     weights = np.zeros((samples, count))
     np.add.at(weights, (np.arange(samples)[:, None], drawn), 1.0)
-    return np.asarray(weights[:, cluster])
+    out = weights[:, cluster]
+    out.flags.writeable = False
+    return np.asarray(out)
 
 
 def ratio(right: Mask, passage: I64) -> Bounded:

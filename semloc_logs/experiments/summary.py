@@ -14,9 +14,12 @@ from semloc_logs.experiments.answers import Answers
 from semloc_logs.experiments.measures import (
     THRESHOLDS_M,
     Bounded,
+    PrecisionRecall,
     abstaining,
+    error_curve,
     localised,
     median_within,
+    precision_recall,
     rank_recall,
     ratio,
 )
@@ -35,6 +38,8 @@ from semloc_logs.experiments.views import ViewStore
 
 RANKS = (1, 5, 20, MOST_POSES)  # of the tables; the curves have all
 ALLOWED_FDR = 0.05  # share of wrong answers that an abstaining system may give
+ERRORS_M = np.array([0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 10.0, 20.0])
+POINTS = 100  # of a precision-recall curve
 
 
 @dataclass(eq=False)
@@ -88,6 +93,15 @@ def figures_of(answers: Answers, scenario: Scenario, store: ViewStore) -> dict[s
             "rank-recall": [_number(value) for value in curve],
             "median error": _number(median_within(answers.first_m, threshold)),
         }
+    out["localised within"] = dict(
+        zip(
+            (f"{at:g} m" for at in ERRORS_M.tolist()),
+            map(_number, error_curve(answers.first_m, ERRORS_M).tolist()),
+            strict=True,
+        )
+    )
+    right = localised(answers.errors_m, THRESHOLDS_M[-1])
+    out["precision-recall"] = _curve(precision_recall(answers.first_score, right, len(answers)))
     retrievals = retrievals_of(answers, scenario, store)
     loops = loop_figures(retrievals)
     pairs = pair_figures(retrievals)
@@ -95,7 +109,6 @@ def figures_of(answers: Answers, scenario: Scenario, store: ViewStore) -> dict[s
     registered = registration_figures(
         answers.first_m[has_loop], answers.errors_deg[has_loop, 0], answers.passage[has_loop]
     )
-    right = localised(answers.errors_m, THRESHOLDS_M[-1])
     careful = abstaining(answers.first_score, right, answers.passage, ALLOWED_FDR)
     return out | {
         "KITTI loops": {name: _number(value) for name, value in loops._asdict().items()},
@@ -114,6 +127,19 @@ def figures_of(answers: Answers, scenario: Scenario, store: ViewStore) -> dict[s
             "query": _number(float(np.median(answers.cpu_s)) if len(answers) else math.nan),
             "fit": answers.fit_cpu_s,
         },
+    }
+
+
+def _curve(curve: PrecisionRecall) -> dict[str, Any]:
+    """A precision-recall curve of at most ``POINTS`` points, and its figures."""
+    kept = np.unique(np.linspace(0, max(0, len(curve.recall) - 1), POINTS).round().astype(int))
+    kept = kept[: len(curve.recall)]
+    return {
+        "average_precision": curve.average_precision,
+        "best_f1": curve.best_f1,
+        "recall_at_full_precision": curve.recall_at_full_precision,
+        "recall": curve.recall[kept].tolist(),
+        "precision": curve.precision[kept].tolist(),
     }
 
 

@@ -11,6 +11,7 @@ from semloc_logs.benchmarks.versions import SUFFIXES, files_version
 
 _ROOT = Path(semloc_logs.__file__).parent
 _PACKAGE = "semloc_logs"
+_LISTS = ("semloc_logs.experiments.systems.catalogue",)  # rows of others do not change a system
 
 
 def module_version(module: str) -> str:
@@ -53,6 +54,8 @@ def _imports(path: Path) -> tuple[str, ...]:
 
 
 def _path(module: str) -> Path | None:
-    """The file of a module of ours; None for a package or another name."""
+    """The file of a module of ours; None for a package, a list of systems, or another name."""
+    if module in _LISTS:
+        return None
     path = _ROOT.joinpath(*module.split(".")[1:]).with_suffix(".py")
     return path if path.is_file() else None

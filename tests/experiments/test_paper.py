@@ -126,6 +126,10 @@ def test_every_measure_is_in_the_json(run: Callable[[], PaperFiles]) -> None:
     assert figures["within 1 m"]["rank 100"]["value"] == 0.0
     assert figures["within 5 m"]["median error"] == 3.5
     assert len(figures["within 5 m"]["rank-recall"]) == 100
+    assert figures["localised within"]["3 m"] == 0.0
+    assert figures["localised within"]["4 m"] == 1.0
+    assert figures["precision-recall"]["average_precision"] == pytest.approx(1.0)
+    assert figures["precision-recall"]["recall"][-1] == 1.0
     assert figures["KITTI loops"] == {
         "loops": 100,
         "average_precision": 1.0,
@@ -184,4 +188,7 @@ def test_the_version_of_a_module_changes_with_the_modules_that_it_imports() -> N
     system = module_version("semloc_logs.experiments.system")
     views = module_version("semloc_logs.experiments.views")
     assert system != views
+    # of an entry that is added only its own row is new
+    listed = module_version("semloc_logs.experiments.systems.catalogue")
+    assert listed == module_version("semloc_logs.nothing")
     assert module_version("semloc_logs.experiments.absent") == module_version("semloc_logs.nothing")
