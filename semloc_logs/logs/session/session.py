@@ -22,7 +22,7 @@ from semloc_logs.logs.poses.base_frame import BasePoses, PoseSource
 from semloc_logs.logs.poses.imu_gravity import up_in_base, up_in_session
 from semloc_logs.logs.poses.lidar_odometry import LidarOdometry
 from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings
-from semloc_logs.logs.poses.navsat import navsat_poses
+from semloc_logs.logs.poses.navsat import NavSatPoses, navsat_poses
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.poses.trajectory_file import FilePoses, TrajectoryFile
 from semloc_logs.logs.problems import Problem, sentences, sorted_problems, without_loss_of
@@ -196,6 +196,11 @@ class Session:
         """The topic of the poses, TF, or the source that replaces them."""
         source = self._pass.poses.source
         return source.name if source else self.roles.pose or "TF"
+
+    @property
+    def are_poses_fixes(self) -> bool:
+        """Whether the poses are fixes of a receiver, which scatter by half a metre or more."""
+        return isinstance(self._pass.poses.source, NavSatPoses)
 
     def trajectory(self) -> tuple[NDArray[np.int64], F64]:
         """Stamps (n,) and ``session_T_base`` (n, 4, 4) of all poses; complete after the pass."""
