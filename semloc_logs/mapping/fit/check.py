@@ -65,7 +65,10 @@ LEAST_SIGMAS = 5.0
 DOUBTFUL = 15.0
 # a pair contradicts its poses when registration brings so many times the points onto planes
 CONTRADICTS = 1.15
-TELLING = 0.2  # registrations with a smaller share of points on planes may have ended anywhere
+# registrations with a smaller share of points on planes may have ended anywhere; a sensor with few
+# lines has so few on planes everywhere, which tell where it brings far more onto them
+TELLING = 0.2
+FEW_TELLING, FEW_CONTRADICT = 0.08, 1.5
 CONTRADICTION = 50.0  # and its squared distance is larger
 LEAST_CONTRADICTIONS = 2  # one after the other
 
@@ -84,6 +87,7 @@ NAMES = {
 }
 HIDDEN = 10.0  # a fault that the drive does not show before it has this effect is hidden
 WRONG_TURN = 0.03  # rad, within a pair: a submap of 20 m would be bent by 15 degrees
+LEAST_DRIFT = np.radians(0.3)  # rad/m, worth a word: odometry drifts by a tenth of it
 STEADY = 0.9  # of the turns of contradicting pairs, summed up, where poses drift to one side
 NEAR_VOXELS = 33.0  # a rotation moves points at this distance (10 m at 0.30 m voxels)
 # of the scale, which moves the far end of a submap: odometry of wheels is off by 1 to 2 %
@@ -449,7 +453,9 @@ def _contradictions(
     meters = np.linalg.norm(off[:, :3], axis=1)
     radians = np.linalg.norm(off[:, 3:], axis=1)
     with np.errstate(invalid="ignore"):
-        is_other = (found.share > CONTRADICTS * found.given_share) & (found.share > TELLING)
+        gain = found.share / np.maximum(found.given_share, 1e-9)
+        is_other = (gain > CONTRADICTS) & (found.share > TELLING)
+        is_other |= (gain > FEW_CONTRADICT) & (found.share > FEW_TELLING)
         is_other &= squares > CONTRADICTION
         is_other &= (meters > WRONG * clouds.voxel) | (radians > WRONG_TURN)
     if not is_other.any():
@@ -479,10 +485,11 @@ def _contradictions(
 
 
 def _drift_text(off: F64, predicted: F64) -> str:
-    """How fast poses drift that turn too far everywhere and to the same side; else empty."""
+    """How fast poses drift that turn wrongly everywhere and to the same side; else empty."""
     way = np.linalg.norm(predicted[:, :3, 3], axis=1).sum()
     turns = off[:, 3:]
     together = float(np.linalg.norm(turns.sum(0)))
-    if way <= 0 or together < STEADY * float(np.linalg.norm(turns, axis=1).sum()):
+    is_steady = together >= STEADY * float(np.linalg.norm(turns, axis=1).sum())
+    if not is_steady or together < LEAST_DRIFT * way:
         return ""
-    return f", they turn too far by {np.degrees(together) / way:.1f} degrees a metre"
+    return f", their rotation drifts by {np.degrees(together) / way:.1f} degrees a metre"

@@ -126,13 +126,14 @@ def _of_inverted(clouds: Clouds) -> Start:
 
 def _of_conventions(clouds: Clouds) -> Iterator[Start]:
     """Motions by poses whose rotations or positions were written by another convention."""
-
-    def motions(target: int, source: int) -> list[F64]:
-        pair = np.array([clouds.pose(target), clouds.pose(source)])
-        return [motion[0] for motion, _ in otherwise_written(pair[None])]
-
     for number in range(CONVENTIONS):
-        yield lambda target, source, number=number: motions(target, source)[number]
+
+        def start(target: int, source: int, number: int = number) -> F64:
+            pair = np.array([clouds.pose(target), clouds.pose(source)])
+            motions = [motion[0] for motion, _ in otherwise_written(pair[None])]
+            return np.asarray(motions[number])
+
+        yield start
 
 
 def _of_mirrors(clouds: Clouds) -> Iterator[Start]:

@@ -233,7 +233,7 @@ def test_odometry_that_turns_too_far_all_the_time_is_named_with_its_drift(check:
         return out
 
     text = _only(check(as_written=drifted))
-    assert "they turn too far by 1.0 degrees a metre" in text
+    assert "their rotation drifts by 1.0 degrees a metre" in text
 
 
 def test_odometry_that_rolls_to_and_fro_is_named(check: Check) -> None:
