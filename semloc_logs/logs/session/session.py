@@ -36,7 +36,7 @@ from semloc_logs.logs.session.image_relay import ImageRelay
 from semloc_logs.logs.session.merge import merged_frames
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.reading import reading_of
-from semloc_logs.logs.session.stamp_offsets import StampOffsets
+from semloc_logs.logs.session.stamp_offsets import StampOffsets, lead, pose_topic
 from semloc_logs.logs.session.summary import conclude
 from semloc_logs.settings import Logs
 
@@ -149,6 +149,20 @@ class Session:
     def stamp_offsets(self) -> StampOffsets:
         """Log times less header stamps of the topics that the pass has read."""
         return self._pass.stamp_offsets
+
+    def lead_of(self, topic: str) -> float:
+        """By how much (s) stamps of a topic are later than they can be; 0 where they are not."""
+        poses = pose_topic(self.stamp_offsets, self.roles, self._pass.poses)
+        return 0.0 if poses is None else lead(self.stamp_offsets, topic, poses)
+
+    def repeats(self, topic: str) -> str:
+        """What is wrong where a sensor repeats measurements while the poses move; else empty."""
+        return self._pass.repeats.text(topic, self.track)
+
+    def is_stuck(self, topic: str) -> bool:
+        """Whether the clock of the stamps of a topic stands still while it is recorded."""
+        offset = self.stamp_offsets.of(topic)
+        return offset is not None and offset.is_stuck
 
     @property
     def problems(self) -> list[Problem]:

@@ -94,6 +94,12 @@ NEAR_VOXELS = 33.0  # a rotation moves points at this distance (10 m at 0.30 m v
 SCALE_NOTED, SCALE_WRONG = 0.03, 0.06
 
 
+_STUCK_TEXT = (
+    "many of its stamps hardly differ although they were recorded at other times; use the times of"
+    " recording with --set logs.stamps=log"
+)
+
+
 class Severity(Enum):
     """How much a finding matters."""
 
@@ -212,8 +218,30 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
         rows = [i for i, h in enumerate(collected.headers) if h.topic == topic]
         clouds = Clouds(collected, np.array(rows, np.int64), voxel)
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
+        # what follows from these would be named with other causes
+        stuck = _STUCK_TEXT if session.is_stuck(topic) else session.repeats(topic)
+        if stuck:
+            stream.findings = [Finding(Severity.WRONG, stuck)]
+        _add_lead(stream, session.lead_of(topic), clouds)
         check.streams.append(stream)
     return check
+
+
+def _add_lead(stream: StreamFit, lead: float, clouds: Clouds) -> None:
+    """Stamps that are later than their recording are wrong, also where the drive does not show it.
+
+    A steady drive along a street hides a clock.
+    """
+    if stream.findings or lead * clouds.rates[0] < WRONG * clouds.voxel:
+        return
+    stream.findings.append(
+        Finding(
+            Severity.WRONG,
+            f"its stamps are up to {lead:.2f} s later than its recording, which the stamps of the"
+            " poses are not: its clock is another one, or was set; give --set logs.time_offset."
+            f"{stream.topic}={-lead:+.2f} where this holds for the whole log, else cut the log",
+        )
+    )
 
 
 def check_stream(
