@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +24,7 @@ from semloc_logs.logs.poses.imu_gravity import up_in_base, up_in_session
 from semloc_logs.logs.poses.lidar_odometry import LidarOdometry
 from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings
 from semloc_logs.logs.poses.navsat import NavSatPoses, navsat_poses
+from semloc_logs.logs.poses.tf_tree import Change, Edge, frame_name
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.poses.trajectory_file import FilePoses, TrajectoryFile
 from semloc_logs.logs.problems import Problem, sentences, sorted_problems, without_loss_of
@@ -154,6 +156,13 @@ class Session:
         """By how much (s) stamps of a topic are later than they can be; 0 where they are not."""
         poses = pose_topic(self.stamp_offsets, self.roles, self._pass.poses)
         return 0.0 if poses is None else lead(self.stamp_offsets, topic, poses)
+
+    def mounting_changes(self, frame_id: str) -> dict[Edge, Change]:
+        """Static transforms between the base frame and a frame that the log changed, by edge."""
+        tree = self._pass.poses.tree
+        path = tree.path(self.base_frame, frame_name(frame_id)) or []
+        steps = {*pairwise(path), *((b, a) for a, b in pairwise(path))}
+        return {edge: change for edge, change in sorted(tree.changes.items()) if edge in steps}
 
     def repeats(self, topic: str) -> str:
         """What is wrong where a sensor repeats measurements while the poses move; else empty."""

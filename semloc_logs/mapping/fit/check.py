@@ -7,7 +7,7 @@ each that explains much is named with its estimate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -85,6 +85,7 @@ NAMES = {
     "lever_z_m": "a mounting shifted along z",
     "scale_log": "a wrong scale",
 }
+FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
 HIDDEN = 10.0  # a fault that the drive does not show before it has this effect is hidden
 WRONG_TURN = 0.03  # rad, within a pair: a submap of 20 m would be bent by 15 degrees
 LEAST_DRIFT = np.radians(0.3)  # rad/m, worth a word: odometry drifts by a tenth of it
@@ -219,12 +220,39 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
         clouds = Clouds(collected, np.array(rows, np.int64), voxel)
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
         # what follows from these would be named with other causes
-        stuck = _STUCK_TEXT if session.is_stuck(topic) else session.repeats(topic)
-        if stuck:
-            stream.findings = [Finding(Severity.WRONG, stuck)]
+        frames = {collected.headers[row].frame_id for row in rows}
+        known = _stuck(session, topic) or _mounting_text(session, frames, voxel)
+        if known:
+            stream.findings = [Finding(Severity.WRONG, known)]
         _add_lead(stream, session.lead_of(topic), clouds)
         check.streams.append(stream)
     return check
+
+
+def _stuck(session: Session, topic: str) -> str:
+    """A clock that stands still, or a sensor that repeats itself; else empty."""
+    return _STUCK_TEXT if session.is_stuck(topic) else session.repeats(topic)
+
+
+def _mounting_text(session: Session, frames: Set[str], voxel: float) -> str:
+    """A mounting of ``frames`` that is no length in metres, or that changes; else empty."""
+    base_T_sensors = session.base_T_sensors()
+    for frame in sorted(frames & base_T_sensors.keys()):
+        distance = float(np.linalg.norm(base_T_sensors[frame][:3, 3]))
+        if distance > FARTHEST_MOUNTING:
+            return (
+                f"its frame '{frame}' is mounted {distance:.0f} m from '{session.base_frame}': the"
+                " transform is not in metres, or of another vehicle; correct it"
+            )
+        for (parent, child), change in session.mounting_changes(frame).items():
+            if change.distance / voxel + change.angle * NEAR_VOXELS >= WRONG:
+                return (
+                    f"the mounting of '{child}' in '{parent}' is recorded with values that differ"
+                    f" by {change.distance:.2f} m and {np.degrees(change.angle):.1f} degrees: it"
+                    " was calibrated anew, or has two publishers; cut the log there, or give the"
+                    f" right one with --set logs.mountings.{child}=[x,y,z,qx,qy,qz,qw]"
+                )
+    return ""
 
 
 def _add_lead(stream: StreamFit, lead: float, clouds: Clouds) -> None:
