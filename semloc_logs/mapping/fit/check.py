@@ -70,6 +70,9 @@ CONTRADICTS = 1.15
 TELLING = 0.2
 FEW_TELLING, FEW_CONTRADICT = 0.08, 1.5
 CONTRADICTION = 50.0  # and its squared distance is larger
+# a camera's clouds move otherwise in the median: voxels, and radians
+MOST_OFF, MOST_TURNED = 2.5, 0.045
+UNEXPLAINED = 30.0  # times the noise of registration, of squared distances in the median
 LEAST_CONTRADICTIONS = 2  # one after the other
 
 # what a closure would suffer, in voxels: noted above the first, wrong above the second
@@ -297,7 +300,27 @@ def check_stream(
         _contradictions(
             stream, best, poses_at, clouds, Severity.NOTED if are_fixes else Severity.WRONG
         )
+    elif not stream.findings:
+        _unexplained(stream, given, poses_at, clouds)
     return stream
+
+
+def _unexplained(stream: StreamFit, found: Registered, poses_at: PosesAt, clouds: Clouds) -> None:
+    """Names a camera most of whose pairs move otherwise than the poses, far beyond its noise."""
+    squares = found.pairs.squares(pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS)))
+    is_off = stream.translation_m > MOST_OFF * clouds.voxel or stream.rotation_rad > MOST_TURNED
+    usual = float(np.nanmedian(squares))
+    if not is_off or usual < UNEXPLAINED or usual < UNEXPLAINED * noise(clouds, found):
+        return
+    stream.findings.append(
+        Finding(
+            Severity.WRONG,
+            f"most of its clouds move otherwise than the poses, by {stream.translation_m:.2f} m and"
+            f" {np.degrees(stream.rotation_rad):.1f} degrees in the median of"
+            f" {len(found.pairs)} pairs, and no offset of a clock or a mounting explains it: its"
+            " calibration (CameraInfo, K, baseline, unit of depth) or the poses are wrong",
+        )
+    )
 
 
 def _starts(clouds: Clouds, poses_at: PosesAt, given: Registered) -> Iterator[Start]:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.fit.check import SessionFit, Severity, StreamFit, check_stream
 from semloc_logs.mapping.fit.plane_cells import PlaneCells, register
+from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import load
 from semloc_logs.stages.check import check_log
@@ -260,6 +261,26 @@ def test_clouds_that_stand_still_beside_poses_that_move_are_not_taken_for_the_fi
 
     text = _only(check(standing, as_written=moving))
     assert "move otherwise than the poses" in text
+
+
+def test_a_camera_that_nothing_explains_is_named_with_its_calibration(
+    shared: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A focal length that is twice the true one: what is beside lies half as far beside."""
+    loaded = Collected.load
+
+    def squeezed(self: Collected, keyframe: int) -> Any:
+        points, labels, sigma = loaded(self, keyframe)
+        return points * np.array([0.5, 0.5, 1.0], np.float32), labels, sigma
+
+    log = shared("logs/room_a.mcap")
+    settings = load(assignments={"fusion.voxel_size": "0.05"})
+    [good] = check_log(log, settings, {}).streams
+    assert good.findings == []
+    monkeypatch.setattr(Collected, "load", squeezed)
+    [stream] = check_log(log, settings, {}).streams
+    assert "most of its clouds move otherwise than the poses" in _only(stream)
+    assert "calibration (CameraInfo, K" in _only(stream)
 
 
 def test_a_straight_drive_backwards_is_an_inverted_pose_or_a_turned_mounting(
