@@ -25,7 +25,7 @@ LEAST_AGREEMENT = 0.15
 # share of the ground that is labelled as ground, and of a ground class that lies near the ground
 LEAST_GROUND = 0.3
 LEAST_ON_ITS_GROUND = 0.2
-# where most points are labelled, one class for all of them says nothing if so much of it lies on
+# where most points are labelled, one class for all of them tells nothing if so much of it lies on
 # the ground, and so much above it
 LEAST_LABELLED, LEAST_APART = 0.5, 0.1
 # m at street scale: slopes, kerbs and the errors of the ground's estimate are lower

@@ -238,7 +238,7 @@ def _stuck(session: Session, topic: str) -> str:
 
 
 def _mounting_text(session: Session, frames: Set[str], voxel: float) -> str:
-    """A mounting of ``frames`` that is no length in metres, or that changes; else empty."""
+    """A mounting of ``frames`` that is not in metres, or that changes; else empty."""
     base_T_sensors = session.base_T_sensors()
     for frame in sorted(frames & base_T_sensors.keys()):
         distance = float(np.linalg.norm(base_T_sensors[frame][:3, 3]))
@@ -539,7 +539,7 @@ def _contradictions(
         is_other &= (meters > WRONG * clouds.voxel) | (radians > WRONG_TURN)
     if not is_other.any():
         return
-    # where most pairs are off, their median is no measure of the noise
+    # where most pairs are off, their median does not show the noise
     usual = float(np.nanmedian(squares)) / MEDIAN_OF_6
     excess = max(1.0, min(usual, noise(clouds, found)))
     rows = np.flatnonzero(is_other & (squares > CONTRADICTION * excess))

@@ -135,7 +135,7 @@ def _near_readings(pairs: Pairs, poses_at: PosesAt) -> Iterator[Reading]:
 def otherwise_written(poses: F64) -> Iterator[tuple[F64, str]]:
     """Motions (n, 4, 4) of pairs of poses (n, 2, 4, 4) that were written by another convention.
 
-    And what is wrong with the poses then.
+    With the sentence that names it.
     """
     quaternions = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_quat()
     for order, parts in _ORDERS.items():
