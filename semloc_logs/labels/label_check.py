@@ -17,12 +17,17 @@ I64 = NDArray[np.int64]
 
 # share of the points whose ids a space has: every shipped space describes all ids of its data set
 LEAST_KNOWN = 0.9
+# a space that the log itself gives may leave out ids of what does not matter, but not most points
+LEAST_OF_LOG = 0.5
 # agreement of two sweeps beyond chance (Cohen's kappa): simulated drives with 15 to 30 % of wrong
 # labels have 0.37 to 0.63, numbers that are given anew in each sweep 0
 LEAST_AGREEMENT = 0.15
 # share of the ground that is labelled as ground, and of a ground class that lies near the ground
 LEAST_GROUND = 0.3
 LEAST_ON_ITS_GROUND = 0.2
+# where most points are labelled, one class for all of them tells nothing if so much of it lies on
+# the ground, and so much above it
+LEAST_LABELLED, LEAST_APART = 0.5, 0.1
 # m at street scale: slopes, kerbs and the errors of the ground's estimate are lower
 NEAR_GROUND = 0.5
 _FEWEST = 300  # points, or cells, that a share is taken of
@@ -86,6 +91,13 @@ class LabelCheck:
                 f"labelled ground has the class of a ground"
             )
         total = int(self._of_class[:UNLABELLED].sum())
+        if total >= max(_FEWEST, LEAST_LABELLED * int(self._of_class.sum())):
+            single = self._of_class[int(np.argmax(self._of_class[:UNLABELLED].sum(1)))]
+            if single.sum() > _SINGLE_CLASS * total and single.min() > LEAST_APART * single.sum():
+                return (
+                    f"{single.sum() / total:.0%} of the labelled points have one class, on the "
+                    f"ground and above it alike"
+                )
         for label in GROUND:
             far, near = self._of_class[label].tolist()
             is_much = far + near >= max(_FEWEST, 0.02 * total)

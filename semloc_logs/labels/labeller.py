@@ -14,7 +14,7 @@ from semloc_logs.errors import LogError
 from semloc_logs.frames import ImageFrame, LabelForm, PosedCloud
 from semloc_logs.labels.camera_labels import Painted, Pictures, PointLabels
 from semloc_logs.labels.from_geometry import classify
-from semloc_logs.labels.label_check import LEAST_KNOWN, LabelCheck
+from semloc_logs.labels.label_check import LEAST_KNOWN, LEAST_OF_LOG, LabelCheck
 from semloc_logs.labels.segmentation import Segmenter
 from semloc_logs.labels.space import (
     SKY,
@@ -242,6 +242,11 @@ class Labeller:
                 topic.doubt = (
                     f"{1 - share:.0%} of their points have ids that {topic.space.name}, the most "
                     f"similar label space, does not have"
+                )
+            elif topic.space and share < LEAST_OF_LOG:
+                topic.doubt = (
+                    f"{1 - share:.0%} of their points have ids that the label space of the log, "
+                    f"{topic.space.name}, does not have"
                 )
             else:
                 topic.doubt = check.doubt()

@@ -35,6 +35,7 @@ FLAGRANT = 0.45  # in place of both, for an IMU where down may be the ceiling
 FITS = 0.4  # score of an expected direction that stays in a room
 CLEAR = 0.1  # lead over every other direction without which a finding is unsure
 FAR_OFF = 30.0  # degrees off where it was expected: better directions may be beyond its reach
+TILTED = 15.0  # degrees off an IMU; streets are less steep
 GIVEN_WITHIN = 0.35  # rad, of a direction that was given; it is refined
 
 
@@ -136,6 +137,8 @@ def find_gravity(expected: Expected, normals: F64, weights: F64, evidence: UpEvi
     elif opposite > doubt:
         other = others[0]
     problems = () if other is None else (_doubt(expected, up, other),)
+    if not problems and expected.imu is not None and _degrees(up, expected.imu) > TILTED:
+        problems = (_tilted(expected, up),)
     return _gravity(expected, up, prior, source, lead, problems)
 
 
@@ -190,6 +193,17 @@ def _doubt(expected: Expected, up: F64, other: F64) -> Problem:
         f"'{expected.frame}' is taken as up {by}, but {_text(other)} fits better",
         expected.imu_topic if expected.imu is not None else "",
     )
+
+
+def _tilted(expected: Expected, up: F64) -> Problem:
+    """An IMU whose mounting is wrong; the map was levelled by its ground and walls."""
+    assert expected.imu is not None
+    text = (
+        f"{expected.log}: up of {expected.imu_topic} is {_degrees(up, expected.imu):.0f} degrees "
+        "off the ground and the walls of the map, which are used: its mounting is wrong, or its "
+        "accelerometer."
+    )
+    return Problem(expected.imu_topic, ProblemKind.GRAVITY, text, lost=False)
 
 
 def _contradiction(expected: Expected, up: F64) -> Problem:

@@ -40,6 +40,8 @@ from semloc_logs.voxels.store import poses_of
 from semloc_logs.workspace import SessionFolder, Workspace
 
 LOGGER = logging.getLogger(__name__)
+# keys without which a session.json is not one that fuse wrote
+_WHOLE = frozenset({"fingerprint", "skipped"})
 
 
 @dataclass(slots=True)
@@ -151,8 +153,15 @@ def _fuse(plan: FusePlan, work: Workspace, engine: Engine) -> Report:
 
 
 def _present(folder: SessionFolder) -> dict[str, Any]:
-    """The content of session.json; empty where there is none."""
-    return read_json(folder.session_json) if folder.session_json.exists() else {}
+    """The content of session.json; empty where there is none, or a damaged one."""
+    if not folder.session_json.exists():
+        return {}
+    try:
+        content = read_json(folder.session_json)
+    except WorkspaceError as problem:
+        LOGGER.warning("%s The session is made again from its log.", problem)
+        return {}
+    return content if content.keys() >= _WHOLE else {}
 
 
 def _as_read_before(present: Mapping[str, Any], settings: Resolved) -> Resolved:

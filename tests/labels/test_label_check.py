@@ -56,6 +56,18 @@ def test_labels_of_one_sweep_and_of_a_single_class() -> None:
     assert doubt(np.full(len(POINTS), 255), np.full(len(POINTS), 255)) == ""
 
 
+@pytest.mark.parametrize("label", [ROAD, BUILDING, CAR])
+def test_one_class_for_everything_says_nothing(label: int) -> None:
+    assert doubt(*[np.full(len(POINTS), label)] * 3) != ""
+
+
+def test_one_class_on_the_ground_and_above_it_is_named_as_such() -> None:
+    reason = doubt(*[np.full(len(POINTS), ROAD)] * 3)
+    assert reason == (
+        "100% of the labelled points have one class, on the ground and above it alike"
+    )
+
+
 def clusters(seed: int) -> I64:
     """Patches of 4 m, numbered anew in each sweep; the ground is a cluster of its own."""
     cell = np.floor(POINTS[:, 0] / 4) * 2 + (POINTS[:, 1] > 0)

@@ -190,6 +190,17 @@ def test_labels_that_are_all_zero_are_none() -> None:
         classes([sweep(10)], source="log")
 
 
+def test_ids_that_the_label_space_of_the_log_does_not_have_are_not_classes() -> None:
+    names = LabelNames(header("/lidar/label_info", 0), names={1: "tree", 2: "street"})
+    _, labeller = classes([names, *(sweep(10 * k, [1001, 1002, 2]) for k in range(1, 5))])
+    assert labeller.source == "geometry"
+    [problem] = labeller.problems
+    assert problem.assumed
+    assert "67% of their points have ids that the label space of the log" in problem.text
+    _, labeller = classes([names, *(sweep(10 * k, [1, 2, 1003]) for k in range(1, 5))])
+    assert labeller.source == "log"  # a class that the log does not name
+
+
 def test_ids_that_no_label_space_has_are_not_classes() -> None:
     numbers = [sweep(10 * k, [101 + k, 230 - k, 77]) for k in range(1, 5)]
     found, labeller = classes(numbers)

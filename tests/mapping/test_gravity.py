@@ -125,6 +125,15 @@ def test_an_imu_that_agrees_says_nothing() -> None:
     assert not found.problems
 
 
+def test_an_imu_whose_mounting_is_turned_is_named_and_the_map_is_level() -> None:
+    tilted = Rotation.from_rotvec(np.radians(20) * X).as_matrix() @ Z
+    found = find(street(), Z, imu=tilted)
+    assert degrees_between(found.up, Z) < 1
+    [problem] = found.problems
+    assert not problem.is_reported
+    assert "up of /imu is 20 degrees off the ground and the walls of the map" in problem.text
+
+
 @pytest.mark.parametrize("imu", [-Z, X, Y])
 def test_an_imu_that_contradicts_the_map_is_not_believed(imu: F64) -> None:
     """Of another axis convention, or with the sign of free fall."""

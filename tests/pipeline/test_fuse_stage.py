@@ -80,6 +80,20 @@ def test_session_json_is_read_once(
     assert [path.name for path in read] == ["session.json"]
 
 
+@pytest.mark.parametrize("damaged", ["", '{"name": "mon', "[]", "{}"])
+def test_a_damaged_session_json_is_made_again(
+    fuse: Fuse, coarse: Workspace, damaged: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = coarse.session("monday").session_json
+    before = path.read_text()
+    path.write_text(damaged)
+    assert was_done(fuse())
+    assert json.loads(path.read_text())["fingerprint"] == json.loads(before)["fingerprint"]
+    if damaged != "{}":
+        assert "The session is made again from its log." in caplog.text
+        assert str(path) in caplog.text
+
+
 def test_overwriting_does_it_again(fuse: Fuse, coarse: Workspace, tools: SimpleNamespace) -> None:
     tables = tools.files(coarse.path)
     times = tools.write_times(coarse.path)

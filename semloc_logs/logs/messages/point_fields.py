@@ -47,6 +47,13 @@ class Points:
     remark: PointTimeRemark | None = None
 
 
+# m; coordinates of a measured point lie between these, but for a few and for zeros
+_NEAREST, _FARTHEST = 1e-7, 1e7
+# shares of coordinates between them, in the wrong order of bytes and in the right one
+_NONSENSE, _SENSE = 0.5, 0.95
+_LOOKED_AT = 1000  # points
+
+
 @dataclass(frozen=True, slots=True)
 class Layout:
     """``height`` rows of ``width`` points; bytes from point to point and from row to row."""
@@ -68,7 +75,7 @@ def decode_points(
     if layout.width == 0 or layout.height == 0:
         # its fields may be missing too
         return Points(np.empty((0, 3), np.float32), None, None, None)
-    rows = _rows(data, layout, fields)
+    rows = _in_true_order(_rows(data, layout, fields))
     columns = {name.lower(): name for name in reversed(rows.dtype.names or ())}
     for axis in "xyz":
         if axis not in columns:
@@ -169,3 +176,33 @@ def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> 
         }
     )
     return np.ndarray((height, width), dtype, buffer=data, strides=(row, step))
+
+
+def _in_true_order(rows: NDArray[np.void]) -> NDArray[np.void]:
+    """The same bytes in the order of bytes that makes sense.
+
+    Writers fill in the flag for the order of bytes wrongly: floats read in the other order than
+    they were written are tiny, huge or no numbers.
+    """
+    swapped = rows.view(rows.dtype.newbyteorder())
+    if _sense(rows) < _NONSENSE and _sense(swapped) > _SENSE:
+        return swapped
+    return rows
+
+
+def _sense(rows: NDArray[np.void]) -> float:
+    """The share of floating-point coordinates that are distances; 1 without any."""
+    floats = [
+        name
+        for name in rows.dtype.names or ()
+        if name.lower() in ("x", "y", "z") and rows.dtype[name].kind == "f"
+    ]
+    shares = []
+    for name in floats:
+        some = rows[name].ravel()[:: max(1, rows.size // _LOOKED_AT)]
+        with np.errstate(invalid="ignore"):  # bytes in the wrong order are any number
+            sizes = np.abs(some.astype(np.float64))
+        sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+        if len(sizes):
+            shares.append(float(np.mean((sizes > _NEAREST) & (sizes < _FARTHEST))))
+    return min(shares, default=1.0)

@@ -25,6 +25,7 @@ from semloc_logs.numerics.transforms import inverse
 BASE_LINK = "base_link"
 # frames of REP 105, and of LIDAR-inertial odometry, in which the world stands still
 _FIXED_FRAMES = {"map", "odom", "world", "earth", "camera_init"}
+_VEHICLE_FRAMES = {BASE_LINK, "base_footprint", "base", "body", "vehicle", "ego_vehicle"}
 _LATE_TF_NS = 1_000_000_000  # a pose waits so long for the transform that leads to the base frame
 
 
@@ -196,6 +197,7 @@ class BasePoses:
         self._child: str | None = None  # of the poses of a topic, once the base frame is chosen
         self._publishers = EdgePublishers()
         self._edge: Edge | None = None
+        self._turned: set[Edge] = set()  # parent and child of moving edges that were upside down
         self._raw: deque[tuple[int, F64]] = deque()
         self._static_count = static_count
         self._static_times: set[tuple[str, int]] = set()
@@ -218,6 +220,8 @@ class BasePoses:
                 self._raw.append((header.stamp_ns, sample.frame_T_child))
                 self._move()
         elif isinstance(sample, TransformSample):
+            sample = self._upright(sample)
+            header = sample.header
             if header.topic in self._roles.tf_static:
                 sample = replace(sample, static=True)
                 self._static_times.add((header.topic, header.log_time_ns))
@@ -230,6 +234,21 @@ class BasePoses:
             ):
                 self._raw.append((header.stamp_ns, sample.frame_T_child))
                 self._move()
+
+    def _upright(self, sample: TransformSample) -> TransformSample:
+        """A moving transform of a fixed frame in a frame of the vehicle, the other way round."""
+        parent = frame_name(sample.header.frame_id)
+        child = frame_name(sample.child_frame_id)
+        is_vehicle = parent.rpartition("/")[2] in _VEHICLE_FRAMES
+        if sample.static or not is_vehicle or child.rpartition("/")[2] not in _FIXED_FRAMES:
+            return sample
+        self._turned.add((parent, child))
+        return replace(
+            sample,
+            header=replace(sample.header, frame_id=child),
+            child_frame_id=parent,
+            frame_T_child=inverse(sample.frame_T_child),
+        )
 
     def settle(self, sensors: Sequence[str], *, is_patient: bool, must: bool) -> bool:
         """Chooses the base frame once its transforms have come, or now if it ``must``.
@@ -285,7 +304,17 @@ class BasePoses:
     @property
     def problems(self) -> list[Problem]:
         """Poses and transforms that are left out, because others of the same name are used."""
-        return [*self._stream.problems(), *self._publishers.problems(self._edge)]
+        turned = [
+            Problem(
+                "",
+                ProblemKind.TRANSFORM,
+                f"TF gives the fixed frame '{child}' below '{parent}', a frame of the vehicle: it"
+                f" is read as the pose of '{parent}' in '{child}'.",
+                lost=False,
+            )
+            for parent, child in sorted(self._turned)
+        ]
+        return [*turned, *self._stream.problems(), *self._publishers.problems(self._edge)]
 
     def _child_of(self, edge: Edge | None) -> str | None:
         """The frame that the poses of a TF edge, or without one of the fallback, belong to."""

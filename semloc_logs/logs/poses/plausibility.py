@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F64
-from semloc_logs.logs.messages.stamps import utc
+from semloc_logs.logs.messages.stamps import duration, time_range, utc
 from semloc_logs.logs.poses.track import PoseTrack
 
 # acceleration (m/s^2) and turn rate (rad/s) that nothing exceeds which carries the sensor; a step
@@ -25,6 +25,20 @@ INTERLEAVED = 0.1
 # a track that begins again: its pose is the identity but for this (m, rad), far from where it was
 AT_IDENTITY, TURNED_AT_IDENTITY = 0.1, 0.02
 FAR = 2.0
+# poses of one publisher before and after another's lie as far apart each time, within this share of
+# the jump to the other's
+STEADY = 0.15
+# poses that are exactly the same for so long (s), at once from or to a speed (m/s) that braking
+# within two steps does not explain, were not measured; so many steps tell the speed
+FROZEN = 1.0
+SLOW = 1.0
+AT_SPEED = 3
+STILL_TURN = 1e-6
+# a vehicle at more than this speed (m/s) before and after a gap of so many seconds at most, which
+# turned nowhere, has not gone less than this share of the way
+FASTER = 2.0
+LONGEST_STOP = 5.0
+SHORT = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +69,25 @@ def implausible(track: PoseTrack) -> Jump | None:
 
     to_and_fro = _to_and_fro(poses, way, seconds)
     if to_and_fro.sum() >= max(3, INTERLEAVED * len(jumps)):
-        return _in_turn(stamps_ns, to_and_fro, way)
+        return _in_turn(stamps_ns, to_and_fro, poses)
     if restarts.any():
         step = int(np.flatnonzero(restarts)[0])
+        silent_ns = int(stamps_ns[step + 1] - stamps_ns[step])
+        gap = (
+            f" after {duration(silent_ns)} without any" if silent_ns > track.gap_limit_ns() else ""
+        )
         text = (
-            f"the poses start again at the identity at {utc(int(stamps_ns[step + 1]))},"
+            f"the poses start again at the identity at {utc(int(stamps_ns[step + 1]))}{gap},"
             f" {np.linalg.norm(poses[step, :3, 3]):.1f} m from where they were: the odometry was"
-            " reset; cut the log there into two sessions"
+            " reset, or its clock was set; cut the log there into two sessions"
         )
         return Jump(tuple(stamps_ns[1:][restarts].tolist()), text)
     if jumps.any():
         return _jumped(stamps_ns, jumps, way, turn)
+    if frozen := _frozen(stamps_ns, way, turn, seconds):
+        return frozen
+    if lost := _lost_in_gap(track, way, turn, seconds):
+        return lost
     usual = float(np.median(speed[way > 0])) if (way > 0).any() else 0.0
     if usual > FASTEST:
         text = (
@@ -112,14 +134,68 @@ def _to_and_fro(poses: F64, way: F64, seconds: F64) -> NDArray[np.bool_]:
     return np.asarray(detour > SLACK + ACCELERATION * (seconds[:-1] + seconds[1:]) ** 2)
 
 
-def _in_turn(stamps_ns: NDArray[np.int64], to_and_fro: NDArray[np.bool_], way: F64) -> Jump:
-    distance = float(np.median(way[:-1][to_and_fro]))
-    count = int(to_and_fro.sum())
+def _in_turn(stamps_ns: NDArray[np.int64], to_and_fro: NDArray[np.bool_], poses: F64) -> Jump:
+    """Poses that jump to and fro. Between jumps of one of two publishers the other one drives on
+    steadily; noise does not.
+    """
+    chords = np.linalg.norm(poses[2:, :3, 3] - poses[:-2, :3, 3], axis=1)[to_and_fro]
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[:-1][to_and_fro]
+    distance = float(np.median(steps))
+    is_steady = float(np.median(np.abs(chords - np.median(chords)))) < STEADY * distance
+    cause = (
+        "two publishers are mixed in one topic; record them on topics of their own"
+        if is_steady
+        else "they are too noisy to build a map with, or several publishers are mixed in one topic;"
+        " give others with --poses FILE, or use --odometry lidar"
+    )
     text = (
-        f"{count} of its {len(stamps_ns)} poses jump to and fro, by {distance:.1f} m in the median:"
-        " two publishers are mixed in one topic; record them on topics of their own"
+        f"{int(to_and_fro.sum())} of its {len(stamps_ns)} poses jump to and fro, by"
+        f" {distance:.1f} m in the median: {cause}"
     )
     return Jump(tuple(stamps_ns[1:-1][to_and_fro].tolist()), text)
+
+
+def _frozen(stamps_ns: NDArray[np.int64], way: F64, turn: F64, seconds: F64) -> Jump | None:
+    """Poses that stop at once and stay exactly the same for a while, as when odometry hangs."""
+    is_still = (way == 0.0) & (turn < STILL_TURN)
+    edges = np.flatnonzero(np.diff(np.r_[False, is_still, False].astype(np.int8)))
+    for first, last in edges.reshape(-1, 2).tolist():  # steps [first, last) stand still
+        if (stamps_ns[last] - stamps_ns[first]) * 1e-9 < FROZEN:
+            continue
+        for steps in (slice(max(first - AT_SPEED, 0), first), slice(last, last + AT_SPEED)):
+            if len(way[steps]) < AT_SPEED:
+                continue
+            speed = float(np.median(way[steps] / seconds[steps]))
+            if speed > ACCELERATION * 2.0 * float(np.median(seconds[steps])) + SLOW:
+                text = (
+                    f"the poses are exactly the same from"
+                    f" {time_range(int(stamps_ns[first]), int(stamps_ns[last]))}, at once from or"
+                    f" to a speed of {speed:.1f} m/s: the odometry froze; cut the log there, give"
+                    " poses with --poses FILE, or use --odometry lidar"
+                )
+                return Jump((int(stamps_ns[first]),), text)
+    return None
+
+
+def _lost_in_gap(track: PoseTrack, way: F64, turn: F64, seconds: F64) -> Jump | None:
+    """Poses that go on after a gap where they were before it, though at speed on both sides."""
+    limit = track.gap_limit_ns() * 1e-9
+    for step in np.flatnonzero((seconds > limit) & (seconds < LONGEST_STOP)).tolist():
+        before = slice(max(step - AT_SPEED, 0), step)
+        after = slice(step + 1, step + 1 + AT_SPEED)
+        if len(way[before]) < AT_SPEED or len(way[after]) < AT_SPEED:
+            continue
+        speed = min(float(np.median(way[side] / seconds[side])) for side in (before, after))
+        if speed > FASTER and way[step] < SHORT * speed * seconds[step] and turn[step] < TURN_SLACK:
+            stamps_ns = track.stamps_ns
+            text = (
+                f"the poses have a gap of {seconds[step]:.2f} s from {utc(int(stamps_ns[step]))}"
+                f" and go on {way[step]:.1f} m from where they were, although at {speed:.1f} m/s"
+                " before and after: the odometry lost the way between; cut the log there into two"
+                " sessions"
+            )
+            return Jump((int(stamps_ns[step + 1]),), text)
+    return None
 
 
 def _jumped(stamps_ns: NDArray[np.int64], jumps: NDArray[np.bool_], way: F64, turn: F64) -> Jump:

@@ -74,11 +74,14 @@ class Standstill:
         """How far (m) the surroundings moved in it."""
         return 0.0 if self.worst is None else self.worst.shift
 
-    def add(self, points: F32, session_T_base: Array, stamp_ns: int = 0) -> None:
-        """Takes the points (n, 3) of a cloud in the base frame."""
-        if len(points) < _FEWEST:
-            return
+    def add(self, points: F32, session_T_base: Array, stamp_ns: int) -> None:
+        """Takes the points (n, 3) of a cloud in the base frame.
+
+        Clouds of one time have one pose, which tells nothing: a clock may stand still.
+        """
         stop = self._stop
+        if len(points) < _FEWEST or (stop is not None and stamp_ns == stop.end_ns):
+            return
         is_still = stop is not None and _is_still(stop.pose, session_T_base)
         if stop is None or not is_still:
             self._worst = self.worst

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,13 +24,26 @@ MAX_EDGES = 10_000  # a log with more frames than this is broken; the rest is ig
 Edge = tuple[str, str]  # (parent, child)
 
 
+class Change(NamedTuple):
+    """How far a static transform moved (m) and turned (rad)."""
+
+    distance: float
+    angle: float
+
+
+_NO_CHANGE = Change(1e-3, 1e-3)  # rounding
+
+
 def frame_name(frame_id: str) -> str:
     """The frame's name without leading slash and blanks."""
     return frame_id.strip().lstrip("/")
 
 
 class TransformTree:
-    """Static and dynamic transforms as they come; ``ignored`` counts samples that made no sense."""
+    """Static and dynamic transforms as they come; ``ignored`` counts samples that made no sense.
+
+    ``changes``: static transforms that were sent with different values, by edge.
+    """
 
     def __init__(self) -> None:
         self.ignored = 0
@@ -39,6 +53,8 @@ class TransformTree:
         self._parents: dict[str, list[str]] = {}
         self._paths: dict[Edge, list[str] | None] = {}
         self._fixed: set[Edge] = set()
+        self._sent: set[Edge] = set()  # static edges that the log has sent
+        self.changes: dict[Edge, Change] = {}
 
     def fix(self, parent: str, child: str, pose: F64) -> None:
         """Sets ``parent_T_child`` (4, 4) for good: samples of this edge are ignored from now on."""
@@ -62,12 +78,24 @@ class TransformTree:
             self.ignored += 1
             return
         if sample.static and edge not in self._moving:
+            self._note_change(edge, sample)
             self._static[edge] = sample.frame_T_child
         elif not sample.static:
             self._moving.setdefault(edge, PoseTrack(keep_seconds=HISTORY_SECONDS)).add(sample)
             self._static.pop(edge, None)
         if is_new:
             self._connect(parent, child)
+
+    def _note_change(self, edge: Edge, sample: TransformSample) -> None:
+        """Keeps the largest change of a static transform that the log sends with other values."""
+        if not sample.header.topic or edge not in self._sent:
+            if sample.header.topic:
+                self._sent.add(edge)
+            return
+        step = transforms.inverse(self._static[edge]) @ sample.frame_T_child
+        change = Change(float(np.linalg.norm(step[:3, 3])), transforms.rotation_angle(step[:3, :3]))
+        if max(change) > max(self.changes.get(edge, _NO_CHANGE)):
+            self.changes[edge] = change
 
     def _connect(self, parent: str, child: str) -> None:
         self._neighbours.setdefault(parent, []).append(child)

@@ -150,7 +150,7 @@ def fitted_camera(
     is_whole = np.array_equal(by_definition.size, full) and (by_definition.binning == 1).all()
     fitted: FittedCamera | None = None
     if is_whole and by_definition.is_of(size):
-        fitted = FittedCamera(camera)
+        fitted = FittedCamera(camera, _other_size(camera, "P" if rectified else "K", full))
     elif not is_whole:
         matrix = "P" if rectified else "K"
         fitted = _with_region(_Claim(camera, matrix, full, by_definition), size)
@@ -236,6 +236,18 @@ class _Claim(NamedTuple):
     def point(self) -> F64:
         """The principal point (x, y)."""
         return np.asarray(getattr(self.camera, self.matrix)[:2, 2])
+
+
+def _other_size(camera: Camera, matrix: str, full: F64) -> str:
+    """What is assumed where a calibration seems to be of a picture of another size; else ""."""
+    point = np.asarray(getattr(camera, matrix)[:2, 2])
+    if not point.any() or _off(point, full / 2, full) <= _OFF_MIDDLE:
+        return ""
+    return (
+        f"CameraInfo {camera.header.topic} is for {_pixels(full)} pixels, but the middle of its "
+        f"{matrix} lies at ({point[0]:.0f}, {point[1]:.0f}), as of a picture of another size: it "
+        f"is taken as it is; {_REMEDY} if that is wrong."
+    )
 
 
 def _with_region(claim: _Claim, size: F64) -> FittedCamera | None:

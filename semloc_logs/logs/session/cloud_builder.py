@@ -56,7 +56,8 @@ class CloudBuilder:
     ``sensors``: the last ``base_T_sensor`` (4, 4) of each frame id that gave a cloud; ``deskewed``:
     sweeps freed of the vehicle's motion; ``fixed``: frame by topic of clouds whose frame is fixed
     in the world; ``looks_up``: frame by topic of pictures that look up by their transform;
-    ``is_base``: of pictures in the base frame that is not called optical.
+    ``is_base``: of pictures in the base frame that is not called optical; ``too_far``: median range
+    (m) by topic of sweeps beyond the limit.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class CloudBuilder:
         self.fixed: dict[str, str] = {}
         self.looks_up: dict[str, str] = {}
         self.is_base: dict[str, str] = {}
+        self.too_far: dict[str, float] = {}
         self.standstill = Standstill()
         self.duplicates = duplicates
         self._roles = roles
@@ -93,6 +95,7 @@ class CloudBuilder:
         if isinstance(cloud, NoCloud):
             return cloud
         if not len(cloud.points):
+            self._see_unit(frame)
             return NoCloud.NO_POINTS
         if not isinstance(frame, LidarFrame):
             self._see_axes(header, place.base_T_sensor)
@@ -107,6 +110,13 @@ class CloudBuilder:
             self.standstill.add(cloud.points, pose, header.stamp_ns)
         # the pose at the time of a frame that is set back belongs to an earlier frame
         return NoCloud.BACK_IN_TIME if is_set_back and pose is not None else cloud
+
+    def _see_unit(self, frame: RangeFrame) -> None:
+        """Keeps the range of the first sweep of a topic that lies beyond the limit."""
+        if isinstance(frame, LidarFrame):
+            median = float(np.median(np.linalg.norm(frame.points, axis=1)))
+            if median > self._limits.farthest:
+                self.too_far.setdefault(frame.header.topic, median)
 
     def _place(self, frame: RangeFrame, *, is_end: bool) -> _Place | NoCloud:
         header = frame.header

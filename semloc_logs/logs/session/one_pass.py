@@ -24,6 +24,7 @@ from semloc_logs.logs.sensors.camera_clouds import CameraClouds
 from semloc_logs.logs.session.cloud_builder import CloudBuilder
 from semloc_logs.logs.session.frame_queue import MOST_WAITING_BYTES, FrameQueue, RangeFrame
 from semloc_logs.logs.session.image_relay import ImageRelay
+from semloc_logs.logs.session.repeats import Repeats
 from semloc_logs.logs.session.stamp_offsets import StampOffsets
 from semloc_logs.logs.session.tally import Tally
 
@@ -53,6 +54,7 @@ class CloudPass:
         self.tally = Tally()
         self.meanings: dict[str, LabelNames] = {}
         self.stamp_offsets = StampOffsets()
+        self.repeats = Repeats()
         self.waiting = FrameQueue(most_bytes)
         self.relay = relay
         self._roles = roles
@@ -116,6 +118,7 @@ class CloudPass:
             if not len(frame.points):
                 self.tally.leave_out(frame.header, NoCloud.EMPTY)
                 return
+        self.repeats.take(frame)
         self.waiting.add(frame)
 
     def _ready(self, *, is_end: bool) -> Iterator[PosedCloud]:

@@ -29,6 +29,15 @@ def clouds_in_fixed_frame(topic: str, frame: str, pose_topic: str) -> Problem:
     return Problem(topic, ProblemKind.TRANSFORM, text, lost=False)
 
 
+def too_far(topic: str, metres: float) -> Problem:
+    """Sweeps of which nothing lies within the range limits."""
+    text = (
+        f"{topic}: half of the points of a sweep lie beyond {metres:.0f} m: their unit is"
+        " millimetres or centimetres, or fusion.max_range is too small; record them in metres."
+    )
+    return Problem(topic, ProblemKind.FRAME, text, lost=False, assumed=True)
+
+
 def looks_up(topic: str, frame: str) -> Problem:
     """Pictures whose axes may be wrong: by TF they look up, as if their frame were a body's."""
     text = (

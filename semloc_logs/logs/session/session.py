@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -22,7 +23,8 @@ from semloc_logs.logs.poses.base_frame import BasePoses, PoseSource
 from semloc_logs.logs.poses.imu_gravity import up_in_base, up_in_session
 from semloc_logs.logs.poses.lidar_odometry import LidarOdometry
 from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings
-from semloc_logs.logs.poses.navsat import navsat_poses
+from semloc_logs.logs.poses.navsat import NavSatPoses, navsat_poses
+from semloc_logs.logs.poses.tf_tree import Change, Edge, frame_name
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.poses.trajectory_file import FilePoses, TrajectoryFile
 from semloc_logs.logs.problems import Problem, sentences, sorted_problems, without_loss_of
@@ -36,7 +38,7 @@ from semloc_logs.logs.session.image_relay import ImageRelay
 from semloc_logs.logs.session.merge import merged_frames
 from semloc_logs.logs.session.one_pass import CloudPass
 from semloc_logs.logs.session.reading import reading_of
-from semloc_logs.logs.session.stamp_offsets import StampOffsets
+from semloc_logs.logs.session.stamp_offsets import StampOffsets, lead, pose_topic
 from semloc_logs.logs.session.summary import conclude
 from semloc_logs.settings import Logs
 
@@ -150,6 +152,27 @@ class Session:
         """Log times less header stamps of the topics that the pass has read."""
         return self._pass.stamp_offsets
 
+    def lead_of(self, topic: str) -> float:
+        """By how much (s) stamps of a topic are later than they can be; 0 where they are not."""
+        poses = pose_topic(self.stamp_offsets, self.roles, self._pass.poses)
+        return 0.0 if poses is None else lead(self.stamp_offsets, topic, poses)
+
+    def mounting_changes(self, frame_id: str) -> dict[Edge, Change]:
+        """Static transforms between the base frame and a frame that the log changed, by edge."""
+        tree = self._pass.poses.tree
+        path = tree.path(self.base_frame, frame_name(frame_id)) or []
+        steps = {*pairwise(path), *((b, a) for a, b in pairwise(path))}
+        return {edge: change for edge, change in sorted(tree.changes.items()) if edge in steps}
+
+    def repeats(self, topic: str) -> str:
+        """What is wrong where a sensor repeats measurements while the poses move; else empty."""
+        return self._pass.repeats.text(topic, self.track)
+
+    def is_stuck(self, topic: str) -> bool:
+        """Whether the clock of the stamps of a topic stands still while it is recorded."""
+        offset = self.stamp_offsets.of(topic)
+        return offset is not None and offset.is_stuck
+
     @property
     def problems(self) -> list[Problem]:
         """All problems: lost data first, then assumptions."""
@@ -196,6 +219,11 @@ class Session:
         """The topic of the poses, TF, or the source that replaces them."""
         source = self._pass.poses.source
         return source.name if source else self.roles.pose or "TF"
+
+    @property
+    def are_poses_fixes(self) -> bool:
+        """Whether the poses are fixes of a receiver, which scatter by half a metre or more."""
+        return isinstance(self._pass.poses.source, NavSatPoses)
 
     def trajectory(self) -> tuple[NDArray[np.int64], F64]:
         """Stamps (n,) and ``session_T_base`` (n, 4, 4) of all poses; complete after the pass."""

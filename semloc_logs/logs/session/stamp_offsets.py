@@ -28,13 +28,20 @@ _TIME_ZONE = 1800.0  # s; time zones differ by multiples of it, but for a few
 _NEARLY = 0.5  # s
 _AT_ONCE = 0.005  # s
 _YEAR = 365.25 * 86400.0
+# messages with one stamp that are recorded over so long a time (s) were not measured at once
+_STUCK = 0.5
+_SLOWEST = 0.01  # of the time of recording; a clock that advances by less stands still
+_FEWEST_STUCK = 3
+_STUCK_SHARE = 0.2  # of the messages of a topic
+_PARTS = 4  # of a log, each of which shows what its stamps are like
 
 
 @dataclass(frozen=True, slots=True)
 class StampOffset:
     """Log time minus stamp (s) over the messages of a topic.
 
-    ``without_stamp`` messages have no stamp, or 0, and take their log time instead.
+    ``without_stamp`` messages have no stamp, or 0, and take their log time instead; ``stuck`` ones
+    have the stamp of the message before, or nearly, for half a second of recording or longer.
     """
 
     messages: int
@@ -42,6 +49,12 @@ class StampOffset:
     median: float
     least: float
     greatest: float
+    stuck: int = 0
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether the clock of the stamps stands still, or counts coarsely."""
+        return self.stuck > _STUCK_SHARE * self.messages
 
 
 class StampOffsets:
@@ -85,6 +98,12 @@ class StampOffsets:
         other_times, others = self._topics[reference].columns()
         return np.asarray(offsets - np.interp(times, other_times, others))
 
+    def latest(self, topic: str) -> float:
+        """By how much (s) stamps are later than their recording, in the part where most."""
+        _, offsets = self._topics[topic].columns()
+        parts = np.array_split(offsets, _PARTS) if len(offsets) >= _FEWEST else [offsets]
+        return -min(float(np.median(part)) for part in parts)
+
     def to_json(self) -> dict[str, object]:
         """For session.json: the figures by topic."""
         return {
@@ -111,8 +130,12 @@ class _Samples:
         self._without_stamp = 0
         self._least = np.inf
         self._greatest = -np.inf
+        self._stuck = 0
+        self._is_counted = False  # whether the run below counts as stuck
+        self._run = (0, 0, 0)  # stamp and log time of the first message of a stamp, and their count
 
     def add(self, header: Header) -> None:
+        self._count_stuck(header)
         offset = (header.log_time_ns - header.stamp_ns) * 1e-9
         self._without_stamp += header.lacks_stamp
         self._least = min(self._least, offset)
@@ -124,6 +147,20 @@ class _Samples:
             del self._values[1::2]
             self._every *= 2
 
+    def _count_stuck(self, header: Header) -> None:
+        stamp_ns, log_time_ns, count = self._run
+        elapsed_ns = _SLOWEST * abs(header.log_time_ns - log_time_ns)
+        if not self._seen or abs(header.stamp_ns - stamp_ns) > elapsed_ns:
+            self._run = (header.stamp_ns, header.log_time_ns, 1)
+            self._is_counted = False
+            return
+        self._run = (stamp_ns, log_time_ns, count + 1)
+        if (header.log_time_ns - log_time_ns) * 1e-9 >= _STUCK and count + 1 >= _FEWEST_STUCK:
+            # the ones before, too, once it is known
+            before = count - 1 if not self._is_counted else 0
+            self._stuck += 1 + before
+            self._is_counted = True
+
     def columns(self) -> tuple[F64, F64]:
         """Log times and offsets."""
         values = np.array(self._values)
@@ -133,7 +170,7 @@ class _Samples:
         median = float(np.median(self.columns()[1]))
         least = float(self._least)
         greatest = float(self._greatest)
-        return StampOffset(self._seen, self._without_stamp, median, least, greatest)
+        return StampOffset(self._seen, self._without_stamp, median, least, greatest, self._stuck)
 
 
 def stamp_problems(
@@ -146,10 +183,10 @@ def stamp_problems(
     labels = roles.label_of.values()
     sensors = [*roles.ranging, *roles.topics("stereo_right"), *labels, *pictures]
     others = [*roles.topics("imu"), *roles.topics("gnss")]
-    return _problems(offsets, _pose_topic(offsets, roles, poses), sensors, others)
+    return _problems(offsets, pose_topic(offsets, roles, poses), sensors, others)
 
 
-def _pose_topic(offsets: StampOffsets, roles: Roles, poses: BasePoses) -> str | None:
+def pose_topic(offsets: StampOffsets, roles: Roles, poses: BasePoses) -> str | None:
     """The topic that the poses come from; None where another source has no messages."""
     if poses.source is not None:
         return poses.source.name
@@ -169,7 +206,10 @@ def _problems(
     named = dict.fromkeys([*([poses] if poses is not None else []), *sensors, *others])
     known = {topic: offset for topic in named if (offset := offsets.of(topic)) is not None}
     problems = [_unstamped(t, o) for t, o in sorted(known.items()) if o.without_stamp]
-    stamped = {t: o for t, o in known.items() if o.without_stamp < o.messages}
+    needed = [t for t in (poses, *sensors) if t is not None]
+    stuck = {t: o for t, o in known.items() if o.is_stuck and t in needed}
+    problems += [_stuck(topic, offset) for topic, offset in stuck.items()]
+    stamped = {t: o for t, o in known.items() if o.without_stamp < o.messages and t not in stuck}
 
     # the poses are what the others are compared with; without any, the first sensor
     reference = next(iter(stamped), None)
@@ -258,6 +298,31 @@ def _usual_shift(shift: float) -> tuple[float, str]:
     if 0 < zones <= 48 and abs(abs(shift) - zones * _TIME_ZONE) < _NEARLY:
         return sign * zones * _TIME_ZONE, "a time zone"
     return shift, ""
+
+
+def lead(offsets: StampOffsets, topic: str, poses: str) -> float:
+    """By how much (s) the stamps of a topic are later than its recording, and the poses' are not.
+
+    In a part of the log at least: a clock may have been set. No clock of the recording makes that.
+    """
+    if offsets.of(topic) is None or offsets.of(poses) is None:
+        return 0.0
+    own = offsets.latest(topic)
+    relative = offsets.relative(topic, poses)
+    parts = np.array_split(relative, _PARTS) if len(relative) >= _FEWEST else [relative]
+    least = min(float(np.median(part)) for part in parts)
+    later = -min(least, 0.0)
+    return later if later > _CLEARLY_LATER and own > _LATEST else 0.0
+
+
+def _stuck(topic: str, offset: StampOffset) -> Problem:
+    text = (
+        f"{topic}: {offset.stuck} of {offset.messages} header stamps hardly differ from the one of"
+        " the message before, although they were recorded at other times: their clock stands still"
+        " or counts in other units; use the times of recording with --set logs.stamps=log."
+    )
+    name = topic.partition(" ")[0]
+    return Problem(name, ProblemKind.STAMP, text, lost=False, assumed=True)
 
 
 def _unstamped(topic: str, offset: StampOffset) -> Problem:

@@ -15,6 +15,7 @@ from semloc_logs.logs.session.pose_problems import (
     optical_base,
     refused_poses,
     smeared,
+    too_far,
 )
 from semloc_logs.logs.session.stamp_offsets import stamp_problems
 
@@ -34,6 +35,7 @@ def conclude(done: CloudPass, roles: Roles) -> list[Problem]:
     ]
     if builder.duplicates is not None:
         problems += builder.duplicates.problems()
+    problems += [too_far(*item) for item in sorted(builder.too_far.items())]
     problems += [looks_up(*item) for item in sorted(builder.looks_up.items())]
     problems += [optical_base(*item) for item in sorted(builder.is_base.items())]
     problems += poses.problems

@@ -7,7 +7,7 @@ each that explains much is named with its estimate.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -27,12 +27,10 @@ from semloc_logs.mapping.fit.model import (
     PARAMETERS,
     ROTATION,
     SCALE,
-    Bools,
     Estimate,
     Fault,
     Pairs,
     PosesAt,
-    cost_of,
     difference,
     fit,
     pose_motion,
@@ -48,8 +46,9 @@ from semloc_logs.mapping.fit.pairs import (
     noise,
     registered,
 )
+from semloc_logs.mapping.fit.readings import FAR_OFF, LEAST_GAIN, far_reading, near_reading
+from semloc_logs.mapping.fit.way import other_distance
 from semloc_logs.mapping.keyframes import Collected
-from semloc_logs.numerics.transforms import inverse
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -60,18 +59,20 @@ FEWEST_PAIRS, MOST_PAIRS = 24, 400
 LEAST_PAIRS = 4
 # a hypothesis explains much: it lowers half of chi squared by so much, and its parameter differs
 # from zero by so many standard deviations
-LEAST_GAIN = 12.0
 LEAST_SIGMAS = 5.0
-# squared distances in the median beyond which other starts of registration are tried, and beyond
-# which other readings of the poses are; with noisy registrations they remain where faults explain
-# the pairs
+# squared distances in the median beyond which other starts of registration are tried; and up to
+# which faults explain the pairs, more with noisy registrations
 DOUBTFUL = 15.0
-FAR_OFF = 40.0
-MUCH_NEARER = 0.05  # such a reading explains the pairs when it lowers the median to this share
 # a pair contradicts its poses when registration brings so many times the points onto planes
 CONTRADICTS = 1.15
-TELLING = 0.2  # registrations with a smaller share of points on planes may have ended anywhere
+# registrations with a smaller share of points on planes may have ended anywhere; a sensor with few
+# lines has so few on planes everywhere, which tell where it brings far more onto them
+TELLING = 0.2
+FEW_TELLING, FEW_CONTRADICT = 0.08, 1.5
 CONTRADICTION = 50.0  # and its squared distance is larger
+# a camera's clouds move otherwise in the median: voxels, and radians
+MOST_OFF, MOST_TURNED = 2.5, 0.045
+UNEXPLAINED = 30.0  # times the noise of registration, of squared distances in the median
 LEAST_CONTRADICTIONS = 2  # one after the other
 
 # what a closure would suffer, in voxels: noted above the first, wrong above the second
@@ -87,11 +88,20 @@ NAMES = {
     "lever_z_m": "a mounting shifted along z",
     "scale_log": "a wrong scale",
 }
+FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
 HIDDEN = 10.0  # a fault that the drive does not show before it has this effect is hidden
-WRONG_TURN = 0.05  # rad, within a pair
+WRONG_TURN = 0.03  # rad, within a pair: a submap of 20 m would be bent by 15 degrees
+LEAST_DRIFT = np.radians(0.3)  # rad/m, worth a word: odometry drifts by a tenth of it
+STEADY = 0.9  # of the turns of contradicting pairs, summed up, where poses drift to one side
 NEAR_VOXELS = 33.0  # a rotation moves points at this distance (10 m at 0.30 m voxels)
 # of the scale, which moves the far end of a submap: odometry of wheels is off by 1 to 2 %
 SCALE_NOTED, SCALE_WRONG = 0.03, 0.06
+
+
+_STUCK_TEXT = (
+    "many of its stamps hardly differ although they were recorded at other times; use the times of"
+    " recording with --set logs.stamps=log"
+)
 
 
 class Severity(Enum):
@@ -211,32 +221,120 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
     for topic in session.roles.ranging:
         rows = [i for i, h in enumerate(collected.headers) if h.topic == topic]
         clouds = Clouds(collected, np.array(rows, np.int64), voxel)
-        check.streams.append(check_stream(topic, clouds, track.at_many))
+        stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
+        # what follows from these would be named with other causes
+        frames = {collected.headers[row].frame_id for row in rows}
+        known = _stuck(session, topic) or _mounting_text(session, frames, voxel)
+        if known:
+            stream.findings = [Finding(Severity.WRONG, known)]
+        _add_lead(stream, session.lead_of(topic), clouds)
+        check.streams.append(stream)
     return check
 
 
-def check_stream(topic: str, clouds: Clouds, poses_at: PosesAt) -> StreamFit:
-    """Checks the keyframes of one stream against the poses."""
+def _stuck(session: Session, topic: str) -> str:
+    """A clock that stands still, or a sensor that repeats itself; else empty."""
+    return _STUCK_TEXT if session.is_stuck(topic) else session.repeats(topic)
+
+
+def _mounting_text(session: Session, frames: Set[str], voxel: float) -> str:
+    """A mounting of ``frames`` that is not in metres, or that changes; else empty."""
+    base_T_sensors = session.base_T_sensors()
+    for frame in sorted(frames & base_T_sensors.keys()):
+        distance = float(np.linalg.norm(base_T_sensors[frame][:3, 3]))
+        if distance > FARTHEST_MOUNTING:
+            return (
+                f"its frame '{frame}' is mounted {distance:.0f} m from '{session.base_frame}': the"
+                " transform is not in metres, or of another vehicle; correct it"
+            )
+        for (parent, child), change in session.mounting_changes(frame).items():
+            if change.distance / voxel + change.angle * NEAR_VOXELS >= WRONG:
+                return (
+                    f"the mounting of '{child}' in '{parent}' is recorded with values that differ"
+                    f" by {change.distance:.2f} m and {np.degrees(change.angle):.1f} degrees: it"
+                    " was calibrated anew, or has two publishers; cut the log there, or give the"
+                    f" right one with --set logs.mountings.{child}=[x,y,z,qx,qy,qz,qw]"
+                )
+    return ""
+
+
+def _add_lead(stream: StreamFit, lead: float, clouds: Clouds) -> None:
+    """Stamps that are later than their recording are wrong, also where the drive does not show it.
+
+    A steady drive along a street hides a clock.
+    """
+    if stream.findings or lead * clouds.rates[0] < WRONG * clouds.voxel:
+        return
+    stream.findings.append(
+        Finding(
+            Severity.WRONG,
+            f"its stamps are up to {lead:.2f} s later than its recording, which the stamps of the"
+            " poses are not: its clock is another one, or was set; give --set logs.time_offset."
+            f"{stream.topic}={-lead:+.2f} where this holds for the whole log, else cut the log",
+        )
+    )
+
+
+def check_stream(
+    topic: str, clouds: Clouds, poses_at: PosesAt, *, are_fixes: bool = False
+) -> StreamFit:
+    """Checks the keyframes of one stream against the poses.
+
+    ``are_fixes``: the poses are fixes of a receiver, whose scatter is noted but not refused.
+    """
     count = len(clouds.rows) // KEYFRAMES_A_PAIR
     numbers = choose(clouds, min(max(count, FEWEST_PAIRS), MOST_PAIRS))
     given = registered(clouds, numbers)
     if len(given.pairs) < LEAST_PAIRS:
         return StreamFit(topic, len(given.pairs))
+    tried = [given]
+    for start in _starts(clouds, poses_at, given):
+        tried.append(registered(clouds, numbers, start))
+        stream = _judged(topic, clouds, poses_at, tried[-1])
+        if stream.findings:
+            return stream
+    stream = _judged(topic, clouds, poses_at, given)
+    # a sensor that looks one way sees other surfaces soon: registration ends where it sees more
+    if not stream.findings and not clouds.sees_one_side():
+        best = max(tried, key=lambda found: float(found.share.sum()))
+        _contradictions(
+            stream, best, poses_at, clouds, Severity.NOTED if are_fixes else Severity.WRONG
+        )
+    elif not stream.findings:
+        _unexplained(stream, given, poses_at, clouds)
+    return stream
+
+
+def _unexplained(stream: StreamFit, found: Registered, poses_at: PosesAt, clouds: Clouds) -> None:
+    """Names a camera most of whose pairs move otherwise than the poses, far beyond its noise."""
+    squares = found.pairs.squares(pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS)))
+    is_off = stream.translation_m > MOST_OFF * clouds.voxel or stream.rotation_rad > MOST_TURNED
+    usual = float(np.nanmedian(squares))
+    if not is_off or usual < UNEXPLAINED or usual < UNEXPLAINED * noise(clouds, found):
+        return
+    stream.findings.append(
+        Finding(
+            Severity.WRONG,
+            f"most of its clouds move otherwise than the poses, by {stream.translation_m:.2f} m and"
+            f" {np.degrees(stream.rotation_rad):.1f} degrees in the median of"
+            f" {len(found.pairs)} pairs, and no offset of a clock or a mounting explains it: its"
+            " calibration (CameraInfo, K, baseline, unit of depth) or the poses are wrong",
+        )
+    )
+
+
+def _starts(clouds: Clouds, poses_at: PosesAt, given: Registered) -> Iterator[Start]:
+    """Other motions than ``given`` ones to start registration from, where they fit far better."""
+    far = other_distance(clouds, given)
+    if far is not None:
+        yield far
     squares = given.pairs.squares(pose_motion(given.pairs, poses_at, np.zeros(PARAMETERS)))
     # poses from which registration hardly moves are not far off
     if float(np.nanmedian(squares)) > DOUBTFUL:
         doubted = Doubted.of(clouds, given, squares)
         for start in (doubted.motion(), doubted.other_poses(poses_at)):
             if start is not None:
-                found = registered(clouds, numbers, start)
-                stream = _judged(topic, clouds, poses_at, found)
-                if stream.findings:
-                    return stream
-    stream = _judged(topic, clouds, poses_at, given)
-    # a sensor that looks one way sees other surfaces soon: registration ends where it sees more
-    if not stream.findings and not clouds.sees_one_side():
-        _contradictions(stream, given, poses_at, clouds.voxel)
-    return stream
+                yield start
 
 
 def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) -> StreamFit:
@@ -251,8 +349,8 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
         float(np.nanmedian(np.linalg.norm(off[:, :3], axis=1))),
         float(np.nanmedian(np.linalg.norm(off[:, 3:], axis=1))),
     )
-    if reading := _other_reading(pairs, poses_at, none):
-        stream.findings.append(reading)
+    if reading := far_reading(pairs, poses_at, none.squares, clouds):
+        stream.findings.append(Finding(Severity.WRONG, reading))
         return stream
     estimate, faults = _explained(pairs, poses_at, none)
     if faults:
@@ -261,8 +359,8 @@ def _judged(topic: str, clouds: Clouds, poses_at: PosesAt, found: Registered) ->
         pairs = refined.pairs
         none = fit(pairs, poses_at, np.zeros(0, np.int64), zero)
         estimate, faults = _explained(pairs, poses_at, none)
-    if reading := _mirrored(pairs, poses_at, none, estimate.cost):
-        stream.findings.append(reading)
+    if reading := near_reading(pairs, poses_at, none.cost, estimate.cost):
+        stream.findings.append(Finding(Severity.WRONG, reading))
         return stream
     rest = float(np.nanmedian(estimate.squares))
     if rest < FAR_OFF or rest < FAR_OFF * noise(clouds, found):
@@ -283,59 +381,6 @@ def _start(clouds: Clouds, poses_at: PosesAt, estimate: Estimate) -> Start:
         return predicted if is_known else motion(clouds, target, source)
 
     return start
-
-
-def _other_reading(pairs: Pairs, poses_at: PosesAt, given: Estimate) -> Finding | None:
-    """Clouds in the fixed frame, or inverted poses, where one of them explains the pairs."""
-    far = float(np.nanmedian(given.squares))
-    if far < FAR_OFF:
-        return None
-    poses, known = pairs.poses(poses_at)
-    fixed = np.tile(np.eye(4), (len(pairs), 1, 1))
-    inverted = poses[:, 0] @ inverse(poses[:, 1])
-    readings = (
-        (
-            fixed,
-            "its clouds do not move although the vehicle does: they are in the fixed frame already,"
-            " and the motion of the vehicle is applied twice; use the clouds as the sensor measures"
-            " them",
-        ),
-        (
-            inverted,
-            "the poses fit when they are inverted: they are of the fixed frame in the frame of the"
-            " vehicle; record or give the poses of the vehicle",
-        ),
-    )
-    nears = [float(np.nanmedian(pairs.squares(_where(known, motion)))) for motion, _ in readings]
-    best = int(np.argmin(nears))
-    if nears[best] < FAR_OFF and nears[best] < MUCH_NEARER * far:
-        return Finding(Severity.WRONG, readings[best][1])
-    return None
-
-
-def _where(known: Bools, motion: F64) -> F64:
-    """Motions (n, 4, 4), nan where the poses are not known."""
-    return np.where(known[:, None, None], motion, np.nan)
-
-
-def _mirrored(pairs: Pairs, poses_at: PosesAt, none: Estimate, most: float) -> Finding | None:
-    """An axis of the clouds that points the other way, where this explains more than faults do.
-
-    ``most``: the cost of what faults leave. Only turns show it, to the side or up and down.
-    """
-    motion, known = pairs.motion(poses_at, 0)
-    for axis, name in enumerate("xyz"):
-        flip = np.diag([-1.0 if k == axis else 1.0 for k in range(4)])
-        predicted = _where(known, flip @ motion @ flip)
-        cost = cost_of(pairs.residuals(predicted))
-        excess = max(1.0, float(np.nanmedian(pairs.squares(predicted))) / MEDIAN_OF_6)
-        if cost <= most and (none.cost - cost) / excess >= LEAST_GAIN:
-            return Finding(
-                Severity.WRONG,
-                f"its clouds are mirrored along {name} of the base frame: they turn the other way"
-                " than the vehicle; correct the sign of the coordinate",
-            )
-    return None
 
 
 def _explained(pairs: Pairs, poses_at: PosesAt, none: Estimate) -> tuple[Estimate, list[Fault]]:
@@ -473,21 +518,31 @@ def _scale_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> s
     )
 
 
-def _contradictions(stream: StreamFit, found: Registered, poses_at: PosesAt, voxel: float) -> None:
+def _contradictions(
+    stream: StreamFit,
+    found: Registered,
+    poses_at: PosesAt,
+    clouds: Clouds,
+    severity: Severity,
+) -> None:
     """Names the time where clouds move otherwise than the poses, and nothing else explains it."""
     predicted = pose_motion(found.pairs, poses_at, np.zeros(PARAMETERS))
     squares = found.pairs.squares(predicted)
     off = difference(found.pairs.measured, predicted)
     meters = np.linalg.norm(off[:, :3], axis=1)
     radians = np.linalg.norm(off[:, 3:], axis=1)
-    excess = max(1.0, float(np.nanmedian(squares)) / MEDIAN_OF_6)
     with np.errstate(invalid="ignore"):
-        rows = np.flatnonzero(
-            (found.share > CONTRADICTS * found.given_share)
-            & (found.share > TELLING)
-            & (squares > CONTRADICTION * excess)
-            & ((meters > WRONG * voxel) | (radians > WRONG_TURN))
-        )
+        gain = found.share / np.maximum(found.given_share, 1e-9)
+        is_other = (gain > CONTRADICTS) & (found.share > TELLING)
+        is_other |= (gain > FEW_CONTRADICT) & (found.share > FEW_TELLING)
+        is_other &= squares > CONTRADICTION
+        is_other &= (meters > WRONG * clouds.voxel) | (radians > WRONG_TURN)
+    if not is_other.any():
+        return
+    # where most pairs are off, their median does not show the noise
+    usual = float(np.nanmedian(squares)) / MEDIAN_OF_6
+    excess = max(1.0, min(usual, noise(clouds, found)))
+    rows = np.flatnonzero(is_other & (squares > CONTRADICTION * excess))
     # single ones are registrations that went wrong
     runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
     rows = np.concatenate([run for run in runs if len(run) >= LEAST_CONTRADICTIONS] or [rows[:0]])
@@ -499,9 +554,21 @@ def _contradictions(stream: StreamFit, found: Registered, poses_at: PosesAt, vox
     most_turned = float(np.degrees(radians[rows].max()))
     stream.findings.append(
         Finding(
-            Severity.WRONG,
+            severity,
             f"{len(rows)} of {len(found.pairs)} pairs of its clouds move otherwise than the poses,"
             f" by up to {farthest:.1f} m and {most_turned:.0f} degrees ({time_range(first, last)}):"
-            " the poses are wrong there; cut the log, or give others with --poses FILE",
+            f" the poses are wrong there{_drift_text(off[rows], predicted[rows])}; cut the log, or"
+            " give others with --poses FILE",
         )
     )
+
+
+def _drift_text(off: F64, predicted: F64) -> str:
+    """How fast poses drift that turn wrongly everywhere and to the same side; else empty."""
+    way = np.linalg.norm(predicted[:, :3, 3], axis=1).sum()
+    turns = off[:, 3:]
+    together = float(np.linalg.norm(turns.sum(0)))
+    is_steady = together >= STEADY * float(np.linalg.norm(turns, axis=1).sum())
+    if not is_steady or together < LEAST_DRIFT * way:
+        return ""
+    return f", their rotation drifts by {np.degrees(together) / way:.1f} degrees a metre"

@@ -131,10 +131,13 @@ class Estimate:
 def pose_motion(pairs: Pairs, poses_at: PosesAt, parameters: F64) -> F64:
     """``target_T_source`` (n, 4, 4) as range data would show it, by the poses and ``parameters``.
 
-    nan where a pose is unknown.
+    An offset of the clock explains nothing where it leads out of the poses: the motion is as it was
+    there. nan where a pose is unknown without an offset, too.
     """
-    motion, known = pairs.motion(poses_at, round(float(parameters[CLOCK]) * 1e9))
-    motion = motion.copy()
+    shifted, is_reached = pairs.motion(poses_at, round(float(parameters[CLOCK]) * 1e9))
+    unshifted, known = pairs.motion(poses_at, 0)
+    motion = np.where(is_reached[:, None, None], shifted, unshifted)
+    known = known | is_reached
     motion[:, :3, 3] *= np.exp(parameters[SCALE])
     mounting = np.eye(4)
     mounting[:3, :3] = Rotation.from_rotvec(parameters[ROTATION]).as_matrix()

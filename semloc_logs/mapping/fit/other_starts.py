@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.fit.model import LONGEST_OFFSET, OFFSET_STEP, PosesAt
 from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, Start, motion
+from semloc_logs.mapping.fit.readings import CONVENTIONS, otherwise_written
 from semloc_logs.numerics.transforms import inverse
 
 F64 = NDArray[np.float64]
@@ -57,9 +58,12 @@ class Doubted:
         return start if share > max(BETTER * self.share, 1e-9) else None
 
     def other_poses(self, poses_at: PosesAt) -> Start | None:
-        """The poses at other times, mirrored or inverted, where far more points lie on planes."""
+        """The poses at other times, mirrored, inverted or written by another convention, where far
+        more points lie on planes.
+        """
         starts = [
             _of_inverted(self.clouds),
+            *_of_conventions(self.clouds),
             *_of_clocks(self.clouds, poses_at),
             *_of_mirrors(self.clouds),
         ]
@@ -118,6 +122,18 @@ def _of_inverted(clouds: Clouds) -> Start:
         return np.asarray(from_pose @ inverse(to_pose))
 
     return start
+
+
+def _of_conventions(clouds: Clouds) -> Iterator[Start]:
+    """Motions by poses whose rotations or positions were written by another convention."""
+    for number in range(CONVENTIONS):
+
+        def start(target: int, source: int, number: int = number) -> F64:
+            pair = np.array([clouds.pose(target), clouds.pose(source)])
+            motions = [motion[0] for motion, _ in otherwise_written(pair[None])]
+            return np.asarray(motions[number])
+
+        yield start
 
 
 def _of_mirrors(clouds: Clouds) -> Iterator[Start]:

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Pairs, difference
-from semloc_logs.mapping.fit.plane_cells import Fit, PlaneCells, register, share_at
+from semloc_logs.mapping.fit.plane_cells import (
+    Fit,
+    PlaneCells,
+    register,
+    share_along,
+    share_at,
+)
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle
@@ -178,6 +184,12 @@ class Registrar:
         planes = self._planes(target)[1]
         points = self._some_points(source)
         return np.array([share_at(planes, points, pose) for pose in poses])
+
+    def shares_along(self, target: int, source: int, poses: Sequence[F64], direction: F64) -> F64:
+        """As :meth:`shares`, of what shows a motion along a unit ``direction`` (3,)."""
+        planes = self._planes(target)[1]
+        points = self._some_points(source)
+        return np.array([share_along(planes, points, pose, direction) for pose in poses])
 
     def _some_points(self, source: int) -> F64:
         if self._source != source:

@@ -87,6 +87,15 @@ def share_at(target: PlaneCells, source: F64, pose: F64) -> float:
     return count / max(len(source), 1)
 
 
+def share_along(target: PlaneCells, source: F64, pose: F64, direction: F64) -> float:
+    """As :func:`share_at`, of what shows a motion along a unit ``direction`` (3,) of the target.
+
+    A point counts by the square of its plane's slope against the direction: the ground and the
+    walls along a street count nothing, they lie on themselves wherever the vehicle is.
+    """
+    return _weight_along(target_arrays(target), source, pose, direction) / max(len(source), 1)
+
+
 def target_arrays(target: PlaneCells) -> tuple[float, I64, I64, F64, F64]:
     """The fields as compiled functions take them."""
     return target.size, target.table, target.rows, target.means, target.normals
@@ -150,13 +159,69 @@ def _planes(points: F64, size: float) -> tuple[I64, I64, F64, F64]:
 
 
 @njit(cache=True, nogil=True)
+def _nearest(target: tuple[float, I64, I64, F64, F64], q: F64) -> int:
+    """The plane of the eight cells around the corner that is nearest to a point; -1 without one."""
+    size, table, rows, means, _ = target
+    x0 = np.int64(np.floor(q[0] / size - 0.5))
+    y0 = np.int64(np.floor(q[1] / size - 0.5))
+    z0 = np.int64(np.floor(q[2] / size - 0.5))
+    best = -1
+    least = size * size
+    for corner in range(8):
+        x = x0 + (corner & 1)
+        y = y0 + ((corner >> 1) & 1)
+        z = z0 + (corner >> 2)
+        row = rows[place_of(table, (x << 42) + (y << 21) + z)]
+        if row < 0:
+            continue
+        distance = (
+            (q[0] - means[row, 0]) ** 2 + (q[1] - means[row, 1]) ** 2 + (q[2] - means[row, 2]) ** 2
+        )
+        if distance < least:
+            least = distance
+            best = row
+    return int(best)
+
+
+@njit(cache=True, nogil=True)
+def _move(pose: F64, point: F64, q: F64) -> None:
+    """Fill ``q`` with a point (3,) moved by a pose (4, 4)."""
+    for k in range(3):
+        q[k] = pose[k, 0] * point[0] + pose[k, 1] * point[1] + pose[k, 2] * point[2] + pose[k, 3]
+
+
+@njit(cache=True, nogil=True)
+def _weight_along(
+    target: tuple[float, I64, I64, F64, F64], source: F64, pose: F64, direction: F64
+) -> float:
+    """Squared slopes of the planes that moved points lie on."""
+    size, _, _, means, normals = target
+    scale = (size / 6.0) ** 2
+    weight = 0.0
+    q = np.empty(3)
+    for i in range(len(source)):
+        _move(pose, source[i], q)
+        best = _nearest(target, q)
+        if best < 0:
+            continue
+        error = 0.0
+        slope = 0.0
+        for k in range(3):
+            error += normals[best, k] * (q[k] - means[best, k])
+            slope += normals[best, k] * direction[k]
+        if error * error < scale:
+            weight += slope * slope
+    return weight
+
+
+@njit(cache=True, nogil=True)
 def _normal_equations(
     target: tuple[float, I64, I64, F64, F64], source: F64, pose: F64, hessian: F64, gradient: F64
 ) -> tuple[int, float]:
     """Fill ``hessian`` and ``gradient`` of the squared distances; the points on planes, and their
     sum of squares. Distances above a sixth of a cell count less and less (Geman and McClure).
     """
-    size, table, rows, means, normals = target
+    size, _, _, means, normals = target
     hessian[:] = 0.0
     gradient[:] = 0.0
     scale = (size / 6.0) ** 2
@@ -165,34 +230,8 @@ def _normal_equations(
     q = np.empty(3)
     jacobian = np.empty(6)
     for i in range(len(source)):
-        for k in range(3):
-            q[k] = (
-                pose[k, 0] * source[i, 0]
-                + pose[k, 1] * source[i, 1]
-                + pose[k, 2] * source[i, 2]
-                + pose[k, 3]
-            )
-        # the eight cells around the corner that is nearest to the point
-        x0 = np.int64(np.floor(q[0] / size - 0.5))
-        y0 = np.int64(np.floor(q[1] / size - 0.5))
-        z0 = np.int64(np.floor(q[2] / size - 0.5))
-        best = -1
-        least = size * size
-        for corner in range(8):
-            x = x0 + (corner & 1)
-            y = y0 + ((corner >> 1) & 1)
-            z = z0 + (corner >> 2)
-            row = rows[place_of(table, (x << 42) + (y << 21) + z)]
-            if row < 0:
-                continue
-            distance = (
-                (q[0] - means[row, 0]) ** 2
-                + (q[1] - means[row, 1]) ** 2
-                + (q[2] - means[row, 2]) ** 2
-            )
-            if distance < least:
-                least = distance
-                best = row
+        _move(pose, source[i], q)
+        best = _nearest(target, q)
         if best < 0:
             continue
         n = normals[best]

@@ -44,6 +44,24 @@ def test_big_endian_float64() -> None:
     assert p.label.tolist() == [258]
 
 
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+@pytest.mark.parametrize("is_big", [False, True])
+def test_a_wrong_flag_for_the_order_of_bytes_is_seen_from_the_coordinates(
+    kind: str, is_big: bool
+) -> None:
+    size = np.dtype(kind).itemsize
+    points = np.random.default_rng(1).uniform(-60, 60, (500, 3))
+    points[::7] = 0.0
+    points[3] = np.nan
+    data = points.astype((">" if is_big else "<") + kind).tobytes()
+    fields = [Field(axis, k * size, kind) for k, axis in enumerate("xyz")]
+    right = decode_points(data, Layout(500, 1, 3 * size, 0, big_endian=is_big), fields, STAMP)
+    wrong = decode_points(data, Layout(500, 1, 3 * size, 0, big_endian=not is_big), fields, STAMP)
+    assert 400 < len(right.points) < 500
+    np.testing.assert_array_equal(wrong.points, right.points)
+    assert wrong.not_finite == right.not_finite == 1
+
+
 def test_rows_with_padding_and_points_that_are_none() -> None:
     nan = float("nan")
     inf = float("inf")

@@ -60,6 +60,62 @@ def test_two_publishers_in_turn_are_recognised() -> None:
     assert len(jump.stamps_ns) > 150
 
 
+def test_noisy_poses_are_not_taken_for_two_publishers() -> None:
+    poses = _drive()
+    poses[:, :2, 3] += np.random.default_rng(3).normal(0, 0.6, (200, 2))
+    jump = implausible(_track(poses))
+    assert jump is not None
+    assert "jump to and fro" in jump.text
+    assert "too noisy to build a map with" in jump.text
+
+
+@pytest.mark.parametrize("is_made_up", [False, True], ids=["goes on there", "has moved on"])
+def test_poses_that_freeze_at_once_are_recognised(is_made_up: bool) -> None:
+    poses = _drive(300)
+    if not is_made_up:
+        poses[160:] = poses[120] @ inverse(poses[160]) @ poses[160:]
+    poses[120:160] = poses[120]  # 2 s
+    jump = implausible(_track(poses))
+    assert jump is not None
+    if is_made_up:
+        assert "jump once" in jump.text
+        return
+    assert "the poses are exactly the same from 1970-01-01T00:00:06.050Z" in jump.text
+    assert "8.0 m/s: the odometry froze" in jump.text
+
+
+def test_poses_that_freeze_until_the_end_are_recognised() -> None:
+    poses = _drive()
+    poses[120:] = poses[120]
+    jump = implausible(_track(poses))
+    assert jump is not None
+    assert "the odometry froze" in jump.text
+
+
+def test_a_vehicle_that_brakes_and_stands_is_possible() -> None:
+    speeds = np.r_[np.full(60, 8.0), np.arange(8.0, 0.0, -0.4), np.zeros(80), np.full(1, 0.4)]
+    way = np.cumsum(speeds * 0.05)
+    poses = np.array([yaw_transform(0.0, (x, 0.0, 0.0)) for x in way])
+    assert implausible(_track(poses)) is None
+
+
+def test_poses_that_repeat_between_slow_updates_are_possible() -> None:
+    assert implausible(_track(np.repeat(_drive(40), 8, axis=0))) is None
+
+
+def test_odometry_that_lost_the_way_in_a_gap_is_recognised() -> None:
+    poses = _drive(turn=0.0)
+    poses[140:] = poses[99] @ inverse(poses[139]) @ poses[140:]
+    track = PoseTrack()
+    for i, pose in enumerate(poses):
+        if not 100 <= i < 140:  # 2 s without poses
+            track.append((i + 1) * STEP_NS, pose)
+    jump = implausible(track)
+    assert jump is not None
+    assert "the poses have a gap of 2.05 s from 1970-01-01T00:00:05.000Z" in jump.text
+    assert "the odometry lost the way between" in jump.text
+
+
 def test_a_slow_publisher_among_the_poses_of_a_fast_one_is_recognised() -> None:
     poses = _drive()
     poses[2::5] = yaw_transform(0.0, (0.0, 4.0, 0.0)) @ poses[2::5]
@@ -78,6 +134,7 @@ def test_a_restart_at_the_identity_is_recognised_with_and_without_a_silence(sile
     jump = implausible(track)
     assert jump is not None
     assert "start again at the identity" in jump.text
+    assert ("without any" in jump.text) == (silent > 0)
     assert jump.stamps_ns == ((121 + silent) * STEP_NS,)
 
 

@@ -116,3 +116,17 @@ def test_dynamic_overrules_static_for_the_same_edge() -> None:
     assert found is not None
     assert found[0, 3] == 10.0
     assert tree.edges == [("a", "b", False)]
+
+
+def test_the_largest_change_of_a_static_transform_is_kept() -> None:
+    tree = TransformTree()
+    tree.add(TransformSample(Header("", 0, 0, "base"), "lidar", np.eye(4), static=True))  # lent
+    tree.add(edge("base", "lidar", yaw_transform(0.0, (1.0, 0.0, 0.0))))
+    tree.add(edge("base", "lidar", yaw_transform(0.0, (1.0, 0.0, 1e-5))))
+    assert tree.changes == {}
+    tree.add(edge("base", "lidar", yaw_transform(0.0, (1.5, 0.0, 0.0))))
+    tree.add(edge("base", "lidar", yaw_transform(0.3, (1.5, 0.0, 0.0))))
+    change = tree.changes["base", "lidar"]
+    assert change.distance == pytest.approx(0.5)
+    assert change.angle == pytest.approx(0.0)
+    assert list(tree.changes) == [("base", "lidar")]

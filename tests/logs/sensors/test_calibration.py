@@ -76,6 +76,20 @@ def test_a_driver_that_writes_the_size_and_k_of_the_picture() -> None:
     assert assumption == ""
 
 
+@pytest.mark.parametrize(
+    ("matrix", "is_assumed"),
+    [((500, 400, 322, 236), False), ((1000, 800, 644, 472), True), ((250, 200, 161, 118), True)],
+    ids=["of the picture", "twice as large", "half as large"],
+)
+def test_a_calibration_of_a_picture_of_another_size_is_named(
+    matrix: tuple[int, int, int, int], is_assumed: bool
+) -> None:
+    fitted, assumption = fitted_camera(camera(K=matrix), 480, 640)
+    assert four(fitted) == list(matrix)
+    assert ("as of a picture of another size" in assumption) == is_assumed
+    assert f"lies at ({matrix[2]}, {matrix[3]})" in assumption or not is_assumed
+
+
 def test_a_driver_that_writes_the_size_of_the_picture_but_k_of_the_sensor() -> None:
     fitted, assumption = fitted_camera(camera((2, 2), width=320, height=240), 240, 320)
     assert four(fitted) == [250, 200, 161, 118]

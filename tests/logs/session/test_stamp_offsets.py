@@ -168,6 +168,54 @@ def test_a_clock_that_is_set_during_the_log_is_named(recorder: Recorder) -> None
     assert "/points: its header stamps change by 7.00 s against the ones of /odom" in problem.text
 
 
+@pytest.mark.parametrize(
+    ("stamp_of", "stuck"),
+    [
+        (lambda ns: EPOCH, 59),
+        (lambda ns: min(ns, EPOCH + 3 * S), 29),
+        (lambda ns: ns // S * S, 54),
+        (lambda ns: ns // S * S + ns % S // 1000, 54),
+    ],
+    ids=["all", "from the middle on", "whole seconds", "microseconds"],
+)
+def test_stamps_that_stand_still_are_named(
+    recorder: Recorder, stamp_of: Callable[[int], int], stuck: int
+) -> None:
+    log = recorder()
+    for k in range(60):
+        time_ns = EPOCH + k * 100 * MS
+        points = np.full(3, k, POINT)
+        stamp_ns = stamp_of(time_ns)
+        log.cloud("/points", stamp_ns, "base_link", points, late_ns=time_ns - stamp_ns)
+        log.pose(time_ns, yaw_transform(0.0, (0.1 * k, 0.0, 0.0)))
+    session, _ = fused(log.write())
+    [problem] = stamp_problems(session)
+    assert problem.assumed
+    assert f"/points: {stuck} of 60 header stamps hardly differ" in problem.text
+    assert "--set logs.stamps=log" in problem.text
+    assert session.is_stuck("/points")
+    assert not session.is_stuck("/odom")
+
+
+@pytest.mark.parametrize(
+    ("until", "after", "lead"), [(0.0, 0.5, 0.5), (0.4, 0.4, 0.4), (0.0, -0.5, 0.0), (0, 0.05, 0)]
+)
+def test_stamps_later_than_their_recording_lead_by_what_a_clock_cannot(
+    recorder: Recorder, until: float, after: float, lead: float
+) -> None:
+    """A clock that is ahead, from the start or since it was set halfway; one behind may be late."""
+    log = recorder()
+    for k in range(60):
+        time_ns = EPOCH + k * 100 * MS
+        stamp_ns = time_ns + round((until if k < 30 else after) * S)
+        log.cloud(
+            "/points", stamp_ns, "base_link", np.full(3, k, POINT), late_ns=time_ns - stamp_ns
+        )
+        log.pose(time_ns, yaw_transform(0.0, (0.1 * k, 0.0, 0.0)))
+    session, _ = fused(log.write())
+    assert session.lead_of("/points") == pytest.approx(lead, abs=0.02)
+
+
 def test_zero_stamps_mean_log_times(recorder: Recorder) -> None:
     """Sweeps are recorded 0.1 s late: without stamps, that is their time."""
     path = drive(recorder, sweeps=None, poses=None)

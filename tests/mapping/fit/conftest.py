@@ -78,8 +78,9 @@ def drive(
     is_fixed: bool = False,
     is_camera: bool = False,
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    as_written: Callable[[F64], F64] = lambda poses: poses,
 ) -> tuple[Clouds, PoseTrack]:
-    """Keyframes three times a second, and the poses twenty times a second.
+    """Keyframes three times a second, and the poses twenty times a second, as they are written.
 
     The clouds are stamped ``clock`` seconds late; their mounting is wrong by ``base_T_assumed``
     (true base frame from the one of the clouds); ``scale`` times as large; or in the session frame.
@@ -89,7 +90,7 @@ def drive(
     rng = np.random.default_rng(5)
     times = np.arange(0.0, seconds, 0.05)
     track = PoseTrack()
-    for time, pose in zip(times, poses_of(times), strict=True):
+    for time, pose in zip(times, as_written(poses_of(times)), strict=True):
         track.append(SECOND + round(time * 1e9), pose)
     collected = Collected(folder, VOXEL / 3)
     taken = np.arange(1.5, seconds - 1.5, 1 / 3)

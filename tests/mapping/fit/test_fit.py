@@ -10,13 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.fit.check import SessionFit, Severity, StreamFit, check_stream
 from semloc_logs.mapping.fit.plane_cells import PlaneCells, register
-from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle
+from semloc_logs.mapping.keyframes import Collected
+from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import load
 from semloc_logs.stages.check import check_log
 
+F64 = NDArray[np.float64]
 TOPIC = "/points"  # of the drives
 Check = Callable[..., StreamFit]
 
@@ -156,19 +160,147 @@ def test_a_mirrored_axis_is_found_where_the_vehicle_turns(
     assert f"mirrored along {axis} of the base frame" in _only(check(signs=signs))
 
 
-def test_poses_that_are_inverted_are_not_taken_for_clouds_in_the_fixed_frame(
-    tmp_path: Path, streets: SimpleNamespace
+def test_poses_that_are_inverted_are_not_taken_for_clouds_in_the_fixed_frame(check: Check) -> None:
+    text = _only(check(as_written=inverse))
+    assert "the poses fit when they are inverted" in text
+
+
+def _gently(seconds: F64) -> F64:
+    """Poses of a nearly straight drive at 4 m/s: within half a metre of a line, by 3 degrees."""
+    way = 4.0 * seconds
+    yaw = np.arctan(0.05 * np.cos(way / 10.0))
+    return np.array(
+        [yaw_transform(a, (x, 0.5 * np.sin(x / 10.0), 1.5)) for a, x in zip(yaw, way, strict=True)]
+    )
+
+
+def _with_quaternions(change: Callable[[F64], F64]) -> Callable[[F64], F64]:
+    def written(poses: F64) -> F64:
+        out = poses.copy()
+        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        out[:, :3, :3] = Rotation.from_quat(change(quaternions)).as_matrix()
+        return out
+
+    return written
+
+
+def _with_other_side(poses: F64) -> F64:
+    out = poses.copy()
+    out[:, 1, 3] *= -1.0
+    return out
+
+
+@pytest.mark.parametrize("is_gentle", [True, False])
+@pytest.mark.parametrize(
+    ("as_written", "text"),
+    [
+        (_with_quaternions(lambda q: q[:, [3, 0, 1, 2]]), "read as w, x, y, z"),
+        (_with_quaternions(lambda q: q * [-1, -1, -1, 1]), "rotations are inverted, but not"),
+        (_with_other_side, "y of their positions has the other sign"),
+    ],
+    ids=["w first", "inverted rotations", "left-handed positions"],
+)
+def test_poses_of_another_convention_are_named_by_it(
+    check: Check, is_gentle: bool, as_written: Callable[[F64], F64], text: str, streets: Any
 ) -> None:
-    def inverted(seconds: np.ndarray) -> np.ndarray:
-        poses: np.ndarray = inverse(streets.winding(seconds))
+    poses_of = _gently if is_gentle else streets.winding
+    seconds = 12.0 if is_gentle else 18.0
+    assert text in _only(check(poses_of, seconds=seconds, as_written=as_written))
+
+
+@pytest.mark.parametrize("factor", [0.4, 3.28])
+@pytest.mark.parametrize("is_gentle", [True, False])
+def test_poses_of_another_unit_are_found_from_any_distance(
+    check: Check, factor: float, is_gentle: bool, streets: SimpleNamespace
+) -> None:
+    def scaled(poses: F64) -> F64:
+        out = poses.copy()
+        out[:, :3, 3] *= factor
+        return out
+
+    poses_of = _gently if is_gentle else streets.winding
+    fit = check(poses_of, seconds=12.0, as_written=scaled)
+    assert "times as far as the poses" in _only(fit)
+    assert np.exp(fit.parameters["scale_log"][0]) == pytest.approx(1 / factor, rel=0.05)
+
+
+def test_odometry_that_turns_too_far_all_the_time_is_named_with_its_drift(check: Check) -> None:
+    def drifted(poses: F64) -> F64:
+        out = poses.copy()
+        for i in range(1, len(poses)):
+            step = inverse(poses[i - 1]) @ poses[i]
+            turn = np.radians(1.0) * float(np.linalg.norm(step[:3, 3]))  # 1 degree a metre
+            out[i] = out[i - 1] @ step @ yaw_transform(turn, (0.0, 0.0, 0.0))
+        return out
+
+    text = _only(check(as_written=drifted))
+    assert "their rotation drifts by 1.0 degrees a metre" in text
+
+
+def test_odometry_that_rolls_to_and_fro_is_named(check: Check) -> None:
+    def rolling(poses: F64) -> F64:
+        rolls = np.radians(4.0) * np.sin(0.3 * np.arange(len(poses)))
+        turns = [exp_se3(np.zeros(3), np.array([roll, 0.0, 0.0])) for roll in rolls]
+        return np.asarray(poses @ np.array(turns))
+
+    text = _only(check(as_written=rolling))
+    assert "move otherwise than the poses" in text
+    assert "a metre" not in text
+
+
+def test_clouds_that_stand_still_beside_poses_that_move_are_not_taken_for_the_fixed_frame(
+    check: Check, streets: SimpleNamespace
+) -> None:
+    def standing(seconds: F64) -> F64:
+        poses: F64 = streets.winding(np.zeros_like(seconds))
         return poses
 
-    clouds, _ = streets.drive(tmp_path)
-    (tmp_path / "other").mkdir()
-    _, track = streets.drive(tmp_path / "other", inverted)
-    clouds.collected.poses[:] = list(track.at_many(clouds.stamps_ns())[0])
-    text = _only(check_stream(TOPIC, clouds, track.at_many))
-    assert "the poses fit when they are inverted" in text
+    def moving(poses: F64) -> F64:
+        written: F64 = streets.winding(0.05 * np.arange(len(poses)))
+        return written
+
+    text = _only(check(standing, as_written=moving))
+    assert "move otherwise than the poses" in text
+
+
+def test_a_camera_that_nothing_explains_is_named_with_its_calibration(
+    shared: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A focal length that is twice the true one: what is beside lies half as far beside."""
+    loaded = Collected.load
+
+    def squeezed(self: Collected, keyframe: int) -> Any:
+        points, labels, sigma = loaded(self, keyframe)
+        return points * np.array([0.5, 0.5, 1.0], np.float32), labels, sigma
+
+    log = shared("logs/room_a.mcap")
+    settings = load(assignments={"fusion.voxel_size": "0.05"})
+    [good] = check_log(log, settings, {}).streams
+    assert good.findings == []
+    monkeypatch.setattr(Collected, "load", squeezed)
+    [stream] = check_log(log, settings, {}).streams
+    assert "most of its clouds move otherwise than the poses" in _only(stream)
+    assert "calibration (CameraInfo, K" in _only(stream)
+
+
+def test_a_straight_drive_backwards_is_an_inverted_pose_or_a_turned_mounting(
+    check: Check, streets: SimpleNamespace
+) -> None:
+    about = exp_se3(np.zeros(3), np.array([0.0, 0.0, np.pi]))
+    text = _only(check(streets.straight, seconds=12.0, base_T_assumed=about))
+    assert "when the mounting is turned by 180 degrees about z" in text
+    assert "which the drive does not tell apart" in text
+    assert "mounting is turned by" in _only(check(base_T_assumed=about))
+
+
+def test_an_offset_of_the_clock_that_leads_out_of_the_poses_explains_nothing(
+    check: Check,
+) -> None:
+    """A short drive whose clouds stand still has no clock by which they would not."""
+    fit = check(
+        _gently, seconds=8.0, as_written=lambda poses: np.tile(poses[:1], (len(poses), 1, 1))
+    )
+    assert not any("clock" in finding.text for finding in fit.findings)
 
 
 def test_clouds_in_the_fixed_frame_are_found(check: Check) -> None:

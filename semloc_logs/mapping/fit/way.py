@@ -1,0 +1,70 @@
+"""How far clouds of a pair lie apart, searched along the way that the poses give.
+
+Along a street the ground and the walls lie on themselves at any distance, so that a registration
+from a wrong distance ends where it began. What stands across the way shows the right one, but only
+from nearby: it is searched in small steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, Start, motion
+
+F64 = NDArray[np.float64]
+
+TRIED = 6  # pairs that show the distance together
+FEWEST = 3
+LEAST_WAY = 3.0  # voxels between both clouds of such a pair
+STEP = 0.3  # voxels, of the search: points lie on planes within a third of a voxel
+FARTHEST = 40.0  # voxels; clouds that lie farther apart have little in common
+MOST = 4.0  # times as far as by the poses
+# the distance is another one when so many times as much across the way lies on planes there; at the
+# right one it is about five times as much as anywhere else
+BETTER = 1.8
+
+
+def other_distance(clouds: Clouds, found: Registered) -> Start | None:
+    """Motions so many times as long as by the poses, where these fit far better than ``found``."""
+    ways = np.array([float(np.linalg.norm(_way(clouds, pair))) for pair in found.numbers.tolist()])
+    rows = np.flatnonzero(ways >= LEAST_WAY * clouds.voxel)
+    if len(rows) < FEWEST:
+        return None
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, TRIED).round().astype(np.int64))]
+    usual = float(np.median(ways[rows]))
+    step = STEP * clouds.voxel / usual
+    factors = np.arange(step, min(MOST, FARTHEST * clouds.voxel / usual), step)
+    registrar = Registrar(clouds)
+    shares = np.zeros(len(factors))
+    found_share = 0.0
+    for row in rows.tolist():
+        target, source = found.numbers[row].tolist()
+        given = motion(clouds, target, source)
+        direction = given[:3, 3] / ways[row]
+        tried = [_lengthened(given, factor) for factor in factors]
+        shares += registrar.shares_along(target, source, tried, direction)
+        measured = [found.pairs.measured[row]]
+        found_share += float(registrar.shares_along(target, source, measured, direction)[0])
+    best = int(np.argmax(shares)) if len(shares) else 0
+    if not len(shares) or shares[best] <= max(BETTER * found_share, 1e-9):
+        return None
+    return _start(clouds, float(factors[best]))
+
+
+def _way(clouds: Clouds, pair: list[int]) -> F64:
+    """The translation (3,) of a pair by the poses."""
+    return motion(clouds, *pair)[:3, 3]
+
+
+def _lengthened(given: F64, factor: float) -> F64:
+    """A motion (4, 4) of another length."""
+    out = given.copy()
+    out[:3, 3] *= factor
+    return out
+
+
+def _start(clouds: Clouds, factor: float) -> Callable[[int, int], F64]:
+    return lambda target, source: _lengthened(motion(clouds, target, source), factor)

@@ -1,0 +1,109 @@
+"""Frames, mountings and units that a log gives wrongly: turned round where sure, else named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from semloc_logs.logs.session.session import Session, open_session
+from semloc_logs.mapping.fit.check import SessionFit
+from semloc_logs.numerics.transforms import inverse, yaw_transform
+from semloc_logs.settings import load
+from semloc_logs.stages.check import check_log
+
+S = 1_000_000_000
+MS = 1_000_000
+EPOCH = 1_700_000_000 * S
+POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+
+Recorder = Callable[..., Any]
+
+
+def _sweep(scale: float = 1.0, seed: int = 0) -> Any:
+    points = np.zeros(400, POINT)
+    values = scale * np.random.default_rng(seed).uniform(3, 20, (400, 3))
+    points["x"], points["y"], points["z"] = values.T
+    return points
+
+
+def _fused(log: Path) -> tuple[Session, list[Any]]:
+    session = open_session([log])
+    try:
+        return session, list(session.clouds())
+    finally:
+        session.close()
+
+
+def _check(log: Path) -> SessionFit:
+    return check_log(log, load(), {})
+
+
+@pytest.mark.parametrize("is_turned", [False, True], ids=["REP 105", "upside down"])
+def test_a_tree_of_transforms_that_is_upside_down_gives_the_same_poses(
+    recorder: Recorder, is_turned: bool
+) -> None:
+    log = recorder()
+    for k in range(60):
+        stamp_ns = EPOCH + k * 50 * MS
+        pose = yaw_transform(0.01 * k, (0.1 * k, 0.0, 0.0))
+        if is_turned:
+            log.transform("base_link", "odom", inverse(pose), stamp_ns, "/tf")
+        else:
+            log.transform("odom", "base_link", pose, stamp_ns, "/tf")
+        if k % 10 == 5:
+            log.cloud("/points", stamp_ns, "base_link", _sweep(seed=k))
+    session, clouds = _fused(log.write())
+    assert session.session_frame == "odom"
+    assert len(clouds) == 6
+    expected = yaw_transform(0.25, (2.5, 0.0, 0.0))
+    np.testing.assert_allclose(clouds[2].session_T_base, expected, atol=1e-6)
+    named = [p for p in session.problems if "TF gives the fixed frame 'odom' below" in p.text]
+    assert len(named) == is_turned
+
+
+@pytest.mark.parametrize(
+    ("mountings", "text"),
+    [
+        ([(0.0, 1.0), (0.0, 1.0)], ""),
+        ([(0.0, 1000.0)], "its frame 'lidar' is mounted 1000 m from 'base_link'"),
+        ([(0.0, 1.0), (0.35, 1.0)], "values that differ by 0.00 m and 20.1 degrees"),
+    ],
+    ids=["sent twice", "millimetres", "changed"],
+)
+def test_mountings_that_cannot_be_right_are_named(
+    recorder: Recorder, mountings: list[tuple[float, float]], text: str
+) -> None:
+    log = recorder()
+    for k in range(60):
+        stamp_ns = EPOCH + k * 50 * MS
+        if k % (60 // len(mountings)) == 0:
+            yaw, ahead = mountings[k * len(mountings) // 60]
+            log.transform("base_link", "lidar", yaw_transform(yaw, (ahead, 0, 0)), stamp_ns)
+        log.pose(stamp_ns, yaw_transform(0.0, (0.2 * k, 0.0, 0.0)))
+        if k % 10 == 5:
+            log.cloud("/points", stamp_ns, "lidar", _sweep(seed=k))
+    check = _check(log.write())
+    texts = [finding.text for stream in check.streams for finding in stream.findings]
+    assert check.fits == (not text)
+    assert [text in found for found in texts] == [True] * bool(text)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0], ids=["metres", "millimetres"])
+def test_points_that_are_not_in_metres_are_named_by_their_unit(
+    recorder: Recorder, scale: float
+) -> None:
+    log = recorder()
+    for k in range(60):
+        stamp_ns = EPOCH + k * 50 * MS
+        log.pose(stamp_ns, yaw_transform(0.0, (0.2 * k, 0.0, 0.0)))
+        if k % 10 == 5:
+            log.cloud("/points", stamp_ns, "base_link", _sweep(scale, seed=k))
+    session, clouds = _fused(log.write())
+    named = [p for p in session.problems if "their unit is millimetres or centimetres" in p.text]
+    assert len(named) == (scale > 1)
+    assert bool(clouds) == (scale == 1.0)
+    assert all(p.is_reported for p in named)
