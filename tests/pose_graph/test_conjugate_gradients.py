@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.numerics.transforms import exp_se3
 from semloc_logs.pose_graph import solver
-from semloc_logs.pose_graph.normal_equations import NormalEquations, PosePriors, moved
+from semloc_logs.pose_graph.graph import Positions
+from semloc_logs.pose_graph.normal_equations import Holds, NormalEquations, PosePriors, moved
 from semloc_logs.pose_graph.problem import Directions, Edges
 from semloc_logs.settings import load
 from semloc_logs.stages.optimise import optimise
@@ -19,7 +20,7 @@ SETTINGS = load().resolved()
 
 
 def _random_equations(rng: np.random.Generator) -> tuple[NormalEquations, np.ndarray]:
-    """Three poses that two edges, a prior and two directions hold, none of them fulfilled."""
+    """Three poses that two edges, a prior, two directions and a fix hold, none fulfilled."""
 
     def pose(scale: float) -> np.ndarray:
         return exp_se3(rng.normal(0, scale, 3), rng.normal(0, 0.5, 3))
@@ -35,7 +36,11 @@ def _random_equations(rng: np.random.Generator) -> tuple[NormalEquations, np.nda
     )
     up = Directions(np.array([0, 2]), np.array([[0.0, 0.1, 0.99], [0.2, 0.0, 0.98]]), 2.0)
     priors = PosePriors(np.array([1]), np.array([pose(1.0)]), np.array([root()]))
-    return NormalEquations(3, edges, up, priors), np.array([pose(1.0) for _ in range(3)])
+    sigma = np.array([[1.0, 2.0, 3.0]])
+    fixes = Positions(np.array([2]), rng.normal(size=(1, 3)), rng.normal(size=(1, 3)), sigma)
+    return NormalEquations(3, edges, Holds(up, priors, fixes)), np.array(
+        [pose(1.0) for _ in range(3)]
+    )
 
 
 def test_the_gradient_is_the_slope_of_the_cost() -> None:
