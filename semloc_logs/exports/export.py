@@ -1,5 +1,5 @@
-"""Sessions and closures in other programs' formats: poses (TUM, KITTI), a pose graph (g2o), points
-(PLY, PCD, LAS, LAZ, XYZ).
+"""Sessions and closures in other programs' formats: poses (TUM, KITTI), a pose graph (g2o), lines
+on the earth (GeoJSON), points (PLY, PCD, LAS, LAZ, XYZ).
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from typing import Literal
 import pyarrow as pa
 
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.exports.common_frame import CommonFrame
 from semloc_logs.exports.foxglove_layout import foxglove_layout
+from semloc_logs.exports.geojson import geojson
 from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
@@ -32,7 +34,7 @@ WRITERS: dict[str, Callable[[Path, SessionPoints], None]] = {
 }
 POINT_FORMATS = tuple(WRITERS)
 LAYOUT = "foxglove-layout"
-FORMATS = ("tum", "kitti", "g2o", LAYOUT, *POINT_FORMATS)
+FORMATS = ("tum", "kitti", "g2o", LAYOUT, "geojson", *POINT_FORMATS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,7 @@ class Selection:
     """
 
     what: Literal["voxels", "keyframes"] = "voxels"
-    frame: Literal["session", "map", "common"] = "session"
+    frame: Literal["session", "map", "common", "utm"] = "session"
     bounds: Bounds | None = None
 
 
@@ -59,6 +61,7 @@ def export(
 
     ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame or the
     common one; ``g2o``: one pose graph of all; ``foxglove-layout``: a layout for annotated logs;
+    ``geojson``: all drives and closures on the earth;
     the point formats: ``selection``, by default the centres of all occupied voxels in the session
     frame. Raises WorkspaceError when a session is not there or does not fit the format, or a file
     exists and ``overwrite`` is not set; SemlocError when a library is missing.
@@ -69,11 +72,10 @@ def export(
         path = _free(output / "closures.g2o", overwrite)
         _write(path, pose_graph(sessions, work).encode())
         return [path]
-    if form in POINT_FORMATS and chosen.frame == "common":
-        raise WorkspaceError(
-            f"Points in the common frame are not written as {form}: 'semloc optimize -w"
-            f" {work.path} --map' writes the merged map as Parquet."
-        )
+    if form == "geojson":
+        path = _free(output / "drives.geojson", overwrite)
+        _write(path, geojson(work, sessions).encode())
+        return [path]
     paths = {name: _free(output / _file_name(name, form, chosen), overwrite) for name in sessions}
     for name, session in sessions.items():
         if form in ("tum", "kitti"):
@@ -83,7 +85,9 @@ def export(
         if form == LAYOUT:
             _write(paths[name], foxglove_layout(session).encode())
             continue
-        points = SessionPoints(session, chosen.what, chosen.frame, chosen.bounds)
+        is_common = chosen.frame in ("common", "utm")
+        common = CommonFrame(work, session, chosen.frame == "utm") if is_common else None
+        points = SessionPoints(session, chosen.what, chosen.frame, chosen.bounds, common)
         with replacing_file(paths[name], suffix=f".{form}") as temporary:
             WRITERS[form](temporary, points)
     return list(paths.values())
