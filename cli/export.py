@@ -27,9 +27,10 @@ POINTS = ("ply", "pcd", "las", "laz", "xyz")
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["tum", "kitti", "g2o", "foxglove-layout", "geojson", *POINTS]),
+    type=click.Choice(["tum", "kitti", "g2o", "foxglove-layout", "geojson", "rrd", *POINTS]),
     required=True,
-    help="Poses, a pose graph with closures, a layout of a viewer, lines on the earth, or points.",
+    help="Poses, a pose graph with closures, a layout or a recording of a viewer, lines on the"
+    " earth, or points.",
 )
 @click.option(
     "--what",
@@ -67,7 +68,8 @@ def command(
 ) -> int:
     """Sessions for other programs: poses of the base frame (tum, kitti), a pose graph with the
     closures (g2o), a layout that shows annotated logs in Foxglove (foxglove-layout), drives and
-    closures on the earth (geojson), points (ply, pcd, las, laz, xyz) with their classes.
+    closures on the earth (geojson), a recording for Rerun (rrd), points (ply, pcd, las, laz,
+    xyz) with their classes.
 
     Poses and points are in the session frame of the log's pose stream, metres, unless --frame is
     given.

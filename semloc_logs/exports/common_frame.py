@@ -31,6 +31,33 @@ def earth_frame(work: Workspace, session: SessionMap) -> LocalFrame | None:
 
 
 @dataclass(eq=False)
+class KeyframeMotion:
+    """Points of a map where its keyframes are elsewhere: from ``map_T_base`` to ``placed_T_base``.
+
+    Each point moves with the nearest keyframe.
+    """
+
+    map_T_base: F64
+    placed_T_base: F64
+
+    @cached_property
+    def placed_T_map(self) -> F64:
+        """By each keyframe (n, 4, 4)."""
+        return np.asarray(self.placed_T_base @ inverse(self.map_T_base))
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.map_T_base[:, :3, 3])
+
+    def points(self, points: F64) -> F64:
+        """Points (n, 3) of the map, placed."""
+        nearest: I64 = self._tree.query(points)[1]
+        placed_T_map = self.placed_T_map[nearest]
+        moved = np.einsum("nij,nj->ni", placed_T_map[:, :3, :3], points)
+        return np.asarray(moved + placed_T_map[:, :3, 3])
+
+
+@dataclass(eq=False)
 class CommonFrame:
     """A session in the common frame, or with ``in_utm`` in UTM coordinates.
 
@@ -69,13 +96,8 @@ class CommonFrame:
         return keyframe_poses(self.work, self.session)
 
     @cached_property
-    def _common_T_map(self) -> F64:
-        """By each keyframe (n, 4, 4)."""
-        return np.asarray(self._common_T_base @ inverse(self.session.map_T_base))
-
-    @cached_property
-    def _places(self) -> cKDTree:
-        return cKDTree(self.session.map_T_base[:, :3, 3])
+    def _motion(self) -> KeyframeMotion:
+        return KeyframeMotion(self.session.map_T_base, self._common_T_base)
 
     @cached_property
     def positions(self) -> F64:
@@ -84,14 +106,11 @@ class CommonFrame:
 
     def points_of(self, points: F64, keyframe: int) -> F64:
         """Points (n, 3) of the map that a keyframe measured."""
-        return self._projected(apply(self._common_T_map[keyframe], points))
+        return self._projected(apply(self._motion.placed_T_map[keyframe], points))
 
     def points(self, points: F64) -> F64:
-        """Points (n, 3) of the map; each moves with the nearest keyframe."""
-        nearest: I64 = self._places.query(points)[1]
-        common_T_map = self._common_T_map[nearest]
-        moved = np.einsum("nij,nj->ni", common_T_map[:, :3, :3], points) + common_T_map[:, :3, 3]
-        return self._projected(moved)
+        """Points (n, 3) of the map."""
+        return self._projected(self._motion.points(points))
 
     def _projected(self, points: F64) -> F64:
         if self.zone is None or self._local is None:

@@ -18,6 +18,7 @@ from semloc_logs.exports.geojson import geojson
 from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
+from semloc_logs.exports.rerun_recording import write_rerun
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.tables.atomic_files import replacing_file
@@ -34,7 +35,7 @@ WRITERS: dict[str, Callable[[Path, SessionPoints], None]] = {
 }
 POINT_FORMATS = tuple(WRITERS)
 LAYOUT = "foxglove-layout"
-FORMATS = ("tum", "kitti", "g2o", LAYOUT, "geojson", *POINT_FORMATS)
+FORMATS = ("tum", "kitti", "g2o", LAYOUT, "geojson", "rrd", *POINT_FORMATS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ def export(
 
     ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame or the
     common one; ``g2o``: one pose graph of all; ``foxglove-layout``: a layout for annotated logs;
-    ``geojson``: all drives and closures on the earth;
+    ``geojson``: all drives and closures on the earth; ``rrd``: a recording of all for Rerun;
     the point formats: ``selection``, by default the centres of all occupied voxels in the session
     frame. Raises WorkspaceError when a session is not there or does not fit the format, or a file
     exists and ``overwrite`` is not set; SemlocError when a library is missing.
@@ -75,6 +76,11 @@ def export(
     if form == "geojson":
         path = _free(output / "drives.geojson", overwrite)
         _write(path, geojson(work, sessions).encode())
+        return [path]
+    if form == "rrd":
+        path = _free(output / "drives.rrd", overwrite)
+        with replacing_file(path, suffix=".rrd") as temporary:
+            write_rerun(temporary, work, sessions)
         return [path]
     paths = {name: _free(output / _file_name(name, form, chosen), overwrite) for name in sessions}
     for name, session in sessions.items():
