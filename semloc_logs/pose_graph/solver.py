@@ -47,13 +47,13 @@ FIRST_ITERATIONS = 6  # of Levenberg-Marquardt before the schedule
 STEP_ITERATIONS = 1  # of Levenberg-Marquardt in each step of the schedule
 LAST_ITERATIONS = 20  # in the solution that follows
 TOLERANCE = 1e-6  # relative decrease of the error that ends it
-LARGE_TOLERANCE = 1e-5  # the same of conjugate gradients
 MOST_STEPS = 100
-# vertices that GTSAM solves; conjugate gradients beyond, as many sessions of the same roads fill
-# the matrix of a direct solution
-MOST_DIRECT = 5_000
+# vertices times squared sessions up to which GTSAM solves directly, and conjugate gradients beyond:
+# sessions of the same roads fill its matrix, as each is connected with all others
+MOST_FILL = 2e7
 NODES_APART = 20.0  # vertex spacings between the nodes of a motion that all sessions share
 RESIDUAL = 1e-2  # of each step; the steps that follow take away what it leaves
+ITERATED_TOLERANCE = 1e-5  # relative decrease of the error that ends it
 FIX_STEP = 4.0  # the weights of satellite fixes narrow down by so much
 BINARY = 1e-3  # a weight that is nearer to 0 or 1 counts as that
 # a chain whose closures are all refused stays where it is, to the width of a continent
@@ -198,9 +198,9 @@ class Solver:
 
     def _solved(self, initial: F64, weight: F64, iterations: int) -> F64:
         """Least squares with these weights of the closures, at most so many iterations."""
-        if len(initial) > MOST_DIRECT:
+        if self._is_large:
             self._equations.fix_scale = self._fix_scale
-            limits = Limits(iterations, LARGE_TOLERANCE, RESIDUAL)
+            limits = Limits(iterations, ITERATED_TOLERANCE, RESIDUAL)
             weights = np.concatenate([np.ones(len(self._problem.odometry)), weight])
             return minimised(self._equations, initial, weights, self._layout, limits)
         gtsam = self._gtsam
@@ -214,6 +214,12 @@ class Solver:
         values = self._values(initial)
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
         return np.array([solved.atPose3(k).matrix() for k in range(len(initial))])
+
+    @property
+    def _is_large(self) -> bool:
+        chain = self._problem.chain
+        sessions = int(chain.max(initial=-1)) + 1
+        return len(chain) * sessions**2 > MOST_FILL
 
     @cached_property
     def _layout(self) -> Layout:

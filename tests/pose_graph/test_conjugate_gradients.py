@@ -82,7 +82,7 @@ def test_conjugate_gradients_give_the_poses_of_a_direct_solution(
     names = ("a", "b", "c")
     by_gtsam = [poses_of(read_table(drives.work.optimized_trajectory(n))) for n in names]
 
-    monkeypatch.setattr(solver, "MOST_DIRECT", 0)
+    monkeypatch.setattr(solver, "MOST_FILL", 0)
     iterated = optimise(drives.work, SETTINGS, overwrite=True)
     assert (iterated.rejected, iterated.frames) == (direct.rejected, direct.frames) == (1, 1)
     for name, expected in zip(names, by_gtsam, strict=True):

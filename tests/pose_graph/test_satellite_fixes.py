@@ -27,11 +27,11 @@ def _in_enu(drives: Any, name: str, datum: tuple[float, float, float]) -> np.nda
     return np.array([local.position(*place) for place in places])
 
 
-@pytest.mark.parametrize("most_direct", [solver.MOST_DIRECT, 0])
+@pytest.mark.parametrize("most_fill", [solver.MOST_FILL, 0])
 def test_fixes_take_the_drift_away_and_turn_the_frame(
-    drives: Any, square_of: Any, datum: Any, monkeypatch: pytest.MonkeyPatch, most_direct: int
+    drives: Any, square_of: Any, datum: Any, monkeypatch: pytest.MonkeyPatch, most_fill: int
 ) -> None:
-    monkeypatch.setattr(solver, "MOST_DIRECT", most_direct)
+    monkeypatch.setattr(solver, "MOST_FILL", most_fill)
     drives.add("a", square_of(2), 0.006, 1.01)  # 5 degrees and 8 m in two laps
     drives.add("b", square_of(1), -0.01, 1.0)
     drives.locate("a", ENU_T_COMMON, wrong=[100, 105, 110, 300])
