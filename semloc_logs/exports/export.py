@@ -11,6 +11,7 @@ from typing import Literal
 
 import pyarrow as pa
 
+from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports.common_frame import CommonFrame
 from semloc_logs.exports.foxglove_layout import foxglove_layout
@@ -89,7 +90,7 @@ def export(
             _write(paths[name], (tum if form == "tum" else kitti)(table))
             continue
         if form == LAYOUT:
-            _write(paths[name], foxglove_layout(session).encode())
+            _write(paths[name], foxglove_layout(session, _targets(work, name)).encode())
             continue
         is_common = chosen.frame in ("common", "utm")
         common = CommonFrame(work, session, chosen.frame == "utm") if is_common else None
@@ -97,6 +98,12 @@ def export(
         with replacing_file(paths[name], suffix=f".{form}") as temporary:
             WRITERS[form](temporary, points)
     return list(paths.values())
+
+
+def _targets(work: Workspace, name: str) -> set[str]:
+    """The sessions in which closures place a session."""
+    rows = read_closures(work.closures) if work.closures.exists() else []
+    return {row["target_session"] for row in rows if row["query_session"] == name}
 
 
 def _file_name(session: str, form: str, chosen: Selection) -> str:
