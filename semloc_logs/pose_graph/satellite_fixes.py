@@ -24,9 +24,9 @@ MOST_GAP_NS = 1_000_000_000  # of a fix to the poses around it
 
 def read_fixes(session: SessionMap) -> pa.Table | None:
     """The usable fixes of a session; None where it has none."""
-    if not session.posed or not session.folder.fixes.exists():
+    table = session.fixes
+    if not session.posed or table is None:
         return None
-    table = read_table(session.folder.fixes)
     east, north = (table[f"sigma_{axis}"].to_numpy() for axis in ("east", "north"))
     table = table.filter(pa.array(~(np.maximum(east, north) > MOST_SIGMA)))
     return table if table.num_rows else None
