@@ -34,7 +34,7 @@ def pairs_of_sessions(maps: Mapping[str, SessionMap]) -> list[Pair]:
     """All pairs of sessions, each once, by the names of query and target.
 
     A log without poses has no map to be searched in: it is the query of those that have one.
-    Sessions that satellites tell apart are no pair.
+    Sessions that satellites tell apart are left out.
     """
     order = sorted(maps, key=lambda n: (not maps[n].posed, int(maps[n].stamps_ns[0]), n))
     tracks = {name: sure_track(session) for name, session in maps.items()}
