@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     "-o",
     "--output",
     type=LogPath(),
-    help="Write a copy of the log with the results to this MCAP file.",
+    help="Write a copy of the log with the results to this MCAP file; a copy of a .bag log may be a"
+    " .bag, too.",
 )
 @click.option(
     "--in-place",

@@ -27,9 +27,10 @@ POINTS = ("ply", "pcd", "las", "laz", "xyz")
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["tum", "kitti", "g2o", "foxglove-layout", *POINTS]),
+    type=click.Choice(["tum", "kitti", "g2o", "foxglove-layout", "geojson", "rrd", *POINTS]),
     required=True,
-    help="Poses, a pose graph with closures, a layout of a viewer, or points.",
+    help="Poses, a pose graph with closures, a layout or a recording of a viewer, lines on the"
+    " earth, or points.",
 )
 @click.option(
     "--what",
@@ -38,10 +39,10 @@ POINTS = ("ply", "pcd", "las", "laz", "xyz")
 )
 @click.option(
     "--frame",
-    type=click.Choice(["session", "map", "common"]),
+    type=click.Choice(["session", "map", "common", "utm"]),
     help="Poses and points are in the session frame of the log's poses (default), points in the"
-    " level map frame that starts at the first keyframe, poses in the common frame of"
-    " semloc optimize.",
+    " level map frame that starts at the first keyframe; both in the common frame of semloc"
+    " optimize, points in UTM coordinates where satellite fixes place it.",
 )
 @click.option(
     "--bounds",
@@ -59,18 +60,19 @@ def command(
     work: Path,
     form: str,
     what: Literal["voxels", "keyframes"] | None,
-    frame: Literal["session", "map", "common"] | None,
+    frame: Literal["session", "map", "common", "utm"] | None,
     bounds: tuple[float, float, float, float] | None,
     output: Path | None,
     overwrite: bool,
     as_json: bool,
 ) -> int:
     """Sessions for other programs: poses of the base frame (tum, kitti), a pose graph with the
-    closures (g2o), a layout that shows annotated logs in Foxglove (foxglove-layout), points (ply,
-    pcd, las, laz, xyz) with their classes.
+    closures (g2o), a layout that shows annotated logs in Foxglove (foxglove-layout), drives and
+    closures on the earth (geojson), a recording for Rerun (rrd), points (ply, pcd, las, laz,
+    xyz) with their classes.
 
-    Poses and points are in the session frame of the log's pose stream, metres; points also in the
-    level map frame.
+    Poses and points are in the session frame of the log's pose stream, metres, unless --frame is
+    given.
 
     \b
     Example:  semloc export -w work --format las --bounds -50 -50 50 50

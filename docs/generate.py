@@ -34,6 +34,7 @@ FILES_OF_TABLES = {  # table -> where it lies in a workspace
     "changed_voxels": "optimized/changes/NAME.parquet",
     "alignments": "alignments/query=NAME/target=NAME/alignments.parquet",
     "trajectory": "sessions/NAME/trajectory.parquet",
+    "fixes": "sessions/NAME/fixes.parquet",
     "frames": "sessions/NAME/frames.parquet",
     "keyframes": "sessions/NAME/keyframes/",
     "voxels": "sessions/NAME/voxels/",

@@ -362,6 +362,13 @@ class Optimize(_Section):
     gravity_sigma_deg: float = Field(
         2.0, gt=0, le=180, description="uncertainty of up in the map frame of a session, degrees"
     )
+    gnss: bool = Field(True, description="use satellite fixes where logs have them")
+    gnss_sigma: float = Field(
+        1.0,
+        gt=0,
+        description="uncertainty of every satellite fix (m) beside its covariance: errors of"
+        " neighbours are alike",
+    )
     vertex_spacing: float | None = Field(
         None,
         gt=0,

@@ -47,6 +47,11 @@ class SessionFolder:
         return self.path / "trajectory.parquet"
 
     @property
+    def fixes(self) -> Path:
+        """Satellite fixes; workspaces of earlier versions have none."""
+        return self.path / "fixes.parquet"
+
+    @property
     def frames(self) -> Path:
         return self.path / "frames.parquet"
 

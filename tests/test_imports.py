@@ -101,6 +101,7 @@ INNER_ORDER = {
         "acceptance",
         "closure_tables",
         "alignment_tables",
+        "tracks",
         "pairs",
         "database",
         "visibility",

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semloc_logs.closures.alignment_tables import Part, by_target, joined, read_parts
+from semloc_logs.closures.tracks import are_apart, sure_track
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.tables.atomic_files import remove_file
@@ -33,10 +34,15 @@ def pairs_of_sessions(maps: Mapping[str, SessionMap]) -> list[Pair]:
     """All pairs of sessions, each once, by the names of query and target.
 
     A log without poses has no map to be searched in: it is the query of those that have one.
+    Sessions that satellites tell apart are left out.
     """
     order = sorted(maps, key=lambda n: (not maps[n].posed, int(maps[n].stamps_ns[0]), n))
+    tracks = {name: sure_track(session) for name, session in maps.items()}
     pairs = [
-        Pair(query, target) for number, query in enumerate(order) for target in order[: number + 1]
+        Pair(query, target)
+        for number, query in enumerate(order)
+        for target in order[: number + 1]
+        if query == target or not are_apart(tracks[query], tracks[target])
     ]
     return sorted(pairs)
 

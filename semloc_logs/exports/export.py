@@ -1,5 +1,5 @@
-"""Sessions and closures in other programs' formats: poses (TUM, KITTI), a pose graph (g2o), points
-(PLY, PCD, LAS, LAZ, XYZ).
+"""Sessions and closures in other programs' formats: poses (TUM, KITTI), a pose graph (g2o), lines
+on the earth (GeoJSON), points (PLY, PCD, LAS, LAZ, XYZ).
 """
 
 from __future__ import annotations
@@ -11,11 +11,15 @@ from typing import Literal
 
 import pyarrow as pa
 
+from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.exports.common_frame import CommonFrame
 from semloc_logs.exports.foxglove_layout import foxglove_layout
+from semloc_logs.exports.geojson import geojson
 from semloc_logs.exports.map_points import Bounds, SessionPoints
 from semloc_logs.exports.point_formats import write_las, write_pcd, write_ply, write_xyz
 from semloc_logs.exports.pose_graph_file import pose_graph
+from semloc_logs.exports.rerun_recording import write_rerun
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.tables.atomic_files import replacing_file
@@ -32,7 +36,7 @@ WRITERS: dict[str, Callable[[Path, SessionPoints], None]] = {
 }
 POINT_FORMATS = tuple(WRITERS)
 LAYOUT = "foxglove-layout"
-FORMATS = ("tum", "kitti", "g2o", LAYOUT, *POINT_FORMATS)
+FORMATS = ("tum", "kitti", "g2o", LAYOUT, "geojson", "rrd", *POINT_FORMATS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +46,7 @@ class Selection:
     """
 
     what: Literal["voxels", "keyframes"] = "voxels"
-    frame: Literal["session", "map", "common"] = "session"
+    frame: Literal["session", "map", "common", "utm"] = "session"
     bounds: Bounds | None = None
 
 
@@ -59,6 +63,7 @@ def export(
 
     ``form`` is one of FORMATS. ``tum`` and ``kitti``: the trajectory in the session frame or the
     common one; ``g2o``: one pose graph of all; ``foxglove-layout``: a layout for annotated logs;
+    ``geojson``: all drives and closures on the earth; ``rrd``: a recording of all for Rerun;
     the point formats: ``selection``, by default the centres of all occupied voxels in the session
     frame. Raises WorkspaceError when a session is not there or does not fit the format, or a file
     exists and ``overwrite`` is not set; SemlocError when a library is missing.
@@ -69,11 +74,15 @@ def export(
         path = _free(output / "closures.g2o", overwrite)
         _write(path, pose_graph(sessions, work).encode())
         return [path]
-    if form in POINT_FORMATS and chosen.frame == "common":
-        raise WorkspaceError(
-            f"Points in the common frame are not written as {form}: 'semloc optimize -w"
-            f" {work.path} --map' writes the merged map as Parquet."
-        )
+    if form == "geojson":
+        path = _free(output / "drives.geojson", overwrite)
+        _write(path, geojson(work, sessions).encode())
+        return [path]
+    if form == "rrd":
+        path = _free(output / "drives.rrd", overwrite)
+        with replacing_file(path, suffix=".rrd") as temporary:
+            write_rerun(temporary, work, sessions)
+        return [path]
     paths = {name: _free(output / _file_name(name, form, chosen), overwrite) for name in sessions}
     for name, session in sessions.items():
         if form in ("tum", "kitti"):
@@ -81,12 +90,20 @@ def export(
             _write(paths[name], (tum if form == "tum" else kitti)(table))
             continue
         if form == LAYOUT:
-            _write(paths[name], foxglove_layout(session).encode())
+            _write(paths[name], foxglove_layout(session, _targets(work, name)).encode())
             continue
-        points = SessionPoints(session, chosen.what, chosen.frame, chosen.bounds)
+        is_common = chosen.frame in ("common", "utm")
+        common = CommonFrame(work, session, chosen.frame == "utm") if is_common else None
+        points = SessionPoints(session, chosen.what, chosen.frame, chosen.bounds, common)
         with replacing_file(paths[name], suffix=f".{form}") as temporary:
             WRITERS[form](temporary, points)
     return list(paths.values())
+
+
+def _targets(work: Workspace, name: str) -> set[str]:
+    """The sessions in which closures place a session."""
+    rows = read_closures(work.closures) if work.closures.exists() else []
+    return {row["target_session"] for row in rows if row["query_session"] == name}
 
 
 def _file_name(session: str, form: str, chosen: Selection) -> str:

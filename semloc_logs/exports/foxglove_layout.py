@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 
 import numpy as np
 
+from semloc_logs.logs.annotation.channels import CLOSURES, MAP, MARKERS, POSE, topics_of_targets
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
 
 CLOUDS = ("lidar", "depth")  # roles of streams that are shown as points
-MARKERS, POSE, CLOSURES = "/semloc/markers", "/semloc/pose", "/semloc/loop_closures"
 LEAST_DISTANCE = 60.0  # metres of the camera from the map
 IMAGES = ("image", "stereo_left")
 
 
-def foxglove_layout(session: SessionMap) -> str:
+def foxglove_layout(session: SessionMap, targets: Collection[str]) -> str:
     """JSON of a layout: the drive and its closures in 3D, the messages of closures, a picture.
+
+    ``targets`` are the sessions in which closures place this one.
 
     A layout that the programs import has the configuration of each panel by its id, and how the
     panels divide the window.
@@ -29,7 +32,11 @@ def foxglove_layout(session: SessionMap) -> str:
     shown = [s["topic"] for s in streams if s.get("role") in CLOUDS]
     topics = {
         MARKERS: {"visible": True},
-        POSE: {"visible": True, "type": "axis", "axisScale": 2},
+        MAP: {"visible": True, "pointSize": 2, "colorMode": "rgb", "colorField": "rgb"},
+        **{
+            topic: {"visible": True, "type": "axis", "axisScale": 2}
+            for topic in (POSE, *topics_of_targets(targets).values())
+        },
         **{topic: {"visible": True, "pointSize": 3} for topic in shown},
     }
     panels: dict[str, object] = {

@@ -26,7 +26,7 @@ def map_cloud(placed: Sequence[tuple[SessionMap, F64]], frame_id: str) -> Cloud 
 
     One voxel in a cell of two voxels, or of more where there are too many points.
     """
-    thinned = _Thinned()
+    thinned = ThinnedPoints()
     for session, frame_T_session in placed[:MOST_SESSIONS]:
         points = SessionPoints(session, "voxels", "session", None)
         thinned.cell = max(thinned.cell, 2.0 * points.voxel_size)
@@ -38,13 +38,13 @@ def map_cloud(placed: Sequence[tuple[SessionMap, F64]], frame_id: str) -> Cloud 
     return Cloud(frame_id, thinned.points.astype(np.float32), colours, thinned.label)
 
 
-class _Thinned:
+class ThinnedPoints:
     """At most MOST_POINTS points: the first one in each ``cell`` (m)."""
 
-    def __init__(self) -> None:
+    def __init__(self, cell: float = 0.0) -> None:
         self.points: F64 = np.zeros((0, 3))
         self.label: U8 = np.zeros(0, np.uint8)
-        self.cell = 0.0
+        self.cell = cell
 
     def add(self, points: F64, label: U8) -> None:
         """More points (n, 3) with train ids (n,)."""

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.exports.common_frame import CommonFrame
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.voxels.store import read_keyframe
@@ -31,14 +32,15 @@ FLOAT32_FINENESS = 16  # steps of 32-bit coordinates in a voxel, at least
 class SessionPoints:
     """Points of one session.
 
-    ``what`` is "voxels" (centres) or "keyframes", ``frame`` "session" or "map"; ``bounds`` are in
-    that frame.
+    ``what`` is "voxels" (centres) or "keyframes", ``frame`` "session" or "map", or "common" or
+    "utm" with ``common``; ``bounds`` are in that frame.
     """
 
     session: SessionMap
     what: str
     frame: str
     bounds: Bounds | None
+    common: CommonFrame | None = None
 
     def __post_init__(self) -> None:
         if self.what == "keyframes" and not self.session.posed:
@@ -68,12 +70,16 @@ class SessionPoints:
     @property
     def origin(self) -> F64:
         """Whole metres (3,) close to the points: the map's origin in the chosen frame."""
+        if self.common is not None:
+            return np.asarray(np.floor(self.common.positions[0]))
         return np.asarray(np.floor(self.frame_T_map[:3, 3]))
 
     @cached_property
     def float32_step(self) -> float:
         """The distance between neighbouring 32-bit floats at the trajectory, in metres."""
         positions = apply(self.frame_T_map, self.session.map_T_base[:, :3, 3])
+        if self.common is not None:
+            positions = self.common.positions
         return float(np.spacing(np.float32(np.abs(positions).max(initial=1.0))))
 
     @property
@@ -91,8 +97,7 @@ class SessionPoints:
 
     def batches(self) -> Iterator[tuple[F64, U8]]:
         """Points (n, 3) in metres with train ids (n,); a row group or a keyframe at a time."""
-        for points, label in self._voxels() if self.what == "voxels" else self._keyframes():
-            placed = apply(self.frame_T_map, points)
+        for placed, label in self._voxels() if self.what == "voxels" else self._keyframes():
             if self.bounds is not None:
                 x0, y0, x1, y1 = self.bounds
                 x = placed[:, 0]
@@ -117,12 +122,21 @@ class SessionPoints:
                 except (OSError, pa.ArrowException) as problem:
                     raise _damaged(path, problem) from None
                 ijk = np.stack([table[c].to_numpy() for c in ("ix", "iy", "iz")], 1)
-                yield (ijk + 0.5) * self.voxel_size, table["label"].to_numpy()
+                points = (ijk + 0.5) * self.voxel_size
+                label = table["label"].to_numpy()
+                if self.common is not None:
+                    yield self.common.points(points), label
+                else:
+                    yield apply(self.frame_T_map, points), label
 
     def _may_hold(self, group: Any) -> bool:
         """Whether any point of a row group can lie within the bounds, by its statistics."""
         ranges = [group.column(k).statistics for k in range(3)]
-        if self.bounds is None or any(r is None or not r.has_min_max for r in ranges):
+        if (
+            self.bounds is None
+            or self.common is not None
+            or any(r is None or not r.has_min_max for r in ranges)
+        ):
             return True
         corners = np.array(list(product(*((r.min, r.max) for r in ranges))))
         placed = apply(self.frame_T_map, (corners + 0.5) * self.voxel_size)
@@ -134,7 +148,11 @@ class SessionPoints:
     def _keyframes(self) -> Iterator[tuple[F64, U8]]:
         for number, map_T_base in enumerate(self.session.map_T_base):
             keyframe = read_keyframe(self.session.folder.keyframes, number)
-            yield apply(map_T_base, keyframe.points.astype(float)), keyframe.label
+            points = apply(map_T_base, keyframe.points.astype(float))
+            if self.common is not None:
+                yield self.common.points_of(points, number), keyframe.label
+            else:
+                yield apply(self.frame_T_map, points), keyframe.label
 
 
 def _open(path: Path) -> pq.ParquetFile:

@@ -141,6 +141,11 @@ def write_las(path: Path, points: SessionPoints) -> None:
     header.generating_software = f"semloc_logs {semloc_logs.__version__}"[:32]
     # point formats from 6 on require it; without a WKT record the frame is a local one
     header.global_encoding.wkt = True
+    zone = None if points.common is None else points.common.zone
+    if zone is not None:
+        from laspy.vlrs.known import WktCoordinateSystemVlr
+
+        header.vlrs.append(WktCoordinateSystemVlr(zone.wkt()))
     colours = point_colours().astype(np.uint16) * 257
     classes = asprs_classes()
     with laspy.open(path, mode="w", header=header, do_compress=path.suffix == ".laz") as file:

@@ -178,7 +178,9 @@ def _scratch(folder: SessionFolder) -> Iterator[Path]:
 
 
 def _write_trajectory(folder: SessionFolder, session: Session, metadata: dict[str, Any]) -> None:
-    """Every pose of the log, in the session frame."""
+    """Every pose of the log, in the session frame, and its satellite fixes."""
     stamps_ns, poses = session.trajectory()
     table = contracts.table("trajectory", {"stamp_ns": stamps_ns, **pose_columns(poses)})
     write_table(folder.trajectory, table, metadata, ("stamp_ns",))
+    fixes = contracts.table("fixes", session.fixes())
+    write_table(folder.fixes, fixes, metadata, ("stamp_ns",))

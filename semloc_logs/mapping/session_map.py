@@ -38,6 +38,11 @@ class SessionMap:
         return read_table(self.folder.frames)
 
     @cached_property
+    def fixes(self) -> pa.Table | None:
+        """The satellite fixes; None in sessions of earlier versions."""
+        return read_table(self.folder.fixes) if self.folder.fixes.exists() else None
+
+    @cached_property
     def map_T_base(self) -> F64:
         """Poses (n, 4, 4) of the keyframes."""
         return poses_of(self.frames)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -10,14 +11,26 @@ from numpy.typing import NDArray
 
 from semloc_logs.closures.closure_tables import keyframe_at
 from semloc_logs.mapping.session_map import SessionMap
-from semloc_logs.pose_graph.graph import Chain, Loops, PoseGraph
+from semloc_logs.pose_graph.graph import (
+    NO_POSITIONS,
+    Chain,
+    Datum,
+    Loops,
+    PoseGraph,
+    Positions,
+)
+from semloc_logs.pose_graph.satellite_fixes import datum_of, positions_of, read_fixes
+from semloc_logs.settings import ResolvedOptimize
 from semloc_logs.voxels.store import poses_of
 
 
-def pose_graph_of(sessions: Mapping[str, SessionMap], closures: pa.Table) -> PoseGraph:
+def pose_graph_of(
+    sessions: Mapping[str, SessionMap], closures: pa.Table, settings: ResolvedOptimize
+) -> PoseGraph:
     """The graph of ``sessions`` with the rows of closures.parquet between them.
 
-    Of a session without poses, the keyframes that have a closure are chains of their own.
+    Of a session without poses, the keyframes that have a closure are chains of their own. Satellite
+    fixes are relative to the first one of the first session that has any.
     """
     ends = {end: _keyframes(sessions, closures, end) for end in ("target", "query")}
     chains: list[Chain] = []
@@ -38,7 +51,29 @@ def pose_graph_of(sessions: Mapping[str, SessionMap], closures: pa.Table) -> Pos
         np.array(closures["covariance"].to_pylist(), float).reshape(-1, 6, 6),
         np.asarray(closures["probability"].to_numpy()),
     )
-    return PoseGraph(chains, loops)
+    graph = PoseGraph(chains, loops)
+    return _with_fixes(graph, sessions, settings) if settings.gnss else graph
+
+
+def _with_fixes(
+    graph: PoseGraph, sessions: Mapping[str, SessionMap], settings: ResolvedOptimize
+) -> PoseGraph:
+    datum: Datum | None = None
+    parts = [NO_POSITIONS]
+    for first, chain in zip(graph.first, graph.chains, strict=True):
+        fixes = read_fixes(sessions[chain.name])
+        if fixes is None:
+            continue
+        datum = datum or datum_of(fixes)
+        own = positions_of(sessions[chain.name], fixes, datum, settings.gnss_sigma)
+        parts.append(replace(own, vertices=own.vertices + first))
+    joined = Positions(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.antenna for part in parts]),
+        np.concatenate([part.position for part in parts]),
+        np.concatenate([part.sigma for part in parts]),
+    )
+    return replace(graph, fixes=joined, datum=datum)
 
 
 def _keyframes(

@@ -133,7 +133,7 @@ def _own_sigma(loops: Loops, settings: ResolvedOptimize) -> tuple[F64, F64]:
 
 
 def _independence(graph: PoseGraph, loops: Loops, stretch: float) -> F64:
-    """Weights (m,) of the closures of one pair: one, shared by those of the same stretches."""
+    """Weights (m,) of the closures of one pair: one, shared by closures of the same road."""
     ends = np.stack([graph.distance[loops.target], graph.distance[loops.query]], axis=1)
     _, place, counts = np.unique(
         np.floor(ends / stretch), axis=0, return_inverse=True, return_counts=True

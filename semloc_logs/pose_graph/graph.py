@@ -62,12 +62,44 @@ class Loops:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Positions:
+    """Where satellites place some ``vertices`` (f,).
+
+    ``antenna`` (f, 3) in the axes of the vertex lies at ``position`` (f, 3), east, north, up of a
+    point that all share, to ``sigma`` (f, 3) metres.
+    """
+
+    vertices: I64
+    antenna: F64
+    position: F64
+    sigma: F64
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def part(self, rows: I64 | Mask) -> Positions:
+        """Some of the rows."""
+        return Positions(
+            self.vertices[rows], self.antenna[rows], self.position[rows], self.sigma[rows]
+        )
+
+
+NO_POSITIONS = Positions(np.zeros(0, np.int64), *(np.zeros((0, 3)) for _ in range(3)))
+Datum = tuple[float, float, float]  # WGS 84 latitude and longitude (degrees), height (m)
+
+
 @dataclass(frozen=True, eq=False)
 class PoseGraph:
-    """All sessions; a vertex is the number of a keyframe, counted through the chains in order."""
+    """All sessions; a vertex is the number of a keyframe, counted through the chains in order.
+
+    ``fixes`` are relative to ``datum``, None without any.
+    """
 
     chains: Sequence[Chain]
     loops: Loops
+    fixes: Positions = NO_POSITIONS
+    datum: Datum | None = None
 
     @cached_property
     def first(self) -> I64:

@@ -14,11 +14,13 @@ from scipy.sparse import bsr_array
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.numerics.transforms import inverse
+from semloc_logs.pose_graph.graph import NO_POSITIONS, Positions
 from semloc_logs.pose_graph.problem import Directions, Edges
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 UP_HUBER = 1.345  # Huber's constant for 95 % efficiency: gravity may be wrong in places
+FIX_CAUCHY = 3.0  # standard deviations at which a satellite fix counts half
 SMALL_TURN = 1e-4  # radians, below which series replace quotients
 
 
@@ -29,6 +31,15 @@ class PosePriors:
     vertices: I64
     poses: F64
     root: F64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Holds:
+    """What single poses are held by: directions of ``up``, ``priors``, and satellite ``fixes``."""
+
+    up: Directions
+    priors: PosePriors
+    fixes: Positions = NO_POSITIONS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,17 +70,23 @@ class Blocks:
 
 
 class NormalEquations:
-    """Of poses that ``edges`` connect, with directions of up and priors of some."""
+    """Of poses that ``edges`` connect, and that ``holds`` hold.
 
-    def __init__(self, vertices: int, edges: Edges, up: Directions, priors: PosePriors) -> None:
+    ``fix_scale`` is the constant of the Cauchy weights of fixes.
+    """
+
+    def __init__(self, vertices: int, edges: Edges, holds: Holds) -> None:
         self._vertices = vertices
         self._edges = edges
-        self._up = up
-        self._priors = priors
+        self._up = up = holds.up
+        self._priors = priors = holds.priors
+        self._fixes = fixes = holds.fixes
+        self.fix_scale = FIX_CAUCHY
         every = np.arange(vertices)
         a, b = edges.a, edges.b
-        rows = np.concatenate([every, a, b, a, b, up.vertices, priors.vertices])
-        columns = np.concatenate([every, a, b, b, a, up.vertices, priors.vertices])
+        single = (up.vertices, priors.vertices, fixes.vertices)
+        rows = np.concatenate([every, a, b, a, b, *single])
+        columns = np.concatenate([every, a, b, b, a, *single])
         self._blocks = Blocks(rows, columns, vertices)
 
     def cost(self, poses: F64, weight: F64) -> float:
@@ -79,7 +96,9 @@ class NormalEquations:
         tilt = np.linalg.norm(_up_errors(self._up, poses), axis=1)
         linear = tilt > UP_HUBER
         gravity = np.where(linear, UP_HUBER * (2.0 * tilt - UP_HUBER), tilt**2).sum()
-        return float(0.5 * (edges + priors + gravity))
+        away = (fix_errors(self._fixes, poses) ** 2).sum(1)
+        fixes = self.fix_scale**2 * np.log1p(away / self.fix_scale**2).sum()
+        return float(0.5 * (edges + priors + gravity + fixes))
 
     def linearised(self, poses: F64, weight: F64) -> Linearised:
         """At ``poses`` (v, 4, 4)."""
@@ -107,6 +126,13 @@ class NormalEquations:
         transposed_prior = np.swapaxes(by_prior, 1, 2)
         _add(gradient, self._priors.vertices, transposed_prior, offsets)
 
+        by_fix, away = _fix_derivatives(self._fixes, poses)
+        share = 1.0 / np.sqrt(1.0 + (away**2).sum(1) / self.fix_scale**2)
+        by_fix *= share[:, None, None]
+        away *= share[:, None]
+        transposed_fix = np.swapaxes(by_fix, 1, 2)
+        _add(gradient, self._fixes.vertices, transposed_fix, away)
+
         blocks = [
             np.zeros((self._vertices, 6, 6)),
             transposed_a @ by_a,
@@ -115,6 +141,7 @@ class NormalEquations:
             np.swapaxes(across, 1, 2),
             transposed_up @ by_up,
             transposed_prior @ by_prior,
+            transposed_fix @ by_fix,
         ]
         hessian = self._blocks.summed(np.concatenate(blocks))
         return Linearised(hessian, gradient.ravel(), self.cost(poses, weight))
@@ -200,6 +227,19 @@ def _up_derivatives(up: Directions, poses: F64) -> tuple[F64, F64]:
     by_pose = np.zeros((len(rows), 2, 6))
     by_pose[:, :, 3:] = -(rows @ crossed(up.up)) / up.sigma
     return by_pose, _up_errors(up, poses)
+
+
+def fix_errors(fixes: Positions, poses: F64) -> F64:
+    """How far fixes are off (f, 3), whitened."""
+    placed = poses[fixes.vertices]
+    here = np.einsum("nij,nj->ni", placed[:, :3, :3], fixes.antenna) + placed[:, :3, 3]
+    return np.asarray((here - fixes.position) / fixes.sigma)
+
+
+def _fix_derivatives(fixes: Positions, poses: F64) -> tuple[F64, F64]:
+    turn = poses[fixes.vertices, :3, :3]
+    by_pose = np.concatenate([turn, -turn @ crossed(fixes.antenna)], axis=2)
+    return by_pose / fixes.sigma[:, :, None], fix_errors(fixes, poses)
 
 
 def _inverse_right_jacobian(rotvec: F64) -> F64:

@@ -4,7 +4,7 @@ of each closure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -15,9 +15,10 @@ from scipy.sparse.csgraph import connected_components
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.pose_graph.carried_poses import SolvedPoses
 from semloc_logs.pose_graph.consistent_sets import ConsistentSet, consistent_sets
+from semloc_logs.pose_graph.earth_frame import LEAST_FIXES, enu_T_frame
 from semloc_logs.pose_graph.graph import PoseGraph, turned_covariance
 from semloc_logs.pose_graph.initial_poses import place_sessions
-from semloc_logs.pose_graph.problem import Problem, coarse_problem, fine_problem
+from semloc_logs.pose_graph.problem import Problem, coarse_problem, fine_problem, with_fixes
 from semloc_logs.pose_graph.solver import BOUND, Method, Solution, Solver
 from semloc_logs.settings import ResolvedOptimize
 
@@ -42,7 +43,8 @@ class Verdict(Enum):
 class Optimised:
     """Poses ``solved`` (v, 4, 4) of the vertices of ``problem``, which thins ``graph``.
 
-    ``component`` (k,) tells which chains share a frame: the map frame of their first. ``verdict``
+    ``component`` (k,) tells which chains share a frame: the map frame of their first, or where
+    ``is_enu`` (k,) east, north, up of the graph's datum. ``verdict``
     (m,) and ``squared_error`` (m,), whitened, are of the closures, ``covariance`` (v, 6, 6) of the
     poses, if it was requested.
     """
@@ -51,6 +53,7 @@ class Optimised:
     problem: Problem
     solved: F64
     component: I64
+    is_enu: Mask
     verdict: list[Verdict]
     squared_error: F64
     method: Method
@@ -81,7 +84,9 @@ def optimise_graph(
     solver = Solver(coarse, placement.component[coarse.chain], placed[coarse.kept])
     rough = solver.solve(placed[coarse.kept], consistent.astype(float), settings.seconds)
     carried = _all_poses(graph, coarse, rough.common_T_base)
-    problem = fine_problem(graph, settings)
+    located = _located(graph, carried, placement.component)
+    carried = located.poses
+    problem = with_fixes(fine_problem(graph, settings), located.graph, settings)
     solver = Solver(problem, placement.component[problem.chain], carried[problem.kept])
     solution = solver.refined(carried[problem.kept], rough.weight)
     solution = _readmitted(solver, solution)
@@ -91,7 +96,9 @@ def optimise_graph(
         for k, c in zip(kept, consistent, strict=True)
     ]
     component = _components(graph, kept)
+    is_enu = _have_fixes(located.graph, component)
     common_T_solved = _to_own_frames(graph, problem, solution.common_T_base, component)
+    common_T_solved[is_enu[problem.chain]] = np.eye(4)
     covariance = None
     if covariances:
         marginal = solver.covariances(solution.common_T_base, solution.weight)
@@ -101,11 +108,42 @@ def optimise_graph(
         problem,
         common_T_solved @ solution.common_T_base,
         component,
+        is_enu,
         verdict,
         solution.squared_error,
         rough.method,
         covariance,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Located:
+    """The graph with the fixes of frames that satellites align, and poses (n, 4, 4) in these."""
+
+    graph: PoseGraph
+    poses: F64
+
+
+def _located(graph: PoseGraph, poses: F64, component: I64) -> _Located:
+    """Frames of components onto east, north, up, where fixes tell their heading."""
+    out = poses.copy()
+    of_vertex = component[graph.chain_of]
+    of_fix = of_vertex[graph.fixes.vertices]
+    is_used = np.zeros(len(graph.fixes), bool)
+    for number in np.unique(of_fix):
+        own = of_fix == number
+        enu_T_common = enu_T_frame(poses, graph.fixes.part(own))
+        if enu_T_common is not None:
+            is_used |= own
+            out[of_vertex == number] = enu_T_common @ poses[of_vertex == number]
+    return _Located(replace(graph, fixes=graph.fixes.part(is_used)), out)
+
+
+def _have_fixes(graph: PoseGraph, component: I64) -> Mask:
+    """Chains (k,) whose component has enough fixes to lie in east, north, up."""
+    of_fix = component[graph.chain_of[graph.fixes.vertices]]
+    counts = np.bincount(of_fix, minlength=int(component.max(initial=-1)) + 1)
+    return np.asarray(counts[component] >= LEAST_FIXES)
 
 
 def _consistent(graph: PoseGraph, sets: list[ConsistentSet]) -> Mask:

@@ -29,6 +29,7 @@ from semloc_logs.workspace import Workspace
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Metadata = Mapping[str, Any]
+DATUM = "datum_lat_lon_height"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,7 +158,11 @@ def write_trajectories(
     optimised: Optimised,
     metadata: Metadata,
 ) -> None:
-    """optimized/SESSION.parquet of the ``sessions``; its ``frame`` names whose map frame it is."""
+    """optimized/SESSION.parquet of the ``sessions``; its ``frame`` names whose map frame it is.
+
+    Where satellites place the frame, it is east, north, up of ``datum_lat_lon_height`` instead.
+    """
+    in_enu = set(optimised.component[optimised.is_enu].tolist())
     graph = optimised.graph
     poses = optimised.common_T_base
     frames: dict[int, str] = {}
@@ -174,7 +179,9 @@ def write_trajectories(
     for name, session in sessions.items():
         own = np.concatenate([np.zeros(0, np.int64), *rows.get(name, [])])
         stamps, placed = _trajectory(session, stamps_ns[own], poses[own])
-        content = {**metadata, "frame": frames[component[name]] if name in component else name}
+        number = component.get(name, -1)
+        datum = graph.datum if number in in_enu else None
+        content = {**metadata, "frame": frames.get(number, name), DATUM: datum}
         table = contracts.table("optimized", {"stamp_ns": stamps, **pose_columns(placed)})
         write_table(work.optimized_trajectory(name), table, content, ("stamp_ns",))
 

@@ -5,13 +5,19 @@ A closure is moved to the nearest vertex along its session's odometry.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.numerics.transforms import inverse
-from semloc_logs.pose_graph.graph import Loops, PoseGraph, turned_covariance
+from semloc_logs.pose_graph.graph import (
+    NO_POSITIONS,
+    Loops,
+    PoseGraph,
+    Positions,
+    turned_covariance,
+)
 from semloc_logs.pose_graph.odometry_noise import OdometryNoise
 from semloc_logs.settings import ResolvedOptimize
 
@@ -65,7 +71,7 @@ class Problem:
     """``kept`` are the graph's vertices (v,) that are solved for, ``chain`` (v,) their sessions.
 
     ``odometry`` connects neighbours of a chain, ``loops`` are in the order of the closures.
-    ``spacing`` is the setting of the spacing of vertices, metres.
+    ``spacing`` is the setting of the spacing of vertices, metres; ``fixes`` hold some vertices.
     """
 
     kept: I64
@@ -74,6 +80,26 @@ class Problem:
     loops: Edges
     up: Directions
     spacing: float
+    fixes: Positions = NO_POSITIONS
+
+
+def with_fixes(problem: Problem, graph: PoseGraph, settings: ResolvedOptimize) -> Problem:
+    """``problem`` with the fixes of ``graph``, moved to the nearest vertices; one for each."""
+    fixes = graph.fixes
+    vertex = nearest_kept(graph, problem.kept, fixes.vertices)
+    road = np.abs(graph.distance[problem.kept[vertex]] - graph.distance[fixes.vertices])
+    order = np.lexsort((road, vertex))
+    _, first = np.unique(vertex[order], return_index=True)
+    rows = order[first]
+    own_T_keyframe = (
+        inverse(graph.map_T_base[problem.kept[vertex[rows]]])
+        @ graph.map_T_base[fixes.vertices[rows]]
+    )
+    antenna = np.einsum("nij,nj->ni", own_T_keyframe[:, :3, :3], fixes.antenna[rows])
+    antenna += own_T_keyframe[:, :3, 3]
+    drift = OdometryNoise.of(settings).position_variance(road[rows])
+    sigma = np.sqrt(fixes.sigma[rows] ** 2 + drift[:, None])
+    return replace(problem, fixes=Positions(vertex[rows], antenna, fixes.position[rows], sigma))
 
 
 def coarse_problem(graph: PoseGraph, settings: ResolvedOptimize) -> Problem:

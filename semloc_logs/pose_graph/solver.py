@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -24,7 +25,14 @@ from semloc_logs.errors import SemlocError
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.pose_graph.conjugate_gradients import Layout, Limits, minimised
 from semloc_logs.pose_graph.graph import turned_covariance
-from semloc_logs.pose_graph.normal_equations import UP_HUBER, NormalEquations, PosePriors
+from semloc_logs.pose_graph.normal_equations import (
+    FIX_CAUCHY,
+    UP_HUBER,
+    Holds,
+    NormalEquations,
+    PosePriors,
+    fix_errors,
+)
 from semloc_logs.pose_graph.problem import Edges, Problem
 
 LOGGER = logging.getLogger(__name__)
@@ -40,11 +48,13 @@ STEP_ITERATIONS = 1  # of Levenberg-Marquardt in each step of the schedule
 LAST_ITERATIONS = 20  # in the solution that follows
 TOLERANCE = 1e-6  # relative decrease of the error that ends it
 MOST_STEPS = 100
-# vertices that GTSAM solves; conjugate gradients beyond, as many sessions of the same roads fill
-# the matrix of a direct solution
-MOST_DIRECT = 5_000
+# vertices times squared sessions up to which GTSAM solves directly, and conjugate gradients beyond:
+# sessions of the same roads fill its matrix, as each is connected with all others
+MOST_FILL = 2e7
 NODES_APART = 20.0  # vertex spacings between the nodes of a motion that all sessions share
 RESIDUAL = 1e-2  # of each step; the steps that follow take away what it leaves
+ITERATED_TOLERANCE = 1e-5  # relative decrease of the error that ends it
+FIX_STEP = 4.0  # the weights of satellite fixes narrow down by so much
 BINARY = 1e-3  # a weight that is nearer to 0 or 1 counts as that
 # a chain whose closures are all refused stays where it is, to the width of a continent
 LOOSE = [1e3, 1e3, 1e3, 3.0, 3.0, 3.0]  # m and rad
@@ -89,8 +99,10 @@ class Solver:
         self._gtsam = gtsam_library()
         self._problem = problem
         self._component = component
-        _, anchors = np.unique(component, return_index=True)
-        self._anchors = set(anchors.tolist())
+        frames, anchors = np.unique(component, return_index=True)
+        is_held = np.isin(frames, component[problem.fixes.vertices])
+        self._anchors = set(anchors[~is_held].tolist())
+        self._fix_scale = FIX_CAUCHY
         self._initial = initial
         self._ordering: Any = None
 
@@ -125,9 +137,25 @@ class Solver:
         return Solution(poses, np.round(weight), squared, Method.GNC)
 
     def refined(self, initial: F64, weight: F64) -> Solution:
-        """Least squares from ``initial`` (v, 4, 4) with given weights of the closures."""
-        poses = self._solved(initial, weight, LAST_ITERATIONS)
+        """Least squares from ``initial`` (v, 4, 4) with given weights of the closures.
+
+        Fixes may be far off at first, as the poses drift: their weights narrow down.
+        """
+        poses = initial
+        for scale in self._fix_scales(initial):
+            self._fix_scale = scale
+            poses = self._solved(poses, weight, STEP_ITERATIONS)
+        self._fix_scale = FIX_CAUCHY
+        poses = self._solved(poses, weight, LAST_ITERATIONS)
         return Solution(poses, weight, squared_errors(self._problem.loops, poses), Method.GNC)
+
+    def _fix_scales(self, poses: F64) -> list[float]:
+        """Constants of the weights of fixes, the largest one first."""
+        if not len(self._problem.fixes):
+            return []
+        away = np.linalg.norm(fix_errors(self._problem.fixes, poses), axis=1)
+        steps = np.ceil(np.log(max(np.median(away) / FIX_CAUCHY, 1.0)) / np.log(FIX_STEP))
+        return [FIX_CAUCHY * FIX_STEP**k for k in range(int(steps), 0, -1)]
 
     def cauchy(self, initial: F64, start: F64) -> Solution:
         """Weights of a Cauchy distribution, iterated; a closure above the bound is refused."""
@@ -155,6 +183,8 @@ class Solver:
         """All factors, the closures with these weights."""
         loops = self._problem.loops
         graph = self._gtsam.NonlinearFactorGraph(self._fixed)
+        for factor in self._fix_factors():
+            graph.add(factor)
         for row in np.flatnonzero(weight > 0).tolist():
             root = loops.root[row] * np.sqrt(weight[row])
             graph.add(_between(self._gtsam, loops, row, root))
@@ -168,8 +198,9 @@ class Solver:
 
     def _solved(self, initial: F64, weight: F64, iterations: int) -> F64:
         """Least squares with these weights of the closures, at most so many iterations."""
-        if len(initial) > MOST_DIRECT:
-            limits = Limits(iterations, TOLERANCE, RESIDUAL)
+        if self._is_large:
+            self._equations.fix_scale = self._fix_scale
+            limits = Limits(iterations, ITERATED_TOLERANCE, RESIDUAL)
             weights = np.concatenate([np.ones(len(self._problem.odometry)), weight])
             return minimised(self._equations, initial, weights, self._layout, limits)
         gtsam = self._gtsam
@@ -184,6 +215,12 @@ class Solver:
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
         return np.array([solved.atPose3(k).matrix() for k in range(len(initial))])
 
+    @property
+    def _is_large(self) -> bool:
+        chain = self._problem.chain
+        sessions = int(chain.max(initial=-1)) + 1
+        return len(chain) * sessions**2 > MOST_FILL
+
     @cached_property
     def _layout(self) -> Layout:
         problem = self._problem
@@ -193,7 +230,8 @@ class Solver:
     def _equations(self) -> NormalEquations:
         problem = self._problem
         edges = problem.odometry.joined(problem.loops)
-        return NormalEquations(len(problem.kept), edges, problem.up, self._priors)
+        holds = Holds(problem.up, self._priors, problem.fixes)
+        return NormalEquations(len(problem.kept), edges, holds)
 
     @cached_property
     def _priors(self) -> PosePriors:
@@ -203,6 +241,16 @@ class Solver:
         sigma = [[ANCHOR_SIGMA] * 6 if k in self._anchors else LOOSE for k in first.tolist()]
         root = np.eye(6) / np.array(sigma)[:, None, :]
         return PosePriors(first, self._initial[first], root)
+
+    def _fix_factors(self) -> Iterator[Any]:
+        gtsam = self._gtsam
+        fixes = self._problem.fixes
+        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(self._fix_scale)
+        for vertex, antenna, position, sigma in zip(
+            fixes.vertices.tolist(), fixes.antenna, fixes.position, fixes.sigma, strict=True
+        ):
+            model = gtsam.noiseModel.Robust.Create(cauchy, gtsam.noiseModel.Diagonal.Sigmas(sigma))
+            yield gtsam.GPSFactorArm(vertex, position, antenna, model)
 
     @cached_property
     def _fixed(self) -> Any:

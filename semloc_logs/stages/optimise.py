@@ -94,7 +94,7 @@ def optimise(
     solved: list[str] = []
     for k, group in enumerate(groups):
         if earlier is not None and _is_up_to_date(work, group, earlier):
-            graph = pose_graph_of(group.sessions, group.closures)
+            graph = pose_graph_of(group.sessions, group.closures, settings.optimize)
             tables.append(earlier.rows_of(graph, fine_problem(graph, settings.optimize)))
         else:
             tables.append(_solve(work, group, settings, metadata, covariances=covariances))
@@ -153,7 +153,7 @@ def _solve(
     *,
     covariances: bool,
 ) -> GroupTables:
-    graph = pose_graph_of(group.sessions, group.closures)
+    graph = pose_graph_of(group.sessions, group.closures, settings.optimize)
     optimised = optimise_graph(graph, settings.optimize, covariances=covariances)
     content = {**metadata, "fingerprint": group.fingerprint, "method": optimised.method.value}
     write_trajectories(work, group.sessions, optimised, content)

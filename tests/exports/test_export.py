@@ -192,6 +192,10 @@ def test_a_layout_shows_the_closures_where_the_drive_is(work: Workspace, tmp_pat
         {"role": "imu", "topic": "/imu"},
     ]
     write_json(path, json.loads(path.read_text()) | {"session_frame": "odom", "streams": streams})
+    _close(work)
+    (with_target,) = export(work, ["b"], "foxglove-layout", tmp_path)
+    scene = json.loads(with_target.read_text())["configById"]["3D!closures"]
+    assert scene["topics"]["/semloc/pose/a"]["visible"]
     (written,) = export(work, ["a"], "foxglove-layout", tmp_path)
     assert written.name == "a.foxglove-layout.json"
     content = json.loads(written.read_text())
@@ -199,6 +203,7 @@ def test_a_layout_shows_the_closures_where_the_drive_is(work: Workspace, tmp_pat
     assert scene["followTf"] == "odom"
     assert scene["cameraState"]["targetOffset"] == [101.5, 0, 0]  # of 100 and 103
     assert {t for t, c in scene["topics"].items() if c["visible"]} == {
+        "/semloc/map",
         "/semloc/markers",
         "/semloc/pose",
         "/points",

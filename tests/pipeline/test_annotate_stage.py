@@ -330,7 +330,7 @@ def test_poses_in_the_common_frame(
     annotate_stage.annotate(drives["monday"].log, labelled, tools.quick_settings(), annotation)
     reads = list(read_ros2(tmp_path / "out.mcap"))
     poses = {r.log_time_ns: r.message for r in reads if r.topic == "/semloc/pose"}
-    assert len(poses) > 10
+    assert len(poses) == pq.read_table(labelled.session("monday").frames).num_rows > 1
     frames = {
         r.log_time_ns: r.message.transforms[0]
         for r in reads

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.logs.poses.navsat import LocalFrame
 from semloc_logs.numerics.transforms import exp_se3, inverse, yaw_transform
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
@@ -19,6 +20,7 @@ F64 = NDArray[np.float64]
 SECOND = 1_000_000_000
 METADATA = {"schema_version": 1, "voxel_size": 0.3}
 SIDE_M = 100
+DATUM = (47.37, 8.54, 410.0)  # WGS 84 degrees, m
 # how a map lies in its session frame: a shift, and a tilt of the sensor's odometry
 SESSION_T_MAP = exp_se3(np.array([3.0, -2.0, 1.0]), np.radians([4.0, -3.0, 50.0]))
 
@@ -105,6 +107,26 @@ class Drives:
             truth[session] = {"trajectory": f"{session}.tum"}
         self.truth_file.write_text(json.dumps(truth))
 
+    def locate(
+        self, name: str, enu_T_common: F64, wrong: Sequence[int] = (), every: int = 5
+    ) -> None:
+        """fixes.parquet: each fifth second, 1 m off at most; the ``wrong`` ones by 80 m."""
+        rng = np.random.default_rng(len(self.true))
+        rows = np.arange(0, len(self.true[name]), every)
+        local = LocalFrame(*DATUM)
+        placed = (enu_T_common @ self.true[name][rows])[:, :3, 3]
+        placed += rng.uniform(-0.5, 0.5, placed.shape)
+        placed[np.isin(rows, wrong), 0] += 80.0
+        places = local.geodetic(placed)
+        columns: dict[str, Any] = {
+            "stamp_ns": (self.start_s[name] + rows) * SECOND,
+            **dict(zip(("latitude_deg", "longitude_deg", "height"), places.T, strict=True)),
+            **{f"sigma_{axis}": np.full(len(rows), 0.5) for axis in ("east", "north", "up")},
+            **{f"antenna_{axis}": np.zeros(len(rows)) for axis in "xyz"},
+        }
+        table = contracts.table("fixes", columns)
+        write_table(self.work.session(name).fixes, table, METADATA)
+
     def close(self, matches: Sequence[Match]) -> None:
         """closures.parquet with these closures, of 5 cm and 0.3 degrees."""
         poses = []
@@ -137,3 +159,9 @@ def drives(tmp_path: Path) -> Drives:
 def square_of() -> Callable[[int], F64]:
     """The poses of laps around the block."""
     return square
+
+
+@pytest.fixture
+def datum() -> tuple[float, float, float]:
+    """The point that fixes are made about."""
+    return DATUM

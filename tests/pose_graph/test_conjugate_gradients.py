@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.numerics.transforms import exp_se3
 from semloc_logs.pose_graph import solver
-from semloc_logs.pose_graph.normal_equations import NormalEquations, PosePriors, moved
+from semloc_logs.pose_graph.graph import Positions
+from semloc_logs.pose_graph.normal_equations import Holds, NormalEquations, PosePriors, moved
 from semloc_logs.pose_graph.problem import Directions, Edges
 from semloc_logs.settings import load
 from semloc_logs.stages.optimise import optimise
@@ -19,7 +20,7 @@ SETTINGS = load().resolved()
 
 
 def _random_equations(rng: np.random.Generator) -> tuple[NormalEquations, np.ndarray]:
-    """Three poses that two edges, a prior and two directions hold, none of them fulfilled."""
+    """Three poses that two edges, a prior, two directions and a fix hold, none fulfilled."""
 
     def pose(scale: float) -> np.ndarray:
         return exp_se3(rng.normal(0, scale, 3), rng.normal(0, 0.5, 3))
@@ -35,7 +36,11 @@ def _random_equations(rng: np.random.Generator) -> tuple[NormalEquations, np.nda
     )
     up = Directions(np.array([0, 2]), np.array([[0.0, 0.1, 0.99], [0.2, 0.0, 0.98]]), 2.0)
     priors = PosePriors(np.array([1]), np.array([pose(1.0)]), np.array([root()]))
-    return NormalEquations(3, edges, up, priors), np.array([pose(1.0) for _ in range(3)])
+    sigma = np.array([[1.0, 2.0, 3.0]])
+    fixes = Positions(np.array([2]), rng.normal(size=(1, 3)), rng.normal(size=(1, 3)), sigma)
+    return NormalEquations(3, edges, Holds(up, priors, fixes)), np.array(
+        [pose(1.0) for _ in range(3)]
+    )
 
 
 def test_the_gradient_is_the_slope_of_the_cost() -> None:
@@ -77,7 +82,7 @@ def test_conjugate_gradients_give_the_poses_of_a_direct_solution(
     names = ("a", "b", "c")
     by_gtsam = [poses_of(read_table(drives.work.optimized_trajectory(n))) for n in names]
 
-    monkeypatch.setattr(solver, "MOST_DIRECT", 0)
+    monkeypatch.setattr(solver, "MOST_FILL", 0)
     iterated = optimise(drives.work, SETTINGS, overwrite=True)
     assert (iterated.rejected, iterated.frames) == (direct.rejected, direct.frames) == (1, 1)
     for name, expected in zip(names, by_gtsam, strict=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ from semloc_logs.logs.annotation.channels import (
     Encoding,
     LogContext,
     LogFacts,
+    NewChannel,
+    NewMessage,
     Scene,
     channel_metadata,
     encode,
@@ -38,7 +41,13 @@ from semloc_logs.logs.annotation.mcap_append import (
     read_end,
     read_header,
 )
-from semloc_logs.logs.annotation.rosbag_copy import bag_facts, opened, write_copy
+from semloc_logs.logs.annotation.rosbag_copy import (
+    CALLER,
+    bag_facts,
+    opened,
+    write_bag,
+    write_copy,
+)
 from semloc_logs.logs.annotation.tail_swap import (
     SIDE_SUFFIX,
     copy_start,
@@ -113,26 +122,46 @@ class Results:
 
     def plan(self, output: Path, end: LogEnd, facts: LogFacts) -> tuple[AppendPlan, AnnotateReport]:
         """How a file that ends with ``end`` takes the results."""
-        run = run_id(self.closures, self.session, self.settings, __version__)
-        frame_id = f"semloc/{self.session}" if self.frame_id is None else self.frame_id
-        size = _marker_size(self.settings)
-        context = LogContext(self.session, facts, self.log_times, frame_id, size, self.scene)
-        metadata = channel_metadata(run, __version__)
-        channels, messages = encode(self.closures, context, encoder_for(facts), metadata)
-
+        run = self.run_id
+        channels, messages = self.encoded(facts)
         own = {f"setting.{key}": value for key, value in sorted(self.settings.items())}
         own |= {"version": __version__, "schema_version": "1", "session": self.session}
         plan = plan_append(end, channels, messages, f"{METADATA_PREFIX}{run}", own)
-        report = AnnotateReport(
+        size = len(plan.new_tail)
+        return plan, self.report(output, facts, messages, size, replaced=end.replaces)
+
+    @property
+    def run_id(self) -> str:
+        """What names this result."""
+        return run_id(self.closures, self.session, self.settings, __version__)
+
+    def encoded(self, facts: LogFacts) -> tuple[list[NewChannel], list[NewMessage]]:
+        """The channels and messages in the encoding of a log."""
+        frame_id = f"semloc/{self.session}" if self.frame_id is None else self.frame_id
+        size = _marker_size(self.settings)
+        context = LogContext(self.session, facts, self.log_times, frame_id, size, self.scene)
+        metadata = channel_metadata(self.run_id, __version__)
+        return encode(self.closures, context, encoder_for(facts), metadata)
+
+    def report(
+        self,
+        output: Path,
+        facts: LogFacts,
+        messages: Sequence[NewMessage],
+        size: int,
+        *,
+        replaced: bool,
+    ) -> AnnotateReport:
+        """What was written in ``size`` bytes."""
+        return AnnotateReport(
             path=output,
-            run_id=run,
+            run_id=self.run_id,
             encoding=facts.encoding,
             closures=sum(m.channel == 0 for m in messages),
             messages=len(messages),
-            bytes_written=len(plan.new_tail),
-            replaced=end.replaces,
+            bytes_written=size,
+            replaced=replaced,
         )
-        return plan, report
 
 
 def annotate_copy(
@@ -141,11 +170,14 @@ def annotate_copy(
     """Write ``output`` (MCAP): all of ``log``, and the results.
 
     An MCAP log is copied undecoded; a .bag, a .db3 or a bag folder is converted, message by
-    message. Raises ``LogError``, and leaves nothing behind, when the log is damaged or ``output``
-    exists and ``overwrite`` is not set. Both may be addresses; RemoteError where a server fails.
+    message. Of a .bag, an ``output`` that ends in .bag is a ROS 1 bag, too. Raises ``LogError``,
+    and leaves nothing behind, when the log is damaged or ``output`` exists and ``overwrite`` is not
+    set. Both may be addresses; RemoteError where a server fails.
     """
     _refuse(log, output, overwrite)
     recover(log)
+    if output.suffix == ".bag":
+        return _annotate_bag(log, output, results)
     if not _is_mcap(log):
         with opened(log, results.memory) as readers, _published(output) as file:
             write_copy(log, readers, file, LIBRARY, results.memory)
@@ -163,6 +195,24 @@ def annotate_copy(
             copy_start(original.fileno(), file.fileno(), plan.start)
         _finish(file, plan)
         return report
+
+
+def _annotate_bag(log: Path, output: Path, results: Results) -> AnnotateReport:
+    if log.suffix != ".bag" or _is_mcap(log) or is_remote(output):
+        raise LogError(
+            f"{output} would be a ROS 1 bag, which only a local copy of a .bag log can be: give"
+            " the name of an MCAP file."
+        )
+    with opened(log, results.memory) as readers, _folder_for(output) as folder:
+        facts = bag_facts(log, readers)
+        channels, messages = results.encoded(facts)
+        written = folder / output.name
+        write_bag(log, readers, written, (channels, messages), results.memory)
+        with replacing_file(output) as temporary:
+            written.replace(temporary)
+        replaced = any(c.ext.callerid == CALLER for c in readers[0].connections)
+    size = sum(len(message.data) for message in messages)
+    return results.report(output, facts, messages, size, replaced=replaced)
 
 
 def annotate_in_place(log: Path, results: Results) -> AnnotateReport:
@@ -345,6 +395,19 @@ def _published(output: Path) -> Iterator[BinaryIO]:
     try:
         with replacing_file(output) as temporary, temporary.open("w+b") as file:
             yield file
+    except OSError as error:
+        raise LogError(
+            f"{output} could not be written ({error.strerror}); make room or give another output."
+        ) from error
+
+
+@contextlib.contextmanager
+def _folder_for(output: Path) -> Iterator[Path]:
+    """A folder beside ``output`` for a writer that makes its file itself."""
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".scratch.", dir=output.parent) as name:
+            yield Path(name)
     except OSError as error:
         raise LogError(
             f"{output} could not be written ({error.strerror}); make room or give another output."

@@ -428,7 +428,7 @@ def _pose_in_target(closure: ClosureRecord, session_T_query: F64) -> StampedPose
 
 
 def _scene(context: LogContext, encoder: Encoder, number: Mapping[str, int]) -> list[NewMessage]:
-    """A message for each moving transform and pose, and one, at the start, for what is fixed."""
+    """A message for each moving transform and pose, and one, at the start, for all fixed ones."""
     scene = context.scene
     moving = [(t.stamp_ns, MOVING, encoder.transforms([t])) for t in scene.moving]
     moving += [(pose.stamp_ns, POSE, encoder.pose(pose)) for pose in scene.common]

@@ -1,10 +1,11 @@
-"""ROS bags that are not MCAP files: facts for a writer of new channels, and a copy as MCAP."""
+"""ROS bags that are not MCAP files: facts for a writer of new channels, and copies of them."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import stat
+from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,20 +13,30 @@ from typing import Any, BinaryIO
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2.metadata import dump_qos_v8
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.errors import LogError, SemlocError
-from semloc_logs.logs.annotation.channels import QOS_KEY, LogFacts, is_old_marker
+from semloc_logs.logs.annotation.channels import (
+    LATCHING_KEY,
+    QOS_KEY,
+    LogFacts,
+    NewChannel,
+    NewMessage,
+    is_old_marker,
+)
 from semloc_logs.logs.containers import sqlite_file
 from semloc_logs.logs.containers.base import unpack_whole
 from semloc_logs.logs.containers.memory import DEFAULT, Memory
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.messages.type_names import ros2_type
 from semloc_logs.logs.remote import is_remote
+
+CALLER = "/semloc"  # of our connections in a ROS 1 bag
 
 
 class _Sqlite(Sqlite3Reader):
@@ -169,6 +180,65 @@ def write_copy(
         )
     writer.finish()  # type: ignore[no-untyped-call]
     return written
+
+
+def write_bag(
+    log: Path,
+    readers: Sequence[Any],
+    output: Path,
+    added: tuple[Sequence[NewChannel], Sequence[NewMessage]],
+    memory: int = DEFAULT,
+) -> None:
+    """Write every message of a ROS 1 bag, and the ``added`` ones, as a ROS 1 bag.
+
+    ``output`` must not exist. Connections of an earlier annotation are left out. Messages are in
+    the order of their receive times, the added ones behind recorded ones of the same time.
+    """
+    reader = readers[0]
+    channels, messages = added
+    with Writer1(output) as writer:
+        connections = {}
+        written: dict[tuple[Any, ...], Any] = {}
+        for connection in reader.connections:
+            if connection.ext.callerid == CALLER:
+                continue
+            name, _, text = _schema(connection, True)
+            key = (connection.topic, name, text, connection.ext.callerid, connection.ext.latching)
+            if key not in written:
+                written[key] = writer.add_connection(
+                    connection.topic,
+                    connection.msgtype,
+                    msgdef=text,
+                    md5sum=connection.digest,
+                    callerid=connection.ext.callerid,
+                    latching=connection.ext.latching,
+                )
+            connections[connection.id] = written[key]
+        own = [_added_connection(writer, channel) for channel in channels]
+        waiting = deque(messages)
+        for connection, time, data in _guarded(log, reader, Memory(memory)):
+            while waiting and waiting[0].log_time_ns < time:
+                message = waiting.popleft()
+                writer.write(own[message.channel], message.log_time_ns, message.data)
+            if connection.id in connections:
+                writer.write(connections[connection.id], max(0, time), bytes(data))
+        for message in waiting:
+            writer.write(own[message.channel], message.log_time_ns, message.data)
+
+
+def _added_connection(writer: Writer1, channel: NewChannel) -> Any:
+    name = channel.schema_name.replace("/", "/msg/")
+    text = channel.schema_data.decode()
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, name))
+    return writer.add_connection(
+        channel.topic,
+        name,
+        msgdef=text,
+        md5sum=store.generate_msgdef(name, ros_version=1)[1],
+        callerid=CALLER,
+        latching=1 if LATCHING_KEY in channel.metadata else None,
+    )
 
 
 def _readers(log: Path) -> list[Any]:

@@ -77,6 +77,29 @@ class LocalFrame:
             self._enu_R_earth @ (earth_centred(latitude_deg, longitude_deg, height) - self._origin)
         )
 
+    def geodetic(self, positions: F64) -> F64:
+        """Latitudes and longitudes (degrees) and heights (m) of positions (n, 3) of the frame.
+
+        Bowring, Survey Review 28, 1985: below a millimetre for heights up to 10 km.
+        """
+        x, y, z = (positions @ self._enu_R_earth + self._origin).T
+        semi_minor = _SEMI_MAJOR * (1.0 - _FLATTENING)
+        around = np.hypot(x, y)
+        parametric = np.arctan2(z * _SEMI_MAJOR, around * semi_minor)
+        for _ in range(2):
+            latitude = np.arctan2(
+                z + _E2 / (1.0 - _E2) * semi_minor * np.sin(parametric) ** 3,
+                around - _E2 * _SEMI_MAJOR * np.cos(parametric) ** 3,
+            )
+            parametric = np.arctan2((1.0 - _FLATTENING) * np.sin(latitude), np.cos(latitude))
+        curvature = _SEMI_MAJOR / np.sqrt(1.0 - _E2 * np.sin(latitude) ** 2)
+        height = (
+            around * np.cos(latitude)
+            + (z + _E2 * curvature * np.sin(latitude)) * np.sin(latitude)
+            - curvature
+        )
+        return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height], axis=1)
+
 
 def navsat_poses(roles: Roles, streams: Sequence[Stream]) -> NavSatPoses | None:
     """A source of poses where the log has fixes and no pose topic.

@@ -17,6 +17,7 @@ from semloc_logs.frames import (
 )
 from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.logs.poses.base_frame import BasePoses
+from semloc_logs.logs.poses.fixes import Fixes
 from semloc_logs.logs.poses.imu_gravity import Accelerometer
 from semloc_logs.logs.problems import NoCloud
 from semloc_logs.logs.roles import Roles
@@ -35,7 +36,8 @@ class CloudPass:
     """The state of a pass: ``poses``, ``tally`` of frames, ``meanings`` of labels by topic.
 
     ``builder`` makes the clouds, ``relay`` hands pictures on; ``stamp_offsets``: header stamps
-    beside log times. Frames that wait for their poses take ``most_bytes`` at most.
+    beside log times; ``fixes`` of satellites. Frames that wait for their poses take ``most_bytes``
+    at most.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class CloudPass:
         self.cameras = cameras
         self.builder = builder
         self.accelerometer = Accelerometer()
+        self.fixes = Fixes()
         self.tally = Tally()
         self.meanings: dict[str, LabelNames] = {}
         self.stamp_offsets = StampOffsets()
@@ -100,6 +103,8 @@ class CloudPass:
             self.poses.take_measurement(frame)
         elif isinstance(frame, NavSatSample):
             self.poses.take_measurement(frame)
+            if topic in self._roles.topics("gnss"):
+                self.fixes.take(frame)
         elif isinstance(frame, LabelNames):
             self.meanings.setdefault(topic, frame)
         elif isinstance(frame, RangeFrame):

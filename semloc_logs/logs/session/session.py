@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -229,6 +229,10 @@ class Session:
         """Stamps (n,) and ``session_T_base`` (n, 4, 4) of all poses; complete after the pass."""
         track = self._pass.poses.track
         return track.stamps_ns.copy(), track.poses
+
+    def fixes(self) -> dict[str, Any]:
+        """Columns of the table ``fixes``; complete after the pass."""
+        return self._pass.fixes.columns(self.base_T)
 
     def pose_at(self, stamp_ns: int) -> F64 | None:
         """``session_T_base`` (4, 4) at a time that the pass has reached; None in a gap."""

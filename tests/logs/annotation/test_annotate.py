@@ -30,6 +30,7 @@ from semloc_logs.logs.annotation.annotate import (
     content_fingerprint,
     recover,
 )
+from semloc_logs.logs.annotation.channels import Cloud, Scene
 
 TEXT = "std_msgs/msg/String"
 
@@ -135,6 +136,7 @@ def test_bags_get_a_converted_copy_or_a_sidecar(tmp_path: Path, kind: str) -> No
         ("/semloc/loop_closures", 102),
         ("/semloc/markers", 102),
         ("/semloc/pose", 102),
+        ("/semloc/pose/b", 102),
     ]
     assert mcap_messages(copy) == sorted(bag_messages(reader) + ours)
     assert content_fingerprint(log) == before
@@ -143,7 +145,7 @@ def test_bags_get_a_converted_copy_or_a_sidecar(tmp_path: Path, kind: str) -> No
         with path.open("rb") as file:
             assert make_reader(file).get_header().profile == profile == report.encoding
     if profile == "ros2":
-        for path, count in ((copy, 13), (side, 3)):
+        for path, count in ((copy, 14), (side, 4)):
             with AnyReader([path]) as any_reader:
                 read = [
                     any_reader.deserialize(raw, c.msgtype) for c, _, raw in any_reader.messages()
@@ -154,6 +156,55 @@ def test_bags_get_a_converted_copy_or_a_sidecar(tmp_path: Path, kind: str) -> No
     # the copy is an MCAP log like any other
     again = annotate_in_place(copy, Results([closure()], "a", {}, log_times={3: 102}))
     assert again.replaced
+
+
+def test_a_bag_gets_a_copy_that_is_a_bag(tmp_path: Path) -> None:
+    log = bag1(tmp_path / "one.bag")
+    copy = tmp_path / "copy.bag"
+    cloud = Cloud(
+        "odom", np.ones((2, 3), np.float32), np.ones((2, 3), np.uint8), np.zeros(2, np.uint8)
+    )
+    results = Results([closure()], "a", {}, log_times={3: 102}, scene=Scene(cloud=cloud))
+    report = annotate_copy(log, copy, results)
+    assert (report.path, report.encoding, report.closures) == (copy, "ros1", 1)
+    side = tmp_path / "side.mcap"
+    annotate_sidecar(log, side, results)
+    ours = mcap_messages(side)
+    assert len(ours) == report.messages == 5
+    assert bag_messages(Reader1(copy)) == sorted(bag_messages(Reader1(log)) + ours)
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Reader1(copy) as reader:
+        for connection in reader.connections:
+            if connection.topic == "/semloc/map":
+                assert connection.ext.latching == 1
+            if connection.msgtype in store.types:  # the sums by which ROS knows definitions
+                expected = store.generate_msgdef(connection.msgtype, ros_version=1)[1]
+                assert connection.digest == expected
+        times = [time for _, time, _ in reader.messages()]
+    assert times == sorted(times)
+    with AnyReader([copy]) as any_reader:
+        (found,) = [
+            any_reader.deserialize(raw, c.msgtype)
+            for c, _, raw in any_reader.messages()
+            if c.topic == "/semloc/loop_closures"
+        ]
+    assert (found.query_session, found.target_session, found.t_x) == ("a", "b", 1.0)
+
+    # a copy of the copy replaces the results
+    again = annotate_copy(copy, tmp_path / "again.bag", results)
+    assert (again.replaced, again.messages) == (True, 5)
+    assert bag_messages(Reader1(tmp_path / "again.bag")) == bag_messages(Reader1(copy))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "again.bag", "copy.bag", "one.bag", "side.mcap",
+    ]  # fmt: skip
+
+
+def test_other_logs_get_no_bag(tmp_path: Path) -> None:
+    log = bag2(tmp_path / "two")
+    with pytest.raises(LogError, match=r"only a local copy of a \.bag log"):
+        annotate_copy(log, tmp_path / "out.bag", Results([], "a", {}, log_times={}))
+    assert not (tmp_path / "out.bag").exists()
 
 
 def test_qos_of_the_log_is_kept(tmp_path: Path) -> None:
@@ -192,7 +243,8 @@ def test_qos_of_the_log_is_kept(tmp_path: Path) -> None:
     assert first.read_bytes() == second.read_bytes()
     with Reader2(second) as reader:
         found = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}  # type: ignore[union-attr]
-    assert sorted(found) == ["/one", "/semloc/loop_closures", "/semloc/markers", "/semloc/pose"]
+    ours = ["/semloc/loop_closures", "/semloc/markers", "/semloc/pose", "/semloc/pose/b"]
+    assert sorted(found) == ["/one", *ours]
     assert all(profiles == [qos] for profiles in found.values())
 
 
@@ -274,7 +326,7 @@ def test_a_log_that_is_cut_off_still_gets_a_sidecar(tmp_path: Path) -> None:
     )
     assert (report.encoding, report.closures) == ("ros2", 1)
     with AnyReader([tmp_path / "side.mcap"]) as reader:
-        assert reader.message_count == 3
+        assert reader.message_count == 4
 
 
 @pytest.mark.parametrize(
@@ -358,9 +410,9 @@ def test_real_ros2_logs(shared: Callable[[str], Path], tmp_path: Path, name: str
     with Reader2(log) as original:
         expected = original.message_count
     with AnyReader([out]) as reader:
-        assert reader.message_count == expected + 5
+        assert reader.message_count == expected + 6
         mine = [c for c in reader.connections if c.topic.startswith("/semloc/")]
-        assert len([reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(mine)]) == 5
+        assert len([reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(mine)]) == 6
     with out.open("rb") as file:
         decoded = list(
             make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(

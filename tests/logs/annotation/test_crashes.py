@@ -89,7 +89,7 @@ def case(tmp_path: Path, kind: str) -> Case:
     """First results, or results that replace others: the log grows, shrinks or keeps its size."""
     log = tmp_path / "made.mcap"
     write_log(log)
-    old, new = {"first": (0, 3), "longer": (1, 3), "shorter": (3, 1), "equal": (2, 2)}[kind]
+    old, new = {"first": (0, 3), "longer": (1, 3), "shorter": (3, 2), "equal": (2, 2)}[kind]
     if old:
         annotate_in_place(log, results(old, "old"))
     before = log.read_bytes()

@@ -175,12 +175,14 @@ def check_indexes(original: Path, annotated: Path) -> None:
 
 
 def check_annotated(original: Path, annotated: Path) -> None:
-    """All of the original is there in its order, our six records are last, all is listed."""
+    """All of the original is there in its order, our seven records are last, all is listed."""
     before = linear(original)
     after = linear(annotated)
     assert [r for r in after if not is_ours(r)] == before
-    assert len(after) == len(before) + 6  # two closures, one pose, two markers, one metadata record
-    assert all(is_ours(r) for r in after[-6:])
+    assert (
+        len(after) == len(before) + 7
+    )  # two closures, two poses, two markers, one metadata record
+    assert all(is_ours(r) for r in after[-7:])
     assert sorted(indexed(annotated)) == sorted(after)
     with annotated.open("rb") as file:
         statistics = make_reader(file).get_summary().statistics  # type: ignore[union-attr]
@@ -230,13 +232,13 @@ def test_every_shape_copy_in_place_and_again(tmp_path: Path, shape: str, count: 
     check_data_section(log, copy)
     if count and shape != "no summary":  # else it is scanned for what it should list
         check_indexes(log, copy)
-    assert (report.closures, report.messages, report.replaced) == (2, 5, False)
+    assert (report.closures, report.messages, report.replaced) == (2, 6, False)
     assert copy.stat().st_size - read_end(log.open("rb"), log).start == report.bytes_written
     fingerprint = content_fingerprint(place)
     annotate_in_place(place, Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES))
     assert place.read_bytes() == copy.read_bytes()
     annotate_in_place(place, Results(closures()[:1], "a", {"k": "other"}, log_times=NO_TIMES))
-    assert sum(is_ours(r) for r in linear(place)) == 4
+    assert sum(is_ours(r) for r in linear(place)) == 5
     assert annotate_in_place(
         place, Results(closures(), "a", {"k": "v"}, log_times=NO_TIMES)
     ).replaced
