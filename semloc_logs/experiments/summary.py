@@ -203,6 +203,7 @@ def to_json(outcome: Outcome) -> dict[str, Any]:
         "findings": [
             {
                 "hypothesis": f.hypothesis,
+                "method": f.method,
                 "sensor": f.sensor,
                 "scenario": f.scenario,
                 "figure": None if f.figure is None else _json(f.figure),
@@ -290,13 +291,14 @@ def _times(outcome: Outcome) -> str:
 
 def _orderings(outcome: Outcome) -> str:
     lines = [
-        _line("hypothesis", ["sensor", "scenario", "figure", "verdict"]),
-        _line("---", ["---"] * 4),
+        _line("hypothesis", ["method", "sensor", "scenario", "figure", "verdict"]),
+        _line("---", ["---"] * 5),
     ]
     lines += [
         _line(
             f.hypothesis,
             [
+                f.method,
                 f.sensor,
                 f.scenario.replace("|", "/"),
                 "" if f.figure is None else _shown(f.figure),
