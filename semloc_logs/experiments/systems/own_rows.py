@@ -58,7 +58,8 @@ def _plain_settings(options: SystemOptions, variant: Variant) -> Resolved:
             raise SettingsError(
                 f"{path} is missing: train it with 'semloc train --method paper --variant"
                 f" {variant} -o {folder}', then 'semloc vocabulary --method paper --variant"
-                f" {variant} -o {words}', and give --weights {folder.parent}."
+                f" {variant} -o {words} --set descriptor.weights={weights}', and give --weights"
+                f" {folder.parent}."
             )
     settings = load(method=METHOD).resolved()
     return with_settings(settings, {"descriptor.weights": weights, "descriptor.vocabulary": words})
