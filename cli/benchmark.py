@@ -106,6 +106,11 @@ def _names(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]
     callback=_names,
     help="Scenarios instead of all, such as 0,90,180, for paper.",
 )
+@click.option(
+    "--tables-only",
+    is_flag=True,
+    help="Tables and figures of the answers that are there, for paper; also while a run goes on.",
+)
 @path_option("-o", "--output", help="Folder of the run, for paper.  [default: paper]")
 @click.option(
     "-j",
@@ -133,6 +138,7 @@ def command(
     systems: tuple[str, ...],
     sensors: tuple[str, ...],
     scenarios: tuple[str, ...],
+    tables_only: bool,
     output: Path | None,
     jobs: int | None,
     as_json: bool,
@@ -184,6 +190,7 @@ def command(
                     scenarios,
                     jobs,
                     weights,
+                    tables_only,
                     console.note,
                 )
             )

@@ -7,7 +7,7 @@ interrupted continues there.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -68,7 +68,7 @@ class PaperRequest:
     """Which experiments: ``folder`` of the run; ``systems``: names, all without; ``quick``: a small
     simulated scene; ``logs`` with their ``truth`` instead of simulated ones; ``queries``: the most
     of a scenario; ``sensors`` and ``scenarios``: names, all without; ``weights``: a folder of
-    trained networks.
+    trained networks; ``only_tables``: of the answers that are there, while others are missing.
     """
 
     settings: Resolved
@@ -82,6 +82,7 @@ class PaperRequest:
     scenarios: Sequence[str] = ()
     jobs: int | None = None
     weights: Path | None = None
+    only_tables: bool = False
     note: Callable[[str], None] = lambda _: None
 
 
@@ -207,7 +208,10 @@ def run_systems(
     A system is a task of the ``engine``; without one they follow each other in this process.
     """
     tasks = [_SystemTask(entry, stores, scenarios, request) for entry in chosen]
-    outcomes = (engine or make_engine("serial")).map(_answer_all, [task.lean() for task in tasks])
+    outcomes: Iterable[dict[str, str]] = ({} for _ in tasks)
+    if not request.only_tables:
+        engine = engine or make_engine("serial")
+        outcomes = engine.map(_answer_all, [task.lean() for task in tasks])
     rows = []
     for task, not_run in zip(tasks, outcomes, strict=True):
         row = Row(task.entry.name, task.entry.title, task.entry.remark, not_run=not_run)

@@ -78,7 +78,7 @@ ENTRIES = (
 @pytest.fixture
 def run(
     make_store: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[], PaperFiles]:
+) -> Callable[..., PaperFiles]:
     module = ModuleType(f"{MODULES}.toys")
     for item in (Nearest, Failing, lacks_library):
         setattr(module, item.__name__, item)
@@ -91,8 +91,12 @@ def run(
         heading_scenario(store, 180.0, ["map"], ["back"]),
         time_scenario(store, "summer>snow", "map", "snow"),
     ]
-    request = PaperRequest(load().resolved(), tmp_path)
-    return lambda: run_systems(request, ENTRIES, {"lidar": store}, {"lidar": scenarios})
+
+    def run_once(*, only_tables: bool = False) -> PaperFiles:
+        request = PaperRequest(load().resolved(), tmp_path, only_tables=only_tables)
+        return run_systems(request, ENTRIES, {"lidar": store}, {"lidar": scenarios})
+
+    return run_once
 
 
 def test_the_table_has_a_row_for_every_system(run: Callable[[], PaperFiles]) -> None:
@@ -165,6 +169,18 @@ def test_a_second_run_asks_no_system_again(run: Callable[[], PaperFiles]) -> Non
     calls.clear()
     run()
     assert calls == ["fit 100"]
+
+
+def test_the_tables_of_what_is_there_need_no_system(
+    run: Callable[..., PaperFiles],
+) -> None:
+    assert "| Nearest |  |  |" in run(only_tables=True).table.read_text()
+    assert calls == []
+    run()
+    calls.clear()
+    text = run(only_tables=True).table.read_text()
+    assert "| Nearest | 1.00" in text
+    assert calls == []
 
 
 def test_unknown_names_are_refused(tmp_path: Path) -> None:
