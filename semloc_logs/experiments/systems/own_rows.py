@@ -43,16 +43,26 @@ def make_ablation(options: SystemOptions) -> System:
 
 
 def make_plain(options: SystemOptions) -> System:
-    """The paper's method; its networks lie in WEIGHTS/paper/. SettingsError where they do not."""
+    """The paper's method; its networks lie in WEIGHTS/paper/. SettingsError where they do not,
+    unless the scene is small: then it trains one of its own.
+    """
     variant = _VARIANTS[options.name]
+    if options.quick and not _plain_files(options, variant)[0].exists():
+        folder = options.folder.parent / f"{METHOD}-{variant}"
+        return Plain(variant, name=options.name, quick=folder)
     return Plain(variant, _plain_settings(options, variant), name=options.name)
+
+
+def _plain_files(options: SystemOptions, variant: Variant) -> tuple[Path, Path]:
+    """Network and words of a variant."""
+    folder = (options.weights or Path("weights")) / METHOD
+    return folder / f"{variant}.safetensors", folder / f"{variant}_words.safetensors"
 
 
 def _plain_settings(options: SystemOptions, variant: Variant) -> Resolved:
     """The paper's settings with its networks."""
-    folder = (options.weights or Path("weights")) / METHOD
-    weights = folder / f"{variant}.safetensors"
-    words = folder / f"{variant}_words.safetensors"
+    weights, words = _plain_files(options, variant)
+    folder = weights.parent
     for path in (weights, words):
         if not path.exists():
             raise SettingsError(

@@ -27,7 +27,6 @@ from semloc_logs.alignment.overlaps import (
 )
 from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
-from semloc_logs.experiments.systems.trained_networks import key_of
 from semloc_logs.experiments.view_sessions import sensor_centre
 from semloc_logs.labels.space import SKY
 from semloc_logs.mapping.selection import thin
@@ -248,9 +247,9 @@ class Plain:
 def _trained_on(
     database: Sequence[View], variant: Variant, settings: Resolved, folder: Path
 ) -> tuple[PlainEncoder, PlainVocabulary]:
-    """A network and words of some subvolumes of the database; kept in ``folder``."""
+    """A network and words of some subvolumes of the first database; kept in ``folder`` for all."""
     views = [database[i] for i in range(0, len(database), max(1, len(database) // QUICK_FRAMES))]
-    own = folder / f"{variant}-{key_of(views)}"
+    own = folder / variant
     shard = own / "pairs.parquet"
     method = load(method=METHOD).training.model_copy(update={"samples": QUICK_SAMPLES})
     if not shard.exists():
