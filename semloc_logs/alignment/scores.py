@@ -104,7 +104,7 @@ class MutualScores(NamedTuple):
 
     @property
     def is_consistent(self) -> bool:
-        """Whether so little structure of either side is in free space that the pose may be right."""
+        """Whether so little structure of either side is in free space that it may be right."""
         return mutual_shares(*self)[1] < CONSISTENT
 
 

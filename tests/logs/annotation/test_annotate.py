@@ -12,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import ConnectionExtRosbag1
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Reader as Reader2
@@ -177,6 +178,7 @@ def test_a_bag_gets_a_copy_that_is_a_bag(tmp_path: Path) -> None:
     with Reader1(copy) as reader:
         for connection in reader.connections:
             if connection.topic == "/semloc/map":
+                assert isinstance(connection.ext, ConnectionExtRosbag1)
                 assert connection.ext.latching == 1
             if connection.msgtype in store.types:  # the sums by which ROS knows definitions
                 expected = store.generate_msgdef(connection.msgtype, ros_version=1)[1]
@@ -184,11 +186,12 @@ def test_a_bag_gets_a_copy_that_is_a_bag(tmp_path: Path) -> None:
         times = [time for _, time, _ in reader.messages()]
     assert times == sorted(times)
     with AnyReader([copy]) as any_reader:
-        (found,) = [
+        read: list[Any] = [
             any_reader.deserialize(raw, c.msgtype)
             for c, _, raw in any_reader.messages()
             if c.topic == "/semloc/loop_closures"
         ]
+    (found,) = read
     assert (found.query_session, found.target_session, found.t_x) == ("a", "b", 1.0)
 
     # a copy of the copy replaces the results
