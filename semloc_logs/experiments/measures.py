@@ -20,7 +20,7 @@ THRESHOLDS_M = 1.0, 5.0  # of the rank-recall curves (paper, section 4.4)
 SAMPLES = 2000  # of a bootstrap
 CONFIDENCE = 0.95
 _Z = 1.959963984540054  # standard normal quantile of (1 + CONFIDENCE) / 2
-_FEWEST = 5  # passages that a bootstrap needs
+FEWEST_PASSAGES = 5  # that a bootstrap needs
 
 
 class Bounded(NamedTuple):
@@ -77,7 +77,7 @@ def ratio(right: Mask, passage: I64) -> Bounded:
     if not len(right):
         return wilson(0, 0)
     share = float(right.mean())
-    if passages < _FEWEST or share in (0.0, 1.0):
+    if passages < FEWEST_PASSAGES or share in (0.0, 1.0):
         return wilson(share * passages, passages)
     weights = resampled(passage)
     low, high = _interval((weights @ right) / weights.sum(axis=1))
@@ -92,7 +92,7 @@ def difference(one: Mask, other: Mask, passage: I64) -> Bounded:
     passages = len(np.unique(passage))
     if not len(off):
         return Bounded(math.nan, -1.0, 1.0, 0)
-    if passages < _FEWEST:
+    if passages < FEWEST_PASSAGES:
         return _unpaired(ratio(one, passage), ratio(other, passage))
     weights = resampled(passage)
     low, high = _interval((weights @ off) / weights.sum(axis=1))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.experiments.answers import Answers
 from semloc_logs.experiments.measures import (
+    FEWEST_PASSAGES,
     Bounded,
     difference,
     difference_of_ratios,
@@ -161,7 +162,7 @@ def _near_zero(known: Known, sensor: str, scenario: str) -> Finding:
     verdict = Verdict.UNDECIDED
     if figure.high < NEAR_ZERO:
         verdict = Verdict.HOLDS
-    elif figure.low > NEAR_ZERO:
+    elif figure.low > NEAR_ZERO and figure.n >= FEWEST_PASSAGES:
         verdict = Verdict.FAILS
     return Finding(text, "SIFT", sensor, scenario, figure, verdict)
 
