@@ -31,6 +31,7 @@ from semloc_logs.mapping.fit.model import (
     Fault,
     Pairs,
     PosesAt,
+    agree_about_scale,
     difference,
     fit,
     pose_motion,
@@ -387,10 +388,9 @@ def _explained(pairs: Pairs, poses_at: PosesAt, none: Estimate) -> tuple[Estimat
     """The estimate with every fault that explains much, the one that explains most first."""
     estimate = none
     faults: list[Fault] = []
-    while len(faults) < len(Fault):
-        tries = {
-            fault: _with(pairs, poses_at, estimate, fault) for fault in Fault if fault not in faults
-        }
+    possible = [f for f in Fault if f is not Fault.SCALE or agree_about_scale(pairs, poses_at)]
+    while len(faults) < len(possible):
+        tries = {f: _with(pairs, poses_at, estimate, f) for f in possible if f not in faults}
         fault, better = min(tries.items(), key=lambda item: item[1].cost)
         excess = max(1.0, float(np.nanmedian(better.squares)) / MEDIAN_OF_6)
         if (estimate.cost - better.cost) / excess < LEAST_GAIN + len(fault.columns):

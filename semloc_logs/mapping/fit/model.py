@@ -38,6 +38,7 @@ PRIOR = np.array([3.0, *[1.5] * 3, *[5.0] * 3, 1.0])  # standard deviations: s, 
 STEPS = np.array([0.01, *[1e-3] * 3, *[1e-3] * 3, 1e-3])  # of the numeric derivatives
 OUTLIER = 4.0  # standard deviations; pairs beyond count less and less (Cauchy)
 ITERATIONS = 8
+LEAST_AGREEMENT = 2.0  # of the median ratio of lengths, in median deviations of the pairs from it
 MEDIAN_OF_6 = 5.348  # of chi squared with six degrees of freedom
 
 
@@ -272,12 +273,27 @@ def _best_rotation(pairs: Pairs, poses_at: PosesAt, given: F64) -> F64:
 
 
 def _best_scale(pairs: Pairs, poses_at: PosesAt, given: F64) -> float:
-    predicted = pose_motion(pairs, poses_at, given)
+    ratios = _log_ratios(pairs, pose_motion(pairs, poses_at, given))
+    return float(given[SCALE] + np.median(ratios)) if len(ratios) else float(given[SCALE])
+
+
+def agree_about_scale(pairs: Pairs, poses_at: PosesAt) -> bool:
+    """Whether the pairs moved by about the same factor farther than the poses.
+
+    Clouds that have little in common are pulled together, some more than others: a scale changes
+    all alike.
+    """
+    ratios = _log_ratios(pairs, pose_motion(pairs, poses_at, np.zeros(PARAMETERS)))
+    if not len(ratios):
+        return False
+    middle = float(np.median(ratios))
+    return abs(middle) >= LEAST_AGREEMENT * float(np.median(np.abs(ratios - middle)))
+
+
+def _log_ratios(pairs: Pairs, predicted: F64) -> F64:
+    """Logarithms (m,) of measured by predicted distances, of pairs that moved far."""
     known = np.isfinite(predicted[:, 0, 0])
     lengths = np.linalg.norm(predicted[known, :3, 3], axis=1)
     measured = np.linalg.norm(pairs.measured[known, :3, 3], axis=1)
-    moved = lengths > 1e-3
-    if not moved.any():
-        return float(given[SCALE])
-    ratio = float(np.median(measured[moved] / lengths[moved]))
-    return float(given[SCALE] + np.log(max(ratio, 1e-3)))
+    moved = lengths > max(1e-3, 0.5 * float(np.median(lengths))) if len(lengths) else lengths > 0
+    return np.asarray(np.log(np.maximum(measured[moved] / lengths[moved], 1e-3)))
