@@ -74,7 +74,8 @@ def _session(
         yield Finding(folder.session_json, str(problem), again)
         return
     counts = {"frames": content.get("keyframes"), "voxels": content.get("voxels")}
-    for name in ("trajectory", "frames", "ground", "keyframes", "voxels", "blocks"):
+    fixes = ["fixes"] if folder.fixes.exists() else []  # sessions of earlier versions lack them
+    for name in ("trajectory", "frames", "ground", "keyframes", "voxels", "blocks", *fixes):
         yield from _tables(getattr(folder, name), name, counts.get(name), again, out)
 
     describe = f"semloc describe {folder.name} -w {work.path}"

@@ -237,11 +237,11 @@ def test_a_small_scene_trains_a_network_of_its_own_once(
     monkeypatch.setattr(plain, "QUICK_SAMPLES", 64)
     system = Plain("geometric", plain_settings(), quick=tmp_path)
     system.fit(database)
-    kept = {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/*")}
+    kept = {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric/*")}
     assert {"pairs.parquet", "checkpoint.safetensors"} <= set(kept)
     assert len(system.localise(hidden(queries[0]))) > 0
     Plain("geometric", plain_settings(), quick=tmp_path).fit(database)
-    assert kept == {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric-*/*")}
+    assert kept == {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric/*")}
 
 
 def test_iterative_closest_points_move_a_wall_onto_a_wall() -> None:

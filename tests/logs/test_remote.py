@@ -356,7 +356,7 @@ def test_copies_and_sidecars_go_back_to_the_server(
     assert sorted(p for p in tmp_path.rglob("*")) == before, "nothing on this disk"
     annotate_copy(log, tmp_path / "local.mcap", RESULTS)
     assert bucket.get("out/copy.mcap") == (tmp_path / "local.mcap").read_bytes()
-    own = {"/semloc/loop_closures", "/semloc/pose", "/semloc/markers"}
+    own = {"/semloc/loop_closures", "/semloc/pose", "/semloc/pose/b", "/semloc/markers"}
     found = topics(bucket.get("out/sidecar.mcap"), tmp_path)
     assert found
     assert found <= own | {"/tf", "/semloc/map"}
