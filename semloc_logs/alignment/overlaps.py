@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.tau import CUBE, closest_bit, cube_offsets
+from semloc_logs.alignment.tau import CUBE, closest_in_cube, cube_offsets
 from semloc_logs.labels.space import UNLABELLED
 from semloc_logs.numerics.bits import lowest_bit
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
@@ -188,15 +188,7 @@ def _closest(
         observed = _observed_cube(arrays, x, y, z)
         if observed == 0:
             continue
-        ox = CUBE * x + 0.5 - point[0]
-        oy = CUBE * y + 0.5 - point[1]
-        oz = CUBE * z + 0.5 - point[2]
-        ax = max(ox, -ox - CUBE + 1, 0.0)
-        ay = max(oy, -oy - CUBE + 1, 0.0)
-        az = max(oz, -oz - CUBE + 1, 0.0)
-        if ax * ax + ay * ay + az * az >= best:
-            continue
-        best, bit = closest_bit(observed, (ox, oy, oz), best)
+        best, bit = closest_in_cube(observed, (x, y, z), point, best)
         if bit >= 0:
             found = (CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3))
     return best, found[0], found[1], found[2]

@@ -189,23 +189,37 @@ def _closest_around(
         observed = cubes[x, y, z]
         if observed == 0:
             continue
-        # from the point to the first centres of the cube, and to the nearest
-        ox = CUBE * x + 0.5 - point[0]
-        oy = CUBE * y + 0.5 - point[1]
-        oz = CUBE * z + 0.5 - point[2]
-        ax = max(ox, -ox - CUBE + 1, 0.0)
-        ay = max(oy, -oy - CUBE + 1, 0.0)
-        az = max(oz, -oz - CUBE + 1, 0.0)
-        if ax * ax + ay * ay + az * az >= best:
-            continue
-        best, bit = closest_bit(observed, (ox, oy, oz), best)
+        best, bit = closest_in_cube(observed, (x, y, z), point, best)
         if bit >= 0:
             found = state[CUBE * x + (bit >> 4), CUBE * y + ((bit >> 2) & 3), CUBE * z + (bit & 3)]
     return found
 
 
 @njit(cache=True, nogil=True)
-def closest_bit(
+def closest_in_cube(
+    observed: np.uint64,
+    cube: tuple[int, int, int],
+    point: tuple[float, float, float],
+    best: float,
+) -> tuple[float, int]:
+    """Squared distance and bit of the ``observed`` cell of a cube closest to ``point``.
+
+    Only those nearer than ``best`` (squared) count; without one it is ``best`` and -1.
+    """
+    # from the point to the first centres of the cube, and to the nearest
+    ox = CUBE * cube[0] + 0.5 - point[0]
+    oy = CUBE * cube[1] + 0.5 - point[1]
+    oz = CUBE * cube[2] + 0.5 - point[2]
+    ax = max(ox, -ox - CUBE + 1, 0.0)
+    ay = max(oy, -oy - CUBE + 1, 0.0)
+    az = max(oz, -oz - CUBE + 1, 0.0)
+    if ax * ax + ay * ay + az * az >= best:
+        return best, -1
+    return _closest_bit(observed, (ox, oy, oz), best)
+
+
+@njit(cache=True, nogil=True)
+def _closest_bit(
     observed: np.uint64, first: tuple[float, float, float], best: float
 ) -> tuple[float, int]:
     """Squared distance and bit of the closest ``observed`` cell nearer than ``best``; else -1.

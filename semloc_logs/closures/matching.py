@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from weakref import WeakKeyDictionary
 
@@ -184,13 +184,18 @@ def match_words(
     index = database.words(variant)
     described, prepared = prepare(query, variant, ground_z, database.settings)
     closures = database.settings.closures
-    quarters = []
-    for turns, batches in enumerate(prepared):
-        matches = index.find(batches, closures.neighbours, allowed)
-        yaw = np.mod(matches.yaw + turns * np.pi / 2, 2 * np.pi)
-        quarters.append(replace(matches, yaw=yaw))
-    columns = (np.concatenate([getattr(m, f.name) for m in quarters]) for f in fields(Matches))
-    return described, Matches(*columns)
+    quarters = [index.find(batches, closures.neighbours, allowed) for batches in prepared]
+    return described, turned_matches(quarters)
+
+
+def turned_matches(quarters: Sequence[Matches]) -> Matches:
+    """The matches of a query's words in each quarter turn, with the yaw of ``target_T_query``."""
+    turned = [
+        replace(matches, yaw=np.mod(matches.yaw + turns * np.pi / 2, 2 * np.pi))
+        for turns, matches in enumerate(quarters)
+    ]
+    columns = (np.concatenate([getattr(m, f.name) for m in turned]) for f in fields(Matches))
+    return Matches(*columns)
 
 
 def prepare(query: Query, variant: str, ground_z: float, settings: Resolved) -> Prepared:

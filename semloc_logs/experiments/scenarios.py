@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.evaluation.headings import in_window
 from semloc_logs.experiments.views import ViewStore
+from semloc_logs.numerics.evenly import evenly
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -179,7 +180,7 @@ def _thinned(passages: Sequence[I64], extent: Extent) -> list[tuple[int, int]]:
 def _evenly(numbers: I64, most: int) -> I64:
     if len(numbers) <= most:
         return numbers
-    return numbers[np.unique(np.linspace(0, len(numbers) - 1, most).round().astype(np.int64))]
+    return numbers[evenly(len(numbers), most)]
 
 
 def _trials(

@@ -24,7 +24,8 @@ from semloc_logs.simulation.drives.drive import simulate_drive
 from semloc_logs.simulation.drives.traffic import random_traffic
 from semloc_logs.simulation.drives.trajectory import drive
 from semloc_logs.simulation.meshes.objects import resample
-from semloc_logs.simulation.output.drive_log import write_session, write_truth
+from semloc_logs.simulation.output.drive_log import write_session
+from semloc_logs.simulation.output.truth_file import write_truth
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.town.road_network import left_of
 from semloc_logs.simulation.town.street import build_street, street_ground
@@ -232,5 +233,5 @@ def write_drive(town: Town, drive_: SimulatedDrive, folder: Path) -> Path:
     )
     with replacing_folder(target) as temporary:
         write_session(temporary / log.name, trajectory, frames, shots=shots)
-        write_truth(temporary / f"{drive_.name}.tum", trajectory)
+        write_truth(temporary / f"{drive_.name}.tum", trajectory.stamps_ns, trajectory.world_T_base)
     return log

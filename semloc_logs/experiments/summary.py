@@ -35,6 +35,7 @@ from semloc_logs.experiments.protocols import (
 from semloc_logs.experiments.scenarios import Scenario
 from semloc_logs.experiments.system import MOST_POSES
 from semloc_logs.experiments.views import ViewStore
+from semloc_logs.numerics.evenly import evenly
 
 RANKS = (1, 5, 20, MOST_POSES)  # of the tables; the curves have all
 ALLOWED_FDR = 0.05  # share of wrong answers that an abstaining system may give
@@ -132,8 +133,7 @@ def figures_of(answers: Answers, scenario: Scenario, store: ViewStore) -> dict[s
 
 def _curve(curve: PrecisionRecall) -> dict[str, Any]:
     """A precision-recall curve of at most ``POINTS`` points, and its figures."""
-    kept = np.unique(np.linspace(0, max(0, len(curve.recall) - 1), POINTS).round().astype(int))
-    kept = kept[: len(curve.recall)]
+    kept = evenly(len(curve.recall), POINTS)
     return {
         "average_precision": curve.average_precision,
         "best_f1": curve.best_f1,

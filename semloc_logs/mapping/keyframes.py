@@ -20,6 +20,7 @@ from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.session.session import Session
 from semloc_logs.mapping.selection import KeyframeSelector, thin
 from semloc_logs.mapping.up_direction import FlatPlaces, flat_places
+from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.prefetch import prefetched
 from semloc_logs.settings import ResolvedFusion
 
@@ -78,7 +79,7 @@ class Collected:
         without poses.
         """
         out = {}
-        for i in np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64)).tolist():
+        for i in evenly(len(self), most).tolist():
             points, _, sigma = self.load(i)
             noise = 0.0 if sigma is None else float(np.median(sigma))
             places = flat_places(points, self.origins[i], 2 * self.cell, noise)

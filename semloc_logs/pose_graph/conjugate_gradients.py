@@ -111,7 +111,8 @@ def solved(hessian: bsr_array, right: F64, precondition: _Preconditioner, residu
         x += length * direction
         rest -= length * product
         along = precondition(rest)
-        before, energy = energy, float(rest @ along)
+        before = energy
+        energy = float(rest @ along)
         if energy <= stop:
             LOGGER.debug("Conjugate gradients: %d iterations.", count + 1)
             break

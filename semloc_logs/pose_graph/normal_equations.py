@@ -83,7 +83,8 @@ class NormalEquations:
         self._fixes = fixes = holds.fixes
         self.fix_scale = FIX_CAUCHY
         every = np.arange(vertices)
-        a, b = edges.a, edges.b
+        a = edges.a
+        b = edges.b
         single = (up.vertices, priors.vertices, fixes.vertices)
         rows = np.concatenate([every, a, b, a, b, *single])
         columns = np.concatenate([every, a, b, b, a, *single])

@@ -16,7 +16,8 @@ from semloc_logs.simulation.drives.drive import DriveFrame, simulate_drive
 from semloc_logs.simulation.drives.traffic import random_traffic
 from semloc_logs.simulation.drives.trajectory import drive
 from semloc_logs.simulation.drives.vehicle_sensors import VehicleSensors
-from semloc_logs.simulation.output.drive_log import write_session, write_truth
+from semloc_logs.simulation.output.drive_log import write_session
+from semloc_logs.simulation.output.truth_file import write_truth
 from semloc_logs.simulation.plan import Plan, Route, Session, Town, plan_sessions
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.town.street import build_street, street_ground
@@ -113,4 +114,4 @@ def _write_session(
         frames = simulate_drive(world, trajectory, sensor, seed=seed, traffic=traffic)
     vehicle = VehicleSensors(imu_hz=sensor.imu_hz)
     write_session(path, trajectory, frames, format=format, sensors=vehicle, shots=shots)
-    write_truth(path.with_suffix(".tum"), trajectory)
+    write_truth(path.with_suffix(".tum"), trajectory.stamps_ns, trajectory.world_T_base)

@@ -173,7 +173,8 @@ class Encoder(Describer):
         self, variant: str, latent: int = LATENT, layer: Callable[..., Any] = P4Convolution
     ) -> None:
         super().__init__()
-        self.variant, self.latent = variant, latent
+        self.variant = variant
+        self.latent = latent
         self.embedding = nn.Embedding(CLASSES[variant] + 3, EMBEDDING)
         self.first = layer(EMBEDDING, CHANNELS[0], (2, 2, 2), group_in=False)
         self.blocks = nn.ModuleList(layer(a, b, (3, 3, 3)) for a, b in pairwise(CHANNELS))

@@ -178,7 +178,8 @@ class PlainEncoder(Describer):
 
     def __init__(self, variant: str, latent: int = LATENT) -> None:
         super().__init__()
-        self.variant, self.latent = variant, latent
+        self.variant = variant
+        self.latent = latent
         self.inputs = CLASSES[variant] + 3  # classes, free, unobserved, occupied of unknown class
         self.first = nn.Conv3d(self.inputs, FIRST, 3, padding=1)
         self.blocks = nn.ModuleList(nn.Conv3d(a, b, 3, padding=1) for a, b in pairwise(CHANNELS))

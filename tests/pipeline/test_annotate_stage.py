@@ -342,7 +342,8 @@ def test_poses_in_the_common_frame(
         assert frame_id == "semloc/common"
         edge = frames[time]
         assert edge.header.frame_id == "odom"
-        t, q = edge.transform.translation, edge.transform.rotation
+        t = edge.transform.translation
+        q = edge.transform.rotation
         odom_T_common = transform(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
         truth = drives["monday"].session_T_world @ drives["monday"].world_T_base(stamp)
         found = odom_T_common @ pose_of(message.pose.pose)

@@ -22,7 +22,7 @@ from semloc_logs.mapping import session_fusion
 from semloc_logs.mapping.session_fusion import FusedSession, FuseTask
 from semloc_logs.numerics.transforms import transform
 from semloc_logs.settings import Resolved
-from semloc_logs.simulation.output.drive_log import write_truth
+from semloc_logs.simulation.output.truth_file import write_truth
 from semloc_logs.stages import fuse as fuse_stage
 from semloc_logs.stages.inputs import SessionInput
 from semloc_logs.stages.report import Report
@@ -210,7 +210,8 @@ def test_the_file_of_poses_is_an_input(
 ) -> None:
     file = tmp_path / "poses.tum"
     twin = tmp_path / "twin.tum"
-    write_truth(file, drives["monday"].trajectory)
+    monday = drives["monday"].trajectory
+    write_truth(file, monday.stamps_ns, monday.world_T_base)
     with pytest.raises(WorkspaceError, match="'monday' was made with other poses"):
         fuse(poses=TrajectoryFile(file))
     assert was_done(fuse(poses=TrajectoryFile(file), overwrite=True))

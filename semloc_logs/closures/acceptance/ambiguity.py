@@ -38,22 +38,25 @@ CHANCE = 0.03  # contradictions of lone queries that are less likely without cop
 
 
 def ambiguity(
-    placed: Placed, pairs: Pairs, roads: Mapping[str, F64], support: F64, voxel_size: float
+    placed: Placed,
+    pairs: Pairs,
+    roads: Mapping[str, F64],
+    support: F64,
+    lone: Bools,
+    voxel_size: float,
 ) -> F64:
     """How ambiguous the road around either end of each alignment is (n,), in [0, 1].
 
     ``support`` (n,) is the probability of an alignment ignoring rivals, times the share of near
-    neighbours that agree, or NaN where the query is a ``lone`` one without neighbours;
+    neighbours that agree; ``lone`` (n,) queries have no neighbours, and no support.
     :func:`.placements.query_roads` makes ``roads``.
 
     It is the mean over the queries about an end of the support of a second place in one session, or
     the share of them that three sessions contradict each other about; the session that shows it
     most counts. Of lone queries it is 1 in a session that copies alone explain.
     """
-    lone = np.isnan(support)
     known = placed.probability_ignoring_rivals * position_confidence(placed.sigma, voxel_size)
     triples = _contradictions(placed, pairs, np.where(lone, known, support), voxel_size)
-    support = np.where(lone, 0.0, support)
     with_lone = lone[triples].any(axis=1)
     reach = FAR * voxel_size / STREET_VOXEL
     # by session: roads of all queries that can show it; where some do, and how much

@@ -67,9 +67,13 @@ def count_votes(
         votes.conflict[rows] = sums[1]
         votes.far_support[rows] = sums[2]
         votes.far_conflict[rows] = sums[3]
-        neighbours = np.where(votes.neighbours[rows] > 0, votes.neighbours[rows], np.nan)
-        support[rows] = group.probability_ignoring_rivals * sums_ignoring_rivals[0] / neighbours
-    return replace(votes, ambiguity=ambiguity(placed, pairs, roads, support, voxel_size))
+        support[rows] = (
+            group.probability_ignoring_rivals
+            * sums_ignoring_rivals[0]
+            / np.maximum(votes.neighbours[rows], 1)
+        )
+    lone = placed.posed & (votes.neighbours == 0)
+    return replace(votes, ambiguity=ambiguity(placed, pairs, roads, support, lone, voxel_size))
 
 
 def _sums(group: Placed, probabilities: Sequence[F64], voxel_size: float) -> list[F64]:

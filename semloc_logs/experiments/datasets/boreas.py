@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from semloc_logs.errors import LogError
 from semloc_logs.experiments.datasets.recording import (
     CameraFiles,
     CloudFile,
@@ -23,6 +22,7 @@ from semloc_logs.experiments.datasets.recording import (
     numbered,
     read_numbers,
     read_records,
+    sequences_with,
 )
 from semloc_logs.numerics.transforms import inverse
 
@@ -32,10 +32,7 @@ _FIELDS = 6  # x y z intensity laser time
 
 def boreas_recordings(folder: Path) -> list[Recording]:
     """The sequence of a folder, or all sequences in it. LogError without any."""
-    sequences = [folder] if (folder / "lidar").is_dir() else sorted(folder.glob("*/"))
-    sequences = [p for p in sequences if (p / "lidar").is_dir()]
-    if not sequences:
-        raise LogError(f"{folder} has no lidar/: give a sequence such as boreas-2021-08-05-13-34.")
+    sequences = sequences_with(folder, "lidar", "a sequence such as boreas-2021-08-05-13-34")
     return [_recording(sequence) for sequence in sequences]
 
 

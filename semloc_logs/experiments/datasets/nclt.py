@@ -24,6 +24,7 @@ from semloc_logs.experiments.datasets.recording import (
     numbered,
     read_numbers,
     read_records,
+    sequences_with,
 )
 from semloc_logs.numerics.transforms import interpolate
 
@@ -35,10 +36,7 @@ _TO_NS = 1000  # from microseconds
 
 def nclt_recordings(folder: Path) -> list[Recording]:
     """The session of a folder, or all sessions in it. LogError without any."""
-    sessions = [folder] if (folder / "velodyne_sync").is_dir() else sorted(folder.glob("*/"))
-    sessions = [p for p in sessions if (p / "velodyne_sync").is_dir()]
-    if not sessions:
-        raise LogError(f"{folder} has no velodyne_sync/: give a session such as 2012-01-08.")
+    sessions = sequences_with(folder, "velodyne_sync", "a session such as 2012-01-08")
     return [_recording(session) for session in sessions]
 
 

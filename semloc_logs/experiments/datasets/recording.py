@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.errors import LogError
-from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.simulation.output.drive_messages import Made, RosMessages
+from semloc_logs.simulation.output.truth_file import write_truth
 from semloc_logs.tables.atomic_files import replacing_file
 
 F32 = NDArray[np.float32]
@@ -112,7 +112,7 @@ def write_recording(recording: Recording, folder: Path) -> Path:
             data = bytes(store.serialize_cdr(message, type_))
             writer.add_message(channels[topic], stamp_ns, data, stamp_ns, number)
         writer.finish()  # type: ignore[no-untyped-call]
-    _write_track(log.with_suffix(".tum"), recording.truth)
+    write_truth(log.with_suffix(".tum"), recording.truth.stamps_ns, recording.truth.poses)
     return log
 
 
@@ -199,17 +199,6 @@ def _pictures(messages: RosMessages, camera: CameraFiles) -> Iterator[Event]:
         yield stamp, messages.picture(topic, stamp, _frame(camera), "png", data)
 
 
-def _write_track(path: Path, track: Track) -> None:
-    """A TUM file."""
-    translation, quaternion = translation_quaternion(track.poses)
-    rows = [
-        f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{v:.9f}" for v in (*t, *q))
-        for stamp, t, q in zip(track.stamps_ns.tolist(), translation, quaternion, strict=True)
-    ]
-    with replacing_file(path) as temporary:
-        temporary.write_text("\n".join(rows) + "\n", encoding="ascii")
-
-
 # -- files of data sets
 
 
@@ -253,6 +242,18 @@ def read_numbers(path: Path, columns: Iterable[int] = (), delimiter: str | None 
     if not rows:
         raise LogError(f"{path} has no numbers.")
     return np.array(rows)
+
+
+def sequences_with(folder: Path, part: str, wanted: str) -> list[Path]:
+    """``folder`` itself where it has the folder ``part``, else all folders in it that have it.
+
+    LogError without any; ``wanted`` tells in words what to give instead.
+    """
+    found = [folder] if (folder / part).is_dir() else sorted(folder.glob("*/"))
+    found = [p for p in found if (p / part).is_dir()]
+    if not found:
+        raise LogError(f"{folder} has no {part}/: give {wanted}.")
+    return found
 
 
 def numbered(folder: Path, ending: str) -> list[tuple[int, Path]]:

@@ -8,7 +8,7 @@ trained otherwise need its weights and vocabulary (:func:`training_command`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from semloc_logs.closures.matching import (
     QueryContext,
     find_hypotheses,
     match_words,
+    turned_matches,
 )
 from semloc_logs.errors import SettingsError, did_you_mean
 from semloc_logs.experiments.system import RankedPose
@@ -77,19 +78,14 @@ def alone_words(
     windows = Windows(settings.fusion.voxel_size, descriptor.query_stride, descriptor.min_occupied)
     together = describe_map(state, low, ground_z, encoder, windows)
     alone = Described(together.centre, described_alone(state, low, together.centre, encoder))
-    quarters = []
-    for turns in range(4):
-        found = database.words(variant).search(
+    words = database.words(variant)
+    quarters = [
+        words.search(
             quarter_turns(alone.descriptor, turns), closures.neighbours, closures.probes, allowed
         )
-        yaw = np.mod(found.yaw + turns * np.pi / 2, 2 * np.pi)
-        quarters.append(replace(found, yaw=yaw))
-    return alone, Matches(
-        *(
-            np.concatenate([getattr(q, name) for q in quarters])
-            for name in ("query", "group", "entry", "centre", "yaw", "distance")
-        )
-    )
+        for turns in range(4)
+    ]
+    return alone, turned_matches(quarters)
 
 
 @torch.inference_mode()

@@ -131,7 +131,7 @@ BASELINES: tuple[Entry, ...] = (
 )
 
 
-# our pipeline without one of its parts (`--systems ablations`)
+# our pipeline without one of its parts (`--systems all-ablations`)
 ABLATIONS: tuple[Entry, ...] = tuple(
     Entry(name, title, "own_rows:make_ablation", frames=5)
     for name, title in (

@@ -106,8 +106,6 @@ class DistanceVolumes:
         return Described(turned_about_z(centre, np.full(len(centre), yaw)), descriptor)
 
     def _train(self, views: Sequence[View], settings: Resolved) -> None:
-        torch.manual_seed(0)
-        self._network.apply(_reset)
         incomplete, complete = training_volumes(views, settings)
         optimiser = torch.optim.Adam(self._network.parameters(), RATE)
         rng = np.random.default_rng(0)
@@ -133,7 +131,8 @@ def describe_points(points: F64, network: Volumes) -> tuple[I64, F32]:
         return cells, out
     width = PATCH // STRIDE
     patch = cells[:, :2] // width
-    bottom, top = cells[:, 2].min(), cells[:, 2].max()
+    bottom = cells[:, 2].min()
+    top = cells[:, 2].max()
     for p in np.unique(patch, axis=0):
         rows = np.flatnonzero((patch == p).all(1))
         first = np.array([*cells[rows, :2].min(0), bottom])
@@ -205,11 +204,6 @@ def _scatter(points: F64, out: F32) -> None:
 def _tensor(volumes: F32) -> Tensor:
     """Volumes (b, x, y, z) as the network's input."""
     return torch.from_numpy(volumes[:, None]).contiguous(memory_format=torch.channels_last_3d)
-
-
-def _reset(module: nn.Module) -> None:
-    if isinstance(module, nn.Conv3d):
-        module.reset_parameters()
 
 
 def make_3dmatch(options: SystemOptions) -> ShapeSystem:

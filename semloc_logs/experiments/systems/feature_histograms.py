@@ -43,7 +43,9 @@ def _add_pair(p: F64, n: F64, q: F64, m: F64, out: F64) -> None:
     dy = q[1] - p[1]
     dz = q[2] - p[2]
     far = np.sqrt(dx * dx + dy * dy + dz * dz)
-    dx, dy, dz = dx / far, dy / far, dz / far
+    dx /= far
+    dy /= far
+    dz /= far
     along_n = n[0] * dx + n[1] * dy + n[2] * dz
     along_m = m[0] * dx + m[1] * dy + m[2] * dz
     # the source has the smaller angle between its normal and the line to the other point
@@ -51,7 +53,9 @@ def _add_pair(p: F64, n: F64, q: F64, m: F64, out: F64) -> None:
     u = m if swapped else n
     t = n if swapped else m
     if swapped:
-        dx, dy, dz = -dx, -dy, -dz
+        dx = -dx
+        dy = -dy
+        dz = -dz
     phi = -along_m if swapped else along_n
     vx = dy * u[2] - dz * u[1]
     vy = dz * u[0] - dx * u[2]
@@ -59,7 +63,9 @@ def _add_pair(p: F64, n: F64, q: F64, m: F64, out: F64) -> None:
     size = np.sqrt(vx * vx + vy * vy + vz * vz)
     if size < 1e-9:  # the line is the normal: the other axes are free
         return
-    vx, vy, vz = vx / size, vy / size, vz / size
+    vx /= size
+    vy /= size
+    vz /= size
     wx = u[1] * vz - u[2] * vy
     wy = u[2] * vx - u[0] * vz
     wz = u[0] * vy - u[1] * vx

@@ -207,7 +207,8 @@ def ground_fit(target: Patches, query: Patches) -> tuple[F64, int] | None:
     scale = float(np.hypot(model[0, 0], model[1, 0]))
     if inside.sum() < LEAST_INLIERS or not SCALES[0] < scale < SCALES[1]:
         return None
-    a, b = a[inside], b[inside]
+    a = a[inside]
+    b = b[inside]
     centred = (b - b.mean(0)).T @ (a - a.mean(0))
     yaw = float(np.arctan2(centred[0, 1] - centred[1, 0], centred[0, 0] + centred[1, 1]))
     pose = yaw_transform(yaw)

@@ -108,9 +108,7 @@ class PoseNetSystem:
 
     def _train(self, pictures: U8, poses: F64) -> None:
         assert self._network is not None
-        torch.manual_seed(0)
         rng = np.random.default_rng(0)
-        self._network.apply(_reset)
         position, quaternion = translation_quaternion(poses)
         centre = position.mean(0)
         extent = max(float(np.linalg.norm(position - centre, axis=1).max()), 1.0)
@@ -165,11 +163,6 @@ def _tensor(pictures: U8) -> Tensor:
     """Pictures as the network's input: without their mean, in units of 64 levels."""
     values = torch.from_numpy(pictures.astype(np.float32))[:, None]
     return (values - values.mean((1, 2, 3), keepdim=True)) / 64
-
-
-def _reset(module: nn.Module) -> None:
-    if isinstance(module, nn.Conv2d | nn.Linear):
-        module.reset_parameters()
 
 
 def make_posenet(options: SystemOptions) -> PoseNetSystem:

@@ -142,9 +142,7 @@ class SceneCoordinateSystem:
 
     def _train(self, examples: Sequence[_Example]) -> None:
         assert self._network is not None
-        torch.manual_seed(0)
         rng = np.random.default_rng(0)
-        self._network.apply(_reset)
         places = np.stack([example.world_T_base[:3, 3] for example in examples])
         self._network.centre.copy_(torch.from_numpy(places.mean(0).astype(np.float32)))
         self._network.extent.copy_(
@@ -266,11 +264,6 @@ def _grid(picture: Picture) -> _Grid:
 def _tensor(grid: _Grid) -> Tensor:
     grey = grid.grey.astype(np.float32)
     return torch.from_numpy((grey - grey.mean()) / 64)[None, None]
-
-
-def _reset(module: nn.Module) -> None:
-    if isinstance(module, nn.Conv2d):
-        module.reset_parameters()
 
 
 def make_dsac(options: SystemOptions) -> SceneCoordinateSystem:

@@ -79,8 +79,6 @@ class SphericalHistograms:
         return Described(points[rows], embedded)
 
     def _train(self, views: Sequence[View], settings: Resolved) -> None:
-        torch.manual_seed(0)
-        self._network.apply(_reset)
         anchor, positive, place = training_pairs(views, settings)
         optimiser = torch.optim.Adam(self._network.parameters(), RATE)
         rng = np.random.default_rng(0)
@@ -132,7 +130,8 @@ def training_pairs(views: Sequence[View], settings: Resolved) -> tuple[F32, F32,
             continue
         distance, nearest = tree.query(points[rows], workers=1)
         near = distance < NEAR * v
-        rows, nearest = rows[near], nearest[near]
+        rows = rows[near]
+        nearest = nearest[near]
         anchors.append(spherical_histograms(points, view_normals, rows, radius))
         positives.append(spherical_histograms(complete, normals, nearest, radius))
         places.append(points[rows])
@@ -205,11 +204,6 @@ def _thinned(level_map: LevelMap) -> tuple[F64, F64]:
 def _triplet(a: torch.Tensor, p: torch.Tensor, n: torch.Tensor) -> torch.Tensor:
     """The loss (b,) of unit vectors: squared distances and a margin."""
     return F.relu((a - p).square().sum(1) - (a - n).square().sum(1) + MARGIN)
-
-
-def _reset(module: nn.Module) -> None:
-    if isinstance(module, nn.Linear):
-        module.reset_parameters()
 
 
 def make_cgf(options: SystemOptions) -> ShapeSystem:

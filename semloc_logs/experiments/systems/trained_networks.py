@@ -28,15 +28,25 @@ def key_of(views: Sequence[View], *settings: object) -> str:
 
 
 def trained(path: Path, network: nn.Module, train: Callable[[], None]) -> None:
-    """Load the weights of ``network`` from the file ``path``, or ``train`` it and write them."""
+    """Load the weights of ``network`` from the file ``path``, or ``train`` it and write them.
+
+    Training begins with the same random weights every time.
+    """
     torch.set_num_threads(1)
     try:
         network.load_state_dict(load_file(path))
     except (OSError, SafetensorError, RuntimeError):
         network.train()
+        torch.manual_seed(0)
+        network.apply(_begin_anew)
         train()
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing_file(path) as temporary:
             weights = {name: value.contiguous() for name, value in network.state_dict().items()}
             save_file(weights, temporary)
     network.eval()
+
+
+def _begin_anew(module: nn.Module) -> None:
+    if isinstance(module, nn.Linear | nn.Conv2d | nn.Conv3d):
+        module.reset_parameters()

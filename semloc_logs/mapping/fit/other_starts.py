@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from semloc_logs.mapping.fit.model import LONGEST_OFFSET, OFFSET_STEP, PosesAt
 from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, Start, motion
 from semloc_logs.mapping.fit.readings import CONVENTIONS, otherwise_written
+from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse
 
 F64 = NDArray[np.float64]
@@ -47,8 +48,7 @@ class Doubted:
     def of(clouds: Clouds, found: Registered, squares: F64) -> Doubted:
         """Those of ``found``, with their squared distances (n,) to the poses."""
         worst = np.argsort(-squares, kind="stable")[:TRIED]
-        evenly = np.linspace(0, len(squares) - 1, TRIED).round().astype(np.int64)
-        rows = np.union1d(worst, evenly)
+        rows = np.union1d(worst, evenly(len(squares), TRIED))
         share, given_share = (float(s[rows].sum()) for s in (found.share, found.given_share))
         return Doubted(clouds, found.numbers[rows], share, given_share)
 

@@ -20,6 +20,7 @@ from semloc_logs.mapping.fit.plane_cells import (
 )
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.selection import thin
+from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle
 
 F64 = NDArray[np.float64]
@@ -122,8 +123,7 @@ def choose(clouds: Clouds, most: int) -> list[tuple[int, int]]:
             chosen.append((target, source))
     if len(chosen) <= most:
         return chosen
-    evenly = np.unique(np.linspace(0, len(chosen) - 1, most).round().astype(np.int64))
-    return [chosen[i] for i in evenly]
+    return [chosen[i] for i in evenly(len(chosen), most)]
 
 
 def _partner(clouds: Clouds, stamps_ns: I64, target: int) -> int | None:
@@ -257,7 +257,7 @@ def noise(clouds: Clouds, found: Registered) -> float:
     planes of the other cloud.
     """
     registrar = Registrar(clouds)
-    rows = np.unique(np.linspace(0, len(found.pairs) - 1, THERE_AND_BACK).round().astype(np.int64))
+    rows = evenly(len(found.pairs), THERE_AND_BACK)
     squares = []
     for row in rows.tolist():
         target, source = found.numbers[row].tolist()

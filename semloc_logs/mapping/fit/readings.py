@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Bools, Pairs, PosesAt, cost_of
 from semloc_logs.mapping.fit.pairs import Clouds
+from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse
 
 F64 = NDArray[np.float64]
@@ -187,8 +188,7 @@ def _are_carried(clouds: Clouds) -> bool:
     Clouds that a registration could not move, or that a driver repeats, stay where they are.
     """
     numbers = [n for n in range(len(clouds.rows)) if clouds.pose(n) is not None]
-    chosen = np.unique(np.linspace(0, len(numbers) - 1, LOOKED_AT).round().astype(np.int64))
-    numbers = [numbers[i] for i in chosen]
+    numbers = [numbers[i] for i in evenly(len(numbers), LOOKED_AT)]
     middles = []
     places = []
     for number in numbers:

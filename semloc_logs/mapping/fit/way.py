@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, Start, motion
+from semloc_logs.numerics.evenly import evenly
 
 F64 = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ def other_distance(clouds: Clouds, found: Registered) -> Start | None:
     rows = np.flatnonzero(ways >= LEAST_WAY * clouds.voxel)
     if len(rows) < FEWEST:
         return None
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, TRIED).round().astype(np.int64))]
+    rows = rows[evenly(len(rows), TRIED)]
     usual = float(np.median(ways[rows]))
     step = STEP * clouds.voxel / usual
     factors = np.arange(step, min(MOST, FARTHEST * clouds.voxel / usual), step)

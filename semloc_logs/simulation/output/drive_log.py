@@ -34,7 +34,6 @@ from rosbags.rosbag2 import Writer as BagFolder
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from semloc_logs.errors import LogError
-from semloc_logs.numerics.transforms import translation_quaternion
 from semloc_logs.simulation.drives.camera_drive import CameraShot
 from semloc_logs.simulation.drives.drive import TURN_NS, DriveFrame
 from semloc_logs.simulation.drives.trajectory import Trajectory
@@ -263,17 +262,6 @@ def write_session(
             sink.write(topic, type_, log_time, message)
             sweeps += topic == "/lidar/points"
     return sweeps
-
-
-def write_truth(path: Path, trajectory: Trajectory) -> None:
-    """``world_T_base`` as a TUM file: seconds with 9 decimals, metres, quaternion xyzw."""
-    translation, quaternion = translation_quaternion(trajectory.world_T_base)
-    rows = [
-        f"{stamp // 10**9}.{stamp % 10**9:09d} " + " ".join(f"{v:.9f}" for v in (*t, *q))
-        for stamp, t, q in zip(trajectory.stamps_ns.tolist(), translation, quaternion, strict=True)
-    ]
-    with replacing_file(path) as temporary:
-        temporary.write_text("\n".join(rows) + "\n", encoding="ascii")
 
 
 def _lidar(messages: Messages, frames: Iterable[DriveFrame], first_ns: int) -> Iterator[Event]:

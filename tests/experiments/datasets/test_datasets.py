@@ -74,7 +74,8 @@ def test_kitti_odometry(tmp_path: Path) -> None:
     assert [len(c.points) for c in lidar] == [4, 4, 4]
     assert np.allclose(lidar[0].points, POINTS)
     # the camera went along its z axis: the LIDAR along its x axis, 1 m a tenth of a second
-    first, second = lidar[0].session_T_base, lidar[1].session_T_base
+    first = lidar[0].session_T_base
+    second = lidar[1].session_T_base
     assert first is not None
     assert second is not None
     assert np.allclose(first, np.eye(4), atol=1e-9)

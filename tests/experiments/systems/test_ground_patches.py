@@ -29,8 +29,9 @@ def test_the_view_from_above_shows_the_ground(town: Any) -> None:
     picture = town.picture(yaw_transform(0.0, (20.0, 0.0, 0.0)))
     view = view_from_above(picture)
     assert view is not None
-    # what is 5 to 8 m ahead and 1 m to a side, drawn without a camera
-    rows, columns = np.arange(75, 150), np.arange(225, 275)
+    # the ground 5 to 8 m ahead and up to 1 m to either side, drawn without a camera
+    rows = np.arange(75, 150)
+    columns = np.arange(225, 275)
     assert view.seen[np.ix_(rows, columns)].all()
     x, y = np.meshgrid(22.0 + 0.04 * rows, -10.0 + 0.04 * columns, indexing="ij")
     wanted = town.brightness(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1))

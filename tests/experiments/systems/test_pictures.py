@@ -68,7 +68,8 @@ def test_the_points_have_the_levels_that_the_library_gives(spots: NDArray[np.uin
     points = sift_points(spots[:, :, 0])
     assert len(points) > 100
     for p in points:
-        octave, layer = p.octave & 255, (p.octave >> 8) & 255
+        octave = p.octave & 255
+        layer = (p.octave >> 8) & 255
         again = keypoint(p.pt[0], p.pt[1], p.size)
         # the library's size has a part of a layer more or less
         level = 3 * (octave - 256 * (octave > 127)) + layer

@@ -266,7 +266,7 @@ def test_clouds_that_stand_still_beside_poses_that_move_are_not_taken_for_the_fi
 def test_a_camera_that_nothing_explains_is_named_with_its_calibration(
     shared: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A focal length that is twice the true one: what is beside lies half as far beside."""
+    """The focal length is twice the true one, so points lie half as far to the side."""
     loaded = Collected.load
 
     def squeezed(self: Collected, keyframe: int) -> Any:

@@ -20,7 +20,8 @@ from semloc_logs.simulation.demo import simulate_demo
 from semloc_logs.simulation.drives.drive import DriveFrame, mounting, simulate_drive
 from semloc_logs.simulation.drives.trajectory import Trajectory, drive, smooth_line
 from semloc_logs.simulation.meshes.world import ROAD, WALL, MeshBuilder, World, box
-from semloc_logs.simulation.output.drive_log import write_session, write_truth
+from semloc_logs.simulation.output.drive_log import write_session
+from semloc_logs.simulation.output.truth_file import write_truth
 from semloc_logs.simulation.plan import Route, Town, plan_sessions
 from semloc_logs.simulation.sensors.lidar_models import MODELS
 from semloc_logs.simulation.sensors.sensor import Sensor
@@ -179,7 +180,7 @@ def test_our_reader_finds_the_roles(log: Path) -> None:
 
 
 def test_truth_is_tum_with_nine_decimals(tmp_path: Path, trajectory: Trajectory) -> None:
-    write_truth(tmp_path / "t.tum", trajectory)
+    write_truth(tmp_path / "t.tum", trajectory.stamps_ns, trajectory.world_T_base)
     lines = (tmp_path / "t.tum").read_text().splitlines()
     assert lines[0].split()[0] == "1760000000.123456789"
     rows = np.array([[float(v) for v in line.split()[1:]] for line in lines])
