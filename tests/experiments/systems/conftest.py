@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from semloc_logs.experiments.system import Picture, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
-from semloc_logs.experiments.systems.training_views import Training
+from semloc_logs.experiments.systems.shapes.training_views import Training
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import Settings
 

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from semloc_logs.experiments.systems.dense_vlad import make_dense_vlad, principal_axes_of
-from semloc_logs.experiments.systems.local_features import (
+from semloc_logs.experiments.systems.pictures.dense_vlad import make_dense_vlad, principal_axes_of
+from semloc_logs.experiments.systems.pictures.local_features import (
     Features,
     dense_sift,
     dsp_sift,
@@ -21,14 +21,14 @@ from semloc_logs.experiments.systems.local_features import (
     sift,
     sift_points,
 )
-from semloc_logs.experiments.systems.picture_pose import (
+from semloc_logs.experiments.systems.pictures.picture_pose import (
     mutual_matches,
     points_of,
     pose_of_points,
     two_view_inliers,
 )
-from semloc_logs.experiments.systems.sift import make_dsp_sift, make_mser, make_sift
-from semloc_logs.experiments.systems.visual_index import VisualIndex
+from semloc_logs.experiments.systems.pictures.sift import make_dsp_sift, make_mser, make_sift
+from semloc_logs.experiments.systems.pictures.visual_index import VisualIndex
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.words.vocabulary import train_vocabulary
 

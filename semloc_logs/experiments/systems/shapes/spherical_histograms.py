@@ -23,15 +23,15 @@ from torch.nn import functional as F
 from semloc_logs.experiments.system import View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
 from semloc_logs.experiments.systems.level_maps import LevelMap, database_map, view_map
-from semloc_logs.experiments.systems.near_points import Cells, cells_of, neighbours
-from semloc_logs.experiments.systems.shape_matching import (
+from semloc_logs.experiments.systems.shapes.near_points import Cells, cells_of, neighbours
+from semloc_logs.experiments.systems.shapes.shape_matching import (
     STRIDE,
     Described,
     ShapeSystem,
     keypoints_of,
 )
+from semloc_logs.experiments.systems.shapes.training_views import Training, simulated_training
 from semloc_logs.experiments.systems.trained_networks import trained
-from semloc_logs.experiments.systems.training_views import Training, simulated_training
 from semloc_logs.mapping.selection import thin
 from semloc_logs.numerics.eigen import eigen
 from semloc_logs.settings import Resolved

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from semloc_logs.experiments.system import MOST_POSES, Picture, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
-from semloc_logs.experiments.systems.local_features import root_sift, unit_descriptors
-from semloc_logs.experiments.systems.picture_pose import (
+from semloc_logs.experiments.systems.pictures.local_features import root_sift, unit_descriptors
+from semloc_logs.experiments.systems.pictures.picture_pose import (
     LEAST_INLIERS,
     SEED,
     mutual_matches,

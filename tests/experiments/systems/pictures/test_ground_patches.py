@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semloc_logs.experiments.systems.ground_patches import (
+from semloc_logs.experiments.systems.pictures.ground_patches import (
     Patches,
     ground_fit,
     ground_plane,

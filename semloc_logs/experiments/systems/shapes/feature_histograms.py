@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.experiments.systems.near_points import Cells, cells_of, neighbours
+from semloc_logs.experiments.systems.shapes.near_points import Cells, cells_of, neighbours
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

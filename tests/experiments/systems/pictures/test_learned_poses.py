@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from semloc_logs.experiments.systems.pose_regression import (
+from semloc_logs.experiments.systems.pictures.pose_regression import (
     PoseNetSystem,
     _has_settled,
     make_posenet,
 )
-from semloc_logs.experiments.systems.scene_coordinates import (
+from semloc_logs.experiments.systems.pictures.scene_coordinates import (
     SceneCoordinateSystem,
     _grid,
     chosen_loss,

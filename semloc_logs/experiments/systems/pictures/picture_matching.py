@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.experiments.system import MOST_POSES, Picture, Query, RankedPose, View
-from semloc_logs.experiments.systems.local_features import Features, unit_descriptors
-from semloc_logs.experiments.systems.picture_pose import (
+from semloc_logs.experiments.systems.pictures.local_features import Features, unit_descriptors
+from semloc_logs.experiments.systems.pictures.picture_pose import (
     base_pose,
     mutual_matches,
     points_of,
     pose_of_points,
     two_view_inliers,
 )
-from semloc_logs.experiments.systems.visual_index import VisualIndex
+from semloc_logs.experiments.systems.pictures.visual_index import VisualIndex
 from semloc_logs.words.vocabulary import train_vocabulary
 
 U8 = NDArray[np.uint8]

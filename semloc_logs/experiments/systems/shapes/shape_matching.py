@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from semloc_logs.experiments.system import Query, RankedPose, View
 from semloc_logs.experiments.systems.level_maps import LevelMap, database_map, query_map
-from semloc_logs.experiments.systems.training_views import Training
-from semloc_logs.experiments.systems.voxel_verification import Verifier
+from semloc_logs.experiments.systems.shapes.training_views import Training
+from semloc_logs.experiments.systems.shapes.voxel_verification import Verifier
 from semloc_logs.numerics.transforms import turned_about_z
 from semloc_logs.settings import Resolved
 from semloc_logs.words.index import Allowed, Index

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from semloc_logs.experiments.systems.catalogue import SystemOptions
-from semloc_logs.experiments.systems.local_features import dsp_sift, mser_dsp_sift, sift
-from semloc_logs.experiments.systems.picture_matching import PictureSystem, WordRetrieval
+from semloc_logs.experiments.systems.pictures.local_features import dsp_sift, mser_dsp_sift, sift
+from semloc_logs.experiments.systems.pictures.picture_matching import PictureSystem, WordRetrieval
 
 
 def make_sift(options: SystemOptions) -> PictureSystem:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from semloc_logs.experiments.systems.catalogue import SystemOptions
-from semloc_logs.experiments.systems.feature_histograms import feature_histograms
 from semloc_logs.experiments.systems.level_maps import LevelMap
-from semloc_logs.experiments.systems.shape_matching import (
+from semloc_logs.experiments.systems.shapes.feature_histograms import feature_histograms
+from semloc_logs.experiments.systems.shapes.shape_matching import (
     STRIDE,
     Described,
     ShapeSystem,
     keypoints_of,
 )
-from semloc_logs.experiments.systems.training_views import Training, simulated_training
+from semloc_logs.experiments.systems.shapes.training_views import Training, simulated_training
 from semloc_logs.mapping.selection import thin
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import SIZE

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from semloc_logs.experiments.systems.feature_histograms import feature_histograms
-from semloc_logs.experiments.systems.fpfh import fpfh_system
 from semloc_logs.experiments.systems.level_maps import oriented_normals
+from semloc_logs.experiments.systems.shapes.feature_histograms import feature_histograms
+from semloc_logs.experiments.systems.shapes.fpfh import fpfh_system
 from semloc_logs.numerics.transforms import yaw_transform
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from semloc_logs.experiments.systems.spherical_histograms import (
+from semloc_logs.experiments.systems.shapes.spherical_histograms import (
     cgf_system,
     spherical_histograms,
     training_pairs,

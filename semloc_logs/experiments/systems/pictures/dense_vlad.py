@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.experiments.systems.catalogue import SystemOptions
-from semloc_logs.experiments.systems.local_features import Features, dense_sift, dsp_sift
-from semloc_logs.experiments.systems.picture_matching import PictureSystem, StoredPicture
+from semloc_logs.experiments.systems.pictures.local_features import Features, dense_sift, dsp_sift
+from semloc_logs.experiments.systems.pictures.picture_matching import PictureSystem, StoredPicture
 from semloc_logs.words.kmeans import grid, kmeans, nearest_centroids
 
 U8 = NDArray[np.uint8]

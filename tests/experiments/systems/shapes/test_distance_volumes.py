@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from semloc_logs.experiments.systems.distance_volumes import (
+from semloc_logs.experiments.systems.shapes.distance_volumes import (
     Volumes,
     describe_points,
     distance_volume,

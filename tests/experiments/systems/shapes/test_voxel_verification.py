@@ -14,8 +14,8 @@ from semloc_logs.experiments.systems.level_maps import (
     query_poses,
     view_map,
 )
-from semloc_logs.experiments.systems.shape_matching import keypoints_of, unit_vectors
-from semloc_logs.experiments.systems.voxel_verification import Verifier
+from semloc_logs.experiments.systems.shapes.shape_matching import keypoints_of, unit_vectors
+from semloc_logs.experiments.systems.shapes.voxel_verification import Verifier
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.settings import Settings
 

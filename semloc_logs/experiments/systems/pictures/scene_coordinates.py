@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from semloc_logs.experiments.system import Picture, Query, RankedPose, View
 from semloc_logs.experiments.systems.catalogue import SystemOptions
-from semloc_logs.experiments.systems.picture_pose import base_pose, pose_of_points
+from semloc_logs.experiments.systems.pictures.picture_pose import base_pose, pose_of_points
 from semloc_logs.experiments.systems.trained_networks import key_of, trained
 from semloc_logs.numerics.transforms import apply, inverse, rotation_angle
 

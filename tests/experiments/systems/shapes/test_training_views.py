@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semloc_logs.experiments.systems.training_views import (
+from semloc_logs.experiments.systems.shapes.training_views import (
     QUICK_FRAMES,
     simulated_training,
     training_views,

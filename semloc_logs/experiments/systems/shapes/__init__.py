@@ -1,0 +1,1 @@
+"""Descriptors of shape in place of ours, in the pipeline of the paper."""
