@@ -21,12 +21,14 @@ from semloc_logs.closures.acceptance.calibration import probability_of, shipped
 from semloc_logs.closures.alignment_tables import write_part
 from semloc_logs.closures.closure import Alignment
 from semloc_logs.closures.database import open_database
-from semloc_logs.closures.matching import ground_below, prepare, search_query
+from semloc_logs.closures.matching import allowed_words, ground_below, prepare, search_query
 from semloc_logs.closures.query import build_query, query_keyframes
+from semloc_logs.closures.visibility import visible_to
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import STREET_VOXEL, Resolved
 from semloc_logs.words.catalogue import segments
-from semloc_logs.words.survey import NO_VOTES, Survey, Votes
+from semloc_logs.words.index import LookUp
+from semloc_logs.words.survey import NO_VOTES, Survey, Votes, votes_in_session
 from semloc_logs.workspace import Workspace
 
 SURVEY_CELL = 4.8  # m, at voxels of 0.30 m: edge of the cells that a survey votes in
@@ -70,9 +72,6 @@ def search_queries(task: SearchTask) -> int:
             database = open_database(task.work, target, key, task.settings)
             return search_query(database, session, keyframe, queries[keyframe])
 
-        if target == task.session:
-            found += [a for keyframe in queries for a in search(keyframe)]
-            continue
         of_target = {k: votes[k].get(target, NO_VOTES) for k in queries}
         for block in _blocks(task.keyframes, block_size(task.settings)):
             found += _search_block(block, of_target, least_votes, search)
@@ -132,20 +131,44 @@ def _may_be_right(found: Sequence[Alignment]) -> bool:
 
 
 def survey_queries(task: SearchTask, session: SessionMap, queries: Mapping[int, Built]) -> Surveyed:
-    """How many words of each query agree about a place in each target, other than the session."""
+    """How many words of each query agree about a place in each target.
+
+    Of the session itself only words of another time vote (:mod:`.visibility`).
+    """
     settings = task.settings
     votes: dict[int, dict[str, Votes]] = {keyframe: {} for keyframe in queries}
-    targets = tuple((n, made_from) for n, made_from in task.targets.items() if n != task.session)
-    if not targets:
-        return votes
-    for variant, survey in _surveys(task.work, targets, session.has_classes, settings).items():
-        for keyframe, (query, _) in queries.items():
-            if len(query.structure[0]):
-                ground_z = ground_below(session, keyframe)
-                described, turned = prepare(query, variant, ground_z, settings)
-                centre = described.centre.astype(float) * settings.fusion.voxel_size
-                votes[keyframe] |= survey.votes(turned, centre)
+    with_structure = {k: query for k, (query, _) in queries.items() if len(query.structure[0])}
+
+    def words(keyframe: int, variant: str) -> tuple[list[list[LookUp]], NDArray[np.float64]]:
+        query = with_structure[keyframe]
+        described, turned = prepare(query, variant, ground_below(session, keyframe), settings)
+        return turned, described.centre.astype(float) * settings.fusion.voxel_size
+
+    others = tuple((n, made_from) for n, made_from in task.targets.items() if n != task.session)
+    if others:
+        surveys = _surveys(task.work, others, session.has_classes, settings)
+        for variant, survey in surveys.items():
+            for keyframe in with_structure:
+                votes[keyframe] |= survey.votes(*words(keyframe, variant))
+
+    if task.session in task.targets:
+        fingerprint = task.targets[task.session]
+        database = open_database(task.work, task.session, fingerprint, settings)
+        for keyframe in with_structure:
+            visible = visible_to(database, session, keyframe)
+            for variant, allowed in allowed_words(visible, session).items():
+                votes[keyframe][task.session] = votes_in_session(
+                    database.words(variant).parts,
+                    allowed,
+                    *words(keyframe, variant),
+                    headings=settings.descriptor.headings,
+                    cell=_survey_cell(settings),
+                )
     return votes
+
+
+def _survey_cell(settings: Resolved) -> float:
+    return SURVEY_CELL * settings.fusion.voxel_size / STREET_VOXEL
 
 
 @lru_cache(maxsize=OPEN_SURVEYS)
@@ -165,7 +188,7 @@ def _surveys(
             known = has_classes and SessionMap(Workspace(work).session(name)).has_classes
             variant = "semantic" if known else "geometric"
         names.setdefault(variant, []).append(name)
-    cell = SURVEY_CELL * settings.fusion.voxel_size / STREET_VOXEL
+    cell = _survey_cell(settings)
     headings = settings.descriptor.headings
     return {
         variant: Survey(segments(Workspace(work), variant, chosen), chosen, headings, cell)

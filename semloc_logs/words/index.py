@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -46,6 +46,9 @@ UNIT = 2.0**19
 QUERIES = 1024  # that are looked up together
 # of a query word, in its nearest cells, that a survey looks into
 NEAREST_WORDS, NEAREST_CELLS = 4, 2
+# of the words of a place: all may match, none
+ALL = -1
+NONE = -2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,14 +81,14 @@ class Allowed:
     def of(self, group: I64) -> tuple[I64, Bools]:
         """For each place, of submap ``group`` (places,): where its rows begin in the masks.
 
-        The masks are returned one behind the other. -2 if none of the words may match, -1 if all
-        may.
+        The masks are returned one behind the other. It is ``NONE`` where none of the words may
+        match, ``ALL`` where all may.
         """
-        open_ = np.where((group >= 0) & self.groups[group], -1, -2).astype(np.int64)
+        open_ = np.where((group >= 0) & self.groups[group], ALL, NONE).astype(np.int64)
         masks = [np.zeros(0, bool)]
         length = 0
         for g, mask in self.rows.items():
-            open_[(group == g) & (open_ == -1)] = length
+            open_[(group == g) & (open_ == ALL)] = length
             masks.append(mask)
             length += len(mask)
         return open_, np.concatenate(masks)
@@ -217,15 +220,20 @@ class _Lists(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _may_answer(lists: _Lists, entry: int) -> bool:
-    place = lists.place[entry]
-    row = np.int64(lists.row[entry])
-    if place >= len(lists.begin):  # a file may be damaged
+def may_match(place: np.integer[Any], row: np.integer[Any], begin: I64, rows: Bools) -> bool:
+    """Whether the word in ``row`` of a place may match: ``begin`` (places,) and ``rows`` are of
+    :meth:`Allowed.of`.
+    """
+    if place >= len(begin):  # a file may be damaged
         return False
-    first = lists.begin[place]
-    return bool(
-        first == -1 or (first >= 0 and first + row < len(lists.rows) and lists.rows[first + row])
-    )
+    first = begin[place]
+    return bool(first == ALL or (first >= 0 and first + row < len(rows) and rows[first + row]))
+
+
+@njit(cache=True, nogil=True)
+def _may_answer(lists: _Lists, entry: int) -> bool:
+    row = np.int64(lists.row[entry])
+    return may_match(lists.place[entry], row, lists.begin, lists.rows)
 
 
 @njit(cache=True, nogil=True)
@@ -412,22 +420,16 @@ class LookUp:
     word_codes: U64
 
 
-def squares(vocabulary: Vocabulary) -> F32:
-    """The square (c, k) of each word's length."""
-    return np.asarray(np.square(vocabulary.children).sum(2))
-
-
 def look_ups(vocabulary: Vocabulary, descriptors: F32, probes: int) -> list[LookUp]:
     """Descriptors (n, N) to be looked for in their ``probes`` nearest cells, in batches."""
     out = []
-    square = squares(vocabulary)
     for first in range(0, len(descriptors), QUERIES):
         batch = descriptors[first : first + QUERIES]
         cells = vocabulary.nearest_cells(batch, probes)
         margin = vocabulary.margins(batch, cells)
         projected = grid(vocabulary.projected(batch))
         codes = codes_of(margin)
-        words = _nearest_words(projected, cells, codes, vocabulary.children, square)
+        words = _nearest_words(projected, cells, codes, vocabulary.children, vocabulary.squares)
         out.append(LookUp(cells, np.abs(margin), codes, projected, *words))
     return out
 
@@ -443,7 +445,6 @@ class Index:
         self.budget = budget
         self.shortlist = SHORTLIST
         self.parts = sorted((p for p in parts if len(p.segment)), key=lambda p: -len(p.segment))
-        self._square = squares(vocabulary)
         self._live = np.zeros(WORDS, np.int64)
         for p in self.parts:
             if (p.group >= 0).all():
@@ -507,7 +508,7 @@ class Index:
             batch.projected,
             batch.cells,
             self.vocabulary.children,
-            self._square,
+            self.vocabulary.squares,
             self._live,
             self._cell_live,
             self.budget,

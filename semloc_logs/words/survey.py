@@ -16,9 +16,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semloc_logs.numerics.bits import popcount
-from semloc_logs.words.index import LookUp
+from semloc_logs.words.index import ALL, NONE, Allowed, LookUp, Part, may_match
 from semloc_logs.words.segment import Segment
 
+Bools = NDArray[np.bool_]
 I32 = NDArray[np.int32]
 U32 = NDArray[np.uint32]
 U64 = NDArray[np.uint64]
@@ -36,18 +37,20 @@ CELL_BITS = 14
 WEIGHT_BITS = 11
 
 
-class _Lists(NamedTuple):
-    """The lists of a segment; ``session`` (places,) is the number of each place's, -1 for none."""
+class _Postings(NamedTuple):
+    """The lists of a segment, and which of their entries may vote (:meth:`Allowed.of`)."""
 
     starts: U32
     code: U64
     place: U32
+    row: U32
     centre: F32
     yaw: F32
-    session: I64
+    begin: I64
+    rows: Bools
 
 
-class _Asked(NamedTuple):
+class _QueryWords(NamedTuple):
     """Words of a query: each (n, w) of its nearest ones, with its code, quarter turns and
     centre (n, 2), metres."""
 
@@ -87,15 +90,9 @@ class Survey:
         self._headings = headings
         self._cell = cell
         numbers = {name: number for number, name in enumerate(self.names)}
-        self._lists = [
-            _Lists(
-                s.starts,
-                s.code,
-                s.place,
-                s.centre,
-                s.yaw,
-                np.array([numbers[n] if n in served else -1 for n, _ in s.places], np.int64),
-            )
+        # the number of each place's session, -1 for none
+        self._segments = [
+            (s, np.array([numbers[n] if n in served else -1 for n, _ in s.places], np.int64))
             for s, served in segments
         ]
 
@@ -107,20 +104,62 @@ class Survey:
         """
         weights = np.zeros((2, len(self.names)), np.int64)
         if len(centre):
-            asked = _asked(turned, centre)
-            for lists in self._lists:
-                for votes in _votes(asked, lists, self._headings, self._cell):
-                    votes.sort()
-                    _count(votes, lists.session, *weights)
-        place, everywhere = weights / FULL_VOTE
-        # both grids have all votes
-        counted = zip(place.tolist(), (everywhere / 2).tolist(), strict=True)
-        return {name: Votes(*of_name) for name, of_name in zip(self.names, counted, strict=True)}
+            words = _query_words(turned, centre)
+            for segment, session in self._segments:
+                served = np.where(session >= 0, ALL, NONE)
+                postings = _postings(segment, served, np.zeros(0, bool))
+                _add_votes(words, postings, session, weights, self._headings, self._cell)
+        return dict(zip(self.names, _of_sessions(weights), strict=True))
 
 
-def _asked(turned: Sequence[Sequence[LookUp]], centre: F64) -> _Asked:
+def votes_in_session(
+    parts: Iterable[Part],
+    allowed: Allowed,
+    turned: Sequence[Sequence[LookUp]],
+    centre: F64,
+    *,
+    headings: int,
+    cell: float,
+) -> Votes:
+    """The votes of a query, as :meth:`Survey.votes` takes it, for the words of one session that
+    are ``allowed``. ``parts`` hold no other session's.
+    """
+    weights = np.zeros((2, 1), np.int64)
+    if len(centre):
+        words = _query_words(turned, centre)
+        for part in parts:
+            postings = _postings(part.segment, *allowed.of(part.group))
+            session = np.zeros(len(part.group), np.int64)
+            _add_votes(words, postings, session, weights, headings, cell)
+    return _of_sessions(weights)[0]
+
+
+def _postings(segment: Segment, begin: I64, rows: Bools) -> _Postings:
+    s = segment
+    return _Postings(s.starts, s.code, s.place, s.row, s.centre, s.yaw, begin, rows)
+
+
+def _add_votes(
+    words: _QueryWords, postings: _Postings, session: I64, weights: I64, headings: int, cell: float
+) -> None:
+    """Add the votes to the ``weights`` (2, sessions) of best places and of everything.
+
+    ``session`` (places,) has the number of each place's.
+    """
+    for votes in _word_votes(words, postings, headings, cell):
+        votes.sort()
+        _count(votes, session, *weights)
+
+
+def _of_sessions(weights: I64) -> list[Votes]:
+    place, everywhere = weights / FULL_VOTE
+    # both grids have all votes
+    return [Votes(*of) for of in zip(place.tolist(), (everywhere / 2).tolist(), strict=True)]
+
+
+def _query_words(turned: Sequence[Sequence[LookUp]], centre: F64) -> _QueryWords:
     batches = [batch for batches in turned for batch in batches]
-    return _Asked(
+    return _QueryWords(
         np.concatenate([batch.word for batch in batches]),
         np.concatenate([batch.word_codes for batch in batches]),
         np.repeat(np.arange(len(turned)), len(centre)),
@@ -129,7 +168,9 @@ def _asked(turned: Sequence[Sequence[LookUp]], centre: F64) -> _Asked:
 
 
 @njit(cache=True, nogil=True)
-def _votes(asked: _Asked, lists: _Lists, headings: int, cell: float) -> tuple[I64, I64]:
+def _word_votes(
+    words: _QueryWords, postings: _Postings, headings: int, cell: float
+) -> tuple[I64, I64]:
     """The votes of all pairs of near words: numbers of cells with a weight in their last bits.
 
     Of cells as they lie, and of cells moved by half their edge, so that no place is split at a
@@ -145,24 +186,24 @@ def _votes(asked: _Asked, lists: _Lists, headings: int, cell: float) -> tuple[I6
     sine = np.sin(np.arange(headings) * step)
     votes = np.empty((2, 4096), np.int64)
     count = 0
-    for q in range(len(asked.word)):
-        for n in range(asked.word.shape[1]):
-            word = np.int64(asked.word[q, n])
-            code = asked.code[q, n]
-            for i in range(np.int64(lists.starts[word]), np.int64(lists.starts[word + 1])):
-                bits = popcount(code ^ lists.code[i])
+    for q in range(len(words.word)):
+        for n in range(words.word.shape[1]):
+            word = np.int64(words.word[q, n])
+            code = words.code[q, n]
+            for i in range(np.int64(postings.starts[word]), np.int64(postings.starts[word + 1])):
+                bits = popcount(code ^ postings.code[i])
                 if bits > NEAR_CODE:
                     continue
-                place = np.int64(lists.place[i])
-                # a file may be damaged
-                if place >= len(lists.session) or lists.session[place] < 0:
+                place = np.int64(postings.place[i])
+                row = np.int64(postings.row[i])
+                if not may_match(place, row, postings.begin, postings.rows):
                     continue
-                own = np.int64(np.rint(lists.yaw[i] / step))
-                heading = (own + asked.turns[q] * quarter) % headings
+                own = np.int64(np.rint(postings.yaw[i] / step))
+                heading = (own + words.turns[q] * quarter) % headings
                 c = cosine[heading]
                 s = sine[heading]
-                x = (lists.centre[i, 0] - c * asked.centre[q, 0] + s * asked.centre[q, 1]) / cell
-                y = (lists.centre[i, 1] - s * asked.centre[q, 0] - c * asked.centre[q, 1]) / cell
+                x = (postings.centre[i, 0] - c * words.centre[q, 0] + s * words.centre[q, 1]) / cell
+                y = (postings.centre[i, 1] - s * words.centre[q, 0] - c * words.centre[q, 1]) / cell
                 if count == votes.shape[1]:
                     more = np.empty((2, 2 * count), np.int64)
                     more[:, :count] = votes

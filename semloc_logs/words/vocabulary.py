@@ -17,7 +17,7 @@ not depend on the order in which a BLAS with so many threads adds: see
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -39,7 +39,7 @@ PER_CELL = 256  # descriptors for each cell that the cells are found from
 F32 = NDArray[np.float32]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Vocabulary:
     """Cells, and children of cells, for descriptors of N >= 64 dimensions.
 
@@ -51,6 +51,11 @@ class Vocabulary:
     projection: F32
     thresholds: F32
     children: F32
+
+    @cached_property
+    def squares(self) -> F32:
+        """The square (c, k) of the length of each child."""
+        return np.asarray(np.square(self.children).sum(2))
 
     def nearest_cells(self, descriptors: F32, probes: int) -> NDArray[np.int32]:
         """The ``probes`` nearest cells (n, probes) of descriptors (n, N), nearest first.

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.words.index import LookUp
+from semloc_logs.words.index import Allowed, LookUp, Part
 from semloc_logs.words.segment import Held, Segment, segment_in_memory
-from semloc_logs.words.survey import FAR_CODE, NEAR_CODE, Survey
+from semloc_logs.words.survey import FAR_CODE, NEAR_CODE, Survey, Votes, votes_in_session
 
 HEADINGS = 20
 CELL = 4.0
@@ -57,17 +57,28 @@ def query(seed: int, n: int) -> tuple[list[list[LookUp]], NDArray[np.float64]]:
 
 
 def by_hand(
-    turned: list[list[LookUp]], centre: NDArray[np.float64], held: Segment, name: str
+    turned: list[list[LookUp]],
+    centre: NDArray[np.float64],
+    held: Segment,
+    name: str,
+    hidden: frozenset[tuple[int, int]] = frozenset(),
 ) -> tuple[float, float]:
-    """Weights of the best cell and of all votes, from every pair of words."""
+    """Weights of the best cell and of all votes, from every pair of words.
+
+    Words at ``hidden`` places and rows do not vote.
+    """
     cells: Counter[tuple[int, ...]] = Counter()
     everywhere = 0.0
     for turns, (batch,) in enumerate(turned):
         for q, i in np.ndindex(len(centre), len(held)):
             word = int(np.searchsorted(held.starts, i, "right")) - 1
-            for asked, code in zip(batch.word[q], batch.word_codes[q], strict=True):
+            if (int(held.place[i]), int(held.row[i])) in hidden:
+                continue
+            for query_word, code in zip(batch.word[q], batch.word_codes[q], strict=True):
                 bits = int(code ^ held.code[i]).bit_count()
-                if held.places[held.place[i]][0] != name or asked != word or bits > NEAR_CODE:
+                if held.places[held.place[i]][0] != name or query_word != word:
+                    continue
+                if bits > NEAR_CODE:
                     continue
                 heading = round(float(held.yaw[i]) * HEADINGS / (2 * np.pi)) + turns * HEADINGS // 4
                 yaw = heading * 2 * np.pi / HEADINGS
@@ -116,3 +127,29 @@ def test_a_query_without_words_gets_no_votes() -> None:
     held = segment(("a", 1, 60))
     survey = Survey([(held, frozenset("a"))], "a", HEADINGS, CELL)
     assert survey.votes([[], [], [], []], np.zeros((0, 3)))["a"] == (0, 0)
+
+
+def own_votes(allowed: Allowed, held: Segment) -> Votes:
+    turned, centre = query(3, 25)
+    parts = [Part(held, np.arange(2))]
+    return votes_in_session(parts, allowed, turned, centre, headings=HEADINGS, cell=CELL)
+
+
+def test_only_words_that_may_match_vote_in_the_own_session() -> None:
+    held = segment(("a", 1, 60))
+    rows = np.arange(60) % 3 > 0
+    hidden = frozenset((1, int(row)) for row in np.flatnonzero(~rows))
+    turned, centre = query(3, 25)
+    expected = by_hand(turned, centre, held, "a", hidden)
+    everything = by_hand(turned, centre, held, "a")
+    votes = own_votes(Allowed(np.array([True, True]), {1: rows}), held)
+    assert votes == pytest.approx(expected, rel=5e-3)
+    assert votes.everywhere < everything[1]
+
+
+def test_hidden_submaps_have_no_votes() -> None:
+    held = segment(("a", 1, 60))
+    assert own_votes(Allowed(np.array([False, False])), held) == (0, 0)
+    whole = own_votes(Allowed(np.array([True, True])), held)
+    turned, centre = query(3, 25)
+    assert whole == Survey([(held, frozenset("a"))], "a", HEADINGS, CELL).votes(turned, centre)["a"]
