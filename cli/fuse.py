@@ -56,6 +56,9 @@ def command(
     Nothing is done again that is there for the same content, settings and version. Another log
     under the name of a known session is refused without --overwrite. Lengths are metres.
 
+    A map of points (PCD, PLY, LAS, LAZ) is a session, too: seen from a tour over its ground, or
+    from the trajectory of --poses.
+
     \b
     Example:  semloc fuse monday_0.mcap monday_1.mcap -w work --session monday
     """

@@ -34,7 +34,7 @@ def pairs_of_sessions(maps: Mapping[str, SessionMap]) -> list[Pair]:
     """All pairs of sessions, each once, by the names of query and target.
 
     A log without poses has no map to be searched in: it is the query of those that have one.
-    Sessions that satellites tell apart are left out.
+    Sessions that satellites tell apart are left out. A map of points has no revisits of its own.
     """
     order = sorted(maps, key=lambda n: (not maps[n].posed, int(maps[n].stamps_ns[0]), n))
     tracks = {name: sure_track(session) for name, session in maps.items()}
@@ -42,7 +42,11 @@ def pairs_of_sessions(maps: Mapping[str, SessionMap]) -> list[Pair]:
         Pair(query, target)
         for number, query in enumerate(order)
         for target in order[: number + 1]
-        if query == target or not are_apart(tracks[query], tracks[target])
+        if (
+            not maps[query].is_map
+            if query == target
+            else not are_apart(tracks[query], tracks[target])
+        )
     ]
     return sorted(pairs)
 

@@ -116,6 +116,11 @@ class SessionMap:
         return texts
 
     @property
+    def is_map(self) -> bool:
+        """Whether it was made from maps of points alone, which nobody drove through."""
+        return {log["format"] for log in self.json["logs"]} == {"map"}
+
+    @property
     def posed(self) -> bool:
         """Whether the log has poses."""
         return bool(self.json["posed"])

@@ -74,6 +74,11 @@ def annotate(
     recover(log)
     name = session or session_name(log)
     own = SessionMap(work.chosen([name])[0])
+    if own.is_map:
+        raise WorkspaceError(
+            f"{log} is a map of points, which has no channels: annotate the logs of drives; they"
+            " get the closures with it."
+        )
     _check_log(log, own)
     results = _results(work, own, settings, common=annotation.common)
     if annotation.mode is AnnotationMode.IN_PLACE:

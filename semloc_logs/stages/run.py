@@ -9,6 +9,7 @@ from pathlib import Path
 
 import semloc_logs
 from semloc_logs.engines import Engine
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.annotate import Annotation, AnnotationMode, annotate
 from semloc_logs.stages.close import close
@@ -83,6 +84,8 @@ class _Total:
 def _annotate_logs(
     session: SessionInput, work: Workspace, settings: Resolved, mode: AnnotationMode
 ) -> None:
+    if SessionMap(work.session(session.name)).is_map:  # it has no channels
+        return
     for log in session.logs:
         output = None if mode is AnnotationMode.IN_PLACE else _output(session, log, work, mode)
         annotation = Annotation(mode, output, overwrite=True)

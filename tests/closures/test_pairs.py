@@ -14,8 +14,9 @@ from semloc_logs.closures.pairs import Pair, pairs_of_sessions
 SECOND = 1_000_000_000
 
 
-def session(start_ns: int, *, posed: bool = True) -> Any:
-    return SimpleNamespace(stamps_ns=np.array([start_ns, start_ns + 1]), posed=posed, fixes=None)
+def session(start_ns: int, *, posed: bool = True, is_map: bool = False) -> Any:
+    stamps_ns = np.array([start_ns, start_ns + 1])
+    return SimpleNamespace(stamps_ns=stamps_ns, posed=posed, fixes=None, is_map=is_map)
 
 
 def located(start_s: int, longitude: float, sigma: float = 1.0, fixes: int = 20) -> Any:
@@ -28,7 +29,8 @@ def located(start_s: int, longitude: float, sigma: float = 1.0, fixes: int = 20)
         "sigma_north": np.full(fixes, sigma),
     }
     stamps_ns = (start_s + np.arange(10)) * SECOND
-    return SimpleNamespace(stamps_ns=stamps_ns, posed=True, fixes=pa.table(columns))
+    fixes_table = pa.table(columns)
+    return SimpleNamespace(stamps_ns=stamps_ns, posed=True, fixes=fixes_table, is_map=False)
 
 
 SESSIONS = {"b": session(5), "a": session(7), "c": session(5), "frames": session(1, posed=False)}
@@ -73,3 +75,8 @@ def test_sessions_that_satellites_tell_apart_are_no_pair(other: Any, is_searched
     pairs = pairs_of_sessions({"a": located(0, 8.0), "b": other})
     assert (Pair("b", "a") in pairs) == is_searched
     assert Pair("a", "a") in pairs
+
+
+def test_a_map_is_not_searched_in_itself() -> None:
+    maps = {"hdmap": session(1, is_map=True), "drive": session(5)}
+    assert pairs_of_sessions(maps) == [Pair("drive", "drive"), Pair("drive", "hdmap")]

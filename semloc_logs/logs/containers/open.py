@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers import rosbag1
+from semloc_logs.logs.containers.map_stations import Stations
 from semloc_logs.logs.containers.mcap import McapLog
 from semloc_logs.logs.containers.mcap_records import MAGIC
 from semloc_logs.logs.containers.memory import DEFAULT, Memory
+from semloc_logs.logs.containers.point_files import is_point_file
+from semloc_logs.logs.containers.point_map import PointMapLog
 from semloc_logs.logs.containers.rosbag1 import Rosbag1Log
 from semloc_logs.logs.containers.rosbag2 import Rosbag2Log
 from semloc_logs.logs.containers.sqlite import SqliteLog
@@ -18,9 +22,11 @@ from semloc_logs.logs.remote import log_path
 _SQLITE = b"SQLite format 3\0"
 
 
-def open_log(path: str | Path, memory: int = DEFAULT) -> Log:
+def open_log(
+    path: str | Path, memory: int = DEFAULT, along: Callable[[], Stations] | None = None
+) -> Log:
     """The log at ``path``, which may be an address: an MCAP file, a ROS 1 bag, a ROS 2 bag
-    directory or one of its files.
+    directory or one of its files; or a map of points, seen ``along`` a trajectory.
 
     At most ``memory`` bytes of it are in memory at once (``logs.memory``). LogError describes the
     file where it is not a log, or its damage.
@@ -49,6 +55,8 @@ def open_log(path: str | Path, memory: int = DEFAULT) -> Log:
         return Rosbag1Log(path, limit)
     if head.startswith(_SQLITE):
         return SqliteLog(path, memory=limit)
+    if is_point_file(head):
+        return PointMapLog(path, limit, along)
     raise LogError(f"{path} {_description(head)}")
 
 
@@ -67,5 +75,5 @@ def _description(head: bytes) -> str:
         return "is cut off within its first bytes; record or copy it again."
     return (
         "is not a log: it starts neither like an MCAP file nor like a ROS 1 bag nor like a ROS 2 "
-        "sqlite3 bag."
+        "sqlite3 bag, nor like a map of points (PCD, PLY, LAS)."
     )

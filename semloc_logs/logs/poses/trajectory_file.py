@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, DepthFrame, Frame, ImageFrame, LidarFrame
+from semloc_logs.logs.containers.map_stations import FIRST_NS, Stations
 from semloc_logs.logs.poses.track import is_time
 from semloc_logs.logs.problems import Problem
 from semloc_logs.numerics import transforms
@@ -29,6 +30,8 @@ _LONGEST_LINE = 4096  # characters; a line of either format has about 150
 _MOST_POSES = 50_000_000  # a kilohertz over half a day; a trajectory has fewer
 # a quaternion's length may be off by so much, a rotation matrix' R R^T from the identity
 _UNIT = 0.05
+STATION_STEP = 1.0  # m between the places that a map is looked at from
+POSE_NS = 100_000_000  # between poses without stamps, as sweeps are
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +102,25 @@ def read_trajectory(source: TrajectoryFile) -> Trajectory:
             f"give one time for each pose."
         )
     return Trajectory(poses, times, is_relative=bool(times[0] == 0))
+
+
+def stations_along(source: TrajectoryFile) -> Stations:
+    """Places along a trajectory from which a map of points is looked at.
+
+    With stamps they are ``STATION_STEP`` apart, else one a pose, at ``POSE_NS`` from each other.
+    LogError as in :func:`read_trajectory`.
+    """
+    trajectory = read_trajectory(source)
+    poses = trajectory.poses
+    if trajectory.stamps_ns is None:
+        return Stations(FIRST_NS + POSE_NS * np.arange(len(poses), dtype=np.int64), poses)
+    order = np.argsort(trajectory.stamps_ns, kind="stable")
+    poses = poses[order]
+    stamps_ns = trajectory.stamps_ns[order] + (FIRST_NS if trajectory.is_relative else 0)
+    way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0, prepend=poses[:1, :3, 3]), axis=1)
+    step = np.floor(np.cumsum(way) / STATION_STEP)
+    chosen = np.flatnonzero(np.diff(step, prepend=-1.0))
+    return Stations(stamps_ns[chosen], poses[chosen])
 
 
 @dataclass(slots=True)

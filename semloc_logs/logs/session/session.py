@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +27,7 @@ from semloc_logs.logs.poses.mountings import NO_MOUNTINGS, Mountings
 from semloc_logs.logs.poses.navsat import NavSatPoses, navsat_poses
 from semloc_logs.logs.poses.tf_tree import Change, Edge, frame_name
 from semloc_logs.logs.poses.track import PoseTrack
-from semloc_logs.logs.poses.trajectory_file import FilePoses, TrajectoryFile
+from semloc_logs.logs.poses.trajectory_file import FilePoses, TrajectoryFile, stations_along
 from semloc_logs.logs.problems import Problem, sentences, sorted_problems, without_loss_of
 from semloc_logs.logs.role_types import no_sensor
 from semloc_logs.logs.roles import Roles, find_roles
@@ -77,8 +78,9 @@ def open_session(paths: Sequence[Path], options: SessionOptions | None = None) -
         raise LogError("A session needs at least one log: none was named.")
     logs: list[Log] = []
     try:
-        memory = (options or SessionOptions()).logs.memory
-        logs.extend(open_log(path, memory) for path in paths)
+        given = options or SessionOptions()
+        along = None if given.poses is None else partial(stations_along, given.poses)
+        logs.extend(open_log(path, given.logs.memory, along) for path in paths)
         logs.sort(key=lambda log: (log.start_ns is None, log.start_ns or 0))
         return Session(logs, options)
     except BaseException:
