@@ -15,7 +15,7 @@ from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.logs.session.session import SessionOptions, open_session
 
 
-def write_map(path: Path) -> np.ndarray:  # type: ignore[type-arg]
+def write_map(path: Path) -> np.ndarray:
     """A floor of 30 m x 10 m and a wall at its side, as PCD text."""
     x, y = np.meshgrid(np.arange(0, 30, 0.2), np.arange(0, 10, 0.2), indexing="ij")
     floor = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
@@ -30,7 +30,7 @@ def write_map(path: Path) -> np.ndarray:  # type: ignore[type-arg]
     return points
 
 
-def nearest(points: np.ndarray, cloud: np.ndarray) -> float:  # type: ignore[type-arg]
+def nearest(points: np.ndarray, cloud: np.ndarray) -> float:
     """The largest distance of a cloud's points from the map."""
     return float(
         max(np.linalg.norm(points - point, axis=1).min() for point in cloud[:: len(cloud) // 50])
