@@ -27,7 +27,7 @@ from semloc_logs.errors import SemlocError, SettingsError, TopicError, did_you_m
 
 from .console import console
 
-COMMANDS = {  # name -> (module, what --help says), in the order of the story
+COMMANDS = {  # name -> (module of commands/, what --help says), in the order of the story
     "inspect": ("inspect_log", "Contents of a log, and what prevents its use."),
     "run": ("run", "Logs -> loop closures: fuse, describe, close, annotate."),
     "fuse": ("fuse", "Logs -> the semantic map of one session."),
@@ -36,8 +36,8 @@ COMMANDS = {  # name -> (module, what --help says), in the order of the story
     "sessions": ("sessions", "What a workspace holds; rename and remove sessions."),
     "doctor": ("doctor", "Every file of a workspace checked, and what mends it."),
     "optimize": ("optimize", "Closures -> all sessions in one frame."),
-    "tasks": ("tasks", "The tasks of a stage as JSON lines, for a cluster."),
-    "task": ("task", "One of these tasks."),
+    "tasks": ("cluster.tasks", "The tasks of a stage as JSON lines, for a cluster."),
+    "task": ("cluster.task", "One of these tasks."),
     "annotate": ("annotate", "Closures -> channels of a log."),
     "index": ("index", "The index of the words: what it holds; up to date."),
     "evaluate": ("evaluate", "Closures against the truth."),
@@ -70,7 +70,8 @@ class Program(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        found: click.Command = import_module(f".{COMMANDS[cmd_name][0]}", __package__).command
+        module = import_module(f".commands.{COMMANDS[cmd_name][0]}", __package__)
+        found: click.Command = module.command
         return found
 
     def resolve_command(

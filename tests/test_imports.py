@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from semloc_logs.cli.main import COMMANDS
+
 ROOT = Path(__file__).resolve().parents[1]
 # rooms in the order of the story; a room imports only what stands above it
 ORDER = [
@@ -57,6 +59,7 @@ INNER_ORDER = {
         "poses",
         "sensors",
         "session",
+        "inspection",
         "annotation",
     ],
     "simulation": [
@@ -207,7 +210,7 @@ def test_only_the_cli_prints_or_exits(path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("path", CLI, ids=lambda p: p.name)
+@pytest.mark.parametrize("path", CLI, ids=lambda p: str(p.relative_to(ROOT / "cli")))
 def test_cli_imports_its_siblings_relatively_and_nothing_heavy(path: Path) -> None:
     light = {"semloc_logs", "semloc_logs.errors"}
     at_import = [
@@ -235,6 +238,27 @@ def test_cli_imports_its_siblings_relatively_and_nothing_heavy(path: Path) -> No
                 "numpy",
                 "rich",
             }
+
+
+def test_what_commands_share_imports_no_command() -> None:
+    """The program imports commands by name, when they are called."""
+    shared = [path for path in CLI if path.parent == ROOT / "cli"]
+    assert not [
+        (path.name, module)
+        for path in shared
+        for module, level in _imports(path)
+        if level == 1 and module.split(".")[0] == "commands"
+    ]
+
+
+def test_every_command_has_a_module() -> None:
+    folder = ROOT / "cli" / "commands"
+    commands = {
+        ".".join(path.relative_to(folder).with_suffix("").parts)
+        for path in folder.rglob("*.py")
+        if "\ncommand = " in (text := path.read_text()) or "\ndef command(" in text
+    }
+    assert commands == {module for module, _ in COMMANDS.values()}
 
 
 def test_stages_load_no_matplotlib_before_something_is_drawn() -> None:

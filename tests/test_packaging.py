@@ -15,11 +15,12 @@ MAPPED = {"semloc_logs.cli": "cli", "semloc_logs.schemas": "schemas"}
 
 def _folders() -> set[str]:
     """Packages as the folders say."""
-    found = {
-        ".".join(p.parent.relative_to(ROOT).parts)
-        for p in (ROOT / "semloc_logs").rglob("__init__.py")
+    tops = {"semloc_logs": "semloc_logs", **MAPPED}
+    return {
+        ".".join((package, *p.parent.relative_to(ROOT / folder).parts))
+        for package, folder in tops.items()
+        for p in (ROOT / folder).rglob("__init__.py")
     }
-    return found | set(MAPPED)
 
 
 def test_packages_listed_are_the_folders() -> None:
@@ -36,7 +37,7 @@ def test_every_folder_with_modules_is_a_package() -> None:
 
 
 def test_no_module_of_the_cli_is_named_like_one_of_the_standard_library() -> None:
-    assert not {p.stem for p in (ROOT / "cli").glob("*.py")} & sys.stdlib_module_names
+    assert not {p.stem for p in (ROOT / "cli").rglob("*.py")} & sys.stdlib_module_names
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semloc_logs.logs.session.verdict import far_range, voxel_size
+from semloc_logs.logs.inspection.verdict import far_range, voxel_size
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.workspace import Workspace
 

@@ -420,7 +420,7 @@ def test_inspect_says_3_when_data_are_lost(tmp_path: Path, monkeypatch: pytest.M
         "problems": [],
         "streams": [],
     }
-    monkeypatch.setattr("semloc_logs.logs.session.inspect.inspect_log", lambda *_, **__: lost)
+    monkeypatch.setattr("semloc_logs.logs.inspection.inspect.inspect_log", lambda *_, **__: lost)
     done = semloc("inspect", "a.mcap", "--json")
     assert done.exit_code == 3
     assert done.stderr == "Warning: a.mcap: /points: 3 messages cannot be read.\n"
@@ -448,7 +448,7 @@ def test_inspect_takes_settings(tmp_path: Path) -> None:
 
 
 def test_inspect_full_reads_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("semloc_logs.logs.session.excerpt.WHOLE_BYTES", 0)
+    monkeypatch.setattr("semloc_logs.logs.inspection.excerpt.WHOLE_BYTES", 0)
     log = _log(tmp_path / "a.mcap")
     quick = semloc("inspect", log)
     assert "--full reads all messages" in quick.stdout
@@ -568,7 +568,7 @@ def test_all_logs_failing_is_1(tmp_path: Path) -> None:
 
 
 def test_every_point_format_of_the_library_is_offered() -> None:
-    from semloc_logs.cli import export
+    from semloc_logs.cli.commands import export
     from semloc_logs.exports import FORMATS, POINT_FORMATS
 
     form = next(p for p in export.command.params if p.name == "form")

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from semloc_logs.cli.main import program
 from semloc_logs.errors import LogError
+from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.logs.messages.image_codecs import decode_compressed, decode_compressed_depth
 from semloc_logs.logs.problems import lost, sentences
-from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.logs.session.session import Session, open_session
 from semloc_logs.numerics.transforms import yaw_transform
 

@@ -25,8 +25,8 @@ from semloc_logs.logs.annotation.annotate import (
 )
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.logs.containers.sqlite_file import overlay_of
+from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.problems import sentences
-from semloc_logs.logs.session.inspect import inspect_log
 
 TYPE = "std_msgs/msg/String"
 ROWS = 60  # messages, the second half of which is not in the file itself

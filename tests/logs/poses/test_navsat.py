@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.frames import F64, Frame, Header, ImuSample, NavSatSample
+from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.poses.navsat import LocalFrame, NavSatPoses, earth_centred
 from semloc_logs.logs.problems import sentences
-from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
 S = 1_000_000_000

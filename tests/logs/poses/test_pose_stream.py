@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from semloc_logs.errors import RoleError
 from semloc_logs.frames import PosedCloud
+from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.problems import Problem
-from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.numerics.transforms import Array, translation_quaternion, yaw_transform
 

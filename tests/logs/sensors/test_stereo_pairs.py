@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.frames import F64, Camera, Header, ImageFrame, PosedCloud
+from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import NoCloud, lost, sentences
 from semloc_logs.logs.roles import Roles
@@ -18,7 +19,6 @@ from semloc_logs.logs.sensors import stereo_pairs
 from semloc_logs.logs.sensors.depth import LabelImages, RangePoints
 from semloc_logs.logs.sensors.rectification import Rectification, rectification
 from semloc_logs.logs.sensors.stereo_pairs import StereoClouds, _grey
-from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.logs.session.session import SessionOptions, open_session
 from semloc_logs.logs.session.tally import Tally
 from semloc_logs.mapping.keyframes import Collected

@@ -11,8 +11,8 @@ import pytest
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import Header, LidarFrame, PosedCloud, PoseSample
+from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.logs.problems import Problem, ProblemKind
-from semloc_logs.logs.session.inspect import inspect_log
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.logs.session.stamp_offsets import StampOffsets, edge_topic
 from semloc_logs.numerics.transforms import translation_quaternion, yaw_transform

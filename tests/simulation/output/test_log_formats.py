@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from semloc_logs.errors import LogError
-from semloc_logs.logs.session.inspect import inspect_log
+from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse

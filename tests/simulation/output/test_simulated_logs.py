@@ -14,7 +14,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from semloc_logs.errors import LogError, SemlocError, SettingsError
-from semloc_logs.logs.session.inspect import inspect_log
+from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.numerics.transforms import apply, interpolate, inverse, transform
 from semloc_logs.simulation.demo import simulate_demo
 from semloc_logs.simulation.drives.drive import DriveFrame, mounting, simulate_drive

@@ -1,0 +1,1 @@
+"""The commands that cut a stage into tasks for a cluster."""
