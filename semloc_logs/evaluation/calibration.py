@@ -32,7 +32,7 @@ from semloc_logs.closures.acceptance.calibration import (
     probability_of,
 )
 from semloc_logs.closures.acceptance.consistency import count_votes, place_odds
-from semloc_logs.closures.acceptance.placements import Placed, contradicts_odometry
+from semloc_logs.closures.acceptance.placements import Placed, contradicts_odometry, pairs_of
 from semloc_logs.closures.closure import FEATURES, Agreement, Features
 from semloc_logs.closures.closure_tables import keyframe_at
 from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, judge_closure, read_truth
@@ -288,9 +288,10 @@ def agreement_of(judged: Judged, own: F64) -> Agreement[F64]:
     """The agreement (n,) within each town of alignments with log-odds ``own`` (n,)."""
     out = Agreement(*np.zeros((7, len(judged))))
     for mine in _towns(judged):
-        votes = count_votes(
-            replace(judged.placed.part(mine), log_odds=own[mine]), judged.voxel_size
-        )
+        placed = replace(judged.placed.part(mine), log_odds=own[mine])
+        pairs = pairs_of(placed)
+        own_odds = place_odds(placed, pairs, placed.log_odds, judged.voxel_size)
+        votes = count_votes(placed, pairs, own_odds.share, judged.voxel_size)
         for name in (f.name for f in fields(Agreement)):
             getattr(out, name)[mine] = getattr(votes, name)
     return out
@@ -321,8 +322,11 @@ def probability(judged: Judged, own: F64, with_votes: F64) -> F64:
     out = position_confidence(judged.placed.sigma, judged.voxel_size)
     for mine in _towns(judged):
         placed = judged.placed.part(mine)
-        out[mine] *= place_odds(placed, with_votes[mine], judged.voxel_size).place_probability
-        out[mine] *= place_odds(placed, own[mine], judged.voxel_size).mode_share
+        pairs = pairs_of(placed)
+        out[mine] *= place_odds(
+            placed, pairs, with_votes[mine], judged.voxel_size
+        ).place_probability
+        out[mine] *= place_odds(placed, pairs, own[mine], judged.voxel_size).mode_share
     return out
 
 

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import ODOMETRY_DRIFT, SAME_PLACE_VOXELS
 from semloc_logs.closures.acceptance.ambiguity import ambiguity
-from semloc_logs.closures.acceptance.placements import ARM, FAR, Placed, pairs_of, query_roads
+from semloc_logs.closures.acceptance.placements import (
+    ARM,
+    FAR,
+    Pairs,
+    Placed,
+    posed_pairs,
+    query_roads,
+)
 from semloc_logs.closures.closure import Agreement
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import STREET_VOXEL
@@ -39,17 +46,22 @@ MIN_VOTE = 0.02  # alignments less probable than this do not vote
 
 
 def count_votes(
-    placed: Placed, voxel_size: float, roads: Mapping[str, F64] | None = None
+    placed: Placed,
+    pairs: Pairs,
+    own_probability: F64,
+    voxel_size: float,
+    roads: Mapping[str, F64] | None = None,
 ) -> Agreement[F64]:
     """The votes on each alignment (n,); the order of the alignments does not matter.
 
-    ``roads`` are of each session's queries, by default of those that have alignments.
+    ``pairs`` are the rows of the alignments by :func:`.placements.pairs_of`; ``own_probability``
+    (n,) is the share of each in its :func:`place_odds`. ``roads`` are of each session's queries, by
+    default of those that have alignments.
     """
     n = len(placed)
-    own_probability = place_odds(placed, placed.log_odds, voxel_size).share
     votes = Agreement(own_probability, *np.zeros((6, n)))
     support = np.zeros(n)
-    pairs = pairs_of(placed)
+    pairs = posed_pairs(placed, pairs)
     roads = query_roads(placed) if roads is None else roads
     for (query, _), rows in pairs.items():
         group = placed.part(rows)
@@ -210,19 +222,18 @@ class PlaceOdds:
         return self.own / self.place
 
 
-def place_odds(placed: Placed, log_odds: F64, voxel_size: float) -> PlaceOdds:
-    """What alignments with ``log_odds`` (n,) leave to each other.
+def place_odds(placed: Placed, pairs: Pairs, log_odds: F64, voxel_size: float) -> PlaceOdds:
+    """What alignments with ``log_odds`` (n,) leave to each other; ``pairs`` are their rows.
 
     Poses of one place are modes: a metre along the road, where each camera saw the other sides of
     things. A place that the target passed twice is not its own rival.
     """
     out = np.ones((4, len(placed)))
-    for rows in pairs_of(placed, posed=False).values():
-        group = placed.part(rows)
+    for rows in pairs.values():
         out[:, rows] = _place_odds(
-            group.query,
-            group.target_T_query,
-            group.target_road,
+            placed.query[rows],
+            placed.target_T_query[rows],
+            placed.target_road[rows],
             log_odds[rows],
             (2 * MOST_SLACK * voxel_size, 2 * TURN, DRIVEN_AGAIN * voxel_size),
         )

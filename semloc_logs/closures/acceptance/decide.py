@@ -22,6 +22,7 @@ from semloc_logs.closures.acceptance.placements import (
     Bools,
     Placed,
     contradicts_odometry,
+    pairs_of,
     place,
     query_roads,
 )
@@ -72,8 +73,7 @@ def decide(
     roads = query_roads(placed)
     for name, keyframes in (queries or {}).items():
         roads[name] = maps[name].distance[np.asarray(keyframes, int)]
-    agreement = count_votes(placed, settings.fusion.voxel_size, roads)
-    decisions = _decisions(rows, placed, agreement, model, settings.fusion.voxel_size)
+    agreement, decisions = _decisions(rows, placed, roads, model, settings.fusion.voxel_size)
     outcomes = Outcomes(
         rows,
         decisions,
@@ -100,22 +100,26 @@ def _is_first(rows: Alignments, order: I64) -> Bools:
 
 
 def _decisions(
-    rows: Alignments, placed: Placed, agreement: Agreement[F64], model: Model, voxel_size: float
-) -> Decisions:
-    """The factors and the vetoes of each alignment (n,)."""
-    with_votes = model.log_odds(placed.log_odds, agreement)
+    rows: Alignments, placed: Placed, roads: Mapping[str, F64], model: Model, voxel_size: float
+) -> tuple[Agreement[F64], Decisions]:
+    """The votes on each alignment (n,), its factors and its vetoes."""
+    pairs = pairs_of(placed)
+    own = place_odds(placed, pairs, placed.log_odds, voxel_size)
+    agreement = count_votes(placed, pairs, own.share, voxel_size, roads)
+    with_votes = place_odds(placed, pairs, model.log_odds(placed.log_odds, agreement), voxel_size)
     vetoes = {
         Veto.CONTRADICTS_ODOMETRY: contradicts_odometry(placed, voxel_size),
         Veto.AMBIGUOUS_PLACE: model.is_ambiguous(agreement),
         Veto.LOOSE_FIT: is_loose(rows.features),
     }
-    return Decisions(
-        place_odds(placed, with_votes, voxel_size).place_probability,
+    decisions = Decisions(
+        with_votes.place_probability,
         # neighbours tell which place is right, and share its errors: not which pose in it
-        place_odds(placed, placed.log_odds, voxel_size).mode_share,
+        own.mode_share,
         position_confidence(placed.sigma, voxel_size),
         np.stack([vetoes[veto] for veto in Veto], axis=1),
     )
+    return agreement, decisions
 
 
 def why_rejected(decision: Decision, features: Features[float], model: Model) -> Reason:

@@ -81,10 +81,10 @@ def place(alignments: Sequence[Alignment], maps: Mapping[str, SessionMap], model
 Pairs = dict[tuple[str, str], I64]
 
 
-def pairs_of(placed: Placed, *, posed: bool = True) -> Pairs:
+def pairs_of(placed: Placed) -> Pairs:
     """Rows of each query session and target session, in the order of names.
 
-    They are ordered by query, and then by place; with ``posed`` only those with odometry.
+    They are ordered by query, and then by place.
     """
     names, number = np.unique(
         np.concatenate([placed.query_session, placed.target_session]).astype(str),
@@ -94,13 +94,18 @@ def pairs_of(placed: Placed, *, posed: bool = True) -> Pairs:
     target = number[len(placed) :]
     at = placed.target_T_query[:, :3, 3]
     rows = np.lexsort((at[:, 2], at[:, 1], at[:, 0], placed.query, target, query))
-    rows = rows[placed.posed[rows]] if posed else rows
     cuts = np.flatnonzero(np.diff(query[rows] * len(names) + target[rows])) + 1
     return {
         (str(names[query[r[0]]]), str(names[target[r[0]]])): r
         for r in np.split(rows, cuts)
         if len(r)
     }
+
+
+def posed_pairs(placed: Placed, pairs: Pairs) -> Pairs:
+    """The rows of ``pairs`` with odometry, and the pairs that have some."""
+    posed = {pair: rows[placed.posed[rows]] for pair, rows in pairs.items()}
+    return {pair: rows for pair, rows in posed.items() if len(rows)}
 
 
 def query_roads(placed: Placed) -> dict[str, F64]:

@@ -36,6 +36,7 @@ from semloc_logs.closures.acceptance.placements import (
     contradicts_odometry,
     pairs_of,
     place,
+    posed_pairs,
     query_roads,
 )
 from semloc_logs.closures.closure import (
@@ -217,7 +218,7 @@ def test_of_a_street_that_the_target_drove_twice_one_place_is_accepted() -> None
 def shares(rows: list[Alignment], maps: dict[str, SessionMap] = MAPS) -> F64:
     """Mode shares (n,)."""
     placed = place(rows, maps, MODEL)
-    return place_odds(placed, placed.log_odds, 0.3).mode_share
+    return place_odds(placed, pairs_of(placed), placed.log_odds, 0.3).mode_share
 
 
 @pytest.mark.parametrize(
@@ -402,14 +403,14 @@ def test_alignments_of_one_pair_of_sessions_belong_together() -> None:
         alignment(40, 0.5, query="b", target="a"),
         alignment(25, 0.5),
     ]
-    assert {pair: r.tolist() for pair, r in pairs_of(place(rows, MAPS, MODEL)).items()} == {
-        ("a", "b"): [1, 3, 0],
-        ("b", "a"): [2],
-    }
-    unposed = {"a": session(ROAD, posed=False), "b": MAPS["b"]}
-    assert {pair: r.tolist() for pair, r in pairs_of(place(rows, unposed, MODEL)).items()} == {
-        ("b", "a"): [2]
-    }
+    both = {("a", "b"): [1, 3, 0], ("b", "a"): [2]}
+    placed = place(rows, MAPS, MODEL)
+    assert {pair: r.tolist() for pair, r in pairs_of(placed).items()} == both
+    assert {pair: r.tolist() for pair, r in posed_pairs(placed, pairs_of(placed)).items()} == both
+    placed = place(rows, {"a": session(ROAD, posed=False), "b": MAPS["b"]}, MODEL)
+    pairs = pairs_of(placed)
+    assert {pair: r.tolist() for pair, r in pairs.items()} == both
+    assert {pair: r.tolist() for pair, r in posed_pairs(placed, pairs).items()} == {("b", "a"): [2]}
 
 
 def test_streets_that_a_target_has_twice_are_not_accepted_there_nor_anywhere_else() -> None:
@@ -521,7 +522,10 @@ def test_a_second_place_that_fits_much_worse_is_no_copy() -> None:
 
 
 def test_without_other_alignments_all_votes_are_zero() -> None:
-    votes = count_votes(place([alignment(20, 0.5)], MAPS, MODEL), 0.3)
+    placed = place([alignment(20, 0.5)], MAPS, MODEL)
+    pairs = pairs_of(placed)
+    own = place_odds(placed, pairs, placed.log_odds, 0.3).share
+    votes = count_votes(placed, pairs, own, 0.3)
     assert dataclasses.astuple(votes.row(0)) == (0.5, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -574,7 +578,7 @@ def test_what_is_as_probable_as_the_settings_require_is_accepted(
 def test_of_none() -> None:
     assert list(decide([], MAPS, SETTINGS, model=MODEL)) == []
     nothing = place([], {}, MODEL)
-    assert len(count_votes(nothing, 0.3)) == 0
+    assert len(count_votes(nothing, pairs_of(nothing), np.zeros(0), 0.3)) == 0
     assert not contradicts_odometry(nothing, 0.3).any()
 
 
@@ -662,7 +666,7 @@ def test_voters_are_counted_as_one_by_one(seed: int, voxel_size: float) -> None:
         rng.normal(-2, 3, 50),
         np.ones(50, bool),
     )
-    own = place_odds(placed, placed.log_odds, voxel_size).share
+    own = place_odds(placed, pairs_of(placed), placed.log_odds, voxel_size).share
     probabilities = own, placed.probability_ignoring_rivals
     for found, expected in zip(
         _sums(placed, probabilities, voxel_size),
