@@ -16,7 +16,7 @@ from semloc_logs.alignment.mask_grid import FREE_BIT, MaskGrid
 from semloc_logs.alignment.overlaps import overlap, overlap_map, query_voxels
 from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.system import Query, RankedPose, View
-from semloc_logs.experiments.systems import plain
+from semloc_logs.experiments.systems import catalogue, plain
 from semloc_logs.experiments.systems.ablations import (
     ABLATIONS,
     ablated,
@@ -282,28 +282,32 @@ def test_every_ablation_finds_the_view_of_the_opposite_lane(
     found = system.localise(hidden(query))
     metres, degrees = errors(found[0], query)
     # a pose that was not refined is as good as the steps of the search
-    assert metres < (1.0 if name == "ours, not refined" else 0.25)
-    assert degrees < (5.0 if name == "ours, not refined" else 1.0)
+    assert metres < (1.0 if name == "ours-not-refined" else 0.25)
+    assert degrees < (5.0 if name == "ours-not-refined" else 1.0)
+
+
+def test_every_row_of_an_ablation_has_its_parts() -> None:
+    assert [entry.name for entry in catalogue.ABLATIONS] == list(ABLATIONS)
 
 
 def test_ablations_change_what_they_name(database: list[View], queries: list[Query]) -> None:
-    assert ablated("ours, one neighbour").settings.closures.neighbours == 1
-    four = ablated("ours, subvolumes every 4 voxels").settings.descriptor
+    assert ablated("ours-one-neighbour").settings.closures.neighbours == 1
+    four = ablated("ours-stride-4").settings.descriptor
     assert (four.stride, four.query_stride) == (4, 4)
-    with pytest.raises(SettingsError, match="there are ours"):
-        ablated("ours, no words")
+    with pytest.raises(SettingsError, match="there are ours-no-classes"):
+        ablated("ours-no-words")
 
 
 def test_a_network_trained_otherwise_is_named_with_its_command(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"training\.contrastive_weight=0"):
-        ablated("ours, no contrastive term", weights=tmp_path)
+        ablated("ours-no-contrast", weights=tmp_path)
     # any network with 64 numbers in place of a trained one
     torch.manual_seed(0)
     save_weights(tmp_path / "semantic.safetensors", Completion("semantic", 64), {})
     random = np.random.default_rng(0).normal(size=(300, 64))
     random /= np.linalg.norm(random, axis=1, keepdims=True)
     save_vocabulary(tmp_path / "words.safetensors", train_vocabulary(random), {})
-    system = ablated("ours, N = 64", settings(), tmp_path)
+    system = ablated("ours-64", settings(), tmp_path)
     chosen = system.settings.descriptor
     assert chosen.weights == tmp_path / "semantic.safetensors"
     assert load_encoder("semantic", chosen.weights).latent == 64

@@ -111,19 +111,16 @@ def described_alone(
 
 
 ABLATIONS: dict[str, Ablation] = {
-    "ours": Ablation(),
-    "ours, words without classes": Ablation({"descriptor.variant": "geometric"}),
-    "ours, every heading described": Ablation(match=sweep_words),
-    "ours, query subvolumes alone": Ablation(match=alone_words),
-    "ours, subvolumes every 4 voxels": Ablation(
-        {"descriptor.stride": 4, "descriptor.query_stride": 4}
-    ),
-    "ours, one neighbour": Ablation({"closures.neighbours": 1}),
-    "ours, free space ignored": Ablation(contradicts=False),
-    "ours, not refined": Ablation(fitted=False),
-    "ours, no contrastive term": Ablation(training={"contrastive_weight": 0}),
-    "ours, N = 64": Ablation(training={"latent": 64}),
-    "ours, N = 512": Ablation(training={"latent": 512}),
+    "ours-no-classes": Ablation({"descriptor.variant": "geometric"}),
+    "ours-every-heading": Ablation(match=sweep_words),
+    "ours-alone": Ablation(match=alone_words),
+    "ours-stride-4": Ablation({"descriptor.stride": 4, "descriptor.query_stride": 4}),
+    "ours-one-neighbour": Ablation({"closures.neighbours": 1}),
+    "ours-no-free-space": Ablation(contradicts=False),
+    "ours-not-refined": Ablation(fitted=False),
+    "ours-no-contrast": Ablation(training={"contrastive_weight": 0}),
+    "ours-64": Ablation(training={"latent": 64}),
+    "ours-512": Ablation(training={"latent": 512}),
 }
 
 

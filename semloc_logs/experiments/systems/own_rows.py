@@ -17,18 +17,6 @@ _VARIANTS: dict[str, Variant] = {
     "paper-geometric": "geometric",
     "paper-acc": "semantic",
 }
-_ROWS = {  # names of rows -> names of ablations
-    "ours-no-classes": "ours, words without classes",
-    "ours-every-heading": "ours, every heading described",
-    "ours-alone": "ours, query subvolumes alone",
-    "ours-stride-4": "ours, subvolumes every 4 voxels",
-    "ours-one-neighbour": "ours, one neighbour",
-    "ours-no-free-space": "ours, free space ignored",
-    "ours-not-refined": "ours, not refined",
-    "ours-no-contrast": "ours, no contrastive term",
-    "ours-64": "ours, N = 64",
-    "ours-512": "ours, N = 512",
-}
 
 
 def make_ours(options: SystemOptions) -> System:
@@ -39,7 +27,7 @@ def make_ours(options: SystemOptions) -> System:
 def make_ablation(options: SystemOptions) -> System:
     """The pipeline without one of its parts; networks of its own lie in WEIGHTS/NAME/."""
     folder = (options.weights or Path("weights")) / options.name
-    return ablated(_ROWS[options.name], options.settings, folder)
+    return ablated(options.name, options.settings, folder)
 
 
 def make_plain(options: SystemOptions) -> System:
