@@ -197,7 +197,22 @@ class RemotePath(PosixPath):
         return file if "b" in mode else io.TextIOWrapper(file, encoding="utf-8")
 
 
-class RemoteFile(io.RawIOBase):
+class _Positioned(io.IOBase):
+    """What is read at a position that can be moved."""
+
+    _position = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._position
+
+
+class RemoteFile(_Positioned, io.RawIOBase):
     """Reads blocks of an address, the last ones kept."""
 
     def __init__(self, path: RemotePath) -> None:
@@ -211,18 +226,8 @@ class RemoteFile(io.RawIOBase):
             )
         self._path = path
         self._size = int(info["size"])
-        self._position = 0
         self._blocks: OrderedDict[int, bytes] = OrderedDict()
         self._last = -2  # block that was read last
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._position
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         origin = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
@@ -302,7 +307,7 @@ class _SendError(Exception):
     """The server did not take a part."""
 
 
-class _Upload(io.BufferedIOBase):
+class _Upload(_Positioned, io.BufferedIOBase):
     """Sends what has been written, apart from the last bytes."""
 
     def __init__(self, path: RemotePath, target: Any) -> None:
@@ -310,19 +315,9 @@ class _Upload(io.BufferedIOBase):
         self._head = b""
         self._sent = 0
         self._held = bytearray()
-        self._position = 0
 
     def writable(self) -> bool:
         return True
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._position
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         end = self._sent + len(self._held)

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from heapq import heappop, heappush, heapreplace
 from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, NamedTuple, Protocol
 
 import lz4.frame
 import zstandard
@@ -34,6 +34,13 @@ _engines = threading.local()
 _ONE_READER = threading.Lock()  # of files without a descriptor
 
 
+class BagFile(NamedTuple):
+    """A file of a bag: its name there, and the problems of the bag, which get its own."""
+
+    name: str
+    problems: Problems
+
+
 class BaseLog(ABC):
     """The parts of :class:`~semloc_logs.logs.log.Log` that do not depend on the container."""
 
@@ -41,8 +48,8 @@ class BaseLog(ABC):
         self,
         path: Path,
         format: str,
-        problems: Problems | None = None,
         memory: Memory | None = None,
+        bag_file: BagFile | None = None,
     ) -> None:
         self.path = path
         self.format = format
@@ -50,7 +57,7 @@ class BaseLog(ABC):
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         self.streams: list[Stream] = []
-        self._problems = Problems() if problems is None else problems
+        self._name, self._problems = bag_file or BagFile(path.name, Problems())
         self._memory = Memory() if memory is None else memory
         self._decoder = Decoder(self._problems)
 

@@ -19,6 +19,7 @@ from mcap.records import Channel, Header, Schema, Statistics
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import (
+    BagFile,
     BaseLog,
     Bytes,
     MessageOrTime,
@@ -59,7 +60,6 @@ from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.containers.read_ahead import ReadAhead
 from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.type_names import ros2_type
-from semloc_logs.logs.problems import Problems
 
 _FOOTER = struct.Struct("<BQQQI")
 _LOOSE = 1 << 22  # messages outside chunks are read in runs of about this many bytes
@@ -81,14 +81,9 @@ class McapLog(BaseLog):
     """An MCAP file of any profile. LogError unless it starts as one."""
 
     def __init__(
-        self,
-        path: Path,
-        name: str = "",
-        problems: Problems | None = None,
-        memory: Memory | None = None,
+        self, path: Path, memory: Memory | None = None, bag_file: BagFile | None = None
     ) -> None:
-        super().__init__(path, "mcap", problems, memory)
-        self._name = name or path.name
+        super().__init__(path, "mcap", memory, bag_file)
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._kinds: dict[int, tuple[str, str, str, Definition]] = {}

@@ -50,11 +50,11 @@ def open_log(
     if path.name == "metadata.yaml":
         return Rosbag2Log(path.parent, limit)
     if head.startswith(MAGIC):
-        return McapLog(path, memory=limit)
+        return McapLog(path, limit)
     if head.startswith(b"#ROSBAG V"):
         return Rosbag1Log(path, limit)
     if head.startswith(_SQLITE):
-        return SqliteLog(path, memory=limit)
+        return SqliteLog(path, limit)
     if is_point_file(head):
         return PointMapLog(path, limit, along)
     raise LogError(f"{path} {_description(head)}")

@@ -61,7 +61,7 @@ class Rosbag1Log(BaseLog):
     """A ROS 1 bag. LogError unless it is one of format 2.0 without encryption."""
 
     def __init__(self, path: Path, memory: Memory | None = None) -> None:
-        super().__init__(path, "rosbag1", memory=memory)
+        super().__init__(path, "rosbag1", memory)
         self.encoding = "ros1"
         self._connections: dict[int, Connection] = {}
         self._publishers: dict[int, str] = {}  # of connections that share their topic

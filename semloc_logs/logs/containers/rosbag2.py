@@ -19,6 +19,7 @@ import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers.base import (
+    BagFile,
     BaseLog,
     encoding_of,
     in_log_time_order,
@@ -42,7 +43,7 @@ class Rosbag2Log(BaseLog):
     """A ROS 2 bag directory. LogError when it holds no file that can be read."""
 
     def __init__(self, path: Path, memory: Memory | None = None) -> None:
-        super().__init__(path, "rosbag2", memory=memory)
+        super().__init__(path, "rosbag2", memory)
         self.files: list[Path] = []  # as they lie in the directory
         self._files: list[Log] = []
         self._folder: tempfile.TemporaryDirectory[str] | None = None
@@ -213,7 +214,7 @@ class Rosbag2Log(BaseLog):
         return sorted([*plain, *packed], key=_natural)
 
     def _open_file(self, path: Path) -> Log:
-        name = path.name
+        bag_file = BagFile(path.name, self._problems)
         try:
             with path.open("rb") as file:
                 head = file.read(16)
@@ -224,8 +225,8 @@ class Rosbag2Log(BaseLog):
             with path.open("rb") as file:
                 head = file.read(16)
         if head.startswith(b"SQLite format 3\0"):
-            return SqliteLog(path, name, self._problems, self._memory)
-        return McapLog(path, name, self._problems, self._memory)
+            return SqliteLog(path, self._memory, bag_file)
+        return McapLog(path, self._memory, bag_file)
 
     def _unpack(self, path: Path) -> Path:
         """A decompressed copy in a temporary folder that lives as long as this log."""

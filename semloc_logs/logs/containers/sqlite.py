@@ -18,12 +18,12 @@ import zstandard
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers import sqlite_file
-from semloc_logs.logs.containers.base import BaseLog, Bytes, decompress
+from semloc_logs.logs.containers.base import BagFile, BaseLog, Bytes, decompress
 from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.log import Definition, Message, Section, Stream
 from semloc_logs.logs.messages.definitions import is_standard
 from semloc_logs.logs.messages.type_names import ros2_type
-from semloc_logs.logs.problems import ProblemKind, Problems
+from semloc_logs.logs.problems import ProblemKind
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message starts like this
 _SECTION_BYTES = 4 << 20  # about as much as a chunk of other containers holds
@@ -38,14 +38,9 @@ class SqliteLog(BaseLog):
     """A ``.db3`` file. LogError unless it holds the tables of rosbag2."""
 
     def __init__(
-        self,
-        path: Path,
-        name: str = "",
-        problems: Problems | None = None,
-        memory: Memory | None = None,
+        self, path: Path, memory: Memory | None = None, bag_file: BagFile | None = None
     ) -> None:
-        super().__init__(path, "rosbag2", problems, memory)
-        self._name = name or path.name
+        super().__init__(path, "rosbag2", memory, bag_file)
         self._damaged = False
         self._topics: dict[int, tuple[str, str, str, Definition]] = {}
         self._state = sqlite_file.state(path)
