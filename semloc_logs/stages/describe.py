@@ -63,15 +63,16 @@ def plan_describe(
 ) -> dict[str, tuple[str, ...]]:
     """The sessions to describe, with the networks that do it. Nothing is written."""
     # a session is comparable with all others, not only with those that are described now
-    sources = [str(read_json(f.session_json)["label_source"]) for f in work.sessions()]
+    maps = {folder.name: SessionMap(folder) for folder in work.sessions()}
+    sources = [session.label_source for session in maps.values()]
     plan = {}
-    for folder in folders:
-        check_settings(folder, settings)
-    for folder in folders:
-        source = str(read_json(folder.session_json)["label_source"])
-        variants = variants_for(source, sources, settings)
-        if overwrite or not is_described(folder, variants, settings):
-            plan[folder.name] = variants
+    chosen = [maps[folder.name] for folder in folders]
+    for session in chosen:
+        check_settings(session, settings)
+    for session in chosen:
+        variants = variants_for(session.label_source, sources, settings)
+        if overwrite or not is_described(session, variants, settings):
+            plan[session.folder.name] = variants
     return plan
 
 
@@ -102,28 +103,30 @@ def _describe(
     return report
 
 
-def words_fingerprint(folder: SessionFolder, settings: Resolved) -> str:
+def words_fingerprint(session: SessionMap, settings: Resolved) -> str:
     """Of all that the words of a session depend on, apart from their variants."""
-    fused = read_json(folder.session_json)["fingerprint"]
+    fused = session.json["fingerprint"]
     return fingerprint_of((fused, settings.fingerprint("descriptor"), _weights(settings)))
 
 
-def is_described(folder: SessionFolder, variants: Iterable[str], settings: Resolved) -> bool:
+def is_described(session: SessionMap, variants: Iterable[str], settings: Resolved) -> bool:
     """Whether a session has words of all ``variants``, made from its present map."""
-    if recorded_fingerprint(folder.words_json) != words_fingerprint(folder, settings):
+    words_json = session.folder.words_json
+    if recorded_fingerprint(words_json) != words_fingerprint(session, settings):
         return False
-    return set(variants) <= set(read_json(folder.words_json)["variants"])
+    return set(variants) <= set(read_json(words_json)["variants"])
 
 
-def check_settings(folder: SessionFolder, settings: Resolved) -> None:
+def check_settings(session: SessionMap, settings: Resolved) -> None:
     """WorkspaceError where a session was fused with other settings of fusion."""
-    fused = read_json(folder.session_json)["settings"]["fusion"]
+    fused = session.json["settings"]["fusion"]
     wanted = settings.tables("fusion")["fusion"]
     for key in wanted:
         if key in fused and fused[key] != wanted[key]:
             raise WorkspaceError(
-                f"Session {folder.name} was fused with fusion.{key}={fused[key]}, the settings"
-                f" are fusion.{key}={wanted[key]}: fuse its log again, or take the other value."
+                f"Session {session.folder.name} was fused with fusion.{key}={fused[key]}, the"
+                f" settings are fusion.{key}={wanted[key]}: fuse its log again, or take the other"
+                " value."
             )
 
 
@@ -141,9 +144,10 @@ class _Described:
         outputs: ExitStack,
     ) -> None:
         self.folder = SessionFolder(folder.path.absolute())  # workers may be in another folder
-        content = read_json(folder.session_json)
-        self._submaps: list[dict[str, Any]] = content["submaps"]
-        self._metadata = {key: content[key] for key in KEPT_METADATA}
+        session = SessionMap(self.folder)
+        self._submaps: list[dict[str, Any]] = session.json["submaps"]
+        self._metadata = {key: session.json[key] for key in KEPT_METADATA}
+        self._fingerprint = words_fingerprint(session, settings)
         self._variants = variants
         self._settings = settings
         self._end = outputs.enter_context(ExitStack())
@@ -182,7 +186,7 @@ class _Described:
         self.folder.words_json.unlink(missing_ok=True)  # it must not vouch for other words
         self._end.close()
         content = {
-            "fingerprint": words_fingerprint(self.folder, self._settings),
+            "fingerprint": self._fingerprint,
             "words": words,
             "variants": list(self._variants),
             "settings": self._settings.tables("descriptor"),

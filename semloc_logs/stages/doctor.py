@@ -66,10 +66,11 @@ def _session(
 ) -> Iterator[Finding]:
     again = f"semloc fuse LOG -w {work.path} --session {folder.name} --overwrite"
     try:
-        content = read_json(folder.session_json)
+        session = SessionMap(folder)
+        content = session.json
         logs = " ".join(str(log["path"]) for log in content["logs"])
         again = f"semloc fuse {logs} -w {work.path} --session {folder.name} --overwrite"
-        check_settings(folder, settings)
+        check_settings(session, settings)
     except (SemlocError, KeyError, TypeError) as problem:
         yield Finding(folder.session_json, str(problem), again)
         return
@@ -79,7 +80,7 @@ def _session(
         yield from _tables(getattr(folder, name), name, counts.get(name), again, out)
 
     describe = f"semloc describe {folder.name} -w {work.path}"
-    if recorded_fingerprint(folder.words_json) != words_fingerprint(folder, settings):
+    if recorded_fingerprint(folder.words_json) != words_fingerprint(session, settings):
         yield Finding(folder.words_json, "the words are missing, or of another map", describe)
         return
     words = read_json(folder.words_json)["words"]

@@ -85,7 +85,7 @@ class PairSearch:
         sessions = work.chosen(sorted({pair.query, pair.target}))
         maps = {folder.name: SessionMap(folder) for folder in sessions}
         for session in maps.values():
-            check_settings(session.folder, settings)
+            check_settings(session, settings)
         fingerprints = {p: f for p, f in pair_fingerprints(maps, settings).items() if p == pair}
         if not fingerprints:
             raise WorkspaceError(
@@ -112,7 +112,7 @@ class PairSearch:
         work.chosen((*selection.queries, *selection.targets))
         maps = {folder.name: SessionMap(folder) for folder in work.chosen(())}
         for session in maps.values():
-            check_settings(session.folder, settings)
+            check_settings(session, settings)
         misfits = misfits_of(maps, settings)
         fingerprints = pair_fingerprints(maps, settings)
         known = known_pairs(work)
@@ -242,7 +242,7 @@ def metadata_of(settings: Resolved, maps: Iterable[SessionMap]) -> dict[str, Any
 
 def pair_fingerprints(maps: Maps, settings: Resolved) -> dict[Pair, str]:
     """All pairs, with what their alignments depend on."""
-    words = {name: words_fingerprint(m.folder, settings) for name, m in maps.items()}
+    words = {name: words_fingerprint(m, settings) for name, m in maps.items()}
     used = settings.tables("query", "closures")
     for key in OF_DECISION:
         section, name = key.split(".")
@@ -265,7 +265,7 @@ def _check_words(work: Workspace, pairs: Iterable[Pair], maps: Maps, settings: R
             needed.setdefault(name, set()).update(common)
     for name, variants in sorted(needed.items()):
         maps[name].check_version()
-        if not is_described(maps[name].folder, variants, settings):
+        if not is_described(maps[name], variants, settings):
             raise WorkspaceError(
                 f"Session {name} lacks {' and '.join(sorted(variants))} words of its present map"
                 f" and settings: run 'semloc describe -w {work.path}' first."
