@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -323,9 +323,3 @@ def _by_query(table: pa.Table, column: str, at: NDArray[np.int64], count: int) -
     out = np.zeros(count)
     out[at] = table[column].to_numpy()
     return out
-
-
-def all_tables(answers: Path) -> Iterator[pa.Table]:
-    """Every table of answers in a folder."""
-    for path in sorted(answers.glob("system=*/*/*.parquet")):
-        yield read_table(path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -126,10 +126,6 @@ class PoseGraph:
     def distance(self) -> F64:
         """Road (n,) from the start of its session to each vertex, metres."""
         return np.concatenate([np.zeros(0), *(chain.distance for chain in self.chains)])
-
-    def with_loops(self, loops: Loops) -> PoseGraph:
-        """The same sessions with other closures."""
-        return replace(self, loops=loops)
 
 
 def turned_covariance(target_R_source: F64, covariance: F64) -> F64:

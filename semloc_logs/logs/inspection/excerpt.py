@@ -25,7 +25,7 @@ class Excerpt:
     ``sampled`` topics are read in evenly spread sections. ``missing`` topics are read until the
     caller takes them out of the set, each in a bounded number of bytes. ``is_complete``: all
     messages are read, because the log is small or because of ``full``; ``samples`` is the number of
-    sections that are read for the ``sampled`` topics, out of ``section_count``.
+    sections that are read for the ``sampled`` topics.
     """
 
     def __init__(
@@ -38,7 +38,6 @@ class Excerpt:
         self.is_complete = full or sum(s.nbytes for s in self._sections) <= WHOLE_BYTES
         self._chosen = frozenset() if self.is_complete else self._samples()
         self.samples = len(self._chosen)
-        self.section_count = len(self._sections)
 
     def messages(self) -> Iterator[Message]:
         """All messages, or the messages of the sample."""
