@@ -20,7 +20,7 @@ from towns import Place, Town, collect
 
 import semloc_logs.closures.acceptance
 from semloc_logs.engines.processes import single_threaded
-from semloc_logs.evaluation.calibration import (
+from semloc_logs.evaluation.calibration_fit import (
     calibration_json,
     fit,
     read_judged,

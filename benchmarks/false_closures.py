@@ -28,7 +28,7 @@ from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.engines.processes import single_threaded
-from semloc_logs.evaluation.calibration import SURE, answers, decided_by, read_judged, recall_at
+from semloc_logs.evaluation.calibration_fit import SURE, answers, decided_by, read_judged, recall_at
 from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse

@@ -16,9 +16,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from semloc_logs.engines import make_engine
-from semloc_logs.evaluation.calibration import judge_town, read_judged
+from semloc_logs.evaluation.calibration_fit import judge_town, read_judged
 from semloc_logs.settings import load
-from semloc_logs.simulation import plan
+from semloc_logs.simulation import drive_plan
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.stages.close import close
@@ -122,14 +122,14 @@ class Place:
         for sensor in town.sensors:
             place = home / sensor
             if not (place / "truth.json").exists():
-                streets = plan.Town(
+                streets = drive_plan.Town(
                     FIRST_SEED + town.seed,
                     town.repeating,
                     town.seasons,
                     roadworks=town.roadworks,
                 )
                 trajectory = self._part(town) if town.trajectory else None
-                route = plan.Route(
+                route = drive_plan.Route(
                     town.sessions,
                     town.length,
                     trajectory,

@@ -12,9 +12,9 @@ from .console import console, duration
 
 if TYPE_CHECKING:
     from semloc_logs.evaluation.trajectory_errors import TrajectoryErrors
-    from semloc_logs.stages.plan import Plan
+    from semloc_logs.stages.dry_run import Plan
     from semloc_logs.stages.report import Report
-    from semloc_logs.stages.sessions import SessionSummary
+    from semloc_logs.stages.stored_sessions import SessionSummary
     from semloc_logs.workspace import Workspace
 
 SHOWN = 20  # rows of a table; files have them all

@@ -69,7 +69,7 @@ INNER_ORDER = {
         "sensors",
         "drives",
         "output",
-        "plan",
+        "drive_plan",
         "sessions",
         "demo",
     ],
@@ -105,12 +105,12 @@ INNER_ORDER = {
         "closure_tables",
         "alignment_tables",
         "tracks",
-        "pairs",
+        "session_pairs",
         "database",
         "visibility",
         "target_surface",
         "matching",
-        "tasks",
+        "search_tasks",
     ],
 }
 SOURCES = sorted((ROOT / "semloc_logs").rglob("*.py"))

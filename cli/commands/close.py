@@ -67,8 +67,8 @@ def command(
     """
     from semloc_logs.closures.closure_tables import read_closures
     from semloc_logs.stages.close import close
+    from semloc_logs.stages.dry_run import Plan
     from semloc_logs.stages.pair_search import Selection
-    from semloc_logs.stages.plan import Plan
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

@@ -37,7 +37,7 @@ def command(
     Example:  semloc describe -w work monday tuesday
     """
     from semloc_logs.stages.describe import describe
-    from semloc_logs.stages.plan import Plan
+    from semloc_logs.stages.dry_run import Plan
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

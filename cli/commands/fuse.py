@@ -63,8 +63,8 @@ def command(
     Example:  semloc fuse monday_0.mcap monday_1.mcap -w work --session monday
     """
     sessions = session_inputs(logs.joined(session), topics, poses)
+    from semloc_logs.stages.dry_run import Plan
     from semloc_logs.stages.fuse import fuse
-    from semloc_logs.stages.plan import Plan
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

@@ -23,7 +23,7 @@ def command(work: Path, as_json: bool) -> int:
     \b
     Example:  semloc index -w work
     """
-    from semloc_logs.words.catalogue import update
+    from semloc_logs.words.segment_catalogue import update
     from semloc_logs.workspace import Workspace
 
     held = update(Workspace(work))

@@ -106,7 +106,7 @@ def _checked(
 
     It is made with the voxel size that suits the log, unless one is given.
     """
-    from semloc_logs.stages.check import check_log, with_fit
+    from semloc_logs.stages.log_check import check_log, with_fit
 
     voxel_size = content["voxel_size"]
     if voxel_size is None or not content["poses"]["count"]:

@@ -68,9 +68,9 @@ def command(
     """
     sessions = session_inputs(logs.each(), topics, poses)
     from semloc_logs.stages.annotate import AnnotationMode
-    from semloc_logs.stages.plan import Plan
+    from semloc_logs.stages.dry_run import Plan
     from semloc_logs.stages.run import run
-    from semloc_logs.stages.sessions import list_sessions
+    from semloc_logs.stages.stored_sessions import list_sessions
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

@@ -39,7 +39,7 @@ def command(action: str | None, names: tuple[str, ...], work: Path, as_json: boo
     if action is not None and len(names) != ACTIONS[action]:
         usage = "NAME NEW_NAME" if action == "rename" else "NAME"
         raise click.UsageError(f"Give semloc sessions {action} {usage}.")
-    from semloc_logs.stages.sessions import list_sessions, remove_session, rename_session
+    from semloc_logs.stages.stored_sessions import list_sessions, remove_session, rename_session
     from semloc_logs.workspace import Workspace
 
     workspace = Workspace(work)

@@ -144,8 +144,8 @@ def command(
     \b
     Example:  semloc simulate -o town --sessions 3 --length 800 --seed 7
     """
+    from semloc_logs.simulation.drive_plan import Route, Town
     from semloc_logs.simulation.meshes.world import require_ray_caster
-    from semloc_logs.simulation.plan import Route, Town
     from semloc_logs.simulation.sensors.sensor import Sensor
     from semloc_logs.simulation.sessions import simulate_sessions
 

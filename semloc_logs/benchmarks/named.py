@@ -74,7 +74,7 @@ def _fuse(request: Request) -> Outcome:
 
 
 def _memory(request: Request) -> Outcome:
-    from semloc_logs.benchmarks.speed.memory import memory_curve
+    from semloc_logs.benchmarks.speed.fusion_memory import memory_curve
 
     return Outcome(memory_curve(request.lengths, request.settings))
 

@@ -17,8 +17,8 @@ from semloc_logs.alignment.target_map import Target
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved
 from semloc_logs.voxels.store import Keyframe, read_keyframe
-from semloc_logs.words.catalogue import read_words, session_segment
 from semloc_logs.words.index import Index, Part
+from semloc_logs.words.segment_catalogue import read_words, session_segment
 from semloc_logs.words.vocabulary import load_vocabulary
 from semloc_logs.workspace import Workspace
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from semloc_logs.engines.base import Engine, Serial
+from semloc_logs.engines.engine import Engine, Serial
 from semloc_logs.errors import SettingsError
 
 ENGINES = ("serial", "processes", "dask")
@@ -28,8 +28,8 @@ def make_engine(
     if name == "serial":
         return Serial(max_memory)
 
-    from semloc_logs.engines.memory import workers_within
     from semloc_logs.engines.processes import Processes, cores
+    from semloc_logs.engines.worker_memory import workers_within
 
     workers = workers_within(max_memory, jobs, cores)
     limit = None if max_memory is None else max_memory // workers

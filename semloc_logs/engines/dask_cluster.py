@@ -23,7 +23,7 @@ from typing import Any, Generic
 
 import semloc_logs
 from semloc_logs import progress
-from semloc_logs.engines.base import Result, Task
+from semloc_logs.engines.engine import Result, Task
 from semloc_logs.errors import SemlocError, SettingsError, TemporaryError
 from semloc_logs.progress import Progress
 

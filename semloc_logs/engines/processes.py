@@ -19,8 +19,8 @@ from multiprocessing.queues import SimpleQueue
 from typing import NoReturn
 
 from semloc_logs import progress
-from semloc_logs.engines.base import Result, Task
-from semloc_logs.engines.memory import memory_limit
+from semloc_logs.engines.engine import Result, Task
+from semloc_logs.engines.worker_memory import memory_limit
 from semloc_logs.errors import TemporaryError
 from semloc_logs.progress import Progress
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from semloc_logs.experiments.answers import Answers
 from semloc_logs.experiments.measures import THRESHOLDS_M, error_curve, rank_recall
 from semloc_logs.experiments.scenarios import Scenario
-from semloc_logs.experiments.summary import Outcome, Row
+from semloc_logs.experiments.summary_table import Outcome, Row
 from semloc_logs.experiments.system import MOST_POSES
 from semloc_logs.tables.atomic_files import replacing_file
 

@@ -16,19 +16,19 @@ from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SemlocError, SettingsError
 from semloc_logs.experiments.answers import Run, answer_scenario, read_answers
 from semloc_logs.experiments.figure import draw_figure
+from semloc_logs.experiments.log_views import (
+    SENSORS,
+    Recorded,
+    fused_views,
+    recorded_logs,
+    simulated_logs,
+)
 from semloc_logs.experiments.orderings import findings
 from semloc_logs.experiments.scenarios import (
     Extent,
     Scenario,
     heading_scenario,
     time_scenario,
-)
-from semloc_logs.experiments.sessions import (
-    SENSORS,
-    Recorded,
-    fused_views,
-    recorded_logs,
-    simulated_logs,
 )
 from semloc_logs.experiments.simulated_drives import (
     AGAIN,
@@ -40,7 +40,8 @@ from semloc_logs.experiments.simulated_drives import (
     quick_town,
     time_session,
 )
-from semloc_logs.experiments.summary import Outcome, Row, to_json, to_markdown
+from semloc_logs.experiments.summary_table import Outcome, Row, to_json, to_markdown
+from semloc_logs.experiments.system_version import module_version
 from semloc_logs.experiments.systems.catalogue import (
     BASELINES,
     MODULES,
@@ -49,7 +50,6 @@ from semloc_logs.experiments.systems.catalogue import (
     entries,
     make_system,
 )
-from semloc_logs.experiments.versions import module_version
 from semloc_logs.experiments.views import ViewStore
 from semloc_logs.settings import Resolved
 from semloc_logs.tables.atomic_files import replacing_file

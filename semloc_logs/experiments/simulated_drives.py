@@ -28,8 +28,8 @@ from semloc_logs.simulation.output.drive_log import write_session
 from semloc_logs.simulation.output.truth_file import write_truth
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.town.road_network import left_of
+from semloc_logs.simulation.town.road_survey import drive_network, opposite_lane
 from semloc_logs.simulation.town.street import build_street, street_ground
-from semloc_logs.simulation.town.survey import drive_network, opposite_lane
 from semloc_logs.tables.atomic_files import replacing_folder
 
 F64 = NDArray[np.float64]

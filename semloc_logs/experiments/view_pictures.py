@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from semloc_logs.errors import LogError
 from semloc_logs.experiments.system import Picture
 from semloc_logs.frames import Camera, ImageFrame
-from semloc_logs.logs.sensors.calibration import fitted_camera, lens_of
+from semloc_logs.logs.sensors.picture_calibration import fitted_camera, lens_of
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply, inverse

@@ -1,4 +1,4 @@
-"""Points in front of a camera -> pixels, by the lenses of logs/sensors/calibration.py."""
+"""Points in front of a camera -> pixels, by the lenses of logs/sensors/picture_calibration.py."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Camera
-from semloc_logs.logs.sensors.calibration import Lens, camera_R_rect, fitted_camera, lens_of
+from semloc_logs.logs.sensors.picture_calibration import Lens, camera_R_rect, fitted_camera, lens_of
 
 _NEAREST = 0.1  # m along the optical axis: nearer points are not projected
 _STEEPEST = np.radians(85)

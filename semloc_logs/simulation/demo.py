@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from semloc_logs.simulation.conditions import Condition
+from semloc_logs.simulation.drive_plan import Plan, Session
 from semloc_logs.simulation.drives.trajectory import smooth_line
-from semloc_logs.simulation.plan import Plan, Session
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import write_sessions
 from semloc_logs.simulation.town.road_network import RoadNetwork, grid_network, lane_path

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from semloc_logs.errors import SemlocError
+from semloc_logs.simulation.drive_plan import Plan, Route, Session, Town, plan_sessions
 from semloc_logs.simulation.drives.camera_drive import CameraShot, simulate_cameras
 from semloc_logs.simulation.drives.drive import DriveFrame, simulate_drive
 from semloc_logs.simulation.drives.traffic import random_traffic
@@ -18,7 +19,6 @@ from semloc_logs.simulation.drives.trajectory import drive
 from semloc_logs.simulation.drives.vehicle_sensors import VehicleSensors
 from semloc_logs.simulation.output.drive_log import write_session
 from semloc_logs.simulation.output.truth_file import write_truth
-from semloc_logs.simulation.plan import Plan, Route, Session, Town, plan_sessions
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.town.street import build_street, street_ground
 from semloc_logs.tables.atomic_files import replacing_file

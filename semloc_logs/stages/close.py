@@ -14,8 +14,8 @@ from semloc_logs.closures.closure_tables import (
     write_closures,
     write_rejected,
 )
-from semloc_logs.closures.pairs import Pair, known_pairs
 from semloc_logs.closures.query import query_keyframes
+from semloc_logs.closures.session_pairs import Pair, known_pairs
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Resolved

@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from semloc_logs.closures.pairs import known_pairs
+from semloc_logs.closures.session_pairs import known_pairs
 from semloc_logs.errors import SemlocError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import Resolved, Settings

@@ -11,7 +11,9 @@ import numpy as np
 
 import semloc_logs
 from semloc_logs import progress
-from semloc_logs.closures.pairs import (
+from semloc_logs.closures.query import query_keyframes
+from semloc_logs.closures.search_tasks import SearchTask, block_size, search_queries
+from semloc_logs.closures.session_pairs import (
     Missing,
     Pair,
     finish,
@@ -21,8 +23,6 @@ from semloc_logs.closures.pairs import (
     missing,
     pairs_of_sessions,
 )
-from semloc_logs.closures.query import query_keyframes
-from semloc_logs.closures.tasks import SearchTask, block_size, search_queries
 from semloc_logs.engines import Engine
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap

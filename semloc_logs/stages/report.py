@@ -11,7 +11,7 @@ class Report:
 
     ``done`` and ``kept`` name the work that was done and the work that was up to date; ``skipped``
     and ``failed`` are sentences about input that was left out; ``seconds`` are by stage. ``amount``
-    of work is in the units of the stage (:mod:`semloc_logs.stages.plan`).
+    of work is in the units of the stage (:mod:`semloc_logs.stages.dry_run`).
     """
 
     done: list[str] = field(default_factory=list)

@@ -14,10 +14,10 @@ from semloc_logs.settings import Resolved
 from semloc_logs.stages.annotate import Annotation, AnnotationMode, annotate
 from semloc_logs.stages.close import close
 from semloc_logs.stages.describe import describe
+from semloc_logs.stages.dry_run import measured_rates
 from semloc_logs.stages.fuse import fuse
 from semloc_logs.stages.inputs import SessionInput, session_name
 from semloc_logs.stages.lock import one_writer
-from semloc_logs.stages.plan import measured_rates
 from semloc_logs.stages.report import Report
 from semloc_logs.stages.report_page import write_report
 from semloc_logs.tables.table import write_json

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from semloc_logs.closures.pairs import Pair, known_pairs, pairs_of_sessions
+from semloc_logs.closures.session_pairs import Pair, known_pairs, pairs_of_sessions
 from semloc_logs.engines import Engine
 from semloc_logs.errors import SettingsError, WorkspaceError, did_you_mean
 from semloc_logs.mapping.session_map import SessionMap

@@ -67,7 +67,7 @@ def called(
         signature = inspect.signature(getattr(module, stage))
         monkeypatch.setattr(module, stage, stand_in)
         # no stage has made sessions that a table could show
-        monkeypatch.setattr("semloc_logs.stages.sessions.list_sessions", lambda work: [])
+        monkeypatch.setattr("semloc_logs.stages.stored_sessions.list_sessions", lambda work: [])
         return seen
 
     _write_closures(Workspace(tmp_path / "work"))

@@ -310,7 +310,7 @@ def test_default_engine(
     kind: str,
 ) -> None:
     monkeypatch.setattr("semloc_logs.engines.processes.cores", lambda: cores)
-    monkeypatch.setattr("semloc_logs.engines.memory.machine_memory", lambda: 1 << 40)
+    monkeypatch.setattr("semloc_logs.engines.worker_memory.machine_memory", lambda: 1 << 40)
     with EngineChoice(name, jobs).open(tasks) as engine:
         assert type(engine).__name__ == kind
         assert engine.jobs == (1 if kind == "Serial" else jobs or cores)

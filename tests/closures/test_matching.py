@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from semloc_logs.engines import make_engine
 from semloc_logs.evaluation.truth import Evaluation, Judged, evaluate_closures
 from semloc_logs.settings import load
-from semloc_logs.simulation.plan import Route, Town
+from semloc_logs.simulation.drive_plan import Route, Town
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.stages.inputs import SessionInput

@@ -19,9 +19,9 @@ from semloc_logs.experiments import paper
 from semloc_logs.experiments.paper import PaperFiles, PaperRequest, run_paper, run_systems
 from semloc_logs.experiments.scenarios import Scenario, heading_scenario, time_scenario
 from semloc_logs.experiments.system import Query, RankedPose, View
+from semloc_logs.experiments.system_version import module_version
 from semloc_logs.experiments.systems import catalogue
 from semloc_logs.experiments.systems.catalogue import MODULES, Entry, SystemOptions
-from semloc_logs.experiments.versions import module_version
 from semloc_logs.experiments.views import ViewStore
 from semloc_logs.settings import load
 

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import semloc_logs
-from semloc_logs.closures import tasks as search_tasks
-from semloc_logs.closures.tasks import search_queries
+from semloc_logs.closures import search_tasks
+from semloc_logs.closures.search_tasks import search_queries
 from semloc_logs.engines import Serial
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.numerics.transforms import inverse, rotation_angle, transform

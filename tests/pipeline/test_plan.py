@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 
 from semloc_logs.cli.main import program
 from semloc_logs.engines import Serial
-from semloc_logs.stages.plan import Plan, measured_rates
+from semloc_logs.stages.dry_run import Plan, measured_rates
 from semloc_logs.stages.run import run
 from semloc_logs.workspace import Workspace
 

@@ -12,7 +12,7 @@ from semloc_logs.engines import Serial
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.stages import close as close_stage
 from semloc_logs.stages import pair_search
-from semloc_logs.stages.sessions import list_sessions, remove_session, rename_session
+from semloc_logs.stages.stored_sessions import list_sessions, remove_session, rename_session
 from semloc_logs.tables.table import read_json
 from semloc_logs.workspace import Workspace
 

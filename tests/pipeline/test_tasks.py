@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from semloc_logs.cli.main import program
-from semloc_logs.closures.pairs import Pair
+from semloc_logs.closures.session_pairs import Pair
 from semloc_logs.engines import Serial
 from semloc_logs.errors import SettingsError, TemporaryError, WorkspaceError
 from semloc_logs.stages.lock import searching, writing

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.tables.table import write_json
 from semloc_logs.voxels.store import blocks_path
-from semloc_logs.words import catalogue
-from semloc_logs.words.catalogue import Change, merged_blocks, segments, update
+from semloc_logs.words import segment_catalogue
 from semloc_logs.words.index import SHORTLIST, Allowed, Index, Part
 from semloc_logs.words.segment import (
     WORDS,
@@ -32,6 +31,7 @@ from semloc_logs.words.segment import (
     segment_in_memory,
     write_segment,
 )
+from semloc_logs.words.segment_catalogue import Change, merged_blocks, segments, update
 from semloc_logs.words.submap_words import write_words
 from semloc_logs.words.vocabulary import BITS, Vocabulary
 from semloc_logs.workspace import Workspace
@@ -373,7 +373,7 @@ def test_a_workspace_that_cannot_be_written_is_searched_in_memory(
         raise OSError("No space left on device")
 
     expected = fresh(work, ["a", "b"], tmp_path / "fresh")
-    monkeypatch.setattr(catalogue, "write_segment", full)
+    monkeypatch.setattr(segment_catalogue, "write_segment", full)
     change = Change()
     segments(work, VARIANT, ["a"], change)
     assert "No space left" in str(change)

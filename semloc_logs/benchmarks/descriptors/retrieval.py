@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from semloc_logs.benchmarks.descriptors.fpfh import fpfh_describes
 from semloc_logs.benchmarks.descriptors.held_out import HeldOut, Size, held_out
+from semloc_logs.benchmarks.descriptors.open3d_fpfh import fpfh_describes
 from semloc_logs.benchmarks.descriptors.places import Place, Street
 from semloc_logs.benchmarks.descriptors.recall import (
     NoEncoder,

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from semloc_logs.simulation.conditions import Condition
+from semloc_logs.simulation.drive_plan import Plan, Session
 from semloc_logs.simulation.meshes.objects import resample
-from semloc_logs.simulation.plan import Plan, Session
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import write_sessions
 from semloc_logs.simulation.town.road_network import left_of
-from semloc_logs.simulation.town.survey import drive_network, opposite_lane
+from semloc_logs.simulation.town.road_survey import drive_network, opposite_lane
 from semloc_logs.tables.atomic_files import replacing_folder
 
 F64 = NDArray[np.float64]

@@ -15,7 +15,6 @@ from functools import cached_property
 from pathlib import Path
 
 from semloc_logs.benchmarks.fused_sessions import fuse_sessions
-from semloc_logs.benchmarks.localisation.answers import UNITS, Answer, figures_of, read_world
 from semloc_logs.benchmarks.localisation.city import (
     CONDITIONS,
     DATABASE,
@@ -25,6 +24,7 @@ from semloc_logs.benchmarks.localisation.city import (
     simulate_drive_log,
     world_drives,
 )
+from semloc_logs.benchmarks.localisation.judged_answers import UNITS, Answer, figures_of, read_world
 from semloc_logs.benchmarks.localisation.our_method import (
     OURS,
     WHOLE,

@@ -17,8 +17,8 @@ import torch
 
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.query_map import Query
-from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
 from semloc_logs.benchmarks.localisation.city import DATABASE, WorldDrive
+from semloc_logs.benchmarks.localisation.judged_answers import Answer, World, read_world
 from semloc_logs.benchmarks.spans import FunctionTimes, Span, span_seconds
 from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.acceptance.decide import decide

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.benchmarks.localisation.answers import Answer, World, read_world
 from semloc_logs.benchmarks.localisation.city import WorldDrive
+from semloc_logs.benchmarks.localisation.judged_answers import Answer, World, read_world
 from semloc_logs.benchmarks.peers.peer_process import run_peer
 from semloc_logs.benchmarks.peers.scan_context import nearest_contexts, scan_context
 from semloc_logs.closures.query import query_members

@@ -14,14 +14,14 @@ import numpy as np
 
 from semloc_logs.benchmarks.fused_sessions import fuse_sessions
 from semloc_logs.benchmarks.spans import FunctionTimes, Rows, Span, span_seconds
-from semloc_logs.benchmarks.speed.memory import PEAKS_PER_MB
+from semloc_logs.benchmarks.speed.fusion_memory import PEAKS_PER_MB
 from semloc_logs.engines import make_engine
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.labels.sweep_ground import ground_surface
 from semloc_logs.logs.annotation.annotate import content_fingerprint
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
 from semloc_logs.mapping import map_tables
-from semloc_logs.mapping.fit.check import check_session
+from semloc_logs.mapping.fit.fit_check import check_session
 from semloc_logs.mapping.ground import GroundMapper, ground_height
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.mapping.levelling import level

@@ -41,8 +41,8 @@ from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.tables.table import write_json
 from semloc_logs.voxels.store import blocks_path
-from semloc_logs.words.catalogue import segments
 from semloc_logs.words.index import Allowed, Index, Part
+from semloc_logs.words.segment_catalogue import segments
 from semloc_logs.words.submap_words import write_words
 from semloc_logs.words.vocabulary import Vocabulary, load_vocabulary
 from semloc_logs.workspace import Workspace

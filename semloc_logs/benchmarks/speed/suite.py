@@ -36,7 +36,7 @@ def _seconds(action: Callable[[], Any], repeats: int = REPEATS) -> float:
 
 
 def _drive(folder: Path, length_m: float = 120.0, seed: int = 3) -> Path:
-    from semloc_logs.simulation.plan import Route, Town
+    from semloc_logs.simulation.drive_plan import Route, Town
     from semloc_logs.simulation.sensors.sensor import Sensor
     from semloc_logs.simulation.sessions import simulate_sessions
 

@@ -15,7 +15,7 @@ from semloc_logs.frames import F32, F64, Camera, DepthFrame, ImageFrame
 from semloc_logs.logs.messages.image_codecs import METRE, MILLIMETRE, depth_metres
 from semloc_logs.logs.problems import NoCloud, ProblemKind, Problems
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.sensors.calibration import Lens, camera_R_rect, fitted_camera, lens_of
+from semloc_logs.logs.sensors.picture_calibration import Lens, camera_R_rect, fitted_camera, lens_of
 from semloc_logs.logs.sensors.stereo import DISPARITY_NOISE
 
 DENSE_PIXELS = 200_000  # a larger depth image is thinned to every second pixel of every second row

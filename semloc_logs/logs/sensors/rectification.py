@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F32, F64, Camera
-from semloc_logs.logs.sensors.calibration import camera_R_rect, fitted_camera, lens_of
+from semloc_logs.logs.sensors.picture_calibration import camera_R_rect, fitted_camera, lens_of
 from semloc_logs.numerics.transforms import rotation_angle, rotation_between
 
 _SHORTEST_BASELINE = 1e-3  # m; below, the two frames are one

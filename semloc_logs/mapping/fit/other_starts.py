@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.mapping.fit.keyframe_pairs import Clouds, Registered, Registrar, Start, motion
 from semloc_logs.mapping.fit.model import LONGEST_OFFSET, OFFSET_STEP, PosesAt
-from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, Start, motion
 from semloc_logs.mapping.fit.readings import CONVENTIONS, otherwise_written
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse
@@ -36,7 +36,7 @@ class Doubted:
     """The pairs that show whether another start is better.
 
     They are few: the ones that contradict the poses most, and as many evenly spread. ``share`` and
-    ``given_share`` are sums as in :class:`~semloc_logs.mapping.fit.pairs.Registered`.
+    ``given_share`` are sums as in :class:`~semloc_logs.mapping.fit.keyframe_pairs.Registered`.
     """
 
     clouds: Clouds

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Bools, Pairs, PosesAt, cost_of
-from semloc_logs.mapping.fit.pairs import Clouds
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse
 

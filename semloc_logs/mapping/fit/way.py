@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.mapping.fit.pairs import Clouds, Registered, Registrar, Start, motion
+from semloc_logs.mapping.fit.keyframe_pairs import Clouds, Registered, Registrar, Start, motion
 from semloc_logs.numerics.evenly import evenly
 
 F64 = NDArray[np.float64]

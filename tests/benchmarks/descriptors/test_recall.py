@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from semloc_logs.benchmarks.descriptors import held_out as module
 from semloc_logs.benchmarks.descriptors import retrieval as benchmark
-from semloc_logs.benchmarks.descriptors.fpfh import fpfh_describes
 from semloc_logs.benchmarks.descriptors.held_out import SCENARIOS, Extent, HeldOut, Size, held_out
+from semloc_logs.benchmarks.descriptors.open3d_fpfh import fpfh_describes
 from semloc_logs.benchmarks.descriptors.places import Place, Street, read_street, write_street
 from semloc_logs.benchmarks.descriptors.recall import (
     DATABASES,

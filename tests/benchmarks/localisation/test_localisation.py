@@ -13,12 +13,6 @@ from typing import cast
 import numpy as np
 import pytest
 
-from semloc_logs.benchmarks.localisation.answers import (
-    Answer,
-    World,
-    figures_of,
-    recall_at_full_precision,
-)
 from semloc_logs.benchmarks.localisation.city import (
     CROSSING,
     OPPOSITE,
@@ -26,6 +20,12 @@ from semloc_logs.benchmarks.localisation.city import (
     UNSEEN,
     WorldDrive,
     world_path,
+)
+from semloc_logs.benchmarks.localisation.judged_answers import (
+    Answer,
+    World,
+    figures_of,
+    recall_at_full_precision,
 )
 from semloc_logs.benchmarks.localisation.our_method import (
     OURS,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semloc_logs.benchmarks.speed.memory import peak_memory
+from semloc_logs.benchmarks.speed.fusion_memory import peak_memory
 from semloc_logs.benchmarks.speed.profiles import SPANS, profile_fuse
 from semloc_logs.errors import SemlocError
 from semloc_logs.logs.session.session import SessionOptions, open_session

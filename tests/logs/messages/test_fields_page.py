@@ -13,7 +13,7 @@ from semloc_logs.logs.log import Definition
 from semloc_logs.logs.messages import image_codecs, livox, point_fields
 from semloc_logs.logs.messages.decode import CONVERTERS
 from semloc_logs.logs.messages.definitions import ros_types
-from semloc_logs.logs.sensors import calibration
+from semloc_logs.logs.sensors import picture_calibration
 
 PAGE = Path(__file__).resolve().parents[3] / "docs/reference/fields.md"
 # values: their parts have no meaning of their own
@@ -102,7 +102,11 @@ def test_names_and_encodings_are_listed() -> None:
     listed = {name.lower() for name in re.findall(r"`([^`]+)`", PAGE.read_text(encoding="utf-8"))}
     names = {*point_fields.LABELS, *point_fields.RINGS, *point_fields.TIMES, point_fields.TAG}
     encodings = {e for e in image_codecs._RAW if not e.startswith("bayer_")}
-    models = calibration._POLYNOMIAL | calibration._WITHOUT_DISTORTION | calibration._FISHEYE
-    models |= calibration._PINHOLE_AT_ZERO
+    models = (
+        picture_calibration._POLYNOMIAL
+        | picture_calibration._WITHOUT_DISTORTION
+        | picture_calibration._FISHEYE
+    )
+    models |= picture_calibration._PINHOLE_AT_ZERO
     # the empty name is written in words, and one model is spelled in two ways
     assert (names | encodings | models) - {"", "kannalabrandt4"} <= listed

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.logs.poses.track import PoseTrack
-from semloc_logs.mapping.fit.pairs import Clouds
+from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
 

@@ -13,12 +13,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from semloc_logs.mapping.fit.check import SessionFit, Severity, StreamFit, check_stream
+from semloc_logs.mapping.fit.fit_check import SessionFit, Severity, StreamFit, check_stream
 from semloc_logs.mapping.fit.plane_cells import PlaneCells, register
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import load
-from semloc_logs.stages.check import check_log
+from semloc_logs.stages.log_check import check_log
 
 F64 = NDArray[np.float64]
 TOPIC = "/points"  # of the drives

@@ -16,12 +16,12 @@ from semloc_logs.mapping.session_fusion import FuseTask, fuse_session
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse
 from semloc_logs.settings import Settings
+from semloc_logs.simulation.drive_plan import Route, Town
 from semloc_logs.simulation.drives.drive import simulate_drive
 from semloc_logs.simulation.drives.trajectory import drive, smooth_line
 from semloc_logs.simulation.drives.vehicle_sensors import VehicleSensors
 from semloc_logs.simulation.meshes.world import BUILDING, ROAD, MeshBuilder, World, box
 from semloc_logs.simulation.output.drive_log import FORMATS, write_session
-from semloc_logs.simulation.plan import Route, Town
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.voxels.store import Keyframe, read_keyframe

@@ -17,12 +17,12 @@ from semloc_logs.errors import LogError, SemlocError, SettingsError
 from semloc_logs.logs.inspection.inspect import inspect_log
 from semloc_logs.numerics.transforms import apply, interpolate, inverse, transform
 from semloc_logs.simulation.demo import simulate_demo
+from semloc_logs.simulation.drive_plan import Route, Town, plan_sessions
 from semloc_logs.simulation.drives.drive import DriveFrame, mounting, simulate_drive
 from semloc_logs.simulation.drives.trajectory import Trajectory, drive, smooth_line
 from semloc_logs.simulation.meshes.world import ROAD, WALL, MeshBuilder, World, box
 from semloc_logs.simulation.output.drive_log import write_session
 from semloc_logs.simulation.output.truth_file import write_truth
-from semloc_logs.simulation.plan import Route, Town, plan_sessions
 from semloc_logs.simulation.sensors.lidar_models import MODELS
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from semloc_logs.closures.pairs import Pair, pairs_of_sessions
+from semloc_logs.closures.session_pairs import Pair, pairs_of_sessions
 
 SECOND = 1_000_000_000
 

@@ -12,7 +12,7 @@ import pytest
 from semloc_logs.engines import Serial
 from semloc_logs.errors import SemlocError
 from semloc_logs.experiments.datasets.conversion import import_dataset
-from semloc_logs.experiments.sessions import LIDAR, STEREO, fused_views, recorded_logs
+from semloc_logs.experiments.log_views import LIDAR, STEREO, fused_views, recorded_logs
 from semloc_logs.experiments.view_pictures import depth_of_points
 from semloc_logs.settings import load
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol, TypeVar
 
-from semloc_logs.engines.memory import memory_limit
+from semloc_logs.engines.worker_memory import memory_limit
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

@@ -19,6 +19,15 @@ from semloc_logs.logs.messages.stamps import time_range
 from semloc_logs.logs.poses.plausibility import Jump, implausible
 from semloc_logs.logs.problems import Problem, ProblemKind
 from semloc_logs.logs.session.session import Session
+from semloc_logs.mapping.fit.keyframe_pairs import (
+    Clouds,
+    Registered,
+    Start,
+    choose,
+    motion,
+    noise,
+    registered,
+)
 from semloc_logs.mapping.fit.model import (
     CLOCK,
     LEVER,
@@ -38,15 +47,6 @@ from semloc_logs.mapping.fit.model import (
     starts,
 )
 from semloc_logs.mapping.fit.other_starts import Doubted
-from semloc_logs.mapping.fit.pairs import (
-    Clouds,
-    Registered,
-    Start,
-    choose,
-    motion,
-    noise,
-    registered,
-)
 from semloc_logs.mapping.fit.readings import FAR_OFF, LEAST_GAIN, far_reading, near_reading
 from semloc_logs.mapping.fit.way import other_distance
 from semloc_logs.mapping.keyframes import Collected

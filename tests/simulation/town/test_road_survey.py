@@ -12,14 +12,14 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError, SettingsError
+from semloc_logs.simulation.drive_plan import Route, Town, plan_sessions
 from semloc_logs.simulation.drives.trajectory import poses_along
 from semloc_logs.simulation.meshes.world import ROAD, Scene
-from semloc_logs.simulation.plan import Route, Town, plan_sessions
 from semloc_logs.simulation.sensors.sensor import Sensor
 from semloc_logs.simulation.sessions import simulate_sessions
 from semloc_logs.simulation.town.road_network import RoadNetwork
+from semloc_logs.simulation.town.road_survey import drive_network, opposite_lane, read_drive
 from semloc_logs.simulation.town.street import build_street, street_ground
-from semloc_logs.simulation.town.survey import drive_network, opposite_lane, read_drive
 
 F64 = NDArray[np.float64]
 

@@ -26,8 +26,8 @@ from semloc_logs.closures.query import build_query, query_keyframes
 from semloc_logs.closures.visibility import visible_to
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.settings import STREET_VOXEL, Resolved
-from semloc_logs.words.catalogue import segments
 from semloc_logs.words.index import LookUp
+from semloc_logs.words.segment_catalogue import segments
 from semloc_logs.words.survey import NO_VOTES, Survey, Votes, votes_in_session
 from semloc_logs.workspace import Workspace
 

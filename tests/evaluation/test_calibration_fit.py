@@ -12,8 +12,8 @@ import pytest
 from semloc_logs.closures.acceptance.calibration import EVIDENCE, VOTES, Calibration
 from semloc_logs.closures.acceptance.placements import Placed
 from semloc_logs.closures.closure import Features
-from semloc_logs.evaluation import calibration
-from semloc_logs.evaluation.calibration import (
+from semloc_logs.evaluation import calibration_fit
+from semloc_logs.evaluation.calibration_fit import (
     Judged,
     calibration_json,
     fit,
@@ -225,7 +225,7 @@ def test_a_town_is_judged_into_a_table_and_read_back(
     monkeypatch.setattr(
         Workspace, "sessions", lambda _: [SimpleNamespace(name="a"), SimpleNamespace(name="b")]
     )
-    monkeypatch.setattr(calibration, "SessionMap", lambda _: map_)
+    monkeypatch.setattr(calibration_fit, "SessionMap", lambda _: map_)
     judge_town(work, tmp_path / "truth.json", "here", tmp_path / "judged.parquet")
     assert read_table(tmp_path / "judged.parquet")["error_m"].to_pylist() == pytest.approx(
         [0, 2, 9], abs=1e-6

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import pyarrow.parquet as pq
 
-from semloc_logs.closures.pairs import forget, known_pairs
+from semloc_logs.closures.session_pairs import forget, known_pairs
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.stages.close import decide_all

@@ -22,7 +22,7 @@ from semloc_logs.simulation.town.road_network import (
     random_route,
     repeating_network,
 )
-from semloc_logs.simulation.town.survey import drive_network, opposite_lane, read_drive
+from semloc_logs.simulation.town.road_survey import drive_network, opposite_lane, read_drive
 
 LENGTHS_M = 50, 100_000  # of a session, least and most
 _BLOCK = 85.0  # m between crossings

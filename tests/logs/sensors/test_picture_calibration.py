@@ -10,8 +10,8 @@ import pytest
 from semloc_logs.errors import LogError
 from semloc_logs.frames import WHOLE_PICTURE, Camera, Header, Region
 from semloc_logs.labels.projection import Projector
-from semloc_logs.logs.sensors.calibration import fitted_camera, lens_of
 from semloc_logs.logs.sensors.depth import Unprojector
+from semloc_logs.logs.sensors.picture_calibration import fitted_camera, lens_of
 from semloc_logs.logs.sensors.rectification import rectification
 
 

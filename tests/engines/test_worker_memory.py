@@ -12,8 +12,13 @@ from types import ModuleType
 
 import pytest
 
-from semloc_logs.engines import make_engine, memory
-from semloc_logs.engines.memory import machine_memory, memory_limit, private_memory, workers_within
+from semloc_logs.engines import make_engine, worker_memory
+from semloc_logs.engines.worker_memory import (
+    machine_memory,
+    memory_limit,
+    private_memory,
+    workers_within,
+)
 from semloc_logs.errors import TemporaryError
 
 TASKS = """
@@ -42,12 +47,12 @@ def tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleTyp
 
 
 def test_workers_have_the_memory_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
-    need = memory.WORKER_BYTES
+    need = worker_memory.WORKER_BYTES
     assert workers_within(4 * need, None, lambda: 16) == 4
     assert workers_within(4 * need, 3, lambda: 16) == 3
     assert workers_within(4 * need, 8, lambda: 16) == 4
     assert workers_within(need // 2, 8, lambda: 16) == 1
-    monkeypatch.setattr(memory, "machine_memory", lambda: 2 * need + 1)
+    monkeypatch.setattr(worker_memory, "machine_memory", lambda: 2 * need + 1)
     assert workers_within(None, None, lambda: 16) == 2
     assert workers_within(None, 8, lambda: 16) == 8  # as it was given
 
@@ -56,7 +61,7 @@ def test_the_memory_of_a_container_is_its_cgroups(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(memory, "CGROUP_LIMITS", (limit,))
+    monkeypatch.setattr(worker_memory, "CGROUP_LIMITS", (limit,))
     whole = machine_memory()
     limit.write_text("max\n")
     assert machine_memory() == whole

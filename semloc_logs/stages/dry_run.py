@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from semloc_logs.closures.pairs import known_pairs
 from semloc_logs.closures.query import query_keyframes
+from semloc_logs.closures.session_pairs import known_pairs
 from semloc_logs.errors import SemlocError, WorkspaceError
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.mapping.session_fusion import FuseTask

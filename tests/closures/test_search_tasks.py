@@ -8,9 +8,9 @@ from typing import Any, cast
 
 import pytest
 
-from semloc_logs.closures import tasks
+from semloc_logs.closures import search_tasks
 from semloc_logs.closures.closure import Features
-from semloc_logs.closures.tasks import _search_block
+from semloc_logs.closures.search_tasks import _search_block
 from semloc_logs.settings import load
 from semloc_logs.words.survey import Votes
 
@@ -70,6 +70,6 @@ def test_all_are_searched_without_a_bound() -> None:
 def test_a_single_query_is_searched_whatever_its_votes(
     queries: list[int], least: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tasks, "query_keyframes", lambda session, settings: queries)
+    monkeypatch.setattr(search_tasks, "query_keyframes", lambda session, settings: queries)
     settings = load(assignments={"closures.min_votes": str(MIN_VOTES)}).resolved()
-    assert tasks.min_votes(cast(Any, None), settings) == least
+    assert search_tasks.min_votes(cast(Any, None), settings) == least
