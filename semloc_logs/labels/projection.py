@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, Camera
-from semloc_logs.logs.sensors.picture_calibration import Lens, camera_R_rect, fitted_camera, lens_of
+from semloc_logs.logs.sensors.picture_calibration import fitted_camera, optics_of
 
 _NEAREST = 0.1  # m along the optical axis: nearer points are not projected
 _STEEPEST = np.radians(85)
@@ -27,19 +26,8 @@ class Projector:
 
     def __init__(self, camera: Camera, height: int, width: int, *, rectified: bool = False) -> None:
         camera, assumption = fitted_camera(camera, height, width, rectified=rectified, scaled=True)
-        matrix = camera.K
-        lens = Lens(is_fisheye=False, coefficients=np.zeros(0))
-        self._rotation = np.eye(3)
-        if (rectified and camera.P[0, 0] > 0) or matrix[0, 0] <= 0:
-            matrix = camera.P[:, :3]
-            self._rotation = camera_R_rect(camera).T
-        else:
-            lens = lens_of(camera)
-        if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-            raise LogError(
-                f"CameraInfo {camera.header.topic} has no focal length: the camera is not "
-                f"calibrated; name another with --topic camera_info=TOPIC."
-            )
+        matrix, lens, camera_R_picture = optics_of(camera, rectified=rectified)
+        self._rotation = camera_R_picture.T
         self.assumptions = [text for text in (assumption, lens.assumption) if text]
         self._matrix = matrix
         self._distortion = lens.coefficients

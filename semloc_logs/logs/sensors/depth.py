@@ -15,7 +15,7 @@ from semloc_logs.frames import F32, F64, Camera, DepthFrame, ImageFrame
 from semloc_logs.logs.messages.image_codecs import METRE, MILLIMETRE, depth_metres
 from semloc_logs.logs.problems import NoCloud, ProblemKind, Problems
 from semloc_logs.logs.roles import Roles
-from semloc_logs.logs.sensors.picture_calibration import Lens, camera_R_rect, fitted_camera, lens_of
+from semloc_logs.logs.sensors.picture_calibration import Lens, fitted_camera, optics_of
 from semloc_logs.logs.sensors.stereo import DISPARITY_NOISE
 
 DENSE_PIXELS = 200_000  # a larger depth image is thinned to every second pixel of every second row
@@ -89,20 +89,7 @@ class Unprojector:
         camera, assumption = fitted_camera(
             camera, height, width, rectified=rectified, what="depth image"
         )
-        matrix = camera.K
-        lens = Lens(is_fisheye=False, coefficients=np.zeros(0))
-        camera_R_picture = np.eye(3)
-        if (rectified and camera.P[0, 0] > 0) or camera.K[0, 0] <= 0:
-            matrix = camera.P[:, :3]
-            camera_R_picture = camera_R_rect(camera)
-        else:
-            lens = lens_of(camera)
-        if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-            raise LogError(
-                f"CameraInfo {camera.header.topic} has no focal length: the camera is not "
-                f"calibrated; name another with --topic camera_info=TOPIC."
-            )
-
+        matrix, lens, camera_R_picture = optics_of(camera, rectified=rectified)
         self.assumptions = [text for text in (assumption, lens.assumption) if text]
         self._width = width
         self.step = stride or (2 if height * width > DENSE_PIXELS else 1)

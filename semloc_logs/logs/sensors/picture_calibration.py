@@ -355,6 +355,34 @@ def _region_and_binning(camera: Camera) -> str:
     return " and ".join(parts) or "the full picture"
 
 
+class Optics(NamedTuple):
+    """Which pixels see which directions: the camera matrix (3, 3), the lens before it, and the
+    rotation (3, 3) from the picture's axes to the camera's optical frame.
+    """
+
+    matrix: F64
+    lens: Lens
+    camera_R_picture: F64
+
+
+def optics_of(camera: Camera, *, rectified: bool) -> Optics:
+    """The optics of a picture of a calibrated camera; of a ``rectified`` one R and P hold, not K
+    and D. LogError where it is not calibrated.
+    """
+    if (rectified and camera.P[0, 0] > 0) or camera.K[0, 0] <= 0:
+        lens = Lens(is_fisheye=False, coefficients=np.zeros(0))
+        optics = Optics(camera.P[:, :3], lens, camera_R_rect(camera))
+    else:
+        optics = Optics(camera.K, lens_of(camera), np.eye(3))
+    matrix = optics.matrix
+    if not np.isfinite(matrix).all() or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        raise LogError(
+            f"CameraInfo {camera.header.topic} has no focal length: the camera is not "
+            f"calibrated; name another with --topic camera_info=TOPIC."
+        )
+    return optics
+
+
 def camera_R_rect(camera: Camera) -> F64:
     """Rotation (3, 3) from the rectified to the camera's optical frame; identity where R is none.
 

@@ -4,6 +4,7 @@ them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TypeVar
 
 import numpy as np
@@ -29,6 +30,16 @@ def boxes(rows: F64) -> Mesh:
     vertices = _CORNERS[None] * rows[:, None, :3] + rows[:, None, 3:]
     triangles = _TRIANGLES[None] + 8 * np.arange(len(rows), dtype=np.int64)[:, None, None]
     return Mesh(vertices.reshape(-1, 3), triangles.reshape(-1, 3))
+
+
+def walls_within(width: float, depth: float) -> Iterator[tuple[float, float, float, float]]:
+    """The walls of a room from (0, 0) to (width, depth), metres: length, yaw, and the corner (x, y)
+    where each starts; the room is on their left.
+    """
+    yield width, 0.0, 0.0, 0.0
+    yield depth, np.pi / 2, width, 0.0
+    yield width, np.pi, width, depth
+    yield depth, -np.pi / 2, 0.0, depth
 
 
 def tubes(

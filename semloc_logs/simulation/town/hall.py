@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semloc_logs.simulation.meshes import objects
+from semloc_logs.simulation.meshes.shapes import walls_within
 from semloc_logs.simulation.meshes.world import (
     BUILDING,
     F64,
@@ -82,12 +83,7 @@ def _shell(builder: MeshBuilder, plan: _Plan, rng: np.random.Generator) -> None:
     w, d = plan.size
     builder.add(box(w + 4, d + 4, 0.3, w / 2, d / 2, -0.3), ROAD, ground="none")
     builder.add(box(w + 4, d + 4, 0.3, w / 2, d / 2, plan.height), BUILDING, ground="none")
-    for length, yaw, x, y in (
-        (w, 0.0, 0.0, 0.0),
-        (d, np.pi / 2, w, 0.0),
-        (w, np.pi, w, d),
-        (d, -np.pi / 2, 0.0, d),
-    ):
+    for length, yaw, x, y in walls_within(w, d):
         u = 0.0
         while u < length:
             piece = min(rng.uniform(1.0, 7.0), length - u)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from semloc_logs.simulation.meshes.shapes import walls_within
 from semloc_logs.simulation.meshes.world import (
     BUILDING,
     F64,
@@ -77,8 +78,7 @@ def _shell(builder: MeshBuilder, size: F64, height: float, rng: Rng) -> None:
     w, d = size
     builder.add(box(w + 1, d + 1, 0.1, w / 2, d / 2, -0.1), ROAD, ground="none")
     builder.add(box(w + 1, d + 1, 0.1, w / 2, d / 2, height), BUILDING, ground="none")
-    walls = ((w, 0.0, 0.0, 0.0), (d, np.pi / 2, w, 0.0), (w, np.pi, w, d), (d, -np.pi / 2, 0.0, d))
-    for length, yaw, x, y in walls:
+    for length, yaw, x, y in walls_within(w, d):
         u = 0.0
         while u < length:
             piece = min(float(rng.uniform(0.7, 2.5)), length - u)
@@ -90,13 +90,7 @@ def _shell(builder: MeshBuilder, size: F64, height: float, rng: Rng) -> None:
 
 def _along_walls(builder: MeshBuilder, size: F64, height: float, rng: Rng) -> None:
     """Shelves, cupboards and sofas with their backs to the walls."""
-    w, d = size
-    for length, yaw, x, y in (
-        (w, 0.0, 0.0, 0.0),
-        (d, np.pi / 2, w, 0.0),
-        (w, np.pi, w, d),
-        (d, -np.pi / 2, 0.0, d),
-    ):
+    for length, yaw, x, y in walls_within(*size):
         u = float(rng.uniform(0.2, 1.0))
         while u < length - 1.2:
             wide = float(rng.uniform(0.5, 1.8))
