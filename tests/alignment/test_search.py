@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
-import numpy as np
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
+import pytest
+
+from semloc_logs.alignment import search as search_module
 from semloc_logs.alignment.hypotheses import Hypothesis
-from semloc_logs.alignment.search import _Searched, _suppressed
+from semloc_logs.alignment.mask_grid import REACH
+from semloc_logs.alignment.search import (
+    MIN_SEARCH_SCORE,
+    Candidate,
+    _chosen,
+    _rotated,
+    _Searched,
+    _suppressed,
+)
 
 
 def test_only_hypotheses_of_one_place_and_heading_are_one() -> None:
@@ -25,3 +38,40 @@ def test_only_hypotheses_of_one_place_and_heading_are_one() -> None:
     ]
     assert len(_suppressed(submaps, 1.0, 10)) == 2
     assert _suppressed([], 1.0, 10) == []
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_voxels_stay_in_the_grid_whatever_the_shift(axis: int) -> None:
+    shape = [4 * REACH] * 3
+    shape[axis] = 4 * REACH + 3
+    cells = np.full((shape[axis] + 4, 3), 2 * REACH)
+    cells[:, axis] = np.arange(-2, shape[axis] + 2)
+    grid = (np.zeros(shape, np.uint8), np.zeros(3), 1.0)
+    base = np.full(len(cells), -1)
+    kept = np.zeros(len(cells), np.uint8)
+    count = _rotated(
+        grid, cells + 0.5, np.arange(len(cells)).astype(np.uint8), np.zeros(4), base, kept
+    )
+    inside = np.arange(REACH, shape[axis] - REACH)  # of the cells along the axis
+    assert count == len(inside)
+    found = np.stack(np.unravel_index(base[:count], shape), axis=1)
+    np.testing.assert_array_equal(found[:, axis], inside)
+    np.testing.assert_array_equal(kept[:count], inside + 2)
+
+
+@pytest.mark.parametrize(
+    ("score", "is_consistent", "kept"),
+    [
+        (MIN_SEARCH_SCORE, False, 1),
+        (MIN_SEARCH_SCORE - 1e-9, False, 0),
+        (MIN_SEARCH_SCORE - 1e-9, True, 1),
+    ],
+)
+def test_no_candidate_stays_where_none_can_become_good(
+    score: float, is_consistent: bool, kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mutual = SimpleNamespace(score=0.5, is_consistent=is_consistent)
+    monkeypatch.setattr(search_module, "mutual_scores", lambda *_: mutual)
+    target = cast(Any, None)
+    found = _chosen([Candidate(3, np.eye(4), score, 1)], {3: target}, cast(Any, None), 5)
+    assert len(found) == kept

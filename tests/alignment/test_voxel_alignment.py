@@ -191,6 +191,21 @@ def test_tau_of_a_map_with_itself_and_with_nothing() -> None:
     assert tau(blocks.occupied(), blocks, V, yaw_transform(0.0, (1e5, 0.0, 0.0)), 3.0) == (0.0, 0)
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(("first", "step"), [(BLOCK, -1), (BLOCK - 1, 1)])
+def test_tau_looks_into_a_map_whose_blocks_begin_within_kappa(
+    axis: int, first: int, step: int
+) -> None:
+    """Five cells of 0.5 m away is within 3 m, six are not; the query lies beside the block."""
+    target = np.zeros(3, int)
+    target[axis] = first
+    for cells, share in ((5, 1.0), (6, 0.0)):
+        query = target.copy()
+        query[axis] += cells * step
+        maps = [block_map({tuple(ijk.tolist()): 2}) for ijk in (query, target)]
+        assert tau(maps[0].occupied(), maps[1], V, np.eye(4), 3.0)[0] == share
+
+
 def test_free_space_counts_against_an_alignment_in_tau() -> None:
     """The closest observed voxel decides, not some occupied one within kappa."""
     query = block_map({(0, 0, 0): 2})
