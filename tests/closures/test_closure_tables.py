@@ -177,3 +177,30 @@ def test_rejections_as_a_table(n: int, tmp_path: Path) -> None:
     for column, value in votes.items():
         assert table[column].to_pylist() == [value] * n
     assert table["sigma"].to_pylist() == pytest.approx([i + 1 for i in reversed(range(n))])
+
+
+def test_rejections_are_sorted_by_query_then_probability_then_target(tmp_path: Path) -> None:
+    ordered = [
+        ("a", 7, "c", 9, 0.1),  # sessions in the order of their names
+        ("b", 2, "c", 8, 0.3),  # queries in the order of their times
+        ("b", 2, "a", 9, 0.2),  # the most probable first
+        ("b", 2, "c", 1, 0.2),  # targets in the order of their names
+        ("b", 2, "c", 4, 0.2),  # and of their times
+        ("b", 5, "a", 1, 0.9),
+    ]
+    rows = [
+        Rejected(alignment(query, i, target, j), decision(p), Reason.NEIGHBOURS_CONFLICT)
+        for query, i, target, j, p in ordered
+    ]
+    for turn in range(len(rows)):
+        write_rejected(tmp_path / "rejected.parquet", rows[turn:] + rows[:turn], {})
+        table = read_table(tmp_path / "rejected.parquet")
+        found = zip(
+            table["query_session"].to_pylist(),
+            table["query_stamp_ns"].to_pylist(),
+            table["target_session"].to_pylist(),
+            table["target_stamp_ns"].to_pylist(),
+            strict=True,
+        )
+        expected = [(query, i * SECOND, target, j * SECOND) for query, i, target, j, _ in ordered]
+        assert list(found) == expected
