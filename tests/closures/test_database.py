@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import Hypothesis
 from semloc_logs.alignment.query_map import view_centres
+from semloc_logs.closures import target_surface as target_surface_module
 from semloc_logs.closures.database import Database, Recent
 from semloc_logs.closures.matching import QueryContext, allowed_words, close_query
 from semloc_logs.closures.target_surface import target_surface
@@ -217,6 +218,40 @@ def test_a_surface_is_made_from_so_many_keyframes(tmp_path: Path) -> None:
     assert heights(1) == [5]
     assert heights(3) == [4, 5, 6]
     assert heights(100) == list(range(10))
+
+
+def test_a_surface_of_a_long_query_has_so_many_keyframes_for_each_radius(tmp_path: Path) -> None:
+    """About number 5 lie 5 keyframes within half of 20 m, 9 within half of 36 m."""
+    road = np.stack([np.arange(11) * 4.0, np.zeros(11)], 1)
+    drive_session(Workspace(tmp_path), "a", road, [(0, 11)], [np.zeros((0, 3))])
+
+    def heights(length: float) -> list[int]:
+        given = {"closures": {"surface_keyframes": 3}, "query": {"length": length}}
+        database = Database(Workspace(tmp_path), ("a",), Settings.model_validate(given).resolved())
+        surface = target_surface(everything(database), 0, np.array([20.0, 0.0, 0.0]) + VIEW)
+        return sorted(np.rint(surface.points[:, 2] * 10).astype(int).tolist())
+
+    assert heights(20.0) == [3, 5, 7]  # three of five: less than a radius, 24 m
+    assert heights(36.0) == [1, 3, 5, 7, 9]  # one and a half radii: 4.5, so five of nine
+
+
+def test_places_of_one_square_share_what_was_seen_from_afar_about_its_centre(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    road = np.stack([np.arange(10) * 4.0, np.zeros(10)], 1)
+    drive_session(Workspace(tmp_path), "a", road, [(0, 10)], [np.zeros((0, 3))])
+    seen: list[Any] = []
+    monkeypatch.setattr(target_surface_module, "_surface", lambda found: seen.append(found))
+    for x in (72.1, 76.7, 76.9):  # squares of 4.8 m: 72 to 76.8, and the next
+        database = Database(Workspace(tmp_path), ("a",), Settings().resolved())
+        target_surface(everything(database), 0, np.array([x, 1.0, -1.0]))
+    np.testing.assert_allclose(
+        [found.afar for found in seen],
+        [[74.4, 2.4, -2.4], [74.4, 2.4, -2.4], [79.2, 2.4, -2.4]],
+    )
+    # half a radius from the last view, 12 m, is not afar
+    target_surface(everything(database), 0, np.array([36.0 + 12.0, 0.0, 0.0]) + VIEW)
+    assert seen[-1].afar is None
 
 
 def test_what_looks_all_around_looks_where_it_is() -> None:
