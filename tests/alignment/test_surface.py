@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from semloc_logs.alignment.surface import (
     LEAST_FLAT,
     NEIGHBOURS,
+    RINGS,
+    _around,
     flattened_surface,
     look_at,
     nearest_points,
@@ -41,6 +43,34 @@ def test_planes_are_made_where_they_are_met() -> None:
     assert (surface.planar[half][on_floor[half]] == 1).all()
     np.testing.assert_allclose(np.abs(surface.normals[half][on_floor[half], 2]), 1, atol=1e-6)
     assert surface.planar[half][~on_floor[half]].mean() < 0.5
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.5, 1.0, 2.0]))
+@settings(max_examples=20, deadline=None)
+def test_the_points_around_a_point_are_those_of_brute_force(seed: int, cell: float) -> None:
+    """300 points in 4 m: more than enough lie within the rings of cells, whatever the axis."""
+    rng = np.random.default_rng(seed)
+    surface = surface_of(rng.uniform(-2, 2, (300, 3)), cell)
+    found = _around(surface.points, surface.cells, np.arange(300))
+    distance = np.linalg.norm(surface.points[:, None] - surface.points, axis=2)
+    nearest = np.argsort(distance, axis=1)[:, :NEIGHBOURS]
+    assert np.sort(distance, axis=1)[:, NEIGHBOURS - 1].max() < RINGS * cell
+    np.testing.assert_array_equal(found, nearest)
+
+
+def test_a_plane_is_less_than_0_3_times_as_thick_as_wide() -> None:
+    """Two layers of a hexagon and its centre, h above and below: along x and y a standard deviation
+    of sqrt(3 / 7) = 0.655 m, along z of h.
+    """
+    angle = np.arange(6) * np.pi / 3
+    flat = np.r_[np.c_[np.cos(angle), np.sin(angle)], np.zeros((1, 2))]
+    for thick, is_plane in ((0.29, 1), (0.31, 0)):
+        h = thick * np.sqrt(3 / 7)
+        points = np.concatenate([np.c_[flat, np.full(7, z)] for z in (-h, h)])
+        assert len(points) == NEIGHBOURS
+        surface = surface_of(points, 1.0)
+        look_at(surface.arrays, np.arange(NEIGHBOURS))
+        assert surface.planar.tolist() == [is_plane] * NEIGHBOURS
 
 
 def test_points_with_few_around_are_no_planes() -> None:
