@@ -7,7 +7,13 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.numerics.transforms import inverse, yaw_transform
-from semloc_logs.pose_graph.consistent_sets import GATE, STRETCH, consistent_sets, largest_clique
+from semloc_logs.pose_graph.consistent_sets import (
+    GATE,
+    STARTS,
+    STRETCH,
+    consistent_sets,
+    largest_clique,
+)
 from semloc_logs.pose_graph.graph import Chain, Loops, PoseGraph
 from semloc_logs.pose_graph.odometry_noise import LEAST_M, LEAST_RAD, REFERENCE_M
 from semloc_logs.settings import Settings
@@ -23,20 +29,25 @@ OWN_M = np.hypot(SIGMA_M, OPTIMIZE.closure_sigma)
 OWN_RAD = np.hypot(SIGMA_RAD, np.radians(OPTIMIZE.closure_sigma_deg))
 
 
-def drives(loops: list[tuple[int, int, F64]]) -> PoseGraph:
-    """Sessions a and b on one road; loops of target vertex, query vertex and the query's pose."""
+def drives(
+    loops: list[tuple[int, int, F64]], sigma_rad: tuple[float, ...] = (SIGMA_RAD,)
+) -> PoseGraph:
+    """Sessions a and b on one road; loops of target vertex, query vertex and the query's pose, and
+    the largest standard deviations of their rotations.
+    """
     poses = np.array([yaw_transform(0.0, (STEP * k, 0.0, 0.0)) for k in range(COUNT)])
     chains = [
         Chain(name, np.arange(COUNT), poses, STEP * np.arange(COUNT, dtype=float)) for name in "ab"
     ]
-    covariance = np.diag([SIGMA_M**2, 0.01, 0.01, SIGMA_RAD**2, 1e-6, 1e-6])
+    covariance = np.tile(np.diag([SIGMA_M**2, 0.01, 0.01, 1e-6, 1e-6, 1e-6]), (len(loops), 1, 1))
+    covariance[:, 3, 3] = np.square(sigma_rad)
     return PoseGraph(
         chains,
         Loops(
             np.array([target for target, _, _ in loops]),
             np.array([query for _, query, _ in loops]),
             np.array([pose for _, _, pose in loops]),
-            np.tile(covariance, (len(loops), 1, 1)),
+            covariance,
             np.ones(len(loops)),
         ),
     )
@@ -92,6 +103,41 @@ def test_odometry_and_the_lever_widen_the_gate_of_closures_far_apart(share: floa
     assert agree(same_place(1), same_place(5, error)) == (share < 1)
 
 
+@pytest.mark.parametrize("swap", [False, True])
+def test_of_two_ends_of_the_lever_the_less_certain_one_counts(swap: bool) -> None:
+    """40 m after 200 m are within 3.5 times 0.1 rad, and not within 3.5 times 0.01 rad."""
+    loops = [same_place(1), same_place(5, yaw_transform(0.0, (0.0, 0.2 * 4 * STEP, 0.0)))]
+    sigma_rad = (0.01, 0.1)
+    if swap:
+        loops.reverse()
+        sigma_rad = (0.1, 0.01)
+    (found,) = consistent_sets(drives(loops, sigma_rad), OPTIMIZE)
+    assert len(found.members) == 2
+    (found,) = consistent_sets(drives(loops, (0.01, 0.01)), OPTIMIZE)
+    assert len(found.members) == 1
+
+
+def test_each_pair_of_sessions_has_a_set_of_its_own() -> None:
+    itself = (0, 2, yaw_transform(0.0, (2 * STEP, 0.0, 0.0)))
+    loops = [same_place(0), itself, same_place(4)]
+    found = [
+        (s.a, s.b, sorted(s.members.tolist())) for s in consistent_sets(drives(loops), OPTIMIZE)
+    ]
+    assert found == [(0, 0, [1]), (0, 1, [0, 2])]
+
+
+def test_the_most_central_of_a_set_come_first() -> None:
+    """At one place, in shares of the gate: 0.9, 0.9, 0.5 and 0 agree; -0.3 with the last two."""
+    most_m = GATE * np.sqrt(2 * OWN_M**2 + 2 * LEAST_M**2)
+    loops = [
+        same_place(2, yaw_transform(0.0, (0.0, share * most_m, 0.0)))
+        for share in (0.9, 0.9, 0.5, 0.0, -0.3)
+    ]
+    (found,) = consistent_sets(drives(loops), OPTIMIZE)
+    assert found.members.tolist() == [2, 3, 0, 1]
+    assert found.others.tolist() == [4]
+
+
 def test_the_heaviest_set_in_which_all_agree() -> None:
     three_and_two = np.zeros((5, 5), bool)
     three_and_two[:3, :3] = True
@@ -102,3 +148,6 @@ def test_the_heaviest_set_in_which_all_agree() -> None:
     path[0, 1] = path[1, 0] = path[1, 2] = path[2, 1] = True
     assert len(largest_clique(path)) == 2  # 0 and 2 do not agree
     assert largest_clique(np.zeros((0, 0), bool)).tolist() == []
+    late = np.eye(STARTS + 3, dtype=bool)
+    late[-2:, -2:] = True  # behind more closures that agree with none than there are starts
+    assert largest_clique(late).tolist() == [STARTS + 1, STARTS + 2]
