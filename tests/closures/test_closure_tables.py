@@ -204,3 +204,15 @@ def test_rejections_are_sorted_by_query_then_probability_then_target(tmp_path: P
         )
         expected = [(query, i * SECOND, target, j * SECOND) for query, i, target, j, _ in ordered]
         assert list(found) == expected
+
+
+@pytest.mark.parametrize("better", [0, 1])
+def test_of_equally_probable_twins_the_one_of_more_structure_stays(better: int) -> None:
+    twins = [closure("a", 10, "b", 50), closure("b", 50, "a", 10)]
+    a = twins[better].alignment
+    features = dataclasses.replace(a.features, structure=0.95)
+    twins[better] = dataclasses.replace(
+        twins[better], alignment=dataclasses.replace(a, features=features)
+    )
+    for given in (twins, twins[::-1]):
+        assert keys(unique_closures(given, ROAD, 5.0)) == keys([twins[better]])
