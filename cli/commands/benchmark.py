@@ -11,7 +11,8 @@ from ..console import console
 from ..options import Command, console_options, json_option, pairs, path_option, settings_options
 
 if TYPE_CHECKING:
-    from semloc_logs.benchmarks.named import Outcome
+    from semloc_logs.benchmarks.named import Outcome, Request
+    from semloc_logs.experiments.paper import PaperRequest
     from semloc_logs.settings import Resolved
 
 
@@ -173,35 +174,27 @@ def command(
               semloc benchmark paper monday.mcap tuesday.bag --truth truth.json --systems paper
     """
     if name == "paper":
-        from semloc_logs.experiments.paper import PaperRequest, run_paper
-        from semloc_logs.tables.table import read_json
+        from semloc_logs.experiments.paper import PaperRequest
 
-        with console.progress():
-            files = run_paper(
-                PaperRequest(
-                    settings,
-                    output or Path("paper"),
-                    systems,
-                    quick,
-                    logs,
-                    truth,
-                    queries,
-                    sensors,
-                    scenarios,
-                    jobs,
-                    weights,
-                    tables_only,
-                    console.note,
-                )
-            )
-        if as_json:
-            console.result_json(read_json(files.json))
-        else:
-            for path in (files.table, files.json, *files.figures, files.answers):
-                console.result(str(path))
+        paper = PaperRequest(
+            settings,
+            output or Path("paper"),
+            systems,
+            quick,
+            logs,
+            truth,
+            queries,
+            sensors,
+            scenarios,
+            jobs,
+            weights,
+            tables_only,
+            console.note,
+        )
+        _run_paper(paper, as_json=as_json)
         return 0
 
-    from semloc_logs.benchmarks.named import Request, run_named
+    from semloc_logs.benchmarks.named import Request
 
     request = Request(
         settings,
@@ -217,13 +210,34 @@ def command(
         work,
         console.note,
     )
+    _run_named(name, request, as_json=as_json)
+    return 0
+
+
+def _run_paper(request: PaperRequest, *, as_json: bool) -> None:
+    """The experiments of the paper, and the names of their files or the table as JSON."""
+    from semloc_logs.experiments.paper import run_paper
+    from semloc_logs.tables.table import read_json
+
+    with console.progress():
+        files = run_paper(request)
+    if as_json:
+        console.result_json(read_json(files.json))
+        return
+    for path in (files.table, files.json, *files.figures, files.answers):
+        console.result(str(path))
+
+
+def _run_named(name: str, request: Request, *, as_json: bool) -> None:
+    """A benchmark, and its figures as a table or JSON."""
+    from semloc_logs.benchmarks.named import run_named
+
     with console.progress():
         outcome = run_named(name, request)
     if as_json:
         console.result_json(outcome.figures)
     else:
         _show(name, outcome)
-    return 0
 
 
 def _show(name: str, outcome: Outcome) -> None:
