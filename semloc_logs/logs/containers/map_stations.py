@@ -1,4 +1,4 @@
-"""Where a map of points is looked at from, and what is seen there.
+"""Stations in a map of points, and the points that are seen from a place.
 
 A map without a trajectory is walked through: stations stand on its ground, and a tour leads from
 each to the nearest that is left.
@@ -36,8 +36,8 @@ RANGE = 40.0  # m that is seen of a map
 # bins of directions: their edges double from level to level, rad
 BIN = 0.0125
 LEVELS = 5
-HIDDEN = 0.6, 0.02  # m and share of the range behind what is nearer
-NEAREST = 0.5  # m: what is closer to a station is not seen
+HIDDEN = 0.6, 0.02  # m and share of the range: a point so far behind another is hidden by it
+NEAREST = 0.5  # m: points closer to a station are not seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,7 +146,7 @@ def _in_turn(stations: F64) -> F64:
 
 
 class Views:
-    """What is seen of a map of points (n, 3) from a place in it."""
+    """A map of points (n, 3) as it is seen from places in it."""
 
     def __init__(self, xyz: F64) -> None:
         self._xyz = xyz

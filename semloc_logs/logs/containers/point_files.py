@@ -70,7 +70,7 @@ def is_point_file(head: bytes) -> bool:
 def read_points(path: Path, memory: Memory) -> MapPoints:
     """The points of a file, one of each cube of ``THIN`` metres.
 
-    LogError for a damaged file, and where what is kept does not fit into ``memory``.
+    LogError for a damaged file, and for more points than fit into ``memory``.
     """
     try:
         with path.open("rb") as file:

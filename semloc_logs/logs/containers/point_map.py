@@ -1,4 +1,4 @@
-"""A map of points as a log: at each station a cloud of what is seen of it.
+"""A map of points as a log: at each station a cloud of the points that are seen.
 
 ``/stations/points`` has the clouds in the frame of the base, ``/stations/odometry`` the poses of a
 tour, which a trajectory replaces.
@@ -42,7 +42,7 @@ _SECTION = 16  # stations
 class PointMapLog(BaseLog):
     """A PCD, PLY, LAS or LAZ file. ``along``: the stations of a trajectory, else a tour is made.
 
-    LogError for a damaged file, and for one without ground where there is no trajectory.
+    LogError for a damaged file, and for one without ground unless there is a trajectory.
     """
 
     def __init__(
