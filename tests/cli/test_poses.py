@@ -162,8 +162,12 @@ def test_a_good_log_is_0(tmp_path: Path) -> None:
             [(t, 7.0) for t in TIMES],
             "/odom gives the same position all the time, but the surroundings move by",
         ),
+        (
+            [(t, 1e-5 * SPEED * t) for t in TIMES],
+            "m in all: in another unit than metres, or never filled in, but the surroundings move",
+        ),
     ],
-    ids=["stop", "repeat", "back", "ahead", "stand"],
+    ids=["stop", "repeat", "back", "ahead", "stand", "degrees"],
 )
 def test_poses_that_make_no_sense_are_3_and_a_sentence(
     tmp_path: Path, poses: list[tuple[float, float]], says: str

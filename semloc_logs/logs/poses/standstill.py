@@ -8,12 +8,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from semloc_logs.frames import F32
-from semloc_logs.numerics.transforms import Array, apply
+from semloc_logs.numerics.transforms import Array, apply, rotation_angle
 
 _EVERY = 4  # clouds; a vehicle is not looked at more often
 _KEPT, _COMPARED = 20_000, 500  # points of the first cloud, and of each that is compared with it
 # m, between poses that stand still
-_STILL = 0.02
+STILL = 0.02
+_TURNED = 0.1  # rad; a sensor that has turned farther sees other surroundings
 # a cloud has moved when it lies so many times as far from the first one as half of the first lies
 # from its other half, and so far (m)
 _TIMES, _MARGIN = 1.5, 0.1
@@ -26,11 +27,14 @@ _LEAST = 4  # clouds that tell whether the sensor moved
 
 @dataclass(slots=True)
 class Stop:
-    """Clouds while the poses stood still: the first one, and how far others lie from it.
+    """Clouds while the positions stood still, and how far they lie from an earlier one.
 
-    ``pose`` is session_T_base, ``first`` (n, 3) are points in the base frame.
+    ``position`` (3,) is where they stood. ``pose`` is session_T_base of the earlier one, ``first``
+    (n, 3) are its points in the base frame; where the poses turn, it is replaced by a later one.
+    ``shifts`` are distances (m) of clouds that have moved, 0 of others.
     """
 
+    position: Array
     pose: Array
     first: F32
     start_ns: int
@@ -38,7 +42,13 @@ class Stop:
     seen: int = 1
     tree: cKDTree | None = None
     noise: float = 0.0
-    distances: list[float] = field(default_factory=list)
+    shifts: list[float] = field(default_factory=list)
+
+    def begin(self, pose: Array, points: F32) -> None:
+        """Compare from now on with the points (n, 3) of another cloud, in the base frame."""
+        self.pose = np.array(pose)
+        self.first = _some(points, _KEPT).copy()
+        self.tree = None
 
     def compare(self, points: Array) -> None:
         """Take a later cloud (n, 3), in the session frame."""
@@ -46,14 +56,14 @@ class Stop:
             first = apply(self.pose, self.first)
             self.tree = cKDTree(first)
             self.noise = _distance(cKDTree(first[::2]), first[1::2])
-        self.distances.append(_distance(self.tree, points))
+        distance = _distance(self.tree, points)
+        self.shifts.append(distance if distance > _TIMES * self.noise + _MARGIN else 0.0)
 
     @property
     def shift(self) -> float:
-        """Distance (m) of moved clouds from the first; 0 unless at least half of them moved."""
-        least = _TIMES * self.noise + _MARGIN
-        moved = [d for d in self.distances if d > least]
-        return max(moved) if 2 * len(moved) >= max(len(self.distances), _LEAST) else 0.0
+        """Distance (m) of the farthest cloud that moved; 0 unless at least half of them moved."""
+        moved = [shift for shift in self.shifts if shift > 0]
+        return max(moved) if 2 * len(moved) >= max(len(self.shifts), _LEAST) else 0.0
 
 
 class Standstill:
@@ -82,20 +92,24 @@ class Standstill:
         stop = self._stop
         if len(points) < _FEWEST or (stop is not None and stamp_ns == stop.end_ns):
             return
-        is_still = stop is not None and _is_still(stop.pose, session_T_base)
-        if stop is None or not is_still:
+        if stop is None or not _is_still(stop.position, session_T_base):
             self._worst = self.worst
             first = _some(points, _KEPT).copy()
-            self._stop = Stop(np.array(session_T_base), first, stamp_ns, stamp_ns)
+            position = np.array(session_T_base[:3, 3])
+            self._stop = Stop(
+                position, np.array(session_T_base), first, start_ns=stamp_ns, end_ns=stamp_ns
+            )
             return
         stop.seen += 1
         stop.end_ns = stamp_ns
-        if stop.seen % _EVERY == 2:
+        if rotation_angle(stop.pose[:3, :3].T @ session_T_base[:3, :3]) > _TURNED:
+            stop.begin(session_T_base, points)
+        elif stop.seen % _EVERY == 2:
             stop.compare(apply(session_T_base, _some(points, _COMPARED)))
 
 
-def _is_still(pose: Array, other: Array) -> bool:
-    return bool(np.abs(other[:3] - pose[:3]).max() < _STILL)
+def _is_still(position: Array, pose: Array) -> bool:
+    return bool(np.abs(pose[:3, 3] - position).max() < STILL)
 
 
 def _distance(tree: cKDTree, points: Array) -> float:

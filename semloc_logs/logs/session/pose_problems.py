@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from semloc_logs.logs.messages.stamps import time_range
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.problems import Problem, ProblemKind
 
 # a vehicle may well stand still so long, but a log of nothing else is suspicious
 _STANDSTILL_NS = 10_000_000_000
+# of a latitude and a longitude: nearer to zero are the Gulf of Guinea, and positions in metres
+_LEAST_DEGREES = 0.5
 
 
 def no_poses() -> Problem:
@@ -83,15 +87,35 @@ def invalid_poses(topic: str, track: PoseTrack) -> list[Problem]:
     return [Problem(topic, ProblemKind.POSE, text, lost=True)]
 
 
-def smeared(topic: str, shift: float) -> Problem:
+def smeared(topic: str, shift: float, track: PoseTrack) -> Problem:
     """Poses that stand still while the surroundings move by ``shift`` metres or more."""
     text = (
-        f"{topic} gives the same position all the time, but the surroundings move by {shift:.1f} m "
+        f"{topic} {_hardly_moves(track)}, but the surroundings move by {shift:.1f} m "
         f"or more: its poses, and the map that is built with them, are wrong; "
         f"use --odometry lidar, give poses with --poses FILE, or name a topic with "
         f"--topic pose=TOPIC."
     )
     return Problem(topic, ProblemKind.POSE, text, lost=True)
+
+
+def _hardly_moves(track: PoseTrack) -> str:
+    """That all positions are the same, or nearly; and in which unit they may be."""
+    positions = track.poses[:, :3, 3]
+    extent = track.extent()
+    if not extent:
+        return "gives the same position all the time"
+    first = positions[0]
+    are_degrees = bool(np.abs(first[:2]).min() >= _LEAST_DEGREES) and any(
+        abs(latitude) <= 90.0 and abs(longitude) <= 180.0
+        for latitude, longitude in (first[:2], first[1::-1])
+    )
+    unit = (
+        f" ({first[0]:.5f}, {first[1]:.5f} at first): degrees of latitude and longitude, it seems,"
+        " not metres"
+        if are_degrees
+        else ": in another unit than metres, or never filled in"
+    )
+    return f"gives positions that change by {extent:.2g} m in all{unit}"
 
 
 def froze(topic: str, shift: float, start_ns: int, end_ns: int) -> Problem:

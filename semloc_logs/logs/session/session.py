@@ -170,6 +170,11 @@ class Session:
         """What is wrong where a sensor repeats measurements while the poses move; else empty."""
         return self._pass.repeats.text(topic, self.track)
 
+    @property
+    def is_frozen(self) -> bool:
+        """Whether the surroundings move while the poses stand still, for a while or always."""
+        return self._pass.builder.standstill.worst is not None
+
     def is_stuck(self, topic: str) -> bool:
         """Whether the clock of the stamps of a topic stands still while it is recorded."""
         offset = self.stamp_offsets.of(topic)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from semloc_logs.logs.poses.standstill import STILL
 from semloc_logs.logs.problems import Problem
 from semloc_logs.logs.roles import Roles
 from semloc_logs.logs.session.one_pass import CloudPass
@@ -47,8 +48,8 @@ def conclude(done: CloudPass, roles: Roles) -> list[Problem]:
     problems += refused_poses(name, track, lost=is_lost)
 
     frozen = builder.standstill.worst
-    if frozen is not None and not track.moves:
-        problems.append(smeared(name, frozen.shift))
+    if frozen is not None and track.extent() < STILL:
+        problems.append(smeared(name, frozen.shift, track))
     elif frozen is not None:
         problems.append(froze(name, frozen.shift, frozen.start_ns, frozen.end_ns))
     else:

@@ -175,16 +175,22 @@ class StreamFit:
 
 @dataclass(slots=True)
 class SessionFit:
-    """The check of a session: of the track of its ``pose`` stream, and of each range stream."""
+    """The check of a session: of the track of its ``pose`` stream, and of each range stream.
+
+    ``is_frozen``: the poses stand still while the surroundings move; the session says so.
+    """
 
     pose: str
     jump: Jump | None = None
+    is_frozen: bool = False
     streams: list[StreamFit] = field(default_factory=list)
 
     @property
     def fits(self) -> bool:
         """Whether nothing is known that would make closures false."""
-        return self.jump is None and not any(stream.is_wrong for stream in self.streams)
+        if self.is_frozen or self.jump is not None:
+            return False
+        return not any(stream.is_wrong for stream in self.streams)
 
     @property
     def problems(self) -> list[Problem]:
@@ -204,11 +210,16 @@ class SessionFit:
                 problems.append(Problem(stream.topic, ProblemKind.FIT, note, lost=False))
         return problems
 
+    def _track_text(self) -> str | None:
+        if self.jump is not None:
+            return self.jump.text
+        return "the poses stand still while the surroundings move" if self.is_frozen else None
+
     def to_json(self) -> dict[str, object]:
         """For session.json."""
         return {
             "fits": self.fits,
-            "track": None if self.jump is None else self.jump.text,
+            "track": self._track_text(),
             "streams": [stream.to_json() for stream in self.streams],
         }
 
@@ -216,7 +227,7 @@ class SessionFit:
 def check_session(session: Session, collected: Collected, voxel: float) -> SessionFit:
     """Checks the poses of a session that was read, and its keyframes against them."""
     track = session.track
-    check = SessionFit(session.pose_name, implausible(track))
+    check = SessionFit(session.pose_name, implausible(track), session.is_frozen)
     if not len(track) or check.jump is not None:
         return check
     for topic in session.roles.ranging:

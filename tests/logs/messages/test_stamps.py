@@ -69,6 +69,25 @@ def test_surroundings_that_move_while_the_poses_stand(
         assert watch.worst.end_ns == frozen[-1] * S
 
 
+def test_surroundings_that_move_while_the_poses_only_turn() -> None:
+    """Positions in degrees hardly change, but rotations are right."""
+    rng = np.random.default_rng(3)
+    watch = Standstill()
+    still = Standstill()
+    corner = np.r_[
+        np.c_[rng.uniform(-20, 20, 5000), np.full(5000, 6.0), rng.uniform(0, 4, 5000)],
+        np.c_[np.full(5000, 25.0), rng.uniform(-6, 6, 5000), rng.uniform(0, 4, 5000)],
+    ]
+    for k in range(24):
+        pose = yaw_transform(0.03 * k, (8.4, 49.0, 0.0))
+        for watched, way in ((watch, 2.0 * k), (still, 0.0)):
+            seen = corner - [way, 0.0, 0.0] + rng.normal(0, 0.02, corner.shape)
+            cloud = (seen @ pose[:3, :3]).astype(np.float32)
+            watched.add(cloud, pose, k * S)
+    assert watch.shift > 1.0
+    assert still.shift == 0.0
+
+
 def test_times_for_people() -> None:
     assert utc(1_700_000_000_123_456_789) == "2023-11-14T22:13:20.123Z"
     assert utc(1 << 62) == "2116-02-20T23:53:38.427Z"
