@@ -177,7 +177,8 @@ class StreamFit:
 class SessionFit:
     """The check of a session: of the track of its ``pose`` stream, and of each range stream.
 
-    ``is_frozen``: the poses stand still while the surroundings move; the session says so.
+    ``is_frozen``: the poses stand still while the surroundings move, which a problem of the session
+    names.
     """
 
     pose: str
