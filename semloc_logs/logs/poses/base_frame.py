@@ -65,9 +65,10 @@ def choose_base_frame(
 ) -> BaseFrame:
     """The base frame: ``base_link`` where TF connects it with a sensor and the pose.
 
-    Else the frame that the pose belongs to; the sensor's own frame where the pose names none, or
-    without a pose. ``sensors``: frame ids of the range sensors, the most important first.
-    ``given``: frames whose mounting in the base frame the user gave; it is in the tree already.
+    Else the frame that the pose belongs to; the sensor's own frame where the pose names none and
+    TF has no mounting of the sensor, or without a pose. ``sensors``: frame ids of the range
+    sensors, the most important first. ``given``: frames whose mounting in the base frame the user
+    gave; it is in the tree already.
     """
     sensors = [frame_name(s) for s in sensors]
     reachable = _has_base_link(tree, sensors)
@@ -79,7 +80,10 @@ def choose_base_frame(
     if not child:
         if first in given or not sensors:
             return BaseFrame(BASE_LINK, BASE_LINK)
-        is_settled = stream.is_of_sensor and not (reachable and first != BASE_LINK)
+        has_mounting = reachable and first != BASE_LINK
+        if has_mounting and not stream.is_of_sensor:
+            return BaseFrame(BASE_LINK, BASE_LINK, problems=(_unnamed_base(first, stream),))
+        is_settled = stream.is_of_sensor and not has_mounting
         return BaseFrame(
             first, first, problems=() if is_settled else (_unnamed_child(first, stream),)
         )
@@ -112,6 +116,16 @@ def _unnamed_child(sensor: str, stream: PoseTopic) -> Problem:
     )
     topic = stream.topic
     return Problem(topic, ProblemKind.POSE, text, lost=False, assumed=not stream.is_of_sensor)
+
+
+def _unnamed_base(sensor: str, stream: PoseTopic) -> Problem:
+    """The frame of a pose is assumed to be the vehicle's, which the sensor is mounted on."""
+    text = (
+        f"{stream.topic} does not name the frame whose pose it is: it is taken as the pose of "
+        f"'{BASE_LINK}', which transforms connect with the sensor frame '{sensor}'; where it is "
+        f"the pose of '{sensor}', give --set logs.mountings.{sensor}=[0,0,0,0,0,0,1]."
+    )
+    return Problem(stream.topic, ProblemKind.POSE, text, lost=False, assumed=True)
 
 
 def _unconnected_sensor(sensor: str, child: str, pose_topic: str) -> Problem:

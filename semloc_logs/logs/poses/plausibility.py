@@ -33,6 +33,9 @@ STEADY = 0.15
 FROZEN = 1.0
 SLOW = 1.0
 AT_SPEED = 3
+HELD = 0.5  # of the steps are exactly none, and of the other ones are jumps: poses are repeated
+# a step over a gap that is this much of a usual one at most: the stamps have a gap, not the poses
+USUAL = 2.0
 STILL_TURN = 1e-6
 # a vehicle at more than this speed (m/s) before and after a gap of so many seconds at most, which
 # turned nowhere, has not gone less than this share of the way
@@ -83,7 +86,8 @@ def implausible(track: PoseTrack) -> Jump | None:
         )
         return Jump(tuple(stamps_ns[1:][restarts].tolist()), text)
     if jumps.any():
-        return _jumped(stamps_ns, jumps, way, turn)
+        held = _held(stamps_ns, jumps, way, turn)
+        return held or _jumped(track, jumps, way, turn)
     if frozen := _frozen(stamps_ns, way, turn, seconds):
         return frozen
     if lost := _lost_in_gap(track, way, turn, seconds):
@@ -136,8 +140,11 @@ def _to_and_fro(poses: F64, way: F64, seconds: F64) -> NDArray[np.bool_]:
 
 def _in_turn(stamps_ns: NDArray[np.int64], to_and_fro: NDArray[np.bool_], poses: F64) -> Jump:
     """Poses that jump to and fro. Between jumps of one of two publishers the other one drives on
-    steadily; noise does not.
+    steadily; noise does not. A clock that was set back mixes the poses of a short stretch with
+    later ones.
     """
+    if set_back := _mixed_by_clock(stamps_ns, to_and_fro, poses):
+        return set_back
     chords = np.linalg.norm(poses[2:, :3, 3] - poses[:-2, :3, 3], axis=1)[to_and_fro]
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)[:-1][to_and_fro]
     distance = float(np.median(steps))
@@ -153,6 +160,32 @@ def _in_turn(stamps_ns: NDArray[np.int64], to_and_fro: NDArray[np.bool_], poses:
         f" {distance:.1f} m in the median: {cause}"
     )
     return Jump(tuple(stamps_ns[1:-1][to_and_fro].tolist()), text)
+
+
+def _mixed_by_clock(
+    stamps_ns: NDArray[np.int64], to_and_fro: NDArray[np.bool_], poses: F64
+) -> Jump | None:
+    """A stretch in which two drives alternate, the second of which begins where the first ends."""
+    rows = np.flatnonzero(to_and_fro) + 1
+    first = int(rows[0])
+    last = int(rows[-1])
+    rest = np.r_[poses[:first, :3, 3], np.full((1, 3), np.nan), poses[last + 1 :, :3, 3]]
+    steps = np.linalg.norm(np.diff(rest, axis=0), axis=1)
+    if np.isfinite(steps).sum() < NEIGHBOURS:
+        return None
+    usual = float(np.nanmedian(steps))
+    begins = poses[max(first - 1, 0) : first + 2, :3, 3]
+    ends = poses[last - 1 : last + 2, :3, 3]
+    apart = np.linalg.norm(begins[:, None] - ends[None], axis=-1)
+    if apart.min() > USUAL * usual + SLACK or apart.max() < SLACK + apart.min():
+        return None
+    seconds = float(stamps_ns[last] - stamps_ns[first]) * 1e-9
+    text = (
+        f"from {time_range(int(stamps_ns[first]), int(stamps_ns[last]))} poses of two stretches of"
+        f" the drive alternate, the second of which begins where the first ends: the clock was set"
+        f" back by about {seconds:.1f} s; cut the log there in the order of its messages"
+    )
+    return Jump(tuple(stamps_ns[rows].tolist()), text)
 
 
 def _frozen(stamps_ns: NDArray[np.int64], way: F64, turn: F64, seconds: F64) -> Jump | None:
@@ -188,19 +221,52 @@ def _lost_in_gap(track: PoseTrack, way: F64, turn: F64, seconds: F64) -> Jump | 
         speed = min(float(np.median(way[side] / seconds[side])) for side in (before, after))
         if speed > FASTER and way[step] < SHORT * speed * seconds[step] and turn[step] < TURN_SLACK:
             stamps_ns = track.stamps_ns
+            usual = max(float(np.median(way[side])) for side in (before, after))
+            # odometry that is lost for a while hardly goes on by just one of its steps
+            is_clock = 0.0 < way[step] <= USUAL * usual and way[step] * USUAL >= usual
+            cause = (
+                "their clock was set forward, or the odometry lost the way between"
+                if is_clock
+                else "the odometry lost the way between"
+            )
             text = (
                 f"the poses have a gap of {seconds[step]:.2f} s from {utc(int(stamps_ns[step]))}"
                 f" and go on {way[step]:.1f} m from where they were, although at {speed:.1f} m/s"
-                " before and after: the odometry lost the way between; cut the log there into two"
-                " sessions"
+                f" before and after: {cause}; cut the log there into two sessions"
             )
             return Jump((int(stamps_ns[step + 1]),), text)
     return None
 
 
-def _jumped(stamps_ns: NDArray[np.int64], jumps: NDArray[np.bool_], way: F64, turn: F64) -> Jump:
+def _held(
+    stamps_ns: NDArray[np.int64], jumps: NDArray[np.bool_], way: F64, turn: F64
+) -> Jump | None:
+    """Poses that are repeated exactly until the next one is known, which is far away by then."""
+    is_same = (way == 0.0) & (turn < STILL_TURN)
+    changes = np.flatnonzero(~is_same)
+    if float(is_same.mean()) < HELD or float(jumps[changes].mean()) < HELD:
+        return None
+    period = float(np.median(np.diff(stamps_ns[1:][changes]))) * 1e-9
+    text = (
+        f"the poses change only every {period:.2f} s, by {np.median(way[changes]):.1f} m, and are"
+        " exactly the same in between: their publisher repeats the last known one; record poses"
+        " when they are computed, or give others with --poses FILE"
+    )
+    return Jump(tuple(stamps_ns[1:][jumps].tolist()), text)
+
+
+def _jumped(track: PoseTrack, jumps: NDArray[np.bool_], way: F64, turn: F64) -> Jump:
+    stamps_ns = track.stamps_ns
     rows = np.flatnonzero(jumps)
     worst = int(rows[np.argmax(way[rows])])
+    if set_back := track.set_back.get(int(stamps_ns[worst])):
+        text = (
+            f"the poses jump by {way[worst]:.1f} m at {utc(int(stamps_ns[worst + 1]))}, after"
+            f" {set_back.count} of them whose stamps go back in time by"
+            f" {set_back.longest_ns * 1e-9:.2f} s: the clock of their stamps was set back; cut the"
+            " log there"
+        )
+        return Jump(tuple(stamps_ns[1:][jumps].tolist()), text)
     seconds = (stamps_ns[worst + 1] - stamps_ns[worst]) * 1e-9
     count = "once" if len(rows) == 1 else f"{len(rows)} times"
     degrees = np.degrees(turn[worst])

@@ -43,7 +43,9 @@ class PoseStream:
         """The next sample; whether it counts, which is not known before the choice."""
         self.count += 1
         parent = frame_name(sample.header.frame_id)
-        kind = PoseKind(parent, frame_name(sample.child_frame_id), publisher_of(sample))
+        child = frame_name(sample.child_frame_id)
+        # the pose of a frame in itself: nobody filled in the name
+        kind = PoseKind(parent, "" if child == parent else child, publisher_of(sample))
         self._counts[kind] += 1
         if self.chosen is None or self._one is None:
             self._waiting.setdefault(kind, []).append(sample)

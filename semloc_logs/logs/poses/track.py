@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,7 @@ _FIRST_NS = -(1 << 60)
 _LAST_NS = 1 << 62
 _AHEAD_NS = 10_000_000_000  # clocks that are adjusted while recording jump less
 _GLITCH = 3  # poses that a glitch of the clock may stamp in a row
+_MOST_SET_BACK = 1000  # runs of poses that go back in time; a broken log has one at every pose
 _PERIOD_WINDOW = 256  # poses that the period is estimated from: the newest ones
 
 
@@ -34,6 +37,14 @@ def _is_rigid(pose: F64) -> bool:
     return is_on_earth and abs(np.linalg.det(pose[:3, :3]) - 1.0) <= _DETERMINANT
 
 
+@dataclass(slots=True)
+class SetBack:
+    """A run of ``count`` poses before the newest one, by ``longest_ns`` at most."""
+
+    count: int = 0
+    longest_ns: int = 0
+
+
 class PoseTrack:
     """Poses at strictly increasing stamps, which may still grow.
 
@@ -41,7 +52,8 @@ class PoseTrack:
     stream. With ``keep_seconds`` only the newest stretch is remembered (at least that long), so
     memory is bounded. ``duplicates``, ``backwards`` and ``invalid`` count refused poses: equal
     stamps, stamps before the newest one, and matrices that are not rigid transforms; ``ahead``
-    counts poses that were taken back.
+    counts poses that were taken back. ``set_back``: the refused poses by the newest stamp before
+    them.
     """
 
     def __init__(self, max_gap: float = 1.0, keep_seconds: float | None = None) -> None:
@@ -50,6 +62,7 @@ class PoseTrack:
         self.backwards = 0
         self.invalid = 0
         self.ahead = 0
+        self.set_back: dict[int, SetBack] = {}
         self.moves = False  # whether any position differs from the first
         self._keep_ns = None if keep_seconds is None else round(keep_seconds * 1e9)
         self._stamps = np.empty(16, np.int64)
@@ -73,6 +86,7 @@ class PoseTrack:
                 self.duplicates += 1
             else:
                 self.backwards += 1
+                self._count_set_back(stamp_ns)
             return False
         if not is_time(stamp_ns) or not _is_rigid(pose):
             self.invalid += 1
@@ -85,6 +99,13 @@ class PoseTrack:
         self._n += 1
         self.moves = self.moves or bool((pose[:3, 3] != self._rows[0, :, 3]).any())
         return True
+
+    def _count_set_back(self, stamp_ns: int) -> None:
+        newest_ns = int(self._stamps[self._n - 1])
+        if newest_ns in self.set_back or len(self.set_back) < _MOST_SET_BACK:
+            run = self.set_back.setdefault(newest_ns, SetBack())
+            run.count += 1
+            run.longest_ns = max(run.longest_ns, newest_ns - stamp_ns)
 
     def _is_late(self, stamp_ns: int) -> bool:
         """Whether a stamp is not after the newest one."""

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Bools, Pairs, PosesAt, cost_of
 from semloc_logs.numerics.evenly import evenly
-from semloc_logs.numerics.transforms import inverse
+from semloc_logs.numerics.transforms import inverse, yaw_transform
 
 F64 = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ _ORDERS = {
     "w, x, y, z": (1, 2, 3, 0),
     "y, z, w, x": (3, 0, 1, 2),
 }
-CONVENTIONS = len(_ORDERS) + 4  # of :func:`otherwise_written`
+CONVENTIONS = len(_ORDERS) + 5  # of :func:`otherwise_written`
 _FIXED = (
     "its clouds do not move although the vehicle does: they are in the fixed frame already, and the"
     " motion of the vehicle is applied twice; use the clouds as the sensor measures them"
@@ -151,6 +151,12 @@ def otherwise_written(poses: F64) -> Iterator[tuple[F64, str]]:
         "the poses fit when their rotations are inverted, but not their positions: the rotations"
         " are of the fixed frame in the frame of the vehicle; give the rotations of the vehicle",
     )
+    yield (
+        _motion(_headed(poses)),
+        "the poses fit when their yaw is read as a compass heading, clockwise from north: positions"
+        " are east, north, up; give the yaw counter-clockwise from east (90 degrees less the"
+        " heading)",
+    )
     for axis, name in enumerate("xyz"):
         other_side = poses.copy()
         other_side[..., axis, 3] *= -1.0
@@ -163,6 +169,14 @@ def otherwise_written(poses: F64) -> Iterator[tuple[F64, str]]:
 
 def _flip(axis: int) -> F64:
     return np.diag([-1.0 if k == axis else 1.0 for k in range(4)])
+
+
+def _headed(poses: F64) -> F64:
+    """Poses (n, 2, 4, 4) whose yaw is 90 degrees less the one that was written."""
+    quarter = yaw_transform(np.pi / 2, (0.0, 0.0, 0.0))[:3, :3]
+    out = poses.copy()
+    out[..., :3, :3] = quarter @ np.swapaxes(poses[..., :3, :3], -1, -2)
+    return out
 
 
 def _turned(poses: F64, quaternions: F64) -> F64:

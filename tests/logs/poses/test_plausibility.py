@@ -116,6 +116,43 @@ def test_odometry_that_lost_the_way_in_a_gap_is_recognised() -> None:
     assert "the odometry lost the way between" in jump.text
 
 
+def test_poses_that_are_repeated_until_the_next_one_are_named_so() -> None:
+    jump = implausible(_track(np.repeat(_drive(40)[::8], 40, axis=0)))  # 3.2 m each 2 s
+    assert jump is not None
+    assert "the poses change only every 2.00 s, by 3.2 m" in jump.text
+
+
+def test_a_clock_that_was_set_forward_is_not_only_lost_odometry() -> None:
+    track = PoseTrack()
+    for i, pose in enumerate(_drive(turn=0.0)):
+        track.append((i + 1) * STEP_NS + (2_000_000_000 if i >= 100 else 0), pose)
+    jump = implausible(track)
+    assert jump is not None
+    assert "a gap of 2.05 s" in jump.text
+    assert "their clock was set forward, or the odometry lost the way" in jump.text
+
+
+def test_a_clock_that_was_set_back_is_named_where_poses_come_in_their_order() -> None:
+    track = PoseTrack()
+    for i, pose in enumerate(_drive(turn=0.0)):
+        track.append((i + 1) * STEP_NS - (1_010_000_000 if i >= 100 else 0), pose)
+    jump = implausible(track)
+    assert jump is not None
+    assert "the clock of their stamps was set back" in jump.text
+    assert "go back in time by 0.96 s" in jump.text
+
+
+def test_a_clock_that_was_set_back_is_named_where_poses_are_sorted_by_it() -> None:
+    poses = _drive(turn=0.0)
+    stamped = [((i + 1) * STEP_NS - (1_010_000_000 if i >= 100 else 0), i) for i in range(200)]
+    track = PoseTrack()
+    for stamp_ns, i in sorted(stamped):
+        track.append(stamp_ns, poses[i])
+    jump = implausible(track)
+    assert jump is not None
+    assert "the clock was set back by about 1.0 s" in jump.text
+
+
 def test_a_slow_publisher_among_the_poses_of_a_fast_one_is_recognised() -> None:
     poses = _drive()
     poses[2::5] = yaw_transform(0.0, (0.0, 4.0, 0.0)) @ poses[2::5]

@@ -446,6 +446,24 @@ def test_a_pose_without_child_frame_is_that_of_the_sensor() -> None:
     assert problem.assumed
 
 
+@pytest.mark.parametrize("child", ["", "odom"], ids=["unnamed", "its own parent"])
+def test_a_pose_without_child_frame_is_of_the_vehicle_where_the_sensor_has_a_mounting(
+    child: str,
+) -> None:
+    frames: list[Frame] = [
+        static("base_link", "lidar", yaw_transform(0.0, (1.0, 0.0, 2.0))),
+        *[sweep(0.1 * k) for k in range(3)],
+        *[odometry(0.1 * k, child) for k in range(4)],
+    ]
+    session = Session([FakeLog(frames)])
+    clouds = list(session.clouds())
+    np.testing.assert_allclose(clouds[0].points, [[6, 0, 2], [1, 7, 2]], atol=1e-6)
+    assert session.base_frame == "base_link"
+    [problem] = session.problems
+    assert "it is taken as the pose of 'base_link'" in problem.text
+    assert problem.assumed
+
+
 def test_the_pose_of_a_sensors_own_slam_needs_no_child_frame() -> None:
     frames: list[Frame] = [
         *[sweep(0.1 * k, "/camera/points") for k in range(3)],

@@ -184,6 +184,14 @@ def _with_quaternions(change: Callable[[F64], F64]) -> Callable[[F64], F64]:
     return written
 
 
+def _with_heading(poses: F64) -> F64:
+    """Yaw clockwise from north (y)."""
+    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    return np.array(
+        [yaw_transform(np.pi / 2 - a, tuple(t)) for a, t in zip(yaw, poses[:, :3, 3], strict=True)]
+    )
+
+
 def _with_other_side(poses: F64) -> F64:
     out = poses.copy()
     out[:, 1, 3] *= -1.0
@@ -196,9 +204,10 @@ def _with_other_side(poses: F64) -> F64:
     [
         (_with_quaternions(lambda q: q[:, [3, 0, 1, 2]]), "read as w, x, y, z"),
         (_with_quaternions(lambda q: q * [-1, -1, -1, 1]), "rotations are inverted, but not"),
+        (_with_heading, "yaw is read as a compass heading"),
         (_with_other_side, "y of their positions has the other sign"),
     ],
-    ids=["w first", "inverted rotations", "left-handed positions"],
+    ids=["w first", "inverted rotations", "heading", "left-handed positions"],
 )
 def test_poses_of_another_convention_are_named_by_it(
     check: Check, is_gentle: bool, as_written: Callable[[F64], F64], text: str, streets: Any
