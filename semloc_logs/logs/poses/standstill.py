@@ -14,6 +14,8 @@ _EVERY = 4  # clouds; a vehicle is not looked at more often
 _KEPT, _COMPARED = 20_000, 500  # points of the first cloud, and of each that is compared with it
 # m, between poses that stand still
 STILL = 0.02
+# m, along one axis beside that: of positions in degrees the altitude is in metres
+_LIFT = 0.3
 _TURNED = 0.1  # rad; a sensor that has turned farther sees other surroundings
 # a cloud has moved when it lies so many times as far from the first one as half of the first lies
 # from its other half, and so far (m)
@@ -109,7 +111,8 @@ class Standstill:
 
 
 def _is_still(position: Array, pose: Array) -> bool:
-    return bool(np.abs(pose[:3, 3] - position).max() < STILL)
+    way = np.sort(np.abs(pose[:3, 3] - position))
+    return bool(way[1] < STILL and way[2] < _LIFT)
 
 
 def _distance(tree: cKDTree, points: Array) -> float:

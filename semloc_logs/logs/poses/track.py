@@ -208,10 +208,10 @@ class PoseTrack:
         holes = np.flatnonzero(np.diff(stamps) > self.gap_limit_ns())
         return [(int(stamps[i]), int(stamps[i + 1])) for i in holes]
 
-    def extent(self) -> float:
-        """Diagonal (m) of the box that holds all positions; 0 without poses."""
+    def extents(self) -> F64:
+        """Edges (3,) of the box along the axes that holds all positions, m; 0 without poses."""
         positions = self._rows[: self._n, :, 3]
-        return float(np.linalg.norm(np.ptp(positions, axis=0))) if self._n else 0.0
+        return np.asarray(np.ptp(positions, axis=0)) if self._n else np.zeros(3)
 
     def length(self) -> float:
         """Metres travelled, gaps left out."""

@@ -101,8 +101,8 @@ def smeared(topic: str, shift: float, track: PoseTrack) -> Problem:
 def _hardly_moves(track: PoseTrack) -> str:
     """That all positions are the same, or nearly; and in which unit they may be."""
     positions = track.poses[:, :3, 3]
-    extent = track.extent()
-    if not extent:
+    extents = track.extents()
+    if not extents.any():
         return "gives the same position all the time"
     first = positions[0]
     are_degrees = bool(np.abs(first[:2]).min() >= _LEAST_DEGREES) and any(
@@ -115,6 +115,8 @@ def _hardly_moves(track: PoseTrack) -> str:
         if are_degrees
         else ": in another unit than metres, or never filled in"
     )
+    # of positions in degrees the altitude changes in metres
+    extent = float(np.linalg.norm(np.sort(extents)[:2]))
     return f"gives positions that change by {extent:.2g} m in all{unit}"
 
 

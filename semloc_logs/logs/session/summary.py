@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from semloc_logs.logs.poses.standstill import STILL
 from semloc_logs.logs.problems import Problem
 from semloc_logs.logs.roles import Roles
@@ -48,7 +50,7 @@ def conclude(done: CloudPass, roles: Roles) -> list[Problem]:
     problems += refused_poses(name, track, lost=is_lost)
 
     frozen = builder.standstill.worst
-    if frozen is not None and track.extent() < STILL:
+    if frozen is not None and np.sort(track.extents())[1] < STILL:
         problems.append(smeared(name, frozen.shift, track))
     elif frozen is not None:
         problems.append(froze(name, frozen.shift, frozen.start_ns, frozen.end_ns))

@@ -70,7 +70,7 @@ def test_surroundings_that_move_while_the_poses_stand(
 
 
 def test_surroundings_that_move_while_the_poses_only_turn() -> None:
-    """Positions in degrees hardly change, but rotations are right."""
+    """Positions in degrees hardly change, but rotations and altitudes are right."""
     rng = np.random.default_rng(3)
     watch = Standstill()
     still = Standstill()
@@ -83,6 +83,7 @@ def test_surroundings_that_move_while_the_poses_only_turn() -> None:
         for watched, way in ((watch, 2.0 * k), (still, 0.0)):
             seen = corner - [way, 0.0, 0.0] + rng.normal(0, 0.02, corner.shape)
             cloud = (seen @ pose[:3, :3]).astype(np.float32)
+            pose[2, 3] = 0.01 * k
             watched.add(cloud, pose, k * S)
     assert watch.shift > 1.0
     assert still.shift == 0.0
