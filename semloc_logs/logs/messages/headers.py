@@ -30,6 +30,8 @@ BAD_VALUES = (
     cv2.error,
 )
 
+_UNIT = 0.1  # of the length of a quaternion, off 1: rounding makes less
+
 
 def ros(body: Body) -> Convert:
     """A converter of ROS messages that begin with a std_msgs/Header."""
@@ -90,6 +92,18 @@ def vector(v: Any) -> F64:
 def quaternion(q: Any) -> F64:
     """x, y, z, w (4,), of any length; a missing value is 0."""
     return np.array([q.x or 0.0, q.y or 0.0, q.z or 0.0, q.w or 0.0], float)
+
+
+def unit_transform(translation: Any, rotation: Any) -> F64:
+    """As :func:`transform`, of a quaternion that a program computed: its length is 1."""
+    pose = transform(translation, rotation)
+    norm = math.hypot(*quaternion(rotation))
+    if abs(norm - 1.0) > _UNIT:
+        raise UndecodableError(
+            f"the quaternion of its pose has the length {norm:.2g} and not 1: it is not a rotation;"
+            " are these Euler angles?"
+        )
+    return pose
 
 
 def transform(translation: Any, rotation: Any) -> F64:

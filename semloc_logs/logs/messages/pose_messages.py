@@ -26,6 +26,7 @@ from semloc_logs.logs.messages.headers import (
     quaternion,
     ros,
     transform,
+    unit_transform,
     vector,
 )
 
@@ -37,7 +38,7 @@ _HIGHEST = 1e6  # m above the ellipsoid: nothing that drives is higher
 
 
 def _pose(header: Header, m: Any) -> Iterator[Frame]:
-    yield PoseSample(header, "", transform(m.pose.position, m.pose.orientation))
+    yield PoseSample(header, "", unit_transform(m.pose.position, m.pose.orientation))
 
 
 def _pose_with_covariance(header: Header, m: Any) -> Iterator[Frame]:
@@ -46,7 +47,7 @@ def _pose_with_covariance(header: Header, m: Any) -> Iterator[Frame]:
 
 def _odometry(header: Header, m: Any) -> Iterator[Frame]:
     pose = m.pose.pose
-    yield PoseSample(header, m.child_frame_id, transform(pose.position, pose.orientation))
+    yield PoseSample(header, m.child_frame_id, unit_transform(pose.position, pose.orientation))
 
 
 def _transform(header: Header, m: Any) -> Iterator[Frame]:
@@ -65,7 +66,7 @@ def _foxglove_transform(header: Header, m: Any) -> Iterator[Frame]:
 
 def _foxglove_odometry(header: Header, m: Any) -> Iterator[Frame]:
     child = str(m.body_frame_id or "")
-    yield PoseSample(header, child, transform(m.pose.position, m.pose.orientation))
+    yield PoseSample(header, child, unit_transform(m.pose.position, m.pose.orientation))
 
 
 def _is_static(header: Header) -> bool:

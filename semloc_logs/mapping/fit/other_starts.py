@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds, Registered, Registrar, Start, motion
 from semloc_logs.mapping.fit.model import LONGEST_OFFSET, OFFSET_STEP, PosesAt
-from semloc_logs.mapping.fit.readings import CONVENTIONS, otherwise_written
+from semloc_logs.mapping.fit.readings import CONVENTIONS, otherwise_written, with_other_axes
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse
 
@@ -130,8 +130,8 @@ def _of_conventions(clouds: Clouds) -> Iterator[Start]:
 
         def start(target: int, source: int, number: int = number) -> F64:
             pair = np.array([clouds.pose(target), clouds.pose(source)])
-            motions = [motion[0] for motion, _ in otherwise_written(pair[None])]
-            return np.asarray(motions[number])
+            motions = [*otherwise_written(pair[None]), *with_other_axes(pair[None])]
+            return np.asarray(motions[number][0][0])
 
         yield start
 

@@ -34,7 +34,15 @@ _ORDERS = {
     "w, x, y, z": (1, 2, 3, 0),
     "y, z, w, x": (3, 0, 1, 2),
 }
-CONVENTIONS = len(_ORDERS) + 5  # of :func:`otherwise_written`
+# axes of the positions that were written as x, y, z: signs and numbers of the axes meant
+_AXES = {
+    "z, -x, -y": ((1, 2), (-1, 0), (-1, 1)),  # of an optical frame, with rotations of a body
+    "-y, -z, x": ((-1, 1), (-1, 2), (1, 0)),
+    "y, x, z": ((1, 1), (1, 0), (1, 2)),  # north and east
+    "y, x, -z": ((1, 1), (1, 0), (-1, 2)),
+}
+# of :func:`otherwise_written` and :func:`with_other_axes` together
+CONVENTIONS = len(_ORDERS) + 5 + len(_AXES)
 _FIXED = (
     "its clouds do not move although the vehicle does: they are in the fixed frame already, and the"
     " motion of the vehicle is applied twice; use the clouds as the sensor measures them"
@@ -52,10 +60,14 @@ _INVERTED_OR_TURNED = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """``motion`` (n, 4, 4) of the pairs, nan where the poses are not known, and what it means."""
+    """``motion`` (n, 4, 4) of the pairs, nan where the poses are not known, and what it means.
+
+    ``lead``: by so much it has to explain the pairs better than faults do.
+    """
 
     motion: F64
     text: str
+    lead: float = 0.0
 
 
 def far_reading(pairs: Pairs, poses_at: PosesAt, squares: F64, clouds: Clouds) -> str:
@@ -111,7 +123,11 @@ def near_reading(pairs: Pairs, poses_at: PosesAt, none: float, most: float) -> s
         cost = cost_of(pairs.residuals(reading.motion))
         excess = max(1.0, float(np.nanmedian(pairs.squares(reading.motion))) / MEDIAN_OF_6)
         # the first one of readings that the drive does not tell apart
-        if cost <= most and (none - cost) / excess >= LEAST_GAIN and cost < least - 1.0:
+        if (
+            cost + reading.lead * excess <= most
+            and (none - cost) / excess >= LEAST_GAIN
+            and cost < least - 1.0
+        ):
             least = cost
             text = reading.text
     return text
@@ -131,6 +147,9 @@ def _near_readings(pairs: Pairs, poses_at: PosesAt) -> Iterator[Reading]:
     poses, known = pairs.poses(poses_at)
     for motions, text in otherwise_written(poses):
         yield Reading(_where(known, motions), text)
+    for motions, text in with_other_axes(poses):
+        # a straight drive shows a mounting that is turned alike
+        yield Reading(_where(known, motions), text, LEAST_GAIN)
 
 
 def otherwise_written(poses: F64) -> Iterator[tuple[F64, str]]:
@@ -164,6 +183,19 @@ def otherwise_written(poses: F64) -> Iterator[tuple[F64, str]]:
             _motion(other_side),
             f"the poses fit when {name} of their positions has the other sign: positions and"
             " rotations are not of one right-handed frame; give both in the same",
+        )
+
+
+def with_other_axes(poses: F64) -> Iterator[tuple[F64, str]]:
+    """As :func:`otherwise_written`: axes of the positions are not the ones of the rotations."""
+    for names, axes in _AXES.items():
+        out = poses.copy()
+        for axis, (sign, other) in enumerate(axes):
+            out[..., axis, 3] = sign * poses[..., other, 3]
+        yield (
+            _motion(out),
+            f"the poses fit when {names} of their positions are read as x, y, z: positions and"
+            " rotations are not of one frame; give both in the same",
         )
 
 

@@ -332,6 +332,21 @@ def test_one_bad_transform_does_not_cost_its_message(recorder: Any) -> None:
     assert "1 of its 2 transforms cannot be used (the quaternion of its pose is zero)" in sentence
 
 
+def test_euler_angles_in_place_of_a_quaternion_are_named(recorder: Any) -> None:
+    log = recorder()
+    log.transform("base_link", "lidar", np.eye(4), EPOCH - S)
+    for k in range(20):
+        log.pose(EPOCH + k * S // 20, np.eye(4))
+        rotation = log.events[-1][2].pose.pose.orientation
+        rotation.z = 0.02 * k
+        rotation.w = 0.0 if k >= 2 else 1.0
+    log.cloud("/points", EPOCH, "lidar", rows())
+    _, session = all_of(log)
+    [sentence] = sentences(lost(session.problems))
+    assert "18 messages skipped" in sentence
+    assert "has the length 0.04 and not 1: it is not a rotation; are these Euler" in sentence
+
+
 # -- claims
 
 

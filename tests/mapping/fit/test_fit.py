@@ -192,6 +192,13 @@ def _with_heading(poses: F64) -> F64:
     )
 
 
+def _with_optical_positions(poses: F64) -> F64:
+    """Positions right, down, forward beside rotations of a body."""
+    out = poses.copy()
+    out[:, :3, 3] = poses[:, :3, 3] @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+    return out
+
+
 def _with_other_side(poses: F64) -> F64:
     out = poses.copy()
     out[:, 1, 3] *= -1.0
@@ -205,9 +212,10 @@ def _with_other_side(poses: F64) -> F64:
         (_with_quaternions(lambda q: q[:, [3, 0, 1, 2]]), "read as w, x, y, z"),
         (_with_quaternions(lambda q: q * [-1, -1, -1, 1]), "rotations are inverted, but not"),
         (_with_heading, "yaw is read as a compass heading"),
+        (_with_optical_positions, "z, -x, -y of their positions are read as x, y, z"),
         (_with_other_side, "y of their positions has the other sign"),
     ],
-    ids=["w first", "inverted rotations", "heading", "left-handed positions"],
+    ids=["w first", "inverted rotations", "heading", "optical positions", "left-handed positions"],
 )
 def test_poses_of_another_convention_are_named_by_it(
     check: Check, is_gentle: bool, as_written: Callable[[F64], F64], text: str, streets: Any
