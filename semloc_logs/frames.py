@@ -34,10 +34,11 @@ class Header:
 
 
 class PointTimeRemark(Enum):
-    """Why the recorded point times of a sweep are not used as they are."""
+    """What is unusual about the recorded point times of a sweep."""
 
     OTHER_CLOCK = "other clock"  # the first point is taken to be measured at the header's time
     UNUSABLE = "unusable"  # no unit and origin makes them times within a sweep
+    OFF_STAMP = "off stamp"  # they are used, but none of them is near to the header's time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +46,8 @@ class LidarFrame:
     """One sweep: ``points`` (n, 3) in the sensor frame.
 
     Rows with NaN, infinity or exactly zero are already gone. ``lost`` counts the points that were
-    not finite although their cloud calls itself dense. ``origin`` (3,) is the sensor's centre in
+    not finite although their cloud calls itself dense, ``without_return`` the ones that are gone
+    because they all have the greatest range. ``origin`` (3,) is the sensor's centre in
     its frame; None: the frame's own origin.
     """
 
@@ -57,6 +59,7 @@ class LidarFrame:
     lost: int = 0
     remark: PointTimeRemark | None = None
     origin: F32 | None = None
+    without_return: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

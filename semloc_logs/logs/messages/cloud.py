@@ -43,6 +43,7 @@ def _point_cloud2(header: Header, m: Any) -> Iterator[Frame]:
         p.ring,
         lost=p.not_finite if m.is_dense else 0,
         remark=p.remark,
+        without_return=p.without_return,
     )
 
 
@@ -60,7 +61,16 @@ def _foxglove_cloud(header: Header, m: Any) -> Iterator[Frame]:
     if not np.array_equal(frame_T_cloud, np.eye(4)):
         points = transforms.apply(frame_T_cloud, points).astype(np.float32)
         origin = frame_T_cloud[:3, 3].astype(np.float32)
-    yield LidarFrame(header, points, p.label, p.offset_ns, p.ring, remark=p.remark, origin=origin)
+    yield LidarFrame(
+        header,
+        points,
+        p.label,
+        p.offset_ns,
+        p.ring,
+        remark=p.remark,
+        origin=origin,
+        without_return=p.without_return,
+    )
 
 
 def _fields(recorded: Iterable[tuple[str, int, Any]], kinds: Mapping[int, str]) -> list[Field]:
@@ -123,7 +133,15 @@ def _old_cloud(header: Header, m: Any) -> Iterator[Frame]:
     p = decode_points(
         rows.tobytes(), Layout(len(rows), 1, 4 * len(fields), 0), fields, header.stamp_ns
     )
-    yield LidarFrame(header, p.points, p.label, p.offset_ns, p.ring, remark=p.remark)
+    yield LidarFrame(
+        header,
+        p.points,
+        p.label,
+        p.offset_ns,
+        p.ring,
+        remark=p.remark,
+        without_return=p.without_return,
+    )
 
 
 CONVERTERS: dict[str, Convert] = {

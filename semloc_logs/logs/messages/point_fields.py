@@ -36,7 +36,8 @@ class Field:
 class Points:
     """``points`` (n, 3) with label, time (relative to the header stamp) and ring where recorded.
 
-    ``not_finite`` counts the positions with NaN or infinity, ``remark`` is about the times.
+    ``not_finite`` counts the positions with NaN or infinity, ``without_return`` the ones at the
+    greatest range of the sensor; ``remark`` is about the times.
     """
 
     points: F32
@@ -45,13 +46,20 @@ class Points:
     ring: NDArray[np.uint16] | None
     not_finite: int = 0
     remark: PointTimeRemark | None = None
+    without_return: int = 0
 
 
+# points at the greatest range, all within so small a share of it, are rays without a return where
+# they are so large a share of a sweep: surfaces at just one range are spheres about the sensor
+_SAME_RANGE = 1e-5
+_WITHOUT_RETURN = 0.05
+_NOTHING_ELSE = 0.95  # and no larger: such clouds are made up
 # m; coordinates of a measured point lie between these, but for a few and for zeros
 _NEAREST, _FARTHEST = 1e-7, 1e7
 # shares of coordinates between them, in the wrong order of bytes and in the right one
 _NONSENSE, _SENSE = 0.5, 0.95
 _LOOKED_AT = 1000  # points
+_FEWEST = 100  # points that show what their ranges have in common
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +104,10 @@ def decode_points(
     valid &= (xyz[:, 0] != 0) | (xyz[:, 1] != 0) | (xyz[:, 2] != 0)
     if {TAG, "line"} <= columns.keys() and rows.dtype[columns[TAG]] == np.uint8:
         valid &= ~is_noise(rows[columns[TAG]].reshape(-1))
+    measured = _have_returned(xyz, valid)
+    without_return = 0 if measured is None else int(np.count_nonzero(valid & ~measured))
+    if measured is not None:
+        valid &= measured
     everything = bool(valid.all())
 
     def column(names: Sequence[str], kinds: str) -> NDArray[np.generic] | None:
@@ -116,7 +128,26 @@ def decode_points(
         ring=None if ring is None else ring.astype(np.uint16),
         not_finite=len(xyz) - finite,
         remark=remark,
+        without_return=without_return,
     )
+
+
+def _have_returned(xyz: F32, valid: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    """Which points (n,) of a sensor are measured, where it gives its greatest range to others.
+
+    None where it does not.
+    """
+    some = xyz[valid][:: max(1, len(xyz) // _LOOKED_AT)]
+    if len(some) < _FEWEST:
+        return None
+    ranges = np.linalg.norm(some.astype(np.float64), axis=1)
+    farthest = float(ranges.max())
+    share = float(np.mean(ranges > (1.0 - _SAME_RANGE) * farthest))
+    if not _WITHOUT_RETURN <= share <= _NOTHING_ELSE:
+        return None
+    with np.errstate(over="ignore", invalid="ignore"):
+        distances = np.linalg.norm(xyz.astype(np.float64), axis=1)
+        return np.asarray(~(distances > (1.0 - _SAME_RANGE) * farthest))
 
 
 def is_noise(tag: NDArray[np.generic]) -> NDArray[np.bool_]:

@@ -19,6 +19,7 @@ _PERIODS_KEPT = 16
 # the share of neighbours measured nearly together: above 0.9 in sweeps, 0.1 where times are noise
 _ORDERED = 0.5
 _NEARLY = 0.05  # of the sweep's span
+_OFF_STAMP_NS = 100_000_000  # from the header to the nearest point: publishing takes less
 _FEWEST = 100  # points of a sweep whose order can be judged
 _LOOKED_AT = 20_000  # points that are compared
 _CELLS = 180  # cells of azimuth of 2 degrees
@@ -98,7 +99,7 @@ class PointTimes:
         self._periods: dict[tuple[str, str], deque[int]] = {}
 
     def checked(self, frame: LidarFrame) -> LidarFrame:
-        """The sweep as it is, or without times and with a remark when they are not plausible.
+        """The sweep as it is, or with a remark: without times when they are not plausible.
 
         A sweep does not take much longer than the time to the next one; clouds gathered from
         several sweeps do. And points recorded one after the other, or seen in the same direction,
@@ -117,8 +118,14 @@ class PointTimes:
         # the longest of some: several sensors on one topic come in bursts
         longest = _PERIODS_PER_SWEEP * max(periods) if len(periods) > 1 else LONGEST_SWEEP_NS
         if int(offset.max()) - int(offset.min()) <= longest and in_order(offset, frame.points):
-            return frame
+            is_near = off_stamp_ns(offset) <= _OFF_STAMP_NS
+            return frame if is_near else replace(frame, remark=PointTimeRemark.OFF_STAMP)
         return replace(frame, offset_ns=None, remark=PointTimeRemark.UNUSABLE)
+
+
+def off_stamp_ns(offset_ns: NDArray[np.int64]) -> int:
+    """From the header's time to the nearest of ``offset_ns`` (n,); 0 within them."""
+    return max(0, int(offset_ns.min()), -int(offset_ns.max())) if len(offset_ns) else 0
 
 
 def in_order(offset_ns: NDArray[np.int64], points: F32) -> bool:

@@ -159,6 +159,10 @@ class Session:
         poses = pose_topic(self.stamp_offsets, self.roles, self._pass.poses)
         return 0.0 if poses is None else lead(self.stamp_offsets, topic, poses)
 
+    def off_stamp_of(self, topic: str) -> float:
+        """From the header of sweeps to their nearest point (s), where most are far off; else 0."""
+        return self._pass.tally.off_stamp(topic)
+
     def mounting_changes(self, frame_id: str) -> dict[Edge, Change]:
         """Static transforms between the base frame and a frame that the log changed, by edge."""
         tree = self._pass.poses.tree

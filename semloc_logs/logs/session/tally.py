@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from semloc_logs.frames import Header, LidarFrame, PointTimeRemark
+from semloc_logs.logs.messages.point_times import off_stamp_ns
 from semloc_logs.logs.messages.stamps import duration, time_range, utc
 from semloc_logs.logs.poses.tf_tree import frame_name
 from semloc_logs.logs.poses.track import PoseTrack
@@ -19,6 +20,10 @@ _REMARKS = {
     PointTimeRemark.UNUSABLE: (
         "sweeps are used as measured, with the motion of the vehicle in them: their point times "
         "are not times within a sweep"
+    ),
+    PointTimeRemark.OFF_STAMP: (
+        "sweeps have points that were all measured {gap:.2f} s or more before or after the time of "
+        "their header: the times of the points are used, but one of both is wrong"
     ),
 }
 
@@ -86,6 +91,8 @@ class Tally:
         self._without_pose: list[Header] = []
         self._points: Counter[str] = Counter()
         self._lost_points: Counter[str] = Counter()
+        self._without_return: Counter[str] = Counter()
+        self._off_stamp_ns: dict[str, int] = {}
         self._remarks: Counter[tuple[str, PointTimeRemark]] = Counter()
 
     def saw(self, topic: str) -> None:
@@ -115,9 +122,20 @@ class Tally:
         """Counts the points of a sweep, and the remark on it."""
         topic = frame.header.topic
         self._points[topic] += len(frame.points) + frame.lost
+        self._points[topic] += frame.without_return
         self._lost_points[topic] += frame.lost
+        self._without_return[topic] += frame.without_return
         if frame.remark is not None:
             self._remarks[topic, frame.remark] += 1
+        if frame.remark is PointTimeRemark.OFF_STAMP and frame.offset_ns is not None:
+            gap_ns = off_stamp_ns(frame.offset_ns)
+            self._off_stamp_ns[topic] = min(gap_ns, self._off_stamp_ns.get(topic, gap_ns))
+
+    def off_stamp(self, topic: str) -> float:
+        """From the header of most sweeps to their nearest point, s; 0 where it is as usual."""
+        count = self._remarks[topic, PointTimeRemark.OFF_STAMP]
+        is_usual = 2 * count <= self.seen[topic]
+        return 0.0 if is_usual else self._off_stamp_ns[topic] * 1e-9
 
     def left_out(self, topic: str) -> dict[str, int]:
         """Key of each reason -> frames of ``topic``."""
@@ -133,7 +151,12 @@ class Tally:
 
         ``track``: the poses; ``base``: name of the base frame.
         """
-        return [*self._lost_frames(track, base), *self._not_finite(), *self._unusual_times()]
+        return [
+            *self._lost_frames(track, base),
+            *self._not_finite(),
+            *self._not_returned(),
+            *self._unusual_times(),
+        ]
 
     def _lost_frames(self, track: PoseTrack, base: str) -> list[Problem]:
         problems = []
@@ -161,13 +184,27 @@ class Tally:
             for topic, count in sorted((+self._lost_points).items())
         ]
 
+    def _not_returned(self) -> list[Problem]:
+        return [
+            Problem(
+                topic,
+                ProblemKind.FRAME,
+                f"{topic}: {count} of {self._points[topic]} points are left out: they have the "
+                f"greatest range of their sweep, all the same: rays of which nothing came back.",
+                lost=False,
+            )
+            for topic, count in sorted((+self._without_return).items())
+        ]
+
     def _unusual_times(self) -> list[Problem]:
         return [
             Problem(
                 topic,
                 ProblemKind.POINT_TIME,
-                f"{topic}: {count} of {self.seen[topic]} {_REMARKS[remark]}.",
+                f"{topic}: {count} of {self.seen[topic]} "
+                f"{_REMARKS[remark].format(gap=self._off_stamp_ns.get(topic, 0) * 1e-9)}.",
                 lost=False,
+                assumed=remark is PointTimeRemark.OFF_STAMP,
             )
             for (topic, remark), count in sorted(
                 self._remarks.items(), key=lambda item: (item[0][0], item[0][1].value)

@@ -91,6 +91,8 @@ NAMES = {
 }
 FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
 HIDDEN = 10.0  # a fault that the drive does not show before it has this effect is hidden
+OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
+OPTICAL = np.radians(120.0)  # between the axes of a body and of an optical frame
 WRONG_TURN = 0.03  # rad, within a pair: a submap of 20 m would be bent by 15 degrees
 LEAST_DRIFT = np.radians(0.3)  # rad/m, worth a word: odometry drifts by a tenth of it
 STEADY = 0.9  # of the turns of contradicting pairs, summed up, where poses drift to one side
@@ -241,6 +243,7 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
         if known:
             stream.findings = [Finding(Severity.WRONG, known)]
         _add_lead(stream, session.lead_of(topic), clouds)
+        _add_off_stamp(stream, session.off_stamp_of(topic), clouds)
         check.streams.append(stream)
     return check
 
@@ -284,6 +287,20 @@ def _add_lead(stream: StreamFit, lead: float, clouds: Clouds) -> None:
             f"its stamps are up to {lead:.2f} s later than its recording, which the stamps of the"
             " poses are not: its clock is another one, or was set; give --set logs.time_offset."
             f"{stream.topic}={-lead:+.2f} where this holds for the whole log, else cut the log",
+        )
+    )
+
+
+def _add_off_stamp(stream: StreamFit, seconds: float, clouds: Clouds) -> None:
+    """Times of points and of their header that contradict each other, wherever it matters."""
+    if stream.findings or seconds * clouds.rates[0] < WRONG * clouds.voxel:
+        return
+    stream.findings.append(
+        Finding(
+            Severity.WRONG,
+            f"its points were all measured {seconds:.2f} s or more before or after the stamp of"
+            " their sweep: the stamps or the times of the points are wrong; record sweeps with"
+            " times that agree",
         )
     )
 
@@ -430,7 +447,11 @@ def _describe(stream: StreamFit, estimate: Estimate, faults: list[Fault], clouds
         Fault.LEVER: _lever_text,
         Fault.SCALE: _scale_text,
     }
-    for fault in faults:
+    # other axes move the points of a sweep the wrong way as they are freed of the motion, which
+    # looks like a clock or a lever arm
+    turned = float(np.linalg.norm(_significant(estimate, Fault.ROTATION)[ROTATION]))
+    are_other_axes = Fault.ROTATION in faults and turned > OTHER_AXES
+    for fault in [Fault.ROTATION] if are_other_axes else faults:
         known = _significant(estimate, fault)
         effect = _effect(known, fault, clouds)
         if effect >= NOTED:
@@ -497,7 +518,8 @@ def _rotation_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -
             spread = np.degrees(sigma(column))
             turns.append(f"{angle:.1f} \u00b1 {spread:.1f} degrees about {axis}")
     convention = ""
-    if rotation.magnitude() > np.radians(45) and _is_axis_rotation(rotation):
+    is_cycle = abs(rotation.magnitude() - OPTICAL) < np.radians(10.0)
+    if is_cycle and _is_axis_rotation(rotation):
         convention = (
             ", as where the axes of an optical frame are taken for the axes of a body frame"
         )

@@ -30,6 +30,26 @@ def test_one_point_by_hand() -> None:
     assert p.offset_ns is None
 
 
+@pytest.mark.parametrize(("share", "gone"), [(0.0, 0), (0.2, 200)])
+def test_rays_without_a_return_at_the_greatest_range_are_left_out(share: float, gone: int) -> None:
+    rng = np.random.default_rng(1)
+    xyz = rng.normal(0, 10, (1000, 3))
+    xyz *= np.minimum(1.0, 49.0 / np.linalg.norm(xyz, axis=1))[:, None]
+    far = rng.random(1000).argsort() < share * 1000
+    xyz[far] *= (50.0 / np.linalg.norm(xyz[far], axis=1))[:, None]
+    p = decode_points(xyz.astype("<f4").tobytes(), Layout(1000, 1, 12, 12000), XYZ, STAMP)
+    assert p.without_return == gone
+    assert len(p.points) == 1000 - gone
+    assert (np.linalg.norm(p.points, axis=1) < 49.9).all()
+
+
+def test_a_wall_in_front_is_not_taken_for_rays_without_a_return() -> None:
+    y, z = np.meshgrid(np.linspace(-20, 20, 60), np.linspace(-5, 5, 20))
+    wall = np.c_[np.full(y.size, 50.0), y.ravel(), z.ravel()].astype("<f4")
+    p = decode_points(wall.tobytes(), Layout(len(wall), 1, 12, 12 * len(wall)), XYZ, STAMP)
+    assert p.without_return == 0
+
+
 def test_big_endian_float64() -> None:
     fields = [
         Field("z", 16, "f8"),

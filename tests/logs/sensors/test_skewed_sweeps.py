@@ -171,6 +171,19 @@ def test_absolute_integers(name: str, stamp_at: float) -> None:
     np.testing.assert_allclose(found, EPOCH + offset - stamp, atol=unit)
 
 
+def test_points_that_are_all_far_from_their_stamp_are_named(recorder: Any) -> None:
+    """The stamps are right; times of points are 0.25 s to 0.15 s before them."""
+    path = record(recorder(), "time", lambda o, s: (o - 250_000_000) * 1e-9, "f4")
+    _, session = walls(path)
+    assert session.off_stamp_of("/points") == pytest.approx(0.15, abs=0.001)
+    [sentence] = sentences(session.problems)
+    assert "sweeps have points that were all measured 0.15 s or more before or after" in sentence
+    assert session.problems[0].assumed
+    _, session = walls(record(recorder(), "time", lambda o, s: (o - 50_000_000) * 1e-9, "f4"))
+    assert session.off_stamp_of("/points") == 0.0
+    assert session.problems == []
+
+
 @pytest.mark.parametrize(
     "order",
     [

@@ -146,6 +146,14 @@ def test_axes_of_an_optical_frame_are_found(check: Check) -> None:
     assert "optical frame" in _only(check(base_T_assumed=optical))
 
 
+def test_a_sensor_mounted_backwards_is_named_alone_and_not_as_optical(check: Check) -> None:
+    backwards = yaw_transform(np.pi, (0.0, 0.0, 0.0))
+    text = _only(check(base_T_assumed=backwards))
+    assert "its mounting is turned by" in text
+    assert "180.0" in text
+    assert "optical" not in text
+
+
 @pytest.mark.parametrize("scale", [0.5, 1.15])
 def test_another_unit_is_found(check: Check, scale: float) -> None:
     fit = check(scale=scale)
