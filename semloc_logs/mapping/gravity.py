@@ -137,6 +137,8 @@ def find_gravity(expected: Expected, normals: F64, weights: F64, evidence: UpEvi
     elif opposite > doubt:
         other = others[0]
     problems = () if other is None else (_doubt(expected, up, other),)
+    if not problems and source is UpSource.CONVENTION:
+        problems = (_unsettled(expected, up, others[int(np.argmax(scores[1:]))]),)
     if not problems and expected.imu is not None and _degrees(up, expected.imu) > TILTED:
         problems = (_tilted(expected, up),)
     return _gravity(expected, up, prior, source, lead, problems)
@@ -192,6 +194,15 @@ def _doubt(expected: Expected, up: F64, other: F64) -> Problem:
         f"the ground and the walls of the map do not settle which way is up: {_text(up)} of frame "
         f"'{expected.frame}' is taken as up {by}, but {_text(other)} fits better",
         expected.imu_topic if expected.imu is not None else "",
+    )
+
+
+def _unsettled(expected: Expected, up: F64, other: F64) -> Problem:
+    """The convention fits as well as another direction: such as floor and ceiling of a room."""
+    return _assumption(
+        expected,
+        f"the ground and the walls of the map do not settle which way is up: {_text(up)} of frame "
+        f"'{expected.frame}' is taken as up by convention, and {_text(other)} fits about as well",
     )
 
 
