@@ -34,6 +34,7 @@ from semloc_logs.mapping.fit.model import (
     LONGEST_OFFSET,
     MEDIAN_OF_6,
     PARAMETERS,
+    PRIOR,
     ROTATION,
     SCALE,
     Estimate,
@@ -81,16 +82,16 @@ NOTED, WRONG = 0.5, 1.0
 # parameters by position, and what a wrong one is called
 NAMES = {
     "clock_s": "an offset of its clock",
-    "rotation_x_rad": "a mounting turned about x",
-    "rotation_y_rad": "a mounting turned about y",
-    "rotation_z_rad": "a mounting turned about z",
-    "lever_x_m": "a mounting shifted along x",
-    "lever_y_m": "a mounting shifted along y",
-    "lever_z_m": "a mounting shifted along z",
+    "rotation_x_rad": "a turn of its mounting about x",
+    "rotation_y_rad": "a turn of its mounting about y",
+    "rotation_z_rad": "a turn of its mounting about z",
+    "lever_x_m": "a shift of its mounting along x",
+    "lever_y_m": "a shift of its mounting along y",
+    "lever_z_m": "a shift of its mounting along z",
     "scale_log": "a wrong scale",
 }
 FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
-HIDDEN = 10.0  # a fault that the drive does not show before it has this effect is hidden
+HIDDEN = 3.0  # a fault that the drive does not show before it has this effect is hidden
 OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
 OPTICAL = np.radians(120.0)  # between the axes of a body and of an optical frame
 WRONG_TURN = 0.03  # rad, within a pair: a submap of 20 m would be bent by 15 degrees
@@ -153,11 +154,23 @@ class StreamFit:
             )
         if not self.hidden or self.findings:
             return ""
-        faults = " or ".join(NAMES[name] for name in self.hidden)
+        faults = " or ".join(self._smallest(name) for name in self.hidden)
         return (
             f"{self.topic}: the drive would not show {faults}: it is too short, too straight or too"
             " steady, or the scene too plain."
         )
+
+    def _smallest(self, name: str) -> str:
+        """A hidden fault, with the size below which it is hidden where that means anything."""
+        sigma = self.parameters[name][1]
+        size = LEAST_SIGMAS * sigma
+        if sigma > 0.5 * PRIOR[list(NAMES).index(name)]:
+            return NAMES[name]
+        unit = {
+            "clock_s": f"{size:.2g} s",
+            "scale_log": f"{100 * np.expm1(size):.0f} %",
+        }.get(name, f"{np.degrees(size):.0f} degrees" if "rotation" in name else f"{size:.1f} m")
+        return f"{NAMES[name]} of less than {unit}"
 
     def to_json(self) -> dict[str, object]:
         """For session.json."""

@@ -141,6 +141,16 @@ def test_a_straight_and_steady_drive_hides_clock_and_lever_arm_and_says_so(
     assert "would not show an offset of its clock" in fit.untold()
 
 
+def test_the_smallest_fault_that_a_drive_shows_is_told(check: Check) -> None:
+    """A winding drive shows shifts of the mounting, but no smaller ones than five deviations."""
+    fit = check()
+    fit.hidden = ["lever_x_m", "clock_s"]
+    fit.parameters["lever_x_m"] = (0.0, 0.2)
+    fit.parameters["clock_s"] = (0.0, 3.0)
+    assert "would not show a shift of its mounting along x of less than 1.0 m or an" in fit.untold()
+    assert "or an offset of its clock: it is" in fit.untold()
+
+
 def test_axes_of_an_optical_frame_are_found(check: Check) -> None:
     optical = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
     assert "optical frame" in _only(check(base_T_assumed=optical))
