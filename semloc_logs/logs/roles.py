@@ -16,6 +16,7 @@ from semloc_logs.logs.role_types import (
     IMAGES,
     POSES,
     ROLES,
+    SINGLE,
     TRANSFORMS,
     Choice,
     best_stream,
@@ -224,6 +225,7 @@ class _Guess:
         """The roles, once all are assigned."""
         topics = self._topics
         pose = topics["pose"]
+        self._keep_one_robot()
         has_pose_of_fixes = any(self.kinds.get(topic) in FIXES for topic in pose)
         gnss = pose if has_pose_of_fixes else topics["gnss"]
         left_out, several = left_out_streams(self._streams, self._used, self._choice.decided)
@@ -264,6 +266,29 @@ class _Guess:
             pose_frame=self._choice.pose_frame,
         )
 
+    def _keep_one_robot(self) -> None:
+        """Leaves out sensors of other robots: in a namespace that has poses of its own."""
+        own = "".join(_namespace(topic) for topic in self._topics["pose"])
+        poses = [t for t in self.of_kind(set(POSES)) if not _NOT_A_POSE.search(t.lower())]
+        others = {_namespace(topic) for topic in poses} - {own, ""}
+        for role in ("lidar", "depth", "imu", "gnss"):
+            topics = self._topics[role]
+            foreign = [topic for topic in topics if _namespace(topic) in others]
+            of_kind = self.of_kind({self.kinds[topic] for topic in topics})
+            rest = [topic for topic in topics if topic not in foreign] or [
+                topic for topic in of_kind if role in SINGLE and _namespace(topic) == own
+            ]
+            has_own = own and any(_namespace(topic) == own for topic in rest)
+            if role in self.chosen or not foreign or not has_own:
+                continue
+            self._topics[role] = tuple(rest[:1] if role in SINGLE else rest)
+            text = (
+                f"{', '.join(foreign)}: left out, because the poses are of '{own}' and "
+                f"'{_namespace(foreign[0])}' has poses of its own, as another robot; "
+                f"--topic {role}=TOPIC uses them."
+            )
+            self.notes.append(Problem(foreign[0], ProblemKind.ROLE, text, lost=False))
+
     def _pair_problems(self) -> list[Problem]:
         if not self.is_pair_chosen or self.pair:
             return []
@@ -272,6 +297,12 @@ class _Guess:
             "--topic stereo_right=TOPIC."
         )
         return [Problem("", ProblemKind.ROLE, text, lost=False)]
+
+
+def _namespace(topic: str) -> str:
+    """The first part of a topic that has several; "" of another."""
+    parts = topic.strip("/").split("/")
+    return parts[0] if len(parts) > 1 else ""
 
 
 # -- rules: the topics of a role, given the roles before it

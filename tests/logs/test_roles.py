@@ -32,6 +32,24 @@ def roles(topics: dict[str, str], **overrides: str) -> Roles:
     return find_roles(log(topics), overrides)
 
 
+def test_sensors_of_another_robot_are_left_out_once_the_poses_are_chosen() -> None:
+    topics = {f"/robot{k}/points": CLOUD for k in (1, 2)}
+    topics |= {f"/robot{k}/odom": ODOM for k in (1, 2)}
+    topics |= {f"/robot{k}/imu": IMU for k in (1, 2)}
+    found = roles(topics, pose="/robot2/odom")
+    assert (found.lidar, found.imu) == (("/robot2/points",), "/robot2/imu")
+    assert any("/robot1/points: left out" in note for note in sentences(found.notes))
+    both = roles(topics, pose="/robot2/odom", lidar="/robot1/points,/robot2/points")
+    assert len(both.lidar) == 2
+
+
+def test_sensors_with_namespaces_of_their_own_are_of_one_car() -> None:
+    topics = {"/front/points": CLOUD, "/rear/points": CLOUD, "/front/odom": ODOM}
+    assert roles(topics).lidar == ("/front/points", "/rear/points")
+    camera = {"/car/points": CLOUD, "/car/odom": ODOM, "/zed/depth/image": IMAGE, "/zed/pose": POSE}
+    assert roles(camera).depth == ("/zed/depth/image",)
+
+
 def test_a_car_with_everything() -> None:
     found = roles(
         {
