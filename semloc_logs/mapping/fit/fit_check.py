@@ -7,7 +7,7 @@ each that explains much is named with its estimate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -91,6 +91,7 @@ NAMES = {
     "scale_log": "a wrong scale",
 }
 FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
+HARDLY_MOVE = 0.05  # times as far as the poses: registration may have found no motion at all
 HIDDEN = 3.0  # a fault that the drive does not show before it has this effect is hidden
 OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
 OPTICAL = np.radians(120.0)  # between the axes of a body and of an optical frame
@@ -329,7 +330,7 @@ def check_stream(
     numbers = choose(clouds, min(max(count, FEWEST_PAIRS), MOST_PAIRS))
     given = registered(clouds, numbers)
     if len(given.pairs) < LEAST_PAIRS:
-        return StreamFit(topic, len(given.pairs))
+        return _far_off(topic, clouds, poses_at, numbers, given)
     tried = [given]
     for start in _starts(clouds, poses_at, given):
         tried.append(registered(clouds, numbers, start))
@@ -346,6 +347,27 @@ def check_stream(
     elif not stream.findings:
         _unexplained(stream, given, poses_at, clouds)
     return stream
+
+
+def _far_off(
+    topic: str,
+    clouds: Clouds,
+    poses_at: PosesAt,
+    numbers: Sequence[tuple[int, int]],
+    given: Registered,
+) -> StreamFit:
+    """The check where by the poses hardly any clouds meet, as where these are in centimetres.
+
+    Clouds that meet well without any motion tell all the same.
+    """
+    unknown = StreamFit(topic, len(given.pairs))
+    if len(numbers) < LEAST_PAIRS:
+        return unknown
+    found = registered(clouds, numbers, lambda target, source: np.eye(4))
+    if len(found.pairs) < LEAST_PAIRS or float(np.median(found.share)) < TELLING:
+        return unknown
+    stream = _judged(topic, clouds, poses_at, found)
+    return stream if stream.findings else unknown
 
 
 def _unexplained(stream: StreamFit, found: Registered, poses_at: PosesAt, clouds: Clouds) -> None:
@@ -559,6 +581,12 @@ def _lever_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> s
 
 def _scale_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> str:
     factor = float(np.exp(parameters[SCALE]))
+    if factor < HARDLY_MOVE:
+        return (
+            f"its clouds move less than {HARDLY_MOVE:g} times as far as the poses: the positions of"
+            " the poses are in another unit or along other axes, or the clouds are not of the time"
+            " of their stamps"
+        )
     return (
         f"its clouds move {factor:.3f} \u00b1 {factor * sigma(SCALE):.3f} times as far as the"
         " poses: one of both is not in metres, or the odometry is badly scaled"

@@ -259,6 +259,21 @@ def test_poses_of_another_unit_are_found_from_any_distance(
     assert np.exp(fit.parameters["scale_log"][0]) == pytest.approx(1 / factor, rel=0.05)
 
 
+def test_clouds_that_hardly_move_beside_the_poses_are_not_only_of_another_unit(
+    check: Check, streets: SimpleNamespace
+) -> None:
+    """Positions in centimetres, which other axes or clouds that stand still look like."""
+
+    def scaled(poses: F64) -> F64:
+        out = poses.copy()
+        out[:, :3, 3] *= 100.0
+        return out
+
+    text = _only(check(_gently, seconds=12.0, as_written=scaled))
+    assert "its clouds move less than 0.05 times as far as the poses" in text
+    assert "in another unit or along other axes" in text
+
+
 def test_odometry_that_turns_too_far_all_the_time_is_named_with_its_drift(check: Check) -> None:
     def drifted(poses: F64) -> F64:
         out = poses.copy()
