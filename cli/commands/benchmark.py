@@ -101,6 +101,13 @@ def _names(_: click.Context, __: click.Parameter, value: str) -> tuple[str, ...]
     help="lidar or stereo instead of both, for paper.",
 )
 @click.option(
+    "--pairs",
+    "pair_list",
+    type=click.Path(path_type=Path),
+    help="Pairs of frames of the LOGs to be registered, a list of the LiDAR-Registration-Benchmark,"
+    " for paper: the scenario pairs.",
+)
+@click.option(
     "--scenarios",
     metavar="NAME,...",
     default="",
@@ -139,6 +146,7 @@ def command(
     systems: tuple[str, ...],
     sensors: tuple[str, ...],
     scenarios: tuple[str, ...],
+    pair_list: Path | None,
     tables_only: bool,
     output: Path | None,
     jobs: int | None,
@@ -190,6 +198,7 @@ def command(
             weights,
             tables_only,
             console.note,
+            pair_list,
         )
         _run_paper(paper, as_json=as_json)
         return 0

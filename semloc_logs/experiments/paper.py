@@ -14,6 +14,7 @@ from pathlib import Path
 
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SemlocError, SettingsError
+from semloc_logs.evaluation.truth import read_truth
 from semloc_logs.experiments.answers import Run, answer_scenario, read_answers
 from semloc_logs.experiments.figure import draw_figure
 from semloc_logs.experiments.log_views import (
@@ -24,6 +25,7 @@ from semloc_logs.experiments.log_views import (
     simulated_logs,
 )
 from semloc_logs.experiments.orderings import findings
+from semloc_logs.experiments.pair_lists import pair_scenario, read_pairs
 from semloc_logs.experiments.scenarios import (
     Extent,
     Scenario,
@@ -68,7 +70,8 @@ class PaperRequest:
     """Which experiments: ``folder`` of the run; ``systems``: names, all without; ``quick``: a small
     simulated scene; ``logs`` with their ``truth`` instead of simulated ones; ``queries``: the most
     of a scenario; ``sensors`` and ``scenarios``: names, all without; ``weights``: a folder of
-    trained networks; ``only_tables``: of the answers that are there, while others are missing.
+    trained networks; ``only_tables``: of the answers that are there, while others are missing;
+    ``pairs``: a list of frames of ``logs`` to be registered, a scenario more.
     """
 
     settings: Resolved
@@ -84,6 +87,7 @@ class PaperRequest:
     weights: Path | None = None
     only_tables: bool = False
     note: Callable[[str], None] = lambda _: None
+    pairs: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +112,8 @@ def run_paper(request: PaperRequest) -> PaperFiles:
             raise SettingsError(f"Unknown sensor '{name}': there are {', '.join(SENSORS)}.")
     if bool(request.logs) != (request.truth is not None):
         raise SettingsError("Benchmark paper takes logs and --truth FILE, or neither.")
+    if request.pairs is not None and request.truth is None:
+        raise SettingsError("A list of --pairs needs its logs and --truth FILE.")
     engine = make_engine("processes", request.jobs)
     try:
         stores, scenarios = _prepared(request, engine)
@@ -185,6 +191,11 @@ def _scenarios(request: PaperRequest, store: ViewStore, town: Town | None) -> li
         ]
     out = [heading_scenario(store, h, database, queries, extent) for h in HEADINGS_DEG]
     out += [time_scenario(store, name, one, other, extent) for name, one, other in pairs]
+    if request.pairs is not None and request.truth is not None:
+        sessions = {s.session.folder.name: s.session for s in store.sessions}
+        tracks = read_truth(request.truth, sessions)
+        frames_ns = {name: track.stamps_ns for name, track in tracks.items()}
+        out.append(pair_scenario(store, read_pairs(request.pairs), frames_ns))
     out = [scenario for scenario in out if scenario.trials]
     wanted = set(request.scenarios)
     unknown = wanted - {scenario.name for scenario in out}

@@ -7,18 +7,15 @@ the database nearest to it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from semloc_logs.errors import TruthError
 from semloc_logs.experiments.measures import Bounded, precision_recall, ratio
-from semloc_logs.numerics.transforms import inverse, rotation_angle
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -151,69 +148,3 @@ def registration_figures(error_m: F64, error_deg: F64, passage: I64) -> Registra
     mean = float(error_m[right].mean()) if right.any() else float("nan")
     turn = float(error_deg[right].mean()) if right.any() else float("nan")
     return RegistrationFigures(ratio(right, passage), mean, turn)
-
-
-# -- pair lists
-
-
-@dataclass(frozen=True, eq=False)
-class RegistrationPair:
-    """Frame ``source`` of ``sequence`` and frame ``target`` of ``target_sequence``;
-    ``target_T_source`` (4, 4) is the truth.
-    """
-
-    sequence: int
-    source: int
-    target_sequence: int
-    target: int
-    target_T_source: F64
-
-
-_HEADER = "seq i seq_db j " + " ".join(f"mot{k}" for k in range(1, 17))
-
-
-def read_pairs(path: Path) -> list[RegistrationPair]:
-    """The pairs of a list of the LiDAR-Registration-Benchmark: a line of titles, then sequence and
-    frame of both sides and 16 numbers of a matrix. TruthError for a file of another form.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()[1:]
-    except (OSError, ValueError) as problem:
-        raise TruthError(f"Pair list {path} cannot be read ({problem}).") from None
-    out = []
-    for number, line in enumerate(lines, start=2):
-        words = line.split()
-        if not words:
-            continue
-        try:
-            ids = [int(word) for word in words[:4]]
-            matrix = np.array([float(word) for word in words[4:20]]).reshape(4, 4)
-        except ValueError:
-            raise TruthError(
-                f"Pair list {path}, line {number}: give four whole numbers and a 4x4 matrix."
-            ) from None
-        out.append(RegistrationPair(ids[0], ids[1], ids[2], ids[3], matrix))
-    return out
-
-
-def write_pairs(path: Path, pairs: Iterable[RegistrationPair]) -> None:
-    """A list of the LiDAR-Registration-Benchmark."""
-    lines = [_HEADER]
-    for pair in pairs:
-        ids = f"{pair.sequence} {pair.source} {pair.target_sequence} {pair.target}"
-        lines.append(ids + "".join(f" {value:.9f}" for value in pair.target_T_source.ravel()))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def judge_pairs(
-    pairs: Sequence[RegistrationPair], found: Sequence[F64 | None]
-) -> RegistrationFigures:
-    """The figures of registrations ``target_T_source`` (4, 4), None where there is none."""
-    error_m = np.full(len(pairs), np.inf)
-    error_deg = np.full(len(pairs), np.inf)
-    for k, (pair, pose) in enumerate(zip(pairs, found, strict=True)):
-        if pose is not None:
-            error_m[k] = np.linalg.norm(pose[:3, 3] - pair.target_T_source[:3, 3])
-            turn = inverse(pair.target_T_source)[:3, :3] @ pose[:3, :3]
-            error_deg[k] = np.degrees(rotation_angle(turn))
-    return registration_figures(error_m, error_deg, np.arange(len(pairs)))

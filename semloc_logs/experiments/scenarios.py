@@ -187,7 +187,7 @@ def _trials(
     chosen: Iterable[tuple[int, int]], allowed: _Allowed, store: ViewStore
 ) -> tuple[Trial, ...]:
     """Queries whose databases agree, and the views that every one of them allows."""
-    queries = [PlannedQuery(_query_name(store, view), view, passage) for passage, view in chosen]
+    queries = [PlannedQuery(query_name(store, view), view, passage) for passage, view in chosen]
     out: list[Trial] = []
     for group in _groups(queries, allowed):
         mask = np.logical_and.reduce([allowed.views(query.view) for query in group])
@@ -236,7 +236,8 @@ def _of_one_heading(
     return out
 
 
-def _query_name(store: ViewStore, view: int) -> str:
+def query_name(store: ViewStore, view: int) -> str:
+    """The name of the query at a view: its session and stamp."""
     return f"{store.names[int(store.session_of[view])]}@{int(store.stamps_ns[view])}"
 
 
@@ -260,7 +261,7 @@ def time_scenario(
     away, _ = cKDTree(place[numbers]).query(place[views])
     near = views[away <= NEAR_M]
     planned = tuple(
-        PlannedQuery(_query_name(store, int(view)), int(view), int(position) // PER_PASSAGE)
+        PlannedQuery(query_name(store, int(view)), int(view), int(position) // PER_PASSAGE)
         for position, view in zip(
             _evenly(np.arange(len(near)), extent.most), _evenly(near, extent.most), strict=True
         )

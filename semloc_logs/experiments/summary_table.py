@@ -24,6 +24,7 @@ from semloc_logs.experiments.measures import (
     ratio,
 )
 from semloc_logs.experiments.orderings import Finding
+from semloc_logs.experiments.pair_lists import PAIRS
 from semloc_logs.experiments.protocols import (
     LOOP_M,
     Retrieval,
@@ -106,7 +107,9 @@ def figures_of(answers: Answers, scenario: Scenario, store: ViewStore) -> dict[s
     retrievals = retrievals_of(answers, scenario, store)
     loops = loop_figures(retrievals)
     pairs = pair_figures(retrievals)
-    has_loop = _has_loop(answers, scenario, store)
+    # a pair is to be registered, however far its frames are apart
+    is_pair = np.full(len(answers), scenario.name == PAIRS)
+    has_loop = is_pair | _has_loop(answers, scenario, store)
     registered = registration_figures(
         answers.first_m[has_loop], answers.errors_deg[has_loop, 0], answers.passage[has_loop]
     )

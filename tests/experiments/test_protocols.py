@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from semloc_logs.errors import TruthError
 from semloc_logs.experiments.protocols import (
-    RegistrationPair,
     Retrieval,
-    judge_pairs,
     loop_decisions,
     loop_figures,
     nearest_frames,
     pair_figures,
-    read_pairs,
     registration_figures,
-    write_pairs,
 )
-from semloc_logs.numerics.transforms import yaw_transform
 
 NOTHING = -np.inf
 
@@ -75,43 +67,3 @@ def test_a_registration_succeeds_within_two_metres_and_five_degrees() -> None:
     figures = registration_figures(error_m, error_deg, np.arange(5))
     assert figures.success.value == pytest.approx(0.4)
     assert (figures.translation_m, figures.rotation_deg) == (1.0, 2.0)
-
-
-def test_a_pair_list_of_the_benchmark_is_read(tmp_path: Path) -> None:
-    # as the benchmark writes it: 15 titles for 16 numbers, and an overlap that not all lists have
-    path = tmp_path / "test_0_10.txt"
-    titles = "seq i seq_db j " + " ".join(f"mot{k}" for k in range(1, 16))
-    matrix = "0.0 -1.0 0.0 3.0 1.0 0.0 0.0 4.0 0.0 0.0 1.0 0.5 0.0 0.0 0.0 1.0"
-    path.write_text(f"{titles}\n8 10 8 1000 {matrix}\n\n8 11 8 1001 {matrix} 0.73\n")
-    pairs = read_pairs(path)
-    assert [(p.sequence, p.source, p.target_sequence, p.target) for p in pairs] == [
-        (8, 10, 8, 1000),
-        (8, 11, 8, 1001),
-    ]
-    assert np.allclose(pairs[0].target_T_source, yaw_transform(np.pi / 2, (3.0, 4.0, 0.5)))
-
-
-def test_pairs_are_written_and_judged(tmp_path: Path) -> None:
-    truth = yaw_transform(0.3, (5.0, 1.0, 0.0))
-    pairs = [RegistrationPair(0, k, 0, 500 + k, truth) for k in range(4)]
-    write_pairs(tmp_path / "pairs.txt", pairs)
-    again = read_pairs(tmp_path / "pairs.txt")
-    assert [p.source for p in again] == [0, 1, 2, 3]
-    found = [
-        yaw_transform(0.3, (5.0, 2.0, 0.0)),  # 1 m off
-        yaw_transform(0.3 + np.radians(6), (5.0, 1.0, 0.0)),  # 6 degrees off
-        yaw_transform(0.3, (7.5, 1.0, 0.0)),  # 2.5 m off
-        None,
-    ]
-    figures = judge_pairs(again, found)
-    assert figures.success.value == 0.25
-    assert figures.translation_m == pytest.approx(1.0, abs=1e-6)
-
-
-def test_a_list_of_another_form_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "list.txt"
-    path.write_text("titles\n8 10 8\n")
-    with pytest.raises(TruthError, match="line 2: give four whole numbers and a 4x4 matrix"):
-        read_pairs(path)
-    with pytest.raises(TruthError, match="cannot be read"):
-        read_pairs(tmp_path / "absent.txt")
