@@ -170,8 +170,9 @@ class Workspace:
     ``settings`` is a :class:`Settings`, a YAML file, or a mapping of key paths such as
     ``{"fusion.voxel_size": 0.05}``. ``engine`` is ``"serial"``, ``"processes"``, ``"dask"`` or an
     engine (:func:`semloc_logs.engines.make_engine`), with ``jobs`` workers (default: the cores this
-    process may use). ``progress`` is called with a :class:`semloc_logs.progress.Progress` now and
-    then.
+    process may use). Scripts that use processes keep their calls under ``if __name__ ==
+    "__main__":``, since workers import them again. ``progress`` is called with a
+    :class:`semloc_logs.progress.Progress` now and then.
 
     Every stage skips work that is up to date, unless ``overwrite``. Errors are of the type
     :class:`semloc_logs.errors.SemlocError`, one sentence each.
@@ -336,7 +337,7 @@ class Workspace:
 
 
 def open_log(path: PathLike) -> AbstractContextManager[Log]:
-    """An MCAP file, ROS 1 bag, ROS 2 bag folder or .db3 file, to read in a ``with`` block.
+    """A log, to read in a ``with`` block: MCAP, ROS 1 or ROS 2 bag, .db3 file, map of points.
 
     ``log.frames()`` gives typed frames (:mod:`semloc_logs.frames`) in log-time order,
     ``log.streams`` the topics. Raises LogError for other files.

@@ -120,7 +120,10 @@ def show_evaluation(result: Evaluation) -> None:
         console.table("Pairs of sessions", columns, drawn_pairs[:SHOWN])
         if len(drawn_pairs) > SHOWN:
             console.result(f"... and {len(drawn_pairs) - SHOWN} more pairs.")
-    console.result(f"{result.closures} closures: {result.correct} correct, {result.false} false")
+    unjudged = f", {result.unjudged} unjudged" if result.unjudged else ""
+    console.result(
+        f"{result.closures} closures: {result.correct} correct, {result.false} false{unjudged}"
+    )
     if result.median_error_m is not None:
         console.result(
             f"Median error {result.median_error_m:.3f} m, {result.median_error_deg:.2f} deg"

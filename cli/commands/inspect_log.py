@@ -52,10 +52,10 @@ def command(
     """What a log holds, whether it can be used, and with which command.
 
     Streams with their roles and rates, sensors, poses, frames, problems and their remedies, and a
-    verdict. LOG is an .mcap, .bag or .db3 file, a ROS 2 bag folder or its metadata.yaml. --json
-    prints an array with one object for each LOG. Settings of reading, such as logs.time_offset,
-    hold as for 'semloc fuse'. Exit code 3: a part of a log cannot be read, or an assumption was
-    needed.
+    verdict. LOG is an .mcap, .bag or .db3 file, a ROS 2 bag folder or its metadata.yaml, or a map
+    of points (.pcd, .ply, .las, .laz). --json prints an array with one object for each LOG.
+    Settings of reading, such as logs.time_offset, hold as for 'semloc fuse'. Exit code 3: a part of
+    a log cannot be read, or an assumption was needed.
 
     \b
     Example:  semloc inspect drive.mcap

@@ -141,8 +141,12 @@ def command(
     """Drive logs through a procedural town, with ground truth for 'semloc evaluate'. Between
     drives, cars and people change.
 
+    Short drives may never meet: drives along a --trajectory share its road. --length is of drives
+    without one; --from and --to cut a trajectory.
+
     \b
     Example:  semloc simulate -o town --sessions 3 --length 800 --seed 7
+              semloc simulate -o road --sessions 2 --trajectory 05.txt --to 200 --there-and-back
     """
     from semloc_logs.simulation.drive_plan import Route, Town
     from semloc_logs.simulation.meshes.world import require_ray_caster

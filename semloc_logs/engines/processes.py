@@ -81,8 +81,9 @@ class Processes:
             self._end_events()
             self._pool = None
             raise TemporaryError(
-                "A worker process ended abruptly, most likely for lack of memory:"
-                " run again with fewer --jobs; finished work is kept."
+                "A worker process ended abruptly: for lack of memory, in which case fewer --jobs"
+                " help, or in a script whose calls are not under 'if __name__ == \"__main__\":'."
+                " Finished work is kept."
             ) from None
 
     def close(self) -> None:

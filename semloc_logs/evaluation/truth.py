@@ -446,7 +446,8 @@ def read_truth(path: Path, sessions: Mapping[str, SessionMap]) -> dict[str, True
     if not tracks:
         raise TruthError(
             f"Truth file {path} knows {', '.join(content) or 'no log'}, "
-            f"but the workspace has the sessions {', '.join(sessions) or 'none'}."
+            f"but the workspace has the sessions {', '.join(sessions) or 'none'}: name its keys "
+            "like the sessions."
         )
     return tracks
 

@@ -153,8 +153,8 @@ def choose(work: Workspace, wanted: Wanted) -> list[Choice]:
     if not chosen:
         whose = f" of session '{wanted.session}'" if wanted.session else ""
         raise WorkspaceError(
-            f"{work.path} has neither a closure nor a rejected hypothesis{whose}: name another "
-            "session, or close again."
+            f"{work.path} has neither a closure nor a rejected hypothesis{whose}: the "
+            "sessions share no place that was found."
         )
     return chosen
 

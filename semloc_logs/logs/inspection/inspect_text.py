@@ -11,7 +11,7 @@ from semloc_logs.logs.inspection import units
 from semloc_logs.logs.messages.stamps import utc
 
 WIDTH = 80
-_FORMATS = {"mcap": "MCAP", "rosbag1": "ROS 1 bag", "rosbag2": "ROS 2 bag"}
+_FORMATS = {"mcap": "MCAP", "rosbag1": "ROS 1 bag", "rosbag2": "ROS 2 bag", "map": "map of points"}
 _ENCODINGS = {"ros1": "ROS 1", "ros2": "ROS 2", "protobuf": "protobuf", "json": "JSON"}
 _LABELS = {
     "cloud": "recorded with the points",
