@@ -16,7 +16,7 @@ from semloc_logs.errors import WorkspaceError
 from semloc_logs.settings import Training
 from semloc_logs.subvolumes.network import Network
 from semloc_logs.tables.atomic_files import replacing_file
-from semloc_logs.training.schedule import plateau_end, steps_of
+from semloc_logs.training.schedule import open_ended
 
 
 def save_checkpoint(
@@ -93,12 +93,12 @@ def steps_done(path: Path) -> int:
 def _goes_on(before: dict[str, Any], now: dict[str, Any], step: int) -> bool:
     """Whether the training of the settings ``now`` would have come by the same ``step``.
 
-    Before the rate falls it does not matter how many samples are to be seen in all.
+    While the rate stays it does not matter how many samples are to be seen in all.
     """
     lengths = ("samples", "scenes")
     if {k: v for k, v in before.items() if k not in lengths} != {
         k: v for k, v in now.items() if k not in lengths
     }:
         return False
-    steps = min(steps_of(Training.model_validate(settings)) for settings in (before, now))
-    return before["samples"] == now["samples"] or step <= plateau_end(steps)
+    latest = min(open_ended(Training.model_validate(settings)) for settings in (before, now))
+    return before["samples"] == now["samples"] or step <= latest

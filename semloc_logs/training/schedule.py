@@ -48,6 +48,12 @@ def plateau_end(steps: int) -> int:
     return steps - int(DECAY * steps)
 
 
+def open_ended(training: Training) -> int:
+    """Steps over which a training does not depend on its length: the paper's rate never falls."""
+    steps = steps_of(training)
+    return steps if training.method == "paper" else plateau_end(steps)
+
+
 def scene_window(samples: int, scenes: int, method: str = "ours") -> range:
     """Numbers of the scenes in use when ``samples`` samples have been seen, of ``scenes`` there
     are.

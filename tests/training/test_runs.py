@@ -19,6 +19,7 @@ from semloc_logs.settings import Resolved, load
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
 from semloc_logs.training.batches import _drawn
+from semloc_logs.training.checkpoints import _goes_on
 from semloc_logs.training.network_training import RECIPES, TrainingRun, train
 from semloc_logs.training.own_sessions import session_frames, stretch_tasks
 from semloc_logs.training.pairs import read_shard, write_shard
@@ -320,6 +321,22 @@ def test_the_rate_of_the_paper_stays_and_nothing_is_mirrored(shards: list[Path])
     }
     assert any(mirrored["ours"])
     assert not any(mirrored["paper"])
+
+
+def test_only_while_the_rate_stays_may_the_number_of_samples_change() -> None:
+    ours = _settings(samples=1800, batch=2).training  # 100 steps, the last 25 of a falling rate
+    longer = ours.model_copy(update={"samples": 3600})
+    paper = ours.model_copy(update={"method": "paper", "samples": 200})  # 100 steps
+    shorter = paper.model_copy(update={"samples": 180})  # 90 steps
+    for before, now, step, goes_on in (
+        (ours, longer, 75, True),
+        (ours, longer, 76, False),
+        (paper, shorter, 90, True),
+        (paper, shorter, 91, False),
+        (paper, ours, 10, False),
+    ):
+        contents = (before.model_dump(mode="json"), now.model_dump(mode="json"))
+        assert _goes_on(*contents, step) is goes_on
 
 
 def test_a_checkpoint_of_before_a_setting_was_made_goes_on(
