@@ -11,6 +11,8 @@ from typing import NamedTuple, Protocol
 from semloc_logs.frames import Frame
 from semloc_logs.logs.problems import Problem
 
+MAP_FORMAT = "map"  # the format of a map of points
+
 
 @dataclass(frozen=True, slots=True)
 class Stream:
@@ -109,7 +111,7 @@ class Log(Protocol):
 
     @property
     def format(self) -> str:
-        """``mcap``, ``rosbag1`` or ``rosbag2``."""
+        """``mcap``, ``rosbag1``, ``rosbag2`` or, of a map of points, ``map``."""
 
     @property
     def encoding(self) -> str:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.labels.space import KNOWS_CLASSES
+from semloc_logs.logs.log import MAP_FORMAT
 from semloc_logs.tables.table import read_json, read_table
 from semloc_logs.voxels.store import Keyframe, poses_of, read_keyframe
 from semloc_logs.workspace import SessionFolder
@@ -118,7 +119,7 @@ class SessionMap:
     @property
     def is_map(self) -> bool:
         """Whether it was made from maps of points alone, which nobody drove through."""
-        return {log["format"] for log in self.json["logs"]} == {"map"}
+        return {log["format"] for log in self.json["logs"]} == {MAP_FORMAT}
 
     @property
     def posed(self) -> bool:

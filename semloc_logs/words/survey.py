@@ -90,11 +90,14 @@ class Survey:
         self._headings = headings
         self._cell = cell
         numbers = {name: number for number, name in enumerate(self.names)}
-        # the number of each place's session, -1 for none
-        self._segments = [
-            (s, np.array([numbers[n] if n in served else -1 for n, _ in s.places], np.int64))
-            for s, served in segments
-        ]
+        self._lists: list[tuple[_Postings, I64]] = []
+        for segment, served in segments:
+            # the number of each place's session, -1 for none
+            session = np.array(
+                [numbers[n] if n in served else -1 for n, _ in segment.places], np.int64
+            )
+            begin = np.where(session >= 0, ALL, NONE)
+            self._lists.append((_postings(segment, begin, np.zeros(0, bool)), session))
 
     def votes(self, turned: Sequence[Sequence[LookUp]], centre: F64) -> Mapping[str, Votes]:
         """The votes in each session.
@@ -105,9 +108,7 @@ class Survey:
         weights = np.zeros((2, len(self.names)), np.int64)
         if len(centre):
             words = _query_words(turned, centre)
-            for segment, session in self._segments:
-                served = np.where(session >= 0, ALL, NONE)
-                postings = _postings(segment, served, np.zeros(0, bool))
+            for postings, session in self._lists:
                 _add_votes(words, postings, session, weights, self._headings, self._cell)
         return dict(zip(self.names, _of_sessions(weights), strict=True))
 

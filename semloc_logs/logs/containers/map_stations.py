@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from semloc_logs.errors import LogError
-from semloc_logs.numerics.transforms import interpolate
+from semloc_logs.numerics.transforms import interpolate, yaw_transform
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -73,14 +73,10 @@ def tour(xyz: F64) -> Stations:
         )
     stations = _in_turn(_spaced(ground))
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(stations, axis=0), axis=1).cumsum()])
-    poses = np.tile(np.eye(4), (len(stations), 1, 1))
-    poses[:, :3, 3] = stations
     # the base looks along the tour
     step = np.gradient(stations[:, :2], axis=0) if len(stations) > 1 else np.ones((1, 2))
     yaw = np.arctan2(step[:, 1], step[:, 0])
-    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(yaw)
-    poses[:, 1, 0] = np.sin(yaw)
-    poses[:, 0, 1] = -np.sin(yaw)
+    poses = np.array([yaw_transform(*at) for at in zip(yaw, stations, strict=True)])
     return Stations(FIRST_NS + (way / SPEED * 1e9).astype(np.int64), poses, is_tour=True)
 
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from semloc_logs.errors import LogError
 from semloc_logs.logs.containers import rosbag1
-from semloc_logs.logs.containers.map_stations import Stations
 from semloc_logs.logs.containers.mcap import McapLog
 from semloc_logs.logs.containers.mcap_records import MAGIC
 from semloc_logs.logs.containers.memory import DEFAULT, Memory
-from semloc_logs.logs.containers.point_files import is_point_file
-from semloc_logs.logs.containers.point_map import PointMapLog
 from semloc_logs.logs.containers.rosbag1 import Rosbag1Log
 from semloc_logs.logs.containers.rosbag2 import Rosbag2Log
 from semloc_logs.logs.containers.sqlite import SqliteLog
 from semloc_logs.logs.log import Log
 from semloc_logs.logs.remote import log_path
+
+if TYPE_CHECKING:
+    from semloc_logs.logs.containers.map_stations import Stations
 
 _SQLITE = b"SQLite format 3\0"
 
@@ -55,6 +56,10 @@ def open_log(
         return Rosbag1Log(path, limit)
     if head.startswith(_SQLITE):
         return SqliteLog(path, limit)
+    # compiled code, which other logs need not wait for
+    from semloc_logs.logs.containers.point_files import is_point_file
+    from semloc_logs.logs.containers.point_map import PointMapLog
+
     if is_point_file(head):
         return PointMapLog(path, limit, along)
     raise LogError(f"{path} {_description(head)}")

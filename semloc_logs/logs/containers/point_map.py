@@ -20,12 +20,11 @@ from semloc_logs.logs.containers.base import BaseLog
 from semloc_logs.logs.containers.map_stations import Stations, Views, tour
 from semloc_logs.logs.containers.memory import Memory
 from semloc_logs.logs.containers.point_files import read_points
-from semloc_logs.logs.log import Definition, Message, Section, Stream
+from semloc_logs.logs.log import MAP_FORMAT, Definition, Message, Section, Stream
 from semloc_logs.logs.problems import ProblemKind
 from semloc_logs.numerics.transforms import apply, inverse, translation_quaternion
 
 F64 = NDArray[np.float64]
-MAP_FORMAT = "map"
 POINTS = "/stations/points"
 ODOMETRY = "/stations/odometry"
 LABEL_SPACE = "/stations/label_space"

@@ -8,10 +8,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from semloc_logs.logs.inspection import units
+from semloc_logs.logs.log import MAP_FORMAT
 from semloc_logs.logs.messages.stamps import utc
 
 WIDTH = 80
-_FORMATS = {"mcap": "MCAP", "rosbag1": "ROS 1 bag", "rosbag2": "ROS 2 bag", "map": "map of points"}
+_FORMATS = {
+    "mcap": "MCAP",
+    "rosbag1": "ROS 1 bag",
+    "rosbag2": "ROS 2 bag",
+    MAP_FORMAT: "map of points",
+}
 _ENCODINGS = {"ros1": "ROS 1", "ros2": "ROS 2", "protobuf": "protobuf", "json": "JSON"}
 _LABELS = {
     "cloud": "recorded with the points",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,7 +22,7 @@ from semloc_logs.logs.messages.headers import (
     transform,
     vector,
 )
-from semloc_logs.logs.messages.point_fields import Field, Layout, decode_points, is_noise
+from semloc_logs.logs.messages.point_fields import Field, Layout, Points, decode_points, is_noise
 from semloc_logs.logs.messages.point_times import LONGEST_SWEEP_NS
 from semloc_logs.numerics import transforms
 
@@ -35,16 +36,7 @@ def _point_cloud2(header: Header, m: Any) -> Iterator[Frame]:
     fields = _fields(((f.name, f.offset, f.datatype) for f in m.fields), _POINT_KINDS)
     layout = Layout(m.width, m.height, m.point_step, m.row_step, bool(m.is_bigendian))
     p = decode_points(binary(m.data), layout, fields, header.stamp_ns)
-    yield LidarFrame(
-        header,
-        p.points,
-        p.label,
-        p.offset_ns,
-        p.ring,
-        lost=p.not_finite if m.is_dense else 0,
-        remark=p.remark,
-        without_return=p.without_return,
-    )
+    yield replace(_sweep(header, p), lost=p.not_finite if m.is_dense else 0)
 
 
 def _foxglove_cloud(header: Header, m: Any) -> Iterator[Frame]:
@@ -61,16 +53,7 @@ def _foxglove_cloud(header: Header, m: Any) -> Iterator[Frame]:
     if not np.array_equal(frame_T_cloud, np.eye(4)):
         points = transforms.apply(frame_T_cloud, points).astype(np.float32)
         origin = frame_T_cloud[:3, 3].astype(np.float32)
-    yield LidarFrame(
-        header,
-        points,
-        p.label,
-        p.offset_ns,
-        p.ring,
-        remark=p.remark,
-        origin=origin,
-        without_return=p.without_return,
-    )
+    yield replace(_sweep(header, p), points=points, origin=origin)
 
 
 def _fields(recorded: Iterable[tuple[str, int, Any]], kinds: Mapping[int, str]) -> list[Field]:
@@ -133,7 +116,11 @@ def _old_cloud(header: Header, m: Any) -> Iterator[Frame]:
     p = decode_points(
         rows.tobytes(), Layout(len(rows), 1, 4 * len(fields), 0), fields, header.stamp_ns
     )
-    yield LidarFrame(
+    yield _sweep(header, p)
+
+
+def _sweep(header: Header, p: Points) -> LidarFrame:
+    return LidarFrame(
         header,
         p.points,
         p.label,

@@ -13,16 +13,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.errors import LogError
 from semloc_logs.frames import F64, DepthFrame, Frame, ImageFrame, LidarFrame
-from semloc_logs.logs.containers.map_stations import FIRST_NS, Stations
 from semloc_logs.logs.poses.track import is_time
 from semloc_logs.logs.problems import Problem
 from semloc_logs.numerics import transforms
+
+if TYPE_CHECKING:
+    from semloc_logs.logs.containers.map_stations import Stations
 
 TUM = 8  # numbers a line
 KITTI = 12
@@ -110,6 +113,9 @@ def stations_along(source: TrajectoryFile) -> Stations:
     With stamps they are ``STATION_STEP`` apart, else one a pose, at ``POSE_NS`` from each other.
     LogError as in :func:`read_trajectory`.
     """
+    # compiled code, which other logs need not wait for
+    from semloc_logs.logs.containers.map_stations import FIRST_NS, Stations
+
     trajectory = read_trajectory(source)
     poses = trajectory.poses
     if trajectory.stamps_ns is None:

@@ -1,4 +1,4 @@
-"""Stations in a map of points, and what is seen there."""
+"""Stations in a map of points, and the points that are seen there."""
 
 from __future__ import annotations
 
