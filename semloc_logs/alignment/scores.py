@@ -9,12 +9,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.mask_grid import FREE_BIT, MaskGrid, look_up
+from semloc_logs.alignment.mask_grid import FREE_BIT, Arrays, MaskGrid
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.target_map import Target
-from semloc_logs.numerics.transforms import apply, inverse
+from semloc_logs.numerics.transforms import inverse
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -122,9 +123,33 @@ def _weighted(worse: float, better: float) -> float:
 
 def _scores(structure: tuple[F64, U8], grid: MaskGrid, grid_T_structure: F64) -> Scores:
     centres, bits = structure
-    if not len(centres):
-        return Scores(0, 0, 0, 0)
-    mask = look_up(grid, apply(grid_T_structure, centres))
-    aligned = (mask & bits) != 0
-    free = (mask & FREE_BIT) != 0
-    return Scores(len(mask), int((mask != 0).sum()), int(aligned.sum()), int(free.sum()))
+    return Scores(len(bits), *_count(grid.arrays, centres, bits, grid_T_structure))
+
+
+@njit(cache=True, nogil=True)
+def _count(grid: Arrays, centres: F64, bits: U8, grid_T_structure: F64) -> tuple[int, int, int]:
+    """Of the voxels in a grid the observed ones, the aligned ones, and those in free space.
+
+    In one pass: the structure of a submap is large, and most of it lies outside a query's grid.
+    """
+    mask, corner, cell = grid
+    nx, ny, nz = mask.shape
+    R = grid_T_structure[:3, :3] / cell
+    t = (grid_T_structure[:3, 3] - corner) / cell
+    observed = aligned = free = 0
+    for n in range(len(bits)):
+        x = np.floor(
+            R[0, 0] * centres[n, 0] + R[0, 1] * centres[n, 1] + R[0, 2] * centres[n, 2] + t[0]
+        )
+        y = np.floor(
+            R[1, 0] * centres[n, 0] + R[1, 1] * centres[n, 1] + R[1, 2] * centres[n, 2] + t[1]
+        )
+        z = np.floor(
+            R[2, 0] * centres[n, 0] + R[2, 1] * centres[n, 1] + R[2, 2] * centres[n, 2] + t[2]
+        )
+        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+            found = mask[int(x), int(y), int(z)]
+            observed += found != 0
+            aligned += (found & bits[n]) != 0
+            free += (found & FREE_BIT) != 0
+    return observed, aligned, free
