@@ -3,30 +3,30 @@ seen.
 
     python benchmarks/calibrate.py collect DIR [--drives FOLDER] [--only TOWN]... [--jobs N]
     python benchmarks/calibrate.py fit DIR [--install]
+    python benchmarks/calibrate.py report DIR...
 
 Collecting simulates, queries and judges, and resumes; fitting takes seconds. Collecting writes
-DIR/TOWN/judged.parquet, all alignments of a town with their features and errors; fitting reads
-these alone. It writes DIR/calibration.json and DIR/reliability.png; --install also replaces the
-calibration of the package.
+DIR/TOWN/judged.parquet, all alignments of a town with their features and errors; the others read
+these alone. Fitting writes DIR/calibration.json, and the report of models that had not seen a town:
+DIR/acceptance.md, DIR/acceptance.json and DIR/reliability.png. --install also replaces the
+calibration of the package. The report of the package's own calibration goes to the terminal.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from towns import Place, Town, collect
 
 import semloc_logs.closures.acceptance
+from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.engines.processes import single_threaded
-from semloc_logs.evaluation.calibration_fit import (
-    calibration_json,
-    fit,
-    read_judged,
-    recall_at,
-    reliability,
-)
+from semloc_logs.evaluation.acceptance_report import reliability, report_of
+from semloc_logs.evaluation.calibration_fit import calibration_json, decided_by, fit
+from semloc_logs.evaluation.judged_alignments import Judged, read_judged
 from semloc_logs.pictures.reliability_diagram import draw_reliability
 
 LATER = ("summer", "autumn", "snow")
@@ -121,28 +121,41 @@ def collect_towns(args: argparse.Namespace) -> None:
     )
 
 
-def report(args: argparse.Namespace) -> None:
-    """Fit the models; print and draw their results in towns that they have not seen."""
-    judged = read_judged(sorted(args.dir.glob("*/judged.parquet")))
+def fit_models(args: argparse.Namespace) -> None:
+    """Fit the models; report and draw their results in towns that they have not seen."""
+    judged = judged_towns([args.dir])
     fitted = fit(judged)
     content = json.dumps(calibration_json(judged, fitted), indent=1) + "\n"
     (args.dir / "calibration.json").write_text(content)
-    print(content)
-    ordinary = ~judged.copies
-    parts = {
-        "alone, outside cities of copies": (judged.part(ordinary), fitted.alone[ordinary]),
-        "with neighbours": (judged, fitted.probability),
+
+    report = report_of(judged, fitted.probability)
+    (args.dir / "acceptance.md").write_text(report.markdown())
+    (args.dir / "acceptance.json").write_text(json.dumps(report.to_json(), indent=1) + "\n")
+    print(report.markdown())
+    ordinary = ~judged.copies & judged.clear
+    curves = {
+        "alone, outside cities of copies": reliability(
+            fitted.alone[ordinary], judged.right[ordinary]
+        ),
+        "with neighbours": reliability(
+            fitted.probability[judged.clear], judged.right[judged.clear]
+        ),
     }
-    curves = {}
-    for name, (part, p) in parts.items():
-        curves[name] = reliability(p[part.clear], part.right[part.clear])
-        print(f"{name}, of towns not seen:")
-        for line in (*curves[name], *recall_at(part, p)):
-            print("  " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
     draw_reliability(args.dir / "reliability.png", curves)
     if args.install:
         package = Path(semloc_logs.closures.acceptance.__file__).parent
         (package / "calibration.json").write_text(content)
+
+
+def report(args: argparse.Namespace) -> None:
+    """Print what the calibration of the package does in the towns of some folders."""
+    judged = judged_towns(args.dirs)
+    print(report_of(judged, decided_by(shipped(), judged)).markdown())
+
+
+def judged_towns(folders: Sequence[Path]) -> Judged:
+    """The judged alignments of all towns of some folders."""
+    return read_judged(sorted(p for folder in folders for p in folder.glob("*/judged.parquet")))
 
 
 def main() -> None:
@@ -164,7 +177,10 @@ def main() -> None:
     second = commands.add_parser("fit")
     second.add_argument("dir", type=Path)
     second.add_argument("--install", action="store_true")
-    second.set_defaults(run=report)
+    second.set_defaults(run=fit_models)
+    third = commands.add_parser("report")
+    third.add_argument("dirs", type=Path, nargs="+", metavar="DIR")
+    third.set_defaults(run=report)
     args = parser.parse_args()
     args.run(args)
 

@@ -28,7 +28,9 @@ from semloc_logs.closures.acceptance.calibration import shipped
 from semloc_logs.closures.closure_tables import read_closures
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.engines.processes import single_threaded
-from semloc_logs.evaluation.calibration_fit import SURE, answers, decided_by, read_judged, recall_at
+from semloc_logs.evaluation.acceptance_report import SURE, answers, report_of
+from semloc_logs.evaluation.calibration_fit import decided_by
+from semloc_logs.evaluation.judged_alignments import read_judged
 from semloc_logs.evaluation.truth import TrueTrack, judge_closure, read_truth
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse
@@ -102,15 +104,7 @@ def search_towns(args: argparse.Namespace) -> None:
     judged = read_judged(paths)
     p = decided_by(shipped(), judged)
     print(f"{sum(read_metadata(path)['queries'] for path in paths)} queries in {len(paths)} towns")
-    cameras = np.array([town.startswith("camera") for town in judged.town], bool)
-    kinds = {
-        "ordinary towns": ~judged.copies & ~cameras,
-        "cities of copies": judged.copies,
-        "towns of cameras": cameras,
-    }
-    for name, rows in ((n, r) for n, r in kinds.items() if r.any()):
-        for line in recall_at(judged.part(rows), p[rows]):
-            print(f"  {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in line.items()))
+    print(report_of(judged, p).markdown())
     accepted = (k for k in answers(judged, p) if p[k] >= SURE)
     for k in (k for k in accepted if not judged.right[k]):
         placed = judged.placed

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from semloc_logs.engines import make_engine
-from semloc_logs.evaluation.calibration_fit import judge_town, read_judged
+from semloc_logs.evaluation.judged_alignments import judge_town, read_judged
 from semloc_logs.settings import load
 from semloc_logs.simulation import drive_plan
 from semloc_logs.simulation.sensors.sensor import Sensor
@@ -151,15 +151,11 @@ class Place:
         return logs
 
     def query(self, town: Town) -> Workspace:
-        """The town's workspace with the alignments of every session with every session; all are
-        kept as rejected, with their features.
-        """
+        """The town's workspace with the alignments of every session with every session."""
         work = Workspace(self.folder / town.name / "work")
         engine = make_engine("serial")
         logs = self.simulate(town)
-        settings = load(
-            assignments={"labels.source": town.labels, "closures.min_probability": "1"}
-        ).resolved()
+        settings = load(assignments={"labels.source": town.labels}).resolved()
         fuse([SessionInput(name, (log,)) for name, log in logs.items()], work, settings, engine)
         describe(work, [], settings, engine)
         close(work, settings, engine)

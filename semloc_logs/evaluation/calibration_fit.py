@@ -1,21 +1,17 @@
 """How probable is it that an alignment is right? Learnt from queries in simulated towns, of which
 many have never been visited.
 
-Every town is judged against its truth into a table of its own; the two logistic models of the
-acceptance are fitted on all of them. The report on each town is by models that never saw
-it.
+The two logistic models of the acceptance are fitted on the judged alignments of all towns. What is
+reported on each town is by models that never saw it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from semloc_logs.closures.acceptance.calibration import (
@@ -32,14 +28,10 @@ from semloc_logs.closures.acceptance.calibration import (
     probability_of,
 )
 from semloc_logs.closures.acceptance.consistency import count_votes, place_odds
-from semloc_logs.closures.acceptance.placements import Placed, contradicts_odometry, pairs_of
-from semloc_logs.closures.closure import FEATURES, Agreement, Features
-from semloc_logs.closures.closure_tables import keyframe_at
-from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, judge_closure, read_truth
-from semloc_logs.mapping.session_map import SessionMap
-from semloc_logs.tables.table import read_metadata, read_table, write_table
-from semloc_logs.voxels.store import poses_of
-from semloc_logs.workspace import Workspace
+from semloc_logs.closures.acceptance.placements import contradicts_odometry, pairs_of
+from semloc_logs.closures.closure import Agreement
+from semloc_logs.evaluation.acceptance_report import SURE
+from semloc_logs.evaluation.judged_alignments import Judged
 
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -47,154 +39,12 @@ Bools = NDArray[np.bool_]
 # the sign with which evidence may count
 SIGNS = (-1, 1, -1)  # of ``EVIDENCE``
 VOTE_SIGNS = (1, -1, 1, -1)  # of ``VOTES``
-COPIES = "repeating"  # in the names of towns of copied blocks
 # weight of far opposing votes beside agreeing ones: copies of a street agree with each other as
 # right alignments do, and where two groups contradict each other one of them is wrong
 AGAINST = 2.0
-SURE = 0.99  # what would be accepted
 # how much streets look like others by chance, in however few towns it was not seen
 BY_CHANCE = 0.01
 EXTREMES = 0.05  # of a town's lookalikes count as outliers
-EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 1.0)
-THRESHOLDS = (0.5, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Judged:
-    """Alignments (n) of several towns: ``features`` (n,), where they lie (the caller sets the
-    probabilities there), whether they are ``right`` (n,), and their errors (n,) in metres and
-    degrees.
-    """
-
-    town: NDArray[np.object_]
-    features: Features[F64]
-    placed: Placed
-    right: Bools
-    error_m: F64
-    error_deg: F64
-    voxel_size: float
-
-    @property
-    def clear(self) -> Bools:
-        """Right, or wrong by three times the bounds (n,): cases in between teach neither side."""
-        return np.asarray(
-            self.right | (self.error_m > 3 * CORRECT_M) | (self.error_deg > 3 * CORRECT_DEG)
-        )
-
-    @property
-    def copies(self) -> Bools:
-        """Which lie in towns of copied blocks (n,)."""
-        return np.array([COPIES in town for town in self.town], bool)
-
-    def __len__(self) -> int:
-        return len(self.town)
-
-    def part(self, rows: Bools) -> Judged:
-        """Some of them."""
-        columns = {n: getattr(self, n)[rows] for n in ("town", "right", "error_m", "error_deg")}
-        return replace(
-            self, features=self.features.part(rows), placed=self.placed.part(rows), **columns
-        )
-
-
-def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
-    """All alignments of a workspace whose closures were made with ``closures.min_probability=1``,
-    judged, as the table ``output``.
-
-    Columns: as in rejected.parquet, without the neighbours, and town, query, road, target_road,
-    own_* and at_* (the query in its own map by odometry, in the target's by alignment), error_m,
-    error_deg, right.
-    """
-    maps = {f.name: SessionMap(f) for f in work.sessions()}
-    tracks = read_truth(truth, maps)
-    table = read_table(work.rejected)
-    rows = table.to_pylist()
-    judged = [judge_closure(row, tracks) for row in rows]
-    ends = [
-        (q, keyframe_at(q, row["query_stamp_ns"]), t, keyframe_at(t, row["target_stamp_ns"]))
-        for row, q, t in (
-            (row, maps[row["query_session"]], maps[row["target_session"]]) for row in rows
-        )
-    ]
-    found = poses_of(table)
-    own = np.array([q.map_T_base[k] for q, k, _, _ in ends]).reshape(-1, 4, 4)
-    at = np.array(
-        [t.map_T_base[k] @ T for (_, _, t, k), T in zip(ends, found, strict=True)]
-    ).reshape(-1, 4, 4)
-    columns: dict[str, Any] = {
-        "town": [town] * len(rows),
-        "query": [k for _, k, _, _ in ends],
-        "road": [float(q.distance[k]) for q, k, _, _ in ends],
-        "target_road": [float(t.distance[k]) for _, _, t, k in ends],
-        "error_m": [j.error_m for j in judged],
-        "error_deg": [j.error_deg for j in judged],
-        "right": [j.correct for j in judged],
-    }
-    columns |= {f"own_{i}{j}": own[:, i, j] for i in range(3) for j in range(4)} | {
-        f"at_{i}{j}": at[:, i, j] for i in range(3) for j in range(4)
-    }
-    kept = [
-        "query_session",
-        "target_session",
-        "query_stamp_ns",
-        "target_stamp_ns",
-        "reason",
-        "sigma",
-        *FEATURES,
-    ]
-    metadata = {k: read_metadata(work.rejected).get(k) for k in ("voxel_size", "queries")} | {
-        "town": town
-    }
-    write_table(output, pa.table({n: table[n] for n in kept} | columns), metadata)
-
-
-def read_judged(paths: Sequence[Path]) -> Judged:
-    """The tables of several towns."""
-    table = pa.concat_tables([read_table(path) for path in paths])
-    table = table.filter(table["right"].is_valid())
-    column = {
-        name: table[name].to_numpy()
-        for name in table.column_names
-        if name not in ("town", "query_session", "target_session")
-    }
-
-    def poses(prefix: str) -> F64:
-        out = np.tile(np.eye(4), (len(table), 1, 1))
-        for i in range(3):
-            for j in range(4):
-                out[:, i, j] = column[f"{prefix}_{i}{j}"]
-        return out
-
-    names = {
-        name: np.array(table[name].to_pylist(), object)
-        for name in ("town", "query_session", "target_session")
-    }
-    placed = Placed(
-        names["query_session"],
-        names["target_session"],
-        column["query"],
-        column["road"],
-        column["target_road"],
-        poses("own"),
-        poses("at"),
-        column["sigma"],
-        np.full(len(table), np.nan),
-        np.ones(len(table), bool),
-    )
-    right = column["right"].astype(bool)
-    features = Features(*(column[n] for n in FEATURES))
-    return Judged(
-        names["town"],
-        features,
-        placed,
-        right,
-        column["error_m"],
-        column["error_deg"],
-        float(read_metadata(paths[0])["voxel_size"]),
-    )
-
-
-# -- fitting
 
 
 def fit_signed(
@@ -386,67 +236,6 @@ def _temper(held_out: F64, judged: Judged, rows: Bools) -> tuple[float, float]:
     rows = rows & judged.clear & ~judged.copies
     scale, shift = fit_logistic(held_out[rows][:, None], judged.right[rows], 1e-3)
     return (1.0, 0.0) if scale[0] >= 1 else (max(float(scale[0]), 0.3), float(shift))
-
-
-# -- reports
-
-
-def reliability(p: F64, right: Bools, edges: Sequence[float] = EDGES) -> list[dict[str, float]]:
-    """How often alignments of each range of probability ``p`` (n,) are right."""
-    out = []
-    for a, b in pairwise(edges):
-        mine = (p >= a) & ((p < b) | (b == edges[-1]))
-        if mine.any():
-            out.append(
-                {
-                    "from": a,
-                    "to": b,
-                    "alignments": int(mine.sum()),
-                    "said": float(p[mine].mean()),
-                    "right": float(right[mine].mean()),
-                }
-            )
-    return out
-
-
-def answers(judged: Judged, p: F64) -> NDArray[np.int64]:
-    """The most probable alignment of each query with each target, which alone can be accepted,
-    ascending.
-    """
-    best: dict[tuple[Any, ...], int] = {}
-    for k, key in enumerate(_query_keys(judged)):
-        if key not in best or p[k] > p[best[key]]:
-            best[key] = k
-    return np.array(sorted(best.values()), np.int64)
-
-
-def _query_keys(judged: Judged) -> Iterator[tuple[Any, ...]]:
-    placed = judged.placed
-    return zip(
-        judged.town, placed.query_session, placed.query.tolist(), placed.target_session, strict=True
-    )
-
-
-def recall_at(
-    judged: Judged, p: F64, thresholds: Sequence[float] = THRESHOLDS
-) -> list[dict[str, float]]:
-    """For each threshold: accepted and false closures, and the share accepted of the queries that
-    have a right alignment with a target.
-    """
-    chosen = answers(judged, p)
-    able = len({key for key, right in zip(_query_keys(judged), judged.right, strict=True) if right})
-    out = []
-    for least in thresholds:
-        accepted = chosen[p[chosen] >= least]
-        right = int(judged.right[accepted].sum())
-        row = {
-            "threshold": least,
-            "accepted": len(accepted),
-            "false": len(accepted) - right,
-            "possible": able,
-        }
-        out.append(row | {"recall": right / max(able, 1)})
-    return out
 
 
 def calibration_json(judged: Judged, fitted: Fitted) -> dict[str, Any]:

@@ -1,0 +1,199 @@
+"""Alignments of simulated towns against the truth: which are right, and how far off the others are.
+
+Every town is judged into a table of its own. The models of the acceptance are fitted on these
+tables, and the report of the acceptance is made from them: neither needs a new query.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from semloc_logs.closures.acceptance.placements import Placed
+from semloc_logs.closures.alignment_tables import read_alignments
+from semloc_logs.closures.closure import FEATURES, Alignments, Features
+from semloc_logs.closures.session_pairs import known_pairs
+from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, TrueTrack, read_truth
+from semloc_logs.mapping.session_map import SessionMap
+from semloc_logs.numerics.transforms import inverse
+from semloc_logs.tables.table import read_metadata, read_table, write_table
+from semloc_logs.workspace import Workspace
+
+F64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+COPIES = "repeating"  # in the names of towns of copied blocks
+OWN = ("error_m", "error_deg", "nees_position", "nees_pose")  # columns of a row by itself
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """Alignments (n) of several towns: ``features`` (n,), where they lie (the caller sets the
+    probabilities there), whether they are ``right`` (n,), and their errors (n,) in metres and
+    degrees.
+
+    ``nees_position`` and ``nees_pose`` (n,) are the squares of the errors over their covariance, of
+    3 and of 6 degrees of freedom (Bar-Shalom et al., Estimation with Applications to Tracking and
+    Navigation, 2001, section 5.4).
+    """
+
+    town: NDArray[np.object_]
+    features: Features[F64]
+    placed: Placed
+    right: Bools
+    error_m: F64
+    error_deg: F64
+    nees_position: F64
+    nees_pose: F64
+    voxel_size: float
+
+    @property
+    def clear(self) -> Bools:
+        """Right, or wrong by three times the bounds (n,): cases in between teach neither side."""
+        return np.asarray(
+            self.right | (self.error_m > 3 * CORRECT_M) | (self.error_deg > 3 * CORRECT_DEG)
+        )
+
+    @property
+    def copies(self) -> Bools:
+        """Which lie in towns of copied blocks (n,)."""
+        return np.array([COPIES in town for town in self.town], bool)
+
+    def __len__(self) -> int:
+        return len(self.town)
+
+    def part(self, rows: Bools) -> Judged:
+        """Some of them."""
+        columns = {n: getattr(self, n)[rows] for n in ("town", "right", *OWN)}
+        return replace(
+            self, features=self.features.part(rows), placed=self.placed.part(rows), **columns
+        )
+
+
+def judge_town(work: Workspace, truth: Path, town: str, output: Path) -> None:
+    """All alignments of a workspace, judged, as the table ``output``.
+
+    Columns: the sessions, stamps, standard deviation and features of alignments, and town, query,
+    road, target_road, own_* and at_* (the query in its own map by odometry, in the target's by
+    alignment), error_m, error_deg, nees_position, nees_pose, right; null without a true pose.
+    """
+    maps = {f.name: SessionMap(f) for f in work.sessions()}
+    tracks = read_truth(truth, maps)
+    rows = Alignments.joined(
+        read_alignments(work.alignments(pair.query, pair.target), pair.query, pair.target)
+        for pair in sorted(known_pairs(work))
+    )
+    n = len(rows)
+    road, target_road = np.zeros((2, n))
+    own, at = np.zeros((2, n, 4, 4))
+    for (query, target), mine in rows.by_pair():
+        ends = (rows.query_keyframe[mine], rows.target_keyframe[mine])
+        road[mine] = maps[query].distance[ends[0]]
+        target_road[mine] = maps[target].distance[ends[1]]
+        own[mine] = maps[query].map_T_base[ends[0]]
+        at[mine] = maps[target].map_T_base[ends[1]] @ rows.target_T_query[mine]
+    query_session, target_session = rows.sessions()
+    columns: dict[str, Any] = {
+        "query_session": query_session.tolist(),
+        "target_session": target_session.tolist(),
+        "query_stamp_ns": rows.query_stamp_ns,
+        "target_stamp_ns": rows.target_stamp_ns,
+        "sigma": rows.sigma(),
+        **{name: getattr(rows.features, name) for name in FEATURES},
+        "town": [town] * n,
+        "query": rows.query_keyframe,
+        "road": road,
+        "target_road": target_road,
+        **_errors(rows, tracks),
+    }
+    columns |= {f"own_{i}{j}": own[:, i, j] for i in range(3) for j in range(4)} | {
+        f"at_{i}{j}": at[:, i, j] for i in range(3) for j in range(4)
+    }
+    metadata = {k: read_metadata(work.rejected).get(k) for k in ("voxel_size", "queries")}
+    write_table(output, pa.table(columns), metadata | {"town": town})
+
+
+def _errors(rows: Alignments, tracks: Mapping[str, TrueTrack]) -> dict[str, pa.Array]:
+    """The errors of alignments and whether they are right, as columns; null where a true pose is
+    not known.
+    """
+    n = len(rows)
+    known = np.zeros(n, bool)
+    off = np.zeros((n, 6))  # in the target's axes, as the covariance is
+    for (query, target), mine in rows.by_pair():
+        if query not in tracks or target not in tracks:
+            continue
+        query_pose, query_known = tracks[query].at(rows.query_stamp_ns[mine])
+        target_pose, target_known = tracks[target].at(rows.target_stamp_ns[mine])
+        known[mine] = query_known & target_known
+        true = inverse(target_pose) @ query_pose
+        found = rows.target_T_query[mine]
+        off[mine, :3] = found[:, :3, 3] - true[:, :3, 3]
+        turned = found[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)
+        off[mine, 3:] = Rotation.from_matrix(turned).as_rotvec()
+
+    error_m = np.linalg.norm(off[:, :3], axis=1)
+    error_deg = np.degrees(np.linalg.norm(off[:, 3:], axis=1))
+    values = {
+        "error_m": error_m,
+        "error_deg": error_deg,
+        "nees_position": normalised_squares(off[:, :3], rows.covariance[:, :3, :3]),
+        "nees_pose": normalised_squares(off, rows.covariance),
+        "right": (error_m <= CORRECT_M) & (error_deg <= CORRECT_DEG),
+    }
+    return {name: pa.array(value, mask=~known) for name, value in values.items()}
+
+
+def normalised_squares(errors: F64, covariance: F64) -> F64:
+    """Squares (n,) of ``errors`` (n, d) over their ``covariance`` (n, d, d): d in the mean, where
+    it is true.
+    """
+    solved = np.linalg.solve(covariance, errors[..., None])[..., 0]
+    return np.asarray(np.einsum("nd,nd->n", errors, solved))
+
+
+def read_judged(paths: Sequence[Path]) -> Judged:
+    """The tables of several towns."""
+    table = pa.concat_tables([read_table(path) for path in paths])
+    table = table.filter(table["right"].is_valid())
+    column = {
+        name: table[name].to_numpy()
+        for name in table.column_names
+        if name not in ("town", "query_session", "target_session")
+    }
+
+    def poses(prefix: str) -> F64:
+        out = np.tile(np.eye(4), (len(table), 1, 1))
+        for i in range(3):
+            for j in range(4):
+                out[:, i, j] = column[f"{prefix}_{i}{j}"]
+        return out
+
+    names = {
+        name: np.array(table[name].to_pylist(), object)
+        for name in ("town", "query_session", "target_session")
+    }
+    placed = Placed(
+        names["query_session"],
+        names["target_session"],
+        column["query"],
+        column["road"],
+        column["target_road"],
+        poses("own"),
+        poses("at"),
+        column["sigma"],
+        np.full(len(table), np.nan),
+        np.ones(len(table), bool),
+    )
+    right = column["right"].astype(bool)
+    features = Features(*(column[n] for n in FEATURES))
+    own = {name: column[name] for name in OWN}
+    voxel_size = float(read_metadata(paths[0])["voxel_size"])
+    return Judged(names["town"], features, placed, right, voxel_size=voxel_size, **own)
