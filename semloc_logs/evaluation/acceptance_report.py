@@ -316,7 +316,7 @@ def _error_rows(groups: Sequence[Group]) -> list[str]:
 
 def _reliability_rows(bins: Sequence[dict[str, float]]) -> list[str]:
     rows = [
-        "| probability, ordinary towns | alignments | said | right |",
+        "| probability, ordinary towns | alignments | mean | right |",
         "| --- | --- | --- | --- |",
     ]
     for b in bins:
