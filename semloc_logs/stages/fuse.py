@@ -276,10 +276,9 @@ def _draw(folder: SessionFolder, content: dict[str, Any]) -> None:
 def _log_outcome(name: str, fused: FusedSession) -> None:
     content = fused.content
     LOGGER.info(
-        "%s: %d keyframes, %d submaps, %d voxels, labels from %s",
+        "%s: %d keyframes, %d voxels, labels from %s",
         name,
         content["keyframes"],
-        len(content["submaps"]),
         content["voxels"],
         content["label_source"],
     )
