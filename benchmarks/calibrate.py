@@ -34,7 +34,16 @@ TOWNS = (
     Town("drawn", 1, noise=0.12, seasons=LATER, length=110.0),
     Town("geometry", 2, ("hdl64",), "geometry", roadworks=4.0, length=110.0),
     Town("sparse", 4, ("vlp16",), noise=0.12, seasons=LATER, drift=0.015, length=110.0),
-    Town("stereo", 6, ("stereo",), noise=0.12, length=110.0),
+    Town(
+        "stereo-back",
+        6,
+        ("stereo",),
+        noise=0.12,
+        trajectory="00",
+        start=1200.0,
+        sessions=2,
+        length=140.0,
+    ),
     Town(
         "there-and-back",
         7,
