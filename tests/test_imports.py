@@ -261,6 +261,7 @@ def test_every_command_has_a_module() -> None:
     assert commands == {module for module, _ in COMMANDS.values()}
 
 
-def test_stages_load_no_matplotlib_before_something_is_drawn() -> None:
-    script = "import sys, semloc_logs.stages.run; sys.exit('matplotlib' in sys.modules)"
+@pytest.mark.parametrize("package", ["matplotlib", "torch"])
+def test_stages_load_what_is_slow_to_load_only_where_they_draw_or_describe(package: str) -> None:
+    script = f"import sys, semloc_logs.stages.run; sys.exit({package!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -20,9 +20,10 @@ from scipy.spatial import cKDTree
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import STREET_VOXEL
 from semloc_logs.subvolumes.cut import MARGIN, SIZE, code_table
-from semloc_logs.subvolumes.network import Encoder, descriptors
-from semloc_logs.subvolumes.weight_files import load_weights
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE
+
+if TYPE_CHECKING:
+    from semloc_logs.subvolumes.network import Encoder
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -70,16 +71,16 @@ def load_encoder(variant: str, weights: Path | None = None) -> Encoder:
 
     SettingsError when the file does not hold one.
     """
+    # torch takes a second to load: only what describes something loads it
+    import torch
+
+    from semloc_logs.subvolumes.network import Encoder
+    from semloc_logs.subvolumes.weight_files import load_weights
+
     encoder = load_weights(Encoder, "encoder.", variant, weights)
     # more cores are used by more processes: the same sums in the same order, whatever the engine
     torch.set_num_threads(1)
     return encoder
-
-
-def random_encoder(variant: str, seed: int = 0) -> Encoder:
-    """An untrained encoder: what training has to beat."""
-    torch.manual_seed(seed)
-    return Encoder(variant).eval()
 
 
 def _window_sums(a: NDArray[np.int64], stride: int) -> NDArray[np.int64]:
@@ -146,7 +147,6 @@ def _layers(state: U8, bottom: int, stride: int) -> NDArray[np.int64]:
     return np.asarray(layer.reshape(len(range(0, lowest.shape[0] - 7, stride // 4)), -1))
 
 
-@torch.inference_mode()
 def describe_map(
     state: U8,
     low: NDArray[np.integer],
@@ -249,8 +249,5 @@ def _encode(codes: U8, wanted: NDArray[np.int64], encoder: Encoder, stride: int)
                 part = np.ascontiguousarray(
                     codes[corner[0] : corner[0] + extent[0], corner[1] : corner[1] + extent[1]]
                 )
-                with torch.autocast("cpu", dtype=torch.bfloat16):
-                    mu = encoder(torch.from_numpy(part)[None])
-                grid = (wanted[rows] - corner) // 8
-                out[rows] = descriptors(mu[:, :, grid[:, 0], grid[:, 1]].unsqueeze(3)).numpy()
+                out[rows] = encoder.describe(part, (wanted[rows] - corner) // 8)
     return out

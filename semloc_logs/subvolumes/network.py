@@ -261,6 +261,16 @@ class Encoder(Describer):
             x = F.relu(max_pool(F.conv3d(x, weight, bias, padding=1)))
         return latent_mean(x[:, :, 1:-1, 1:-1], *mean)  # the pooled margin has served
 
+    @torch.inference_mode()
+    def describe(self, codes: U8, windows: NDArray[np.int64]) -> F32:
+        """Unit descriptors (n, latent) of the outputs (i, j) of ``windows`` (n, 2), of the codes
+        (x, y, 32) of a map with its margin.
+        """
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            mu = self(torch.from_numpy(codes)[None])
+        i, j = windows.T
+        return np.asarray(descriptors(mu[:, :, i, j].unsqueeze(3)).numpy())
+
 
 def latent_mean(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Features (b, 64, x, y, 4) at an eighth of the resolution -> mu (b, latent, x - 3, y - 3)."""
@@ -371,3 +381,9 @@ class Completion(Network):
 def descriptors(mu: Tensor) -> Tensor:
     """Unit-length descriptors (b * i * j, latent) from mu (b, latent, i, j)."""
     return F.normalize(mu.float().permute(0, 2, 3, 1).reshape(-1, mu.shape[1]), dim=1)
+
+
+def random_encoder(variant: str, seed: int = 0) -> Encoder:
+    """An untrained encoder: what training has to beat."""
+    torch.manual_seed(seed)
+    return Encoder(variant).eval()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,11 @@ from semloc_logs.labels.space import KNOWS_CLASSES
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import turned_map
 from semloc_logs.subvolumes.describe import Described, Windows, describe_map
-from semloc_logs.subvolumes.network import Encoder
 from semloc_logs.voxels.store import read_blocks
 from semloc_logs.workspace import SessionFolder
+
+if TYPE_CHECKING:
+    from semloc_logs.subvolumes.network import Encoder
 
 
 @dataclass(frozen=True, slots=True, eq=False)

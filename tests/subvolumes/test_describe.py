@@ -20,7 +20,6 @@ from semloc_logs.subvolumes.describe import (
     describe_map,
     load_encoder,
     quarter_turns,
-    random_encoder,
 )
 from semloc_logs.subvolumes.network import (
     Completion,
@@ -28,6 +27,7 @@ from semloc_logs.subvolumes.network import (
     Encoder,
     depth_to_space,
     descriptors,
+    random_encoder,
     space_to_depth,
 )
 from semloc_logs.subvolumes.weight_files import save_weights

@@ -18,8 +18,8 @@ from semloc_logs.benchmarks.descriptors.word_matches import (
 from semloc_logs.benchmarks.fused_sessions import fused_maps
 from semloc_logs.evaluation.truth import read_truth
 from semloc_logs.settings import Resolved
-from semloc_logs.subvolumes.describe import load_encoder, random_encoder
-from semloc_logs.subvolumes.network import Encoder
+from semloc_logs.subvolumes.describe import load_encoder
+from semloc_logs.subvolumes.network import Encoder, random_encoder
 from semloc_logs.words.vocabulary import Vocabulary, load_vocabulary
 
 Figures = dict[str, dict[str, float | str]]

@@ -22,7 +22,8 @@ from semloc_logs.benchmarks.descriptors.recall import (
 )
 from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Resolved
-from semloc_logs.subvolumes.describe import load_encoder, random_encoder
+from semloc_logs.subvolumes.describe import load_encoder
+from semloc_logs.subvolumes.network import random_encoder
 
 Figures = dict[str, dict[str, float | str]]
 Note = Callable[[str], None]

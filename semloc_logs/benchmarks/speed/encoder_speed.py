@@ -26,8 +26,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from semloc_logs.errors import SemlocError
 from semloc_logs.settings import Resolved
 from semloc_logs.subvolumes.cut import WIDE, code_table
-from semloc_logs.subvolumes.describe import random_encoder
-from semloc_logs.subvolumes.network import Encoder, descriptors
+from semloc_logs.subvolumes.network import Encoder, descriptors, random_encoder
 from semloc_logs.training.pairs import fuse
 from semloc_logs.training.scene_shards import scene_frame
 from semloc_logs.training.training_scenes import training_scene

@@ -6,8 +6,7 @@ import torch
 
 from semloc_logs.benchmarks.speed.encoder_speed import encode, macs, one_by_one, watch
 from semloc_logs.subvolumes.cut import WIDE
-from semloc_logs.subvolumes.describe import random_encoder
-from semloc_logs.subvolumes.network import Encoder
+from semloc_logs.subvolumes.network import Encoder, random_encoder
 
 
 @pytest.fixture(scope="module")
