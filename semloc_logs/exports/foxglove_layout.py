@@ -7,12 +7,24 @@ from collections.abc import Collection
 
 import numpy as np
 
-from semloc_logs.logs.annotation.channels import CLOSURES, MAP, MARKERS, POSE, topics_of_targets
+from semloc_logs.logs.annotation.channels import (
+    CLOSURES,
+    MAP,
+    MARKERS,
+    OVERVIEW,
+    POSE,
+    topics_of_targets,
+)
+from semloc_logs.logs.topic_pairs import calibrations
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import apply
 
 CLOUDS = ("lidar", "depth")  # roles of streams that are shown as points
-LEAST_DISTANCE = 60.0  # metres of the camera from the map
+LEAST_EXTENT = 20.0  # m, of half the view
+DISTANCE = 3.5  # of the camera, over half the extent of the drive
+AXES = 0.08  # size over half the extent
+SWEEP = "#00b4ffff"  # colour of range data, which no class of the map has
+GRID_CELLS = 20
 IMAGES = ("image", "stereo_left")
 
 
@@ -27,25 +39,31 @@ def foxglove_layout(session: SessionMap, targets: Collection[str]) -> str:
     streams = session.json.get("streams", [])
     places = apply(np.array(session.json["session_T_map"]), session.map_T_base[:, :3, 3])
     middle = (places.min(0) + places.max(0)) / 2
-    distance = max(LEAST_DISTANCE, float(abs(places[:, :2] - middle[:2]).max()) * 3)
-    frame = str(session.json.get("session_frame") or f"semloc/{session.folder.name}")
+    extent = max(LEAST_EXTENT, float(abs(places[:, :2] - middle[:2]).max()))
+    frame = session.frame_id if session.posed else str(session.json["base_frame"])
     shown = [s["topic"] for s in streams if s.get("role") in CLOUDS]
+    # a colour mode counts only with a field
+    packed = {"colorMode": "rgb", "colorField": "rgb"}
+    in_ros = {log["encoding"] for log in session.json["logs"]} <= {"ros1", "ros2"}
+    colours = packed if in_ros else {"colorMode": "rgba-fields", "colorField": "red"}
+    sweep = {"pointSize": 2, "colorMode": "flat", "flatColor": SWEEP, "colorField": "z"}
     topics = {
+        OVERVIEW: {"visible": True},
         MARKERS: {"visible": True},
-        MAP: {"visible": True, "pointSize": 2, "colorMode": "rgb", "colorField": "rgb"},
+        MAP: {"visible": True, "pointSize": 2, **colours},
         **{
-            topic: {"visible": True, "type": "axis", "axisScale": 2}
+            topic: {"visible": True, "type": "axis", "axisScale": AXES * extent}
             for topic in (POSE, *topics_of_targets(targets).values())
         },
-        **{topic: {"visible": True, "pointSize": 3} for topic in shown},
+        **{topic: {"visible": True, **sweep} for topic in shown},
     }
     panels: dict[str, object] = {
         "3D!closures": {
-            "followMode": "follow-none",
+            "followMode": "follow-pose",
             "followTf": frame,
             "cameraState": {
                 "perspective": True,
-                "distance": distance,
+                "distance": DISTANCE * extent,
                 "phi": 35,
                 "thetaOffset": 0,
                 "targetOffset": middle.tolist(),
@@ -55,18 +73,36 @@ def foxglove_layout(session: SessionMap, targets: Collection[str]) -> str:
                 "near": 0.5,
                 "far": 50000,
             },
-            "scene": {"transforms": {"showLabel": True, "axisScale": 2}},
+            # lines between frames look like closures; the overview has names of the sessions
+            "scene": {
+                "transforms": {"showLabel": False, "lineWidth": 0, "axisScale": AXES * extent}
+            },
             "transforms": {},
             "topics": topics,
-            "layers": {"grid": {"layerId": "foxglove.Grid", "visible": True, "frameId": frame}},
+            "layers": {
+                "grid": {
+                    "layerId": "foxglove.Grid",
+                    "visible": True,
+                    "frameId": frame,
+                    "size": 4 * extent,
+                    "divisions": GRID_CELLS,
+                    "position": middle.tolist(),
+                    "color": "#8080804d",
+                }
+            },
             "imageMode": {},
         },
-        "RawMessages!closures": {"topicPath": CLOSURES, "expansion": "auto"},
+        "RawMessages!closures": {"topicPath": CLOSURES},
     }
     side: object = "RawMessages!closures"
     images = [s["topic"] for s in streams if s.get("role") in IMAGES]
     if images:
-        panels["Image!camera"] = {"imageMode": {"imageTopic": images[0]}}
+        infos = [s["topic"] for s in streams if s.get("role") == "camera_info"]
+        info_of = calibrations(images, (), infos, forced=False)
+        picture = {"imageTopic": images[0]}
+        if images[0] in info_of:
+            picture["calibrationTopic"] = info_of[images[0]]
+        panels["Image!camera"] = {"imageMode": picture}
         side = {
             "first": "Image!camera",
             "second": "RawMessages!closures",

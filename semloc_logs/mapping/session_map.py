@@ -122,6 +122,11 @@ class SessionMap:
         return {log["format"] for log in self.json["logs"]} == {MAP_FORMAT}
 
     @property
+    def frame_id(self) -> str:
+        """The frame of the log's poses; ``semloc/SESSION`` where the log does not name it."""
+        return str(self.json.get("session_frame") or "") or f"semloc/{self.folder.name}"
+
+    @property
     def posed(self) -> bool:
         """Whether the log has poses."""
         return bool(self.json["posed"])

@@ -24,16 +24,24 @@ from semloc_logs.logs.annotation.annotate import (
     annotate_sidecar,
     recover,
 )
-from semloc_logs.logs.annotation.channels import COMMON_FRAME, Scene, StampedPose, Transform
+from semloc_logs.logs.annotation.channels import (
+    COMMON_FRAME,
+    Drive,
+    Scene,
+    StampedPose,
+    Transform,
+)
 from semloc_logs.logs.containers.open import open_log
 from semloc_logs.mapping.session_map import SessionMap
-from semloc_logs.numerics.transforms import inverse, transform
+from semloc_logs.numerics.transforms import apply, inverse, transform
+from semloc_logs.pictures.colours import SESSIONS
 from semloc_logs.pose_graph.merged_map import keyframe_poses
 from semloc_logs.settings import Resolved
 from semloc_logs.stages.inputs import session_name
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
+MOST_POSITIONS = 2000  # of a drive in the overview
 SECTIONS = ("fusion", "labels", "descriptor", "query", "closures")
 
 
@@ -120,9 +128,9 @@ def _results(work: Workspace, own: SessionMap, settings: Resolved, *, common: bo
         "settings": settings.fingerprint(*SECTIONS),
         "fusion.voxel_size": str(settings.fusion.voxel_size),
     }
-    frame_id = str(own.json.get("session_frame") or "") or None
+    frame_id = own.frame_id
     memory = settings.logs.memory
-    scene = _scene(others, own, rows) if frame_id else Scene()
+    scene = _scene(others, own, rows) if own.posed else Scene()
     if common:
         notes["pose_frame"] = COMMON_FRAME
         scene = _with_common_poses(scene, work, own)
@@ -175,16 +183,17 @@ def _scene(sessions: _Sessions, own: SessionMap, rows: list[dict[str, Any]]) -> 
     """What viewers show around the closures: the frames of the messages, and a map.
 
     ``semloc/SESSION`` is the session frame of each session that closures connect with the log, laid
-    by the most probable one. The vehicle's own poses are given where the log has no transforms.
+    by the most probable one. The vehicle's own poses are given where the log has no transform above
+    the vehicle.
     """
     name = own.folder.name
-    frame_id = str(own.json["session_frame"])
+    frame_id = own.frame_id
     start_ns = int(own.stamps_ns[0])
     placed = {name: np.eye(4)}
     for row in sorted(rows, key=lambda r: (-r["probability"], r["query_stamp_ns"])):
         ends = ("query", "target") if row["query_session"] == name else ("target", "query")
         other = row[f"{ends[1]}_session"]
-        if other in placed or not own.posed or not sessions[other].posed:
+        if other in placed or not sessions[other].posed:
             continue
         target_T_query = _pose_of(row)
         own_T_other = inverse(target_T_query) if ends[0] == "query" else target_T_query
@@ -193,19 +202,43 @@ def _scene(sessions: _Sessions, own: SessionMap, rows: list[dict[str, Any]]) -> 
     fixed = [
         Transform(start_ns, frame_id, f"semloc/{session}", pose)
         for session, pose in sorted(placed.items())
+        if f"semloc/{session}" != frame_id
     ]
     shown = {n: pose for n, pose in placed.items() if n != name} or placed
     cloud = map_cloud([(sessions[n], pose) for n, pose in shown.items()], frame_id)
-    base_frame = str(own.json.get("base_frame") or "")
-    has_transforms = "tf" in own.json.get("roles", {})
-    if not own.posed or has_transforms or base_frame in ("", frame_id):
-        return Scene(fixed=fixed, cloud=cloud)
-    session_T_map = np.array(own.json["session_T_map"])
-    moving = [
-        Transform(int(stamp_ns), frame_id, base_frame, session_T_map @ pose)
-        for stamp_ns, pose in zip(own.stamps_ns, own.map_T_base, strict=True)
+    drives = [
+        _drive(sessions[n], frame_id if n == name else f"semloc/{n}", SESSIONS[k % len(SESSIONS)])
+        for k, n in enumerate(sorted(placed))
+        if sessions[n].posed and not sessions[n].is_map
     ]
-    return Scene(moving, fixed, cloud=cloud)
+    return Scene(_moving(own), fixed, cloud=cloud, drives=drives)
+
+
+def _moving(own: SessionMap) -> list[Transform]:
+    """Poses of the topmost frame of the vehicle, where the log has nothing above it.
+
+    A frame has one parent, so other logs get no transform between the vehicle and its poses.
+    """
+    root = own.json.get("vehicle_root")
+    if root is None or root["frame"] == own.frame_id:
+        return []
+    session_T_base = np.array(own.json["session_T_map"]) @ own.map_T_base
+    session_T_root = session_T_base @ np.array(root["base_T_root"])
+    return [
+        Transform(int(stamp_ns), own.frame_id, root["frame"], pose)
+        for stamp_ns, pose in zip(own.stamps_ns, session_T_root, strict=True)
+    ]
+
+
+def _drive(session: SessionMap, frame_id: str, colour: tuple[int, int, int]) -> Drive:
+    """The way of a session in its session frame, which is called ``frame_id``."""
+    step = -(-len(session.map_T_base) // MOST_POSITIONS)
+    positions = session.map_T_base[::step, :3, 3]
+    red, green, blue = (part / 255 for part in colour)
+    session_T_map = np.array(session.json["session_T_map"])
+    return Drive(
+        session.folder.name, frame_id, apply(session_T_map, positions), (red, green, blue, 1.0)
+    )
 
 
 def _with_common_poses(scene: Scene, work: Workspace, own: SessionMap) -> Scene:
@@ -226,13 +259,10 @@ def _with_common_poses(scene: Scene, work: Workspace, own: SessionMap) -> Scene:
         StampedPose(stamp_ns, COMMON_FRAME, pose, unknown)
         for stamp_ns, pose in zip(stamps_ns, common_T_base, strict=True)
     ]
-    frame_id = str(own.json.get("session_frame") or "")
-    if not frame_id:
-        return replace(scene, common=poses)
     session_T_base = np.array(own.json["session_T_map"]) @ own.map_T_base
     session_T_common = session_T_base @ inverse(common_T_base)
     frames = [
-        Transform(stamp_ns, frame_id, COMMON_FRAME, pose)
+        Transform(stamp_ns, own.frame_id, COMMON_FRAME, pose)
         for stamp_ns, pose in zip(stamps_ns, session_T_common, strict=True)
     ]
     return replace(scene, moving=[*scene.moving, *frames], common=poses)

@@ -9,6 +9,8 @@ import pytest
 
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.exports import Selection, export
+from semloc_logs.logs.annotation.annotate import encoder_for
+from semloc_logs.logs.annotation.channels import Cloud, Encoding, LogFacts
 from semloc_logs.numerics.transforms import yaw_transform
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
@@ -188,14 +190,20 @@ def test_a_layout_shows_the_closures_where_the_drive_is(work: Workspace, tmp_pat
     path = work.session("a").session_json
     streams = [
         {"role": "lidar", "topic": "/points"},
-        {"role": "image", "topic": "/camera"},
+        {"role": "image", "topic": "/front/image"},
+        {"role": "camera_info", "topic": "/rear/camera_info"},
+        {"role": "camera_info", "topic": "/front/camera_info"},
         {"role": "imu", "topic": "/imu"},
     ]
-    write_json(path, json.loads(path.read_text()) | {"session_frame": "odom", "streams": streams})
+    found: dict[str, Any] = {"streams": streams, "logs": [{"encoding": "ros2"}]}
+    for name, frame in (("a", "odom"), ("b", "")):
+        path = work.session(name).session_json
+        write_json(path, json.loads(path.read_text()) | found | {"session_frame": frame})
     _close(work)
     (with_target,) = export(work, ["b"], "foxglove-layout", tmp_path)
     scene = json.loads(with_target.read_text())["configById"]["3D!closures"]
     assert scene["topics"]["/semloc/pose/a"]["visible"]
+    assert scene["followTf"] == "semloc/b"  # as the markers of a log whose poses have no frame
     (written,) = export(work, ["a"], "foxglove-layout", tmp_path)
     assert written.name == "a.foxglove-layout.json"
     content = json.loads(written.read_text())
@@ -205,14 +213,51 @@ def test_a_layout_shows_the_closures_where_the_drive_is(work: Workspace, tmp_pat
     assert {t for t, c in scene["topics"].items() if c["visible"]} == {
         "/semloc/map",
         "/semloc/markers",
+        "/semloc/overview",
         "/semloc/pose",
         "/points",
+    }
+    # viewers choose colours themselves unless the field is named
+    assert all("colorField" in scene["topics"][topic] for topic in ("/semloc/map", "/points"))
+    assert content["configById"]["Image!camera"]["imageMode"] == {
+        "imageTopic": "/front/image",
+        "calibrationTopic": "/front/camera_info",
     }
 
     def named(place: Any) -> set[str]:
         return {place} if isinstance(place, str) else named(place["first"]) | named(place["second"])
 
     assert named(content["layout"]) == set(content["configById"])
+
+
+@pytest.mark.parametrize(
+    ("encoding", "mode"), [("ros1", "rgb"), ("protobuf", "rgba-fields"), ("json", "rgba-fields")]
+)
+def test_a_layout_colours_the_map_by_the_fields_that_it_has(
+    work: Workspace, tmp_path: Path, encoding: Encoding, mode: str
+) -> None:
+    path = work.session("a").session_json
+    write_json(path, json.loads(path.read_text()) | {"logs": [{"encoding": encoding}]})
+    (written,) = export(work, ["a"], "foxglove-layout", tmp_path)
+    config = json.loads(written.read_text())["configById"]["3D!closures"]["topics"]["/semloc/map"]
+    cloud = Cloud(
+        "odom", np.ones((1, 3), np.float32), np.ones((1, 3), np.uint8), np.zeros(1, np.uint8)
+    )
+    encoder = encoder_for(LogFacts(encoding, "", {}, 0, 0, 0))
+    data = encoder.cloud(cloud, 0)
+    names = ["rgb"] if mode == "rgb" else ["red", "green", "blue", "alpha"]
+    quoted = '"' if encoding == "json" else ""
+    assert all(f"{quoted}{name}{quoted}".encode() in data for name in names)
+    assert (config["colorMode"], config["colorField"]) == (mode, names[0])
+
+
+def test_a_layout_without_poses_follows_the_vehicle(work: Workspace, tmp_path: Path) -> None:
+    path = work.session("a").session_json
+    unposed = {"posed": False, "base_frame": "velodyne", "logs": []}
+    write_json(path, json.loads(path.read_text()) | unposed)
+    (written,) = export(work, ["a"], "foxglove-layout", tmp_path)
+    scene = json.loads(written.read_text())["configById"]["3D!closures"]
+    assert scene["followTf"] == scene["layers"]["grid"]["frameId"] == "velodyne"
 
 
 def test_points_are_not_said_to_be_in_the_common_frame(work: Workspace, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ table and the truth.
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -96,6 +97,7 @@ def annotated(
     for read in READERS[name](output):
         by_topic.setdefault(read.topic, []).append(read)
     own = {"/semloc/loop_closures", "/semloc/markers", "/semloc/tf_static", "/semloc/map"}
+    own.add("/semloc/overview")
     if name != "wednesday":  # whose log has transforms of the vehicle
         own.add("/semloc/tf")
     if name != "monday":  # the first drive is never localised in another
@@ -296,6 +298,71 @@ def test_the_vehicle_moves_in_logs_without_transforms(annotated: Any, drives: An
         truth = drives[name].session_T_world @ drives[name].world_T_base(stamp)
         t = edge.transform.translation
         np.testing.assert_allclose([t.x, t.y, t.z], truth[:3, 3], atol=0.01)
+
+
+def test_the_overview_has_the_true_way_of_every_drive(
+    annotated: Any, labelled: Workspace, drives: Any
+) -> None:
+    name, topics = annotated
+    (read,) = topics["/semloc/overview"]
+    assert read.log_time_ns == min(r.log_time_ns for reads in topics.values() for r in reads)
+    if name == "wednesday":
+        *entities, closures = read.message.entities
+        ways = {entity.frame_id: entity.lines[0].points for entity in entities}
+        names = {entity.frame_id: entity.texts[0].text for entity in entities}
+        spheres = len(closures.spheres)
+    else:
+        markers = read.message.markers
+        ways = {m.header.frame_id: m.points for m in markers if m.ns == "semloc/drives"}
+        names = {m.header.frame_id: m.text for m in markers if m.ns == "semloc/sessions"}
+        (places,) = [m for m in markers if m.ns == "semloc/places"]
+        spheres = len(places.points)
+    assert spheres == len(topics["/semloc/loop_closures"])
+    frames = {other: "odom" if other == name else f"semloc/{other}" for other in NAMES}
+    assert names == {frame: other for other, frame in frames.items()}
+    for other, frame in frames.items():
+        drive = drives[other]
+        truth = np.array(
+            [
+                (drive.session_T_world @ drive.world_T_base(int(t)))[:3, 3]
+                for t in drive.trajectory.stamps_ns
+            ]
+        )
+        way = np.array([[p.x, p.y, p.z] for p in ways[frame]])
+        assert len(way) == pq.read_table(labelled.session(other).frames).num_rows > 1
+        away = np.linalg.norm(way[:, None] - truth[None], axis=2).min(1)
+        assert away.max() < 0.5  # between two poses
+        assert np.linalg.norm(way[-1] - way[0]) > 5.0
+
+
+def test_frames_are_connected_where_the_log_names_no_frame_and_has_one_above_the_vehicle(
+    labelled: Workspace, drives: Any, tools: SimpleNamespace, tmp_path: Path
+) -> None:
+    """The frame of the poses has no name; base_footprint is 0.3 m below base_link, its child."""
+    work = Workspace(tmp_path / "work")
+    shutil.copytree(labelled.path, work.path)
+    path = work.session("monday").session_json
+    content = json.loads(path.read_text())
+    assert content["vehicle_root"] == {"frame": "base_link", "base_T_root": np.eye(4).tolist()}
+    base_T_root = transform(np.array([0.0, 0.0, -0.3]), np.array([0.0, 0.0, 0.0, 1.0]))
+    root = {"frame": "base_footprint", "base_T_root": base_T_root.tolist()}
+    path.write_text(json.dumps(content | {"session_frame": "", "vehicle_root": root}))
+    annotation = Annotation(AnnotationMode.SIDECAR, tmp_path / "out.mcap")
+    annotate_stage.annotate(drives["monday"].log, work, tools.quick_settings(), annotation)
+    reads = list(read_ros2(tmp_path / "out.mcap"))
+    marks = [m for r in reads if r.topic == "/semloc/markers" for m in r.message.markers]
+    assert {header(mark)[1] for mark in marks} == {"semloc/monday"}
+    (fixed,) = [r.message.transforms for r in reads if r.topic == "/semloc/tf_static"]
+    assert {edge.child_frame_id for edge in fixed} == {"semloc/tuesday", "semloc/wednesday"}
+    assert {edge.header.frame_id for edge in fixed} == {"semloc/monday"}
+    moving = [r.message.transforms[0] for r in reads if r.topic == "/semloc/tf"]
+    assert moving
+    for edge in moving:
+        assert (edge.header.frame_id, edge.child_frame_id) == ("semloc/monday", "base_footprint")
+        stamp = stamp_ns(edge.header.stamp)
+        truth = drives["monday"].session_T_world @ drives["monday"].world_T_base(stamp)
+        t = edge.transform.translation
+        np.testing.assert_allclose([t.x, t.y, t.z], (truth @ base_T_root)[:3, 3], atol=0.01)
 
 
 def test_the_map_of_the_other_sessions_lies_along_the_road(annotated: Any, drives: Any) -> None:

@@ -21,6 +21,7 @@ from semloc_logs.errors import ContractError
 from semloc_logs.numerics.transforms import inverse, transform
 
 F64 = NDArray[np.float64]
+Colour = tuple[float, float, float, float]  # red, green, blue, opacity from 0 to 1
 Encoding = Literal["ros2", "ros1", "protobuf", "json"]
 
 
@@ -40,6 +41,7 @@ CLOSURES, POSE, MARKERS, MAP = (
     "/semloc/markers",
     "/semloc/map",
 )
+OVERVIEW = "/semloc/overview"
 MOVING, FIXED = "/semloc/tf", "/semloc/tf_static"
 TOPICS = {
     CLOSURES: Kind.CLOSURE,
@@ -48,8 +50,9 @@ TOPICS = {
     MOVING: Kind.TRANSFORMS,
     FIXED: Kind.TRANSFORMS,
     MAP: Kind.CLOUD,
+    OVERVIEW: Kind.MARKERS,
 }
-LATCHED = (FIXED, MAP)  # a reader that starts later gets the last message
+LATCHED = (FIXED, MAP, OVERVIEW)  # a reader that starts later gets the last message
 COMMON_FRAME = "semloc/common"
 QOS_KEY = "offered_qos_profiles"
 LATCHING_KEY = "latching"  # of a ROS 1 connection
@@ -137,19 +140,35 @@ class Cloud:
         return out
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """Positions (n, 3) of a session's vehicle in ``frame_id``, in the order of time."""
+
+    session: str
+    frame_id: str
+    positions: F64
+    color: Colour
+
+    def name_position(self, size: float) -> F64:
+        """Place (3,) of a text of ``size`` m: above the start."""
+        return np.asarray(self.positions[0] + np.array([0.0, 0.0, 1.5 * size]))
+
+
 @dataclass(frozen=True, slots=True)
 class Scene:
     """What viewers show around the closures.
 
     ``moving`` transforms are of the vehicle, where the log has none, and of the common frame;
     ``fixed`` ones hold for the whole log. ``common`` are poses in the common frame, which /semloc/
-    pose has instead of the ones in the frames of the targets. ``cloud`` is the map.
+    pose has instead of the ones in the frames of the targets. ``cloud`` is the map, ``drives`` are
+    of the log and of the sessions that closures connect with it.
     """
 
     moving: Sequence[Transform] = ()
     fixed: Sequence[Transform] = ()
     common: Sequence[StampedPose] = ()
     cloud: Cloud | None = None
+    drives: Sequence[Drive] = ()
 
 
 NO_SCENE = Scene()
@@ -270,11 +289,35 @@ class Mark:
     other: F64 | None  # position of the other end
     size: float  # diameter of the sphere, m
     text: str
-    color: tuple[float, float, float, float]
+    color: Colour
 
     def text_position(self) -> F64:
         """Above the sphere (3,)."""
         return np.asarray(self.position + np.array([0.0, 0.0, 1.5 * self.size]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Overview:
+    """All drives and closures in one message.
+
+    Viewers that jump to a time show the last message of each topic only, so that messages of single
+    closures do not show them all. ``size`` (m) is the diameter of the ``marks`` in ``frame_id``.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    size: float
+    drives: Sequence[Drive]
+    marks: Sequence[Mark]
+
+    def lines(self) -> list[tuple[F64, Colour]]:
+        """The ends of the lines, and their colours: two for each mark with another end."""
+        return [
+            (end, mark.color)
+            for mark in self.marks
+            if mark.other is not None
+            for end in (mark.position, mark.other)
+        ]
 
 
 class Encoder(Protocol):
@@ -284,6 +327,7 @@ class Encoder(Protocol):
     def loop_closure(self, closure: ClosureRecord, stamp_ns: int) -> bytes: ...
     def pose(self, pose: StampedPose) -> bytes: ...
     def mark(self, mark: Mark) -> bytes: ...
+    def overview(self, overview: Overview) -> bytes: ...
     def transforms(self, transforms: Sequence[Transform]) -> bytes: ...
     def cloud(self, cloud: Cloud, stamp_ns: int) -> bytes: ...
 
@@ -368,6 +412,7 @@ def encode(
     topics = [*TOPICS.items(), *((topic, Kind.POSE) for topic in pose_topics.values())]
     number = {topic: k for k, (topic, _) in enumerate(topics)}
     messages: list[NewMessage] = []
+    marks: list[Mark] = []
     for key, closure in enumerate(sorted(mine, key=_order)):
         _refuse_infinite(closure)
         is_query = closure.query_session == session
@@ -382,10 +427,10 @@ def encode(
             topic = pose_topics[closure.target_session]
             messages.append(NewMessage(number[topic], log_time, data))
         if closure.session_position is not None:
-            mark = _mark(closure, stamp, key, context)
-            messages.append(NewMessage(number[MARKERS], log_time, encoder.mark(mark)))
+            marks.append(_mark(closure, stamp, key, context))
+            messages.append(NewMessage(number[MARKERS], log_time, encoder.mark(marks[-1])))
     if mine:
-        messages += _scene(context, encoder, number)
+        messages += _scene(context, encoder, number, marks)
     messages.sort(key=lambda m: m.log_time_ns)  # stable: closures of one frame stay in their order
     shared = {**context.facts.channel_metadata, **metadata}
     channels = [
@@ -427,8 +472,13 @@ def _pose_in_target(closure: ClosureRecord, session_T_query: F64) -> StampedPose
     return StampedPose(closure.query_stamp_ns, frame_id, session_T_query, covariance)
 
 
-def _scene(context: LogContext, encoder: Encoder, number: Mapping[str, int]) -> list[NewMessage]:
-    """A message for each moving transform and pose, and one, at the start, for all fixed ones."""
+def _scene(
+    context: LogContext, encoder: Encoder, number: Mapping[str, int], marks: Sequence[Mark]
+) -> list[NewMessage]:
+    """A message for each moving transform and pose.
+
+    At the start one for all fixed transforms, one for the map, and one for drives and closures.
+    """
     scene = context.scene
     moving = [(t.stamp_ns, MOVING, encoder.transforms([t])) for t in scene.moving]
     moving += [(pose.stamp_ns, POSE, encoder.pose(pose)) for pose in scene.common]
@@ -441,9 +491,12 @@ def _scene(context: LogContext, encoder: Encoder, number: Mapping[str, int]) -> 
     start_ns = max(0, facts.start_ns)
     if scene.fixed:
         messages.append(NewMessage(number[FIXED], start_ns, encoder.transforms(scene.fixed)))
+    stamp_ns = scene.fixed[0].stamp_ns if scene.fixed else start_ns
     if scene.cloud is not None:
-        stamp_ns = scene.fixed[0].stamp_ns if scene.fixed else start_ns
         messages.append(NewMessage(number[MAP], start_ns, encoder.cloud(scene.cloud, stamp_ns)))
+    if scene.drives:
+        shown = Overview(stamp_ns, context.frame_id, context.marker_size, scene.drives, marks)
+        messages.append(NewMessage(number[OVERVIEW], start_ns, encoder.overview(shown)))
     return messages
 
 

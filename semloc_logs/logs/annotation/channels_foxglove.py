@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any, Literal
 
@@ -29,6 +29,7 @@ from semloc_logs.logs.annotation.channels import (
     Kind,
     Mark,
     NewChannel,
+    Overview,
     StampedPose,
     Transform,
 )
@@ -119,14 +120,53 @@ class FoxgloveEncoder:
         text = entity.texts.add(billboard=True, font_size=mark.size, color=color, text=mark.text)
         _set_pose(text.pose, mark.text_position())
         if mark.other is not None:
-            points = [
-                Point3(x=float(x), y=float(y), z=float(z))
-                for x, y, z in (mark.position, mark.other)
-            ]
             line = entity.lines.add(
-                type=LinePrimitive.LINE_LIST, thickness=mark.size / 5, points=points, color=color
+                type=LinePrimitive.LINE_LIST,
+                thickness=mark.size / 5,
+                points=_points([mark.position, mark.other]),
+                color=color,
             )
             _set_pose(line.pose, np.zeros(3))
+        return self._bytes(update)
+
+    def overview(self, overview: Overview) -> bytes:
+        update = SceneUpdate()
+        time = _time(overview.stamp_ns)
+        thickness = overview.size / 5
+        for drive in overview.drives:
+            entity = update.entities.add(
+                timestamp=time, frame_id=drive.frame_id, id=f"semloc/drives/{drive.session}"
+            )
+            color = dict(zip("rgba", drive.color, strict=True))
+            line = entity.lines.add(
+                type=LinePrimitive.LINE_STRIP,
+                thickness=thickness,
+                points=_points(drive.positions),
+                color=color,
+            )
+            _set_pose(line.pose, np.zeros(3))
+            size = 2 * overview.size
+            text = entity.texts.add(billboard=True, font_size=size, color=color, text=drive.session)
+            _set_pose(text.pose, drive.name_position(size))
+        entity = update.entities.add(
+            timestamp=time, frame_id=overview.frame_id, id="semloc/closures"
+        )
+        for mark in overview.marks:
+            color = dict(zip("rgba", mark.color, strict=True))
+            sphere = entity.spheres.add(size=dict.fromkeys("xyz", mark.size), color=color)
+            _set_pose(sphere.pose, mark.position)
+        lines = overview.lines()
+        if lines:
+            line = entity.lines.add(
+                type=LinePrimitive.LINE_LIST,
+                thickness=thickness,
+                points=_points([end for end, _ in lines]),
+                colors=[dict(zip("rgba", color, strict=True)) for _, color in lines],
+            )
+            _set_pose(line.pose, np.zeros(3))
+        for entity in update.entities:
+            entity.lifetime.SetInParent()  # zero: stays
+            entity.frame_locked = True
         return self._bytes(update)
 
     def transforms(self, transforms: Sequence[Transform]) -> bytes:
@@ -247,6 +287,10 @@ def _json_item(value: Any) -> Any:
 def _time(stamp_ns: int) -> timestamp_pb2.Timestamp:
     sec, nanos = divmod(stamp_ns, 10**9)
     return timestamp_pb2.Timestamp(seconds=sec, nanos=nanos)
+
+
+def _points(positions: Iterable[F64]) -> list[Point3]:
+    return [Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in positions]
 
 
 def _set_pose(

@@ -14,9 +14,11 @@ from semloc_logs.logs.annotation.channels import (
     F64,
     ClosureRecord,
     Cloud,
+    Colour,
     Kind,
     Mark,
     NewChannel,
+    Overview,
     StampedPose,
     Transform,
 )
@@ -36,11 +38,8 @@ NAMES = {
     Kind.CLOUD: CLOUD,
 }
 _UINT8, _FLOAT32 = 2, 7  # values of sensor_msgs/PointField.datatype
-_SPHERE, _LINE_LIST, _TEXT = (
-    2,
-    5,
-    9,
-)  # values of visualization_msgs/Marker.type, equal in ROS 1 and 2
+# values of visualization_msgs/Marker.type, equal in ROS 1 and 2
+_SPHERE, _LINE_STRIP, _LINE_LIST, _SPHERE_LIST, _TEXT = (2, 4, 5, 7, 9)
 
 
 class RosEncoder:
@@ -94,29 +93,86 @@ class RosEncoder:
         return self._bytes(message)
 
     def mark(self, mark: Mark) -> bytes:
-        markers = [self._marker(mark, _SPHERE, "semloc/places", mark.position, (mark.size,) * 3)]
+        shared = {
+            "header": self._header(mark.stamp_ns, mark.frame_id),
+            "id": mark.key,
+            "color": self._color(mark.color),
+        }
+        markers = [
+            self._marker(
+                _SPHERE,
+                "semloc/places",
+                (mark.size,) * 3,
+                pose=self._place(mark.position),
+                **shared,
+            )
+        ]
         if mark.other is not None:
             ends = [self._point(mark.position), self._point(mark.other)]
+            width = mark.size / 5
             markers.append(
                 self._marker(
-                    mark,
-                    _LINE_LIST,
-                    "semloc/closures",
-                    np.zeros(3),
-                    (mark.size / 5, 0.0, 0.0),
-                    points=ends,
+                    _LINE_LIST, "semloc/closures", (width, 0.0, 0.0), points=ends, **shared
                 )
             )
         markers.append(
             self._marker(
-                mark,
                 _TEXT,
                 "semloc/names",
-                mark.text_position(),
                 (0.0, 0.0, mark.size),
+                pose=self._place(mark.text_position()),
                 text=mark.text,
+                **shared,
             )
         )
+        return self._bytes(self._new(MARKERS, markers=markers))
+
+    def overview(self, overview: Overview) -> bytes:
+        width = overview.size / 5
+        markers = []
+        for key, drive in enumerate(overview.drives):
+            shared = {
+                "header": self._header(overview.stamp_ns, drive.frame_id),
+                "id": key,
+                "color": self._color(drive.color),
+                "frame_locked": True,
+            }
+            points = [self._point(position) for position in drive.positions]
+            markers.append(
+                self._marker(
+                    _LINE_STRIP, "semloc/drives", (width, 0.0, 0.0), points=points, **shared
+                )
+            )
+            size = 2 * overview.size
+            markers.append(
+                self._marker(
+                    _TEXT,
+                    "semloc/sessions",
+                    (0.0, 0.0, size),
+                    pose=self._place(drive.name_position(size)),
+                    text=drive.session,
+                    **shared,
+                )
+            )
+        places = [(mark.position, mark.color) for mark in overview.marks]
+        lists = (
+            (_SPHERE_LIST, "semloc/places", (overview.size,) * 3, places),
+            (_LINE_LIST, "semloc/closures", (width, 0.0, 0.0), overview.lines()),
+        )
+        for kind, ns, scale, coloured in lists:
+            if coloured:
+                markers.append(
+                    self._marker(
+                        kind,
+                        ns,
+                        scale,
+                        header=self._header(overview.stamp_ns, overview.frame_id),
+                        color=self._color((1.0, 1.0, 1.0, 1.0)),
+                        points=[self._point(position) for position, _ in coloured],
+                        colors=[self._color(color) for _, color in coloured],
+                        frame_locked=True,
+                    )
+                )
         return self._bytes(self._new(MARKERS, markers=markers))
 
     def transforms(self, transforms: Sequence[Transform]) -> bytes:
@@ -139,29 +195,21 @@ class RosEncoder:
             ),
         )
 
-    def _marker(
-        self,
-        mark: Mark,
-        kind: int,
-        ns: str,
-        position: F64,
-        scale: tuple[float, ...],
-        **more: Any,
-    ) -> Any:
+    def _marker(self, kind: int, ns: str, scale: tuple[float, ...], **more: Any) -> Any:
         given = {
-            "header": self._header(mark.stamp_ns, mark.frame_id),
             "ns": ns,
-            "id": mark.key,
             "type": kind,
-            "pose": self._pose(position, np.array([0.0, 0.0, 0.0, 1.0])),
+            "pose": self._place(np.zeros(3)),
             "scale": self._new("geometry_msgs/msg/Vector3", x=scale[0], y=scale[1], z=scale[2]),
-            "color": self._new(
-                "std_msgs/msg/ColorRGBA", **dict(zip("rgba", mark.color, strict=True))
-            ),
-            "points": [],
-            "text": "",
         }
         return self._new("visualization_msgs/msg/Marker", **(given | more))
+
+    def _color(self, color: Colour) -> Any:
+        return self._new("std_msgs/msg/ColorRGBA", **dict(zip("rgba", color, strict=True)))
+
+    def _place(self, position: F64) -> Any:
+        """A pose without rotation."""
+        return self._pose(position, np.array([0.0, 0.0, 0.0, 1.0]))
 
     def _pose(self, position: F64, quaternion: F64) -> Any:
         x, y, z, w = (float(v) for v in quaternion)

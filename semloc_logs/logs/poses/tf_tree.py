@@ -130,6 +130,23 @@ class TransformTree:
             coming += parents
         return above
 
+    def root_above(self, frame: str) -> tuple[str, F64] | None:
+        """The topmost frame above ``frame`` and ``frame_T_root`` (4, 4).
+
+        None where an edge between them moves, a frame has several parents, or edges are a loop.
+        """
+        root = frame_name(frame)
+        frame_T_root = np.eye(4)
+        seen = {root}
+        while parents := self._parents.get(root, []):
+            pose = self._static.get((parents[0], root))
+            if len(parents) > 1 or pose is None or parents[0] in seen:
+                return None
+            frame_T_root = frame_T_root @ transforms.inverse(pose)
+            root = parents[0]
+            seen.add(root)
+        return root, frame_T_root
+
     def connected(self, target: str, source: str) -> bool:
         """Whether edges lead from one frame to the other; a frame is connected with itself."""
         return self._path(frame_name(target), frame_name(source)) is not None

@@ -283,6 +283,7 @@ class Session:
         """The streams, their roles, frames and problems, for session.json."""
         poses = self._pass.poses
         tally = self._pass.tally
+        root = poses.tree.root_above(self.base_frame) if self.base_frame else None
         return {
             "logs": [
                 {
@@ -306,6 +307,9 @@ class Session:
             "roles": self.roles.to_json(),
             "base_frame": self.base_frame,
             "session_frame": self.session_frame,
+            "vehicle_root": None
+            if root is None
+            else {"frame": root[0], "base_T_root": root[1].tolist()},
             "base_T_sensors": {
                 frame: pose.tolist() for frame, pose in sorted(self.base_T_sensors().items())
             },

@@ -203,6 +203,7 @@ def _write_session(work: Workspace, drive: _Drive, rng: np.random.Generator) -> 
             "voxels": len(voxels["ix"]),
             "base_frame": "base_link",
             "session_frame": "odom",
+            "vehicle_root": {"frame": "base_link", "base_T_root": np.eye(4).tolist()},
             "skipped": [],
         },
     )

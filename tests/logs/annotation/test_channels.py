@@ -24,6 +24,7 @@ from semloc_logs.logs.annotation.channels import (
     TOPICS,
     ClosureRecord,
     Cloud,
+    Drive,
     Encoding,
     LogContext,
     LogFacts,
@@ -193,7 +194,12 @@ def test_markers_show_the_place_and_the_other_end() -> None:
         session_position=np.array([5.0, 0.0, 0.0]),
     )
     found = decoded([closure], "wet_monday", "ros2")
-    assert [len(found[t]) for t in TOPICS] == [1, 1, 1, 0, 0, 0]  # one message, at the query's end
+    shown = {topic: len(found[topic]) for topic in TOPICS if found[topic]}
+    assert shown == {  # one message each, at the query's end
+        "/semloc/loop_closures": 1,
+        "/semloc/pose": 1,
+        "/semloc/markers": 1,
+    }
     sphere, line, text = found["/semloc/markers"][0][1].markers
     assert (sphere.type, line.type, text.type) == (2, 5, 9)
     assert {m.header.frame_id for m in (sphere, line, text)} == {"odom"}
@@ -433,7 +439,67 @@ def test_the_map_is_a_cloud_at_the_start(encoding: Encoding) -> None:
         assert row[offset["label"]] == (0, 255)[k]
 
 
-def test_late_readers_get_the_map() -> None:
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_one_message_at_the_start_has_all_drives_and_closures(encoding: Encoding) -> None:
+    """Closures from (1, 2, 3) to (4, 2, 3), and at (5, 0, 0) with an unknown other end."""
+    ends: list[tuple[list[float], list[float] | None]] = [
+        ([1.0, 2.0, 3.0], [4.0, 2.0, 3.0]),
+        ([5.0, 0.0, 0.0], None),
+    ]
+    closures = [
+        ClosureRecord.from_row(
+            ROW | {"query_stamp_ns": stamp_ns, "probability": probability},
+            session_T_query=np.eye(4),
+            session_position=np.array(end),
+            session_other=None if other is None else np.array(other),
+        )
+        for stamp_ns, probability, (end, other) in zip((14, 15), (1.0, 0.5), ends, strict=True)
+    ]
+    way = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 3.0, 0.0]])
+    orange = (0.75, 0.5, 0.0, 1.0)
+    drives = [
+        Drive("wet_monday", "odom", way, orange),
+        Drive("dry_sunday", "semloc/dry_sunday", way + 1.0, orange),
+    ]
+    found = decoded(closures, "wet_monday", encoding, scene=Scene(drives=drives))
+    assert [time for time, _ in found["/semloc/markers"]] == [14, 15]
+    ((time, message),) = found["/semloc/overview"]
+    assert time == 10
+    red_and_green = [(0.0, 1.0), (1.0, 0.0)]  # sure, unsure
+    if encoding.startswith("ros"):
+        kinds = {4: "way", 9: "name", 7: "places", 5: "closures"}
+        parts = {(kinds[m.type], m.header.frame_id): m for m in message.markers}
+        assert len(message.markers) == len(parts) == 6
+        assert len({(m.ns, m.id) for m in message.markers}) == 6  # none replaces another
+        assert all(m.frame_locked for m in message.markers)
+        names = [parts["name", d.frame_id].text for d in drives]
+        ways = [parts["way", d.frame_id].points for d in drives]
+        places = parts["places", "odom"].points
+        colours = parts["places", "odom"].colors
+        line = parts["closures", "odom"]
+        assert len(line.colors) == len(line.points)
+    else:
+        *of_drives, of_closures = message.entities
+        assert len({entity.id for entity in message.entities}) == 3
+        assert all(entity.frame_locked for entity in message.entities)
+        assert [e.frame_id for e in message.entities] == ["odom", "semloc/dry_sunday", "odom"]
+        names = [entity.texts[0].text for entity in of_drives]
+        ways = [entity.lines[0].points for entity in of_drives]
+        assert [entity.lines[0].type for entity in of_drives] == [0, 0]  # LINE_STRIP
+        places = [sphere.pose.position for sphere in of_closures.spheres]
+        colours = [sphere.color for sphere in of_closures.spheres]
+        (line,) = of_closures.lines
+        assert line.type == 2  # LINE_LIST
+        assert len(line.colors) == len(line.points)
+    assert names == ["wet_monday", "dry_sunday"]
+    for shown, drive in zip(ways, drives, strict=True):
+        assert [[p.x, p.y, p.z] for p in shown] == drive.positions.tolist()
+    assert [[p.x, p.y, p.z] for p in places] == [end for end, _ in ends]
+    assert [(c.r, c.g) for c in colours] == red_and_green
+    assert [[p.x, p.y, p.z] for p in line.points] == list(ends[0])
+
+
+def test_late_readers_get_the_last_message() -> None:
     def facts(encoding: Encoding) -> LogFacts:
         return LogFacts(encoding, "", {}, 0, 0, 0)
 

@@ -83,6 +83,25 @@ def test_loops_end() -> None:
     assert tree.ignored == 1
 
 
+def test_the_root_of_a_vehicle_is_above_static_edges_only() -> None:
+    tree = TransformTree()
+    assert tree.root_above("base_link") is not None  # itself, as nothing is above it
+    tree.add(edge("footprint", "base_link", yaw_transform(np.pi / 2, (1.0, 0.0, 0.5))))
+    tree.add(edge("ground", "footprint", yaw_transform(0.0, (0.0, 0.0, 0.25))))
+    tree.add(drive("base_link", "wheel", 0.0))
+    found = tree.root_above("/base_link")
+    assert found is not None
+    assert found[0] == "ground"
+    # the ground is 1 m behind along x of the footprint, which is left of the vehicle
+    np.testing.assert_allclose(found[1][:3, 3], [0.0, 1.0, -0.75], atol=1e-12)
+    tree.add(drive("odom", "ground", 0.0))
+    assert tree.root_above("base_link") is None
+    loop = TransformTree()
+    for parent, child in (("b", "a"), ("c", "b"), ("b", "c")):
+        loop.add(edge(parent, child, np.eye(4)))
+    assert loop.root_above("a") is None
+
+
 def test_nonsense_is_ignored_and_counted() -> None:
     tree = TransformTree()
     tree.add(edge("a", "", np.eye(4)))
