@@ -114,6 +114,7 @@ class FoxgloveEncoder:
             timestamp=_time(mark.stamp_ns), frame_id=mark.frame_id, id=f"semloc/{mark.key}"
         )
         entity.lifetime.SetInParent()  # zero: stays
+        entity.frame_locked = True
         color = dict(zip("rgba", mark.color, strict=True))
         sphere = entity.spheres.add(size=dict.fromkeys("xyz", mark.size), color=color)
         _set_pose(sphere.pose, mark.position)

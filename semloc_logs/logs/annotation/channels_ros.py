@@ -97,6 +97,7 @@ class RosEncoder:
             "header": self._header(mark.stamp_ns, mark.frame_id),
             "id": mark.key,
             "color": self._color(mark.color),
+            "frame_locked": True,
         }
         markers = [
             self._marker(

@@ -203,11 +203,13 @@ def test_markers_show_the_place_and_the_other_end() -> None:
     sphere, line, text = found["/semloc/markers"][0][1].markers
     assert (sphere.type, line.type, text.type) == (2, 5, 9)
     assert {m.header.frame_id for m in (sphere, line, text)} == {"odom"}
+    assert all(m.frame_locked for m in (sphere, line, text))  # as the overview is
     assert (sphere.pose.position.x, sphere.scale.x) == (5.0, 1.0)
     assert [(p.x, p.y, p.z) for p in line.points] == [(5.0, 0.0, 0.0), (0.0, 0.0, 0.0)]
     assert text.text == "an earlier place 0.97"
     entity = decoded([closure], "wet_monday", "json")["/semloc/markers"][0][1].entities[0]
     assert (entity.frame_id, entity.spheres[0].pose.position.x) == ("odom", 5.0)
+    assert entity.frame_locked
     assert [(p.x, p.y, p.z) for p in entity.lines[0].points] == [(5.0, 0.0, 0.0), (0.0, 0.0, 0.0)]
     assert entity.texts[0].text == "an earlier place 0.97"
 
