@@ -292,8 +292,8 @@ class Closures(_Section):
         3.0,
         ge=0,
         description="weight of a query's words that agree about a place in another session, below"
-        " which it is not searched there; 0: all queries are searched in all sessions. The one"
-        " query of a short session is searched in any case",
+        " which it is not searched there, nor where chance brings as much; 0: all queries are"
+        " searched in all sessions. The one query of a short session is searched in any case",
     )
     hypotheses: int = Field(
         32,

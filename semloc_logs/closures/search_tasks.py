@@ -73,8 +73,9 @@ def search_queries(task: SearchTask) -> int:
             return search_query(database, session, keyframe, queries[keyframe])
 
         of_target = {k: votes[k].get(target, NO_VOTES) for k in queries}
+        is_other = target != task.session
         for block in _blocks(task.keyframes, block_size(task.settings)):
-            found += _search_block(block, of_target, least_votes, search)
+            found += _search_block(block, of_target, least_votes, search, is_other=is_other)
     found.sort(key=lambda a: (a.query_keyframe, a.target_session))
     write_part(task.output, task.keyframes, task.targets, found)
     return len(found)
@@ -102,15 +103,21 @@ def _search_block(
     votes: Mapping[int, Votes],
     min_votes: float,
     search: Callable[[int], list[Alignment]],
+    *,
+    is_other: bool,
 ) -> list[Alignment]:
     """The alignments of the queries of a block in one target, as far as these are worth a search.
 
-    With a ``min_votes`` of 0 all are searched.
+    With a ``min_votes`` of 0 all are searched. In another session the votes must be more than
+    chance brings: there may be hundreds that never meet the query's. Its own is one, and a revisit
+    begins with a few votes.
     """
     if min_votes <= 0:
         return [a for keyframe in block for a in search(keyframe)]
     first = max(block, key=lambda keyframe: (votes[keyframe].place, -keyframe))
     enough = min(min_votes, MIN_SHARE * votes[first].everywhere)
+    if is_other:
+        enough = max(enough, votes[first].by_chance)
     if votes[first].place <= 0 or votes[first].place < enough:
         return []
     found = search(first)

@@ -23,7 +23,13 @@ def alignment(keyframe: int, contradiction: float) -> Any:
     return SimpleNamespace(query_keyframe=keyframe, features=features)
 
 
-def searched(votes: Mapping[int, Votes], found: Mapping[int, Any], least: float) -> list[int]:
+def searched(
+    votes: Mapping[int, Votes],
+    found: Mapping[int, Any],
+    least: float,
+    *,
+    is_other: bool = True,
+) -> list[int]:
     """The queries that are searched, in turn; all that is found is returned."""
     order: list[int] = []
 
@@ -31,13 +37,13 @@ def searched(votes: Mapping[int, Votes], found: Mapping[int, Any], least: float)
         order.append(keyframe)
         return [found[keyframe]] if keyframe in found else []
 
-    out = _search_block(BLOCK, votes, least, search)
+    out = _search_block(BLOCK, votes, least, search, is_other=is_other)
     assert out == [found[keyframe] for keyframe in order if keyframe in found]
     return order
 
 
-def votes(*places: float, everywhere: float = 200.0) -> dict[int, Votes]:
-    return {k: Votes(place, everywhere) for k, place in zip(BLOCK, places, strict=True)}
+def votes(*places: float, everywhere: float = 100.0, submaps: int = 12) -> dict[int, Votes]:
+    return {k: Votes(place, everywhere, submaps) for k, place in zip(BLOCK, places, strict=True)}
 
 
 @pytest.mark.parametrize(
@@ -60,6 +66,20 @@ def test_a_block_without_votes_is_not_searched() -> None:
 
 def test_in_a_small_map_fewer_votes_are_enough() -> None:
     assert searched(votes(1.4, 0.0, 0.0, 0.0, everywhere=5.0), {}, MIN_VOTES) == [10]
+
+
+def test_votes_by_chance_by_hand() -> None:
+    assert Votes(9.0, 400.0, 12).by_chance == 5.0
+    assert Votes(9.0, 400.0, 3).by_chance == 5.0  # a short map
+    assert Votes(9.0, 400.0, 48).by_chance == 2.5  # four kilometres
+    assert Votes(0.0, 0.0, 0).by_chance == 0.0
+
+
+def test_in_another_session_votes_are_more_than_chance_brings() -> None:
+    few, more = (votes(v, 0.0, 0.0, 0.0, everywhere=400.0) for v in (4.9, 5.0))
+    assert searched(few, {}, MIN_VOTES) == []
+    assert searched(more, {}, MIN_VOTES) == [10]
+    assert searched(few, {}, MIN_VOTES, is_other=False) == [10]
 
 
 def test_all_are_searched_without_a_bound() -> None:
