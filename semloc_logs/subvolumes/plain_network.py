@@ -13,6 +13,7 @@ but free or but unobserved voxels; a repeated voxel meets sums of a filter's wei
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -36,6 +37,9 @@ from semloc_logs.subvolumes.network import (
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
+BoxArrays = tuple[U8, F32, U8]
+Filters = tuple[F32, F32, F32]
+Place = tuple[int, int, int]
 CHANNELS = (8, 16, 32, 64)
 FIRST = CHANNELS[0]
 CORNER = 2  # voxels along an edge after four poolings
@@ -49,14 +53,30 @@ REPEATED = ((((1, 0, 0), (0, 1, 1), (0, 0, 0))), (((0, 0, 0), (1, 1, 0), (0, 0, 
 def first_block(codes: U8, table: F32, bias: F32, out: F32, largest: U8) -> None:
     """Convolution, ReLU and max-pooling of one-hot voxels.
 
-    ``codes`` (b, 34, 34, 34) have a margin of the code whose rows of ``table`` (27, codes, FIRST)
-    are zero, the last; before it are occupied of unknown class, unobserved and free. ``out`` is (b,
-    16, 16, 16, FIRST), ``largest`` of its shape gets the voxel of each cell that has the maximum,
-    or the uniform code of its neighbourhood plus ``UNIFORM``. Neighbourhoods are nearly uniform:
-    only the differences from free or unobserved space are added.
+    ``codes`` (b, 34, 34, 34), or of other even lengths, have a margin of the code whose rows of
+    ``table`` (27, codes, FIRST) are zero, the last; before it are occupied of unknown class,
+    unobserved and free. ``out`` is (b, 16, 16, 16, FIRST), ``largest`` of its shape gets the voxel
+    of each cell that has the maximum, or the uniform code of its neighbourhood plus ``UNIFORM``.
+    Neighbourhoods are nearly uniform: only the differences from free or unobserved space are added.
     """
-    unobserved = table.shape[1] - 3
-    free = unobserved - 1
+    differences, of_uniform = _from_uniform(table, bias)
+    total = np.empty((2, 2, 2, FIRST), np.float32)
+    for b in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            for y in range(out.shape[2]):
+                for z in range(out.shape[3]):
+                    cell = codes[b, 2 * x : 2 * x + 4, 2 * y : 2 * y + 4, 2 * z : 2 * z + 4]
+                    _pooled(
+                        cell, differences, of_uniform, total, out[b, x, y, z], largest[b, x, y, z]
+                    )
+
+
+@njit(cache=True, nogil=True)
+def _from_uniform(table: F32, bias: F32) -> tuple[F32, F32]:
+    """What the rows of ``table`` differ by from free and from unobserved space (2, 27, codes,
+    FIRST), and the values (2, FIRST) in such space.
+    """
+    free = table.shape[1] - 4
     differences = np.empty((2, *table.shape), np.float32)
     of_uniform = np.empty((2, FIRST), np.float32)
     for u in range(2):
@@ -64,37 +84,92 @@ def first_block(codes: U8, table: F32, bias: F32, out: F32, largest: U8) -> None
         for tap in range(27):
             of_uniform[u] += table[tap, free + u]
             differences[u, tap] = table[tap] - table[tap, free + u]
+    return differences, of_uniform
+
+
+@njit(cache=True, nogil=True)
+def _pooled(cell: U8, differences: F32, of_uniform: F32, total: F32, best: F32, which: U8) -> None:
+    """The maxima ``best`` (FIRST,) of the eight voxels in the middle of ``cell`` (4, 4, 4), and
+    ``which`` have them; ``total`` (2, 2, 2, FIRST) is working memory.
+    """
+    free = differences.shape[2] - 4
+    count_free = 0
+    count_unobserved = 0
+    for i in range(4):
+        for j in range(4):
+            for k in range(4):
+                count_free += cell[i, j, k] == free
+                count_unobserved += cell[i, j, k] == free + 1
+    u = int(count_unobserved > count_free)
+    if max(count_free, count_unobserved) == 64:
+        for c in range(FIRST):
+            best[c] = max(of_uniform[u, c], np.float32(0))
+            which[c] = UNIFORM + u
+        return
+    total[:] = of_uniform[u]
+    _add_differences(cell, free + u, differences[u], total)
+    for c in range(FIRST):
+        best[c] = np.float32(0)
+        which[c] = 0
+        for voxel in range(8):
+            value = total[voxel >> 2, (voxel >> 1) & 1, voxel & 1, c]
+            if value > best[c]:
+                best[c] = value
+                which[c] = voxel
+
+
+@njit(cache=True, nogil=True)
+def window_blocks(box: BoxArrays, corners: NDArray[np.int64], filters: Filters, out: F32) -> None:
+    """:func:`first_block` of windows of a box whose own first block is known.
+
+    Of ``box`` are the codes (x + 2, y + 2, z + 2) with their margin, and ``out`` and ``largest`` of
+    the box without the batch. ``corners`` (n, 3) are even voxels of it; ``filters``: the table and
+    the bias, and ``out`` of two windows of free and of unobserved space. ``out`` is (n, 16, 16, 16,
+    FIRST). A window sees nothing beyond its faces, so only the cells there differ from the box's.
+    """
+    codes, features, largest = box
+    table, bias, of_space = filters
+    differences, of_uniform = _from_uniform(table, bias)
     total = np.empty((2, 2, 2, FIRST), np.float32)
-    for b in range(out.shape[0]):
-        for x in range(out.shape[1]):
-            for y in range(out.shape[2]):
-                for z in range(out.shape[3]):
-                    cell = codes[b, 2 * x : 2 * x + 4, 2 * y : 2 * y + 4, 2 * z : 2 * z + 4]
-                    count_free = 0
-                    count_unobserved = 0
-                    for i in range(4):
-                        for j in range(4):
-                            for k in range(4):
-                                count_free += cell[i, j, k] == free
-                                count_unobserved += cell[i, j, k] == unobserved
-                    u = int(count_unobserved > count_free)
-                    best = out[b, x, y, z]
-                    which = largest[b, x, y, z]
-                    if max(count_free, count_unobserved) == 64:
+    cell = np.empty((4, 4, 4), np.uint8)
+    which = np.empty(FIRST, np.uint8)
+    last = SIZE // 2 - 1
+    for n in range(len(corners)):
+        first_x = corners[n, 0] // 2
+        first_y = corners[n, 1] // 2
+        first_z = corners[n, 2] // 2
+        for x in range(SIZE // 2):
+            for y in range(SIZE // 2):
+                for z in range(SIZE // 2):
+                    i = first_x + x
+                    j = first_y + y
+                    k = first_z + z
+                    value = out[n, x, y, z]
+                    if 0 < x < last and 0 < y < last and 0 < z < last:
                         for c in range(FIRST):
-                            best[c] = max(of_uniform[u, c], np.float32(0))
-                            which[c] = UNIFORM + u
-                        continue
-                    total[:] = of_uniform[u]
-                    _add_differences(cell, free + u, differences[u], total)
-                    for c in range(FIRST):
-                        best[c] = np.float32(0)
-                        which[c] = 0
-                        for voxel in range(8):
-                            value = total[voxel >> 2, (voxel >> 1) & 1, voxel & 1, c]
-                            if value > best[c]:
-                                best[c] = value
-                                which[c] = voxel
+                            value[c] = features[i, j, k, c]
+                    elif largest[i, j, k, 0] >= UNIFORM:
+                        for c in range(FIRST):
+                            value[c] = of_space[largest[i, j, k, 0] - UNIFORM, x, y, z, c]
+                    else:
+                        _inside(codes, (i, j, k), (x, y, z), cell, table.shape[1] - 1)
+                        _pooled(cell, differences, of_uniform, total, value, which)
+
+
+@njit(cache=True, nogil=True)
+def _inside(codes: U8, at: Place, within: Place, cell: U8, margin: int) -> None:
+    """The codes about the cell ``at`` of a box in ``cell`` (4, 4, 4), those beyond the faces of the
+    window in which it is the cell ``within`` as ``margin``.
+    """
+    for a in range(4):
+        for b in range(4):
+            for c in range(4):
+                x = 2 * within[0] + a - 1
+                y = 2 * within[1] + b - 1
+                z = 2 * within[2] + c - 1
+                cell[a, b, c] = margin
+                if 0 <= x < SIZE and 0 <= y < SIZE and 0 <= z < SIZE:
+                    cell[a, b, c] = codes[2 * at[0] + a, 2 * at[1] + b, 2 * at[2] + c]
 
 
 @njit(cache=True, nogil=True)
@@ -147,6 +222,15 @@ def first_block_gradient(
             of_table[tap, free + u] += of_uniform[u]
 
 
+def _computed(padded: U8, table: F32, bias: F32) -> tuple[F32, U8]:
+    """``out`` and ``largest`` of :func:`first_block`."""
+    cells = [(length - 2) // 2 for length in padded.shape[1:]]
+    out = np.empty((len(padded), *cells, FIRST), np.float32)
+    largest = np.empty(out.shape, np.uint8)
+    first_block(padded, table, bias, out, largest)
+    return out, largest
+
+
 class _FirstBlock(torch.autograd.Function):
     """:func:`first_block` of codes (b, 32, 32, 32) with its gradient."""
 
@@ -156,10 +240,7 @@ class _FirstBlock(torch.autograd.Function):
         padded = np.full((len(codes), *(SIZE + 2,) * 3), inputs, np.uint8)
         padded[:, 1:-1, 1:-1, 1:-1] = codes.numpy()
         rows = F.pad(table.float(), (0, 0, 0, 1)).contiguous()  # the margin adds nothing
-        half = SIZE // 2
-        out = np.empty((len(codes), half, half, half, FIRST), np.float32)
-        largest = np.empty(out.shape, np.uint8)
-        first_block(padded, rows.numpy(), bias.float().numpy(), out, largest)
+        out, largest = _computed(padded, rows.numpy(), bias.float().numpy())
         ctx.kept = (padded, out, largest, rows.shape)
         return torch.from_numpy(out).permute(0, 4, 1, 2, 3)
 
@@ -200,10 +281,44 @@ class PlainEncoder(Describer):
     def features(self, codes: Tensor) -> Tensor:
         """The last hidden layer (b, HIDDEN)."""
         x, y = ((length - SIZE) // 2 for length in codes.shape[1:3])
-        voxels = self.first_features(codes[:, x : x + SIZE, y : y + SIZE])
+        return self._deeper(self.first_features(codes[:, x : x + SIZE, y : y + SIZE]))
+
+    def _deeper(self, voxels: Tensor) -> Tensor:
+        """The last hidden layer of the first block (b, FIRST, 16, 16, 16)."""
         for block in self.blocks:
             voxels = F.relu(max_pool(block(voxels)))
         return torch.tanh(self.hidden(voxels.flatten(1)))
+
+    def of_windows(self, codes: U8, corners: NDArray[np.int64], batch: int) -> Iterator[Tensor]:
+        """mu (b, latent) of the windows of a box of ``codes`` (x, y, z) at even ``corners`` (n, 3),
+        ``batch`` at once. Equal to each window's own; their first block is computed once for all.
+        """
+        table, bias = (part.detach().numpy() for part in self._rows())
+        even = [length + length % 2 for length in codes.shape]
+        padded = np.full([length + 2 for length in even], self.inputs, np.uint8)
+        padded[tuple(slice(1, 1 + length) for length in codes.shape)] = codes
+        box = (padded, *(part[0] for part in _computed(padded[None], table, bias)))
+        space = np.full((2, *(SIZE + 2,) * 3), self.inputs, np.uint8)
+        for u in range(2):
+            space[u, 1:-1, 1:-1, 1:-1] = self.inputs - 3 + u
+        filters = (table, bias, _computed(space, table, bias)[0])
+        for first in range(0, len(corners), batch):
+            part = corners[first : first + batch]
+            out = np.empty((len(part), *(SIZE // 2,) * 3, FIRST), np.float32)
+            window_blocks(box, part, filters, out)
+            with torch.autocast("cpu", dtype=torch.bfloat16):
+                mean: Tensor = self.mean(self._deeper(torch.from_numpy(out).movedim(-1, 1)))
+            yield mean.float()
+
+    def _rows(self) -> tuple[Tensor, Tensor]:
+        """The filter of the first block as rows (27, inputs + 1, FIRST), the last of a margin that
+        adds nothing, and its bias.
+        """
+        weight = self.first.weight
+        bias = self.first.bias
+        assert bias is not None
+        table = weight.permute(2, 3, 4, 1, 0).reshape(27, self.inputs, FIRST)
+        return F.pad(table.float(), (0, 0, 0, 1)).contiguous(), bias.float()
 
     def forward(self, codes: Tensor) -> Tensor:
         mean: Tensor = self.mean(self.features(codes))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,10 @@ from semloc_logs.subvolumes.cut import SIZE, code_table
 from semloc_logs.subvolumes.network import Encoder, descriptors
 from semloc_logs.subvolumes.plain_network import PlainEncoder
 from semloc_logs.training.pairs import read_shard
+
+TOGETHER = 8  # views that are described together
+# corners (9, 3) of the subvolumes of a complete view
+NINE = np.array([(x, y, 0) for x in range(0, 33, SIZE // 2) for y in range(0, 33, SIZE // 2)])
 
 
 @torch.inference_mode()
@@ -41,7 +46,6 @@ def shard_descriptors(
     return np.concatenate(out) if out else np.zeros((0, 256), np.float16)
 
 
-@torch.inference_mode()
 def plain_shard_descriptors(
     shards: Sequence[Path],
     encoder: PlainEncoder,
@@ -52,16 +56,21 @@ def plain_shard_descriptors(
     voxels apart: the words of the training maps.
     """
     table = code_table(encoder.variant)
+
+    @torch.inference_mode()  # of a thread
+    def nine_each(some: NDArray[np.uint8]) -> NDArray[np.float32]:
+        codes = table[some].reshape(-1, *some.shape[2:])  # one behind the other along x
+        along = np.arange(len(some))[:, None, None] * (some.shape[1], 0, 0)
+        corners = (NINE + along).reshape(-1, 3)
+        return torch.cat([*encoder.of_windows(codes, corners, len(corners))]).numpy()
+
     out = []
-    for done, path in enumerate(shards, 1):
-        views = read_shard(path)[2][:pairs_per_shard]
-        for view in views:
-            codes = torch.from_numpy(table[view])
-            windows = codes.unfold(0, SIZE, SIZE // 2).unfold(1, SIZE, SIZE // 2)
-            single = windows.permute(0, 1, 3, 4, 2)[:3, :3].reshape(-1, *(SIZE,) * 3)
-            with torch.autocast("cpu", dtype=torch.bfloat16):
-                mu = encoder(single)
-            out.append(mu[:, :, 0, 0].float().numpy())
-        if note is not None:
-            note(f"{encoder.variant}: descriptors of {done} of {len(shards)} shards")
+    # the first block is compiled code of one thread
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for done, path in enumerate(shards, 1):
+            views = read_shard(path)[2][:pairs_per_shard]
+            parts = [views[i : i + TOGETHER] for i in range(0, len(views), TOGETHER)]
+            out += pool.map(nine_each, parts)
+            if note is not None:
+                note(f"{encoder.variant}: descriptors of {done} of {len(shards)} shards")
     return np.concatenate(out) if out else np.zeros((0, encoder.latent), np.float32)

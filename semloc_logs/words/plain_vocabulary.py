@@ -8,8 +8,10 @@ l^2 / (1 - l^2), where l is the greater of s times both lengths.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from safetensors import SafetensorError, safe_open
 from semloc_logs.errors import SettingsError
 from semloc_logs.words.vocabulary import (
     Vocabulary,
+    cells_of,
     load_vocabulary,
     save_vocabulary,
     train_vocabulary,
@@ -27,6 +30,7 @@ from semloc_logs.words.vocabulary import (
 F32 = NDArray[np.float32]
 USUAL_LENGTH = 0.5  # of s times a descriptor: nearly all are shorter
 QUANTILE = 0.99
+PER_WORD = 4  # descriptors of a word, on average, of few descriptors
 LONGEST = 0.95  # longer ones are cut to it
 
 
@@ -56,11 +60,14 @@ def train_plain_vocabulary(
 ) -> PlainVocabulary:
     """A vocabulary of ``cells`` x ``children`` words from descriptors (n, N) of any length.
 
-    Raises SettingsError where there are too few.
+    Fewer than ``PER_WORD`` descriptors to a word give fewer children, a power of two. Raises
+    SettingsError where there are too few.
     """
     length = np.linalg.norm(np.asarray(descriptors, np.float32), axis=1)
     longest = float(np.quantile(length, QUANTILE)) if len(length) else 1.0
     scale = USUAL_LENGTH / max(longest, 1e-9)
+    enough = max(1, len(length) // (PER_WORD * cells_of(len(length), cells)))
+    children = min(children, 1 << (enough.bit_length() - 1))
     return PlainVocabulary(
         train_vocabulary(lifted(descriptors, scale), cells, children, seed), scale
     )
@@ -72,14 +79,18 @@ def save_plain_vocabulary(path: Path, words: PlainVocabulary, card: dict[str, st
 
 
 @lru_cache(maxsize=8)
-def load_plain_vocabulary(variant: str, path: Path) -> PlainVocabulary:
-    """The vocabulary of a file; SettingsError when it does not hold one of the paper's method."""
-    vocabulary = load_vocabulary(variant, path)
-    try:
-        with safe_open(path, "np") as handle:
-            return PlainVocabulary(vocabulary, float((handle.metadata() or {})["scale"]))
-    except (OSError, SafetensorError, KeyError, ValueError):
-        raise SettingsError(
-            f"{path} is not a vocabulary of the paper's method: make one with"
-            " 'semloc vocabulary --method paper'."
-        ) from None
+def load_plain_vocabulary(variant: str, path: Path | None = None) -> PlainVocabulary:
+    """The vocabulary of a file, or the shipped one; SettingsError when the file does not hold one
+    of the paper's method.
+    """
+    shipped = files("semloc_logs.words") / "vocabularies" / f"paper_{variant}.safetensors"
+    with nullcontext(path) if path is not None else as_file(shipped) as file:
+        vocabulary = load_vocabulary(variant, file)
+        try:
+            with safe_open(file, "np") as handle:
+                return PlainVocabulary(vocabulary, float((handle.metadata() or {})["scale"]))
+        except (OSError, SafetensorError, KeyError, ValueError):
+            raise SettingsError(
+                f"{file} is not a vocabulary of the paper's method: make one with"
+                " 'semloc vocabulary --method paper'."
+            ) from None

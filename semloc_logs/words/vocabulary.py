@@ -145,6 +145,11 @@ def _directions(descriptors: F32, cells: F32, rng: np.random.Generator) -> F32:
     return grid((directions @ (q * np.sign(np.diag(r)))).T)
 
 
+def cells_of(descriptors: int, most: int) -> int:
+    """How many cells a vocabulary of so many descriptors has."""
+    return min(most, max(8, descriptors // 64))
+
+
 def train_vocabulary(
     descriptors: NDArray[np.floating], cells: int = 256, children: int = 256, seed: int = 0
 ) -> Vocabulary:
@@ -161,7 +166,7 @@ def train_vocabulary(
             f"{descriptors.shape[1]}: describe more sessions."
         )
     rng = np.random.default_rng(seed)
-    cells = int(min(cells, max(8, n // 64)))
+    cells = cells_of(n, cells)
     some = grid(descriptors[np.sort(rng.choice(n, min(n, PER_CELL * cells), replace=False))])
     centroids = kmeans(some, cells, rng, 15)
     centroids = grid(centroids / np.maximum(np.linalg.norm(centroids, axis=1, keepdims=True), 1e-9))

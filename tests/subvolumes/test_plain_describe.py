@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from semloc_logs.subvolumes.cut import SIZE, code_table
 from semloc_logs.subvolumes.plain_describe import (
     TILE,
     describe_blocks,
     describe_box,
+    describe_windows,
     occupied_windows,
 )
 from semloc_logs.subvolumes.plain_network import PlainEncoder
-from semloc_logs.voxels.grid import UNOBSERVED_STATE, BlockMap
+from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 from semloc_logs.voxels.keys import BLOCK, pack, unpack
 
 
@@ -73,3 +75,22 @@ def test_only_subvolumes_near_the_road_are_described(encoder: PlainEncoder) -> N
     near = describe_blocks(blocks, 8, 1, encoder, (np.array([[0.0, 0.0]]), 100.0))
     assert len(near.centre) == 64
     assert near.centre[:, 0].max() < 100
+
+
+def test_windows_of_a_box_are_described_as_each_alone(encoder: PlainEncoder) -> None:
+    rng = np.random.default_rng(0)
+    # free space over a floor, a wall, unobserved beyond, and a corner of noise
+    state = np.full((45, 50, 41), UNOBSERVED_STATE, np.uint8)
+    state[:, :30] = FREE_STATE
+    state[:, :, 4] = 0
+    state[:, 30] = 2
+    state[:12, :12, :12] = rng.choice([0, 2, FREE_STATE, UNOBSERVED_STATE], (12, 12, 12))
+    corners = np.array([[0, 0, 0], [2, 4, 8], [13, 18, 9], [12, 17, 0], [2, 18, 8]])
+    found = describe_windows(state, corners, encoder)
+    size = slice(0, SIZE)
+    for corner, vector in zip(corners, found, strict=True):
+        x, y, z = corner
+        alone = torch.from_numpy(code_table("geometric")[state[x:, y:, z:][size, size, size]])
+        with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
+            expected = encoder(alone[None])[0, :, 0, 0].float()
+        np.testing.assert_allclose(vector, expected, atol=1e-3)
