@@ -56,18 +56,39 @@ def cpu_seconds() -> float:
     return times.user + times.system + times.children_user + times.children_system
 
 
-def answer_scenario(
-    run: Run,
-    scenario: Scenario,
-    store: ViewStore,
-    answers: Path,
-    make: Callable[[], System],
-) -> int:
+@dataclass(eq=False)
+class Learner:
+    """Systems that ``make`` makes, fitted to databases of a ``store``.
+
+    The latest one is kept: scenarios that follow each other may share their database.
+    """
+
+    store: ViewStore
+    make: Callable[[], System]
+
+    def __post_init__(self) -> None:
+        self._latest: tuple[bytes, System] | None = None
+
+    def fitted(self, database: NDArray[np.int64]) -> tuple[System, float]:
+        """The system that has learnt the views of these numbers, and the CPU time that it took."""
+        key = database.tobytes()
+        if self._latest is not None and self._latest[0] == key:
+            return self._latest[1], 0.0
+        self._latest = None  # two of them may not fit into memory
+        started = cpu_seconds()
+        system = self.make()
+        system.fit(self.store.selection(database))
+        self._latest = (key, system)
+        return system, cpu_seconds() - started
+
+
+def answer_scenario(run: Run, scenario: Scenario, learner: Learner, answers: Path) -> int:
     """Answer the queries that have no answer yet; their number.
 
     The system is made and fitted only for trials with open queries. Whatever it raises is passed
     on; the answers before it are kept.
     """
+    store = learner.store
     folder = run.folder(answers, scenario)
     answered = 0
     total = len(scenario.queries)
@@ -77,10 +98,7 @@ def answer_scenario(
         left = parts.left()
         done += len(trial.queries) - len(left)
         if left:
-            started = cpu_seconds()
-            system = make()
-            system.fit(store.selection(trial.database))
-            parts.fit_cpu_s = cpu_seconds() - started
+            system, parts.fit_cpu_s = learner.fitted(trial.database)
             name = f"{run.system}, {run.sensor} {scenario.name}"
             try:
                 for query in left:

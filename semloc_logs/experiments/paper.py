@@ -15,7 +15,7 @@ from pathlib import Path
 from semloc_logs.engines import Engine, make_engine
 from semloc_logs.errors import SemlocError, SettingsError
 from semloc_logs.evaluation.truth import read_truth
-from semloc_logs.experiments.answers import Run, answer_scenario, read_answers
+from semloc_logs.experiments.answers import Learner, Run, answer_scenario, read_answers
 from semloc_logs.experiments.figure import draw_figure
 from semloc_logs.experiments.log_views import (
     SENSORS,
@@ -59,7 +59,7 @@ from semloc_logs.tables.table import write_json
 
 ANSWERS = "answers"  # folder of a run
 HEADINGS_DEG = 0.0, 90.0, 180.0
-QUICK = Extent(per_passage=2, most=2)
+QUICK = Extent(per_passage=1, most=1)
 FULL = Extent(most=120)
 
 _log = logging.getLogger(__name__)
@@ -289,11 +289,13 @@ def _answer_sensor(task: _SystemTask, sensor: str, options: SystemOptions) -> st
     store = task.stores[sensor]
     if entry.needs_pictures and not store.has_pictures:
         return "it works on pictures, and the logs have no calibrated camera."
-    make = partial(make_system, entry, options)
+    if not entry.needs_pictures:
+        store = store.without_pictures()
+    learner = Learner(store, partial(make_system, entry, options))
     try:
         for scenario in task.scenarios[sensor]:
             answers = task.request.folder / ANSWERS
-            answer_scenario(task.run(sensor), scenario, store, answers, make)
+            answer_scenario(task.run(sensor), scenario, learner, answers)
     except SemlocError as problem:
         return str(problem)
     except Exception as problem:  # one system must not end a run of hours

@@ -128,7 +128,7 @@ def quick_town(seed: int = SEED) -> Town:
     summer, *_, snow = TIMES
     pairs = ((summer, summer), (summer, snow))
     drives = _drives(plan, _Parts((8.0, 38.0), (0.0, 40.0), (10.0, 35.0)), pairs)
-    return Town(plan, drives, rate_hz=2.0, speed=5.0, pairs=pairs, seed=seed)
+    return Town(plan, drives, rate_hz=1.0, speed=4.0, pairs=pairs, seed=seed)
 
 
 def _winding(corners: list[tuple[float, float]], seed: int, bend: float) -> F64:

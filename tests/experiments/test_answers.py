@@ -10,6 +10,7 @@ import pytest
 
 from semloc_logs.errors import SemlocError
 from semloc_logs.experiments.answers import (
+    Learner,
     Run,
     answer_scenario,
     pose_errors,
@@ -70,7 +71,7 @@ def test_answers_come_back_with_their_errors(
     plan: tuple[ViewStore, Scenario], tmp_path: Path
 ) -> None:
     store, scenario = plan
-    assert answer_scenario(RUN, scenario, store, tmp_path, Nearest) == 100
+    assert answer_scenario(RUN, scenario, Learner(store, Nearest), tmp_path) == 100
     found = read_answers(RUN, scenario, tmp_path)
     assert len(found) == 100
     assert found.first_m.tolist() == pytest.approx([0.25] * 100)
@@ -86,14 +87,14 @@ def test_an_interrupted_run_continues(plan: tuple[ViewStore, Scenario], tmp_path
     store, scenario = plan
     broken = Nearest(breaks_after=30)
     with pytest.raises(KeyboardInterrupt):
-        answer_scenario(RUN, scenario, store, tmp_path, lambda: broken)
+        answer_scenario(RUN, scenario, Learner(store, lambda: broken), tmp_path)
     again = Nearest()
-    assert answer_scenario(RUN, scenario, store, tmp_path, lambda: again) == 70
+    assert answer_scenario(RUN, scenario, Learner(store, lambda: again), tmp_path) == 70
     assert not set(again.queries) & set(broken.queries)
     assert len(read_answers(RUN, scenario, tmp_path)) == 100
 
     idle = Nearest()
-    assert answer_scenario(RUN, scenario, store, tmp_path, lambda: idle) == 0
+    assert answer_scenario(RUN, scenario, Learner(store, lambda: idle), tmp_path) == 0
     assert idle.fits == 0
 
 
@@ -109,7 +110,7 @@ def test_answers_are_written_on_the_way_too(
             written.append(len(read_answers(RUN, scenario, tmp_path)))
             return super().localise(query)
 
-    answer_scenario(RUN, scenario, store, tmp_path, Watching)
+    answer_scenario(RUN, scenario, Learner(store, Watching), tmp_path)
     assert written == list(range(100))
 
 
@@ -117,9 +118,9 @@ def test_another_version_of_a_system_answers_again(
     plan: tuple[ViewStore, Scenario], tmp_path: Path
 ) -> None:
     store, scenario = plan
-    answer_scenario(RUN, scenario, store, tmp_path, Nearest)
+    answer_scenario(RUN, scenario, Learner(store, Nearest), tmp_path)
     newer = Run("nearest", "lidar", 1, "v2")
-    assert answer_scenario(newer, scenario, store, tmp_path, Nearest) == 100
+    assert answer_scenario(newer, scenario, Learner(store, Nearest), tmp_path) == 100
     assert len(read_answers(newer, scenario, tmp_path)) == 100
 
 
@@ -132,12 +133,12 @@ def test_a_query_without_a_pose_is_an_answer(
         def localise(self, query: Query) -> list[RankedPose]:
             return []
 
-    answer_scenario(RUN, scenario, store, tmp_path, Silent)
+    answer_scenario(RUN, scenario, Learner(store, Silent), tmp_path)
     found = read_answers(RUN, scenario, tmp_path)
     assert len(found) == 100
     assert np.isinf(found.errors_m).all()
     assert (found.first_score == -np.inf).all()
-    assert answer_scenario(RUN, scenario, store, tmp_path, Silent) == 0
+    assert answer_scenario(RUN, scenario, Learner(store, Silent), tmp_path) == 0
 
 
 def test_a_pose_that_is_not_finite_is_refused(
@@ -150,4 +151,4 @@ def test_a_pose_that_is_not_finite_is_refused(
             return [RankedPose(query.views[-1].world_T_base, 1.0)]
 
     with pytest.raises(SemlocError, match="not a finite 4x4 matrix"):
-        answer_scenario(RUN, scenario, store, tmp_path, Cheat)
+        answer_scenario(RUN, scenario, Learner(store, Cheat), tmp_path)
