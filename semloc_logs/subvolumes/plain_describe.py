@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from functools import lru_cache
+from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +28,13 @@ BATCH = 64  # subvolumes that are encoded together
 
 
 @lru_cache(maxsize=8)
-def load_plain_encoder(variant: str, weights: Path) -> PlainEncoder:
-    """The encoder of a file; SettingsError when it does not hold one of the paper's network."""
-    encoder = load_weights(PlainEncoder, "encoder.", variant, weights)
+def load_plain_encoder(variant: str, weights: Path | None = None) -> PlainEncoder:
+    """The encoder of a file, or the shipped one; SettingsError when the file does not hold one of
+    the paper's network.
+    """
+    shipped = files("semloc_logs.subvolumes") / "weights" / f"paper_{variant}.safetensors"
+    with nullcontext(weights) if weights is not None else as_file(shipped) as path:
+        encoder = load_weights(PlainEncoder, "encoder.", variant, path)
     torch.set_num_threads(1)
     return encoder
 
@@ -76,16 +82,15 @@ def occupied_windows(state: U8, low: NDArray[np.integer], stride: int, least: in
 @torch.inference_mode()
 def describe_windows(state: U8, corners: I64, encoder: PlainEncoder) -> F32:
     """Descriptors mu (n, latent) of the windows of ``state`` at ``corners`` (n, 3) in it."""
-    table = code_table(encoder.variant)
+    codes = code_table(encoder.variant)[state]
     out = np.zeros((len(corners), encoder.latent), np.float32)
-    for first in range(0, len(corners), BATCH):
-        part = corners[first : first + BATCH]
-        codes = np.stack(
-            [table[state[x : x + SIZE, y : y + SIZE, z : z + SIZE]] for x, y, z in part.tolist()]
-        )
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            mu = encoder(torch.from_numpy(codes))
-        out[first : first + BATCH] = mu[:, :, 0, 0].float().numpy()
+    # the first block pools two voxels along each axis
+    odd = corners % 2
+    for shift in np.unique(odd, axis=0):
+        rows = np.flatnonzero((odd == shift).all(1))
+        x, y, z = shift.tolist()
+        found = encoder.of_windows(codes[x:, y:, z:], corners[rows] - shift, BATCH)
+        out[rows] = torch.cat([*found]).numpy()
     return out
 
 

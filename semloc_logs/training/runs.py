@@ -210,7 +210,7 @@ def learn_vocabulary(
     """A vocabulary from the descriptors of the shards' complete views; the number of descriptors.
 
     2^16 words need half a million descriptors or more to lie well; with fewer there are words of
-    few descriptors or of none. The paper's method needs its weights as a file: SettingsError.
+    few descriptors or of none.
     """
     if settings.training.method == "paper":
         return _learn_plain_vocabulary(variant, shards, settings, output, pairs_per_shard, note)
@@ -237,14 +237,8 @@ def _learn_plain_vocabulary(
     note: Note,
 ) -> int:
     """The same of the paper's network."""
-    weights = settings.descriptor.weights
-    if weights is None:
-        raise SettingsError(
-            "The paper's method has no shipped weights: name the file that 'semloc train --method"
-            " paper' wrote with --set descriptor.weights=FILE."
-        )
     threads = torch.get_num_threads()
-    encoder = load_plain_encoder(variant, weights)
+    encoder = load_plain_encoder(variant, settings.descriptor.weights)
     use_threads(threads)
     descriptors = plain_shard_descriptors(shards, encoder, pairs_per_shard, note)
     note(f"{variant}: clustering {len(descriptors)} descriptors")

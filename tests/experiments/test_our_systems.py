@@ -4,8 +4,11 @@ known.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,8 @@ from scipy.spatial.transform import Rotation
 from semloc_logs.alignment.mask_grid import FREE_BIT, MaskGrid
 from semloc_logs.alignment.overlaps import overlap, overlap_map, query_voxels
 from semloc_logs.errors import SettingsError
+from semloc_logs.experiments.answers import Learner, Run, answer_scenario
+from semloc_logs.experiments.scenarios import time_scenario
 from semloc_logs.experiments.system import Query, RankedPose, View
 from semloc_logs.experiments.systems import catalogue, plain
 from semloc_logs.experiments.systems.ablations import (
@@ -25,6 +30,7 @@ from semloc_logs.experiments.systems.ablations import (
 )
 from semloc_logs.experiments.systems.ours import Ours
 from semloc_logs.experiments.systems.plain import Plain, refined, rigid_fit
+from semloc_logs.experiments.views import ViewStore
 from semloc_logs.numerics.transforms import inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import Resolved, load
 from semloc_logs.simulation.meshes.world import (
@@ -40,7 +46,7 @@ from semloc_logs.simulation.meshes.world import (
 )
 from semloc_logs.simulation.sensors.lidar import SweepOptions, full_sweep
 from semloc_logs.simulation.sensors.lidar_models import MODELS
-from semloc_logs.subvolumes.describe import Windows, describe_map, load_encoder
+from semloc_logs.subvolumes.describe import Described, Windows, describe_map, load_encoder
 from semloc_logs.subvolumes.network import Completion, Encoder
 from semloc_logs.subvolumes.plain_describe import describe_blocks
 from semloc_logs.subvolumes.plain_network import PlainEncoder
@@ -217,31 +223,41 @@ def test_poses_below_the_least_tau_are_left_out(database: list[View]) -> None:
     assert system.localise(Query("vegetation", (changed,))) == []
 
 
-def test_the_plain_method_names_what_it_lacks(database: list[View]) -> None:
-    with pytest.raises(SettingsError, match="no shipped weights: train them"):
-        Plain(settings=plain_settings()).fit(database)
+def test_the_plain_method_names_a_file_that_is_missing(database: list[View]) -> None:
     missing = plain_settings(descriptor__weights="missing.safetensors")
     with pytest.raises(SettingsError, match=r"missing\.safetensors"):
         Plain(settings=missing).fit(database)
-    encoder = PlainEncoder("semantic").eval()
-    with pytest.raises(SettingsError, match="no shipped vocabulary: make one"):
-        Plain(settings=plain_settings(), encoder=encoder).fit(database)
 
 
-def test_a_small_scene_trains_a_network_of_its_own_once(
+def test_a_store_is_described_once_for_all_scenarios(
     database: list[View],
-    queries: list[Query],
+    make_store: Callable[..., ViewStore],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(plain, "QUICK_SAMPLES", 64)
-    system = Plain("geometric", plain_settings(), quick=tmp_path)
-    system.fit(database)
-    kept = {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric/*")}
-    assert {"pairs.parquet", "checkpoint.safetensors"} <= set(kept)
-    assert len(system.localise(hidden(queries[0]))) > 0
-    Plain("geometric", plain_settings(), quick=tmp_path).fit(database)
-    assert kept == {p.name: p.stat().st_mtime_ns for p in tmp_path.glob("geometric/*")}
+    places = [(*v.world_T_base[:2, 3].tolist(), 0.0) for v in database[:4]]
+    store = make_store(map=places, drive=places[:1])
+    for session in store.sessions:
+        monkeypatch.setattr(session, "view", lambda number: database[number])
+    described: list[int] = []
+
+    def counted(*given: Any) -> Described:
+        described.append(1)
+        return describe_blocks(*given)
+
+    monkeypatch.setattr(plain, "describe_blocks", counted)
+    base = plain_system("semantic", database[:4], plain_settings())
+    for name in ("paper-semantic", "paper-acc"):
+        system = replace(base, kept=tmp_path / "kept")
+        learner = Learner(store, partial(replace, system))
+        for scenario in ("day", "night"):
+            planned = time_scenario(store, scenario, "map", "drive")
+            run = Run(name, "lidar", 1, "v1")
+            assert answer_scenario(run, planned, learner, tmp_path) == 1
+    assert described == [1]
+    # a map of other views is another map
+    system.fit(database[:2])
+    assert described == [1, 1]
 
 
 def test_iterative_closest_points_move_a_wall_onto_a_wall() -> None:

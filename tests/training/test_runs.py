@@ -288,8 +288,6 @@ def test_the_papers_network_is_learned_as_written_with_words_of_its_own(
         "acc_delta",
     }
     words = tmp_path / "words.safetensors"
-    with pytest.raises(SettingsError, match="no shipped weights"):
-        learn_vocabulary("geometric", shards, settings, words)
     named = settings.model_copy(
         update={"descriptor": settings.descriptor.model_copy(update={"weights": output})}
     )

@@ -31,26 +31,22 @@ def make_ablation(options: SystemOptions) -> System:
 
 
 def make_plain(options: SystemOptions) -> System:
-    """The paper's method; its networks lie in WEIGHTS/paper/. SettingsError where they do not,
-    unless the scene is small: then it trains one of its own.
+    """The paper's method, with the networks in WEIGHTS/paper/ or, without this folder, the shipped
+    ones. SettingsError where one of the files is missing.
     """
     variant = _VARIANTS[options.name]
-    if options.quick and not _plain_files(options, variant)[0].exists():
-        folder = options.folder.parent / f"{METHOD}-{variant}"
-        return Plain(variant, name=options.name, quick=folder)
-    return Plain(variant, _plain_settings(options, variant), name=options.name)
-
-
-def _plain_files(options: SystemOptions, variant: Variant) -> tuple[Path, Path]:
-    """Network and words of a variant."""
-    folder = (options.weights or Path("weights")) / METHOD
-    return folder / f"{variant}.safetensors", folder / f"{variant}_words.safetensors"
+    kept = options.folder.parent / f"{METHOD}-{variant}"  # also for acc.
+    return Plain(variant, _plain_settings(options, variant), name=options.name, kept=kept)
 
 
 def _plain_settings(options: SystemOptions, variant: Variant) -> Resolved:
     """The paper's settings with its networks."""
-    weights, words = _plain_files(options, variant)
-    folder = weights.parent
+    settings = load(method=METHOD).resolved()
+    folder = (options.weights or Path("weights")) / METHOD
+    if not folder.exists():
+        return settings
+    weights = folder / f"{variant}.safetensors"
+    words = folder / f"{variant}_words.safetensors"
     for path in (weights, words):
         if not path.exists():
             raise SettingsError(
@@ -59,5 +55,4 @@ def _plain_settings(options: SystemOptions, variant: Variant) -> Resolved:
                 f" {variant} -o {words} --set descriptor.weights={weights}', and give --weights"
                 f" {folder.parent}."
             )
-    settings = load(method=METHOD).resolved()
     return with_settings(settings, {"descriptor.weights": weights, "descriptor.vocabulary": words})

@@ -8,13 +8,15 @@ verified once.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors.numpy import load_file, save_file
 
 from semloc_logs.alignment.overlaps import (
     OverlapMap,
@@ -25,7 +27,6 @@ from semloc_logs.alignment.overlaps import (
     overlap_map,
     query_voxels,
 )
-from semloc_logs.errors import SettingsError
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
 from semloc_logs.experiments.view_sessions import sensor_centre
 from semloc_logs.labels.space import SKY
@@ -39,15 +40,12 @@ from semloc_logs.subvolumes.plain_describe import (
     load_plain_encoder,
 )
 from semloc_logs.subvolumes.plain_network import PlainEncoder
-from semloc_logs.training.descriptor_samples import plain_shard_descriptors
-from semloc_logs.training.network_training import TrainingRun, train
-from semloc_logs.training.pairs import SceneFrame, cut_pairs, write_shard
+from semloc_logs.tables.atomic_files import replacing_file
 from semloc_logs.voxels.grid import BlockMap, Fuser
 from semloc_logs.words.index import Allowed, Index
 from semloc_logs.words.plain_vocabulary import (
     PlainVocabulary,
     load_plain_vocabulary,
-    train_plain_vocabulary,
 )
 
 U8 = NDArray[np.uint8]
@@ -58,9 +56,6 @@ METHOD = "paper"
 SINGLE_LABEL = 2  # of all voxels, in the geometric variant
 PROBES = 1  # the tree is traversed to one cell
 CONVERGED = 1e-3  # voxels and radians
-# of the network of a small scene
-QUICK_FRAMES = 24
-QUICK_SAMPLES = 640
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,9 +83,8 @@ class Plain:
     """The method of ``settings`` (schemas/methods/paper.yaml), in one of the ``variant``s of 4.4.
 
     The geometric one gives all voxels one label. A query of five views is the paper's *acc.* An
-    ``encoder`` and ``words`` may replace the files that the settings name. With a folder ``quick``
-    and without such files a network is trained for a minute on the first database, for small
-    scenes that only show that everything runs.
+    ``encoder`` and ``words`` may replace the files that the settings name, or the shipped ones. A
+    folder ``kept`` has the words of databases, so that each is described once.
     """
 
     variant: Variant = "semantic"
@@ -98,7 +92,7 @@ class Plain:
     encoder: PlainEncoder | None = None
     words: PlainVocabulary | None = None
     name: str = ""
-    quick: Path | None = None
+    kept: Path | None = None
 
     def __post_init__(self) -> None:
         self.name = self.name or f"paper ({self.variant})"
@@ -108,25 +102,57 @@ class Plain:
 
     def _encoder(self) -> PlainEncoder:
         if self.encoder is None:
-            weights = self.settings.descriptor.weights
-            if weights is None:
-                raise SettingsError(
-                    "The paper's method has no shipped weights: train them with 'semloc train"
-                    " --method paper', and name the file with descriptor.weights."
-                )
-            self.encoder = load_plain_encoder(self.variant, weights)
+            self.encoder = load_plain_encoder(self.variant, self.settings.descriptor.weights)
         return self.encoder
 
     def _vocabulary(self) -> PlainVocabulary:
         if self.words is None:
             path = self.settings.descriptor.vocabulary
-            if path is None:
-                raise SettingsError(
-                    "The paper's method has no shipped vocabulary: make one with 'semloc"
-                    " vocabulary --method paper', and name the file with descriptor.vocabulary."
-                )
             self.words = load_plain_vocabulary(self.variant, path)
         return self.words
+
+    def _words_of(self, fused: _Map) -> dict[str, NDArray[Any]]:
+        """``word`` and ``code`` (n,) of all occupied subvolumes of a map, and their ``centre`` (n,
+        3) in voxels.
+        """
+        path = None if self.kept is None else self.kept / f"{self._key(fused)}.safetensors"
+        if path is not None and path.exists():
+            return load_file(path)
+        plain = self.settings.plain
+        described = describe_blocks(
+            fused.blocks,
+            plain.stride,
+            plain.min_occupied,
+            self._encoder(),
+            (fused.road, self.settings.descriptor.reach / self.settings.fusion.voxel_size),
+        )
+        words = self._vocabulary()
+        word, code = words.vocabulary.words(words.lifted(described.descriptor))
+        found = {"word": word, "code": code, "centre": described.centre}
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing_file(path) as temporary:
+                save_file(found, temporary)
+        return found
+
+    def _key(self, fused: _Map) -> str:
+        """What the words of a map depend on, as a name."""
+        vocabulary = self._vocabulary()
+        parts = [
+            *(value.detach().numpy() for value in self._encoder().state_dict().values()),
+            vocabulary.vocabulary.cells,
+            vocabulary.vocabulary.projection,
+            vocabulary.vocabulary.thresholds,
+            vocabulary.vocabulary.children,
+            fused.blocks.keys,
+            fused.blocks.state,
+            fused.road,
+        ]
+        settings = self.settings.tables("fusion", "descriptor", "plain")
+        key = hashlib.sha256(repr((settings, vocabulary.scale)).encode())
+        for part in parts:
+            key.update(np.ascontiguousarray(part))
+        return key.hexdigest()[:16]
 
     def _fused(self, posed: Iterable[tuple[View, F64]], radius: float) -> _Map:
         """Views fused by their poses (4, 4) in the map, with points within ``radius`` metres."""
@@ -152,32 +178,21 @@ class Plain:
         """Fuse the views in their world, describe all occupied subvolumes, and index them."""
         settings = self.settings
         plain = settings.plain
-        v = settings.fusion.voxel_size
-        named = settings.descriptor.weights
-        if self.quick is not None and named is None and self.encoder is None:
-            self.encoder, self.words = _trained_on(database, self.variant, settings, self.quick)
         world_T_map = np.eye(4)
         world_T_map[:3, 3] = database[0].world_T_base[:3, 3]
         fused = self._fused(
             ((view, inverse(world_T_map) @ view.world_T_base) for view in database),
             settings.fusion.max_range,
         )
-        described = describe_blocks(
-            fused.blocks,
-            plain.stride,
-            plain.min_occupied,
-            self._encoder(),
-            (fused.road, settings.descriptor.reach / v),
-        )
-        words = self._vocabulary()
-        word, code = words.vocabulary.words(words.lifted(described.descriptor))
-        index = Index.of_words(words.vocabulary, word, code, np.zeros(len(word), np.int64))
+        words = self._words_of(fused)
+        submap = np.zeros(len(words["word"]), np.int64)
+        index = Index.of_words(self._vocabulary().vocabulary, words["word"], words["code"], submap)
         index.shortlist = plain.neighbours  # the nearest in Hamming space
         self._database = _Database(
             world_T_map[:3, 3],
             overlap_map(fused.blocks, plain.kappa / STREET_VOXEL, free=plain.closest == "observed"),
             index,
-            described.centre,
+            words["centre"],
         )
 
     def localise(self, query: Query) -> list[RankedPose]:
@@ -242,33 +257,6 @@ class Plain:
             part = -turned_R_map @ np.array([*turned.middle, 0.0])
             out.append(Shifts(turned_R_map, part, np.unique(shift, axis=0).reshape(-1, 3)))
         return out
-
-
-def _trained_on(
-    database: Sequence[View], variant: Variant, settings: Resolved, folder: Path
-) -> tuple[PlainEncoder, PlainVocabulary]:
-    """A network and words of some subvolumes of the first database; kept in ``folder`` for all."""
-    views = [database[i] for i in range(0, len(database), max(1, len(database) // QUICK_FRAMES))]
-    own = folder / variant
-    shard = own / "pairs.parquet"
-    method = load(method=METHOD).training.model_copy(update={"samples": QUICK_SAMPLES})
-    if not shard.exists():
-        frames = []
-        for view in views:
-            kept = thin(view.points, settings.fusion.keyframe_resolution)
-            kept = kept[view.label[kept] != SKY]
-            points = view.points[kept]
-            frames.append(
-                SceneFrame(points, sensor_centre(view), view.label[kept], view.world_T_base)
-            )
-        own.mkdir(parents=True, exist_ok=True)
-        rng = np.random.default_rng(method.seed)
-        write_shard(shard, cut_pairs(frames, settings.fusion, method, rng))
-    network = train(variant, [shard], method, TrainingRun(own / "checkpoint.safetensors"))
-    if network is None or not isinstance(network.encoder, PlainEncoder):
-        raise SettingsError(f"{shard}: the network of the paper could not be trained.")
-    encoder = network.encoder.eval()
-    return encoder, train_plain_vocabulary(plain_shard_descriptors([shard], encoder))
 
 
 def refined(target: OverlapMap, query: Voxels, start: F64, iterations: int) -> tuple[F64, float]:
