@@ -64,7 +64,7 @@ def plain_shard_descriptors(
         corners = (NINE + along).reshape(-1, 3)
         return torch.cat([*encoder.of_windows(codes, corners, len(corners))]).numpy()
 
-    out = []
+    out: list[NDArray[np.float32]] = []
     # the first block is compiled code of one thread
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         for done, path in enumerate(shards, 1):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from importlib.resources import as_file, files
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 
 from semloc_logs.subvolumes.cut import SIZE, code_table
 from semloc_logs.subvolumes.plain_describe import (
@@ -12,11 +16,13 @@ from semloc_logs.subvolumes.plain_describe import (
     describe_blocks,
     describe_box,
     describe_windows,
+    load_plain_encoder,
     occupied_windows,
 )
 from semloc_logs.subvolumes.plain_network import PlainEncoder
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 from semloc_logs.voxels.keys import BLOCK, pack, unpack
+from semloc_logs.words.plain_vocabulary import load_plain_vocabulary
 
 
 @pytest.fixture(scope="module")
@@ -94,3 +100,25 @@ def test_windows_of_a_box_are_described_as_each_alone(encoder: PlainEncoder) -> 
         with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
             expected = encoder(alone[None])[0, :, 0, 0].float()
         np.testing.assert_allclose(vector, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("variant", ["semantic", "geometric"])
+def test_shipped_weights_and_words_go_together_and_state_their_samples(variant: str) -> None:
+    encoder = load_plain_encoder(variant)
+    words = load_plain_vocabulary(variant)
+    assert words.vocabulary.projection.shape == (64, encoder.latent + 1)
+    # a descriptor of an empty map and of a wall differ, and their words do, too
+    state = np.full((32, 32, 64), FREE_STATE, np.uint8)
+    state[:, 10, 32:] = 2
+    described = describe_windows(state, np.array([[0, 0, 0], [0, 0, 32]]), encoder)
+    word, _ = words.vocabulary.words(words.lifted(described))
+    assert word[0] != word[1]
+    page = Path(__file__).parents[2] / "docs" / "explanation" / "plain_method.md"
+    folder = files("semloc_logs.subvolumes") / "weights"
+    with (
+        as_file(folder / f"paper_{variant}.safetensors") as path,
+        safe_open(path, "np") as handle,
+    ):
+        samples = int(handle.metadata()["samples"])
+    text = page.read_text(encoding="utf-8").replace(" subvolumes", "")
+    assert f"{samples:,} ({variant})" in text

@@ -46,3 +46,10 @@ def test_words_of_near_descriptors_are_the_same_after_a_file(tmp_path: Path) -> 
     cell = again.vocabulary.nearest_cells(again.lifted(descriptors), 1)[:, 0].reshape(20, 30)
     assert (cell == cell[:, :1]).all()
     assert len(np.unique(cell[:, 0])) > 4
+
+
+def test_few_descriptors_give_few_words() -> None:
+    descriptors = np.random.default_rng(0).normal(size=(1200, 64))
+    # 1200 of 16 cells of at most 256 words: 18 to a word of 4, and 16 is the power of two below
+    words = train_plain_vocabulary(descriptors, cells=16)
+    assert words.vocabulary.children.shape == (16, 16, 64)

@@ -128,7 +128,7 @@ class Plain:
         )
         words = self._vocabulary()
         word, code = words.vocabulary.words(words.lifted(described.descriptor))
-        found = {"word": word, "code": code, "centre": described.centre}
+        found: dict[str, NDArray[Any]] = {"word": word, "code": code, "centre": described.centre}
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing_file(path) as temporary:
@@ -151,7 +151,7 @@ class Plain:
         settings = self.settings.tables("fusion", "descriptor", "plain")
         key = hashlib.sha256(repr((settings, vocabulary.scale)).encode())
         for part in parts:
-            key.update(np.ascontiguousarray(part))
+            key.update(np.ascontiguousarray(part).tobytes())
         return key.hexdigest()[:16]
 
     def _fused(self, posed: Iterable[tuple[View, F64]], radius: float) -> _Map:
