@@ -5,7 +5,7 @@ and the pose from 2D-3D matches with each of them.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.experiments.system import MOST_POSES, Picture, Query, RankedPose, View
+from semloc_logs.experiments.systems.pictures.kept_features import Extract, kept_features
 from semloc_logs.experiments.systems.pictures.local_features import Features, unit_descriptors
 from semloc_logs.experiments.systems.pictures.picture_pose import (
     base_pose,
@@ -28,7 +29,6 @@ from semloc_logs.words.vocabulary import train_vocabulary
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-Extract = Callable[[U8], Features]
 VERIFIED = 30  # top retrievals that are verified
 TRAINING_FEATURES = 1_000_000  # that the vocabulary is trained on, at most
 LEAST_FEATURES = 256  # that a vocabulary needs
@@ -107,13 +107,14 @@ class WordRetrieval:
 class PictureSystem:
     """Features by ``extract``, candidates by ``retrieval``, poses by the points of their depth.
 
-    Features of the database lie in files in ``folder`` as long as the system is used, so that
-    memory does not grow with them.
+    Features of the database lie in files, so that memory does not grow with them; the features of
+    each picture stay in ``folder`` for other databases.
     """
 
     def __init__(self, name: str, extract: Extract, retrieval: Retrieval, folder: Path) -> None:
         self.name = name
         self._extract = extract
+        self._kept = kept_features(extract, folder / "features")
         self._retrieval = retrieval
         self._folder = tempfile.TemporaryDirectory(prefix=".scratch.", dir=folder)
         self._stored: list[StoredPicture] = []
@@ -124,7 +125,7 @@ class PictureSystem:
             view = database[number]
             if view.picture is None:
                 continue
-            features = self._extract(view.picture.image)
+            features = self._kept(view.picture.image)
             path = Path(self._folder.name) / f"{number:06d}.npz"
             np.savez(path, *features, points_of(view.picture, features.xy))
             self._stored.append(StoredPicture(path, database, number, view.world_T_base))
