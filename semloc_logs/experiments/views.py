@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -108,7 +109,10 @@ class ViewStore(Sequence[View]):
 
     def without_pictures(self) -> ViewStore:
         """The same views without their pictures, which take most of the time of reading them."""
-        return ViewStore([replace(session, pictures=None) for session in self.sessions])
+        sessions = [copy(session) for session in self.sessions]
+        for session in sessions:
+            session.pictures = None
+        return ViewStore(sessions)
 
     def __len__(self) -> int:
         return int(self._first[-1])

@@ -117,3 +117,11 @@ def test_accumulated_queries_are_the_views_before_in_the_same_session(make_store
     assert query_views(store, 120, 5) == [116, 117, 118, 119, 120]
     assert query_views(store, 102, 5) == [101, 102]
     assert query_views(store, 120, 1) == [120]
+
+
+def test_a_store_without_pictures_leaves_the_other_alone(make_store: Make) -> None:
+    store = make_store(map=[(0.0, 0.0, 0.0)])
+    store.sessions[0].pictures = PictureFolder(Path("pictures"), {}, {})
+    assert not store.without_pictures().has_pictures
+    assert store.has_pictures
+    assert store.without_pictures()[0].picture is None
