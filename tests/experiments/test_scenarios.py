@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from semloc_logs.experiments.scenarios import (
     query_views,
     time_scenario,
 )
+from semloc_logs.experiments.view_pictures import PictureFolder
 from semloc_logs.experiments.views import ViewStore
 
 Make = Callable[..., ViewStore]
@@ -121,7 +123,7 @@ def test_accumulated_queries_are_the_views_before_in_the_same_session(make_store
 
 def test_a_store_without_pictures_leaves_the_other_alone(make_store: Make) -> None:
     store = make_store(map=[(0.0, 0.0, 0.0)])
-    store.sessions[0].pictures = PictureFolder(Path("pictures"), {}, {})
+    store.sessions[0].pictures = PictureFolder(Path("pictures"))
     assert not store.without_pictures().has_pictures
     assert store.has_pictures
     assert store.without_pictures()[0].picture is None
