@@ -47,7 +47,7 @@ class LidarFrame:
 
     Rows with NaN, infinity or exactly zero are already gone. ``lost`` counts the points that were
     not finite although their cloud calls itself dense, ``without_return`` the ones that are gone
-    because they all have the greatest range. ``origin`` (3,) is the sensor's centre in
+    because they all have one range. ``origin`` (3,) is the sensor's centre in
     its frame; None: the frame's own origin.
     """
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.frames import F32, PointTimeRemark
+from semloc_logs.frames import F32, F64, PointTimeRemark
 from semloc_logs.logs.messages.definitions import UndecodableError
 from semloc_logs.logs.messages.point_times import offsets_ns
 
@@ -36,8 +37,8 @@ class Field:
 class Points:
     """``points`` (n, 3) with label, time (relative to the header stamp) and ring where recorded.
 
-    ``not_finite`` counts the positions with NaN or infinity, ``without_return`` the ones at the
-    greatest range of the sensor; ``remark`` is about the times.
+    ``not_finite`` counts the positions with NaN or infinity, ``without_return`` the ones at a range
+    that many share; ``remark`` is about the times.
     """
 
     points: F32
@@ -49,11 +50,14 @@ class Points:
     without_return: int = 0
 
 
-# points at the greatest range, all within so small a share of it, are rays without a return where
-# they are so large a share of a sweep: surfaces at just one range are spheres about the sensor
+# points at one range, all within so small a share of it, are rays without a return where they are
+# so large a share of a sweep: surfaces at just one range are spheres about the sensor
 _SAME_RANGE = 1e-5
 _WITHOUT_RETURN = 0.05
 _NOTHING_ELSE = 0.95  # and no larger: such clouds are made up
+# points of a circle, or of two on floor and ceiling, are this share at least in few slices across
+# its axis: so wide (of the range), and so many where the border of two slices cuts each circle
+_ON_CIRCLES, _DIRECTION, _SLICES = 0.6, 0.02, 4
 # m; coordinates of a measured point lie between these, but for a few and for zeros
 _NEAREST, _FARTHEST = 1e-7, 1e7
 # shares of coordinates between them, in the wrong order of bytes and in the right one
@@ -83,6 +87,7 @@ def decode_points(
     if layout.width == 0 or layout.height == 0:
         # its fields may be missing too
         return Points(np.empty((0, 3), np.float32), None, None, None)
+    _check_places(fields, layout.point_step)
     rows = _in_true_order(_rows(data, layout, fields))
     columns = {name.lower(): name for name in reversed(rows.dtype.names or ())}
     for axis in "xyz":
@@ -133,21 +138,41 @@ def decode_points(
 
 
 def _have_returned(xyz: F32, valid: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-    """Which points (n,) of a sensor are measured, where it gives its greatest range to others.
+    """Which points (n,) of a sensor are measured, where it gives one range to all others.
 
-    None where it does not.
+    None where it does not. Below the greatest range such points have to lie in many directions: a
+    ring of a LIDAR on a level floor has one range, too.
     """
-    some = xyz[valid][:: max(1, len(xyz) // _LOOKED_AT)]
+    some = xyz[valid][:: max(1, len(xyz) // _LOOKED_AT)].astype(np.float64)
     if len(some) < _FEWEST:
         return None
-    ranges = np.linalg.norm(some.astype(np.float64), axis=1)
-    farthest = float(ranges.max())
-    share = float(np.mean(ranges > (1.0 - _SAME_RANGE) * farthest))
-    if not _WITHOUT_RETURN <= share <= _NOTHING_ELSE:
-        return None
-    with np.errstate(over="ignore", invalid="ignore"):
-        distances = np.linalg.norm(xyz.astype(np.float64), axis=1)
-        return np.asarray(~(distances > (1.0 - _SAME_RANGE) * farthest))
+    ranges = np.linalg.norm(some, axis=1)
+    order = np.sort(ranges)
+    ends = np.searchsorted(order, order * (1.0 + _SAME_RANGE), side="right")
+    best = int(np.argmax(ends - np.arange(len(order))))
+    usual = float(order[best])
+    for shared in (float(order[-1]), usual):
+        is_shared = np.abs(ranges - shared) <= _SAME_RANGE * shared
+        share = float(np.mean(is_shared))
+        if not _WITHOUT_RETURN <= share <= _NOTHING_ELSE:
+            continue
+        if shared == usual and not _is_spread(some[is_shared], shared):
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            distances = np.linalg.norm(xyz.astype(np.float64), axis=1)
+            return np.asarray(~(np.abs(distances - shared) <= _SAME_RANGE * shared))
+    return None
+
+
+def _is_spread(points: F64, distance: float) -> bool:
+    """Whether points (n, 3) at one ``distance`` lie in many directions, not on a circle or two."""
+    _, axes = np.linalg.eigh(np.cov(points.T))
+    slices = np.floor(points @ axes / (_DIRECTION * distance)).astype(np.int64)
+    for column in slices.T:
+        _, counts = np.unique(column, return_counts=True)
+        if np.sort(counts)[-_SLICES:].sum() > _ON_CIRCLES * len(points):
+            return False
+    return True
 
 
 def is_noise(tag: NDArray[np.generic]) -> NDArray[np.bool_]:
@@ -176,6 +201,26 @@ def _offsets(
     return offset, PointTimeRemark.OTHER_CLOCK if is_other_clock else None
 
 
+def _check_places(fields: Sequence[Field], point_step: int) -> None:
+    """UndecodableError where fields lie beyond a point, or coordinates in one another."""
+    axes: dict[str, tuple[int, int]] = {}
+    for field in fields:
+        name = field.name.lower()
+        end = field.offset + np.dtype(field.kind).itemsize
+        if name in _USED and end > point_step:
+            raise UndecodableError(
+                f"its field {field.name} ends at byte {end}, but a point has {point_step} bytes"
+            )
+        if name in ("x", "y", "z"):
+            axes.setdefault(name, (field.offset, end))
+    placed = sorted(axes, key=lambda axis: axes[axis])
+    for name, other in pairwise(placed):
+        if axes[other][0] < axes[name][1]:
+            raise UndecodableError(
+                f"its fields {name} and {other} share bytes: an offset or a type is wrong"
+            )
+
+
 def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> NDArray[np.void]:
     """A view (height, width) of the points as records."""
     width = layout.width
@@ -191,11 +236,7 @@ def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> 
         )
     names: dict[str, Field] = {}
     for field in fields:
-        if (
-            field.name.lower() in _USED
-            and field.offset >= 0
-            and field.offset + np.dtype(field.kind).itemsize <= step
-        ):
+        if field.name.lower() in _USED and field.offset >= 0:
             names.setdefault(field.name, field)
     order = ">" if layout.big_endian else "<"
     dtype = np.dtype(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,9 @@ from semloc_logs.frames import F32, LidarFrame, PointTimeRemark
 LONGEST_SWEEP_NS = 1_000_000_000
 # a sweep takes longer than this, so milliseconds and microseconds are not confused
 _LEAST_SPAN_NS = 5_000_000
+_WRAPPING_BYTES = (
+    4  # of counters that begin again: 4.3 s of nanoseconds, 72 minutes of microseconds
+)
 _PERIODS_PER_SWEEP = 1.5  # a sweep is over when the next one begins, give or take
 _PERIODS_KEPT = 16
 # the share of neighbours measured nearly together: above 0.9 in sweeps, 0.1 where times are noise
@@ -36,6 +39,7 @@ def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int
     """
     if time.size == 0:
         return np.zeros(0, np.int64), False
+    time = _unwrapped(time)
     low = time.min().item()
     high = time.max().item()
     if not (np.isfinite(low) and np.isfinite(high)):
@@ -62,6 +66,25 @@ def offsets_ns(time: NDArray[np.generic], stamp_ns: int) -> tuple[NDArray[np.int
     for unit, first in sweeps.items():
         return _shift(time, unit, first), True
     return (_shift(time, *plausible[0]), False) if plausible else (None, False)
+
+
+def _unwrapped(time: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Times (n,) of a counter of at most 32 bits that began again at zero within the sweep.
+
+    Those before are negative then, as a difference to the stamp is that was kept without its sign.
+    """
+    if time.dtype.kind != "u" or time.dtype.itemsize > _WRAPPING_BYTES:
+        return time
+    turn = 1 << (8 * time.dtype.itemsize)
+    signed = time.astype(np.int64)
+    is_before = signed >= turn // 2
+    if is_before.all() or not is_before.any():
+        return time
+    signed = np.where(is_before, signed - turn, signed)
+    span = int(signed.max()) - int(signed.min())
+    # a wild value is far from all others
+    gap = int(signed[~is_before].min()) - int(signed[is_before].max())
+    return signed if gap <= _NEARLY * span < _NEARLY * turn // 2 else time
 
 
 def _units(time: NDArray[np.generic]) -> tuple[int, ...]:
@@ -97,13 +120,16 @@ class PointTimes:
     def __init__(self) -> None:
         self._newest: dict[tuple[str, str], int] = {}
         self._periods: dict[tuple[str, str], deque[int]] = {}
+        # sweeps with times of another clock, less the ones with times that follow the stamp
+        self._other_clock: Counter[tuple[str, str]] = Counter()
 
     def checked(self, frame: LidarFrame) -> LidarFrame:
         """The sweep as it is, or with a remark: without times when they are not plausible.
 
         A sweep does not take much longer than the time to the next one; clouds gathered from
         several sweeps do. And points recorded one after the other, or seen in the same direction,
-        were measured nearly together; where they were not, the values are not times.
+        were measured nearly together; where they were not, the values are not times. Where most
+        sweeps have times of another clock, others only look as if theirs followed the stamp.
         """
         key = (frame.header.topic, frame.header.frame_id)
         stamp_ns = frame.header.stamp_ns
@@ -115,6 +141,12 @@ class PointTimes:
         offset = frame.offset_ns
         if offset is None or not len(offset):
             return frame
+        is_other = frame.remark is PointTimeRemark.OTHER_CLOCK
+        are_others = self._other_clock[key] > 0
+        self._other_clock[key] += 1 if is_other else -1
+        if are_others and not is_other:
+            offset = offset - offset.min()
+            frame = replace(frame, offset_ns=offset, remark=PointTimeRemark.OTHER_CLOCK)
         # the longest of some: several sensors on one topic come in bursts
         longest = _PERIODS_PER_SWEEP * max(periods) if len(periods) > 1 else LONGEST_SWEEP_NS
         if int(offset.max()) - int(offset.min()) <= longest and in_order(offset, frame.points):

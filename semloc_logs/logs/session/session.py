@@ -163,6 +163,10 @@ class Session:
         """From the header of sweeps to their nearest point (s), where most are far off; else 0."""
         return self._pass.tally.off_stamp(topic)
 
+    def sweep_span_of(self, topic: str) -> float:
+        """From the first to the last point of a sweep (s); 0 without times of points."""
+        return self._pass.tally.sweep_span(topic)
+
     def mounting_changes(self, frame_id: str) -> dict[Edge, Change]:
         """Static transforms between the base frame and a frame that the log changed, by edge."""
         tree = self._pass.poses.tree

@@ -93,6 +93,7 @@ class Tally:
         self._lost_points: Counter[str] = Counter()
         self._without_return: Counter[str] = Counter()
         self._off_stamp_ns: dict[str, int] = {}
+        self._span_ns: dict[str, int] = {}
         self._remarks: Counter[tuple[str, PointTimeRemark]] = Counter()
 
     def saw(self, topic: str) -> None:
@@ -127,6 +128,9 @@ class Tally:
         self._without_return[topic] += frame.without_return
         if frame.remark is not None:
             self._remarks[topic, frame.remark] += 1
+        if frame.offset_ns is not None and len(frame.offset_ns):
+            span_ns = int(frame.offset_ns.max()) - int(frame.offset_ns.min())
+            self._span_ns[topic] = max(span_ns, self._span_ns.get(topic, 0))
         if frame.remark is PointTimeRemark.OFF_STAMP and frame.offset_ns is not None:
             gap_ns = off_stamp_ns(frame.offset_ns)
             self._off_stamp_ns[topic] = min(gap_ns, self._off_stamp_ns.get(topic, gap_ns))
@@ -136,6 +140,10 @@ class Tally:
         count = self._remarks[topic, PointTimeRemark.OFF_STAMP]
         is_usual = 2 * count <= self.seen[topic]
         return 0.0 if is_usual else self._off_stamp_ns[topic] * 1e-9
+
+    def sweep_span(self, topic: str) -> float:
+        """From the first to the last point of the longest sweep, s; 0 without times of points."""
+        return self._span_ns.get(topic, 0) * 1e-9
 
     def left_out(self, topic: str) -> dict[str, int]:
         """Key of each reason -> frames of ``topic``."""
@@ -189,8 +197,8 @@ class Tally:
             Problem(
                 topic,
                 ProblemKind.FRAME,
-                f"{topic}: {count} of {self._points[topic]} points are left out: they have the "
-                f"greatest range of their sweep, all the same: rays of which nothing came back.",
+                f"{topic}: {count} of {self._points[topic]} points are left out: they all have one "
+                f"range, the greatest or in many directions: rays of which nothing came back.",
                 lost=False,
             )
             for topic, count in sorted((+self._without_return).items())

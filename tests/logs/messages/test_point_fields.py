@@ -43,6 +43,59 @@ def test_rays_without_a_return_at_the_greatest_range_are_left_out(share: float, 
     assert (np.linalg.norm(p.points, axis=1) < 49.9).all()
 
 
+def _shell(elevations: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
+    """Points (n, 3) at one distance, around the sensor at these elevations (rad)."""
+    azimuth = np.linspace(0, 200.0, len(elevations))
+    level = np.cos(elevations)
+    directions = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevations)]
+    return distance * np.stack(directions, axis=1)
+
+
+def _in_a_street(shell: NDArray[np.float64]) -> NDArray[np.float32]:
+    """A shell (200, 3), and 800 points at other ranges up to 60 m."""
+    rng = np.random.default_rng(2)
+    around = _shell(rng.uniform(-0.4, 0.4, 800), 1.0) * rng.uniform(3, 60, (800, 1))
+    return np.concatenate([around, shell]).astype("<f4")
+
+
+def test_rays_without_a_return_at_a_range_within_the_sweep_are_left_out() -> None:
+    xyz = _in_a_street(_shell(np.random.default_rng(1).uniform(-0.05, 0.3, 200), 12.0))
+    p = decode_points(xyz.tobytes(), Layout(1000, 1, 12, 12000), XYZ, STAMP)
+    assert p.without_return == 200
+    np.testing.assert_array_equal(p.points, xyz[:800])
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7])  # rad, of the sensor about y
+def test_rings_of_one_range_on_floor_and_ceiling_are_surfaces(turn: float) -> None:
+    tilt = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+    rings = _shell(np.repeat([-0.26, 0.26], 100), 6.0) @ tilt.T
+    p = decode_points(_in_a_street(rings).tobytes(), Layout(1000, 1, 12, 12000), XYZ, STAMP)
+    assert p.without_return == 0
+    assert len(p.points) == 1000
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        (Field("y", 2, "f4"), "its fields x and y share bytes"),
+        (Field("y", 8, "f4"), "its fields y and z share bytes"),
+        (Field("x", 0, "f8"), "its fields x and y share bytes"),
+        (Field("t", 18, "u4"), "its field t ends at byte 22, but a point has 20 bytes"),
+    ],
+)
+def test_fields_that_contradict_each_other_are_refused(changed: Field, reason: str) -> None:
+    fields = {f.name: f for f in [*XYZ, Field("t", 16, "u4"), changed]}
+    with pytest.raises(UndecodableError, match=reason):
+        decode_points(bytes(200), Layout(10, 1, 20, 200), [*fields.values()], STAMP)
+
+
+def test_other_fields_may_share_bytes_or_lie_beyond_a_point() -> None:
+    fields = [*XYZ, Field("rgb", 12, "f4"), Field("rgba", 12, "u4"), Field("padding", 16, "f8")]
+    data = struct.pack("<ffff", 1.0, 2.0, 3.0, 0.0)
+    p = decode_points(data, Layout(1, 1, 16, 16), fields, STAMP)
+    assert p.points.tolist() == [[1.0, 2.0, 3.0]]
+
+
 def test_a_wall_in_front_is_not_taken_for_rays_without_a_return() -> None:
     y, z = np.meshgrid(np.linspace(-20, 20, 60), np.linspace(-5, 5, 20))
     wall = np.c_[np.full(y.size, 50.0), y.ravel(), z.ravel()].astype("<f4")
@@ -168,6 +221,13 @@ def test_units_and_origins_of_times(values: NDArray[np.generic], expected: list[
     assert found is not None
     assert found.dtype == np.int64
     np.testing.assert_allclose(found, expected, atol=20)
+
+
+def test_differences_to_the_stamp_may_have_lost_their_sign() -> None:
+    offsets = np.arange(-40_000_000, 60_000_000, 1_000_000)
+    found, is_other = offsets_ns((offsets % 2**32).astype(np.uint32), STAMP)
+    assert not is_other
+    np.testing.assert_array_equal(found, offsets)
 
 
 def test_absolute_seconds_are_exact_to_their_precision() -> None:

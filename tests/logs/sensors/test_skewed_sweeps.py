@@ -184,6 +184,18 @@ def test_points_that_are_all_far_from_their_stamp_are_named(recorder: Any) -> No
     assert session.problems == []
 
 
+def test_a_counter_that_begins_again_is_of_another_clock_in_every_sweep(recorder: Any) -> None:
+    """Within the third sweep of four; the last one looks as if 0.05 to 0.15 s after its stamp."""
+    start = 2**32 - 250_000_000
+    plane, session = walls(
+        record(recorder(), "t", lambda o, s: (start + (s - EPOCH) + o) % 2**32, "u4")
+    )
+    assert max(plane) < 0.02
+    assert session.off_stamp_of("/points") == 0.0
+    [sentence] = sentences(session.problems)
+    assert "4 of 4 sweeps have point times of another clock" in sentence
+
+
 @pytest.mark.parametrize(
     "order",
     [
