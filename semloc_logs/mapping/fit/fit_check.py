@@ -45,6 +45,7 @@ from semloc_logs.mapping.fit.model import (
     difference,
     fit,
     pose_motion,
+    scatter,
     starts,
 )
 from semloc_logs.mapping.fit.other_starts import Doubted
@@ -91,6 +92,8 @@ NAMES = {
     "scale_log": "a wrong scale",
 }
 FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
+OTHER_END = 0.5, 1.5  # of a sweep: an offset may be from its other end
+MIRRORED = 0.25  # of a shift, by which it differs from twice the mounting it is of
 HARDLY_MOVE = 0.05  # times as far as the poses: registration may have found no motion at all
 HIDDEN = 3.0  # a fault that the drive does not show before it has this effect is hidden
 OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
@@ -249,7 +252,8 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
         return check
     for topic in session.roles.ranging:
         rows = [i for i, h in enumerate(collected.headers) if h.topic == topic]
-        clouds = Clouds(collected, np.array(rows, np.int64), voxel)
+        span = session.sweep_span_of(topic)
+        clouds = Clouds(collected, np.array(rows, np.int64), voxel, span)
         stream = check_stream(topic, clouds, track.at_many, are_fixes=session.are_poses_fixes)
         # what follows from these would be named with other causes
         frames = {collected.headers[row].frame_id for row in rows}
@@ -456,8 +460,9 @@ def _explained(pairs: Pairs, poses_at: PosesAt, none: Estimate) -> tuple[Estimat
     while len(faults) < len(possible):
         tries = {f: _with(pairs, poses_at, estimate, f) for f in possible if f not in faults}
         fault, better = min(tries.items(), key=lambda item: item[1].cost)
-        excess = max(1.0, float(np.nanmedian(better.squares)) / MEDIAN_OF_6)
-        if (estimate.cost - better.cost) / excess < LEAST_GAIN + len(fault.columns):
+        if (estimate.cost - better.cost) / scatter(better.squares) < LEAST_GAIN + len(
+            fault.columns
+        ):
             break
         estimate = better
         faults.append(fault)
@@ -476,12 +481,6 @@ def _with(pairs: Pairs, poses_at: PosesAt, estimate: Estimate, fault: Fault) -> 
 
 def _describe(stream: StreamFit, estimate: Estimate, faults: list[Fault], clouds: Clouds) -> None:
     """Enters a finding for each fault that matters."""
-    texts = {
-        Fault.CLOCK: _clock_text,
-        Fault.ROTATION: _rotation_text,
-        Fault.LEVER: _lever_text,
-        Fault.SCALE: _scale_text,
-    }
     # other axes move the points of a sweep the wrong way as they are freed of the motion, which
     # looks like a clock or a lever arm
     turned = float(np.linalg.norm(_significant(estimate, Fault.ROTATION)[ROTATION]))
@@ -491,7 +490,7 @@ def _describe(stream: StreamFit, estimate: Estimate, faults: list[Fault], clouds
         effect = _effect(known, fault, clouds)
         if effect >= NOTED:
             severity = Severity.WRONG if effect >= WRONG else Severity.NOTED
-            text = texts[fault](stream.topic, known, estimate.sigma)
+            text = _text(fault, known, estimate.sigma, stream.topic, clouds)
             stream.findings.append(Finding(severity, text))
 
 
@@ -535,16 +534,34 @@ def _effect(parameters: F64, fault: Fault, clouds: Clouds) -> float:
     return WRONG * change / SCALE_WRONG if change >= SCALE_NOTED else 0.0
 
 
-def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> str:
+def _text(
+    fault: Fault, known: F64, sigma: Callable[[int], float], topic: str, clouds: Clouds
+) -> str:
+    """The sentence's end about a fault with these parameters (8,)."""
+    if fault is Fault.CLOCK:
+        return _clock_text(topic, known, sigma, clouds.span)
+    if fault is Fault.LEVER:
+        return _lever_text(known, sigma, clouds.mounting())
+    return _rotation_text(known, sigma) if fault is Fault.ROTATION else _scale_text(known, sigma)
+
+
+def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float], span: float) -> str:
     offset = float(parameters[CLOCK])
     side = "behind" if offset > 0 else "ahead of"
+    least, most = OTHER_END
+    ends = ""
+    if least * span <= abs(offset) <= most * span:
+        ends = (
+            f" (a sweep takes {span:.2f} s: its stamps, or the times of its points, may be counted"
+            " from its other end)"
+        )
     return (
-        f"its stamps are {abs(offset):.2f} \u00b1 {sigma(CLOCK):.2f} s {side} the clock of the"
-        f" poses; give --set logs.time_offset.{topic}={offset:+.2f}"
+        f"its stamps are {abs(offset):.2f} \u00b1 {max(sigma(CLOCK), 0.01):.2f} s {side} the clock"
+        f" of the poses{ends}; give --set logs.time_offset.{topic}={offset:+.2f}"
     )
 
 
-def _rotation_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> str:
+def _rotation_text(parameters: F64, sigma: Callable[[int], float]) -> str:
     rotation = Rotation.from_rotvec(parameters[ROTATION])
     turns = []
     for column, axis in zip(Fault.ROTATION.columns.tolist(), "xyz", strict=True):
@@ -570,16 +587,24 @@ def _is_axis_rotation(rotation: Rotation) -> bool:
     return bool((group.inv() * rotation).magnitude().min() < np.radians(10.0))
 
 
-def _lever_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> str:
-    shifts = [
-        f"{parameters[column]:.2f} \u00b1 {sigma(column):.2f} m along {axis}"
-        for column, axis in zip(Fault.LEVER.columns.tolist(), "xyz", strict=True)
-        if parameters[column]
-    ]
-    return f"its mounting is off by {', '.join(shifts)} of the base frame; correct its transform"
+def _lever_text(parameters: F64, sigma: Callable[[int], float], mounting: F64) -> str:
+    shifts = []
+    mirrored = []
+    for column, axis, given in zip(Fault.LEVER.columns.tolist(), "xyz", mounting, strict=True):
+        off = float(parameters[column])
+        if not off:
+            continue
+        spread = sigma(column)
+        shifts.append(f"{off:.2f} \u00b1 {spread:.2f} m along {axis}")
+        if abs(off + 2.0 * given) < MIRRORED * abs(off):
+            mirrored.append(f"{axis} of {given:.2f} m")
+    sign = f", as where its {' and its '.join(mirrored)} has the wrong sign" if mirrored else ""
+    return (
+        f"its mounting is off by {', '.join(shifts)} of the base frame{sign}; correct its transform"
+    )
 
 
-def _scale_text(topic: str, parameters: F64, sigma: Callable[[int], float]) -> str:
+def _scale_text(parameters: F64, sigma: Callable[[int], float]) -> str:
     factor = float(np.exp(parameters[SCALE]))
     if factor < HARDLY_MOVE:
         return (

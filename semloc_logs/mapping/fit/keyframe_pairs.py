@@ -57,11 +57,15 @@ Start = Callable[[int, int], F64]
 
 @dataclass(frozen=True, eq=False)
 class Clouds:
-    """The keyframes of one stream: ``rows`` of ``collected``, ``voxel`` is the voxel size (m)."""
+    """The keyframes of one stream: ``rows`` of ``collected``, ``voxel`` is the voxel size (m).
+
+    ``span``: from the first to the last point of a sweep (s), 0 without times of points.
+    """
 
     collected: Collected
     rows: I64
     voxel: float
+    span: float = 0.0
 
     def stamps_ns(self) -> I64:
         """Their stamps (n,)."""
@@ -93,6 +97,11 @@ class Clouds:
         if not speeds:
             return 0.0, 0.0
         return float(np.quantile(speeds, 0.9)), float(np.quantile(turn_rates, 0.9))
+
+    def mounting(self) -> F64:
+        """The sensor (3,) in the base frame, as the log gives it."""
+        origins = np.array([self.collected.origins[r] for r in self.rows], float)
+        return np.asarray(np.median(origins, axis=0))
 
     def sees_one_side(self) -> bool:
         """Whether the sensor has a narrow field of view: its points lie on one side of it."""

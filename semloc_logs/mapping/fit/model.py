@@ -40,6 +40,9 @@ OUTLIER = 4.0  # standard deviations; pairs beyond count less and less (Cauchy)
 ITERATIONS = 8
 LEAST_AGREEMENT = 2.0  # of the median ratio of lengths, in median deviations of the pairs from it
 MEDIAN_OF_6 = 5.348  # of chi squared with six degrees of freedom
+# the covariances of pairs allow for poor odometry; good pairs scatter by a tenth of it. As many
+# pairs as these are taken to scatter as expected, beside the real ones
+EXPECTED_PAIRS = 3
 
 
 class Fault(Enum):
@@ -185,10 +188,20 @@ def fit(pairs: Pairs, poses_at: PosesAt, free: I64, start: F64) -> Estimate:
     squares = np.asarray((residuals(parameters) ** 2).sum(1))
     if len(free):
         hessian, _ = _equations(residuals, parameters, free)
-        # distances that are larger than expected widen every estimate
-        excess = max(1.0, float(np.nanmedian(squares)) / MEDIAN_OF_6)
-        covariance[np.ix_(free, free)] = excess * np.linalg.inv(hessian)
+        covariance[np.ix_(free, free)] = scatter(squares) * np.linalg.inv(hessian)
     return Estimate(parameters, free, covariance, best, squares)
+
+
+def scatter(squares: F64) -> float:
+    """How many times the squared distances (n,) of pairs are as large as their covariances have it.
+
+    Below 1 as far as the pairs show it: :data:`EXPECTED_PAIRS` more count as expected.
+    """
+    known = int(np.isfinite(squares).sum())
+    if not known:
+        return 1.0
+    ratio = float(np.nanmedian(squares)) / MEDIAN_OF_6
+    return max(ratio, (EXPECTED_PAIRS + known * ratio) / (EXPECTED_PAIRS + known))
 
 
 def _equations(residuals: Callable[[F64], F64], parameters: F64, free: I64) -> tuple[F64, F64]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
-from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Bools, Pairs, PosesAt, cost_of
+from semloc_logs.mapping.fit.model import Bools, Pairs, PosesAt, cost_of, scatter
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 
@@ -26,6 +26,7 @@ MUCH_NEARER = 0.05  # a far reading explains the pairs when it lowers the median
 LEAST_GAIN = 12.0
 LOOKED_AT = 5  # keyframes that show where the points of clouds lie
 CARRIED = 0.5  # of the way of the vehicle by which points of the fixed frame move at least
+LONGEST_LAG, LAG_STEP = 2.0, 0.1  # s, between positions and rotations; of its search
 LEAST_WAY = 30.0  # voxels; on a shorter way other surroundings look like such a motion
 
 # positions in x, y, z, w of the parts of a quaternion that were written as w, x, y, z, and of one
@@ -103,12 +104,39 @@ def _inverted_or_turned(pairs: Pairs, poses_at: PosesAt, inverted: Reading) -> s
     axis_name = min(costs, key=lambda name: (costs[name], name != "z"))
     least = costs[axis_name]
     cost = cost_of(pairs.residuals(inverted.motion))
-    excess = max(1.0, float(np.nanmedian(pairs.squares(inverted.motion))) / MEDIAN_OF_6)
+    excess = scatter(pairs.squares(inverted.motion))
     if (cost - least) / excess >= LEAST_GAIN:
         return ""  # the mounting is turned, which its fault names with the angle
     if (least - cost) / excess >= LEAST_GAIN:
         return inverted.text
     return _INVERTED_OR_TURNED.format(axis=axis_name)
+
+
+def _lagging(pairs: Pairs, poses_at: PosesAt) -> Iterator[Reading]:
+    """Poses whose rotations, or positions, are of another time than the rest of them."""
+    given, known = pairs.poses(poses_at)
+    for part, rest in (("rotations", "positions"), ("positions", "rotations")):
+
+        def reading(seconds: float, part: str = part) -> F64:
+            other, is_reached = pairs.poses(poses_at, round(seconds * 1e9))
+            poses = given.copy()
+            columns = slice(3) if part == "rotations" else slice(3, 4)
+            poses[..., :3, columns] = other[..., :3, columns]
+            return _where(known & is_reached, _motion(poses))
+
+        best = 0.0
+        for reach, step in ((LONGEST_LAG, LAG_STEP), (LAG_STEP, LAG_STEP / 5)):
+            tried = best + np.arange(-reach, reach + step / 2, step)
+            costs = [cost_of(pairs.residuals(reading(seconds))) for seconds in tried]
+            best = float(tried[int(np.argmin(costs))])
+        side = "behind" if best > 0 else "ahead of"
+        yield Reading(
+            reading(best),
+            f"the poses fit when their {part} are taken {abs(best):.2f} s "
+            f"{'later' if best > 0 else 'earlier'}: the {part} are {side} the {rest}, as from a"
+            " filter or another receiver; give poses whose parts are of one time",
+            LEAST_GAIN,
+        )
 
 
 def near_reading(pairs: Pairs, poses_at: PosesAt, none: float, most: float) -> str:
@@ -121,7 +149,7 @@ def near_reading(pairs: Pairs, poses_at: PosesAt, none: float, most: float) -> s
     text = ""
     for reading in _near_readings(pairs, poses_at):
         cost = cost_of(pairs.residuals(reading.motion))
-        excess = max(1.0, float(np.nanmedian(pairs.squares(reading.motion))) / MEDIAN_OF_6)
+        excess = scatter(pairs.squares(reading.motion))
         # the first one of readings that the drive does not tell apart
         if (
             cost + reading.lead * excess <= most
@@ -150,6 +178,7 @@ def _near_readings(pairs: Pairs, poses_at: PosesAt) -> Iterator[Reading]:
     for motions, text in with_other_axes(poses):
         # a straight drive shows a mounting that is turned alike
         yield Reading(_where(known, motions), text, LEAST_GAIN)
+    yield from _lagging(pairs, poses_at)
 
 
 def otherwise_written(poses: F64) -> Iterator[tuple[F64, str]]:

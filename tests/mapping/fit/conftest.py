@@ -14,7 +14,7 @@ from semloc_logs.frames import Header, PosedCloud
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 from semloc_logs.mapping.keyframes import Collected
-from semloc_logs.numerics.transforms import apply, inverse, yaw_transform
+from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 
 F64 = NDArray[np.float64]
 VOXEL = 0.3
@@ -49,6 +49,16 @@ def winding(seconds: F64) -> F64:
     return np.array([yaw_transform(a, (x, y, 1.5)) for a, x, y in zip(yaw, way, side, strict=True)])
 
 
+def hilly(seconds: F64) -> F64:
+    """As :func:`winding`, over humps: the vehicle pitches to and fro by 3 degrees."""
+    poses = winding(seconds)
+    pitch = np.radians(3.0) * np.sin(1.3 * seconds)
+    for pose, angle in zip(poses, pitch, strict=True):
+        turn = np.array([0.0, angle, 0.0])
+        pose[:] = pose @ exp_se3(np.zeros(3), turn)
+    return poses
+
+
 def straight(seconds: F64) -> F64:
     """Poses (n, 4, 4) at a steady 3 m/s along x."""
     return np.array([yaw_transform(0.0, (3.0 * s, 0.0, 1.5)) for s in seconds])
@@ -79,12 +89,14 @@ def drive(
     is_camera: bool = False,
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0),
     as_written: Callable[[F64], F64] = lambda poses: poses,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Clouds, PoseTrack]:
     """Keyframes three times a second, and the poses twenty times a second, as they are written.
 
     The clouds are stamped ``clock`` seconds late; their mounting is wrong by ``base_T_assumed``
     (true base frame from the one of the clouds); ``scale`` times as large; or in the session frame.
     A LIDAR sees all around, a camera ahead. ``signs``: an axis of the clouds may be mirrored.
+    ``origin``: where the sensor is in the base frame, as the log has it.
     """
     world = street()
     rng = np.random.default_rng(5)
@@ -108,7 +120,7 @@ def drive(
         cloud = PosedCloud(
             header,
             (scale * points * signs).astype(np.float32),
-            np.zeros(3, np.float32),
+            np.array(origin, np.float32),
             track.at(stamp_ns),
             None,
         )
@@ -119,4 +131,6 @@ def drive(
 @pytest.fixture(scope="session")
 def streets() -> SimpleNamespace:
     """The functions of this file, for tests that cannot import it."""
-    return SimpleNamespace(street=street, drive=drive, winding=winding, straight=straight)
+    return SimpleNamespace(
+        street=street, drive=drive, winding=winding, hilly=hilly, straight=straight
+    )

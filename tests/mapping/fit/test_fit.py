@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -129,6 +130,47 @@ def test_a_shifted_mounting_is_found_where_the_vehicle_turns(check: Check) -> No
     fit = check(base_T_assumed=mounting)
     assert "m along x of the base frame" in _only(fit)
     assert fit.parameters["lever_x_m"][0] == pytest.approx(1.2, abs=0.2)
+
+
+def test_the_height_of_a_mounting_with_the_wrong_sign_is_found_over_humps(
+    check: Check, streets: SimpleNamespace
+) -> None:
+    """The sensor is 1.9 m above the base, the log has it 1.9 m below: 3.8 m."""
+    shift = yaw_transform(0.0, (0.0, 0.0, 3.8))
+    text = _only(check(streets.hilly, base_T_assumed=shift, origin=(0.3, 0.0, -1.9)))
+    assert "its mounting is off by 3." in text
+    assert "m along z of the base frame, as where its z of -1.90 m has the wrong sign" in text
+    assert "wrong sign" not in _only(
+        check(streets.hilly, base_T_assumed=shift, origin=(0.3, 0.0, 1.9))
+    )
+
+
+@pytest.mark.parametrize("part", ["rotations", "positions"])
+@pytest.mark.parametrize("late", [0.6, 1.0])
+def test_rotations_and_positions_of_different_times_are_named(
+    check: Check, part: str, late: float
+) -> None:
+    steps = round(late / 0.05)  # the drive has poses 0.05 s apart
+    columns = slice(3) if part == "rotations" else 3
+
+    def lagging(poses: F64) -> F64:
+        out = poses.copy()
+        out[steps:, :3, columns] = poses[:-steps, :3, columns]
+        out[:steps, :3, columns] = poses[0, :3, columns]
+        return out
+
+    text = _only(check(as_written=lagging))
+    assert f"their {part} are taken {late:.2f} s later: the {part} are behind" in text
+
+
+def test_an_offset_as_long_as_a_sweep_may_be_from_its_other_end(
+    tmp_path: Path, streets: SimpleNamespace
+) -> None:
+    clouds, track = streets.drive(tmp_path, clock=-0.1)
+    for span, is_told in ((0.1, True), (0.0, False), (0.4, False)):
+        text = _only(check_stream(TOPIC, replace(clouds, span=span), track.at_many))
+        assert "its stamps are 0.1" in text
+        assert (f"a sweep takes {span:.2f} s" in text) == is_told
 
 
 def test_a_straight_and_steady_drive_hides_clock_and_lever_arm_and_says_so(

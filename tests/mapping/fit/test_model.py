@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from semloc_logs.mapping.fit.model import Pairs, agree_about_scale
+from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Pairs, agree_about_scale, scatter
 from semloc_logs.numerics.transforms import yaw_transform
 
 F64 = NDArray[np.float64]
@@ -36,3 +36,12 @@ def test_standing_still_tells_no_scale() -> None:
     stamps = np.zeros((3, 2), np.int64)
     pairs = Pairs(stamps, np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(6), (3, 1, 1)))
     assert not agree_about_scale(pairs, _poses_at)
+
+
+def test_pairs_that_scatter_less_than_expected_narrow_estimates_as_far_as_they_show_it() -> None:
+    """With 3 pairs as expected: 27 pairs of a tenth make (3 + 2.7) / 30."""
+    tenth = np.full(27, 0.1 * MEDIAN_OF_6)
+    assert scatter(tenth) == pytest.approx(0.19)
+    assert scatter(tenth[:3]) == pytest.approx(0.55)
+    assert scatter(np.full(3, 4.0 * MEDIAN_OF_6)) == pytest.approx(4.0)
+    assert scatter(np.full(3, np.nan)) == 1.0
