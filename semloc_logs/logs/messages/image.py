@@ -33,6 +33,7 @@ def _picture(header: Header, pixels: Any, encoding: str, depth: bool) -> Iterato
 def _raw(header: Header, m: Any) -> Iterator[Frame]:
     encoding = str(m.encoding)
     big_endian = bool(getattr(m, "is_bigendian", False))
+    of_depth = image_codecs.is_depth(header.topic, encoding)
     pixels = image_codecs.decode_raw(
         binary(m.data),
         int(m.width or 0),
@@ -40,8 +41,9 @@ def _raw(header: Header, m: Any) -> Iterator[Frame]:
         int(m.step or 0),
         encoding,
         big_endian,
+        of_depth=of_depth,
     )
-    yield from _picture(header, pixels, encoding, image_codecs.is_depth(header.topic, encoding))
+    yield from _picture(header, pixels, encoding, of_depth)
 
 
 def _compressed(header: Header, m: Any) -> Iterator[Frame]:

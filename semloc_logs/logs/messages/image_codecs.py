@@ -65,25 +65,36 @@ _ROUGHER = 30.0
 _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
 
 
-def _is_rough_beside(pixels: NDArray[np.uint16], other: np.dtype[Any]) -> bool:
+def _is_rough_beside(pixels: NDArray[np.uint16], other: np.dtype[Any], *, of_depth: bool) -> bool:
     """Whether neighbours (h, w, 1) differ far more than in the ``other`` order of bytes.
 
     Writers fill in the flag for the order of bytes wrongly; pictures are smooth in one order only.
+    Only depths are judged by the neighbours that differ: a camera's depths are the same for most,
+    and so are labels, which may count in steps of 256.
     """
     rows = pixels[:: max(1, len(pixels) // _ROWS), :, 0]
 
     def roughness(values: NDArray[np.uint16]) -> float:
         steps = np.abs(np.diff(values.astype(np.int64), axis=1))
         both = (values[:, 1:] > 0) & (values[:, :-1] > 0)
+        if of_depth:
+            both &= steps > 0
         return float(np.median(steps[both])) if both.sum() >= _FEWEST_PIXELS else 0.0
 
     return roughness(rows) > _ROUGHER * max(roughness(rows.view(other)), 1.0)
 
 
 def decode_raw(
-    data: bytes | memoryview, width: int, height: int, step: int, encoding: str, big_endian: bool
+    data: bytes | memoryview,
+    width: int,
+    height: int,
+    step: int,
+    encoding: str,
+    big_endian: bool,
+    *,
+    of_depth: bool = False,
 ) -> Image | F32:
-    """(h, w), (h, w, 3) RGB, or float32 (h, w) for 32FC1.
+    """(h, w), (h, w, 3) RGB, or float32 (h, w) for 32FC1. ``of_depth``: the pixels are depths.
 
     UndecodableError when the size does not fit the data.
     """
@@ -98,11 +109,18 @@ def decode_raw(
         raise UndecodableError(
             f"{width} x {height} pixels of {encoding} do not fit its {len(data)} bytes"
         )
+    if height > 1 and step > row and step % row == 0:  # padding is shorter than the row
+        raise UndecodableError(
+            f"its rows of {step} bytes are {step // row} times as long as {width} pixels of"
+            f" {encoding}: its encoding, width or step is wrong"
+        )
     shape = (height, width, channels)
     strides = (step, channels * value.itemsize, value.itemsize)
     strided = np.ndarray(shape, value, buffer=data, strides=strides)
-    if value.str[1:] == "u2" and channels == 1 and _is_rough_beside(strided, value.newbyteorder()):
-        strided = strided.view(value.newbyteorder())
+    if value.str[1:] == "u2" and channels == 1:
+        other = value.newbyteorder()
+        if _is_rough_beside(strided, other, of_depth=of_depth):
+            strided = strided.view(other)
     pixels: Any = np.ascontiguousarray(strided, value.newbyteorder("="))
     if channels == 1:
         pixels = pixels[:, :, 0]

@@ -129,6 +129,8 @@ def _lagging(pairs: Pairs, poses_at: PosesAt) -> Iterator[Reading]:
             tried = best + np.arange(-reach, reach + step / 2, step)
             costs = [cost_of(pairs.residuals(reading(seconds))) for seconds in tried]
             best = float(tried[int(np.argmin(costs))])
+        if abs(best) > LONGEST_LAG - LAG_STEP:  # not found within the range of the search
+            continue
         side = "behind" if best > 0 else "ahead of"
         yield Reading(
             reading(best),

@@ -235,6 +235,28 @@ def test_a_wrong_flag_for_the_order_of_bytes_is_seen_from_neighbouring_pixels(is
         np.testing.assert_array_equal(decode_raw(data, 80, 60, 160, "16UC1", flag), depth)
 
 
+@pytest.mark.parametrize("is_big", [False, True])
+def test_depths_of_which_most_are_the_same_show_the_order_of_bytes_too(is_big: bool) -> None:
+    depth = np.repeat(1500 + 7 * np.arange(20), 4)[None].repeat(60, 0).astype(np.uint16)
+    data = depth.astype(">u2" if is_big else "<u2").tobytes()
+    for flag in (False, True):
+        pixels = decode_raw(data, 80, 60, 160, "16UC1", flag, of_depth=True)
+        np.testing.assert_array_equal(pixels, depth)
+
+
+def test_labels_in_steps_of_256_keep_their_order_of_bytes() -> None:
+    labels = np.repeat(256 * np.arange(1, 21), 4)[None].repeat(60, 0).astype(np.uint16)
+    pixels = decode_raw(labels.astype("<u2").tobytes(), 80, 60, 160, "mono16", False)
+    np.testing.assert_array_equal(pixels, labels)
+
+
+@pytest.mark.parametrize(("encoding", "times"), [("mono8", 4), ("16UC1", 2)])
+def test_rows_many_times_as_long_as_their_pixels_are_refused(encoding: str, times: int) -> None:
+    with pytest.raises(UndecodableError, match=f"its rows of 32 bytes are {times} times as long"):
+        decode_raw(bytes(320), 8, 10, 32, encoding, big_endian=False)
+    assert decode_raw(bytes(200), 8, 10, 20, "16UC1", big_endian=False).shape == (10, 8)
+
+
 def test_a_noisy_picture_keeps_the_order_that_it_names() -> None:
     noise = np.random.default_rng(1).integers(0, 1 << 16, (60, 80)).astype(np.uint16)
     for order, flag in (("<u2", False), (">u2", True)):
