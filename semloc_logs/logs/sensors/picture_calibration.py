@@ -21,6 +21,8 @@ from semloc_logs.frames import F64, WHOLE_PICTURE, Camera
 _OFF_MIDDLE = 0.2
 # and by which it usually is: between two readings that differ by less, nothing can be told
 _NEAR_MIDDLE = 0.08
+# share by which it is off where it lies near the middle of the picture turned by 90 degrees
+_OFF_TURNED = 0.1
 _NO_MATTER = 0.01  # share of a side: readings that differ by less give the same map
 _MOST_STRETCH = 0.02  # by which a picture may be scaled differently along its axes
 _REMEDY = "name another calibration with --topic camera_info=TOPIC"
@@ -241,11 +243,19 @@ class _Claim(NamedTuple):
 def _other_size(camera: Camera, matrix: str, full: F64) -> str:
     """What is assumed where a calibration seems to be of a picture of another size; else ""."""
     point = np.asarray(getattr(camera, matrix)[:2, 2])
-    if not point.any() or _off(point, full / 2, full) <= _OFF_MIDDLE:
+    off = _off(point, full / 2, full)
+    off_turned = _off(point, full[::-1] / 2, full)
+    is_turned = off > _OFF_TURNED and off_turned < _NEAR_MIDDLE
+    if not point.any() or (off <= _OFF_MIDDLE and not is_turned):
         return ""
+    likeness = (
+        "as where its x and y are exchanged, or of a picture that was turned"
+        if is_turned
+        else "as of a picture of another size"
+    )
     return (
         f"CameraInfo {camera.header.topic} is for {_pixels(full)} pixels, but the middle of its "
-        f"{matrix} lies at ({point[0]:.0f}, {point[1]:.0f}), as of a picture of another size: it "
+        f"{matrix} lies at ({point[0]:.0f}, {point[1]:.0f}), {likeness}: it "
         f"is taken as it is; {_REMEDY} if that is wrong."
     )
 

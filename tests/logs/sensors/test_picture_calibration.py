@@ -90,6 +90,18 @@ def test_a_calibration_of_a_picture_of_another_size_is_named(
     assert f"lies at ({matrix[2]}, {matrix[3]})" in assumption or not is_assumed
 
 
+@pytest.mark.parametrize(
+    ("middle", "is_told"), [((236, 322), True), ((322, 236), False), ((270, 280), False)]
+)
+def test_a_principal_point_with_its_axes_exchanged_is_named(
+    middle: tuple[int, int], is_told: bool
+) -> None:
+    _, assumption = fitted_camera(camera(K=(500, 400, *middle)), 480, 640)
+    assert ("x and y are exchanged, or of a picture that was turned" in assumption) == is_told
+    _, assumption = fitted_camera(camera(K=(500, 500, 322, 322), width=640, height=640), 640, 640)
+    assert assumption == ""
+
+
 def test_a_driver_that_writes_the_size_of_the_picture_but_k_of_the_sensor() -> None:
     fitted, assumption = fitted_camera(camera((2, 2), width=320, height=240), 240, 320)
     assert four(fitted) == [250, 200, 161, 118]
