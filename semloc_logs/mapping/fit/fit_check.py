@@ -63,6 +63,7 @@ LEAST_PAIRS = 4
 # a hypothesis explains much: it lowers half of chi squared by so much, and its parameter differs
 # from zero by so many standard deviations
 LEAST_SIGMAS = 5.0
+AS_EXPECTED = 3.0  # a gain of cost is as expected down to one part of so many
 # squared distances in the median beyond which other starts of registration are tried; and up to
 # which faults explain the pairs, more with noisy registrations
 DOUBTFUL = 15.0
@@ -460,13 +461,31 @@ def _explained(pairs: Pairs, poses_at: PosesAt, none: Estimate) -> tuple[Estimat
     while len(faults) < len(possible):
         tries = {f: _with(pairs, poses_at, estimate, f) for f in possible if f not in faults}
         fault, better = min(tries.items(), key=lambda item: item[1].cost)
-        if (estimate.cost - better.cost) / scatter(better.squares) < LEAST_GAIN + len(
-            fault.columns
-        ):
+        if not explains_much(fault, estimate, better):
             break
         estimate = better
         faults.append(fault)
     return estimate, faults
+
+
+def explains_much(fault: Fault, before: Estimate, after: Estimate) -> bool:
+    """Whether one more ``fault`` lowers the cost by much.
+
+    Beside the noise that pairs are expected to have; or beside the noise that they show, where the
+    cost falls as the parameters and their standard deviations have it. A dip of the cost far off
+    is narrow: poses that jitter have many.
+    """
+    gain = before.cost - after.cost
+    shown = scatter(after.squares)
+    least = LEAST_GAIN + len(fault.columns)
+    if gain / max(1.0, shown) >= least:
+        return True
+    sigmas = [
+        (after.parameters[column] - before.parameters[column]) / max(after.sigma(column), 1e-9)
+        for column in fault.columns.tolist()
+    ]
+    expected = 0.5 * float(np.square(sigmas).sum())
+    return gain / shown >= max(least, expected / AS_EXPECTED)
 
 
 def _with(pairs: Pairs, poses_at: PosesAt, estimate: Estimate, fault: Fault) -> Estimate:

@@ -104,7 +104,7 @@ def _inverted_or_turned(pairs: Pairs, poses_at: PosesAt, inverted: Reading) -> s
     axis_name = min(costs, key=lambda name: (costs[name], name != "z"))
     least = costs[axis_name]
     cost = cost_of(pairs.residuals(inverted.motion))
-    excess = scatter(pairs.squares(inverted.motion))
+    excess = max(1.0, scatter(pairs.squares(inverted.motion)))
     if (cost - least) / excess >= LEAST_GAIN:
         return ""  # the mounting is turned, which its fault names with the angle
     if (least - cost) / excess >= LEAST_GAIN:
@@ -151,7 +151,7 @@ def near_reading(pairs: Pairs, poses_at: PosesAt, none: float, most: float) -> s
     text = ""
     for reading in _near_readings(pairs, poses_at):
         cost = cost_of(pairs.residuals(reading.motion))
-        excess = scatter(pairs.squares(reading.motion))
+        excess = max(1.0, scatter(pairs.squares(reading.motion)))
         # the first one of readings that the drive does not tell apart
         if (
             cost + reading.lead * excess <= most

@@ -14,7 +14,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from semloc_logs.mapping.fit.fit_check import SessionFit, Severity, StreamFit, check_stream
+from semloc_logs.mapping.fit.fit_check import (
+    SessionFit,
+    Severity,
+    StreamFit,
+    check_stream,
+    explains_much,
+)
+from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Estimate, Fault
 from semloc_logs.mapping.fit.plane_cells import PlaneCells, register
 from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import exp_se3, inverse, rotation_angle, yaw_transform
@@ -161,6 +168,28 @@ def test_rotations_and_positions_of_different_times_are_named(
 
     text = _only(check(as_written=lagging))
     assert f"their {part} are taken {late:.2f} s later: the {part} are behind" in text
+
+
+@pytest.mark.parametrize(
+    ("gain", "sigma", "is_much"),
+    [
+        (14.0, 0.001, True),  # much beside the noise that is expected
+        (8.0, 0.05, True),  # 0.5 * 4 ** 2 = 8: as the standard deviation has it, at a tenth of it
+        (2.0, 0.1, False),  # 2 sigma
+        (8.0, 0.002, False),  # a dip 100 standard deviations off: as if the cost fell by 5000
+    ],
+)
+def test_a_small_gain_counts_where_the_cost_falls_as_expected(
+    gain: float, sigma: float, is_much: bool
+) -> None:
+    """24 pairs that scatter by a tenth of what is expected: (3 + 2.4) / 27 = 0.2."""
+    covariance = np.zeros((8, 8))
+    covariance[0, 0] = sigma**2
+    squares = np.full(24, 0.1 * MEDIAN_OF_6)
+    before = Estimate(np.zeros(8), np.zeros(0, np.int64), np.zeros((8, 8)), 20.0, squares)
+    offset = np.array([0.2, *[0.0] * 7])
+    after = Estimate(offset, Fault.CLOCK.columns, covariance, 20.0 - gain, squares)
+    assert explains_much(Fault.CLOCK, before, after) == is_much
 
 
 def test_an_offset_as_long_as_a_sweep_may_be_from_its_other_end(
