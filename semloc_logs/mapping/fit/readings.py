@@ -147,6 +147,8 @@ def near_reading(pairs: Pairs, poses_at: PosesAt, none: float, most: float) -> s
     ``none``: the cost of the poses as they are; ``most``: the cost of what faults leave. Only turns
     show such a reading, to the side or up and down.
     """
+    if none < LEAST_GAIN:  # no reading could explain so much
+        return ""
     least = np.inf
     text = ""
     for reading in _near_readings(pairs, poses_at):
