@@ -50,7 +50,7 @@ from semloc_logs.mapping.fit.model import (
 )
 from semloc_logs.mapping.fit.other_starts import Doubted
 from semloc_logs.mapping.fit.readings import FAR_OFF, LEAST_GAIN, far_reading, near_reading
-from semloc_logs.mapping.fit.way import other_distance
+from semloc_logs.mapping.fit.way import other_distance, searched
 from semloc_logs.mapping.keyframes import Collected
 
 F64 = NDArray[np.float64]
@@ -336,6 +336,7 @@ def check_stream(
     given = registered(clouds, numbers)
     if len(given.pairs) < LEAST_PAIRS:
         return _far_off(topic, clouds, poses_at, numbers, given)
+    given = searched(clouds, given)
     tried = [given]
     for start in _starts(clouds, poses_at, given):
         tried.append(registered(clouds, numbers, start))

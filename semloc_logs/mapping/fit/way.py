@@ -12,7 +12,15 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.mapping.fit.keyframe_pairs import Clouds, Registered, Registrar, Start, motion
+from semloc_logs.mapping.fit.keyframe_pairs import (
+    Clouds,
+    Registered,
+    Registrar,
+    Start,
+    covariance_of,
+    motion,
+)
+from semloc_logs.mapping.fit.model import Pairs
 from semloc_logs.numerics.evenly import evenly
 
 F64 = NDArray[np.float64]
@@ -26,6 +34,8 @@ MOST = 4.0  # times as far as by the poses
 # the distance is another one when so many times as much across the way lies on planes there; at the
 # right one it is about five times as much as anywhere else
 BETTER = 1.8
+SLIPPED = 0.3, 1.8  # as far as by the poses, at least and at most, where odometry slips
+FAR_BETTER = 1.15  # times as many points lie on planes at such a distance
 
 
 def other_distance(clouds: Clouds, found: Registered) -> Start | None:
@@ -53,6 +63,37 @@ def other_distance(clouds: Clouds, found: Registered) -> Start | None:
     if not len(shares) or shares[best] <= max(BETTER * found_share, 1e-9):
         return None
     return _start(clouds, float(factors[best]))
+
+
+def searched(clouds: Clouds, found: Registered) -> Registered:
+    """The pairs, each registered again from the distance at which most across the way fits.
+
+    Odometry that slips for a while is wrong in a few pairs only. A pair is replaced where far more
+    of its points lie on planes then.
+    """
+    registrar = Registrar(clouds)
+    measured = found.pairs.measured.copy()
+    covariance = found.pairs.covariance.copy()
+    share = found.share.copy()
+    for row, (target, source) in enumerate(found.numbers.tolist()):
+        given = motion(clouds, target, source)
+        way = float(np.linalg.norm(given[:3, 3]))
+        if way < LEAST_WAY * clouds.voxel:
+            continue
+        factors = np.arange(SLIPPED[0], SLIPPED[1], STEP * clouds.voxel / way)
+        starts = [_lengthened(given, factor) for factor in factors]
+        direction = given[:3, 3] / way
+        shares = registrar.shares_along(target, source, [measured[row], *starts], direction)
+        best = int(np.argmax(shares))
+        if shares[best] <= BETTER * shares[0]:
+            continue
+        fit = registrar.fit(target, source, [starts[best - 1]])
+        if fit.share > FAR_BETTER * share[row]:
+            measured[row] = fit.target_T_source
+            covariance[row] = covariance_of(fit, clouds.voxel)
+            share[row] = fit.share
+    pairs = Pairs(found.pairs.stamps_ns, measured, covariance)
+    return Registered(pairs, found.numbers, share, found.given_share)
 
 
 def _way(clouds: Clouds, pair: list[int]) -> F64:
