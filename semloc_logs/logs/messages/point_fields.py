@@ -54,6 +54,7 @@ class Points:
 # so large a share of a sweep: surfaces at just one range are spheres about the sensor
 _SAME_RANGE = 1e-5
 _WITHOUT_RETURN = 0.05
+_WITHIN = 0.1  # the least share below the greatest range: radars have few ranges
 _NOTHING_ELSE = 0.95  # and no larger: such clouds are made up
 # points of a circle, or of two on floor and ceiling, are this share at least in few slices across
 # its axis: so wide (of the range), and so many where the border of two slices cuts each circle
@@ -156,7 +157,8 @@ def _have_returned(xyz: F32, valid: NDArray[np.bool_]) -> NDArray[np.bool_] | No
         share = float(np.mean(is_shared))
         if not _WITHOUT_RETURN <= share <= _NOTHING_ELSE:
             continue
-        if shared == usual and not _is_spread(some[is_shared], shared):
+        is_within = shared < float(order[-1])
+        if is_within and (share < _WITHIN or not _is_spread(some[is_shared], shared)):
             continue
         with np.errstate(over="ignore", invalid="ignore"):
             distances = np.linalg.norm(xyz.astype(np.float64), axis=1)

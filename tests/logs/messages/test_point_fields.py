@@ -52,10 +52,17 @@ def _shell(elevations: NDArray[np.float64], distance: float) -> NDArray[np.float
 
 
 def _in_a_street(shell: NDArray[np.float64]) -> NDArray[np.float32]:
-    """A shell (200, 3), and 800 points at other ranges up to 60 m."""
+    """800 points at ranges up to 60 m, and a shell (n, 3) behind them."""
     rng = np.random.default_rng(2)
     around = _shell(rng.uniform(-0.4, 0.4, 800), 1.0) * rng.uniform(3, 60, (800, 1))
     return np.concatenate([around, shell]).astype("<f4")
+
+
+def test_a_few_points_of_one_range_are_surfaces() -> None:
+    """A radar counts ranges in coarse steps: 60 of 860 points share one."""
+    xyz = _in_a_street(_shell(np.random.default_rng(1).uniform(-0.05, 0.3, 60), 12.0))
+    p = decode_points(xyz.tobytes(), Layout(860, 1, 12, 0), XYZ, STAMP)
+    assert p.without_return == 0
 
 
 def test_rays_without_a_return_at_a_range_within_the_sweep_are_left_out() -> None:
