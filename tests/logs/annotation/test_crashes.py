@@ -93,13 +93,19 @@ def case(tmp_path: Path, kind: str) -> Case:
     if old:
         annotate_in_place(log, results(old, "old"))
     before = log.read_bytes()
-    annotate_copy(log, tmp_path / "copy.mcap", results(new))
-    after = (tmp_path / "copy.mcap").read_bytes()
+    copy = tmp_path / "copy.mcap"
+    # compressed sizes depend on the text: of equal results some text has the same size
+    for text in ("new", *map(str, range(100, 200))):
+        after_results = results(new, text)
+        annotate_copy(log, copy, after_results, overwrite=True)
+        after = copy.read_bytes()
+        if kind != "equal" or len(after) == len(before):
+            break
     sizes = {"first": (1, 0), "longer": (1, 0), "shorter": (0, 1), "equal": (0, 0)}[kind]
     assert (len(after) > len(before), len(after) < len(before)) == tuple(map(bool, sizes))
     assert topics(log).count("/semloc/loop_closures") == old
-    assert topics(tmp_path / "copy.mcap").count("/semloc/loop_closures") == new
-    return Case(before, after, results(new))
+    assert topics(copy).count("/semloc/loop_closures") == new
+    return Case(before, after, after_results)
 
 
 KINDS = ("first", "longer", "shorter", "equal")
