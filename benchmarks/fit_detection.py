@@ -29,7 +29,8 @@ from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.poses.plausibility import implausible
 from semloc_logs.logs.poses.track import PoseTrack
 from semloc_logs.logs.session.session import Session, open_session
-from semloc_logs.mapping.fit.fit_check import StreamFit, check_stream
+from semloc_logs.mapping.fit.findings import StreamFit
+from semloc_logs.mapping.fit.fit_check import check_stream
 from semloc_logs.mapping.fit.keyframe_pairs import Clouds
 from semloc_logs.mapping.keyframes import Collected, collect
 from semloc_logs.mapping.session_fusion import reading_options

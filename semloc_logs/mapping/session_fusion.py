@@ -20,7 +20,8 @@ from semloc_logs.logs.poses.trajectory_file import TrajectoryFile
 from semloc_logs.logs.problems import Problem, sentences, sorted_problems, to_report
 from semloc_logs.logs.sensors.depth import RangeNoise
 from semloc_logs.logs.session.session import Session, SessionOptions, open_session
-from semloc_logs.mapping.fit.fit_check import SessionFit, check_session
+from semloc_logs.mapping.fit.findings import SessionFit
+from semloc_logs.mapping.fit.fit_check import check_session
 from semloc_logs.mapping.gravity import Gravity
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.levelling import check_reach, level

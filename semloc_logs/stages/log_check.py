@@ -11,7 +11,8 @@ from typing import Any
 from semloc_logs.labels.labeller import Labeller
 from semloc_logs.logs.problems import sentences, to_report
 from semloc_logs.logs.session.session import open_session
-from semloc_logs.mapping.fit.fit_check import SessionFit, check_session
+from semloc_logs.mapping.fit.findings import SessionFit
+from semloc_logs.mapping.fit.fit_check import check_session
 from semloc_logs.mapping.keyframes import collect
 from semloc_logs.mapping.session_fusion import reading_options
 from semloc_logs.settings import Labels, Settings

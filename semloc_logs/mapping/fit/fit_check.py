@@ -7,18 +7,24 @@ each that explains much is named with its estimate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence, Set
-from dataclasses import dataclass, field
-from enum import Enum
+from collections.abc import Iterator, Sequence, Set
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from semloc_logs.logs.messages.stamps import time_range
-from semloc_logs.logs.poses.plausibility import Jump, implausible
-from semloc_logs.logs.problems import Problem, ProblemKind
+from semloc_logs.logs.poses.plausibility import implausible
 from semloc_logs.logs.session.session import Session
+from semloc_logs.mapping.fit.fault_texts import fault_text
+from semloc_logs.mapping.fit.findings import (
+    LEAST_PAIRS,
+    LEAST_SIGMAS,
+    NAMES,
+    Finding,
+    SessionFit,
+    Severity,
+    StreamFit,
+)
 from semloc_logs.mapping.fit.keyframe_pairs import (
     Clouds,
     Registered,
@@ -34,7 +40,6 @@ from semloc_logs.mapping.fit.model import (
     LONGEST_OFFSET,
     MEDIAN_OF_6,
     PARAMETERS,
-    PRIOR,
     ROTATION,
     SCALE,
     Estimate,
@@ -59,10 +64,8 @@ I64 = NDArray[np.int64]
 # pairs of a stream: one for so many keyframes, within these bounds; a pair costs about 15 ms
 KEYFRAMES_A_PAIR = 8
 FEWEST_PAIRS, MOST_PAIRS = 24, 400
-LEAST_PAIRS = 4
-# a hypothesis explains much: it lowers half of chi squared by so much, and its parameter differs
-# from zero by so many standard deviations
-LEAST_SIGMAS = 5.0
+# a hypothesis explains much: it lowers half of chi squared by :data:`LEAST_GAIN`, and its parameter
+# differs from zero by :data:`LEAST_SIGMAS`
 AS_EXPECTED = 3.0  # a gain of cost is as expected down to one part of so many
 # squared distances in the median beyond which other starts of registration are tried; and up to
 # which faults explain the pairs, more with noisy registrations
@@ -81,24 +84,9 @@ LEAST_CONTRADICTIONS = 2  # one after the other
 
 # what a closure would suffer, in voxels: noted above the first, wrong above the second
 NOTED, WRONG = 0.5, 1.0
-# parameters by position, and what a wrong one is called
-NAMES = {
-    "clock_s": "an offset of its clock",
-    "rotation_x_rad": "a turn of its mounting about x",
-    "rotation_y_rad": "a turn of its mounting about y",
-    "rotation_z_rad": "a turn of its mounting about z",
-    "lever_x_m": "a shift of its mounting along x",
-    "lever_y_m": "a shift of its mounting along y",
-    "lever_z_m": "a shift of its mounting along z",
-    "scale_log": "a wrong scale",
-}
 FARTHEST_MOUNTING = 100.0  # m; ships are longer, but carry no sensors so far from their middle
-OTHER_END = 0.5, 1.5  # of a sweep: an offset may be from its other end
-MIRRORED = 0.25  # of a shift, by which it differs from twice the mounting it is of
-HARDLY_MOVE = 0.05  # times as far as the poses: registration may have found no motion at all
 HIDDEN = 3.0  # a fault that the drive does not show before it has this effect is hidden
 OTHER_AXES = np.radians(45.0)  # a mounting that is turned farther has other axes
-OPTICAL = np.radians(120.0)  # between the axes of a body and of an optical frame
 WRONG_TURN = 0.03  # rad, within a pair: a submap of 20 m would be bent by 15 degrees
 LEAST_DRIFT = np.radians(0.3)  # rad/m, worth a word: odometry drifts by a tenth of it
 STEADY = 0.9  # of the turns of contradicting pairs, summed up, where poses drift to one side
@@ -111,138 +99,6 @@ _STUCK_TEXT = (
     "many of its stamps hardly differ although they were recorded at other times; use the times of"
     " recording with --set logs.stamps=log"
 )
-
-
-class Severity(Enum):
-    """How much a finding matters."""
-
-    NOTED = "noted"
-    WRONG = "wrong"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that is wrong with a stream: the sentence's end, after the topics."""
-
-    severity: Severity
-    text: str
-
-
-@dataclass(slots=True)
-class StreamFit:
-    """The check of one stream.
-
-    ``pairs`` were registered; poses and clouds differ by ``translation_m`` and ``rotation_rad`` in
-    the median. ``parameters`` are (estimate, standard deviation) by name; ``hidden`` are the faults
-    that the drive would not show: a straight one hides a lever arm, a steady one a clock offset.
-    """
-
-    topic: str
-    pairs: int = 0
-    translation_m: float = 0.0
-    rotation_rad: float = 0.0
-    parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
-    findings: list[Finding] = field(default_factory=list)
-    hidden: list[str] = field(default_factory=list)
-
-    @property
-    def is_wrong(self) -> bool:
-        """Whether closures of this stream would be false."""
-        return any(f.severity is Severity.WRONG for f in self.findings)
-
-    def untold(self) -> str:
-        """A sentence about the faults that could not be checked; empty where all could."""
-        if self.pairs < LEAST_PAIRS:
-            return (
-                f"{self.topic}: whether the poses fit its clouds cannot be told: only {self.pairs}"
-                " pairs of its keyframes could be compared."
-            )
-        if not self.hidden or self.findings:
-            return ""
-        faults = " or ".join(self._smallest(name) for name in self.hidden)
-        return (
-            f"{self.topic}: the drive would not show {faults}: it is too short, too straight or too"
-            " steady, or the scene too plain."
-        )
-
-    def _smallest(self, name: str) -> str:
-        """A hidden fault, with the size below which it is hidden where that means anything."""
-        sigma = self.parameters[name][1]
-        size = LEAST_SIGMAS * sigma
-        if sigma > 0.5 * PRIOR[list(NAMES).index(name)]:
-            return NAMES[name]
-        unit = {
-            "clock_s": f"{size:.2g} s",
-            "scale_log": f"{100 * np.expm1(size):.0f} %",
-        }.get(name, f"{np.degrees(size):.0f} degrees" if "rotation" in name else f"{size:.1f} m")
-        return f"{NAMES[name]} of less than {unit}"
-
-    def to_json(self) -> dict[str, object]:
-        """For session.json."""
-        return {
-            "topic": self.topic,
-            "pairs": self.pairs,
-            "translation_m": round(self.translation_m, 4),
-            "rotation_rad": round(self.rotation_rad, 5),
-            "parameters": {
-                name: {"estimate": round(value, 5), "sigma": round(sigma, 5)}
-                for name, (value, sigma) in self.parameters.items()
-            },
-            "hidden": self.hidden,
-            "findings": [{"severity": f.severity.value, "text": f.text} for f in self.findings],
-        }
-
-
-@dataclass(slots=True)
-class SessionFit:
-    """The check of a session: of the track of its ``pose`` stream, and of each range stream.
-
-    ``is_frozen``: the poses stand still while the surroundings move, which a problem of the session
-    names.
-    """
-
-    pose: str
-    jump: Jump | None = None
-    is_frozen: bool = False
-    streams: list[StreamFit] = field(default_factory=list)
-
-    @property
-    def fits(self) -> bool:
-        """Whether nothing is known that would make closures false."""
-        if self.is_frozen or self.jump is not None:
-            return False
-        return not any(stream.is_wrong for stream in self.streams)
-
-    @property
-    def problems(self) -> list[Problem]:
-        """A sentence for each finding."""
-        problems = []
-        if self.jump is not None:
-            text = f"{self.pose}: {self.jump.text}."
-            problems.append(Problem(self.pose, ProblemKind.FIT, text, lost=False, assumed=True))
-        for stream in self.streams:
-            for finding in stream.findings:
-                is_wrong = finding.severity is Severity.WRONG
-                verb = "do not fit each other" if is_wrong else "hardly fit each other"
-                text = f"{stream.topic} and the poses of {self.pose} {verb}: {finding.text}."
-                problem = Problem(stream.topic, ProblemKind.FIT, text, lost=False, assumed=is_wrong)
-                problems.append(problem)
-            if note := stream.untold():
-                problems.append(Problem(stream.topic, ProblemKind.FIT, note, lost=False))
-        return problems
-
-    def _track_text(self) -> str | None:
-        if self.jump is not None:
-            return self.jump.text
-        return "the poses stand still while the surroundings move" if self.is_frozen else None
-
-    def to_json(self) -> dict[str, object]:
-        """For session.json."""
-        return {
-            "fits": self.fits,
-            "track": self._track_text(),
-            "streams": [stream.to_json() for stream in self.streams],
-        }
 
 
 def check_session(session: Session, collected: Collected, voxel: float) -> SessionFit:
@@ -510,7 +366,7 @@ def _describe(stream: StreamFit, estimate: Estimate, faults: list[Fault], clouds
         effect = _effect(known, fault, clouds)
         if effect >= NOTED:
             severity = Severity.WRONG if effect >= WRONG else Severity.NOTED
-            text = _text(fault, known, estimate.sigma, stream.topic, clouds)
+            text = fault_text(fault, known, estimate.sigma, stream.topic, clouds)
             stream.findings.append(Finding(severity, text))
 
 
@@ -552,90 +408,6 @@ def _effect(parameters: F64, fault: Fault, clouds: Clouds) -> float:
         return float(np.linalg.norm(parameters[LEVER])) / clouds.voxel
     change = abs(float(np.expm1(parameters[SCALE])))
     return WRONG * change / SCALE_WRONG if change >= SCALE_NOTED else 0.0
-
-
-def _text(
-    fault: Fault, known: F64, sigma: Callable[[int], float], topic: str, clouds: Clouds
-) -> str:
-    """The sentence's end about a fault with these parameters (8,)."""
-    if fault is Fault.CLOCK:
-        return _clock_text(topic, known, sigma, clouds.span)
-    if fault is Fault.LEVER:
-        return _lever_text(known, sigma, clouds.mounting())
-    return _rotation_text(known, sigma) if fault is Fault.ROTATION else _scale_text(known, sigma)
-
-
-def _clock_text(topic: str, parameters: F64, sigma: Callable[[int], float], span: float) -> str:
-    offset = float(parameters[CLOCK])
-    side = "behind" if offset > 0 else "ahead of"
-    least, most = OTHER_END
-    ends = ""
-    if least * span <= abs(offset) <= most * span:
-        ends = (
-            f" (a sweep takes {span:.2f} s: its stamps, or the times of its points, may be counted"
-            " from its other end)"
-        )
-    return (
-        f"its stamps are {abs(offset):.2f} \u00b1 {max(sigma(CLOCK), 0.01):.2f} s {side} the clock"
-        f" of the poses{ends}; give --set logs.time_offset.{topic}={offset:+.2f}"
-    )
-
-
-def _rotation_text(parameters: F64, sigma: Callable[[int], float]) -> str:
-    rotation = Rotation.from_rotvec(parameters[ROTATION])
-    turns = []
-    for column, axis in zip(Fault.ROTATION.columns.tolist(), "xyz", strict=True):
-        if parameters[column]:
-            angle = np.degrees(parameters[column])
-            spread = np.degrees(sigma(column))
-            turns.append(f"{angle:.1f} \u00b1 {spread:.1f} degrees about {axis}")
-    convention = ""
-    is_cycle = abs(rotation.magnitude() - OPTICAL) < np.radians(10.0)
-    if is_cycle and _is_axis_rotation(rotation):
-        convention = (
-            ", as where the axes of an optical frame are taken for the axes of a body frame"
-        )
-    return (
-        f"its mounting is turned by {', '.join(turns)} of the base frame{convention}; correct its"
-        " transform"
-    )
-
-
-def _is_axis_rotation(rotation: Rotation) -> bool:
-    """Whether a rotation takes axes to axes, within 10 degrees."""
-    group = Rotation.create_group("O")
-    return bool((group.inv() * rotation).magnitude().min() < np.radians(10.0))
-
-
-def _lever_text(parameters: F64, sigma: Callable[[int], float], mounting: F64) -> str:
-    shifts = []
-    mirrored = []
-    for column, axis, given in zip(Fault.LEVER.columns.tolist(), "xyz", mounting, strict=True):
-        off = float(parameters[column])
-        if not off:
-            continue
-        spread = sigma(column)
-        shifts.append(f"{off:.2f} \u00b1 {spread:.2f} m along {axis}")
-        if abs(off + 2.0 * given) < MIRRORED * abs(off):
-            mirrored.append(f"{axis} of {given:.2f} m")
-    sign = f", as where its {' and its '.join(mirrored)} has the wrong sign" if mirrored else ""
-    return (
-        f"its mounting is off by {', '.join(shifts)} of the base frame{sign}; correct its transform"
-    )
-
-
-def _scale_text(parameters: F64, sigma: Callable[[int], float]) -> str:
-    factor = float(np.exp(parameters[SCALE]))
-    if factor < HARDLY_MOVE:
-        return (
-            f"its clouds move less than {HARDLY_MOVE:g} times as far as the poses: the positions of"
-            " the poses are in another unit or along other axes, or the clouds are not of the time"
-            " of their stamps"
-        )
-    return (
-        f"its clouds move {factor:.3f} \u00b1 {factor * sigma(SCALE):.3f} times as far as the"
-        " poses: one of both is not in metres, or the odometry is badly scaled"
-    )
 
 
 def _contradictions(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from semloc_logs.logs.session.session import Session, open_session
-from semloc_logs.mapping.fit.fit_check import SessionFit
+from semloc_logs.mapping.fit.findings import SessionFit
 from semloc_logs.numerics.transforms import inverse, yaw_transform
 from semloc_logs.settings import load
 from semloc_logs.stages.log_check import check_log

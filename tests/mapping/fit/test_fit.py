@@ -14,13 +14,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from semloc_logs.mapping.fit.fit_check import (
-    SessionFit,
-    Severity,
-    StreamFit,
-    check_stream,
-    explains_much,
-)
+from semloc_logs.mapping.fit.findings import SessionFit, Severity, StreamFit
+from semloc_logs.mapping.fit.fit_check import check_stream, explains_much
 from semloc_logs.mapping.fit.model import MEDIAN_OF_6, Estimate, Fault
 from semloc_logs.mapping.fit.plane_cells import PlaneCells, register
 from semloc_logs.mapping.keyframes import Collected
