@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import nullcontext
 from functools import lru_cache
-from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,7 @@ from scipy.spatial import cKDTree
 from semloc_logs.subvolumes.cut import SIZE, code_table
 from semloc_logs.subvolumes.describe import Described
 from semloc_logs.subvolumes.plain_network import PlainEncoder
-from semloc_logs.subvolumes.weight_files import load_weights
+from semloc_logs.subvolumes.weight_files import load_weights, weights_file
 from semloc_logs.voxels.grid import FREE_STATE, UNOBSERVED_STATE, BlockMap
 
 U8 = NDArray[np.uint8]
@@ -32,8 +30,7 @@ def load_plain_encoder(variant: str, weights: Path | None = None) -> PlainEncode
     """The encoder of a file, or the shipped one; SettingsError when the file does not hold one of
     the paper's network.
     """
-    shipped = files("semloc_logs.subvolumes") / "weights" / f"paper_{variant}.safetensors"
-    with nullcontext(weights) if weights is not None else as_file(shipped) as path:
+    with weights_file(f"paper_{variant}", weights) as path:
         encoder = load_weights(PlainEncoder, "encoder.", variant, path)
     torch.set_num_threads(1)
     return encoder

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TypeVar
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import nn
 
@@ -30,6 +31,20 @@ def save_weights(path: Path, model: Network, card: dict[str, str]) -> None:
         save_file(tensors, temporary, metadata={**card, "variant": model.encoder.variant})
 
 
+@contextmanager
+def weights_file(name: str, weights: Path | None = None) -> Iterator[Path]:
+    """The file of ``weights``, or of the shipped ones with this name."""
+    shipped = files("semloc_logs.subvolumes") / "weights" / f"{name}.safetensors"
+    with nullcontext(weights) if weights is not None else as_file(shipped) as path:
+        yield path
+
+
+def samples_of(name: str, weights: Path | None = None) -> int:
+    """How many subvolumes the training of weights has seen, by their card; 0 if it does not say."""
+    with weights_file(name, weights) as path, safe_open(path, "pt") as file:
+        return int((file.metadata() or {}).get("samples", 0))
+
+
 def load_weights(
     build: Callable[[str, int], Loaded], part: str, variant: str, weights: Path | None = None
 ) -> Loaded:
@@ -39,13 +54,8 @@ def load_weights(
     not hold them.
     """
     try:
-        if weights is not None:
-            tensors = load_file(weights)
-        else:
-            with as_file(
-                files("semloc_logs.subvolumes") / "weights" / f"{variant}.safetensors"
-            ) as path:
-                tensors = load_file(path)
+        with weights_file(variant, weights) as path:
+            tensors = load_file(path)
         network = build(variant, len(tensors["encoder.log_variance.bias"]))
         network.load_state_dict(
             {k.removeprefix(part): v.float() for k, v in tensors.items() if k.startswith(part)}

@@ -21,7 +21,7 @@ from semloc_logs.errors import SettingsError
 from semloc_logs.settings import Resolved, Training
 from semloc_logs.subvolumes.describe import load_encoder
 from semloc_logs.subvolumes.plain_describe import load_plain_encoder
-from semloc_logs.subvolumes.weight_files import save_weights
+from semloc_logs.subvolumes.weight_files import samples_of, save_weights
 from semloc_logs.training.completion_scores import completion_scores
 from semloc_logs.training.descriptor_samples import plain_shard_descriptors, shard_descriptors
 from semloc_logs.training.network_training import Progress, TrainingRun, train
@@ -220,11 +220,7 @@ def learn_vocabulary(
     descriptors = shard_descriptors(shards, encoder, pairs_per_shard, note)
     note(f"{variant}: clustering {len(descriptors)} descriptors")
     vocabulary = train_vocabulary(descriptors, seed=settings.training.seed)
-    save_vocabulary(
-        output,
-        vocabulary,
-        _card(settings, len(shards), variant=variant, descriptors=len(descriptors)),
-    )
+    save_vocabulary(output, vocabulary, _words_card(settings, shards, variant, len(descriptors)))
     return len(descriptors)
 
 
@@ -243,7 +239,7 @@ def _learn_plain_vocabulary(
     descriptors = plain_shard_descriptors(shards, encoder, pairs_per_shard, note)
     note(f"{variant}: clustering {len(descriptors)} descriptors")
     words = train_plain_vocabulary(descriptors, seed=settings.training.seed)
-    card = _card(settings, len(shards), variant=variant, descriptors=len(descriptors))
+    card = _words_card(settings, shards, variant, len(descriptors))
     save_plain_vocabulary(output, words, card)
     return len(descriptors)
 
@@ -251,6 +247,16 @@ def _learn_plain_vocabulary(
 def use_threads(count: int) -> None:
     """Let the network use so many cores."""
     torch.set_num_threads(count)
+
+
+def _words_card(
+    settings: Resolved, shards: Sequence[Path], variant: str, descriptors: int
+) -> dict[str, str]:
+    """The origin of words: the samples are those that their weights have seen."""
+    name = f"paper_{variant}" if settings.training.method == "paper" else variant
+    samples = samples_of(name, settings.descriptor.weights)
+    facts = {"variant": variant, "descriptors": descriptors, "samples": samples}
+    return _card(settings, len(shards), **facts)
 
 
 def _card(settings: Resolved, shards: int, **facts: Any) -> dict[str, str]:

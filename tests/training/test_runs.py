@@ -133,6 +133,10 @@ def test_a_vocabulary_belongs_to_its_weights(shards: list[Path], tmp_path: Path)
     own = settings.model_copy(
         update={"descriptor": settings.descriptor.model_copy(update={"weights": weights})}
     )
+    # what a later training is asked for is not what these weights have seen
+    own = own.model_copy(
+        update={"training": settings.training.model_copy(update={"samples": 250_000})}
+    )
     output = tmp_path / "words.safetensors"
     # 24 pairs of nine descriptors are fewer than 256: three times the same shards are enough
     with pytest.raises(SettingsError, match="256"):
@@ -140,6 +144,7 @@ def test_a_vocabulary_belongs_to_its_weights(shards: list[Path], tmp_path: Path)
     assert learn_vocabulary("geometric", [*shards, *shards], own, output, 6) == 8 * 6 * 9
     with safe_open(output, "np") as handle:
         assert handle.metadata()["descriptors"] == "432"
+        assert handle.metadata()["samples"] == "36"
         assert handle.get_tensor("projection").shape == (64, 256)
 
 
