@@ -27,6 +27,10 @@ from semloc_logs.words.submap_words import index_submap, write_words
 from semloc_logs.workspace import SessionFolder, Workspace
 
 LOGGER = logging.getLogger(__name__)
+OTHER_WORDS = (
+    "descriptor.weights is given without descriptor.vocabulary: the shipped words belong to the"
+    " shipped weights and fit others badly; learn words of these with 'semloc vocabulary'."
+)
 KEPT_METADATA = (
     "schema_version",
     "voxel_size",
@@ -85,6 +89,8 @@ def _describe(
 ) -> Report:
     plan = plan_describe(work, folders, settings, overwrite=overwrite)
     keep(work, settings)
+    if plan and settings.descriptor.weights and not settings.descriptor.vocabulary:
+        LOGGER.warning(OTHER_WORDS)
     report = Report(kept=[folder.name for folder in folders if folder.name not in plan])
     with ExitStack() as outputs:
         coming = [

@@ -141,6 +141,23 @@ def test_files_of_weights_and_vocabulary_are_inputs(
     assert describe("monday", settings=settings).kept == ["monday"]
 
 
+@pytest.mark.parametrize(("both", "warned"), [(False, True), (True, False)])
+def test_weights_without_their_words_are_warned_of(
+    describe: Describe,
+    tools: SimpleNamespace,
+    caplog: pytest.LogCaptureFixture,
+    *,
+    both: bool,
+    warned: bool,
+) -> None:
+    given = {"descriptor__weights": str(SHIPPED / "subvolumes/weights/semantic.safetensors")}
+    if both:
+        words = SHIPPED / "words/vocabularies/semantic.safetensors"
+        given["descriptor__vocabulary"] = str(words)
+    describe("monday", settings=tools.coarse_settings(**given))
+    assert ("learn words of these" in caplog.text) is warned
+
+
 # -- which words
 
 
