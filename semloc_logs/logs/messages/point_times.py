@@ -14,9 +14,8 @@ from semloc_logs.frames import F32, LidarFrame, PointTimeRemark
 LONGEST_SWEEP_NS = 1_000_000_000
 # a sweep takes longer than this, so milliseconds and microseconds are not confused
 _LEAST_SPAN_NS = 5_000_000
-_WRAPPING_BYTES = (
-    4  # of counters that begin again: 4.3 s of nanoseconds, 72 minutes of microseconds
-)
+# of counters that begin again: 4.3 s of nanoseconds, 72 minutes of microseconds
+_WRAPPING_BYTES = 4
 _PERIODS_PER_SWEEP = 1.5  # a sweep is over when the next one begins, give or take
 _PERIODS_KEPT = 16
 # the share of neighbours measured nearly together: above 0.9 in sweeps, 0.1 where times are noise
