@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numba import njit
@@ -31,6 +31,19 @@ BELOW_GROUND = 1.0  # of the lowest layer (m at 0.30 m voxels)
 LAYER = 8
 RARE = 0.05  # a layer with a smaller share of the subvolumes is not worth a pass of the network
 PATCH = 256  # voxels along the edge of the part of a map that is encoded at once
+
+
+class DescribesWindows(Protocol):
+    """What describes the windows of a map: the encoder, or another one to compare it with.
+
+    ``describe``: descriptors (n, latent) of the ``windows`` (n, 2), counted in eight voxels, of the
+    codes (x, y, 32) of a map with its margin.
+    """
+
+    variant: str
+    latent: int
+
+    def describe(self, codes: U8, windows: NDArray[np.int64]) -> F32: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +164,7 @@ def describe_map(
     state: U8,
     low: NDArray[np.integer],
     ground_z: float,
-    encoder: Encoder,
+    encoder: DescribesWindows,
     windows: Windows,
     road: NDArray[np.floating] | None = None,
 ) -> Described:
@@ -205,7 +218,7 @@ def describe_map(
     return Described(np.concatenate(centres).astype(np.float32), np.concatenate(vectors))
 
 
-def _nothing(encoder: Encoder) -> Described:
+def _nothing(encoder: DescribesWindows) -> Described:
     """No subvolumes."""
     return Described(np.zeros((0, 3), np.float32), np.zeros((0, encoder.latent), np.float32))
 
@@ -231,7 +244,7 @@ def _cropped(state: U8) -> tuple[U8, NDArray[np.int64]] | None:
     return box, first
 
 
-def _encode(codes: U8, wanted: NDArray[np.int64], encoder: Encoder, stride: int) -> F32:
+def _encode(codes: U8, wanted: NDArray[np.int64], encoder: DescribesWindows, stride: int) -> F32:
     """Descriptors (n, latent) of windows, patch by patch.
 
     Their corners within the margin are ``wanted`` (n, 2).

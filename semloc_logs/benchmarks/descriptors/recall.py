@@ -11,19 +11,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from torch import Tensor, nn
 
 from semloc_logs.benchmarks.descriptors.held_out import HeldOut
 from semloc_logs.benchmarks.descriptors.places import Place
 from semloc_logs.numerics.transforms import apply
 from semloc_logs.settings import Resolved
-from semloc_logs.subvolumes.cut import MARGIN, SIZE
-from semloc_logs.subvolumes.describe import Described, Windows, describe_map
+from semloc_logs.subvolumes.describe import (
+    Described,
+    DescribesWindows,
+    Windows,
+    describe_map,
+)
 from semloc_logs.subvolumes.network import LATENT
 
+U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -57,20 +60,18 @@ class Words:
         return Words(self.centre[rows], self.descriptor[rows])
 
 
-class NoEncoder(nn.Module):
+class NoEncoder:
     """Describes everything alike: which subvolumes are described does not depend on the network."""
 
     variant = "geometric"
     latent = LATENT
 
-    def forward(self, codes: Tensor) -> Tensor:
-        """Ones (b, 256, i, j) for codes (b, x, y, 32)."""
-        return torch.ones(
-            len(codes), self.latent, *((n - 2 * MARGIN - SIZE) // 8 + 1 for n in codes.shape[1:3])
-        )
+    def describe(self, codes: U8, windows: NDArray[np.int64]) -> F32:
+        """Equal unit descriptors (n, latent) of the ``windows`` (n, 2)."""
+        return np.full((len(windows), self.latent), self.latent**-0.5, np.float32)
 
 
-def network_describes(encoder: nn.Module, settings: Resolved) -> Describe:
+def network_describes(encoder: DescribesWindows, settings: Resolved) -> Describe:
     """Describes places by the network, as ``semloc describe`` and ``semloc close`` do. ``settings``
     are resolved.
     """
@@ -84,7 +85,7 @@ def network_describes(encoder: nn.Module, settings: Resolved) -> Describe:
             place.state,
             place.low,
             place.ground_z,
-            encoder,  # type: ignore[arg-type]
+            encoder,
             Windows(v, stride, d.min_occupied, np.inf if is_query else d.reach),
             road,
         )
@@ -94,17 +95,13 @@ def network_describes(encoder: nn.Module, settings: Resolved) -> Describe:
 
 def count_subvolumes(settings: Resolved) -> Callable[[Place], int]:
     """How many descriptors a place of a database has, whatever the network."""
-    describe = network_describes(NoEncoder().eval(), settings)
+    describe = network_describes(NoEncoder(), settings)
     return lambda place: len(describe(place, False).centre)
 
 
-def retrieval_recall(world: HeldOut, encoder: nn.Module) -> dict[str, float]:
-    """Recall at 5 of each scenario, in [0, 1], of a network that maps codes to mu as
-    :class:`~semloc_logs.subvolumes.network.Encoder` does.
-
-    See :func:`recalls`.
-    """
-    return recalls(world, network_describes(encoder.eval(), world.settings))
+def retrieval_recall(world: HeldOut, encoder: DescribesWindows) -> dict[str, float]:
+    """Recall at 5 of each scenario, in [0, 1], of what an encoder describes; see :func:`recalls`."""
+    return recalls(world, network_describes(encoder, world.settings))
 
 
 def recalls(world: HeldOut, describe: Describe) -> dict[str, float]:

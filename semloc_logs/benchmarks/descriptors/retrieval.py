@@ -130,7 +130,7 @@ def _fpfh(world: HeldOut, python: str, folder: Path) -> dict[str, float]:
             yield from ((place, False) for _, place in street.database)
             yield from ((place, True) for places in street.queries.values() for place in places)
 
-    same = network_describes(NoEncoder().eval(), world.settings)
+    same = network_describes(NoEncoder(), world.settings)
     return recalls(
         world, fpfh_describes(python, folder, places(), same, world.settings.fusion.voxel_size)
     )

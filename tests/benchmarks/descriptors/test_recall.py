@@ -229,9 +229,11 @@ def _comes_back(street: Street, path: Path) -> None:
 
 
 def test_everything_alike_has_one_descriptor_for_each_subvolume() -> None:
-    import torch
-
-    assert NoEncoder()(torch.zeros((2, 64, 56, 32), dtype=torch.uint8)).shape == (2, 256, 3, 2)
+    windows = np.argwhere(np.ones((3, 2)))
+    found = NoEncoder().describe(np.zeros((64, 56, 32), np.uint8), windows)
+    assert found.shape == (6, 256)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, rtol=1e-6)
+    assert (found == found[0, 0]).all()
 
 
 def test_the_benchmark_names_its_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,7 +259,7 @@ def test_a_peer_that_is_not_there_is_an_error(tmp_path: Path) -> None:
     state = np.full((40, 40, 40), 253, np.uint8)
     state[:, :, 10] = 0
     at = Place(state, np.zeros(3, np.int64), 3.0, np.array([[6.0, 6.0, 4.0]]), np.eye(4))
-    same = network_describes(NoEncoder().eval(), SETTINGS)
+    same = network_describes(NoEncoder(), SETTINGS)
     for python, error in ((str(tmp_path / "none"), SettingsError), (sys.executable, SemlocError)):
         with pytest.raises(error, match=r"fpfh|FPFH"):  # this Python has no open3d
             fpfh_describes(python, tmp_path / "features", [(at, False)], same, V)
