@@ -100,7 +100,7 @@ def count_subvolumes(settings: Resolved) -> Callable[[Place], int]:
 
 
 def retrieval_recall(world: HeldOut, encoder: DescribesWindows) -> dict[str, float]:
-    """Recall at 5 of each scenario, in [0, 1], of what an encoder describes; see :func:`recalls`."""
+    """Recall at 5 of each scenario, in [0, 1], of what an encoder describes (:func:`recalls`)."""
     return recalls(world, network_describes(encoder, world.settings))
 
 
