@@ -31,7 +31,7 @@ ALL = "all"
 @dataclass(frozen=True, slots=True)
 class AtThreshold:
     """Closures at a least probability: the ``possible`` are the queries that have a right alignment
-    with a target, ``towns`` the towns that have any, and ``false_towns`` those with a false one.
+    with a target, ``towns`` the towns with accepted ones, ``false_towns`` those with a false one.
     """
 
     threshold: float

@@ -20,6 +20,7 @@ from semloc_logs.closures.acceptance.placements import Placed
 from semloc_logs.closures.alignment_tables import read_alignments
 from semloc_logs.closures.closure import FEATURES, Alignments, Features
 from semloc_logs.closures.session_pairs import known_pairs
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.evaluation.truth import CORRECT_DEG, CORRECT_M, TrueTrack, read_truth
 from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.numerics.transforms import inverse
@@ -160,8 +161,14 @@ def normalised_squares(errors: F64, covariance: F64) -> F64:
 
 
 def read_judged(paths: Sequence[Path]) -> Judged:
-    """The tables of several towns."""
-    table = pa.concat_tables([read_table(path) for path in paths])
+    """The tables of several towns. WorkspaceError without any, or of another version."""
+    if not paths:
+        raise WorkspaceError("No town was judged yet: run 'collect' first.")
+    tables = [read_table(path) for path in paths]
+    for path, held in zip(paths, tables, strict=True):
+        if not set(OWN) <= set(held.column_names):
+            raise WorkspaceError(f"{path} is of another version: remove it and collect again.")
+    table = pa.concat_tables(tables)
     table = table.filter(table["right"].is_valid())
     column = {
         name: table[name].to_numpy()

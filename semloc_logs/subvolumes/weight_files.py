@@ -39,10 +39,11 @@ def weights_file(name: str, weights: Path | None = None) -> Iterator[Path]:
         yield path
 
 
-def samples_of(name: str, weights: Path | None = None) -> int:
-    """How many subvolumes the training of weights has seen, by their card; 0 if it does not say."""
+def samples_of(name: str, weights: Path | None = None) -> str | None:
+    """How many subvolumes the training of weights has seen, by their card."""
     with weights_file(name, weights) as path, safe_open(path, "pt") as file:
-        return int((file.metadata() or {}).get("samples", 0))
+        samples: str | None = (file.metadata() or {}).get("samples")
+    return samples
 
 
 def load_weights(

@@ -255,7 +255,7 @@ def _words_card(
     """The origin of words: the samples are those that their weights have seen."""
     name = f"paper_{variant}" if settings.training.method == "paper" else variant
     samples = samples_of(name, settings.descriptor.weights)
-    facts = {"variant": variant, "descriptors": descriptors, "samples": samples}
+    facts = {"variant": variant, "descriptors": descriptors, "samples": samples or "unknown"}
     return _card(settings, len(shards), **facts)
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from semloc_logs.closures.alignment_tables import alignment_table
 from semloc_logs.closures.closure import Alignment, Features
+from semloc_logs.errors import WorkspaceError
 from semloc_logs.evaluation import judged_alignments
 from semloc_logs.evaluation.judged_alignments import judge_town, normalised_squares, read_judged
 from semloc_logs.mapping.session_map import SessionMap
@@ -104,6 +105,18 @@ def test_squared_errors_over_their_covariance_by_hand(judge: Any) -> None:
     back = read_judged([judge(*found)])
     np.testing.assert_allclose(back.nees_position, [4.0, 0.16, 0.0], atol=1e-5)
     np.testing.assert_allclose(back.nees_pose, [4.0, 0.16, 4.0], atol=1e-5)
+
+
+def test_tables_that_are_missing_or_of_another_version_are_named(
+    judge: Any, tmp_path: Path
+) -> None:
+    with pytest.raises(WorkspaceError, match="No town"):
+        read_judged([])
+    table = judge(alignment(inverse(ROAD[2]) @ ROAD[1]))
+    old = tmp_path / "old.parquet"
+    write_table(old, read_table(table).drop_columns(["nees_pose"]), {"voxel_size": 0.3})
+    with pytest.raises(WorkspaceError, match=r"old\.parquet is of another version"):
+        read_judged([table, old])
 
 
 def test_what_the_truth_does_not_know_is_not_judged(judge: Any) -> None:

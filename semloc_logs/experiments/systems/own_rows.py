@@ -31,7 +31,7 @@ def make_ablation(options: SystemOptions) -> System:
 
 
 def make_plain(options: SystemOptions) -> System:
-    """The paper's method, with the networks in WEIGHTS/paper/ or, without this folder, the shipped
+    """The paper's method, with the networks in WEIGHTS/paper/ or, without any weights, the shipped
     ones. SettingsError where one of the files is missing.
     """
     variant = _VARIANTS[options.name]
@@ -43,7 +43,7 @@ def _plain_settings(options: SystemOptions, variant: Variant) -> Resolved:
     """The paper's settings with its networks."""
     settings = load(method=METHOD).resolved()
     folder = (options.weights or Path("weights")) / METHOD
-    if not folder.exists():
+    if options.weights is None and not folder.exists():
         return settings
     weights = folder / f"{variant}.safetensors"
     words = folder / f"{variant}_words.safetensors"

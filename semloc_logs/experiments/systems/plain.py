@@ -28,6 +28,7 @@ from semloc_logs.alignment.overlaps import (
     query_voxels,
 )
 from semloc_logs.experiments.system import MOST_POSES, Query, RankedPose, View
+from semloc_logs.experiments.system_version import module_version
 from semloc_logs.experiments.view_sessions import sensor_centre
 from semloc_logs.labels.space import SKY
 from semloc_logs.mapping.selection import thin
@@ -55,6 +56,11 @@ Variant = Literal["semantic", "geometric"]
 METHOD = "paper"
 SINGLE_LABEL = 2  # of all voxels, in the geometric variant
 PROBES = 1  # the tree is traversed to one cell
+# the code that the words of a map depend on
+_DESCRIBED_BY = tuple(
+    f"semloc_logs.{name}"
+    for name in ("subvolumes.plain_describe", "subvolumes.plain_network", "words.plain_vocabulary")
+)
 CONVERGED = 1e-3  # voxels and radians
 
 
@@ -149,7 +155,8 @@ class Plain:
             fused.road,
         ]
         settings = self.settings.tables("fusion", "descriptor", "plain")
-        key = hashlib.sha256(repr((settings, vocabulary.scale)).encode())
+        code = [module_version(module) for module in _DESCRIBED_BY]
+        key = hashlib.sha256(repr((settings, vocabulary.scale, code)).encode())
         for part in parts:
             key.update(np.ascontiguousarray(part).tobytes())
         return key.hexdigest()[:16]

@@ -109,7 +109,8 @@ def decode_raw(
         raise UndecodableError(
             f"{width} x {height} pixels of {encoding} do not fit its {len(data)} bytes"
         )
-    if height > 1 and step > row and step % row == 0:  # padding is shorter than the row
+    # a camera's picture may be the half of a wider one; depths are not
+    if of_depth and height > 1 and step > row and step % row == 0:
         raise UndecodableError(
             f"its rows of {step} bytes are {step // row} times as long as {width} pixels of"
             f" {encoding}: its encoding, width or step is wrong"

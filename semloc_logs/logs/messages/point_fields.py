@@ -93,9 +93,7 @@ def decode_points(
     columns = {name.lower(): name for name in reversed(rows.dtype.names or ())}
     for axis in "xyz":
         if axis not in columns:
-            raise UndecodableError(
-                f"it has no field {axis} within the {layout.point_step} bytes of a point"
-            )
+            raise UndecodableError(f"it has no field {axis}")
         if rows.dtype[columns[axis]].kind != "f":
             raise UndecodableError(
                 f"its field {axis} is {rows.dtype[columns[axis]].name}, not floating point"
@@ -204,16 +202,16 @@ def _offsets(
 
 
 def _check_places(fields: Sequence[Field], point_step: int) -> None:
-    """UndecodableError where fields lie beyond a point, or coordinates in one another."""
+    """UndecodableError where coordinates lie beyond a point, or in one another."""
     axes: dict[str, tuple[int, int]] = {}
     for field in fields:
         name = field.name.lower()
         end = field.offset + np.dtype(field.kind).itemsize
-        if name in _USED and end > point_step:
-            raise UndecodableError(
-                f"its field {field.name} ends at byte {end}, but a point has {point_step} bytes"
-            )
         if name in ("x", "y", "z"):
+            if end > point_step:
+                raise UndecodableError(
+                    f"its field {field.name} ends at byte {end}, but a point has {point_step} bytes"
+                )
             axes.setdefault(name, (field.offset, end))
     placed = sorted(axes, key=lambda axis: axes[axis])
     for name, other in pairwise(placed):
@@ -238,7 +236,8 @@ def _rows(data: bytes | memoryview, layout: Layout, fields: Sequence[Field]) -> 
         )
     names: dict[str, Field] = {}
     for field in fields:
-        if field.name.lower() in _USED and field.offset >= 0:
+        end = field.offset + np.dtype(field.kind).itemsize
+        if field.name.lower() in _USED and field.offset >= 0 and end <= step:
             names.setdefault(field.name, field)
     order = ">" if layout.big_endian else "<"
     dtype = np.dtype(

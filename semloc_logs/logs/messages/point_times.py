@@ -14,6 +14,9 @@ from semloc_logs.frames import F32, LidarFrame, PointTimeRemark
 LONGEST_SWEEP_NS = 1_000_000_000
 # a sweep takes longer than this, so milliseconds and microseconds are not confused
 _LEAST_SPAN_NS = 5_000_000
+# sweeps with times of another clock, less others, that count: those at the start of a log do not
+# decide for the rest
+_REMEMBERED = 2
 # of counters that begin again: 4.3 s of nanoseconds, 72 minutes of microseconds
 _WRAPPING_BYTES = 4
 _PERIODS_PER_SWEEP = 1.5  # a sweep is over when the next one begins, give or take
@@ -142,7 +145,8 @@ class PointTimes:
             return frame
         is_other = frame.remark is PointTimeRemark.OTHER_CLOCK
         are_others = self._other_clock[key] > 0
-        self._other_clock[key] += 1 if is_other else -1
+        counted = self._other_clock[key] + (1 if is_other else -1)
+        self._other_clock[key] = min(max(counted, -_REMEMBERED), _REMEMBERED)
         if are_others and not is_other:
             offset = offset - offset.min()
             frame = replace(frame, offset_ns=offset, remark=PointTimeRemark.OTHER_CLOCK)

@@ -121,8 +121,9 @@ def _lagging(pairs: Pairs, poses_at: PosesAt) -> Iterator[Reading]:
             other, is_reached = pairs.poses(poses_at, round(seconds * 1e9))
             poses = given.copy()
             columns = slice(3) if part == "rotations" else slice(3, 4)
-            poses[..., :3, columns] = other[..., :3, columns]
-            return _where(known & is_reached, _motion(poses))
+            # beyond the ends of the poses they stay as they are: no pair is lost by a lag
+            poses[is_reached, :, :3, columns] = other[is_reached, :, :3, columns]
+            return _where(known, _motion(poses))
 
         best = 0.0
         for reach, step in ((LONGEST_LAG, LAG_STEP), (LAG_STEP, LAG_STEP / 5)):

@@ -66,7 +66,7 @@ def other_distance(clouds: Clouds, found: Registered) -> Start | None:
 
 
 def searched(clouds: Clouds, found: Registered) -> Registered:
-    """The pairs, each registered again from the distance at which most across the way fits.
+    """The pairs, registered again where at another distance far more across the way fits.
 
     Odometry that slips for a while is wrong in a few pairs only. A pair is replaced where far more
     of its points lie on planes then.

@@ -253,8 +253,15 @@ def test_labels_in_steps_of_256_keep_their_order_of_bytes() -> None:
 @pytest.mark.parametrize(("encoding", "times"), [("mono8", 4), ("16UC1", 2)])
 def test_rows_many_times_as_long_as_their_pixels_are_refused(encoding: str, times: int) -> None:
     with pytest.raises(UndecodableError, match=f"its rows of 32 bytes are {times} times as long"):
-        decode_raw(bytes(320), 8, 10, 32, encoding, big_endian=False)
-    assert decode_raw(bytes(200), 8, 10, 20, "16UC1", big_endian=False).shape == (10, 8)
+        decode_raw(bytes(320), 8, 10, 32, encoding, big_endian=False, of_depth=True)
+    padded = decode_raw(bytes(200), 8, 10, 20, "16UC1", big_endian=False, of_depth=True)
+    assert padded.shape == (10, 8)
+
+
+def test_a_picture_may_be_the_left_half_of_a_wider_one() -> None:
+    wide = np.arange(160, dtype=np.uint8).reshape(10, 16)
+    left = decode_raw(wide.tobytes(), 8, 10, 16, "mono8", big_endian=False)
+    np.testing.assert_array_equal(left, wide[:, :8])
 
 
 def test_a_noisy_picture_keeps_the_order_that_it_names() -> None:

@@ -87,7 +87,7 @@ def test_rings_of_one_range_on_floor_and_ceiling_are_surfaces(turn: float) -> No
         (Field("y", 2, "f4"), "its fields x and y share bytes"),
         (Field("y", 8, "f4"), "its fields y and z share bytes"),
         (Field("x", 0, "f8"), "its fields x and y share bytes"),
-        (Field("t", 18, "u4"), "its field t ends at byte 22, but a point has 20 bytes"),
+        (Field("z", 18, "f4"), "its field z ends at byte 22, but a point has 20 bytes"),
     ],
 )
 def test_fields_that_contradict_each_other_are_refused(changed: Field, reason: str) -> None:
