@@ -89,7 +89,8 @@ class Errors:
         """Of the ``rows`` of some closures; None without any."""
         if not len(rows):
             return None
-        position, pose = (judged.nees_position[rows], judged.nees_pose[rows])
+        position = judged.nees_position[rows]
+        pose = judged.nees_pose[rows]
         return cls(
             len(rows),
             float(np.median(judged.error_m[rows])),
@@ -157,6 +158,7 @@ def report_of(judged: Judged, p: F64) -> AcceptanceReport:
     """The report of alignments with probabilities ``p`` (n,)."""
     kinds = kinds_of(judged)
     sensors = sensors_of(judged)
+    ordinary = judged.clear & ~judged.copies
     groups = []
     for kind in sorted(set(kinds)):
         mine = kinds == kind
@@ -168,7 +170,7 @@ def report_of(judged: Judged, p: F64) -> AcceptanceReport:
         len({key[:3] for key in _query_keys(judged)}),
         len(set(judged.town)),
         groups,
-        reliability(p[judged.clear & ~judged.copies], judged.right[judged.clear & ~judged.copies]),
+        reliability(p[ordinary], judged.right[ordinary]),
     )
 
 
@@ -184,6 +186,7 @@ def _group(judged: Judged, p: F64, kind: str, sensors: str) -> Group:
 def kinds_of(judged: Judged) -> NDArray[np.object_]:
     """Of each alignment (n,): drives or single sweeps, in ordinary towns or in copied blocks."""
     out = np.full(len(judged), "", object)
+    copied = judged.copies
     for town in set(judged.town):
         mine = judged.town == town
         queries = set(
@@ -191,7 +194,7 @@ def kinds_of(judged: Judged) -> NDArray[np.object_]:
         )
         sessions = {session for session, _ in queries}
         sweeps = "single sweeps" if len(queries) == len(sessions) else "drives"
-        copies = "copied blocks" if judged.copies[mine].any() else "ordinary towns"
+        copies = "copied blocks" if copied[mine].any() else "ordinary towns"
         out[mine] = f"{sweeps}, {copies}"
     return out
 

@@ -133,7 +133,7 @@ def test_a_vocabulary_belongs_to_its_weights(shards: list[Path], tmp_path: Path)
     own = settings.model_copy(
         update={"descriptor": settings.descriptor.model_copy(update={"weights": weights})}
     )
-    # what a later training is asked for is not what these weights have seen
+    # the setting is of trainings to come; these weights have seen 36
     own = own.model_copy(
         update={"training": settings.training.model_copy(update={"samples": 250_000})}
     )

@@ -140,6 +140,11 @@ class Cloud:
         return out
 
 
+def _above(position: F64, size: float) -> F64:
+    """Where a text of ``size`` m stands, or one beside a sphere of this size (3,)."""
+    return np.asarray(position + np.array([0.0, 0.0, 1.5 * size]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
     """Positions (n, 3) of a session's vehicle in ``frame_id``, in the order of time."""
@@ -151,7 +156,7 @@ class Drive:
 
     def name_position(self, size: float) -> F64:
         """Place (3,) of a text of ``size`` m: above the start."""
-        return np.asarray(self.positions[0] + np.array([0.0, 0.0, 1.5 * size]))
+        return _above(self.positions[0], size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +298,7 @@ class Mark:
 
     def text_position(self) -> F64:
         """Above the sphere (3,)."""
-        return np.asarray(self.position + np.array([0.0, 0.0, 1.5 * self.size]))
+        return _above(self.position, self.size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,6 +26,7 @@ from semloc_logs.logs.annotation.channels import (
     F64,
     ClosureRecord,
     Cloud,
+    Colour,
     Kind,
     Mark,
     NewChannel,
@@ -115,7 +116,7 @@ class FoxgloveEncoder:
         )
         entity.lifetime.SetInParent()  # zero: stays
         entity.frame_locked = True
-        color = dict(zip("rgba", mark.color, strict=True))
+        color = _color(mark.color)
         sphere = entity.spheres.add(size=dict.fromkeys("xyz", mark.size), color=color)
         _set_pose(sphere.pose, mark.position)
         text = entity.texts.add(billboard=True, font_size=mark.size, color=color, text=mark.text)
@@ -138,7 +139,7 @@ class FoxgloveEncoder:
             entity = update.entities.add(
                 timestamp=time, frame_id=drive.frame_id, id=f"semloc/drives/{drive.session}"
             )
-            color = dict(zip("rgba", drive.color, strict=True))
+            color = _color(drive.color)
             line = entity.lines.add(
                 type=LinePrimitive.LINE_STRIP,
                 thickness=thickness,
@@ -153,7 +154,7 @@ class FoxgloveEncoder:
             timestamp=time, frame_id=overview.frame_id, id="semloc/closures"
         )
         for mark in overview.marks:
-            color = dict(zip("rgba", mark.color, strict=True))
+            color = _color(mark.color)
             sphere = entity.spheres.add(size=dict.fromkeys("xyz", mark.size), color=color)
             _set_pose(sphere.pose, mark.position)
         lines = overview.lines()
@@ -162,7 +163,7 @@ class FoxgloveEncoder:
                 type=LinePrimitive.LINE_LIST,
                 thickness=thickness,
                 points=_points([end for end, _ in lines]),
-                colors=[dict(zip("rgba", color, strict=True)) for _, color in lines],
+                colors=[_color(color) for _, color in lines],
             )
             _set_pose(line.pose, np.zeros(3))
         for entity in update.entities:
@@ -288,6 +289,10 @@ def _json_item(value: Any) -> Any:
 def _time(stamp_ns: int) -> timestamp_pb2.Timestamp:
     sec, nanos = divmod(stamp_ns, 10**9)
     return timestamp_pb2.Timestamp(seconds=sec, nanos=nanos)
+
+
+def _color(color: Colour) -> dict[str, float]:
+    return dict(zip("rgba", color, strict=True))
 
 
 def _points(positions: Iterable[F64]) -> list[Point3]:

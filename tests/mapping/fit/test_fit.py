@@ -177,7 +177,7 @@ def test_rotations_and_positions_of_different_times_are_named(
 def test_a_small_gain_counts_where_the_cost_falls_as_expected(
     gain: float, sigma: float, is_much: bool
 ) -> None:
-    """24 pairs that scatter by a tenth of what is expected: (3 + 2.4) / 27 = 0.2."""
+    """Of 24 pairs with a tenth of the expected scatter: (3 + 24 x 0.1) / (3 + 24) = 0.2."""
     covariance = np.zeros((8, 8))
     covariance[0, 0] = sigma**2
     squares = np.full(24, 0.1 * MEDIAN_OF_6)
