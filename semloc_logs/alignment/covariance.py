@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.hypotheses import (
-    ODOMETRY_DRIFT,
-    SAME_PLACE_DEGREES,
-    SAME_PLACE_VOXELS,
-)
+from semloc_logs.alignment.hypotheses import SAME_PLACE_DEGREES, SAME_PLACE_VOXELS
 from semloc_logs.alignment.icp import Fit
+from semloc_logs.mapping.drift import UNMEASURED, Drift
+from semloc_logs.numerics.transforms import inverse
 
 F64 = NDArray[np.float64]
 NORMAL_NOISE = np.radians(2.0)  # of tangent planes
@@ -24,10 +22,9 @@ LEAST_INFLATION = 2.0
 INFLATION_OF_SHARE = 0.5
 LEAST_SHARE = 0.05
 UNCERTAIN_INFLATION = 12.0  # where ranges are uncertain: all points of a wall are off alike
-# of the road that a query's and a target's keyframes come from: the mean of several drifts less
-# than one of them
-LOCAL_DRIFT = 0.003
-LOCAL_TURN_DRIFT = 2e-4  # rad a metre
+# of the variance of the road between a pose and the keyframes that its map is made from: their
+# errors average, and those before and behind cancel. Measured in simulated drives
+SPREAD_SHARE = 0.25
 # standard deviations that uncertain ranges of a query, and of a target, may all be off by
 RANGE_BIAS = 1.0
 # share of the bias' variance that query and target have in common, and that cancels where both look
@@ -49,23 +46,25 @@ def stiffness(fit: Fit) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Roads:
-    """Metres of road that odometry bridges in an alignment; 0 for single sweeps.
+class Stretch:
+    """The road between a pose and the keyframes that its map is made from, and how poses drift.
 
-    ``query`` and ``target``: that the keyframes of either side come from; ``between``: from the
-    target's keyframe to the one that saw what the query sees.
+    ``road`` in metres, as :meth:`between` has it; 0 for single sweeps.
     """
 
-    query: float = 0.0
-    target: float = 0.0
-    between: float = 0.0
+    road: float = 0.0
+    drift: Drift = UNMEASURED
+
+    @classmethod
+    def between(cls, offsets: F64, drift: Drift) -> Stretch:
+        """Of keyframes ``offsets`` (n,) metres of road ahead of the pose."""
+        squares = np.mean(offsets) ** 2 + SPREAD_SHARE * np.var(offsets)
+        return cls(float(np.sqrt(squares)), drift)
 
     @property
     def covariance(self) -> F64:
-        """What drift adds (6, 6): square metres and square radians."""
-        local = (self.query**2 + self.target**2) / 4
-        position = (LOCAL_DRIFT**2 * local + (ODOMETRY_DRIFT * self.between) ** 2) / 3
-        return np.diag([position] * 3 + [LOCAL_TURN_DRIFT**2 * local / 3] * 3)
+        """Covariance (6, 6) of the map against the pose, in the axes of the base."""
+        return self.drift.covariance(self.road)
 
 
 def covariance_of(
@@ -73,7 +72,8 @@ def covariance_of(
     map_T_query: F64,
     map_T_target: F64,
     voxel_size: float,
-    roads: Roads = Roads(),
+    query: Stretch = Stretch(),
+    target: Stretch = Stretch(),
     *,
     uncertain: bool = False,
 ) -> F64:
@@ -81,23 +81,41 @@ def covariance_of(
 
     What noisy normals alone would claim to know is taken off first. Where the points then hold
     nothing (along a corridor) the error is as large as the search lets it be: the bounds of the
-    same place. Uncertain ranges may all be too long or too short, which no number of points
-    averages out. Where keyframes along ``roads`` made the maps, their odometry drifts.
-    ``uncertain``: whether the ranges of either side are.
+    same place. Uncertain ranges may all be too long or too short, and level ground may be lifted,
+    which no number of points averages out. Along the stretches of road that made the maps poses
+    drift: the map of the ``target`` is off and turned against its pose, which moves a query that
+    stands aside, and the map of the ``query`` against its own. ``uncertain``: whether the ranges of
+    either side are.
     """
     share = max(fit.inliers, LEAST_SHARE)
     inflation = max(LEAST_INFLATION, INFLATION_OF_SHARE / share**2)
     about_centre = _about_centre(fit, voxel_size, UNCERTAIN_INFLATION if uncertain else inflation)
 
     # from the centre of the query to its base, and into the target's axes
-    x, y, z = map_T_query[:3, 3] - fit.centre
+    to_base = _in_axes(map_T_target[:3, :3].T) @ _at(map_T_query[:3, 3] - fit.centre)
+    C = to_base @ about_centre @ to_base.T
+
+    target_T_query = inverse(map_T_target) @ map_T_query
+    of_target = _at(target_T_query[:3, 3])
+    of_query = _in_axes(target_T_query[:3, :3])
+    C += of_target @ target.covariance @ of_target.T
+    C += of_query @ query.covariance @ of_query.T + FLOOR
+    return np.asarray((C + C.T) / 2)
+
+
+def _at(arm: F64) -> F64:
+    """Takes increments (6,) about a point to a point at the ``arm`` (3,) from it."""
+    x, y, z = arm
     A = np.eye(6)
     A[:3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turned = np.zeros((6, 6))
-    turned[:3, :3] = turned[3:, 3:] = map_T_target[:3, :3].T
+    return A
 
-    C = turned @ A @ about_centre @ A.T @ turned.T + roads.covariance + FLOOR
-    return np.asarray((C + C.T) / 2)
+
+def _in_axes(rotation: F64) -> F64:
+    """Takes increments (6,) into other axes."""
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = rotation
+    return out
 
 
 def _about_centre(fit: Fit, voxel_size: float, inflation: float) -> F64:
@@ -107,30 +125,33 @@ def _about_centre(fit: Fit, voxel_size: float, inflation: float) -> F64:
         [1 / (SAME_PLACE_VOXELS * voxel_size) ** 2] * 3
         + [1 / np.radians(SAME_PLACE_DEGREES) ** 2] * 3
     )
-    information, bias = _beyond_normal_noise(fit.information, fit.range_bias)
+    information, bias = _beyond_normal_noise(
+        fit.information, np.concatenate([RANGE_BIAS * fit.range_bias, fit.ground_bias])
+    )
     covariance = np.asarray(np.linalg.inv(information / noise + prior))
 
-    of_query, of_target = RANGE_BIAS * bias / noise @ covariance
+    of_query, of_target, *of_ground = bias / noise @ covariance
     alone = np.sqrt(1 - COMMON_BIAS)
     common = np.sqrt(COMMON_BIAS)
-    biases = np.stack([alone * of_query, alone * of_target, common * (of_query - of_target)])
+    of_ranges = [alone * of_query, alone * of_target, common * (of_query - of_target)]
+    biases = np.stack([*of_ranges, *of_ground])
     covariance += biases.T @ biases
     return covariance
 
 
-def _beyond_normal_noise(information: F64, range_bias: F64) -> tuple[F64, F64]:
+def _beyond_normal_noise(information: F64, bias: F64) -> tuple[F64, F64]:
     """Information (6, 6) less what normals that are 2 degrees off would pretend, and the bias.
 
-    It is taken off in axes scaled so that lengths and angles compare. Of ``range_bias`` (n, 6) the
-    share in the remaining information is returned.
+    It is taken off in axes scaled so that lengths and angles compare. Of ``bias`` (n, 6) the share
+    in the remaining information is returned.
     """
     points = float(np.trace(information[:3, :3]))
     arms = float(np.trace(information[3:, 3:]))
     if points <= 0:
-        return np.zeros((6, 6)), np.zeros_like(range_bias)
+        return np.zeros((6, 6)), np.zeros_like(bias)
     scale = np.r_[1.0, 1.0, 1.0, np.full(3, max(np.sqrt(arms / points), 1e-6))]
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     kept = np.maximum(values - points * np.sin(NORMAL_NOISE) ** 2, 0.0)
     share = np.divide(kept, values, out=np.zeros(6), where=values > 0)
     remaining = (vectors * kept) @ vectors.T * np.outer(scale, scale)
-    return np.asarray(remaining), range_bias / scale @ (vectors * share) @ vectors.T * scale
+    return np.asarray(remaining), bias / scale @ (vectors * share) @ vectors.T * scale

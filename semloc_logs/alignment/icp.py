@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
@@ -33,7 +33,8 @@ class Fit:
     ``rmse`` of their plane distances (m); ``information`` (6, 6), of (translation, rotation) as
     left increments about the query's centre ``centre`` in the target frame, in units of 1 / (plane
     distance noise)^2; ``range_bias`` (2, 6): the right side of its equations if all uncertain
-    points of the query, or of the target, were a standard deviation too far.
+    points of the query, or of the target, were a standard deviation too far; ``ground_bias``
+    (3, 6): the same if level ground was off (:mod:`.level_ground`).
     """
 
     target_T_query: F64
@@ -43,6 +44,7 @@ class Fit:
     information: F64
     centre: F64
     range_bias: F64
+    ground_bias: F64 = field(default_factory=lambda: np.zeros((3, 6)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from semloc_logs.alignment.hypotheses import pose_matrix
 from semloc_logs.alignment.icp import Fit, Step, Weighting, align
+from semloc_logs.alignment.level_ground import ground_bias
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.scores import structure_scores
 from semloc_logs.alignment.search import Candidate, search
@@ -31,6 +32,7 @@ FINE_STRIDES = (3, 2)
 FINE_ITERATIONS = (6, 10)
 UNCERTAIN_ITERATIONS = (10, 20)
 RIVAL_STRIDE = 3  # of the points that a rival is measured by, which stand for all
+GROUND_REACH = 1.5  # voxels: snow lifts the ground by as much
 HOLD = 10.0  # points on planes that a start weighs as much as, where points are uncertain
 ESCAPE_REACH = 0.6  # of half the heading step: how far a second start may be turned
 
@@ -88,7 +90,13 @@ def fine_fit(start: F64, surface: Surface, query: Query) -> Fit:
         Step(last, second_count, FINE_STRIDES[1] * stride),
         Step(last, 1, stride),
     )
-    return _fit(start, surface, query, steps, HOLD if uncertain else 0.0)
+    fit = _fit(start, surface, query, steps, HOLD if uncertain else 0.0)
+    if uncertain:
+        return fit
+    bias = ground_bias(
+        query.points[::stride], surface, fit.target_T_query, fit.centre, GROUND_REACH * v, last
+    )
+    return replace(fit, ground_bias=bias)
 
 
 def measured(start: F64, surface: Surface, query: Query) -> Fit:

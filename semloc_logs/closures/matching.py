@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from semloc_logs.alignment.covariance import Roads, covariance_of, stiffness
+from semloc_logs.alignment.covariance import covariance_of, stiffness
 from semloc_logs.alignment.hypotheses import Hypothesis, keep_best_submaps, pool, same_place
 from semloc_logs.alignment.icp import Fit
 from semloc_logs.alignment.query_map import Query
@@ -20,7 +20,7 @@ from semloc_logs.alignment.target_map import is_uncertain
 from semloc_logs.alignment.tau import tau
 from semloc_logs.closures.closure import Alignment, Features
 from semloc_logs.closures.database import Database
-from semloc_logs.closures.query import build_query, query_members, road_along, road_of
+from semloc_logs.closures.query import build_query, stretch_of_query, stretch_of_target
 from semloc_logs.closures.target_surface import target_surface
 from semloc_logs.closures.visibility import Visibility, visible_to
 from semloc_logs.labels.space import cityscapes
@@ -362,6 +362,8 @@ def _alignment(context: QueryContext, fitted: Fitted) -> Alignment:
     map_T_query_base = fitted.fit.target_T_query @ context.query_T_base
     nearest = visible.nearest_keyframe(group, map_T_query_base[:3, 3])
     map_T_target = target_session.map_T_base[nearest]
+    viewing = visible.viewing_keyframe(group, fitted.view)
+    count = context.settings.closures.surface_keyframes
     return Alignment(
         query_session=session.folder.name,
         target_session=target_session.folder.name,
@@ -375,26 +377,14 @@ def _alignment(context: QueryContext, fitted: Fitted) -> Alignment:
             map_T_query_base,
             map_T_target,
             context.voxel_size,
-            _roads(context, fitted, nearest),
+            stretch_of_query(session, context.keyframe, context.settings),
+            stretch_of_target(target_session, nearest, viewing, count),
             uncertain=is_uncertain(fitted.range_sigma, context.voxel_size),
         ),
         overlap=overlap,
         inliers=inliers,
         words=fitted.candidate.votes,
         features=features,
-    )
-
-
-def _roads(context: QueryContext, fitted: Fitted, nearest: int) -> Roads:
-    """The road that the query, its target and what lies between them were driven along."""
-    group = fitted.candidate.group
-    target = context.target_session(group)
-    viewing = context.visible.viewing_keyframe(group, fitted.view)
-    settings = context.settings
-    return Roads(
-        query=road_of(context.session, query_members(context.session, context.keyframe, settings)),
-        target=road_along(target, viewing, settings.closures.surface_keyframes),
-        between=abs(float(target.distance[nearest] - target.distance[viewing])),
     )
 
 

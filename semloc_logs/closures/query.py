@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from semloc_logs.alignment.covariance import Stretch
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.surface import thin_points
 from semloc_logs.mapping.session_map import SessionMap
@@ -53,15 +54,17 @@ def query_members(session: SessionMap, keyframe: int, settings: Resolved) -> lis
     return [i for i in range(first, first + count) if distance[i] <= settings.query.radius]
 
 
-def road_along(session: SessionMap, keyframe: int, count: int) -> float:
-    """Metres of road that the ``count`` keyframes nearest to one were driven along."""
-    away = np.abs(session.distance - session.distance[keyframe])
-    return road_of(session, np.argsort(away, kind="stable")[:count].tolist())
+def stretch_of_query(session: SessionMap, keyframe: int, settings: Resolved) -> Stretch:
+    """The road that the query at ``keyframe`` was driven along."""
+    members = query_members(session, keyframe, settings)
+    return Stretch.between(session.distance[members] - session.distance[keyframe], session.drift)
 
 
-def road_of(session: SessionMap, keyframes: list[int]) -> float:
-    """Metres of road between the first and the last of some keyframes."""
-    return float(np.ptp(session.distance[keyframes]))
+def stretch_of_target(session: SessionMap, keyframe: int, viewing: int, count: int) -> Stretch:
+    """The road of the ``count`` keyframes nearest to the ``viewing`` one, from ``keyframe`` on."""
+    away = np.abs(session.distance - session.distance[viewing])
+    members = np.argsort(away, kind="stable")[:count]
+    return Stretch.between(session.distance[members] - session.distance[keyframe], session.drift)
 
 
 def build_query(session: SessionMap, keyframe: int, settings: Resolved) -> tuple[Query, F64]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from semloc_logs.errors import WorkspaceError
 from semloc_logs.labels.space import KNOWS_CLASSES
 from semloc_logs.logs.log import MAP_FORMAT
+from semloc_logs.mapping.drift import UNMEASURED, Drift
 from semloc_logs.tables.table import read_json, read_table
 from semloc_logs.voxels.store import Keyframe, poses_of, read_keyframe
 from semloc_logs.workspace import SessionFolder
@@ -115,6 +116,12 @@ class SessionMap:
             wrong = (f["text"] for f in stream["findings"] if f["severity"] == "wrong")
             texts += [f"{stream['topic']}: {text}" for text in wrong]
         return texts
+
+    @cached_property
+    def drift(self) -> Drift:
+        """How its poses drift, as its range data showed."""
+        measured = (self.json.get("fit") or {}).get("drift")
+        return UNMEASURED if measured is None else Drift.from_json(measured)
 
     @property
     def is_map(self) -> bool:

@@ -9,16 +9,18 @@ from numpy.typing import NDArray
 from semloc_logs.alignment.covariance import (
     COMMON_BIAS,
     RANGE_BIAS,
-    Roads,
+    Stretch,
     covariance_of,
     stiffness,
 )
 from semloc_logs.alignment.hypotheses import SAME_PLACE_VOXELS
 from semloc_logs.alignment.icp import Fit, Step, Weighting, _add_point, align
+from semloc_logs.alignment.level_ground import ground_bias
 from semloc_logs.alignment.query_map import Query
 from semloc_logs.alignment.refine import fine_fit
 from semloc_logs.alignment.surface import flattened_surface, surface_of
 from semloc_logs.alignment.target_map import point_surface
+from semloc_logs.mapping.drift import UNMEASURED, Drift
 from semloc_logs.numerics.transforms import apply, exp_se3, inverse, rotation_angle, yaw_transform
 from semloc_logs.settings import Settings
 from semloc_logs.voxels.grid import Fuser
@@ -528,22 +530,92 @@ def test_a_fit_that_meets_too_little_knows_nothing() -> None:
     assert not found.range_bias.any()
 
 
-@pytest.mark.parametrize(
-    ("roads", "position", "angle"),
-    [
-        (Roads(), 0.0, 0.0),
-        (Roads(between=30.0), 0.3**2 / 3, 0.0),  # 1 % of the way
-        (Roads(query=20.0), 0.03**2 / 3, 0.002**2 / 3),  # 0.3 % and 0.2 mrad a metre of half of it
-        (Roads(target=20.0), 0.03**2 / 3, 0.002**2 / 3),
-        (Roads(20.0, 20.0, 30.0), (0.3**2 + 2 * 0.03**2) / 3, 2 * 0.002**2 / 3),
-    ],
-)
-def test_where_odometry_bridges_a_road_its_drift_is_added(
-    roads: Roads, position: float, angle: float
-) -> None:
+def test_a_stretch_of_road_counts_by_its_middle_and_a_share_of_its_width() -> None:
+    """Keyframes from 4 m behind the pose to 8 m before it: 2 m in the mean."""
+    offsets = np.array([-4.0, 0.0, 4.0, 8.0])
+    stretch = Stretch.between(offsets, UNMEASURED)
+    assert stretch.road == pytest.approx(np.sqrt(2.0**2 + 0.25 * 20.0))
+    assert Stretch.between(np.zeros(1), UNMEASURED).road == 0.0
+
+
+DRIFT = Drift((0.01, 0.02, 0.03), (1e-3, 2e-3, 3e-3))
+
+
+def added(query: Stretch, target: Stretch, target_T_query: F64) -> F64:
+    """What the drift along both stretches adds to a covariance (6, 6)."""
     found = fit(np.eye(4), SMALL)
     alone, bridged = (
-        covariance_of(found, np.eye(4), np.eye(4), 0.3, given) for given in (Roads(), roads)
+        covariance_of(found, target_T_query, np.eye(4), 0.3, *stretches)
+        for stretches in ((Stretch(), Stretch()), (query, target))
     )
-    expected = [position] * 3 + [angle] * 3
-    np.testing.assert_allclose(np.diag(bridged - alone), expected, atol=1e-12)
+    return bridged - alone
+
+
+@pytest.mark.parametrize("of_query", [True, False])
+def test_drift_along_the_road_of_a_map_is_added(of_query: bool) -> None:
+    """10 m of road, both bases at one place: 1, 2 and 3 % of it, and 1, 2 and 3 mrad a metre."""
+    stretches = [Stretch(), Stretch()]
+    stretches[0 if of_query else 1] = Stretch(10.0, DRIFT)
+    expected = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
+    np.testing.assert_allclose(added(*stretches, np.eye(4)), np.diag(expected), atol=1e-12)
+
+
+def test_the_drift_of_a_query_is_along_its_own_axes() -> None:
+    """A quarter turn: the query's x is the target's y."""
+    turned = added(Stretch(10.0, DRIFT), Stretch(), yaw_transform(np.pi / 2, (0.0, 0.0, 0.0)))
+    expected = np.array([0.2, 0.1, 0.3, 0.02, 0.01, 0.03]) ** 2
+    np.testing.assert_allclose(turned, np.diag(expected), atol=1e-12)
+
+
+def test_a_turned_map_of_a_target_moves_a_query_aside() -> None:
+    """A query 30 m to the left: the target's map is turned by 30 mrad, which is 0.9 m along x."""
+    aside = added(Stretch(), Stretch(10.0, DRIFT), yaw_transform(0.0, (0.0, 30.0, 0.0)))
+    assert aside[0, 0] == pytest.approx(0.1**2 + (30 * 0.03) ** 2)
+    assert aside[1, 1] == pytest.approx(0.2**2)
+    assert aside[2, 2] == pytest.approx(0.3**2 + (30 * 0.01) ** 2)
+    assert aside[0, 5] == pytest.approx(-30 * 0.03**2)  # turned to the left, it moves back
+
+
+def ground_and_walls(rng: np.random.Generator, lifted: float, left_only: bool = False) -> F64:
+    """Points (n, 3) of 20 m of level ground, a part of it ``lifted``, and of walls around it."""
+    ground = np.column_stack([rng.uniform(-10, 10, (6000, 2)), np.zeros(6000)])
+    off_road = ground[:, 1] > 3 if left_only else np.abs(ground[:, 1]) > 3
+    ground[off_road, 2] += lifted
+    along = rng.uniform(-10, 10, 6000)
+    height = rng.uniform(0, 4, 6000)
+    side = np.where(rng.random(6000) < 0.5, -10.0, 10.0)
+    walls = np.where(
+        (np.arange(6000) % 2 == 0)[:, None],
+        np.column_stack([along, side, height]),
+        np.column_stack([side, along, height]),
+    )
+    return np.concatenate([ground, walls]) + rng.normal(scale=0.01, size=(12000, 3))
+
+
+@pytest.mark.parametrize("left_only", [False, True])
+def test_ground_that_is_lifted_as_a_whole_makes_height_and_tilt_uncertain(left_only: bool) -> None:
+    """Snow of 0.2 m beside a road of 6 m, on 70 or 35 % of the ground."""
+    rng = np.random.default_rng(8)
+    surface = surface_of(ground_and_walls(rng, 0.0), CELL)
+    covariances = []
+    for lifted in (0.0, 0.2):
+        points = ground_and_walls(rng, lifted, left_only)
+        found = align(points, surface, np.eye(4), (Step(0.12, 10),))
+        bias = ground_bias(points, surface, found.target_T_query, found.centre, 0.45, 0.12)
+        covariances.append(
+            covariance_of(replace(found, ground_bias=bias), np.eye(4), np.eye(4), 0.3)
+        )
+    same, snow = covariances
+    mean = 0.2 * (0.35 if left_only else 0.7)
+    assert snow[2, 2] - same[2, 2] == pytest.approx(mean**2, rel=0.15)
+    tilt = mean / 5.8  # 5.8 m: a standard deviation of 20 m
+    assert 0.3 * tilt < np.sqrt(snow[3, 3] - same[3, 3]) < tilt
+    assert snow[5, 5] == pytest.approx(same[5, 5], rel=0.02)  # walls hold the heading
+    assert np.sqrt(same[2, 2]) < 0.02
+
+
+def test_without_level_ground_none_is_off() -> None:
+    rng = np.random.default_rng(9)
+    points = ground_and_walls(rng, 0.0)[6000:]
+    surface = surface_of(points, CELL)
+    assert not ground_bias(points, surface, np.eye(4), np.zeros(3), 0.45, 0.12).any()

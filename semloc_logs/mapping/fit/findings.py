@@ -9,6 +9,7 @@ import numpy as np
 
 from semloc_logs.logs.poses.plausibility import Jump
 from semloc_logs.logs.problems import Problem, ProblemKind
+from semloc_logs.mapping.drift import Drift
 from semloc_logs.mapping.fit.model import PRIOR
 
 LEAST_PAIRS = 4  # fewer tell nothing
@@ -48,6 +49,7 @@ class StreamFit:
     ``pairs`` were registered; poses and clouds differ by ``translation_m`` and ``rotation_rad`` in
     the median. ``parameters`` are (estimate, standard deviation) by name; ``hidden`` are the faults
     that the drive would not show: a straight one hides a lever arm, a steady one a clock offset.
+    ``drift`` of the poses, where the clouds show it.
     """
 
     topic: str
@@ -57,6 +59,7 @@ class StreamFit:
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
     hidden: list[str] = field(default_factory=list)
+    drift: Drift | None = None
 
     @property
     def is_wrong(self) -> bool:
@@ -144,6 +147,13 @@ class SessionFit:
                 problems.append(Problem(stream.topic, ProblemKind.FIT, note, lost=False))
         return problems
 
+    @property
+    def drift(self) -> Drift | None:
+        """The smallest one that a stream shows: what noise of a stream adds is no drift."""
+        drifts = (stream.drift for stream in self.streams)
+        shown = [drift for drift in drifts if drift is not None]
+        return min(shown, key=lambda d: float(np.linalg.norm(d.translation)), default=None)
+
     def _track_text(self) -> str | None:
         if self.jump is not None:
             return self.jump.text
@@ -155,4 +165,5 @@ class SessionFit:
             "fits": self.fits,
             "track": self._track_text(),
             "streams": [stream.to_json() for stream in self.streams],
+            "drift": None if self.drift is None else self.drift.to_json(),
         }

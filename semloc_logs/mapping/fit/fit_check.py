@@ -34,6 +34,7 @@ from semloc_logs.mapping.fit.keyframe_pairs import (
     noise,
     registered,
 )
+from semloc_logs.mapping.fit.local_drift import local_drift
 from semloc_logs.mapping.fit.model import (
     CLOCK,
     LEVER,
@@ -119,6 +120,8 @@ def check_session(session: Session, collected: Collected, voxel: float) -> Sessi
             stream.findings = [Finding(Severity.WRONG, known)]
         _add_lead(stream, session.lead_of(topic), clouds)
         _add_off_stamp(stream, session.off_stamp_of(topic), clouds)
+        if not stream.is_wrong:
+            stream.drift = local_drift(clouds)
         check.streams.append(stream)
     return check
 

@@ -1,0 +1,50 @@
+"""What level ground says otherwise than a fit: snow, leaves and grass lift it for a whole place."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.alignment.icp import KERNEL
+from semloc_logs.alignment.surface import Surface, look_at, nearest_points
+from semloc_logs.numerics.transforms import apply
+
+F64 = NDArray[np.float64]
+STRIDE = 3  # of the points that are looked at, which stand for all
+LEVEL = 0.9  # of the normal's height on level ground
+PLANAR = 0.3  # of its surroundings
+LEAST_POINTS = 30
+
+
+def ground_bias(
+    points: F64, surface: Surface, target_T_query: F64, centre: F64, reach: float, radius: float
+) -> F64:
+    """Right sides (3, 6) of a fit's equations if its level ground is off as a whole.
+
+    Points (n, 3) of the query within ``reach`` metres of level ground lie above or below it by so
+    much in the mean. Each row is that much: all of it lifted, and tilted along x and along y. The
+    fit used those within ``radius``; its equations are about ``centre`` (3,).
+    """
+    moved = apply(target_T_query, points[::STRIDE])
+    index = nearest_points(surface.arrays, moved, reach)
+    look_at(surface.arrays, index)
+    met = index >= 0
+    index = index[met]
+    normal = surface.normals[index]
+    is_level = (np.abs(normal[:, 2]) > LEVEL) & (surface.planar[index] > PLANAR)
+    if int(is_level.sum()) < LEAST_POINTS:
+        return np.zeros((3, 6))
+
+    up = normal[is_level] * np.sign(normal[is_level, 2:])
+    at = moved[met][is_level]
+    off = at - surface.points[index[is_level]]
+    above = np.einsum("ij,ij->i", off, up)
+    arm = at - centre
+    weight = STRIDE * surface.planar[index[is_level]] / (1 + (above / (KERNEL * radius)) ** 2)
+    weight *= np.linalg.norm(off, axis=1) < radius
+
+    around = arm - arm.mean(0)
+    width = max(float(np.sqrt(np.mean(around[:, :2] ** 2))), radius)
+    shapes = np.stack([np.ones(len(arm)), around[:, 0] / width, around[:, 1] / width])
+    jacobian = np.concatenate([up, np.cross(arm, up)], axis=1)
+    return np.asarray(float(np.mean(above)) * (shapes * weight) @ jacobian)

@@ -1,0 +1,72 @@
+"""How far poses drift over the road that a map of a place is made from, as range data show it.
+
+Keyframes some way apart are registered with each other, there and back, from the motion that the
+poses give; what the registration changes is drift, less what both ways differ.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semloc_logs.mapping.drift import Drift
+from semloc_logs.mapping.fit.keyframe_pairs import Clouds, Registrar, motion
+from semloc_logs.mapping.fit.model import difference
+from semloc_logs.numerics.evenly import evenly
+from semloc_logs.numerics.transforms import inverse
+
+F64 = NDArray[np.float64]
+WAY = 40.0  # voxels between both keyframes: about the road of a query
+LONGEST_WAY = 1.5  # of it: where keyframes are sparse, or poses jump
+PAIRS = 16
+LEAST_PAIRS = 8
+# registrations that differ there and back by more than so many times the usual went wrong
+AGREE = 3.0
+# of the way: registrations of more noise than this tell less than is known anyway
+MOST_NOISE = 0.003
+
+
+def local_drift(clouds: Clouds) -> Drift | None:
+    """The drift of the poses of one stream's keyframes; None where these do not show it."""
+    numbers = _apart(clouds)
+    if len(numbers) < LEAST_PAIRS:
+        return None
+    registrar = Registrar(clouds)
+    given = np.array([motion(clouds, target, source) for target, source in numbers])
+    there = np.empty_like(given)
+    back = np.empty_like(given)
+    for k, (target, source) in enumerate(numbers):
+        there[k] = registrar.fit(target, source, [given[k]]).target_T_source
+        back[k] = inverse(registrar.fit(source, target, [inverse(given[k])]).target_T_source)
+    return drift_of(given, there, back)
+
+
+def drift_of(given: F64, there: F64, back: F64) -> Drift | None:
+    """The drift of ``given`` motions (n, 4, 4), registered twice; None where both ways differ."""
+    off = np.stack([difference(there, given), difference(back, given)])
+    noise = 0.5 * (off[0] - off[1])
+    lengths = np.linalg.norm(noise[:, :3], axis=1)
+    agree = lengths <= AGREE * np.median(lengths)
+    way = float(np.sqrt(np.mean(np.sum(given[agree, :3, 3] ** 2, axis=1))))
+    noise_squares = np.mean(noise[agree] ** 2, axis=0)
+    if float(np.sqrt(noise_squares[:3].max())) > MOST_NOISE * way:
+        return None
+    squares = np.mean(off.mean(0)[agree] ** 2, axis=0)
+    return Drift.of(np.sqrt(np.maximum(squares - noise_squares, 0.0)) / way)
+
+
+def _apart(clouds: Clouds) -> list[tuple[int, int]]:
+    """Numbers of the target and the source of at most :data:`PAIRS` pairs, evenly spread."""
+    way = WAY * clouds.voxel
+    poses = [clouds.pose(number) for number in range(len(clouds.rows))]
+    known = [number for number, pose in enumerate(poses) if pose is not None]
+    if not known:
+        return []
+    positions = np.array([pose[:3, 3] for pose in poses if pose is not None])
+    chosen = []
+    for k, target in enumerate(known):
+        lengths = np.linalg.norm(positions[k + 1 :] - positions[k], axis=1)
+        apart = np.flatnonzero(lengths >= way)
+        if len(apart) and lengths[apart[0]] <= LONGEST_WAY * way:
+            chosen.append((target, known[k + 1 + int(apart[0])]))
+    return [chosen[i] for i in evenly(len(chosen), PAIRS)]

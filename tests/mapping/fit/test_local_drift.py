@@ -1,0 +1,114 @@
+"""Drift that is put into the poses of a drive is measured from its clouds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semloc_logs.mapping.drift import Drift
+from semloc_logs.mapping.fit.findings import SessionFit, StreamFit
+from semloc_logs.mapping.fit.local_drift import drift_of, local_drift
+from semloc_logs.numerics.transforms import exp_se3, inverse
+
+F64 = NDArray[np.float64]
+SPREAD = np.array([0.05, 0.02, 0.01, 0.001, 0.002, 0.004])  # m and rad over 10 m
+RATES = SPREAD / 10.0
+
+
+def drifting(scale: float, turn: float) -> SimpleNamespace:
+    """Poses whose steps are ``scale`` times as long and turned by ``turn`` rad a metre."""
+
+    def written(poses: F64) -> F64:
+        steps = inverse(poses[:-1]) @ poses[1:]
+        out = [poses[0]]
+        for step in steps:
+            wrong = step.copy()
+            wrong[:3, 3] *= scale
+            way = float(np.linalg.norm(step[:3, 3]))
+            wrong[:3, :3] = (
+                step[:3, :3] @ exp_se3(np.zeros(3), np.array([0, 0, turn * way]))[:3, :3]
+            )
+            out.append(out[-1] @ wrong)
+        return np.array(out)
+
+    return SimpleNamespace(written=written)
+
+
+def measured(folder: Path, streets: SimpleNamespace, scale: float, turn: float) -> Drift:
+    clouds, _ = streets.drive(folder, as_written=drifting(scale, turn).written, seconds=25.0)
+    drift = local_drift(clouds)
+    assert drift is not None
+    return drift
+
+
+def test_poses_without_drift_show_none(tmp_path: Path, streets: SimpleNamespace) -> None:
+    drift = measured(tmp_path, streets, 1.0, 0.0)
+    assert max(drift.translation) < 1e-3
+    assert max(drift.rotation) < 2e-4
+
+
+def test_a_wrong_scale_is_drift_along_the_way(tmp_path: Path, streets: SimpleNamespace) -> None:
+    drift = measured(tmp_path, streets, 1.02, 0.0)
+    assert drift.translation[0] == pytest.approx(0.02, rel=0.15)
+    assert max(drift.translation[1:]) < 0.007  # the drive winds
+    assert max(drift.rotation) < 2e-4
+
+
+def test_a_wrong_turn_rate_is_drift_of_the_heading(
+    tmp_path: Path, streets: SimpleNamespace
+) -> None:
+    drift = measured(tmp_path, streets, 1.0, 1e-3)
+    assert drift.rotation[2] == pytest.approx(1e-3, rel=0.2)
+    assert max(drift.rotation[:2]) < 2e-4
+
+
+def test_too_short_a_drive_shows_no_drift(tmp_path: Path, streets: SimpleNamespace) -> None:
+    clouds, _ = streets.drive(tmp_path, seconds=5.0)
+    assert local_drift(clouds) is None
+
+
+def given_and_registered(noise: float, wrong: int = 0) -> tuple[F64, F64, F64]:
+    """400 motions of 10 m with errors of :data:`SPREAD`; registrations there and back with
+    ``noise`` times as large ones, and ``wrong`` ones that ended elsewhere on the way back.
+    """
+    rng = np.random.default_rng(3)
+    true = np.tile(np.eye(4), (400, 1, 1))
+    true[:, 0, 3] = 10.0
+
+    def off(size: F64) -> F64:
+        errors = rng.normal(size=(400, 6)) * size
+        return np.array([m @ exp_se3(e[:3], e[3:]) for m, e in zip(true, errors, strict=True)])
+
+    back = off(noise * SPREAD)
+    back[:wrong, 1, 3] += 3.0
+    return off(SPREAD), off(noise * SPREAD), back
+
+
+@pytest.mark.parametrize(("noise", "wrong"), [(0.0, 0), (0.5, 0), (0.5, 40)])
+def test_noise_of_registrations_is_no_drift(noise: float, wrong: int) -> None:
+    drift = drift_of(*given_and_registered(noise, wrong))
+    assert drift is not None
+    np.testing.assert_allclose([*drift.translation, *drift.rotation], RATES, rtol=0.15)
+
+
+def test_noisy_registrations_tell_nothing() -> None:
+    assert drift_of(*given_and_registered(2.0)) is None
+
+
+def test_drift_over_a_road_in_json_and_back() -> None:
+    drift = Drift.of(RATES)
+    np.testing.assert_allclose(np.diag(drift.covariance(10.0)), SPREAD**2)
+    assert Drift.from_json(drift.to_json()) == drift
+
+
+def test_a_session_drifts_as_the_stream_says_that_shows_least() -> None:
+    small = Drift.of(RATES)
+    streams = [StreamFit("/a", drift=Drift.of(2 * RATES)), StreamFit("/b", drift=small)]
+    fit = SessionFit("/odometry", streams=[*streams, StreamFit("/c")])
+    assert fit.drift == small
+    assert fit.to_json()["drift"] == small.to_json()
+    assert SessionFit("/odometry", streams=[StreamFit("/c")]).to_json()["drift"] is None
