@@ -1,4 +1,4 @@
-"""What level ground says otherwise than a fit: snow, leaves and grass lift it for a whole place."""
+"""The error of a fit where level ground is lifted as a whole, by snow, leaves or grass."""
 
 from __future__ import annotations
 

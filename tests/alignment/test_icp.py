@@ -554,10 +554,10 @@ def added(query: Stretch, target: Stretch, target_T_query: F64) -> F64:
 @pytest.mark.parametrize("of_query", [True, False])
 def test_drift_along_the_road_of_a_map_is_added(of_query: bool) -> None:
     """10 m of road, both bases at one place: 1, 2 and 3 % of it, and 1, 2 and 3 mrad a metre."""
-    stretches = [Stretch(), Stretch()]
-    stretches[0 if of_query else 1] = Stretch(10.0, DRIFT)
+    long = Stretch(10.0, DRIFT)
+    query, target = (long, Stretch()) if of_query else (Stretch(), long)
     expected = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2
-    np.testing.assert_allclose(added(*stretches, np.eye(4)), np.diag(expected), atol=1e-12)
+    np.testing.assert_allclose(added(query, target, np.eye(4)), np.diag(expected), atol=1e-12)
 
 
 def test_the_drift_of_a_query_is_along_its_own_axes() -> None:

@@ -149,7 +149,7 @@ class SessionFit:
 
     @property
     def drift(self) -> Drift | None:
-        """The smallest one that a stream shows: what noise of a stream adds is no drift."""
+        """The smallest one that a stream shows: noise of a stream only adds to it."""
         drifts = (stream.drift for stream in self.streams)
         shown = [drift for drift in drifts if drift is not None]
         return min(shown, key=lambda d: float(np.linalg.norm(d.translation)), default=None)

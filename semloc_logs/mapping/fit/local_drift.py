@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semloc_logs.mapping.drift import Drift
-from semloc_logs.mapping.fit.keyframe_pairs import Clouds, Registrar, motion
+from semloc_logs.mapping.fit.keyframe_pairs import LEAST_SHARE, Clouds, Registrar, motion
 from semloc_logs.mapping.fit.model import difference
 from semloc_logs.numerics.evenly import evenly
 from semloc_logs.numerics.transforms import inverse
@@ -29,16 +29,18 @@ MOST_NOISE = 0.003
 def local_drift(clouds: Clouds) -> Drift | None:
     """The drift of the poses of one stream's keyframes; None where these do not show it."""
     numbers = _apart(clouds)
-    if len(numbers) < LEAST_PAIRS:
-        return None
     registrar = Registrar(clouds)
-    given = np.array([motion(clouds, target, source) for target, source in numbers])
-    there = np.empty_like(given)
-    back = np.empty_like(given)
-    for k, (target, source) in enumerate(numbers):
-        there[k] = registrar.fit(target, source, [given[k]]).target_T_source
-        back[k] = inverse(registrar.fit(source, target, [inverse(given[k])]).target_T_source)
-    return drift_of(given, there, back)
+    met = []
+    for target, source in numbers:
+        given = motion(clouds, target, source)
+        there = registrar.fit(target, source, [given])
+        back = registrar.fit(source, target, [inverse(given)])
+        if min(there.share, back.share) >= LEAST_SHARE:
+            met.append((given, there.target_T_source, inverse(back.target_T_source)))
+    if len(met) < LEAST_PAIRS:
+        return None
+    motions = np.array(met)
+    return drift_of(motions[:, 0], motions[:, 1], motions[:, 2])
 
 
 def drift_of(given: F64, there: F64, back: F64) -> Drift | None:

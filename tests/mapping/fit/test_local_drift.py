@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from semloc_logs.mapping.drift import Drift
 from semloc_logs.mapping.fit.findings import SessionFit, StreamFit
 from semloc_logs.mapping.fit.local_drift import drift_of, local_drift
+from semloc_logs.mapping.keyframes import Collected
 from semloc_logs.numerics.transforms import exp_se3, inverse
 
 F64 = NDArray[np.float64]
@@ -68,6 +69,16 @@ def test_a_wrong_turn_rate_is_drift_of_the_heading(
 
 def test_too_short_a_drive_shows_no_drift(tmp_path: Path, streets: SimpleNamespace) -> None:
     clouds, _ = streets.drive(tmp_path, seconds=5.0)
+    assert local_drift(clouds) is None
+
+
+def test_clouds_that_do_not_meet_show_no_drift(
+    tmp_path: Path, streets: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A registration without a plane stays where it began, which is no proof of it."""
+    clouds, _ = streets.drive(tmp_path, seconds=25.0)
+    ball = np.random.default_rng(0).normal(0, 0.3, (500, 3))
+    monkeypatch.setattr(Collected, "load", lambda self, k: (ball + 100.0 * k, None, None))
     assert local_drift(clouds) is None
 
 
