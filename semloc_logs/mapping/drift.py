@@ -30,6 +30,11 @@ class Drift:
         x, y, z, roll, pitch, yaw = rates.tolist()
         return cls((x, y, z), (roll, pitch, yaw))
 
+    @property
+    def percent(self) -> float:
+        """The greatest part of the translation, in percent of the way."""
+        return 100 * max(self.translation)
+
     def covariance(self, road: float) -> F64:
         """Covariance (6, 6) of a motion over ``road`` metres, in the axes of the base."""
         return np.diag((road * np.array([*self.translation, *self.rotation])) ** 2)

@@ -118,10 +118,15 @@ class SessionMap:
         return texts
 
     @cached_property
-    def drift(self) -> Drift:
-        """How its poses drift, as its range data showed."""
+    def measured_drift(self) -> Drift | None:
+        """How its poses drift, where its range data showed it."""
         measured = (self.json.get("fit") or {}).get("drift")
-        return UNMEASURED if measured is None else Drift.from_json(measured)
+        return None if measured is None else Drift.from_json(measured)
+
+    @property
+    def drift(self) -> Drift:
+        """How its poses drift, measured or as odometry usually does."""
+        return self.measured_drift or UNMEASURED
 
     @property
     def is_map(self) -> bool:

@@ -22,7 +22,10 @@ from semloc_logs.workspace import Workspace
 
 @dataclass(frozen=True, slots=True)
 class SessionSummary:
-    """A session of a workspace; ``searched`` counts the sessions that it was compared with."""
+    """A session of a workspace; ``searched`` counts the sessions that it was compared with.
+
+    ``drift_percent`` of its poses over some ten metres, None where its clouds do not show it.
+    """
 
     name: str
     logs: tuple[str, ...]
@@ -31,6 +34,7 @@ class SessionSummary:
     road_m: float
     keyframes: int
     submaps: int
+    drift_percent: float | None
     label_source: str
     described: bool
     searched: int
@@ -46,6 +50,7 @@ def list_sessions(work: Workspace, names: Iterable[str] = ()) -> list[SessionSum
     for folder in folders:
         session = SessionMap(folder)
         stamps_ns = session.stamps_ns
+        drift = session.measured_drift
         summary = SessionSummary(
             name=folder.name,
             logs=tuple(str(log["path"]) for log in session.json["logs"]),
@@ -54,6 +59,7 @@ def list_sessions(work: Workspace, names: Iterable[str] = ()) -> list[SessionSum
             road_m=float(session.distance[-1]),
             keyframes=len(stamps_ns),
             submaps=len(session.submaps),
+            drift_percent=None if drift is None else round(drift.percent, 2),
             label_source=session.label_source,
             described=folder.words_json.exists(),
             searched=sum(folder.name in (p.query, p.target) for p in pairs),

@@ -10,10 +10,12 @@ import pytest
 
 from semloc_logs.engines import Serial
 from semloc_logs.errors import WorkspaceError
+from semloc_logs.mapping.drift import UNMEASURED
+from semloc_logs.mapping.session_map import SessionMap
 from semloc_logs.stages import close as close_stage
 from semloc_logs.stages import pair_search
 from semloc_logs.stages.stored_sessions import list_sessions, remove_session, rename_session
-from semloc_logs.tables.table import read_json
+from semloc_logs.tables.table import read_json, write_json
 from semloc_logs.workspace import Workspace
 
 
@@ -27,9 +29,20 @@ def test_sessions_are_listed_in_the_order_of_their_recording(coarse: Workspace) 
     assert (monday.name, tuesday.name) == ("monday", "tuesday")
     assert monday.logs[0].endswith("monday.mcap")
     assert 10.0 < monday.road_m < 20.0
+    assert monday.drift_percent is None  # too short a drive
     assert monday.described
     assert (monday.searched, monday.closures) == (2, len(closures(coarse)))
     assert [s.name for s in list_sessions(coarse, ["tuesday"])] == ["tuesday"]
+
+
+def test_a_session_tells_the_drift_that_its_clouds_showed(coarse: Workspace) -> None:
+    path = coarse.session("monday").session_json
+    content = read_json(path)
+    content["fit"]["drift"] = {"translation": [0.0197, 0.004, 0.001], "rotation": [0.0, 0.0, 3e-4]}
+    write_json(path, content)
+    assert list_sessions(coarse, ["monday"])[0].drift_percent == 1.97
+    assert SessionMap(coarse.session("monday")).drift.rotation == (0.0, 0.0, 3e-4)
+    assert SessionMap(coarse.session("tuesday")).drift is UNMEASURED
 
 
 @pytest.mark.parametrize("name", ["monday", "tuesday"])
