@@ -54,7 +54,9 @@ def drift_of(given: F64, there: F64, back: F64) -> Drift | None:
     if float(np.sqrt(noise_squares[:3].max())) > MOST_NOISE * way:
         return None
     squares = np.mean(off.mean(0)[agree] ** 2, axis=0)
-    return Drift.of(np.sqrt(np.maximum(squares - noise_squares, 0.0)) / way)
+    # the mean of n squares of noise is itself known to a share of (2 / n)^0.5
+    unknown = np.sqrt(2.0 / np.count_nonzero(agree)) * noise_squares
+    return Drift.of(np.sqrt(np.maximum(squares - noise_squares, 0.0) + unknown) / way)
 
 
 def _apart(clouds: Clouds) -> list[tuple[int, int]]:

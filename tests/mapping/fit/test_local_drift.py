@@ -106,6 +106,18 @@ def test_noise_of_registrations_is_no_drift(noise: float, wrong: int) -> None:
     np.testing.assert_allclose([*drift.translation, *drift.rotation], RATES, rtol=0.15)
 
 
+def test_drift_that_noise_hides_may_be_as_large_as_the_noise_is_unsure() -> None:
+    """Of 400 pairs the variance of noise is known to 7 %, of 16 to 35 %."""
+    _, there, back = given_and_registered(0.5)
+    for count, share in ((400, 0.07), (16, 0.35)):
+        # the same noise both ways: no drift
+        middle = 0.5 * (there[:count] + back[:count])
+        drift = drift_of(middle, there[:count], back[:count])
+        assert drift is not None
+        noise = 0.5 * SPREAD[0] / np.sqrt(2)
+        assert drift.translation[0] == pytest.approx(np.sqrt(share) * noise / 10.0, rel=0.3)
+
+
 def test_noisy_registrations_tell_nothing() -> None:
     assert drift_of(*given_and_registered(2.0)) is None
 
