@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from .console import console, duration
 
 if TYPE_CHECKING:
+    from semloc_logs.evaluation.map_sharpness import Sharpness
     from semloc_logs.evaluation.trajectory_errors import TrajectoryErrors
     from semloc_logs.stages.dry_run import Plan
     from semloc_logs.stages.report import Report
@@ -167,3 +168,17 @@ def show_trajectory_errors(errors: TrajectoryErrors) -> None:
     if errors.ate_after_m is not None:
         before = "-" if errors.ate_before_m is None else f"{errors.ate_before_m:.3f} m"
         console.result(f"ATE {before} before, {errors.ate_after_m:.3f} m after")
+
+
+def show_sharpness(sharpness: Sharpness) -> None:
+    """The planes of the common map before and after, where sessions meet."""
+    figures = [
+        f"{100 * planes:.0f} % of the cells are planes, {thickness:.3f} m thick, {when}"
+        for planes, thickness, when in (
+            (sharpness.planes_before, sharpness.thickness_before_m, "before"),
+            (sharpness.planes_after, sharpness.thickness_after_m, "after"),
+        )
+        if planes is not None and thickness is not None
+    ]
+    if figures:
+        console.result(f"Map in {sharpness.places} places: {'; '.join(figures)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from ..options import (
     tables_settings_options,
     work_option,
 )
-from ..results import SHOWN, show_trajectory_errors
+from ..results import SHOWN, show_sharpness, show_trajectory_errors
 
 if TYPE_CHECKING:
     from semloc_logs.evaluation.truth import Evaluation
@@ -54,12 +55,14 @@ def command(
 
     Recall is the share of the queries near a database keyframe (5 m) that have a correct closure.
     After semloc optimize also the errors of the trajectories before and after: ATE and RPE of 10 m,
-    root mean squares, as evo defines them. With --heading 90 a query counts where all keyframes
+    root mean squares, as evo defines them; and how sharp the common map is, which needs no truth.
+    With --heading 90 a query counts where all keyframes
     near it were driven across, and closures between such views.
 
     \b
     Example:  semloc evaluate -w work --truth truth.json
     """
+    from semloc_logs.evaluation.map_sharpness import map_sharpness
     from semloc_logs.evaluation.trajectory_errors import trajectory_errors
     from semloc_logs.evaluation.truth import evaluate_closures
     from semloc_logs.workspace import Workspace
@@ -68,13 +71,20 @@ def command(
     result = evaluate_closures(
         workspace, truth, settings, self_closures=not no_self, heading_deg=heading
     )
-    errors = trajectory_errors(workspace, truth) if workspace.graph_closures.exists() else None
+    is_optimized = workspace.graph_closures.exists()
+    errors = trajectory_errors(workspace, truth) if is_optimized else None
+    sharpness = map_sharpness(workspace) if is_optimized else None
     if as_json:
-        console.result_json(result.to_json() | ({} if errors is None else errors.to_json()))
+        content = result.to_json()
+        if errors is not None and sharpness is not None:
+            content |= errors.to_json() | {"sharpness": asdict(sharpness)}
+        console.result_json(content)
     else:
         show_evaluation(result)
         if errors is not None:
             show_trajectory_errors(errors)
+        if sharpness is not None:
+            show_sharpness(sharpness)
     if result.unjudged:
         console.warn(
             f"{result.unjudged} closures have an end whose true pose {truth} does not say: they"

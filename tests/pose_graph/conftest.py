@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from semloc_logs.logs.poses.navsat import LocalFrame
-from semloc_logs.numerics.transforms import exp_se3, inverse, yaw_transform
+from semloc_logs.numerics.transforms import apply, exp_se3, inverse, yaw_transform
 from semloc_logs.tables import contracts
 from semloc_logs.tables.table import write_json, write_table
-from semloc_logs.voxels.store import pose_columns
+from semloc_logs.voxels.store import Keyframe, keep_keyframes, pose_columns
 from semloc_logs.workspace import Workspace
 
 F64 = NDArray[np.float64]
@@ -106,6 +106,19 @@ class Drives:
             (self.truth_file.parent / f"{session}.tum").write_text("\n".join(lines) + "\n")
             truth[session] = {"trajectory": f"{session}.tum"}
         self.truth_file.write_text(json.dumps(truth))
+
+    def see(self, world: F64) -> None:
+        """Keyframes of points (n, 3) of the ``world`` within 12 m of where a drive truly was."""
+        for name, poses in self.true.items():
+            folder = self.work.session(name).keyframes
+            folder.mkdir()
+            clouds = []
+            for pose in poses:
+                near = world[np.linalg.norm(world - pose[:3, 3], axis=1) < 12.0]
+                points = apply(inverse(pose), near).astype(np.float32)
+                clouds.append(Keyframe(points, np.zeros(len(points), np.uint8)))
+            stamps_ns = (self.start_s[name] + np.arange(len(poses))) * SECOND
+            list(keep_keyframes(folder, stamps_ns.tolist(), clouds, METADATA))
 
     def locate(
         self, name: str, enu_T_common: F64, wrong: Sequence[int] = (), every: int = 5

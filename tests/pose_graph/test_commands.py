@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from numpy.typing import NDArray
 
 from semloc_logs.cli.main import program
 from semloc_logs.evaluation.truth import read_tum
 from semloc_logs.numerics.transforms import yaw_transform
 
+F64 = NDArray[np.float64]
 pytest.importorskip("gtsam")
 
 
@@ -29,9 +31,20 @@ def work(drives: Any, square_of: Any) -> Any:
     return drives
 
 
+def fence() -> F64:
+    """Points (n, 3) of walls of 3 m, 8 m outside a block of 100 m."""
+    at, height = (a.ravel() for a in np.meshgrid(np.arange(-8.0, 108.0, 0.2), np.arange(0, 3, 0.3)))
+    sides = []
+    for outside in (-8.0, 108.0):
+        sides.append(np.column_stack([at, np.full(len(at), outside), height]))
+        sides.append(np.column_stack([np.full(len(at), outside), at, height]))
+    return np.concatenate(sides)
+
+
 def test_the_errors_before_and_after_are_printed(work: Any) -> None:
     result = semloc("optimize", "-w", work.work.path, "--truth", work.truth_file, "--json")
     assert result.exit_code == 0, result.output
+    work.see(fence())
     content = json.loads(result.stdout)
     assert (content["sessions"], content["closures"], content["rejected"]) == (3, 42, 1)
     assert content["frames"] == 2
@@ -43,6 +56,10 @@ def test_the_errors_before_and_after_are_printed(work: Any) -> None:
     assert evaluated["false"] == 1
     for name in ("ate_before_m", "ate_after_m", "rpe_after_m"):
         assert evaluated[name] == content[name]
+    sharpness = evaluated["sharpness"]
+    assert sharpness["places"] > 10
+    assert sharpness["planes_after"] > sharpness["planes_before"]
+    assert sharpness["thickness_after_m"] < 0.15
     text = semloc("optimize", "-w", work.work.path, "--truth", work.truth_file).stdout
     assert "3 sessions in 2 frames by 42 closures, 1 of them refused" in text
     assert "ATE" in text
