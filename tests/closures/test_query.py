@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from semloc_logs.alignment.covariance import SPREAD_SHARE
 from semloc_logs.closures.closure_tables import keyframe_at
-from semloc_logs.closures.query import build_query, query_keyframes, query_members
+from semloc_logs.closures.query import (
+    build_query,
+    query_keyframes,
+    query_members,
+    stretch_of_query,
+    stretch_of_target,
+)
 from semloc_logs.errors import SettingsError, WorkspaceError
 from semloc_logs.mapping.selection import road_distance
 from semloc_logs.mapping.session_map import SessionMap
@@ -200,3 +207,20 @@ def test_points_of_a_camera_keep_their_spread(tmp_path: Path) -> None:
     assert query.spread is not None
     np.testing.assert_allclose(query.spread, [[0.0, 0.2, 0.0]], atol=1e-4)
     assert query.sigma == pytest.approx(0.2, abs=1e-4)
+
+
+def test_the_stretch_of_a_query_begins_at_its_pose(tmp_path: Path) -> None:
+    """Keyframes 1 m apart: two on either side of the middle one; all four ahead of the first."""
+    s = session(tmp_path, straight(12, 1.0))
+    middle = stretch_of_query(s, 6, settings())
+    assert middle.road == pytest.approx(np.sqrt(SPREAD_SHARE * 2.0))
+    first = stretch_of_query(s, 0, settings())
+    assert first.road == pytest.approx(np.sqrt(2.0**2 + SPREAD_SHARE * 2.0))
+
+
+def test_the_stretch_of_a_target_leads_from_its_pose_to_where_it_was_seen(tmp_path: Path) -> None:
+    """Seen from keyframes 7 to 9, the pose at 2: 6 m ahead."""
+    s = session(tmp_path, straight(12, 1.0))
+    seen = stretch_of_target(s, 2, 8, 3)
+    assert seen.road == pytest.approx(np.sqrt(6.0**2 + SPREAD_SHARE * 2.0 / 3.0))
+    assert stretch_of_target(s, 8, 8, 1).road == 0.0
