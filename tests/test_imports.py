@@ -95,6 +95,7 @@ INNER_ORDER = {
         "target_map",
         "scores",
         "search",
+        "level_ground",
         "refine",
         "covariance",
     ],
